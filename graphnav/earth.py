@@ -1,0 +1,106 @@
+"""WGS-84: geodetic and Earth-centred coordinates, gravity, Earth rate, and the local ENU frame.
+
+Constants and normal gravity from NIMA TR8350.2 (WGS-84, 3rd ed.), table 3.1-3.4 and eq. 4-1, 4-3;
+frames as in Groves, *Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems*
+(2nd ed.), section 2.4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.rotation import Array
+
+A = 6378137.0  # semi-major axis, m
+F = 1.0 / 298.257223563  # flattening
+E2 = F * (2.0 - F)  # first eccentricity squared
+GM = 3.986004418e14  # m^3/s^2
+RATE = 7.292115e-5  # rad/s
+_GAMMA_E, _K_SOMIGLIANA = 9.7803253359, 0.00193185265241
+_M = RATE**2 * A**2 * (A * (1.0 - F)) / GM
+
+
+def llh_to_ecef(llh: Array) -> Array:
+    """(lat, lon, h) in rad, rad, m -> Earth-centred Earth-fixed metres; (..., 3) -> (..., 3)."""
+    lat, lon, h = np.moveaxis(np.asarray(llh, dtype=float), -1, 0)
+    n = A / np.sqrt(1.0 - E2 * np.sin(lat) ** 2)
+    return np.stack(
+        [(n + h) * np.cos(lat) * np.cos(lon), (n + h) * np.cos(lat) * np.sin(lon), (n * (1 - E2) + h) * np.sin(lat)],
+        -1,
+    )
+
+
+def ecef_to_llh(r: Array) -> Array:
+    """Inverse of `llh_to_ecef`: Bowring's start and fixed-point steps, exact to 1e-9 m near the surface."""
+    x, y, z = np.moveaxis(np.asarray(r, dtype=float), -1, 0)
+    p = np.hypot(x, y)
+    lat = np.arctan2(z, p * (1.0 - E2))
+    for _ in range(5):
+        s = np.sin(lat)
+        n = A / np.sqrt(1.0 - E2 * s * s)
+        lat = np.arctan2(z + E2 * n * s, p)
+    s, c = np.sin(lat), np.cos(lat)
+    h = p * c + z * s - A * np.sqrt(1.0 - E2 * s * s)
+    return np.stack([lat, np.arctan2(y, x), h], -1)
+
+
+def enu_axes(llh: Array) -> Array:
+    """R_ne: rows are the east, north and up axes in ECEF; (..., 3) -> (..., 3, 3)."""
+    lat, lon = np.asarray(llh, dtype=float)[..., 0], np.asarray(llh, dtype=float)[..., 1]
+    sl, cl, so, co = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
+    zero = np.zeros_like(sl)
+    rows = [[-so, co, zero], [-sl * co, -sl * so, cl], [cl * co, cl * so, sl]]
+    return np.stack([np.stack(r, -1) for r in rows], -2)
+
+
+def gravity(lat: Array, h: Array) -> Array:
+    """Magnitude of normal gravity, m/s^2, at geodetic latitude (rad) and height (m)."""
+    s2 = np.sin(lat) ** 2
+    surface = _GAMMA_E * (1.0 + _K_SOMIGLIANA * s2) / np.sqrt(1.0 - E2 * s2)
+    return surface * (1.0 - 2.0 / A * (1.0 + F + _M - 2.0 * F * s2) * h + 3.0 * (h / A) ** 2)
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """One fixed ENU tangent frame (n) with its origin at `origin` = (lat, lon, h) in rad, rad, m."""
+
+    origin: Array
+
+    @property
+    def R_ne(self) -> Array:
+        """Navigation from ECEF coordinates."""
+        return enu_axes(self.origin)
+
+    @property
+    def r_e(self) -> Array:
+        """The origin in ECEF, m."""
+        return llh_to_ecef(self.origin)
+
+    @property
+    def omega_n(self) -> Array:
+        """Earth's rotation rate in n, rad/s."""
+        return self.R_ne @ np.array([0.0, 0.0, RATE])
+
+    def to_llh(self, p_n: Array) -> Array:
+        """Positions in n (..., 3) -> (lat, lon, h)."""
+        return ecef_to_llh(self.r_e + np.asarray(p_n, dtype=float) @ self.R_ne)
+
+    def from_llh(self, llh: Array) -> Array:
+        """(lat, lon, h) (..., 3) -> positions in n."""
+        return (llh_to_ecef(llh) - self.r_e) @ self.R_ne.T
+
+    def R_ln(self, p_n: Array) -> Array:
+        """The local ENU axes at a point, from n: v_local = R_ln @ v_n; (..., 3) -> (..., 3, 3)."""
+        return enu_axes(self.to_llh(p_n)) @ self.R_ne.T
+
+    def gravity_n(self, p_n: Array) -> Array:
+        """Gravity (gravitation and the centrifugal term) at points, m/s^2 in n; (..., 3) -> (..., 3).
+
+        Normal gravity is taken along the ellipsoid's normal; its tilt with height (1.5e-9 rad/m at
+        most) is left out.
+        """
+        llh = self.to_llh(p_n)
+        up_n = enu_axes(llh)[..., 2, :] @ self.R_ne.T
+        return -gravity(llh[..., 0], llh[..., 2])[..., None] * up_n

@@ -1,0 +1,147 @@
+"""A recording: what the sensors said, in SI units, body axes RFU and one clock. Frozen arrays.
+
+`graphnav.formats.read` makes one from any source graphnav knows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from graphnav.errors import RecordingError
+from graphnav.rotation import Array
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """1-sigma noise figures of an IMU, SI, continuous time (the field names are recording.toml's)."""
+
+    gyro_noise_density: float = 1.0e-4  # rad/s/sqrt(Hz)
+    accel_noise_density: float = 1.0e-3  # m/s^2/sqrt(Hz)
+    gyro_bias_walk: float = 2.0e-6  # rad/s/sqrt(s)
+    accel_bias_walk: float = 5.0e-5  # m/s^2/sqrt(s)
+    gyro_bias_sigma: float = 5.0e-3  # rad/s at turn-on
+    accel_bias_sigma: float = 1.0e-1  # m/s^2 at turn-on
+
+
+@dataclass(frozen=True)
+class Imu:
+    """Row k is the mean rate and specific force over the period that ends at t[k]."""
+
+    t: Array  # (N,) s, strictly increasing
+    gyro: Array  # (N, 3) rad/s with respect to inertial space, RFU
+    accel: Array  # (N, 3) m/s^2, specific force, RFU
+    noise: ImuNoise = ImuNoise()
+    R_bs: Array = field(default_factory=lambda: np.eye(3))  # body (RFU) from the file's axes
+    noise_assumed: bool = False  # True when the recording states no noise figures
+
+
+@dataclass(frozen=True)
+class Gnss:
+    """Position and optional velocity of the antenna; NaN where an epoch has none."""
+
+    t: Array  # (M,) s
+    llh: Array  # (M, 3) rad, rad, m
+    sd: Array  # (M, 3) m, east, north, up
+    v: Array | None = None  # (M, 3) m/s, local ENU
+    sd_v: Array | None = None  # (M, 3) m/s
+    lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
+
+
+@dataclass(frozen=True)
+class Odometer:
+    """Signed forward speed of the point that does not slip sideways."""
+
+    t: Array  # (M,) s
+    speed: Array  # (M,) m/s
+    lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
+    scale_sigma: float = 0.02
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A reference, only for evaluation. Exactly one of `llh`, `xyz`, `closed_loop_sigma` is given."""
+
+    t: Array  # (M,) s
+    llh: Array | None = None  # (M, 3) rad, rad, m
+    xyz: Array | None = None  # (M, 2 or 3) m in a local frame of unknown origin and yaw
+    v: Array | None = None  # (M, 3) m/s, local ENU, NaN where absent
+    rph: Array | None = None  # (M, 3) rad, NaN where absent
+    of: str = "imu"  # whose point it is: "imu", "gnss", "odometer"
+    closed_loop_sigma: float | None = None  # m; the end is the start
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One drive or walk. `remarks` are sentences about what loading changed or found odd."""
+
+    name: str
+    platform: str  # "vehicle" | "foot"
+    imu: Imu
+    gnss: Gnss | None = None
+    odometer: Odometer | None = None
+    truth: Truth | None = None
+    source: Path | None = None
+    files: tuple[Path, ...] = ()  # everything that was read, for provenance
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def start(self) -> float:
+        """Start of the first IMU period: where the recording's own clock reads 0, s."""
+        t = self.imu.t
+        return float(t[0] - np.median(np.diff(t[:1000])))
+
+    @property
+    def end(self) -> float:
+        """End of the last IMU period, s."""
+        return float(self.imu.t[-1])
+
+    @property
+    def duration(self) -> float:
+        """Seconds covered by the IMU."""
+        return self.end - self.start
+
+    def without(self, source: str, span: tuple[float, float] | None = None) -> Recording:
+        """The recording with one source withheld, in a span in seconds from the start or throughout.
+
+        Raises
+        ------
+        RecordingError
+            If the recording has no such source.
+        """
+        if source not in ("gnss", "odometer"):
+            raise RecordingError(f"cannot withhold '{source}': only 'gnss' or 'odometer' can be withheld")
+        sensor = getattr(self, source)
+        if sensor is None:
+            raise RecordingError(f"cannot withhold '{source}': the recording '{self.name}' has none")
+        if span is None:
+            return replace(self, **{source: None})
+        t = sensor.t - self.start
+        return replace(self, **{source: _rows(sensor, ~((t >= span[0]) & (t <= span[1])))})
+
+    def crop(self, start: float | None = None, end: float | None = None) -> Recording:
+        """The part between two times in seconds from the start; the clock keeps its epoch."""
+        if start is None and end is None:
+            return self
+        lo = -np.inf if start is None else self.start + start
+        hi = np.inf if end is None else self.start + end
+        parts = {
+            name: _rows(sensor, (sensor.t >= lo) & (sensor.t <= hi))
+            for name in ("imu", "gnss", "odometer")
+            if (sensor := getattr(self, name)) is not None
+        }
+        if len(parts["imu"].t) < 2:
+            raise RecordingError(f"nothing is left of '{self.name}' between {start} and {end} s")
+        return replace(self, **parts)
+
+
+def _rows(sensor, mask: Array):
+    """A sensor with only the rows of `mask`."""
+    parts = {
+        key: value[mask]
+        for key, value in sensor.__dict__.items()
+        if isinstance(value, np.ndarray) and key not in ("lever_arm", "R_bs")
+    }
+    return replace(sensor, **parts)

@@ -1,0 +1,175 @@
+"""SO(3) for whole arrays: every function takes leading axes of any shape.
+
+Rotation matrices are ``(..., 3, 3)``, rotation vectors ``(..., 3)`` in radians. ``R_nb`` turns body
+coordinates into navigation coordinates: ``v_n = R_nb @ v_b``. Perturbations act on the right:
+``R <- R Exp(theta)``. Closed forms as in Sola, Deray, Atchuthan, "A micro Lie theory for state
+estimation in robotics" (2018), eq. 132-147.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_SMALL = 1e-4  # rad; below this the series is more exact than the quotients
+
+
+def skew(v: Array) -> Array:
+    """Cross-product matrix: ``skew(a) @ b == cross(a, b)``; (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(v, dtype=float)
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def _coefficients(theta2: Array) -> tuple[Array, Array, Array]:
+    """sin(x)/x, (1-cos x)/x^2 and (x-sin x)/x^3 for x^2 = theta2."""
+    x = np.sqrt(theta2)
+    small = x < _SMALL
+    safe = np.where(small, 1.0, x)
+    half = np.sin(0.5 * safe) / safe
+    a = np.where(small, 1.0 - theta2 / 6.0, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - theta2 / 24.0, 2.0 * half * half)
+    c = np.where(small, 1.0 / 6.0 - theta2 / 120.0, (1.0 - a) / (safe * safe))
+    return a, b, c
+
+
+def _polynomial(v: Array, first: Array, second: Array) -> Array:
+    """I + first [v]x + second [v]x^2."""
+    S = skew(v)
+    return np.eye(3) + first[..., None, None] * S + second[..., None, None] * (S @ S)
+
+
+def exp(v: Array) -> Array:
+    """Exp of rotation vectors: (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(v, dtype=float)
+    a, b, _ = _coefficients(np.sum(v * v, axis=-1))
+    return _polynomial(v, a, b)
+
+
+def log(R: Array) -> Array:
+    """Rotation vectors in [0, pi] of rotation matrices: (..., 3, 3) -> (..., 3)."""
+    q = to_quaternion(R)
+    w, xyz = q[..., 0], q[..., 1:]
+    n = np.linalg.norm(xyz, axis=-1)
+    small = n < 1e-9
+    scale = np.where(small, 2.0 / np.where(w > 0.5, w, 1.0), 2.0 * np.arctan2(n, w) / np.where(small, 1.0, n))
+    return xyz * scale[..., None]
+
+
+def right_jacobian(v: Array) -> Array:
+    """Jr with Exp(v + d) = Exp(v) Exp(Jr d) to first order; (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(v, dtype=float)
+    _, b, c = _coefficients(np.sum(v * v, axis=-1))
+    return _polynomial(v, -b, c)
+
+
+def right_jacobian_inverse(v: Array) -> Array:
+    """Inverse of `right_jacobian`; singular at 2 pi, which `log` never returns."""
+    v = np.asarray(v, dtype=float)
+    theta2 = np.sum(v * v, axis=-1)
+    a, b, _ = _coefficients(theta2)
+    small = theta2 < _SMALL**2
+    second = np.where(small, 1.0 / 12.0, (1.0 - 0.5 * a / b) / np.where(small, 1.0, theta2))
+    return _polynomial(v, np.full_like(theta2, 0.5), second)
+
+
+def integrals(v: Array) -> tuple[Array, Array]:
+    """Gamma1 and Gamma2 of a constant rotation: int_0^1 Exp(s v) ds and the integral of that.
+
+    Gamma1 is the left Jacobian of SO(3); both are what the exponential of the Galilean group Gal(3)
+    puts in front of a constant force (Kelly, "All about the Galilean group SGal(3)", 2023, eq. 27-28).
+    """
+    v = np.asarray(v, dtype=float)
+    theta2 = np.sum(v * v, axis=-1)
+    _, b, c = _coefficients(theta2)
+    small = theta2 < 1e-4  # here the quotient for d loses digits much earlier than those above
+    d = np.where(small, 1.0 / 24.0 - theta2 / 720.0, (0.5 - b) / np.where(small, 1.0, theta2))
+    S = skew(v)
+    S2 = S @ S
+    first = np.eye(3) + b[..., None, None] * S + c[..., None, None] * S2
+    second = 0.5 * np.eye(3) + c[..., None, None] * S + d[..., None, None] * S2
+    return first, second
+
+
+def to_quaternion(R: Array) -> Array:
+    """Unit quaternions (w, x, y, z) with w >= 0: (..., 3, 3) -> (..., 4)."""
+    R = np.asarray(R, dtype=float)
+    d = np.diagonal(R, axis1=-2, axis2=-1)
+    trace = d.sum(-1)
+    # Four squared components; build from the largest so that no quotient is small.
+    squared = np.stack([1 + trace, *(1 + 2 * d[..., i] - trace for i in range(3))], -1)
+    wx, wy, wz = (
+        R[..., 2, 1] - R[..., 1, 2],
+        R[..., 0, 2] - R[..., 2, 0],
+        R[..., 1, 0] - R[..., 0, 1],
+    )
+    xy, xz, yz = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
+    rows = np.stack(
+        [
+            np.stack([squared[..., 0], wx, wy, wz], -1),
+            np.stack([wx, squared[..., 1], xy, xz], -1),
+            np.stack([wy, xy, squared[..., 2], yz], -1),
+            np.stack([wz, xz, yz, squared[..., 3]], -1),
+        ],
+        -2,
+    )
+    best = np.argmax(squared, -1)
+    q = np.take_along_axis(rows, best[..., None, None], -2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
+
+
+def from_quaternion(q: Array) -> Array:
+    """Rotation matrices of quaternions (w, x, y, z), normalised first: (..., 4) -> (..., 3, 3)."""
+    q = np.asarray(q, dtype=float)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    S = skew(q[..., 1:])
+    return np.eye(3) + 2.0 * q[..., 0, None, None] * S + 2.0 * (S @ S)
+
+
+def from_rph(rph: Array) -> Array:
+    """R_nb (ENU from RFU) of (roll, pitch, heading) in radians: (..., 3) -> (..., 3, 3).
+
+    Roll right side down, pitch nose up, heading clockwise from north; applied heading, pitch, roll.
+    """
+    roll, pitch, heading = np.moveaxis(np.asarray(rph, dtype=float), -1, 0)
+    sr, cr, sp, cp, sh, ch = (
+        np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch), np.sin(heading), np.cos(heading)
+    )  # fmt: skip
+    rows = [
+        [ch * cr + sh * sp * sr, sh * cp, ch * sr - sh * sp * cr],
+        [-sh * cr + ch * sp * sr, ch * cp, -sh * sr - ch * sp * cr],
+        [-cp * sr, sp, cp * cr],
+    ]
+    return np.stack([np.stack(r, -1) for r in rows], -2)
+
+
+def to_rph(R_nb: Array) -> Array:
+    """(roll, pitch, heading) in radians, heading in [0, 2 pi): inverse of `from_rph`."""
+    R = np.asarray(R_nb, dtype=float)
+    roll = np.arctan2(-R[..., 2, 0], R[..., 2, 2])
+    pitch = np.arctan2(R[..., 2, 1], np.hypot(R[..., 2, 0], R[..., 2, 2]))
+    heading = np.mod(np.arctan2(R[..., 0, 1], R[..., 1, 1]), 2 * np.pi)
+    return np.stack([roll, pitch, heading], -1)
+
+
+def rph_jacobian(rph: Array) -> Array:
+    """d(roll, pitch, heading) / d(theta) for R_nb <- R_nb Exp(theta): (..., 3) -> (..., 3, 3).
+
+    Grows as 1/cos(pitch), as Euler angles do.
+    """
+    roll, pitch, _ = np.moveaxis(np.asarray(rph, dtype=float), -1, 0)
+    sr, cr, tp, cp = np.sin(roll), np.cos(roll), np.tan(pitch), np.cos(pitch)
+    zero, one = np.zeros_like(roll), np.ones_like(roll)
+    rows = [[sr * tp, one, -cr * tp], [cr, zero, sr], [sr / cp, zero, -cr / cp]]
+    return np.stack([np.stack(r, -1) for r in rows], -2)
+
+
+def wrap(angle: Array) -> Array:
+    """Angles into [-pi, pi)."""
+    return np.mod(np.asarray(angle, dtype=float) + np.pi, 2 * np.pi) - np.pi

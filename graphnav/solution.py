@@ -1,0 +1,94 @@
+"""What a solver returns: states, covariances, parameters, residuals and how it got there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from graphnav import rotation
+from graphnav.earth import LocalFrame
+from graphnav.rotation import Array
+from graphnav.state import States
+from graphnav.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class ConstraintRecord:
+    """What one constraint said to one solver: innovations of a filter, residuals of a smoother."""
+
+    kind: str  # "innovation" or "residual"
+    t: Array  # (N,) s
+    residual: Array  # (N, m) predicted minus measured
+    sigma: Array  # (N, m) of the innovation (state and measurement) or of the measurement
+    nis: Array  # (N,) normalised squared innovation or residual, chi-square with m degrees of freedom for a filter
+    weight: Array  # (N,) robust weight, 1 = as a Gaussian, 0 = rejected
+    axes: tuple[str, ...]  # names of the m components
+    unit: str
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """A slow or constant parameter: `t` holds its nodes, one for a constant."""
+
+    t: Array  # (n,) s
+    value: Array  # (n, k)
+    sigma: Array  # (n, k)
+    prior_sigma: Array  # (k,)
+    unit: str
+
+    @property
+    def observable(self) -> Array:
+        """(k,) whether the data told more than half of what was unknown."""
+        return self.sigma[-1] < 0.5 * self.prior_sigma
+
+
+@dataclass(frozen=True)
+class Solution:
+    """One solver's answer. Covariance blocks are of the error state of `graphnav.state`, (K, 15, 15)."""
+
+    solver: str
+    frame: LocalFrame
+    t: Array  # (K,) s
+    states: States
+    covariance: Array
+    parameters: dict[str, ParameterEstimate] = field(default_factory=dict)
+    records: dict[str, ConstraintRecord] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)  # factors or updates by kind
+    iterations: int = 0
+    cost: float = float("nan")  # half the sum of squared whitened residuals at the end
+    stopped: str = ""  # why it stopped, a sentence
+    timings: dict[str, float] = field(default_factory=dict)  # s by stage
+    notes: tuple[str, ...] = ()
+    intervals: Any = None  # the preintegrated intervals, for output between keyframes
+
+    def trajectory(self) -> Trajectory:
+        """The keyframes in geodetic coordinates and local axes, with full 9 x 9 covariance."""
+        return to_trajectory(self.solver, self.frame, self.t, self.states, self.covariance)
+
+
+def to_trajectory(name: str, frame: LocalFrame, t: Array, states: States, covariance: Array) -> Trajectory:
+    """States in the fixed navigation frame turned into the local ENU at each point."""
+    R_ln = frame.R_ln(states.p)
+    rph = rotation.to_rph(R_ln @ states.R_nb)
+    # (p, v, rph) in local axes from (theta, p, v) in the error state
+    J = np.zeros((len(t), 9, 9))
+    J[:, 0:3, 3:6] = R_ln
+    J[:, 3:6, 6:9] = R_ln
+    J[:, 6:9, 0:3] = rotation.rph_jacobian(rph)
+    cov = J @ covariance[:, :9, :9] @ np.swapaxes(J, -1, -2)
+    sd = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
+    return Trajectory(
+        t=t,
+        llh=frame.to_llh(states.p),
+        v=np.einsum("kij,kj->ki", R_ln, states.v),
+        rph=rph,
+        sd_p=sd[:, 0:3],
+        sd_v=sd[:, 3:6],
+        sd_rph=sd[:, 6:9],
+        gyro_bias=states.bg,
+        accel_bias=states.ba,
+        covariance=cov,
+        name=name,
+    )

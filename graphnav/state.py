@@ -1,0 +1,73 @@
+"""Navigation states as a struct of arrays, and the error state every solver works in.
+
+Error state of one keyframe, 15 numbers in this order::
+
+    theta (3)  rad     right perturbation, R_nb <- R_nb Exp(theta)
+    p     (3)  m       additive, navigation frame
+    v     (3)  m/s     additive, navigation frame
+    ba    (3)  m/s^2   additive, accelerometer bias
+    bg    (3)  rad/s   additive, gyro bias
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav import rotation
+from graphnav.rotation import Array
+
+BLOCKS = {
+    "theta": slice(0, 3),
+    "p": slice(3, 6),
+    "v": slice(6, 9),
+    "ba": slice(9, 12),
+    "bg": slice(12, 15),
+}
+DIM = 15
+
+
+@dataclass(frozen=True)
+class States:
+    """K states; `states[index]` takes rows (a slice or an index array, so rows stay an axis)."""
+
+    R_nb: Array  # (K, 3, 3)
+    p: Array  # (K, 3)
+    v: Array  # (K, 3)
+    ba: Array  # (K, 3)
+    bg: Array  # (K, 3)
+
+    def __len__(self) -> int:
+        return len(self.p)
+
+    def __getitem__(self, index: slice | Array) -> States:
+        return States(self.R_nb[index], self.p[index], self.v[index], self.ba[index], self.bg[index])
+
+    def plus(self, delta: Array) -> States:
+        """Move by error states (K, 15)."""
+        return States(
+            self.R_nb @ rotation.exp(delta[:, 0:3]),
+            self.p + delta[:, 3:6],
+            self.v + delta[:, 6:9],
+            self.ba + delta[:, 9:12],
+            self.bg + delta[:, 12:15],
+        )
+
+    def minus(self, other: States) -> Array:
+        """The error states (K, 15) with ``other.plus(d) == self``."""
+        return np.concatenate(
+            [
+                rotation.log(np.swapaxes(other.R_nb, -1, -2) @ self.R_nb),
+                self.p - other.p,
+                self.v - other.v,
+                self.ba - other.ba,
+                self.bg - other.bg,
+            ],
+            axis=-1,
+        )
+
+    @staticmethod
+    def stack(rows: list[States]) -> States:
+        """One struct of many."""
+        return States(*(np.concatenate([getattr(s, f) for s in rows]) for f in ("R_nb", "p", "v", "ba", "bg")))
