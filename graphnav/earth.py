@@ -37,7 +37,7 @@ def ecef_to_llh(r: Array) -> Array:
     x, y, z = np.moveaxis(np.asarray(r, dtype=float), -1, 0)
     p = np.hypot(x, y)
     lat = np.arctan2(z, p * (1.0 - E2))
-    for _ in range(5):
+    for _ in range(4):
         s = np.sin(lat)
         n = A / np.sqrt(1.0 - E2 * s * s)
         lat = np.arctan2(z + E2 * n * s, p)
