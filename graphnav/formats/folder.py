@@ -1,0 +1,131 @@
+"""graphnav's own form: a folder with recording.toml and CSV files, or any .toml of that form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from graphnav.formats import schema
+from graphnav.formats.registry import Format
+from graphnav.formats.repair import Remarks, geodetic, sigmas, usable_rows
+from graphnav.formats.table import Table, read_table
+from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording, Truth
+from graphnav.rotation import Array
+
+# 1-sigma where a recording states none, from the GPS Standard Positioning Service Performance Standard (5th ed.,
+# 2020, section 3.8): 8 m horizontal (2.45 sigma in two dimensions) and 13 m vertical (1.96 sigma), both 95 %.
+DEFAULT_SD = (3.3, 3.3, 6.6)  # m
+# The same section's 0.2 m/s (95 %, one axis) is for the open sky; twice its sigma for a vehicle among buildings.
+DEFAULT_SD_V = (0.2, 0.2, 0.4)  # m/s
+
+
+def read_folder(source: str | Path) -> Recording:
+    """A recording from a folder holding recording.toml, or from a .toml of that form.
+
+    Raises
+    ------
+    RecordingError
+        For anything that cannot be used, naming file, line and field.
+    """
+    path = Path(source)
+    path = path / "recording.toml" if path.is_dir() else path
+    d = schema.read_description(path)
+    remarks = Remarks()
+    files = [path]
+
+    def table(name: str) -> Table:
+        section = getattr(d, name)
+        file = path.parent / section.file
+        files.append(file)
+        required, optional, keep = section.required, section.optional, section.keep
+        if name == "truth":
+            position = ("x", "y") if section.frame == "local" else ("lat", "lon", "h")
+            required, optional = (*required, *position), tuple(c for c in optional if c not in position)
+        rows = read_table(file, required, optional, section.columns, keep.column if keep else None)
+        return usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
+
+    imu = _imu(d.imu, table("imu"), remarks)
+    gnss = _gnss(d.gnss, table("gnss"), remarks) if d.gnss else None
+    odometer = _odometer(d.odometer, table("odometer")) if d.odometer else None
+    truth = None
+    if d.truth and d.truth.closed_loop_sigma:
+        truth = Truth(imu.t[[0, -1]], of=d.truth.of, closed_loop_sigma=d.truth.closed_loop_sigma)
+    elif d.truth:
+        truth = _truth(d.truth, table("truth"), remarks)
+    name = d.name or (path.resolve().parent.name if path.name == "recording.toml" else path.stem)
+    return Recording(name, d.platform, imu, gnss, odometer, truth, path, tuple(files), tuple(remarks))
+
+
+def _imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
+    R_bs = d.R_bs
+    gyro = rows.stack("gx", "gy", "gz") * schema.RATE[d.units.gyro] @ R_bs.T
+    accel = rows.stack("ax", "ay", "az") * schema.FORCE[d.units.accel] @ R_bs.T
+    stated = d.noise.model_dump(exclude_none=True) if d.noise else {}
+    noise = replace(ImuNoise(), **stated)
+    missing = [key for key in ImuNoise.__dataclass_fields__ if key not in stated]
+    if missing and stated:
+        remarks.add(f"[imu.noise] says nothing of {', '.join(missing)}: defaults of a consumer IMU are used")
+    elif missing:
+        remarks.add(
+            "no [imu.noise]: figures of a consumer IMU are assumed "
+            f"(gyro {noise.gyro_noise_density:g} rad/s/sqrt(Hz), "
+            f"accelerometer {noise.accel_noise_density:g} m/s2/sqrt(Hz))"
+        )
+    return Imu(rows["t"], gyro, accel, noise, R_bs, noise_assumed=not stated)
+
+
+def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
+    llh, rows = geodetic(rows, d.units.angle, "GNSS", remarks)
+    every = np.ones(len(rows), dtype=bool)
+    sd = sigmas(rows, ("sd_e", "sd_n", "sd_u"), d.sd, DEFAULT_SD, "GNSS position", every, remarks)
+    v = sd_v = None
+    there = [c for c in ("ve", "vn", "vu") if c in rows]
+    if len(there) == 3:
+        scale = schema.SPEED[d.units.speed]
+        for name in ("sd_ve", "sd_vn", "sd_vu"):  # the file's sigmas have the file's unit, the .toml's are m/s
+            rows = rows.with_column(name, rows[name] * scale) if name in rows else rows
+        v = rows.stack("ve", "vn", "vu") * scale
+        absent = np.isnan(v).any(-1)
+        v[absent] = np.nan
+        sd_v = sigmas(rows, ("sd_ve", "sd_vn", "sd_vu"), d.sd_v, DEFAULT_SD_V, "GNSS velocity", ~absent, remarks)
+        sd_v[absent] = np.nan
+        if absent.all():
+            v = sd_v = None
+            remarks.add("the GNSS velocity columns are blank throughout: no velocities")
+    elif there:
+        remarks.add(f"GNSS velocities need ve, vn and vu; only {', '.join(there)} is there, so none are used")
+    return Gnss(rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm))
+
+
+def _odometer(d: schema.OdometerTable, rows: Table) -> Odometer:
+    speed = rows["speed"] * schema.SPEED[d.units.speed]
+    return Odometer(rows["t"], speed, np.array(d.lever_arm), d.scale_sigma)
+
+
+def _truth(d: schema.TruthTable, rows: Table, remarks: Remarks) -> Truth:
+    llh = xyz = None
+    if d.frame == "local":
+        xyz = rows.stack("x", "y", "z") if "z" in rows else rows.stack("x", "y")
+    else:
+        llh, rows = geodetic(rows, d.units.angle, "truth", remarks)
+    v = _partial(rows, ("ve", "vn", "vu"), schema.SPEED[d.units.speed])
+    rph = _partial(rows, ("roll", "pitch", "heading"), schema.ANGLE[d.units.angle or "deg"])
+    return Truth(rows["t"], llh, xyz, v, rph, d.of)
+
+
+def _partial(rows: Table, names: tuple[str, ...], scale: float) -> Array | None:
+    """Columns of which some may be missing (NaN then); None if all are."""
+    if not any(name in rows for name in names):
+        return None
+    absent = np.full(len(rows), np.nan)
+    return np.stack([rows.get(name, absent) for name in names], -1) * scale
+
+
+FORMAT = Format(
+    name="folder",
+    about="a folder holding recording.toml and CSV files, or a .toml of that form",
+    recognises=lambda source: Path(source).suffix == ".toml" or (Path(source) / "recording.toml").is_file(),
+    read=read_folder,
+)

@@ -1,0 +1,160 @@
+"""Which rows of a sensor's file can be used; whatever is changed is said in a remark."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.errors import RecordingError
+from graphnav.formats.schema import TIME, Keep
+from graphnav.formats.table import Mask, Table
+from graphnav.rotation import Array
+
+_LABEL = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"}
+_RADIANS = (1.58, 3.15)  # |lat|, |lon| that angles in radians cannot exceed
+
+
+class Remarks(list[str]):
+    """Sentences about what loading changed or assumed."""
+
+    def add(self, sentence: str) -> None:
+        """One more sentence."""
+        self.append(sentence)
+
+
+def usable_rows(
+    rows: Table, sensor: str, needed: tuple[str, ...], keep: Keep | None, unit: str, offset: float, remarks: Remarks
+) -> Table:
+    """The rows that hold every needed value, in order of time, each time once; t in seconds plus `offset`.
+
+    Raises
+    ------
+    RecordingError
+        For infinite values, if too few rows are left, or if the time steps cannot be seconds.
+    """
+    label = _LABEL[sensor]
+    for name in rows.columns:
+        bad = np.flatnonzero(np.isinf(rows[name]))
+        if len(bad):
+            raise RecordingError(f"{rows.where(bad[0], name)}: the value is infinite")
+    if keep is not None:
+        rows = rows.take(rows[Table.KEEP] >= keep.at_least)
+        if not len(rows):
+            raise RecordingError(f"{rows.path}: no row has {keep.column} of at least {keep.at_least:g} (keep)")
+    rows = rows.with_column("t", rows["t"] * TIME[unit] + offset)
+
+    blank = np.isnan(np.stack([rows[name] for name in needed])).any(0)
+    if blank.all():
+        raise RecordingError(f"{rows.path}: no row holds all of {', '.join(needed)} (all blank or NaN)")
+    if blank.any():
+        first = np.flatnonzero(blank)[0]
+        at = f" (first at t = {rows['t'][first]:.3f} s)" if np.isfinite(rows["t"][first]) else ""
+        remarks.add(f"{blank.sum()} {label} rows with blank or NaN values were dropped{at}")
+        rows = rows.take(~blank)
+
+    t = rows["t"]
+    step = np.diff(t)
+    if (step < 0).any():
+        first = np.flatnonzero(step < 0)[0]
+        remarks.add(
+            f"{label} rows were out of order and were sorted by time ({(step < 0).sum()} steps back, "
+            f"the first after t = {t[first]:.3f} s)"
+        )
+        rows = rows.take(np.argsort(t, kind="stable"))
+        t = rows["t"]
+    repeated = np.r_[False, np.diff(t) == 0]
+    if repeated.any():
+        remarks.add(
+            f"{repeated.sum()} {label} rows repeat the time of the row before and were dropped "
+            f"(first at t = {t[repeated][0]:.3f} s)"
+        )
+        rows = rows.take(~repeated)
+    if sensor == "imu":
+        _check_imu_time(rows, unit)
+    return rows
+
+
+def _check_imu_time(rows: Table, unit: str) -> None:
+    if len(rows) < 2:
+        raise RecordingError(f"{rows.path}: {len(rows)} usable row; an IMU recording needs at least 2")
+    step = float(np.median(np.diff(rows["t"])))
+    if 1e-5 < step < 0.5:
+        return
+    fitting = [u for u in TIME if 2.5e-4 <= step / TIME[unit] * TIME[u] <= 0.1 and u != unit]
+    hint = f'; if t is in {fitting[0]}, say units = {{ t = "{fitting[0]}" }}' if fitting else ""
+    raise RecordingError(f"{rows.path}: IMU rows are {step:g} s apart, which no usable IMU is{hint}")
+
+
+def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tuple[Array, Table]:
+    """(lat, lon, h) in rad, rad, m of rows whose position is usable, and those rows.
+
+    `unit` None means degrees, and angles that are all small enough to be radians are refused.
+
+    Raises
+    ------
+    RecordingError
+        For positions that are nowhere on Earth, naming the line and the likely mistake.
+    """
+    nowhere = (rows["lat"] == 0) & (rows["lon"] == 0)
+    if nowhere.any() and not nowhere.all():
+        first = rows["t"][nowhere][0]
+        remarks.add(f"{nowhere.sum()} {label} rows at 0, 0 (no fix) were dropped (first at t = {first:.3f} s)")
+        rows = rows.take(~nowhere)
+    lat, lon, h = rows["lat"], rows["lon"], rows["h"]
+    scale = 1.0 if unit == "rad" else np.pi / 180.0
+    if unit is None and np.abs(lat).max() < _RADIANS[0] and np.abs(lon).max() < _RADIANS[1]:
+        raise RecordingError(
+            f"{rows.path}: lat and lon look like radians (first {lat[0]:g}, {lon[0]:g}); say "
+            'units = { angle = "rad" } if they are, { angle = "deg" } if the drive really is there'
+        )
+    beyond = np.flatnonzero(np.abs(lat) * scale > np.pi / 2)
+    if len(beyond):
+        k = beyond[0]
+        swapped = np.abs(lon * scale).max() <= np.pi / 2
+        hint = "; are lat and lon swapped?" if swapped else ""
+        raise RecordingError(f"{rows.where(k, 'lat')}: {lat[k]:g} is not a latitude{hint}")
+    beyond = np.flatnonzero((lon * scale < -np.pi - 1e-9) | (lon * scale > 2 * np.pi))
+    if len(beyond):
+        raise RecordingError(f"{rows.where(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude")
+    beyond = np.flatnonzero((h < -1000.0) | (h > 50000.0))
+    if len(beyond):
+        k = beyond[0]
+        hint = "; is it in millimetres?" if abs(h[k]) > 1e5 else ""
+        raise RecordingError(f"{rows.where(k, 'h')}: {h[k]:g} m is not the height of a drive{hint}")
+    lon = np.where(lon * scale > np.pi, lon * scale - 2 * np.pi, lon * scale)
+    return np.stack([lat * scale, lon, h], -1), rows
+
+
+def sigmas(
+    rows: Table,
+    names: tuple[str, str, str],
+    stated: tuple[float, float, float] | None,
+    default: tuple[float, float, float],
+    what: str,
+    used: Mask,
+    remarks: Remarks,
+) -> Array:
+    """The 1-sigmas of `used` rows (N, 3): the file's, else the .toml's, else a default that is remarked on.
+
+    Raises
+    ------
+    RecordingError
+        If the file holds a sigma that is not above zero.
+    """
+    there = [name for name in names if name in rows]
+    fallback = np.array(stated or default)
+    assumed = f"{what} sigmas of {default[0]:g}, {default[1]:g}, {default[2]:g} (east, north, up) are assumed"
+    if len(there) < 3:
+        if there:
+            remarks.add(f"{what} sigmas need {', '.join(names)}; only {', '.join(there)} is there, so it is not used")
+        if stated is None:
+            remarks.add(f"{assumed}: neither the file nor the description states any")
+        return np.tile(fallback, (len(rows), 1))
+    sd = rows.stack(*names)
+    for k, name in enumerate(names):
+        bad = np.flatnonzero(used & (sd[:, k] <= 0))
+        if len(bad):
+            raise RecordingError(f"{rows.where(bad[0], name)}: a 1-sigma must be above zero, not {sd[bad[0], k]:g}")
+    blank = np.isnan(sd)
+    if stated is None and (n := (blank.any(-1) & used).sum()):
+        remarks.add(f"{assumed} in {n} rows whose own are blank")
+    return np.where(blank, fallback, sd)

@@ -1,0 +1,283 @@
+"""recording.toml: every key it may hold, with its unit, and what is wrong with one that cannot be used."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic.types import Strict
+
+from graphnav.config import explain, suggestion
+from graphnav.errors import RecordingError
+from graphnav.rotation import Array
+
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0)]
+
+
+def _three_numbers(value: Any) -> Any:
+    if not isinstance(value, list | tuple) or len(value) != 3:
+        raise ValueError("must be three numbers in brackets")
+    if any(isinstance(x, bool) or not isinstance(x, int | float) or not np.isfinite(x) for x in value):
+        raise ValueError("must be three numbers in brackets")
+    return tuple(float(x) for x in value)
+
+
+def _three_positive(value: Any) -> Any:
+    value = _three_numbers(value)
+    if min(value) <= 0:
+        raise ValueError("must be three numbers above zero: a 1-sigma each for east, north, up")
+    return value
+
+
+Vector = Annotated[tuple[float, float, float], BeforeValidator(_three_numbers)]
+Sigmas = Annotated[tuple[float, float, float], BeforeValidator(_three_positive)]
+
+TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+ANGLE = {"deg": np.pi / 180.0, "rad": 1.0}
+RATE = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
+FORCE = {"m/s2": 1.0, "g": 9.80665}  # standard gravity, by definition
+SPEED = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600}
+
+TimeUnit = Literal["s", "ms", "us", "ns"]
+AngleUnit = Literal["deg", "rad"]
+SpeedUnit = Literal["m/s", "km/h", "mph", "knots"]
+
+_LETTERS = {"R": (1, 0, 0), "L": (-1, 0, 0), "F": (0, 1, 0), "B": (0, -1, 0), "U": (0, 0, 1), "D": (0, 0, -1)}
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Keep(_Section):
+    """Rows to use: those whose column holds at least this."""
+
+    column: str
+    at_least: Number
+
+
+class _Sensor(_Section):
+    """What every sensor's table may hold."""
+
+    required: ClassVar[tuple[str, ...]] = ()
+    optional: ClassVar[tuple[str, ...]] = ()
+
+    file: str = Field(min_length=1)
+    columns: dict[str, str] = {}  # our name = the file's name
+    time_offset: Number = 0.0  # s, added to the file's stamps
+    keep: Keep | None = None
+
+    @field_validator("columns")
+    @classmethod
+    def _known_columns(cls, columns: dict[str, str]) -> dict[str, str]:
+        known = (*cls.required, *cls.optional)
+        for name in columns:
+            if name not in known:
+                raise ValueError(
+                    f"'{name}' is not one of graphnav's columns; {_nearest(name, known)} (ours = the file's)"
+                )
+        return columns
+
+
+class ImuUnits(_Section):
+    """Units of imu.csv."""
+
+    t: TimeUnit = "s"
+    gyro: Literal["rad/s", "deg/s"] = "rad/s"
+    accel: Literal["m/s2", "g"] = "m/s2"
+
+
+class GnssUnits(_Section):
+    """Units of gnss.csv; `angle` is that of lat and lon, None: degrees unless they look like radians."""
+
+    t: TimeUnit = "s"
+    angle: AngleUnit | None = None
+    speed: SpeedUnit = "m/s"
+
+
+class OdometerUnits(_Section):
+    """Units of odometer.csv."""
+
+    t: TimeUnit = "s"
+    speed: SpeedUnit = "m/s"
+
+
+class Noise(_Section):
+    """[imu.noise]: 1-sigma, SI, as in `graphnav.recording.ImuNoise`; None where the file says nothing."""
+
+    gyro_noise_density: Positive | None = None
+    accel_noise_density: Positive | None = None
+    gyro_bias_walk: Positive | None = None
+    accel_bias_walk: Positive | None = None
+    gyro_bias_sigma: Positive | None = None
+    accel_bias_sigma: Positive | None = None
+
+
+class ImuTable(_Sensor):
+    """[imu]"""
+
+    required = ("t", "gx", "gy", "gz", "ax", "ay", "az")
+
+    axes: str | None = None
+    forward: Vector | None = None
+    up: Vector | None = None
+    units: ImuUnits = ImuUnits()
+    noise: Noise | None = None
+
+    @model_validator(mode="after")
+    def _one_mount(self) -> ImuTable:
+        if self.axes is not None and (self.forward is not None or self.up is not None):
+            raise ValueError("say either axes or forward and up, not both")
+        if (self.forward is None) != (self.up is None):
+            raise ValueError("forward and up belong together: give both")
+        return self
+
+    @property
+    def R_bs(self) -> Array:
+        """Body (RFU) from the file's axes, (3, 3); ValueError if they make none."""
+        if self.forward is not None and self.up is not None:
+            return rotation_from_vectors(self.forward, self.up)
+        return rotation_from_letters(self.axes or "RFU")
+
+
+class GnssTable(_Sensor):
+    """[gnss]"""
+
+    required = ("t", "lat", "lon", "h")
+    optional = ("sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu")
+
+    units: GnssUnits = GnssUnits()
+    lever_arm: Vector = (0.0, 0.0, 0.0)
+    sd: Sigmas | None = None
+    sd_v: Sigmas | None = None
+
+
+class OdometerTable(_Sensor):
+    """[odometer]"""
+
+    required = ("t", "speed")
+
+    units: OdometerUnits = OdometerUnits()
+    lever_arm: Vector = (0.0, 0.0, 0.0)
+    scale_sigma: Positive = 0.02
+
+
+class TruthTable(_Sensor):
+    """[truth]"""
+
+    required = ("t",)
+    optional = ("lat", "lon", "h", "x", "y", "z", "ve", "vn", "vu", "roll", "pitch", "heading")
+
+    file: str | None = Field(None, min_length=1)  # type: ignore[assignment]
+    units: GnssUnits = GnssUnits()
+    of: Literal["imu", "gnss", "odometer"] = "imu"
+    frame: Literal["geodetic", "local"] = "geodetic"
+    closed_loop_sigma: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> TruthTable:
+        if (self.file is None) == (self.closed_loop_sigma is None):
+            raise ValueError("say either file or closed_loop_sigma")
+        return self
+
+
+class RecordingFile(_Section):
+    """The whole of recording.toml."""
+
+    format: Literal["graphnav-recording/1"]
+    name: str | None = None
+    platform: Literal["vehicle", "foot"]
+    imu: ImuTable
+    gnss: GnssTable | None = None
+    odometer: OdometerTable | None = None
+    truth: TruthTable | None = None
+
+    @model_validator(mode="after")
+    def _truth_of_a_sensor(self) -> RecordingFile:
+        of = self.truth.of if self.truth else "imu"
+        if getattr(self, of) is None:
+            raise ValueError(f"truth.of = '{of}', but there is no [{of}] table whose lever arm would apply")
+        return self
+
+
+def _nearest(name: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"did you mean '{close[0]}'?" if close else f"known are {', '.join(known)}"
+
+
+def rotation_from_letters(axes: str) -> Array:
+    """R_bs of three letters saying where the file's x, y, z point; 'BRU': x backward, y right, z up."""
+    if len(axes) != 3 or any(letter not in _LETTERS for letter in axes):
+        raise ValueError("must be three letters out of R/L, F/B, U/D, such as RFU, FLU or FRD")
+    R_bs = np.array([_LETTERS[letter] for letter in axes], dtype=float).T
+    determinant = np.linalg.det(R_bs)
+    if abs(determinant) < 0.5:
+        raise ValueError("must use one of R/L, one of F/B and one of U/D")
+    if determinant < 0:
+        flipped = axes[:2] + {"U": "D", "D": "U", "R": "L", "L": "R", "F": "B", "B": "F"}[axes[2]]
+        raise ValueError(f"is a left-handed triple, which no sensor has; with z the other way it would be {flipped}")
+    return R_bs
+
+
+def rotation_from_vectors(forward: Sequence[float], up: Sequence[float]) -> Array:
+    """R_bs of two vectors in the file's axes: up is kept, forward is made square to it."""
+    f, u = np.asarray(forward, dtype=float), np.asarray(up, dtype=float)
+    if np.linalg.norm(f) < 1e-6 or np.linalg.norm(u) < 1e-6:
+        raise ValueError("forward and up must not be zero")
+    f, u = f / np.linalg.norm(f), u / np.linalg.norm(u)
+    square = f - (f @ u) * u
+    # Below 10 degrees apart a rough up turns forward into noise.
+    if np.linalg.norm(square) < np.sin(np.radians(10.0)):
+        raise ValueError("forward and up are nearly parallel")
+    f = square / np.linalg.norm(square)
+    return np.stack([np.cross(f, u), f, u])
+
+
+def read_description(path: Path) -> RecordingFile:
+    """Read and validate a recording's .toml.
+
+    Raises
+    ------
+    RecordingError
+        Naming the file and the key, and the nearest known key for an unknown one.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: is not UTF-8 text") from None
+    except tomllib.TOMLDecodeError as error:
+        raise RecordingError(f"{path}: not valid TOML ({error})") from None
+    try:
+        description = RecordingFile.model_validate(values)
+    except ValidationError as error:
+        raise RecordingError(f"{path}: {_sentence(error)}") from None
+    try:
+        _ = description.imu.R_bs
+    except ValueError as error:
+        key = "forward, up" if description.imu.axes is None else "axes"
+        value = "" if description.imu.axes is None else f" = '{description.imu.axes}'"
+        raise RecordingError(f"{path}: 'imu.{key}'{value} {error}") from None
+    return description
+
+
+def _sentence(error: ValidationError) -> str:
+    """One complaint in plain words; an unknown key before the missing one that it may have been meant for."""
+    complaints = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+    first = complaints[0]
+    where = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"unknown key '{where}'{suggestion(first['loc'], RecordingFile)}"
+    if first["type"] == "value_error":  # our own sentence
+        what = str(first["ctx"]["error"])
+        return f"'{where}': {what}" if where else what
+    if first["type"] == "model_type":
+        return f"'{where}' must be a table: [{where}]"
+    return explain(error, RecordingFile)

@@ -1,0 +1,258 @@
+"""CSV files of numbers, read at the speed of NumPy's C parser and explained line by line when they fail."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import re
+import warnings
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.errors import RecordingError
+from graphnav.rotation import Array
+
+_BLANK = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that has cells
+
+
+Mask = NDArray[Any]  # of bool, or of row numbers
+
+
+@dataclass(frozen=True)
+class Table:
+    """The wanted columns of one file, by our names, NaN where a cell is blank."""
+
+    path: Path
+    columns: dict[str, Array]  # each (N,)
+    file_names: dict[str, str]  # our name -> the file's
+    rows: NDArray[np.intp]  # (N,) which rows of the file these are
+
+    KEEP: ClassVar[str] = "keep"  # the name under which the column of `keep` is found
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
+
+    def __getitem__(self, name: str) -> Array:
+        return self.columns[name]
+
+    def get(self, name: str, default: Array) -> Array:
+        """A column, or what stands for it."""
+        return self.columns.get(name, default)
+
+    def stack(self, *names: str) -> Array:
+        """Columns side by side, (N, len(names))."""
+        return np.stack([self.columns[n] for n in names], -1)
+
+    def take(self, mask: Mask) -> Table:
+        """The rows of a mask or an index array."""
+        return replace(self, columns={n: c[mask] for n, c in self.columns.items()}, rows=self.rows[mask])
+
+    def with_column(self, name: str, values: Array) -> Table:
+        """The table with one column replaced."""
+        return replace(self, columns={**self.columns, name: values})
+
+    def where(self, row: int, name: str) -> str:
+        """'file, line 12, column lat' for an error about one cell."""
+        for k, (number, _) in enumerate(_data_lines(self.path)):
+            if k == self.rows[row]:
+                return f"{self.path}, line {number}, column '{self.file_names[name]}'"
+        return f"{self.path}, column '{self.file_names[name]}'"
+
+
+def read_table(
+    path: Path,
+    required: Sequence[str],
+    optional: Sequence[str] = (),
+    renamed: Mapping[str, str] | None = None,
+    keep: str | None = None,
+) -> Table:
+    """Read columns of a .csv or .csv.gz by name, in any order; other columns are not looked at.
+
+    Parameters
+    ----------
+    required, optional
+        Our names. A missing optional column is simply not in the result.
+    renamed
+        Our name -> the file's name, for those that differ; what is listed must be there.
+    keep
+        The file's name of one more column, found in the result as `Table.KEEP`.
+
+    Raises
+    ------
+    RecordingError
+        Naming file, line, column and cell, for anything that is not a table of numbers.
+    """
+    renamed = dict(renamed or {})
+    skip, header = _header(path)
+    if keep is not None:
+        required, renamed = (*required, Table.KEEP), {**renamed, Table.KEEP: keep}
+    file_names = {}
+    for name in (*required, *optional):
+        theirs = renamed.get(name, name)
+        if header.count(theirs) > 1:
+            raise RecordingError(
+                f"{path}: {header.count(theirs)} columns are called '{theirs}'; give them their own names"
+            )
+        if theirs in header:
+            file_names[name] = theirs
+        elif name in required or name in renamed:
+            hint = "" if name in renamed else f'; if it has another name, say columns = {{ {name} = "..." }}'
+            raise RecordingError(f"{path}: no column '{theirs}' (there are: {', '.join(header)}){hint}")
+    use = [header.index(theirs) for theirs in file_names.values()]
+    values = _parse(path, skip, header, use)
+    if not len(values):
+        raise RecordingError(f"{path}: holds a header and no rows")
+    # contiguous columns: what follows works on whole columns
+    columns = dict(zip(file_names, np.ascontiguousarray(values.T), strict=True))
+    return Table(path, columns, file_names, np.arange(len(values)))
+
+
+def _open(path: Path) -> IO[str]:
+    """Text of a plain or gzip file."""
+    return io.TextIOWrapper(_open_bytes(path), encoding="utf-8-sig")
+
+
+def _open_bytes(path: Path) -> IO[bytes]:
+    try:
+        plain = path.open("rb")
+    except IsADirectoryError:
+        raise RecordingError(f"{path}: is a folder where a CSV file is wanted") from None
+    except FileNotFoundError:
+        other = path.with_suffix("") if path.suffix == ".gz" else path.with_name(path.name + ".gz")
+        hint = f"; there is {other.name}" if other.exists() else ""
+        raise RecordingError(f"{path}: no such file{hint}") from None
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
+    magic = plain.read(2)
+    plain.seek(0)
+    if not magic:
+        raise RecordingError(f"{path}: is empty")
+    if path.suffix == ".gz":
+        if magic != b"\x1f\x8b":
+            raise RecordingError(f"{path}: is not gzip-compressed although its name ends in .gz")
+        return gzip.GzipFile(fileobj=plain)  # type: ignore[return-value]
+    if magic == b"\x1f\x8b":
+        raise RecordingError(f"{path}: is gzip-compressed; its name must end in .gz")
+    return plain
+
+
+def _header(path: Path) -> tuple[int, list[str]]:
+    """How many lines come before the data, and the column names."""
+    try:
+        with _open_bytes(path) as raw:
+            start = raw.read(1 << 16)
+    except (OSError, EOFError, zlib.error) as error:
+        raise _broken_gzip(path, error) from None
+    if b"\0" in start:
+        raise RecordingError(f"{path}: is a binary file, not a CSV table")
+    text = start.decode("utf-8-sig", errors="replace")
+    for number, line in enumerate(text.splitlines(), 1):
+        line = line.split("#")[0].strip()
+        if not line:
+            continue
+        names = [name.strip().strip('"') for name in line.split(",")]
+        if "\ufffd" in line:
+            raise RecordingError(f"{path}, line {number}: is not UTF-8 text")
+        if len(names) == 1 and (";" in line or "\t" in line):
+            raise RecordingError(f"{path}, line {number}: fields must be separated by commas")
+        if all(_is_number(name) for name in names):
+            raise RecordingError(f"{path}, line {number}: the first line must name the columns, and it holds numbers")
+        return number, names
+    raise RecordingError(f"{path}: is empty")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> Array:
+    """The data, (N, len(use)): straight through, else with blanks made NaN, else cell by cell."""
+    try:
+        return _loadtxt(str(path), skip, header, use)
+    except (OSError, EOFError, zlib.error) as error:
+        raise _broken_gzip(path, error) from None
+    except ValueError:
+        pass
+    try:
+        with _open(path) as file:
+            return _loadtxt(io.StringIO(_BLANK.sub("nan", file.read())), skip, header, use)
+    except ValueError:
+        return _parse_cells(path, header, use)
+
+
+def _loadtxt(source: str | io.StringIO, skip: int, header: list[str], use: list[int]) -> Array:
+    # Without usecols NumPy checks that no row is longer than the others; with it, only that none is too short.
+    everything = len(use) == len(header)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # no rows: said by the caller
+        values = np.loadtxt(
+            source,
+            delimiter=",",
+            comments="#",
+            skiprows=skip,
+            usecols=None if everything else use,
+            ndmin=2,
+            encoding="utf-8",
+        )
+    if not everything or not len(values):
+        return values.reshape(-1, len(use))
+    if values.shape[1] != len(header):
+        raise ValueError("rows and header differ in length")
+    return values[:, use]
+
+
+def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """(line number, text) of every line after the header that holds something."""
+    with _open(path) as file:
+        seen_header = False
+        for number, line in enumerate(file, 1):
+            line = line.split("#")[0].strip()
+            if line and seen_header:
+                yield number, line
+            seen_header = seen_header or bool(line)
+
+
+def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
+    """The slow and careful way, which says what is wrong and where."""
+    rows = []
+    try:
+        for number, line in _data_lines(path):
+            cells = [cell.strip() for cell in line.split(",")]
+            if len(cells) != len(header):
+                raise RecordingError(
+                    f"{path}, line {number}: has {len(cells)} fields where the header has {len(header)}"
+                )
+            row = []
+            for column in use:
+                cell = cells[column].strip('"')
+                try:
+                    row.append(float(cell) if cell else np.nan)
+                except ValueError:
+                    raise RecordingError(
+                        f"{path}, line {number}, column '{header[column]}': '{cell[:40]}' is not a number"
+                    ) from None
+            rows.append(row)
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: is not UTF-8 text") from None
+    except (OSError, EOFError, zlib.error) as error:
+        raise _broken_gzip(path, error) from None
+    return np.array(rows, dtype=float).reshape(-1, len(use))
+
+
+def _broken_gzip(path: Path, error: Exception) -> RecordingError:
+    if isinstance(error, EOFError):
+        return RecordingError(f"{path}: the compressed file is cut off; copy it again")
+    return RecordingError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})")

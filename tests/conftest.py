@@ -1,0 +1,24 @@
+"""What several test modules share."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real recordings: GRAPHNAV_DATA, or shared/data beside the repository.
+
+    Without it the test is skipped, except in CI, where missing data would hide a failure.
+    """
+    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("GRAPHNAV_DATA", beside))
+    if not folder.is_dir():
+        reason = f"no recordings at {folder} (set GRAPHNAV_DATA)"
+        if os.environ.get("CI"):
+            pytest.fail(reason)
+        pytest.skip(reason)
+    return folder
