@@ -82,7 +82,7 @@ def read_kitti(source: str | Path = "kitti") -> Recording:
         files=files,
         remarks=(
             f"the first IMU row, 1.92 s before the second, and {early.sum()} position before the second were dropped",
-            f"positions are local metres: {lat:g} N, {lon:g} E, {h:g} m (Karlsruhe) is a nominal origin, not the true one",
+            f"positions are local metres: {lat:g} N, {lon:g} E, {h:g} m (Karlsruhe) is only a nominal origin",
             "position sigmas (0.1 m) and IMU noise are graphnav's own, larger than the file's, which hold at rest",
         ),
     )

@@ -48,7 +48,7 @@ def usable_rows(
     if blank.any():
         first = np.flatnonzero(blank)[0]
         at = f" (first at t = {rows['t'][first]:.3f} s)" if np.isfinite(rows["t"][first]) else ""
-        remarks.add(f"{blank.sum()} {label} rows with blank or NaN values were dropped{at}")
+        remarks.add(f"{_rows(blank, label)} with blank or NaN values dropped{at}")
         rows = rows.take(~blank)
 
     t = rows["t"]
@@ -56,7 +56,7 @@ def usable_rows(
     if (step < 0).any():
         first = np.flatnonzero(step < 0)[0]
         remarks.add(
-            f"{label} rows were out of order and were sorted by time ({(step < 0).sum()} steps back, "
+            f"{label} rows out of order sorted by time ({(step < 0).sum()} steps back, "
             f"the first after t = {t[first]:.3f} s)"
         )
         rows = rows.take(np.argsort(t, kind="stable"))
@@ -64,13 +64,17 @@ def usable_rows(
     repeated = np.r_[False, np.diff(t) == 0]
     if repeated.any():
         remarks.add(
-            f"{repeated.sum()} {label} rows repeat the time of the row before and were dropped "
-            f"(first at t = {t[repeated][0]:.3f} s)"
+            f"{_rows(repeated, label)} with the time of the row before dropped (first at t = {t[repeated][0]:.3f} s)"
         )
         rows = rows.take(~repeated)
     if sensor == "imu":
         _check_imu_time(rows, unit)
     return rows
+
+
+def _rows(mask: Mask, label: str) -> str:
+    n = int(mask.sum())
+    return f"{n} {label} row{'s' if n > 1 else ''}"
 
 
 def _check_imu_time(rows: Table, unit: str) -> None:
@@ -97,7 +101,7 @@ def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tup
     nowhere = (rows["lat"] == 0) & (rows["lon"] == 0)
     if nowhere.any() and not nowhere.all():
         first = rows["t"][nowhere][0]
-        remarks.add(f"{nowhere.sum()} {label} rows at 0, 0 (no fix) were dropped (first at t = {first:.3f} s)")
+        remarks.add(f"{_rows(nowhere, label)} at 0, 0 (no fix) dropped (first at t = {first:.3f} s)")
         rows = rows.take(~nowhere)
     lat, lon, h = rows["lat"], rows["lon"], rows["h"]
     scale = 1.0 if unit == "rad" else np.pi / 180.0
@@ -156,5 +160,5 @@ def sigmas(
             raise RecordingError(f"{rows.where(bad[0], name)}: a 1-sigma must be above zero, not {sd[bad[0], k]:g}")
     blank = np.isnan(sd)
     if stated is None and (n := (blank.any(-1) & used).sum()):
-        remarks.add(f"{assumed} in {n} rows whose own are blank")
+        remarks.add(f"{assumed} where the file's own are blank ({n} of {len(rows)} rows)")
     return np.where(blank, fallback, sd)

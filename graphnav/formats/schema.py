@@ -262,9 +262,9 @@ def read_description(path: Path) -> RecordingFile:
     try:
         _ = description.imu.R_bs
     except ValueError as error:
-        key = "forward, up" if description.imu.axes is None else "axes"
-        value = "" if description.imu.axes is None else f" = '{description.imu.axes}'"
-        raise RecordingError(f"{path}: 'imu.{key}'{value} {error}") from None
+        axes = description.imu.axes
+        where = "'imu': " if axes is None else f"'imu.axes' = '{axes}' "
+        raise RecordingError(f"{path}: {where}{error}") from None
     return description
 
 

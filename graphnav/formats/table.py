@@ -21,7 +21,7 @@ from graphnav.rotation import Array
 _BLANK = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that has cells
 
 
-Mask = NDArray[Any]  # of bool, or of row numbers
+Mask = Any  # an array of bool, or of row numbers
 
 
 @dataclass(frozen=True)

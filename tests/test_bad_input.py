@@ -1,0 +1,346 @@
+"""Broken recordings: every one gets a single plain line that says where, what and, where it can, how to mend it."""
+
+from __future__ import annotations
+
+import gzip
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphnav.errors import RecordingError
+from graphnav.formats import read
+
+TOML = """\
+format = "graphnav-recording/1"
+name = "small"
+platform = "vehicle"
+
+[imu]
+file = "imu.csv"
+axes = "RFU"
+
+[imu.noise]
+gyro_noise_density = 1e-4
+accel_noise_density = 1e-3
+gyro_bias_walk = 1e-6
+accel_bias_walk = 1e-5
+gyro_bias_sigma = 1e-3
+accel_bias_sigma = 1e-2
+
+[gnss]
+file = "gnss.csv"
+lever_arm = [0.1, 0.2, 0.3]
+
+[odometer]
+file = "odometer.csv"
+
+[truth]
+file = "truth.csv"
+"""
+
+
+def write_small(folder: Path) -> Path:
+    """One second of a standing car: 100 IMU rows, 5 fixes, 10 speeds, 2 truth rows."""
+    t = np.arange(1, 101) / 100
+    _csv(folder / "imu.csv", "t,gx,gy,gz,ax,ay,az", [[x, 0.001, 0.002, 0.003, 0.1, 0.2, 9.8] for x in t])
+    fixes = [[0.2 * k, 50.0, 100.0, 115.0, 0.5, 0.5, 1.0] for k in range(5)]
+    _csv(folder / "gnss.csv", "t,lat,lon,h,sd_e,sd_n,sd_u", fixes)
+    _csv(folder / "odometer.csv", "t,speed", [[0.1 * k, 0.0] for k in range(10)])
+    _csv(folder / "truth.csv", "t,lat,lon,h", [[0.1, 50.0, 100.0, 115.0], [0.9, 50.0, 100.0, 115.0]])
+    (folder / "recording.toml").write_text(TOML)
+    return folder
+
+
+def _csv(path: Path, header: str, rows: list[list[float]]) -> None:
+    path.write_text("\n".join([header, *(",".join(f"{x:.6f}" for x in row) for row in rows)]) + "\n")
+
+
+Break = Callable[[Path], None]
+
+
+def toml(old: str, new: str) -> Break:
+    """Replace text in recording.toml."""
+
+    def change(folder: Path) -> None:
+        text = (folder / "recording.toml").read_text()
+        assert old in text
+        (folder / "recording.toml").write_text(text.replace(old, new, 1))
+
+    return change
+
+
+def line(file: str, number: int, text: str | None) -> Break:
+    """Put another text in one line of a file (1-based), or take the line out."""
+
+    def change(folder: Path) -> None:
+        lines = (folder / file).read_text().splitlines()
+        lines[number - 1 : number] = [] if text is None else [text]
+        (folder / file).write_text("\n".join(lines) + "\n")
+
+    return change
+
+
+def every(file: str, change_row: Callable[[list[float]], list[float]]) -> Break:
+    """Change all data rows of a file."""
+
+    def change(folder: Path) -> None:
+        header, *rows = (folder / file).read_text().splitlines()
+        _csv(folder / file, header, [change_row([float(x) for x in row.split(",")]) for row in rows])
+
+    return change
+
+
+def content(file: str, data: bytes) -> Break:
+    """Replace a whole file."""
+
+    def change(folder: Path) -> None:
+        (folder / file).write_bytes(data)
+
+    return change
+
+
+def zipped(data: bytes) -> Break:
+    """Make the IMU file a .csv.gz with these bytes."""
+
+    def change(folder: Path) -> None:
+        (folder / "imu.csv.gz").write_bytes(data)
+        toml('"imu.csv"', '"imu.csv.gz"')(folder)
+
+    return change
+
+
+def both(*changes: Break) -> Break:
+    """Several changes."""
+
+    def change(folder: Path) -> None:
+        for one in changes:
+            one(folder)
+
+    return change
+
+
+def remove(file: str) -> Break:
+    """Delete a file."""
+    return lambda folder: (folder / file).unlink()
+
+
+def shift_decimal(k: int, factor: float) -> Callable[[list[float]], list[float]]:
+    """A row change: one column multiplied."""
+    return lambda row: [x * factor if j == k else x for j, x in enumerate(row)]
+
+
+IMU_HEADER = "t,gx,gy,gz,ax,ay,az"
+GOOD_ROW = "0.01,0,0,0,0,0,9.8"
+
+# what is broken: (how, fragments that the one line must hold)
+BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
+    # files
+    "empty file": (content("imu.csv", b""), ("imu.csv", "is empty")),
+    "only blank lines": (content("imu.csv", b"\n\n  \n"), ("imu.csv", "is empty")),
+    "header only": (content("imu.csv", b"t,gx,gy,gz,ax,ay,az\n"), ("imu.csv", "header and no rows")),
+    "binary file": (content("imu.csv", bytes(range(256)) * 20), ("imu.csv", "binary")),
+    "not utf-8": (content("imu.csv", "t,gx,gy,gz,ax,ay,\xe4z\n".encode("latin-1")), ("imu.csv", "line 1", "UTF-8")),
+    "no header": (line("imu.csv", 1, None), ("imu.csv, line 1", "must name the columns")),
+    "semicolons": (content("imu.csv", b"t;gx;gy;gz;ax;ay;az\n1;2;3;4;5;6;7\n"), ("line 1", "separated by commas")),
+    "gz that is none": (zipped(b"t,gx\n1,2\n"), ("imu.csv.gz", "not gzip-compressed")),
+    "gz cut off": (zipped(gzip.compress(b"t,gx,gy,gz,ax,ay,az\n" * 50)[:30]), ("imu.csv.gz", "cut off")),
+    "gz without the name": (content("imu.csv", gzip.compress(b"t,gx\n")), ("imu.csv", "must end in .gz")),
+    "missing file": (remove("gnss.csv"), ("gnss.csv", "no such file")),
+    "missing file, zipped there": (
+        toml('"gnss.csv"', '"imu.csv.gz"'),
+        ("imu.csv.gz", "no such file", "there is imu.csv"),
+    ),
+    "a folder as file": (toml('"gnss.csv"', '"."'), ("is a folder",)),
+    # columns and cells
+    "missing column": (line("imu.csv", 1, "t,gx,gy,gz,ax,ay,acc_z"), ("no column 'az'", "acc_z", "columns = { az")),
+    "renamed column missing": (toml('axes = "RFU"', 'columns = { t = "time" }'), ("imu.csv", "no column 'time'")),
+    "column twice": (line("imu.csv", 1, "t,gx,gx,gz,ax,ay,az"), ("imu.csv", "2 columns are called 'gx'")),
+    "non-numeric cell": (
+        line("imu.csv", 7, "0.06,0,0,0,0,oops,9.8"),
+        ("imu.csv, line 7", "column 'ay'", "'oops' is not a number"),
+    ),
+    "decimal comma": (line("odometer.csv", 3, "0,1,0,5"), ("odometer.csv, line 3", "4 fields", "header has 2")),
+    "short row": (line("imu.csv", 5, "0.04,0,0,0"), ("imu.csv, line 5", "4 fields", "header has 7")),
+    "all rows short": (content("imu.csv", b"t,gx,gy,gz,ax,ay,az\n1,2\n3,4\n"), ("imu.csv, line 2", "2 fields")),
+    "infinite value": (line("imu.csv", 9, "0.08,0,0,0,0,0,inf"), ("imu.csv, line 9", "column 'az'", "infinite")),
+    "infinite after comments": (
+        both(line("imu.csv", 1, f"# made by hand\n\n{IMU_HEADER}"), line("imu.csv", 9, "0.06,0,-inf,0,0,0,9")),
+        ("imu.csv, line 9", "column 'gy'", "infinite"),
+    ),
+    "NaN everywhere": (every("imu.csv", lambda row: [row[0], *[float("nan")] * 6]), ("imu.csv", "no row holds")),
+    "one row": (content("imu.csv", f"{IMU_HEADER}\n{GOOD_ROW}\n".encode()), ("imu.csv", "at least 2")),
+    "one time": (every("imu.csv", lambda row: [3.0, *row[1:]]), ("imu.csv", "at least 2")),
+    "time in ms": (every("imu.csv", shift_decimal(0, 1e3)), ("imu.csv", "10 s apart", 't = "ms"')),
+    "time in us": (every("imu.csv", shift_decimal(0, 1e6)), ("imu.csv", "10000 s apart", 't = "us"')),
+    # positions
+    "lat and lon swapped": (
+        both(line("gnss.csv", 1, "t,lon,lat,h,sd_e,sd_n,sd_u")),
+        ("gnss.csv, line 2", "column 'lat'", "100 is not a latitude", "swapped"),
+    ),
+    "radians": (
+        every("gnss.csv", lambda row: [row[0], row[1] / 57.3, row[2] / 57.3, *row[3:]]),
+        ("gnss.csv", "radians", 'angle = "rad"'),
+    ),
+    "longitude": (line("gnss.csv", 4, "0.4,50,400,115,1,1,1"), ("gnss.csv, line 4", "column 'lon'", "400")),
+    "height in mm": (every("gnss.csv", shift_decimal(3, 1e3)), ("gnss.csv, line 2", "column 'h'", "millimetres")),
+    "zero sd in the file": (line("gnss.csv", 3, "0.2,50,100,115,1,0,1"), ("gnss.csv, line 3", "'sd_n'", "above zero")),
+    # recording.toml
+    "toml syntax": (toml('platform = "vehicle"', "platform = vehicle"), ("recording.toml", "not valid TOML", "line 3")),
+    "toml not text": (content("recording.toml", b"\xff\xfe\x00"), ("recording.toml", "UTF-8")),
+    "wrong format": (toml("recording/1", "recording/2"), ("recording.toml", "'format'", "graphnav-recording/1")),
+    "no platform": (toml('platform = "vehicle"', ""), ("recording.toml", "'platform' is missing")),
+    "bad platform": (toml('"vehicle"', '"boat"'), ("recording.toml", "'platform' = 'boat'", "'vehicle' or 'foot'")),
+    "no imu": (toml("[imu]", "[imus]"), ("recording.toml", "unknown key 'imus'", "did you mean 'imu'")),
+    "no file": (toml('file = "gnss.csv"', ""), ("recording.toml", "'gnss.file' is missing")),
+    "unknown key": (toml("lever_arm", "leverarm"), ("recording.toml", "unknown key 'gnss.leverarm'", "'lever_arm'")),
+    "unknown noise key": (toml("gyro_bias_walk", "gyro_walk"), ("unknown key 'imu.noise.gyro_walk'", "gyro_bias_walk")),
+    "unknown column key": (
+        toml('file = "gnss.csv"', 'file = "gnss.csv"\ncolumns = { latt = "lat" }'),
+        ("'gnss.columns'", "'latt'", "did you mean 'lat'"),
+    ),
+    "wrong type": (toml('file = "gnss.csv"', "file = 7"), ("recording.toml", "'gnss.file' = 7", "string")),
+    "number as text": (
+        toml("gyro_bias_walk = 1e-6", 'gyro_bias_walk = "1e-6"'),
+        ("'imu.noise.gyro_bias_walk'", "number"),
+    ),
+    "not a table": (toml("[truth]\nfile =", "truth ="), ("recording.toml", "unknown key 'odometer.truth'")),
+    "negative noise": (
+        toml("gyro_bias_walk = 1e-6", "gyro_bias_walk = -1e-6"),
+        ("'imu.noise.gyro_bias_walk'", "greater"),
+    ),
+    "zero noise": (toml("= 1e-3", "= 0.0"), ("'imu.noise.accel_noise_density'", "greater than 0")),
+    "zero sd": (toml("lever_arm", "sd = [1.0, 0.0, 1.0]\nlever_arm"), ("'gnss.sd'", "above zero")),
+    "two sd": (toml("lever_arm", "sd_v = [1.0, 1.0]\nlever_arm"), ("'gnss.sd_v'", "three numbers")),
+    "lever arm of two": (toml("[0.1, 0.2, 0.3]", "[0.1, 0.2]"), ("'gnss.lever_arm'", "three numbers")),
+    "lever arm of nan": (toml("[0.1, 0.2, 0.3]", "[0.1, 0.2, nan]"), ("'gnss.lever_arm'", "three numbers")),
+    "bad unit": (toml('axes = "RFU"', 'units = { gyro = "rpm" }'), ("'imu.units.gyro' = 'rpm'", "'rad/s' or 'deg/s'")),
+    "unknown unit key": (
+        toml('axes = "RFU"', 'units = { gyros = "rad/s" }'),
+        ("'imu.units.gyros'", "did you mean 'gyro'"),
+    ),
+    "infinite offset": (toml('axes = "RFU"', "time_offset = inf"), ("'imu.time_offset'", "finite")),
+    # mounting
+    "left-handed axes": (toml("RFU", "FRU"), ("'imu.axes' = 'FRU'", "left-handed", "FRD")),
+    "axes garbage": (toml("RFU", "XYZ"), ("'imu.axes' = 'XYZ'", "three letters")),
+    "axes repeat": (toml("RFU", "RLU"), ("'imu.axes' = 'RLU'", "one of F/B")),
+    "axes too short": (toml("RFU", "RF"), ("'imu.axes' = 'RF'", "three letters")),
+    "axes and forward": (
+        toml('axes = "RFU"', 'axes = "RFU"\nforward = [0, 1, 0]\nup = [0, 0, 1]'),
+        ("'imu'", "not both"),
+    ),
+    "forward alone": (toml('axes = "RFU"', "forward = [0, 1, 0]"), ("'imu'", "give both")),
+    "forward along up": (
+        toml('axes = "RFU"', "forward = [0, 0.1, 1]\nup = [0, 0, 1]"),
+        ("'imu'", "nearly parallel"),
+    ),
+    "zero up": (toml('axes = "RFU"', "forward = [0, 1, 0]\nup = [0, 0, 0]"), ("'imu'", "zero")),
+    # truth and keep
+    "truth of unknown": (toml('file = "truth.csv"', 'file = "truth.csv"\nof = "camera"'), ("'truth.of' = 'camera'",)),
+    "truth of nobody": (
+        both(toml('[odometer]\nfile = "odometer.csv"', ""), toml('"truth.csv"', '"truth.csv"\nof = "odometer"')),
+        ("truth.of = 'odometer'", "no [odometer] table"),
+    ),
+    "truth of two kinds": (toml('"truth.csv"', '"truth.csv"\nclosed_loop_sigma = 0.1'), ("'truth'", "either file")),
+    "local truth without x": (toml('"truth.csv"', '"truth.csv"\nframe = "local"'), ("truth.csv", "no column 'x'")),
+    "keep column missing": (
+        toml('"truth.csv"', '"truth.csv"\nkeep = { column = "trust", at_least = 1 }'),
+        ("truth.csv", "no column 'trust'"),
+    ),
+    "keep leaves nothing": (
+        toml('"truth.csv"', '"truth.csv"\nkeep = { column = "h", at_least = 1000 }'),
+        ("truth.csv", "no row has h of at least 1000"),
+    ),
+    "keep incomplete": (
+        toml('"truth.csv"', '"truth.csv"\nkeep = { column = "h" }'),
+        ("'truth.keep.at_least' is missing",),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN, ids=lambda name: name.replace(" ", "-"))
+def test_a_broken_recording_gets_one_plain_line(tmp_path: Path, case: str) -> None:
+    change, fragments = BROKEN[case]
+    change(write_small(tmp_path))
+    with pytest.raises(RecordingError) as caught:
+        read(tmp_path)
+    sentence = str(caught.value)
+    assert "\n" not in sentence
+    assert "Error" not in sentence
+    for fragment in fragments:
+        assert fragment in sentence
+
+
+def test_the_unbroken_recording_loads_without_a_remark(tmp_path: Path) -> None:
+    recording = read(write_small(tmp_path))
+    assert recording.remarks == ()
+    assert (len(recording.imu.t), len(recording.gnss.t), len(recording.odometer.t)) == (100, 5, 10)
+
+
+def test_what_is_no_recording_says_what_to_point_at(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"no such file or folder.*kitti"):
+        read(tmp_path / "nowhere")
+    with pytest.raises(RecordingError, match=r"holds no recording\.toml$"):
+        read(tmp_path)
+    write_small(tmp_path)
+    (tmp_path / "recording.toml").rename(tmp_path / "other.toml")
+    with pytest.raises(RecordingError, match=r"point at one of other\.toml"):
+        read(tmp_path)
+    with pytest.raises(RecordingError, match=r"imu\.csv: not a recording; point at its folder"):
+        read(tmp_path / "imu.csv")
+    with pytest.raises(RecordingError, match=r"absent\.toml: cannot be read"):
+        read(tmp_path / "absent.toml")
+
+
+# what is odd but safe to mend: (how, what the remark says, IMU rows left)
+MENDED: dict[str, tuple[Break, str, int]] = {
+    "unsorted": (
+        both(line("imu.csv", 3, "0.03,1,0,0,0,0,9"), line("imu.csv", 4, "0.02,2,0,0,0,0,9")),
+        r"IMU rows out of order sorted by time \(1 steps back, the first after t = 0\.030 s\)",
+        100,
+    ),
+    "repeated": (line("imu.csv", 4, "0.02,5,5,5,5,5,5"), r"1 IMU row with the time of the row before .*t = 0\.020", 99),
+    "NaN row": (line("imu.csv", 4, "0.03,0,nan,0,0,0,9.8"), r"1 IMU row with blank or NaN .*t = 0\.030", 99),
+    "blank cell": (line("imu.csv", 4, "0.03,0,,0,0,0,9.8"), r"1 IMU row with blank or NaN .*t = 0\.030", 99),
+    "blank last cell": (line("imu.csv", 101, "1.00,0,0,0,0,0,"), r"1 IMU row with blank or NaN .*t = 1\.000", 99),
+    "blank time": (line("imu.csv", 4, ",0,0,0,0,0,9.8"), r"1 IMU row with blank or NaN values dropped$", 99),
+    "blank fix": (line("gnss.csv", 3, "0.2,,,,,,"), r"1 GNSS row with blank or NaN", 100),
+    "fix at 0, 0": (line("gnss.csv", 3, "0.2,0,0,0,1,1,1"), r"1 GNSS row at 0, 0", 100),
+    "no noise": (toml(TOML[TOML.index("[imu.noise]") : TOML.index("[gnss]")], ""), "no .imu.noise.*assumed", 100),
+    "partial noise": (toml("gyro_bias_walk = 1e-6\n", ""), "says nothing of gyro_bias_walk:", 100),
+    "no sd": (line("gnss.csv", 1, "t,lat,lon,h,a,b,c"), "GNSS position sigmas of 3.3, 3.3, 6.6 .* are assumed", 100),
+    "one sd": (line("gnss.csv", 1, "t,lat,lon,h,sd_e,b,c"), "only sd_e is there, so it is not used", 100),
+    "blank sd": (line("gnss.csv", 3, "0.2,50,100,115,1,,1"), r"assumed where the file.s own are blank \(1 of 5 rows\)", 100),
+    "no sd_v": (line("gnss.csv", 1, "t,lat,lon,h,ve,vn,vu"), "GNSS velocity sigmas of 0.2, 0.2, 0.4 .* assumed", 100),
+    "two velocities": (line("gnss.csv", 1, "t,lat,lon,h,ve,vn,c"), "only ve, vn is there, so none are used", 100),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", MENDED, ids=lambda name: name.replace(" ", "-"))
+def test_what_can_be_mended_safely_is_and_is_remarked_on(tmp_path: Path, case: str) -> None:
+    change, remark, rows = MENDED[case]
+    change(write_small(tmp_path))
+    recording = read(tmp_path)
+    assert any(re.search(remark, sentence) for sentence in recording.remarks), recording.remarks
+    assert len(recording.imu.t) == rows
+    assert (np.diff(recording.imu.t) > 0).all()
+
+
+def test_sorting_keeps_rows_together_and_repeats_keep_the_first(tmp_path: Path) -> None:
+    write_small(tmp_path)
+    MENDED["unsorted"][0](tmp_path)
+    assert np.array_equal(read(tmp_path).imu.gyro[:4, 0], [0.001, 2.0, 1.0, 0.001])
+    write_small(tmp_path)
+    MENDED["repeated"][0](tmp_path)
+    assert np.array_equal(read(tmp_path).imu.gyro[:3, 0], [0.001, 0.001, 0.001])
+
+
+def test_gaps_are_left_as_they_are(tmp_path: Path) -> None:
+    write_small(tmp_path)
+    lines = (tmp_path / "imu.csv").read_text().splitlines()
+    (tmp_path / "imu.csv").write_text("\n".join(lines[:30] + lines[60:]) + "\n")
+    recording = read(tmp_path)
+    assert len(recording.imu.t) == 70
+    assert recording.duration == pytest.approx(1.0)
