@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphnav import rotation
 from graphnav.earth import LocalFrame
@@ -21,7 +22,7 @@ _SAME_TIME = 1e-6  # s; what a text file rounds a time stamp to
 
 def interpolate(
     trajectory: Trajectory, t: Array, *, max_gap: float = 3.0, lever_arm: Array | None = None
-) -> tuple[Trajectory, Array]:
+) -> tuple[Trajectory, NDArray[np.bool_]]:
     """The trajectory at the times `t` (N,) it can be interpolated to, and the mask (N,) of those times.
 
     Never outside the trajectory, and never between two of its rows more than `max_gap` s apart; a time
@@ -44,9 +45,10 @@ def interpolate(
     omega = None
     R_at = None
     if R is not None:
-        turn = rotation.log(np.swapaxes(R[k], -1, -2) @ R[nxt])
-        R_at = R[k] @ rotation.exp(s * turn)
-        omega = turn / np.where(dt > 0, dt, 1.0)
+        R_at = R[k] @ rotation.exp(s * rotation.log(np.swapaxes(R[k], -1, -2) @ R[nxt]))
+        if lever_arm is not None:
+            rate = _rates(trajectory.t, R)
+            omega = _lerp(rate[k], rate[nxt], s)
     p_at = _lerp(p[k], p[nxt], s)
     v_at = None
     if v is not None:
@@ -135,7 +137,7 @@ def placed(trajectory: Trajectory, frame: LocalFrame, yaw: float, offset: Array)
     )  # fmt: skip
 
 
-def _bracket(times: Array, t: Array, max_gap: float) -> tuple[Array, Array, Array]:
+def _bracket(times: Array, t: Array, max_gap: float) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_]]:
     """The row before each time, the fraction of the way to the next, and whether it may be used."""
     k = np.clip(np.searchsorted(times, t, side="right") - 1, 0, max(len(times) - 2, 0))
     dt = times[np.minimum(k + 1, len(times) - 1)] - times[k]
@@ -143,6 +145,16 @@ def _bracket(times: Array, t: Array, max_gap: float) -> tuple[Array, Array, Arra
     inside = (t >= times[0] - _SAME_TIME) & (t <= times[-1] + _SAME_TIME)
     on_row = np.minimum(s, 1 - s) * dt <= _SAME_TIME
     return k, s, inside & ((dt <= max_gap) | on_row)
+
+
+def _rates(t: Array, R: Array) -> Array:
+    """Body rates (K, 3), rad/s, at the rows: central differences that weigh the nearer neighbour more."""
+    if len(t) < 2:
+        return np.zeros((len(t), 3))
+    dt = np.diff(t)[:, None]
+    rate = rotation.log(np.swapaxes(R[:-1], -1, -2) @ R[1:]) / dt
+    inner = (rate[:-1] * dt[1:] + rate[1:] * dt[:-1]) / (dt[1:] + dt[:-1])
+    return np.concatenate([rate[:1], inner, rate[-1:]])
 
 
 def _lerp(a: Array, b: Array, s: Array) -> Array:

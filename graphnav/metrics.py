@@ -21,7 +21,7 @@ from graphnav.rotation import Array
 
 @dataclass(frozen=True)
 class Errors:
-    """Estimate minus truth at N epochs of the truth; NaN where either has nothing to compare."""
+    """Estimate minus truth at N shared epochs; NaN where either has nothing to compare."""
 
     t: Array  # (N,) s
     p: Array  # (N, 3) m, east, north, up at the point
@@ -37,7 +37,7 @@ class Errors:
     nees_rph: Array  # (N,) 3 degrees of freedom, of the rotation between estimate and truth
     distance: Array  # (N,) m, horizontal, travelled by the truth since its first scored epoch
     dof_p: int = 3  # 2 for a truth without height
-    epochs: int = 0  # of the truth, scored or not
+    epochs: int = 0  # that there were, scored or not
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -150,7 +150,7 @@ def measure(errors: Errors, name: str = "", spans: Sequence[tuple[float, float]]
         "ve": errors.v[:, 0], "vn": errors.v[:, 1], "vu": errors.v[:, 2],
         "roll": deg[:, 0], "pitch": deg[:, 1], "heading": deg[:, 2],
     }  # fmt: skip
-    nees = {
+    values = {
         "p": (errors.nees_p, errors.dof_p), "e": (errors.nees_axis[:, 0], 1), "n": (errors.nees_axis[:, 1], 1),
         "up": (errors.nees_axis[:, 2], 1), "v": (errors.nees_v, 3), "rph": (errors.nees_rph, 3),
     }  # fmt: skip
@@ -161,7 +161,7 @@ def measure(errors: Errors, name: str = "", spans: Sequence[tuple[float, float]]
         duration=float(errors.t[-1] - errors.t[0]) if len(errors) else 0.0,
         distance=float(errors.distance[-1]) if len(errors) else 0.0,
         components={key: found for key, x in series.items() if (found := statistic(x)) is not None},
-        nees={key: found for key, (x, dof) in nees.items() if (found := average_nees(x, dof)) is not None},
+        nees={key: mean for key, (x, dof) in values.items() if (mean := average_nees(x, dof)) is not None},
         spans=tuple(_span(errors, start, end) for start, end in spans),
         notes=errors.notes,
         errors=errors,
@@ -210,7 +210,8 @@ def ensemble_nees(runs: Sequence[Errors], block: str = "p") -> tuple[Array, Arra
         shared = np.intersect1d(shared, stamp)
     dof = min(run.dof_p for run in runs) if block == "p" else 3
     rows = [getattr(run, f"nees_{block}")[np.searchsorted(s, shared)] for run, s in zip(runs, stamps, strict=True)]
-    return shared * 1e-6, np.mean(rows, axis=0) / dof, *chi_square_band(dof, len(runs))
+    low, high = chi_square_band(dof, len(runs))
+    return shared * 1e-6, np.asarray(np.mean(rows, axis=0)) / dof, low, high
 
 
 def _span(errors: Errors, start: float, end: float) -> Span:
@@ -291,9 +292,9 @@ def text(metrics: Metrics) -> str:
     if metrics.spans:
         titles = ("end hor.", "end 3-D", "max hor.", "max up", "m/s", "% dist.", "NEES")
         lines.append(f"{'span (s)':<16}" + "".join(f"{title:>10}" for title in titles))
-        for s in metrics.spans:
-            numbers = (s.end_h, s.end_3d, s.max_h, s.max_up, s.drift, s.drift_percent, s.nees)
-            lines.append(f"{f'{s.start:.1f}-{s.end:.1f}':<16}" + "".join(f"{_short(x):>10}" for x in numbers))
+        for span in metrics.spans:
+            row = (span.end_h, span.end_3d, span.max_h, span.max_up, span.drift, span.drift_percent, span.nees)
+            lines.append(f"{f'{span.start:.1f}-{span.end:.1f}':<16}" + "".join(f"{_short(x):>10}" for x in row))
     if metrics.closure is not None:
         c = metrics.closure
         lines.append(

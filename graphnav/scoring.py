@@ -21,7 +21,10 @@ _SLOW = 0.5  # m/s; slower than this a direction of travel means little
 def errors(
     trajectory: Trajectory, truth: Trajectory, *, lever_arm: Array | None = None, max_gap: float = MAX_GAP
 ) -> Errors:
-    """Estimate minus truth at the epochs of `truth` that `trajectory` can be interpolated to.
+    """Estimate minus truth at every epoch of the sparser of the two that the other can be interpolated to.
+
+    So the attitude of one-second keyframes, which no interpolation follows through a turn, is compared
+    at the keyframes when the truth has ten rows a second, and a dense estimate at the truth's epochs.
 
     Parameters
     ----------
@@ -49,10 +52,9 @@ def errors(
     flat = truth.frame == "local" and bool(np.isnan(truth.llh[:, 2]).all())
     if trajectory.frame == "local" or truth.frame == "local":
         trajectory, truth = _fitted(trajectory, truth, lever_arm, max_gap, notes)
-    estimate, ok = interpolate(trajectory, truth.t, max_gap=max_gap, lever_arm=lever_arm)
-    if not ok.any():
-        raise RecordingError(_nothing_shared(trajectory, truth, max_gap))
-    seen = truth.take(ok)
+    estimate, seen, travel, epochs = _paired(trajectory, truth, lever_arm, max_gap)
+    if _spacing(truth) < _spacing(trajectory):
+        notes.append("compared at the estimate's own epochs, to which the denser truth is interpolated")
 
     R_le = enu_axes(seen.llh)
     p = np.einsum("kij,kj->ki", R_le, llh_to_ecef(estimate.llh) - llh_to_ecef(seen.llh))
@@ -78,10 +80,11 @@ def errors(
         nees_rph = _nees(theta, to_theta @ cov[:, 6:9, 6:9] @ np.swapaxes(to_theta, -1, -2))
     with np.errstate(divide="ignore", invalid="ignore"):
         per_axis = p**2 / np.diagonal(cov, axis1=-2, axis2=-1)[:, :3]
-    direction, derived = _direction(truth, max_gap)
-    if derived:
+    if truth.v is None:
         notes.append("the truth has no velocity: its direction of travel is taken from its positions")
-    along = direction[ok]
+    speed = np.linalg.norm(travel, axis=1)
+    moving = speed > _SLOW
+    along = np.where(moving[:, None], travel / np.where(moving, speed, 1.0)[:, None], np.nan)
     return Errors(
         t=seen.t,
         p=p,
@@ -99,7 +102,7 @@ def errors(
         nees_rph=nees_rph,
         distance=travelled(seen.t, seen.llh),
         dof_p=dof,
-        epochs=len(truth),
+        epochs=epochs,
         notes=tuple(dict.fromkeys(notes)),
     )
 
@@ -132,10 +135,8 @@ def _fitted(
     if trajectory.frame == truth.frame:
         # Neither knows where it is: anywhere will do, and lengths stay what they are.
         trajectory = placed(trajectory, LocalFrame(np.zeros(3)), 0.0, np.zeros(3))
-    estimate, ok = interpolate(trajectory, truth.t, max_gap=max_gap, lever_arm=lever_arm)
-    if not ok.any():
-        raise RecordingError(_nothing_shared(trajectory, truth, max_gap))
-    mine, theirs = estimate.llh, truth.llh[ok]
+    estimate, seen, _, _ = _paired(trajectory, truth, lever_arm, max_gap)
+    mine, theirs = estimate.llh, seen.llh
     frame = LocalFrame(mine[0] if trajectory.frame == "geodetic" else theirs[0])
     truth_is_local = truth.frame == "local"
     source, target = (theirs, frame.from_llh(mine)) if truth_is_local else (mine, frame.from_llh(theirs))
@@ -158,18 +159,38 @@ def _fitted(
     return placed(trajectory, frame, yaw, offset), truth
 
 
-def _direction(truth: Trajectory, max_gap: float) -> tuple[Array, bool]:
-    """Unit vectors (N, 2) of the truth's horizontal travel, NaN when slow; and whether positions gave them."""
-    v = np.full((len(truth), 2), np.nan) if truth.v is None else truth.v[:, :2].copy()
-    derived = bool(np.isnan(v).any(axis=1).all())
-    if derived and len(truth) > 2:
-        p = LocalFrame(truth.llh[0]).from_llh(truth.llh)[:, :2]
-        v = np.gradient(p, truth.t, axis=0)
-        gap = np.diff(truth.t) > max_gap
-        v[np.concatenate([[False], gap]) | np.concatenate([gap, [False]])] = np.nan
-    speed = np.linalg.norm(v, axis=1)
-    moving = speed > _SLOW
-    return np.where(moving[:, None], v / np.where(moving, speed, 1.0)[:, None], np.nan), derived
+def _paired(
+    trajectory: Trajectory, truth: Trajectory, lever_arm: Array | None, max_gap: float
+) -> tuple[Trajectory, Trajectory, Array, int]:
+    """Estimate and truth at the epochs they share, the truth's horizontal velocity there (N, 2), and of how many."""
+    moving = truth if truth.v is not None else replace(truth, v=_derived_velocity(truth, max_gap))
+    if _spacing(truth) < _spacing(trajectory):
+        seen, _ = interpolate(moving, trajectory.t, max_gap=max_gap)
+        epochs = len(trajectory)
+    else:
+        seen, epochs = moving, len(truth)
+    estimate, reached = interpolate(trajectory, seen.t, max_gap=max_gap, lever_arm=lever_arm)
+    if not reached.any():
+        raise RecordingError(_nothing_shared(trajectory, truth, max_gap))
+    seen = seen.take(reached)
+    assert seen.v is not None
+    return estimate, seen if truth.v is not None else replace(seen, v=None), seen.v[:, :2], epochs
+
+
+def _spacing(trajectory: Trajectory) -> float:
+    """Usual time between rows, s, to 0.1 ms so that rounding decides nothing; infinite for one row."""
+    return float(np.round(np.median(np.diff(trajectory.t)), 4)) if len(trajectory) > 1 else np.inf
+
+
+def _derived_velocity(truth: Trajectory, max_gap: float) -> Array:
+    """Velocity (N, 3) from positions by central differences, NaN beside a gap."""
+    if len(truth) < 3:
+        return np.full((len(truth), 3), np.nan)
+    p = truth.llh if truth.frame == "local" else LocalFrame(truth.llh[0]).from_llh(truth.llh)
+    v = np.asarray(np.gradient(p, truth.t, axis=0))
+    gap = np.diff(truth.t) > max_gap
+    v[np.concatenate([[False], gap]) | np.concatenate([gap, [False]])] = np.nan
+    return v
 
 
 def _nees(e: Array, cov: Array) -> Array:
@@ -191,7 +212,10 @@ def _nothing_shared(trajectory: Trajectory, truth: Trajectory, max_gap: float) -
     name = trajectory.name or "the trajectory"
     if trajectory.t[-1] < truth.t[0] or truth.t[-1] < trajectory.t[0]:
         return f"{name}: {ranges(trajectory, truth)}"
-    return f"{name}: no epoch of the truth lies between two rows of the estimate at most {max_gap:g} s apart"
+    return (
+        f"{name}: nothing to compare; no row of the sparser file lies between two rows of the other at most "
+        f"{max_gap:g} s apart"
+    )
 
 
 def ranges(trajectory: Trajectory, truth: Trajectory) -> str:
