@@ -1,0 +1,190 @@
+"""The HTML around figures and tables: one self-contained page, light or dark as the reader prefers, no script.
+
+Every function takes plain values and escapes them; only `svg` strings of `graphnav.panels` go in as they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+from graphnav.panels import PALETTE, css_colours
+
+_CSS = """
+:root{color-scheme:light dark;--page:#ffffff;--card:#f6f7f8;--words:#1b1d20;--soft:#5b6068;--edge:#dfe2e6}
+@media (prefers-color-scheme:dark){:root{--page:#141619;--card:#1c1f23;--words:#e7e9ec;--soft:#a2a8b1;--edge:#33383f}}
+*{box-sizing:border-box}
+body{margin:0;background:var(--page);color:var(--words);font:16px/1.5 system-ui,"Segoe UI",Roboto,sans-serif}
+main{max-width:1180px;margin:0 auto;padding:20px 16px 48px}
+h1{font-size:1.6rem;line-height:1.2;margin:.2em 0;overflow-wrap:anywhere}
+h2{font-size:1.2rem;margin:2.2em 0 .5em;padding-top:.7em;border-top:1px solid var(--edge)}
+h3{font-size:1rem;margin:1.2em 0 .4em}
+p{margin:.5em 0;max-width:75ch}
+ul{margin:.4em 0;padding-left:1.3em;max-width:75ch}
+.soft,figcaption{color:var(--soft);font-size:.9rem}
+nav{font-size:.9rem;margin:.8em 0}
+nav a{color:inherit;margin-right:1em;white-space:nowrap}
+.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(135px,1fr));gap:8px;margin:1em 0}
+.tile{background:var(--card);border:1px solid var(--edge);border-radius:8px;padding:8px 12px}
+.tile b{display:block;font-size:1.25rem;font-variant-numeric:tabular-nums;line-height:1.3}
+.tile span{color:var(--soft);font-size:.82rem;line-height:1.25;display:block}
+.wide{overflow-x:auto;margin:.6em 0}
+table{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums}
+th,td{padding:4px 12px 4px 0;text-align:right;border-bottom:1px solid var(--edge);vertical-align:top}
+th:first-child,td:first-child{text-align:left;overflow-wrap:anywhere}
+td.words{text-align:left}
+th{color:var(--soft);font-weight:600}
+td.best{font-weight:700}
+.figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,480px),1fr));gap:18px;margin:.8em 0}
+figure{margin:0;min-width:0}
+figure svg{display:block;width:100%;height:auto;max-width:680px}
+svg text{font-family:system-ui,"Segoe UI",Roboto,sans-serif!important}
+.verdict{border-left:4px solid var(--ink);background:var(--card);padding:8px 12px;border-radius:0 8px 8px 0}
+.verdict.good{border-color:var(--incremental)} .verdict.bad{border-color:var(--alert)}
+.swatch{display:inline-block;width:.8em;height:.8em;border-radius:2px;margin-right:.45em;vertical-align:-.05em}
+details{margin:.6em 0} summary{cursor:pointer}
+code{font-size:.85rem;overflow-wrap:anywhere}
+@media print{h2{break-after:avoid} figure{break-inside:avoid}}
+"""
+
+
+class Raw(str):
+    """HTML made here, not to be escaped again."""
+
+
+def text(value: Any) -> str:
+    """A value as escaped words; numbers with four significant digits."""
+    if isinstance(value, Raw):
+        return value
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return number(value)
+    return escape(str(value))
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number for people: `digits` significant digits, whole from a thousand on, '-' where there is none."""
+    if not math.isfinite(value):
+        return "-"
+    if value == 0:
+        return "0"
+    size = abs(value)
+    if size >= 1e7 or size < 1e-4:
+        return f"{value:.{digits - 1}g}"
+    places = max(0, digits - 1 - math.floor(math.log10(size)))
+    return f"{value:.{min(places, digits)}f}"
+
+
+def measured(value: float, sigma: float) -> str:
+    """A value with as many places as its sigma gives sense to."""
+    if not (math.isfinite(value) and math.isfinite(sigma)) or sigma <= 0:
+        return number(value)
+    places = 1 - math.floor(math.log10(sigma))
+    return f"{value:.{max(places, 0)}f}" if places <= 8 else f"{value:.4g}"
+
+
+def solver(name: str) -> Raw:
+    """A solver's name with its colour."""
+    key = name if name in PALETTE else "other"
+    return Raw(f'<span class="swatch" style="background:var(--{key})"></span>{escape(name)}')
+
+
+def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int] = ()) -> Raw:
+    """A table, words left and numbers right; in the columns `best` the smallest number is bold."""
+    rows = [list(row) for row in rows]
+    least = {
+        k: min((row[k] for row in rows if isinstance(row[k], float) and math.isfinite(row[k])), default=None)
+        for k in (best if len(rows) > 1 else ())
+    }
+    body = []
+    for row in rows:
+        cells = []
+        for k, value in enumerate(row):
+            kind = ' class="words"' if k and isinstance(value, str) and not isinstance(value, Raw) else ""
+            if k in least and value == least[k]:
+                kind = ' class="best"'
+            cells.append(f"<td{kind}>{text(value)}</td>")
+        body.append(f"<tr>{''.join(cells)}</tr>")
+    heads = "".join(f'<th scope="col">{text(h)}</th>' for h in head)
+    return Raw(f'<div class="wide"><table><thead><tr>{heads}</tr></thead><tbody>{"".join(body)}</tbody></table></div>')
+
+
+def pairs(values: Mapping[str, Any]) -> Raw:
+    """A table of two columns without a head."""
+    rows = "".join(f'<tr><td>{text(k)}</td><td class="words">{text(v)}</td></tr>' for k, v in values.items())
+    return Raw(f'<div class="wide"><table><tbody>{rows}</tbody></table></div>')
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A nested mapping with dotted keys."""
+    out: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            out.update(flat(value, f"{prefix}{key}."))
+        else:
+            out[f"{prefix}{key}"] = value
+    return out
+
+
+def tiles(values: Iterable[tuple[str, str]]) -> Raw:
+    """The few numbers to see first: (number with unit, what it is)."""
+    inner = "".join(f'<div class="tile"><b>{text(v)}</b><span>{text(k)}</span></div>' for v, k in values)
+    return Raw(f'<div class="tiles">{inner}</div>')
+
+
+def paragraph(words: str, kind: str = "") -> Raw:
+    """A paragraph, of a CSS class if given."""
+    mark = f' class="{kind}"' if kind else ""
+    return Raw(f"<p{mark}>{text(words)}</p>")
+
+
+def bullets(lines: Iterable[str]) -> Raw:
+    """A list of sentences."""
+    return Raw("<ul>" + "".join(f"<li>{text(line)}</li>" for line in lines) + "</ul>")
+
+
+def picture(svg: str, caption: str) -> Raw:
+    """An SVG element with its caption."""
+    return Raw(f"<figure>{svg}<figcaption>{text(caption)}</figcaption></figure>")
+
+
+def gallery(pictures: Iterable[Raw]) -> Raw:
+    """Pictures, two beside each other where there is room."""
+    return Raw(f'<div class="figures">{"".join(pictures)}</div>')
+
+
+def and_list(parts: Sequence[str]) -> str:
+    """a, b and c"""
+    return parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]
+
+
+def folded(title: str, content: str) -> Raw:
+    """Content that opens on demand."""
+    return Raw(f"<details><summary>{text(title)}</summary>{content}</details>")
+
+
+def page(title: str, lead: Sequence[str], sections: Sequence[tuple[str, Sequence[str]]]) -> str:
+    """The whole page.
+
+    Parameters
+    ----------
+    lead : HTML between the title and the first section.
+    sections : heading and HTML parts; sections without parts are left out.
+    """
+    sections = [(head, parts) for head, parts in sections if any(parts)]
+    links = "".join(f'<a href="#s{k}">{escape(head)}</a>' for k, (head, _) in enumerate(sections))
+    body = "".join(
+        f'<section id="s{k}"><h2>{escape(head)}</h2>{"".join(parts)}</section>'
+        for k, (head, parts) in enumerate(sections)
+    )
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}</title>\n<style>{css_colours()}{_CSS}</style>\n</head>\n<body><main>\n"
+        f"<h1>{escape(title)}</h1>\n{''.join(lead)}\n<nav>{links}</nav>\n{body}\n</main></body>\n</html>\n"
+    )
