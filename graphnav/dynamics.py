@@ -31,8 +31,8 @@ import numpy as np
 
 from graphnav import earth, rotation
 from graphnav.earth import LocalFrame
-from graphnav.preintegration import Intervals, _mv
-from graphnav.rotation import Array
+from graphnav.preintegration import Intervals
+from graphnav.rotation import Array, mv
 from graphnav.state import DIM, States
 
 
@@ -68,9 +68,9 @@ class EarthMotion:
         up = -g[..., None] / size
         gradient = -size / earth.A * (np.eye(3) - 3.0 * up @ np.swapaxes(up, -1, -2))
         G = g + states.p @ self.W2.T
-        change = _mv(gradient, states.v * T)
-        gv = _mv(self.gamma1[rows], G) * T + 0.5 * change * T
-        gp = _mv(self.gamma2[rows], G) * T * T + change * T * T / 6.0
+        change = mv(gradient, states.v * T)
+        gv = mv(self.gamma1[rows], G) * T + 0.5 * change * T
+        gp = mv(self.gamma2[rows], G) * T * T + change * T * T / 6.0
         return _EarthTerms(self.E[rows], gv, gp, gradient, self.omega)
 
 
@@ -81,8 +81,8 @@ def predict(intervals: Intervals, rows: slice, start: States, motion: EarthMotio
     dR, dV, dP, _ = iv.corrected(start.ba, start.bg)
     back = np.swapaxes(e.E, -1, -2)
     rate = start.v + start.p @ motion.W.T
-    p = _mv(back, start.p + rate * T + e.gp + _mv(start.R_nb, dP))
-    v = _mv(back, rate + e.gv + _mv(start.R_nb, dV)) - p @ motion.W.T
+    p = mv(back, start.p + rate * T + e.gp + mv(start.R_nb, dP))
+    v = mv(back, rate + e.gv + mv(start.R_nb, dV)) - p @ motion.W.T
     return States(back @ start.R_nb @ dR, p, v, start.ba, start.bg)
 
 
@@ -92,16 +92,11 @@ def linearize(
     """Residual (n, 15) and its Jacobians (n, 15, 15) with respect to the states at both ends."""
     iv, e = intervals[rows], motion.terms(rows, start)
     n, T = len(iv), iv.T[:, None]
-    dR, dV, dP, turn = iv.corrected(start.ba, start.bg)
     Rt = np.swapaxes(start.R_nb, -1, -2)
     RtE = Rt @ e.E
     seen = RtE @ end.R_nb  # R_i^T E R_j
-    r_theta = rotation.log(np.swapaxes(dR, -1, -2) @ seen)
-    rate = start.v + start.p @ motion.W.T
-    a = _mv(Rt, _mv(e.E, end.v + end.p @ motion.W.T) - rate - e.gv)
-    b = _mv(Rt, _mv(e.E, end.p) - start.p - rate * T - e.gp)
-
-    residual = np.concatenate([r_theta, b - dP, a - dV, end.ba - start.ba, end.bg - start.bg], -1)
+    value, a, b, turn = _residual(iv, e, start, end, motion, seen)
+    r_theta = value[:, :3]
     Ji, Jj = np.zeros((n, DIM, DIM)), np.zeros((n, DIM, DIM))
     th, p, v, ba, bg = (slice(3 * k, 3 * k + 3) for k in range(5))
     inverse = rotation.right_jacobian_inverse(r_theta)
@@ -121,7 +116,29 @@ def linearize(
     Jj[:, v, p], Jj[:, v, v] = RtE @ motion.W, RtE
     for k in (ba, bg):
         Ji[:, k, k], Jj[:, k, k] = -np.eye(3), np.eye(3)
-    return residual, Ji, Jj
+    return value, Ji, Jj
+
+
+def residual(intervals: Intervals, start: States, end: States, motion: EarthMotion) -> Array:
+    """Only the residual (n, 15) of `linearize`, for all intervals."""
+    e = motion.terms(slice(None), start)
+    seen = np.swapaxes(start.R_nb, -1, -2) @ e.E @ end.R_nb
+    return _residual(intervals, e, start, end, motion, seen)[0]
+
+
+def _residual(
+    iv: Intervals, e: _EarthTerms, start: States, end: States, motion: EarthMotion, seen: Array
+) -> tuple[Array, Array, Array, Array]:
+    """The residual, the measured-like velocity and position steps in it, and the bias turn of dR."""
+    T = iv.T[:, None]
+    dR, dV, dP, turn = iv.corrected(start.ba, start.bg)
+    Rt = np.swapaxes(start.R_nb, -1, -2)
+    rate = start.v + start.p @ motion.W.T
+    a = mv(Rt, mv(e.E, end.v + end.p @ motion.W.T) - rate - e.gv)
+    b = mv(Rt, mv(e.E, end.p) - start.p - rate * T - e.gp)
+    r_theta = rotation.log(np.swapaxes(dR, -1, -2) @ seen)
+    value = np.concatenate([r_theta, b - dP, a - dV, end.ba - start.ba, end.bg - start.bg], -1)
+    return value, a, b, turn
 
 
 def transition(

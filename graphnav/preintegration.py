@@ -35,7 +35,7 @@ import numpy as np
 
 from graphnav import rotation
 from graphnav.recording import Imu
-from graphnav.rotation import Array
+from graphnav.rotation import Array, mv
 
 _CHUNK = 40_000  # pieces handled at once: keeps the working arrays in the processor's cache
 _WALK_POINTS = 6  # quadrature points for the effect of bias walk inside an interval
@@ -77,11 +77,11 @@ class Intervals:
     def corrected(self, ba: Array, bg: Array) -> tuple[Array, Array, Array, Array]:
         """dR, dV, dP for other biases to first order, and the rotation-vector correction of dR."""
         da, dg = ba - self.ba, bg - self.bg
-        turn = _mv(self.theta_bg, dg)
+        turn = mv(self.theta_bg, dg)
         return (
             self.dR @ rotation.exp(turn),
-            self.dV + _mv(self.v_ba, da) + _mv(self.v_bg, dg),
-            self.dP + _mv(self.p_ba, da) + _mv(self.p_bg, dg),
+            self.dV + mv(self.v_ba, da) + mv(self.v_bg, dg),
+            self.dP + mv(self.p_ba, da) + mv(self.p_bg, dg),
             turn,
         )
 
@@ -221,10 +221,6 @@ def _chunks(count: Array) -> Iterator[Array]:
             lo, hi = (mid, hi) if fits and alike else (lo, mid - 1)
         yield order[start:lo]
         start = lo
-
-
-def _mv(M: Array, v: Array) -> Array:
-    return (M @ v[..., None])[..., 0]
 
 
 def _cross(a: Array, b: Array) -> Array:

@@ -24,6 +24,11 @@ def skew(v: Array) -> Array:
     return out
 
 
+def mv(M: Array, v: Array) -> Array:
+    """Matrix times vector along the leading axes: (..., m, k), (..., k) -> (..., m)."""
+    return (M @ v[..., None])[..., 0]
+
+
 def coefficients(theta2: Array) -> tuple[Array, Array, Array, Array]:
     """sin(x)/x, (1 - cos x)/x^2, (x - sin x)/x^3 and (1/2 - (1 - cos x)/x^2)/x^2 for x^2 = theta2.
 

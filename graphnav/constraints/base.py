@@ -1,0 +1,106 @@
+"""The contract of every constraint: written once, used by every solver.
+
+A constraint is N rows of m numbers, each row tied to one keyframe. `linearize` gives, at the states and
+parameter values of some rows, the residual (predicted minus measured), its derivative with respect to
+the error-state blocks and parameters it depends on, and the measurement's sigma. It knows nothing of
+filters or graphs, and no weights, gates or robust kernels: those belong to the solvers, which read
+`robust`, `robust_scale` and `gate`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.earth import LocalFrame
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+from graphnav.state import BLOCKS, DIM, States
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Something estimated beside the states: a constant (walk 0) or a chain of slowly moving values."""
+
+    name: str
+    initial: Array  # (k,)
+    sigma: Array  # (k,) 1-sigma of the initial value
+    unit: str
+    walk: float = 0.0  # unit/sqrt(s); 0 = one constant for the whole recording
+
+
+@dataclass(frozen=True)
+class Linearized:
+    """Rows at one point: residual (N, m), {block or parameter: (N, m, k)}, sigma (N, m)."""
+
+    residual: Array
+    jacobians: dict[str, Array]
+    sigma: Array
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a constraint may look at to build its rows."""
+
+    recording: Recording
+    settings: Settings
+    frame: LocalFrame
+    t: Array  # (K,) keyframe times, s
+
+    def keyframe_at(self, t: Array) -> Array:
+        """Index of the keyframe at each time, -1 where there is none."""
+        right = np.clip(np.searchsorted(self.t, t), 0, len(self.t) - 1)
+        left = np.maximum(right - 1, 0)
+        best = np.where(np.abs(self.t[left] - t) < np.abs(self.t[right] - t), left, right)
+        return np.where(np.abs(self.t[best] - t) < SAME_TIME, best, -1)
+
+
+SAME_TIME = 1e-6  # s; measurements closer than this share a keyframe
+
+
+@dataclass(frozen=True)
+class Constraint(ABC):
+    """N rows of one kind of measurement. Subclasses add their arrays and `linearize`."""
+
+    name: ClassVar[str]
+    axes: ClassVar[tuple[str, ...]]
+    unit: ClassVar[str]
+
+    keyframe: Array  # (N,) int, ascending
+    parameters: tuple[Parameter, ...] = ()
+    robust: str = "none"
+    robust_scale: float = 3.0
+    gate: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.keyframe)
+
+    @classmethod
+    @abstractmethod
+    def epochs(cls, recording: Recording, settings: Settings) -> Array:
+        """Times (s) at which this constraint wants keyframes."""
+
+    @classmethod
+    @abstractmethod
+    def build(cls, scene: Scene) -> Constraint | None:
+        """The rows for a recording, or None when it has nothing for this constraint."""
+
+    @abstractmethod
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        """Rows `rows` at `states` (one per row) and parameter values (n, k), one per row."""
+
+
+def assemble(linearized: Linearized, parameters: dict[str, slice] | None = None, width: int = DIM) -> Array:
+    """(N, m, width) Jacobian over the error state, with parameters in the columns given."""
+    n, m = linearized.residual.shape
+    H = np.zeros((n, m, width))
+    for key, J in linearized.jacobians.items():
+        if key in BLOCKS:
+            H[:, :, BLOCKS[key]] = J
+        elif parameters is not None and key in parameters:
+            H[:, :, parameters[key]] = J
+    return H

@@ -1,0 +1,130 @@
+"""Keyframes, the intervals between them and the constraint rows on them; no solver in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints import registered
+from graphnav.constraints.base import SAME_TIME, Constraint, Parameter, Scene
+from graphnav.constraints.prior import InitialPrior
+from graphnav.dynamics import EarthMotion
+from graphnav.earth import LocalFrame
+from graphnav.preintegration import Intervals, Samples, bridge_gaps, preintegrate
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+from graphnav.state import DIM, States
+
+NODE_SPACING = 30.0  # s between the nodes of a slowly moving parameter
+
+
+@dataclass(frozen=True)
+class ParameterChain:
+    """A parameter and its nodes: one for a constant, one every half minute for a slow one."""
+
+    parameter: Parameter
+    t: Array  # (n,) s
+    node: Array  # (K,) int, the node in force at each keyframe
+
+    @property
+    def step_sigma(self) -> Array:
+        """(n-1, k) how far the value may move from node to node."""
+        width = len(self.parameter.initial)
+        return self.parameter.walk * np.sqrt(np.diff(self.t))[:, None] * np.ones(width)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything a solver needs, and nothing it has to look up elsewhere."""
+
+    recording: Recording
+    settings: Settings
+    frame: LocalFrame
+    t: Array  # (K,) keyframe times, s
+    samples: Samples
+    intervals: Intervals
+    motion: EarthMotion
+    prior: InitialPrior
+    constraints: tuple[Constraint, ...]
+    chains: tuple[ParameterChain, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def columns(self) -> dict[str, slice]:
+        """Where each parameter stands behind the fifteen states in an augmented error state."""
+        out, at = {}, DIM
+        for chain in self.chains:
+            width = len(chain.parameter.initial)
+            out[chain.parameter.name] = slice(at, at + width)
+            at += width
+        return out
+
+    def reintegrated(self, ba: Array, bg: Array) -> Problem:
+        """The same problem with its intervals integrated anew about better biases, (K-1, 3) each."""
+        return replace(self, intervals=preintegrate(self.samples, self.recording.imu, self.t, ba, bg))
+
+
+def pose(recording: Recording, settings: Settings, frame: LocalFrame, start: States, sigma: Array) -> Problem:
+    """Pose the estimation problem for a recording.
+
+    Parameters
+    ----------
+    start : one state at the start of the recording: mean of the prior and where biases are expected.
+    sigma : (15,) 1-sigma of the prior.
+    """
+    classes = registered()
+    wanted = [cls.epochs(recording, settings) for cls in classes]
+    t = keyframe_times(recording.start, recording.end, np.concatenate([*wanted, np.empty(0)]), settings.keyframes.rate)
+    scene = Scene(recording, settings, frame, t)
+    built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
+    samples = bridge_gaps(recording.imu)
+    intervals = preintegrate(samples, recording.imu, t, start.ba[0], start.bg[0])
+    prior = InitialPrior(keyframe=np.zeros(1, dtype=int), mean=start, sigma=np.asarray(sigma)[None])
+    return Problem(
+        recording=recording,
+        settings=settings,
+        frame=frame,
+        t=t,
+        samples=samples,
+        intervals=intervals,
+        motion=EarthMotion(frame, intervals.T),
+        prior=prior,
+        constraints=built,
+        chains=_chains(built, t),
+        notes=_notes(samples, recording),
+    )
+
+
+def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Array:
+    """Keyframes at both ends, at every epoch between, and in between at `rate` at least."""
+    inside = epochs[(epochs > start + SAME_TIME) & (epochs < end - SAME_TIME)]
+    fixed = np.unique(np.concatenate([[start], inside, [end]]))
+    fixed = fixed[np.concatenate([[True], np.diff(fixed) > SAME_TIME])]
+    parts = np.maximum(1, np.ceil(np.diff(fixed) * rate - 1e-6).astype(int))
+    step = np.repeat(np.diff(fixed) / parts, parts)
+    within = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
+    return np.append(np.repeat(fixed[:-1], parts) + within * step, fixed[-1])
+
+
+def _chains(constraints: tuple[Constraint, ...], t: Array) -> tuple[ParameterChain, ...]:
+    parameters = {p.name: p for rows in constraints for p in rows.parameters}
+    chains = []
+    for parameter in parameters.values():
+        count = 1 if parameter.walk == 0.0 else max(1, round((t[-1] - t[0]) / NODE_SPACING))
+        nodes = t[0] + (t[-1] - t[0]) / count * np.arange(count)
+        chains.append(ParameterChain(parameter, nodes, np.searchsorted(nodes, t, side="right") - 1))
+    return tuple(chains)
+
+
+def _notes(samples: Samples, recording: Recording) -> tuple[str, ...]:
+    if not len(samples.bridged):
+        return ()
+    length = samples.bridged[:, 1] - samples.bridged[:, 0]
+    worst = int(np.argmax(length))
+    return (
+        f"{len(length)} gaps in the IMU bridged ({length.sum():.2f} s in all, longest {length[worst]:.2f} s at "
+        f"{samples.bridged[worst, 0] - recording.start:.1f} s): uncertainty grows there by what the signal usually "
+        "changes in such a time",
+    )

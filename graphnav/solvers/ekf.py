@@ -1,0 +1,225 @@
+"""Error-state extended Kalman filter and its Rauch-Tung-Striebel smoother.
+
+The filter holds one state and the covariance P of its error state, widened by the parameters that the
+constraints ask for. From keyframe to keyframe it predicts with a whole preintegrated interval,
+
+    x <- f(x)      P <- F P F^T + Q
+
+and updates with the rows of every constraint there, nu = -r,
+
+    S = H P H^T + R     K = P H^T S^-1     d = K nu     x <- x [+] d     P <- (I-KH) P (I-KH)^T + K R K^T
+
+(closed loop: the error state is moved into x at once; Joseph's form keeps P symmetric and positive).
+Backwards, with C = P_k F^T P^-_{k+1}^-1 (Rauch, Tung, Striebel 1965),
+
+    x^s_k = x_k [+] C (x^s_{k+1} [-] x^-_{k+1})     P^s_k = P_k + C (P^s_{k+1} - P^-_{k+1}) C^T
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from graphnav import dynamics
+from graphnav.constraints.base import Constraint, assemble
+from graphnav.problem import Problem
+from graphnav.rotation import Array
+from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.state import DIM, States
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """A forward pass, with what the backward pass needs."""
+
+    solution: Solution
+    states: list[States]  # K filtered states of one row each
+    values: Array  # (K, D-15) parameter values
+    P: Array  # (K, D, D) filtered
+    predicted: list[States]  # K predicted states
+    P_predicted: Array  # (K, D, D)
+    F: Array  # (K-1, D, D)
+
+
+def ekf(problem: Problem, progress: Progress | None = None) -> Filtered:
+    """Run the filter over all keyframes."""
+    began = time.perf_counter()
+    K, columns = len(problem.t), problem.columns
+    D = DIM + sum(s.stop - s.start for s in columns.values())
+    state = problem.prior.mean
+    assert state is not None
+    values = np.concatenate([np.empty(0), *(c.parameter.initial for c in problem.chains)])
+    P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.parameter.sigma for c in problem.chains)]) ** 2)
+    records = {rows.name: _Innovations(rows) for rows in problem.constraints}
+    first = {rows.name: np.searchsorted(rows.keyframe, np.arange(K + 1)) for rows in problem.constraints}
+
+    all_P, all_Pp, all_F = np.empty((K, D, D)), np.empty((K, D, D)), np.empty((K - 1, D, D))
+    all_values = np.empty((K, D - DIM))
+    states, predicted = [], []
+    all_F[:] = np.eye(D)
+    for k in range(K):
+        if k:
+            step = slice(k - 1, k)
+            ahead = dynamics.predict(problem.intervals, step, state, problem.motion)
+            F15, Q15 = dynamics.transition(problem.intervals, step, state, ahead, problem.motion)
+            F = all_F[k - 1]
+            F[:DIM, :DIM] = F15[0]
+            P = F @ P @ F.T
+            P[:DIM, :DIM] += Q15[0]
+            for chain in problem.chains:
+                if chain.node[k] != chain.node[k - 1]:
+                    at = columns[chain.parameter.name]
+                    P[at, at] += np.diag(chain.step_sigma[chain.node[k] - 1] ** 2)
+            state = ahead
+        predicted.append(state)
+        all_Pp[k] = P
+        for rows in problem.constraints:
+            lo, hi = first[rows.name][k], first[rows.name][k + 1]
+            if hi > lo:
+                state, values, P = _update(rows, lo, hi, state, values, P, columns, records[rows.name])
+        states.append(state)
+        all_P[k], all_values[k] = P, values
+        if progress is not None and k % 256 == 0:
+            progress("filter", k / K)
+    seconds = time.perf_counter() - began
+    solution = Solution(
+        solver="ekf",
+        frame=problem.frame,
+        t=problem.t,
+        states=States.stack(states),
+        covariance=all_P[:, :DIM, :DIM],
+        parameters=_parameters(problem, all_values, all_P),
+        records={name: r.record(problem) for name, r in records.items()},
+        counts={"imu": K - 1, **{rows.name: len(rows) for rows in problem.constraints}},
+        iterations=1,
+        stopped="one pass forward over all keyframes",
+        timings={"filter": seconds},
+        notes=problem.notes,
+        intervals=problem.intervals,
+    )
+    return Filtered(solution, states, all_values, all_P, predicted, all_Pp, all_F)
+
+
+def _update(
+    rows: Constraint,
+    lo: int,
+    hi: int,
+    state: States,
+    values: Array,
+    P: Array,
+    columns: dict[str, slice],
+    record: _Innovations,
+) -> tuple[States, Array, Array]:
+    """One measurement update with rows lo..hi of a constraint."""
+    n = hi - lo
+    here = state if n == 1 else state[np.zeros(n, dtype=int)]
+    given = {p.name: np.broadcast_to(values[_shift(columns[p.name])], (n, len(p.initial))) for p in rows.parameters}
+    linear = rows.linearize(here, given, slice(lo, hi))
+    H = assemble(linear, columns, len(P)).reshape(-1, len(P))
+    r, sigma = linear.residual.ravel(), linear.sigma.ravel()
+    PHt = P @ H.T
+    S = H @ PHt + np.diag(sigma * sigma)
+    factor = cho_factor(S, check_finite=False)
+    nis = float(r @ cho_solve(factor, r, check_finite=False))
+    used = rows.gate is None or nis <= rows.gate**2
+    record.set(slice(lo, hi), linear.residual, np.sqrt(np.diag(S)).reshape(n, -1), nis / n, float(used))
+    if not used:
+        return state, values, P
+    K = cho_solve(factor, PHt.T, check_finite=False).T
+    d = -K @ r
+    IKH = -K @ H
+    IKH.flat[:: len(P) + 1] += 1.0
+    P = IKH @ P @ IKH.T + (K * (sigma * sigma)) @ K.T
+    return state.plus(d[None, :DIM]), values + d[DIM:], P
+
+
+def rts(problem: Problem, forward: Filtered, progress: Progress | None = None) -> Solution:
+    """Smooth a forward pass backwards; residuals are those of the smoothed states."""
+    began = time.perf_counter()
+    K, D = len(problem.t), forward.P.shape[-1]
+    state, values, P = forward.states[-1], forward.values[-1], forward.P[-1]
+    states: list[States] = [state]
+    all_P, all_values = np.empty((K, D, D)), np.empty((K, D - DIM))
+    all_P[-1], all_values[-1] = P, values
+    for k in range(K - 2, -1, -1):
+        Pp = forward.P_predicted[k + 1]
+        C = cho_solve(cho_factor(Pp, check_finite=False), forward.F[k] @ forward.P[k], check_finite=False).T
+        d = C @ np.concatenate([state.minus(forward.predicted[k + 1])[0], values - forward.values[k]])
+        state, values = forward.states[k].plus(d[None, :DIM]), forward.values[k] + d[DIM:]
+        P = forward.P[k] + C @ (P - Pp) @ C.T
+        P = 0.5 * (P + P.T)
+        states.append(state)
+        all_P[k], all_values[k] = P, values
+        if progress is not None and k % 256 == 0:
+            progress("smoother", 1.0 - k / K)
+    smoothed = States.stack(states[::-1])
+    seconds = time.perf_counter() - began
+    chains = {c.parameter.name: all_values[:, _shift(problem.columns[c.parameter.name])] for c in problem.chains}
+    return Solution(
+        solver="rts",
+        frame=problem.frame,
+        t=problem.t,
+        states=smoothed,
+        covariance=all_P[:, :DIM, :DIM],
+        parameters=_parameters(problem, all_values, all_P),
+        records={rows.name: residual_record(problem, rows, smoothed, chains) for rows in problem.constraints},
+        counts=forward.solution.counts,
+        iterations=1,
+        stopped="one pass forward and one back",
+        timings={**forward.solution.timings, "smoother": seconds},
+        notes=problem.notes,
+        intervals=problem.intervals,
+    )
+
+
+def residual_record(
+    problem: Problem, rows: Constraint, states: States, values: dict[str, Array], weight: Array | None = None
+) -> ConstraintRecord:
+    """What is left of a constraint at the solution; `values` holds (K, k) per parameter."""
+    at = rows.keyframe
+    linear = rows.linearize(states[at], {p.name: values[p.name][at] for p in rows.parameters}, slice(None))
+    nis = np.sum((linear.residual / linear.sigma) ** 2, axis=-1)
+    weight = np.ones(len(rows)) if weight is None else weight
+    return ConstraintRecord("residual", problem.t[at], linear.residual, linear.sigma, nis, weight, rows.axes, rows.unit)
+
+
+class _Innovations:
+    """Collects one constraint's innovations as the filter goes."""
+
+    def __init__(self, rows: Constraint) -> None:
+        self.rows = rows
+        shape = (len(rows), len(rows.axes))
+        self.residual, self.sigma = np.zeros(shape), np.ones(shape)
+        self.nis, self.weight = np.zeros(len(rows)), np.ones(len(rows))
+
+    def set(self, at: slice, residual: Array, sigma: Array, nis: float, weight: float) -> None:
+        self.residual[at], self.sigma[at], self.nis[at], self.weight[at] = residual, sigma, nis, weight
+
+    def record(self, problem: Problem) -> ConstraintRecord:
+        t = problem.t[self.rows.keyframe]
+        return ConstraintRecord(
+            "innovation", t, self.residual, self.sigma, self.nis, self.weight, self.rows.axes, self.rows.unit
+        )
+
+
+def _shift(columns: slice) -> slice:
+    return slice(columns.start - DIM, columns.stop - DIM)
+
+
+def _parameters(problem: Problem, values: Array, P: Array) -> dict[str, ParameterEstimate]:
+    """At each node: the value after the last keyframe that it governs."""
+    out = {}
+    for chain in problem.chains:
+        at = problem.columns[chain.parameter.name]
+        last = np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
+        sigma = np.sqrt(np.maximum(np.diagonal(P[last][:, at, at], axis1=-2, axis2=-1), 0.0))
+        out[chain.parameter.name] = ParameterEstimate(
+            chain.t, values[last][:, _shift(at)], sigma, chain.parameter.sigma, chain.parameter.unit
+        )
+    return out

@@ -1,0 +1,102 @@
+"""The adapter between NumPy rows and GTSAM: linear factor graphs built, eliminated with QR, read back.
+
+Variables are fifteen-dimensional error states, key k for keyframe k, and one key per parameter node.
+Elimination goes along time, which for a chain is the ordering without fill, and is sequential, so a
+long drive cannot exhaust the stack. QR, because GTSAM's Cholesky rejects the small pivots of tight bias
+walks beside loose priors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from graphnav.rotation import Array
+
+Blocks = Sequence[tuple[Array, Array]]  # (keys (N,), A (N, m, k)) per variable a factor touches
+
+
+class LinearGraph:
+    """A Gaussian factor graph over vector variables with whitened rows A d = b."""
+
+    def __init__(self) -> None:
+        self._graph = gtsam.GaussianFactorGraph()
+        self._unit: dict[int, gtsam.noiseModel.Unit] = {}
+
+    def add(self, blocks: Blocks, b: Array) -> None:
+        """N factors of m rows each: sum over blocks of A[n] d[key[n]] = b[n]."""
+        n, m = b.shape
+        unit = self._unit.setdefault(m, gtsam.noiseModel.Unit.Create(m))
+        # GTSAM keeps matrices by columns: handing them over that way saves it a strided copy
+        columns = [np.ascontiguousarray(np.swapaxes(A, 1, 2)).swapaxes(1, 2) for _, A in blocks]
+        keys = [k.tolist() for k, _ in blocks]
+        push, factor = self._graph.push_back, gtsam.JacobianFactor
+        if len(blocks) == 1:
+            (k0,), (A0,) = keys, columns
+            for i in range(n):
+                push(factor(k0[i], A0[i], b[i], unit))
+        elif len(blocks) == 2:
+            (k0, k1), (A0, A1) = keys, columns
+            for i in range(n):
+                push(factor(k0[i], A0[i], k1[i], A1[i], b[i], unit))
+        elif len(blocks) == 3:
+            (k0, k1, k2), (A0, A1, A2) = keys, columns
+            for i in range(n):
+                push(factor(k0[i], A0[i], k1[i], A1[i], k2[i], A2[i], b[i], unit))
+        else:
+            raise ValueError(f"a row may touch one to three variables, not {len(blocks)}")
+
+    def eliminate(self, order: Sequence[int]) -> Eliminated:
+        """Eliminate the variables in this order."""
+        ordering = gtsam.Ordering()
+        for key in order:
+            ordering.push_back(int(key))
+        return Eliminated(self._graph.eliminateSequential(ordering, gtsam.EliminateQR))
+
+
+class Eliminated:
+    """The graph as a Bayes net: solution and covariances by substitution."""
+
+    def __init__(self, net: gtsam.GaussianBayesNet) -> None:
+        self._net = net
+
+    def solve(self, keys: Sequence[int]) -> list[Array]:
+        """The optimum, one vector per key."""
+        values = self._net.optimize()
+        return [values.at(int(k)) for k in keys]
+
+    def covariances(self, keys: set[int] | None = None) -> dict[int, Array]:
+        """Marginal covariance of every variable (or of `keys`).
+
+        Backwards through the net: a conditional |R x + S s - d|^2 gives, with U = -R^-1 S and the joint
+        covariance P_s of its parents s,
+
+            P_x = R^-1 R^-T + U P_s U^T        P_xs = U P_s
+
+        The parents of a variable are among the next variable and its parents, because the order runs along a
+        chain; so only that one joint block is ever kept (Kaess and Dellaert 2009, eq. 20-21).
+        """
+        out: dict[int, Array] = {}
+        where: dict[int, Array] = {}  # columns of the joint block, per variable in it
+        joint = np.zeros((0, 0))
+        for i in range(self._net.size() - 1, -1, -1):
+            conditional = self._net.at(i)
+            key, *parents = conditional.keys()
+            R_inverse = np.linalg.inv(conditional.R())
+            n = len(R_inverse)
+            if parents:
+                index = np.concatenate([where[p] for p in parents])
+                P_s = joint[np.ix_(index, index)]
+                U = -R_inverse @ conditional.S()
+                P_xs = U @ P_s
+                joint = np.block([[R_inverse @ R_inverse.T + P_xs @ U.T, P_xs], [P_xs.T, P_s]])
+            else:
+                joint = R_inverse @ R_inverse.T
+            widths = [n, *(len(where[p]) for p in parents)]
+            edges = np.cumsum([0, *widths])
+            where = {k: np.arange(lo, hi) for k, lo, hi in zip([key, *parents], edges[:-1], edges[1:], strict=True)}
+            if keys is None or key in keys:
+                out[key] = joint[:n, :n]
+        return out

@@ -1,0 +1,39 @@
+"""Robust kernels as weights of iteratively re-weighted least squares.
+
+With s the whitened norm of a whole measurement (not of one axis) and k its scale, a kernel replaces
+s^2/2 by rho(s) and the solver weighs the rows by w = rho'(s)/s. Forms as in Zhang, "Parameter estimation
+techniques" (1997), table 1, and Barron, "A general and adaptive robust loss function" (2019).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.rotation import Array
+
+
+def weight_and_cost(kernel: str, s: Array, k: float) -> tuple[Array, Array]:
+    """w(s) and rho(s) for whitened norms s (N,).
+
+    Raises
+    ------
+    ValueError
+        For a kernel that does not exist.
+    """
+    x = (s / k) ** 2
+    if kernel == "none":
+        return np.ones_like(s), 0.5 * s * s
+    if kernel == "huber":
+        far = s > k
+        w = np.where(far, k / np.maximum(s, 1e-300), 1.0)
+        return w, np.where(far, k * s - 0.5 * k * k, 0.5 * s * s)
+    if kernel == "cauchy":
+        return 1.0 / (1.0 + x), 0.5 * k * k * np.log1p(x)
+    if kernel == "geman-mcclure":
+        return 1.0 / (1.0 + x) ** 2, 0.5 * k * k * x / (1.0 + x)
+    if kernel == "tukey":
+        inside = np.maximum(0.0, 1.0 - x)
+        return inside**2, k * k / 6.0 * (1.0 - inside**3)
+    if kernel == "welsch":
+        return np.exp(-x), 0.5 * k * k * -np.expm1(-x)
+    raise ValueError(f"no robust kernel '{kernel}'")
