@@ -69,6 +69,7 @@ class ExactPath:
 
         t = self.t[0] + self.dt * np.arange(count * len(self.gyro) + 1)
         llh, v, rph = rows(self.llh), rows(self.v), rows(self.rph)
+        rph[1:] += np.repeat(np.arange(count), len(self.gyro))[:, None] * turn  # the heading goes on turning
         return ExactPath(t, llh, v, rph, np.tile(self.gyro, (count, 1)), np.tile(self.accel, (count, 1)), self.name)
 
     def point(self, t: Array, lever_arm: tuple[float, float, float]) -> tuple[Array, Array, Array]:
@@ -139,9 +140,9 @@ def _moved(llh: Array, offset_e: Array) -> Array:
     """Points moved by ECEF vectors (a few metres), by Newton steps on pyins's own ellipsoid."""
     start = degrees(llh)
     target, lla = transform.lla_to_ecef(start) + offset_e, start
-    for _ in range(3):
-        missing = target - transform.lla_to_ecef(lla)
-        lla = transform.perturb_lla(lla, util.mv_prod(transform.mat_en_from_ll(lla[:, 0], lla[:, 1]), missing, True))
+    R_en = transform.mat_en_from_ll(start[:, 0], start[:, 1])
+    for _ in range(3):  # each step leaves 1e-7 of what was missing
+        lla = transform.perturb_lla(lla, util.mv_prod(R_en, target - transform.lla_to_ecef(lla), True))
     return np.column_stack([np.deg2rad(lla[:, :2]), lla[:, 2]])
 
 
@@ -205,8 +206,10 @@ def _city(half: float, rng: np.random.Generator) -> list[tuple[float, float, flo
         if rng.random() < 0.35 and half - used - ending > 30.0:
             add(5.0, 0.0, psi)
             add(rng.uniform(5.0, 15.0), 0.0, psi)
-    if half - used - ending > 15.0:
-        add(half - used - ending, 12.0, psi)
+    rest = half - used - ending
+    if rest > 15.0:
+        add(9.0, 12.0, psi)
+        add(rest - 9.0, 12.0, psi + 0.02 * rest)
     add(6.0, 6.0, psi)
     add(16.0, 6.0, np.pi + 2 * np.pi * np.round((psi - np.pi) / (2 * np.pi)))
     add(6.0, 0.0, psi)
