@@ -143,6 +143,11 @@ def paragraph(words: str, kind: str = "") -> Raw:
     return Raw(f"<p{mark}>{text(words)}</p>")
 
 
+def heading(words: str) -> Raw:
+    """A heading inside a section."""
+    return Raw(f"<h3>{text(words)}</h3>")
+
+
 def bullets(lines: Iterable[str]) -> Raw:
     """A list of sentences."""
     return Raw("<ul>" + "".join(f"<li>{text(line)}</li>" for line in lines) + "</ul>")

@@ -71,6 +71,20 @@ def thin(t: Array, y: Array, bins: int = BINS) -> np.ndarray:
     return np.unique(np.concatenate([starts, ends, order[starts], order[highest], breaks]))
 
 
+def with_breaks(t: Array, rows: np.ndarray, *columns: Array) -> Any:
+    """t and columns at the kept rows, with a NaN row in every long gap of t, where a line must not lead across.
+
+    Long is more than 20 median steps and more than one hundredth of the whole.
+    """
+    steps = np.diff(t)
+    long = np.flatnonzero(steps > max(20.0 * np.median(steps), (t[-1] - t[0]) / 100.0)) if len(t) > 2 else steps[:0]
+    if not len(long):
+        return tuple(c[rows] for c in (t, *columns))
+    rows = np.union1d(rows, np.concatenate([long, long + 1]).astype(int))
+    at = np.searchsorted(rows, long) + 1
+    return (np.insert(t[rows], at, t[long.astype(int)]), *(np.insert(c[rows], at, np.nan) for c in columns))
+
+
 def ticks(lo: float, hi: float, count: int) -> tuple[Array, list[str]]:
     """Round values between lo and hi, about `count` of them, and their labels."""
     step = 10.0 ** math.floor(math.log10((hi - lo) / count))
@@ -214,14 +228,20 @@ class Panel:
 
     def band(self, x: Array, lo: Array, hi: Array, name: str, *, label: str = "", alpha: float = 0.2) -> Any:
         """A tinted area between two lines."""
-        from matplotlib.patches import Polygon
+        from matplotlib.patches import PathPatch
+        from matplotlib.path import Path
 
         ok = np.isfinite(lo) & np.isfinite(hi)
-        x, lo, hi = x[ok], np.clip(lo[ok], *self.ylim), np.clip(hi[ok], *self.ylim)
-        if not len(x):
+        runs = np.split(np.arange(len(x)), np.flatnonzero(np.diff(ok)) + 1)
+        outlines = []
+        for run in (r for r in runs if len(r) and ok[r[0]]):
+            there, back = x[run], x[run[::-1]]
+            edges = np.clip(np.concatenate([hi[run], lo[run[::-1]]]), *self.ylim)
+            outlines.append(np.stack([np.concatenate([there, back]), edges], -1))
+        if not outlines:
             return None
-        outline = np.stack([np.concatenate([x, x[::-1]]), np.concatenate([hi, lo[::-1]])], -1)
-        return self._add(Polygon(outline, fc=colour(name), ec="none", alpha=alpha, zorder=1.5, label=label or "_"))
+        path = Path.make_compound_path(*(Path(np.vstack([o, o[:1]]), closed=True) for o in outlines))
+        return self._add(PathPatch(path, fc=colour(name), ec="none", alpha=alpha, zorder=1.5, label=label or "_"))
 
     def shade(self, spans: Sequence[tuple[float, float]]) -> None:
         """Tint whole spans of x: what was withheld there."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from graphnav.panels import BINS, WIDTH, Panel, legend, limits, new_figure, thin
+from graphnav.panels import BINS, WIDTH, Panel, legend, limits, new_figure, thin, with_breaks
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord
 
@@ -142,12 +142,12 @@ def bands(
         for name, s in series.items():
             rows = thin(s.t, s.value[:, k])
             if s.sigma is not None:
-                edge = thin(s.t, s.sigma[:, k], BINS // 2)
-                sigma = 3.0 * s.sigma[edge, k]
-                centre = 0.0 if about_zero else s.value[edge, k]
+                t, sigma, value = with_breaks(s.t, thin(s.t, s.sigma[:, k], BINS // 2), s.sigma[:, k], s.value[:, k])
+                centre = 0.0 if about_zero else value
                 tint = 0.22 if len(series) == 1 else 0.12
-                panel.band(s.t[edge], centre - sigma, centre + sigma, name, label=f"{name} 3 sigma", alpha=tint)
-            panel.line(s.t[rows], s.value[rows, k], name, label=name)
+                panel.band(t, centre - 3 * sigma, centre + 3 * sigma, name, label=f"{name} 3 sigma", alpha=tint)
+            x, y = with_breaks(s.t, rows, s.value[:, k])
+            panel.line(x, y, name, label=name)
         if about_zero:
             panel.line(np.array(xlim), np.zeros(2), "ink", lw=0.5, label="_zero", zorder=1.8)
     entries = [(name, name, "line") for name in series]
@@ -168,7 +168,8 @@ def sigmas(series: Mapping[str, Series], components: Sequence[str], unit: str, *
         panel.shade(spans)
         for name, s in series.items():
             rows = thin(s.t, positive[name])
-            panel.line(s.t[rows], positive[name][rows], name, label=name)
+            x, y = with_breaks(s.t, rows, positive[name])
+            panel.line(x, y, name, label=name)
     _time_legend(figure, [(name, name, "line") for name in series], spans)
     return figure
 
@@ -283,8 +284,11 @@ def span_zoom(series: Mapping[str, Series], spans: Spans, unit: str = "m") -> Fi
         )
         panel.shade([(a, b)])
         for name, (t, y) in cut.items():
+            if not len(t):
+                continue
             keep = thin(t, y)
-            panel.line(t[keep], y[keep], name, label=name, lw=1.4)
+            x, y = with_breaks(t, keep, y)
+            panel.line(x, y, name, label=name, lw=1.4)
     legend(figure, [(n, n, "line") for n in series] + [("withheld", "withheld", "band")], rows * pitch + 7, LEFT)
     return figure
 

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graphnav import page
-from graphnav import report_parts as parts
+from graphnav import report_pictures as pictures
+from graphnav import report_tables as tables
 from graphnav.recording import Recording
-from graphnav.report_parts import Spans
+from graphnav.report_tables import Withheld
 from graphnav.solution import Solution
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ def write_report(
     settings: Mapping[str, Any],
     metrics: Mapping[str, Any] | None = None,
     errors: Errors | None = None,
-    spans: Spans = (),
+    withheld: Withheld = (),
     findings: Sequence[str] = (),
     provenance: Mapping[str, Any] | None = None,
 ) -> Path:
@@ -34,32 +35,33 @@ def write_report(
     ----------
     settings : resolved settings, nested plain values.
     metrics, errors : of `graphnav.evaluation`, where there is a truth.
-    spans : s from the recording's start, what was withheld: (start, end) or (source, start, end).
+    withheld : (source, span), span in s from the recording's start or None for all of it.
     findings : sentences about what was odd in the recording.
     provenance : version, input hashes and the like, plain values.
     """
-    name, start, times = solution.solver, recording.start, parts.times_of(spans)
+    name, start, times = solution.solver, recording.start, tables.times_of(withheld)
     every = {} if errors is None else {name: errors}
+    metrics_of = {} if metrics is None else {name: metrics}
     html = page.page(
         f"{recording.name}: {name}",
         [
-            page.paragraph(parts.what_was_done(recording, solution, spans)),
-            parts.tiles(recording, {name: solution}, every),
+            page.paragraph(tables.what_was_done(recording, {name: solution}, withheld)),
+            tables.tiles(recording, {name: solution}, every),
         ],
         [
-            ("Trajectory", [page.gallery([parts.trajectory_picture(recording, {name: solution}, times)])]),
-            ("Accuracy", [*_accuracy(every, spans, start), *parts.metric_tables(metrics)]),
-            ("Errors against truth", _gallery(parts.error_pictures(every, start, times))),
-            ("Uncertainty", _gallery(parts.sigma_pictures({name: solution.trajectory()}, start, times))),
-            ("Biases", _gallery(parts.bias_pictures(solution, start, times))),
+            ("Trajectory", [page.gallery([pictures.trajectory_picture(recording, {name: solution}, times)])]),
+            ("Accuracy", [*_accuracy(every, metrics_of, withheld, start), *tables.metric_tables(metrics)]),
+            ("Errors against truth", _gallery(pictures.error_pictures(every, start, times))),
+            ("Uncertainty", _gallery(pictures.sigma_pictures({name: solution.trajectory()}, start, times))),
+            ("Biases", _gallery(pictures.bias_pictures(solution, start, times))),
             (
                 "Constraints",
-                [*parts.constraint_table(solution), *_gallery(parts.record_pictures(solution, start, times))],
+                [*tables.constraint_table(solution), *_gallery(pictures.record_pictures(solution, start, times))],
             ),
-            ("Calibration", parts.parameter_table(solution.parameters)),
-            ("What was odd", parts.odd(recording, findings)),
-            ("How it ran", parts.run_table({name: solution})),
-            ("Provenance", parts.provenance_tables(settings, provenance)),
+            ("Calibration", tables.parameter_table(solution.parameters)),
+            ("What was odd", tables.odd(recording, findings)),
+            ("How it ran", tables.run_table({name: solution})),
+            ("Provenance", tables.provenance_tables(settings, provenance)),
         ],
     )
     return _write(path, html)
@@ -73,55 +75,56 @@ def write_comparison(
     settings: Mapping[str, Any],
     metrics: Mapping[str, Mapping[str, Any]] | None = None,
     errors: Mapping[str, Errors] | None = None,
-    spans: Spans = (),
+    withheld: Withheld = (),
     findings: Sequence[str] = (),
     provenance: Mapping[str, Any] | None = None,
 ) -> Path:
     """Several solvers on one recording as one self-contained HTML file; arguments as in `write_report`, per solver."""
-    start, times = recording.start, parts.times_of(spans)
-    every = errors or {}
-    first = next(iter(solutions.values()))
+    start, times = recording.start, tables.times_of(withheld)
+    every, metrics_of = errors or {}, metrics or {}
     rows = [
-        [kind, page.solver(name), *parts.consistency_row(parts.consistency(solution.records[kind]))]
+        [kind, page.solver(name), *tables.consistency_row(tables.consistency(solution.records[kind]))]
         for kind in dict.fromkeys(kind for s in solutions.values() for kind in s.records)
         for name, solution in solutions.items()
         if kind in solution.records
     ]
-    measured = [
-        page.folded(f"All measures of {name}", page.pairs(page.flat(values)))
-        for name, values in (metrics or {}).items()
-        if values
-    ]
+    measured = [table for name, values in metrics_of.items() for table in tables.metric_tables(values, name)]
     html = page.page(
         f"{recording.name}: comparison",
         [
-            page.paragraph(parts.what_was_done(recording, first, spans, tuple(solutions))),
-            parts.tiles(recording, solutions, every),
+            page.paragraph(tables.what_was_done(recording, solutions, withheld)),
+            tables.tiles(recording, solutions, every),
         ],
         [
-            ("Accuracy", [*_accuracy(every, spans, start), *measured]),
-            ("Withheld spans", _gallery(parts.zoom_pictures(every, start, times))),
-            ("Trajectory", [page.gallery([parts.trajectory_picture(recording, solutions, times)])]),
-            ("Errors against truth", _gallery(parts.error_pictures(every, start, times))),
+            ("Accuracy", [*_accuracy(every, metrics_of, withheld, start), *measured]),
+            ("Withheld spans", _gallery(pictures.zoom_pictures(every, start, times))),
+            ("Trajectory", [page.gallery([pictures.trajectory_picture(recording, solutions, times)])]),
+            ("Errors against truth", _gallery(pictures.error_pictures(every, start, times))),
             (
                 "Uncertainty",
-                _gallery(parts.sigma_pictures({n: s.trajectory() for n, s in solutions.items()}, start, times)),
+                _gallery(pictures.sigma_pictures({n: s.trajectory() for n, s in solutions.items()}, start, times)),
             ),
-            ("Constraints", [page.table(["constraint", "solver", *parts.CONSISTENCY_HEAD], rows)] if rows else []),
-            ("What was odd", parts.odd(recording, findings)),
-            ("How they ran", parts.run_table(solutions)),
-            ("Provenance", parts.provenance_tables(settings, provenance)),
+            ("Constraints", [page.table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
+            ("What was odd", tables.odd(recording, findings)),
+            ("How they ran", tables.run_table(solutions)),
+            ("Provenance", tables.provenance_tables(settings, provenance)),
         ],
     )
     return _write(path, html)
 
 
-def _accuracy(errors: Mapping[str, Errors], spans: Spans, start: float) -> list[str]:
-    return [*(parts.believe(name, e) for name, e in errors.items()), *parts.accuracy_tables(errors, spans, start)]
+def _accuracy(
+    errors: Mapping[str, Errors], metrics: Mapping[str, Mapping[str, Any]], withheld: Withheld, start: float
+) -> list[str]:
+    return [
+        *(tables.believe(name, e) for name, e in errors.items()),
+        *(note for name, values in metrics.items() for note in tables.closure_note(name, values)),
+        *tables.accuracy_tables(errors, withheld, start),
+    ]
 
 
-def _gallery(pictures: Sequence[page.Raw]) -> list[str]:
-    return [page.gallery(pictures)] if pictures else []
+def _gallery(images: Sequence[page.Raw]) -> list[str]:
+    return [page.gallery(images)] if images else []
 
 
 def _write(path: str | Path, html: str) -> Path:

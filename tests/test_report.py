@@ -13,7 +13,7 @@ from graphnav.earth import LocalFrame
 from graphnav.metrics import Errors
 from graphnav.recording import Gnss, Imu, Recording, Truth
 from graphnav.report import write_comparison, write_report
-from graphnav.report_parts import accuracy_row, consistency
+from graphnav.report_tables import accuracy_row, consistency, span_row
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.state import States
 
@@ -143,7 +143,7 @@ def checked(path):
 def write(tmp_path, recording, **kw):
     values = {
         "settings": {"gnss": {"robust": "none", "robust_scale": 3.25}},
-        "spans": [("gnss", 100.0, 160.0)],
+        "withheld": [("gnss", (99.5, 160.5)), ("odometer", None)],
         "findings": ["the IMU clock drifts by 12 ppm"],
         "provenance": {"version": "9.8.7", "inputs": {"imu.csv": "deadbeef"}},
     }
@@ -153,9 +153,10 @@ def write(tmp_path, recording, **kw):
 def test_report_holds_what_it_was_given(tmp_path, recording):
     _, text = checked(write(tmp_path, recording, metrics={"h_rms_m": 0.8765}, errors=errors_of()))
     for words in (
-        "gnss 100 to 160 s", "1.0123", "0.0004", "599 gnss_position", "0.321", "1.821", "1237",
+        "539 GNSS fixes", "gnss 99.5 to 160.5 s", "all of odometer",
+        "1.0123", "0.0004", "599 gnss_position", "0.321", "1.821", "1237",
         "the IMU clock drifts by 12 ppm", "3 rows < NaN were left out", "9.8.7", "deadbeef", "gnss.robust_scale",
-        "3.25", "0.8765", "6000 IMU rows at 10 Hz", "Withheld 100 to 160 s",
+        "3.25", "0.8765", "6000 IMU rows at 10 Hz", "Withheld 99.5 to 160.5 s",
     ):  # fmt: skip
         assert words in text, words
 
@@ -188,7 +189,7 @@ def test_comparison_has_a_row_per_solver_and_span(tmp_path, recording):
             for k, (s, sd) in enumerate(zip(solvers, (0.07, 0.9, 0.2, 0.1), strict=False))
         },
         metrics={s: {"h_rms_m": 0.5 + k} for k, s in enumerate(solvers)},
-        spans=[(100.0, 160.0), (250.0, 350.0)],
+        withheld=[("gnss", (100.0, 160.0)), ("gnss", (250.0, 350.0))],
     )
     parser, text = checked(path)
     for k in range(4):
@@ -202,10 +203,26 @@ def test_comparison_has_a_row_per_solver_and_span(tmp_path, recording):
     assert parser.tags.count("table") >= 5
 
 
-def test_accuracy_row():
-    row = accuracy_row(errors_of(0.25, sd=0.5), (100.0, 160.0), START)
-    np.testing.assert_allclose(row, [0.25, 0.25, 0.0, np.nan, *np.degrees([0.01, 0.01]), 0.5 / np.sqrt(3)], atol=1e-12)
-    assert accuracy_row(errors_of(0.25), None, START)[1] == 7 * 0.25
+def test_accuracy_rows():
+    e = errors_of(0.25, sd=0.5)
+    squares = np.array([0.25**2] * (COUNT - 1) + [(7 * 0.25) ** 2])
+    np.testing.assert_allclose(
+        accuracy_row(e),
+        [np.sqrt(squares.mean()), 7 * 0.25, 0, np.nan, *np.degrees([0.01, 0.01]), np.sqrt(squares.mean() / 3) / 0.5],
+    )
+    # 61 epochs, so 60 intervals of 5 m
+    np.testing.assert_allclose(
+        span_row(e, (100.0, 160.0), START),
+        [0.25, 0.25, 0.25, 100 * 0.25 / 300, 0, np.degrees(0.01), 0.5 / np.sqrt(3)],
+    )
+    assert np.isnan(span_row(e, (5000.0, 5001.0), START)).all()
+
+
+def test_closed_loop_without_errors(tmp_path, recording):
+    metrics = {"closure_h_m": 0.321, "closure_distance_m": 78.5, "closure_percent": 0.4089, "closure_up_m": -0.0625}
+    _, text = checked(write(tmp_path, recording, metrics=metrics))
+    for words in ("0.3210 m", "78.50 m", "0.4089 %", "-0.0625 m"):
+        assert words in text
 
 
 def test_consistency_counts_and_judges():
@@ -260,7 +277,20 @@ def test_bands_draw_the_values_given():
         np.testing.assert_array_equal(line.get_ydata(), value[:, k])
     tints = drawn_as(figure, "batch 3 sigma")
     assert len(tints) == 3
-    assert np.abs(tints[0].get_xy()[:, 1]).tolist() == [6.0] * len(tints[0].get_xy())
+    assert set(np.abs(tints[0].get_path().vertices[:, 1])) == {6.0}
+
+
+def test_lines_and_bands_do_not_lead_across_gaps():
+    t = np.concatenate([np.arange(100.0), 500 + np.arange(100.0)])
+    value = np.ones((200, 1))
+    figure = plots.bands({"ekf": plots.Series(t, value, value)}, ("east",), "m")
+    x, y = drawn_as(figure, "ekf")[0].get_data()
+    assert np.flatnonzero(np.isnan(y)).tolist() == [100]
+    np.testing.assert_array_equal(x[np.isfinite(y)], t)
+    (tint,) = drawn_as(figure, "ekf 3 sigma")
+    assert not tint.get_path().contains_point((300.0, 0.0))
+    assert tint.get_path().contains_point((50.0, 0.0))
+    assert tint.get_path().contains_point((550.0, 0.0))
 
 
 def test_the_scale_shows_every_value_but_not_the_first_sigma():

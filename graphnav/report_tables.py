@@ -1,4 +1,4 @@
-"""The tables and pictures that `graphnav.report` puts together, each from plain data to HTML."""
+"""The tables and sentences that `graphnav.report` puts together, each from plain data to HTML."""
 
 from __future__ import annotations
 
@@ -8,23 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graphnav import page, plots
+from graphnav import page
 from graphnav.page import Raw
-from graphnav.panels import svg
-from graphnav.plots import Series
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
-from graphnav.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from graphnav.metrics import Errors
 
-ENU = ("east", "north", "up")
-RPH = ("roll", "pitch", "heading")
-XYZ = ("x right", "y forward", "z up")
-DEG_H = float(np.degrees(3600.0))
-Spans = Sequence[tuple[float, float] | tuple[str, float, float]]
+Withheld = Sequence[tuple[str, tuple[float, float] | None]]
 
 
 @dataclass(frozen=True)
@@ -100,29 +93,35 @@ def constraint_table(solution: Solution) -> list[Raw]:
     return out
 
 
-def times_of(spans: Spans) -> list[tuple[float, float]]:
-    return [(float(s[-2]), float(s[-1])) for s in spans]
+def times_of(withheld: Withheld) -> list[tuple[float, float]]:
+    """The spans of time that something was withheld in, each once."""
+    return list(dict.fromkeys(span for _, span in withheld if span is not None))
 
 
-def what_was_done(recording: Recording, solution: Solution, spans: Spans, solvers: Sequence[str] = ()) -> str:
+def what_was_done(recording: Recording, solutions: Mapping[str, Solution], withheld: Withheld) -> str:
     """The run in two or three sentences."""
-    imu = recording.imu
-    rate = 1.0 / float(np.median(np.diff(imu.t)))
-    parts = [f"{len(imu.t)} IMU rows at {rate:.4g} Hz"]
-    if recording.gnss is not None:
-        parts.append(f"{len(recording.gnss.t)} GNSS fixes")
-    if recording.odometer is not None:
-        parts.append(f"{len(recording.odometer.t)} odometer rows")
-    who = "The solvers " + ", ".join(solvers) if solvers else f"The {solution.solver} solver"
+    used = recording
+    for source, span in withheld:
+        if getattr(used, source, None) is not None:
+            used = used.without(source, span)
+    rate = 1.0 / float(np.median(np.diff(used.imu.t)))
+    sources = [f"{len(used.imu.t)} IMU rows at {rate:.4g} Hz"]
+    if used.gnss is not None:
+        sources.append(f"{len(used.gnss.t)} GNSS fixes")
+    if used.odometer is not None:
+        sources.append(f"{len(used.odometer.t)} odometer rows")
+    solution = next(iter(solutions.values()))
+    several = len(solutions) > 1
+    who = f"The solvers {page.and_list(list(solutions))}" if several else f"The {solution.solver} solver"
     words = (
         f"{who} estimated the trajectory of the {recording.platform} recording '{recording.name}' "
-        f"({recording.duration:.1f} s) from {page.and_list(parts)}, at {len(solution.t)} keyframes."
+        f"({recording.duration:.1f} s) from {page.and_list(sources)}, at {len(solution.t)} keyframes."
     )
-    if spans:
-        listed = [f"{s[0] if len(s) == 3 else 'gnss'} {s[-2]:g} to {s[-1]:g} s" for s in spans]
-        words += f" Withheld: {page.and_list(listed)}, counted from the start."
-    if not solvers and solution.stopped:
-        words += f" {solution.stopped[0].upper()}{solution.stopped[1:].rstrip('.')}."
+    if withheld:
+        listed = [f"{source} {span[0]:g} to {span[1]:g} s" if span else f"all of {source}" for source, span in withheld]
+        words += f" Withheld: {page.and_list(listed)} (seconds from the start)."
+    if not several and solution.stopped:
+        words += f" It stopped because {solution.stopped.rstrip('.')}."
     return words
 
 
@@ -154,24 +153,14 @@ def _rms(x: Array) -> float:
     return float(np.sqrt(_mean(x * x)))
 
 
+def _largest(x: Array) -> float:
+    x = np.abs(x[np.isfinite(x)])
+    return float(x.max()) if x.size else float("nan")
+
+
 def _mean(x: Array) -> float:
     x = x[np.isfinite(x)]
     return float(np.mean(x)) if x.size else float("nan")
-
-
-def error_series(errors: Errors, start: float) -> dict[str, Series]:
-    """Errors as things to draw: position (m), velocity (m/s), attitude (deg), where there are any."""
-    t = errors.t - start
-    deg = float(np.degrees(1.0))
-    out = {}
-    for kind, value, sigma, scale in (
-        ("position", errors.p, errors.sd_p, 1.0),
-        ("velocity", errors.v, errors.sd_v, 1.0),
-        ("attitude", errors.rph, errors.sd_rph, deg),
-    ):
-        if np.isfinite(value).any():
-            out[kind] = Series(t, scale * value, scale * sigma if np.isfinite(sigma).any() else None)
-    return out
 
 
 def believe(name: str, errors: Errors) -> Raw:
@@ -194,139 +183,66 @@ def believe(name: str, errors: Errors) -> Raw:
     return page.paragraph(f"{name}: the stated sigma can be believed: {measured}.", "verdict good")
 
 
+COMPARED_SPAN = ("horizontal RMS [m]", "largest [m]", "at the end [m]", "largest, % of way", "up largest [m]",
+                 "heading largest [deg]", "error / sigma, RMS")  # fmt: skip
 COMPARED = ("horizontal RMS [m]", "horizontal largest [m]", "up RMS [m]", "speed RMS [m/s]", "roll, pitch RMS [deg]",
             "heading RMS [deg]", "error / sigma, RMS")  # fmt: skip
 
 
-def accuracy_row(errors: Errors, span: tuple[float, float] | None, start: float) -> list[float]:
-    """The numbers under `COMPARED`, over a span in seconds from the start or over everything."""
-    out = [float("nan")] * len(COMPARED)
-    for kind, s in error_series(errors, start).items():
-        rows = np.ones(len(s.t), bool) if span is None else (s.t >= span[0]) & (s.t <= span[1])
-        x = s.value[rows]
-        if kind == "position":
-            horizontal = np.hypot(x[:, 0], x[:, 1])
-            out[0], out[2] = _rms(horizontal), _rms(x[:, 2])
-            out[1] = float(np.nanmax(horizontal)) if np.isfinite(horizontal).any() else float("nan")
-            out[6] = float(np.sqrt(_mean(errors.nees_axis[rows])))
-        elif kind == "velocity":
-            out[3] = _rms(np.linalg.norm(x, axis=1))
-        else:
-            out[4], out[5] = _rms(x[:, :2]), _rms(x[:, 2])
-    return out
-
-
-def accuracy_tables(errors: Mapping[str, Errors], spans: Spans, start: float) -> list[Raw]:
-    """A table of all solvers over everything, and one for each withheld span."""
-    if not errors:
-        return []
-    out = []
-    wanted: list[tuple[str, tuple[float, float] | None]] = [("Whole recording", None)]
-    wanted += [(f"Withheld {a:g} to {b:g} s", (a, b)) for a, b in times_of(spans)]
-    for words, span in wanted:
-        rows = [[page.solver(name), *accuracy_row(e, span, start)] for name, e in errors.items()]
-        out += [Raw(f"<h3>{page.text(words)}</h3>"), page.table(["solver", *COMPARED], rows, best=range(1, 7))]
-    return out
-
-
-def trajectory_picture(
-    recording: Recording, solutions: Mapping[str, Solution], spans: list[tuple[float, float]]
-) -> Raw:
-    """The way from above."""
-    start = recording.start
-    frame = next(iter(solutions.values())).frame
-    fixes = truth = None
-    if recording.gnss is not None:
-        fixes = frame.from_llh(recording.gnss.llh)[:, :2]
-    if recording.truth is not None and recording.truth.llh is not None:
-        truth = frame.from_llh(recording.truth.llh)[:, :2]
-    tracks = {name: (s.t - start, s.states.p[:, :2]) for name, s in solutions.items()}
-    figure = plots.trajectory(tracks, fixes=fixes, truth=truth, spans=spans)
-    lat, lon = np.degrees(frame.origin[:2])
-    return page.picture(
-        svg(figure, "trajectory from above", "way"),
-        f"From above; origin at latitude {lat:.6f}, longitude {lon:.6f} deg.",
-    )
-
-
-def error_pictures(errors: Mapping[str, Errors], start: float, spans: list[tuple[float, float]]) -> list[Raw]:
-    """Position, velocity and attitude errors with 3 sigma."""
-    series = {name: error_series(e, start) for name, e in errors.items()}
-    out = []
-    for kind, parts, unit in (("position", ENU, "m"), ("velocity", ENU, "m/s"), ("attitude", RPH, "deg")):
-        chosen = {name: s[kind] for name, s in series.items() if kind in s}
-        if chosen:
-            figure = plots.bands(chosen, parts, unit, spans=spans)
-            out.append(
-                page.picture(svg(figure, f"{kind} errors", f"e-{kind}"), f"{kind.capitalize()}: error and 3 sigma.")
-            )
-    return out
-
-
-def sigma_pictures(tracks: Mapping[str, Trajectory], start: float, spans: list[tuple[float, float]]) -> list[Raw]:
-    """What the solvers themselves say of their uncertainty."""
-    out = []
-    wanted = (("position", "sd_p", ENU, "m", 1.0), ("attitude", "sd_rph", RPH, "deg", float(np.degrees(1.0))))
-    for kind, key, parts, unit, scale in wanted:
-        series = {
-            name: Series(track.t - start, getattr(track, key) * scale)
-            for name, track in tracks.items()
-            if getattr(track, key) is not None
-        }
-        if series:
-            figure = plots.sigmas(series, parts, unit, spans=spans)
-            out.append(
-                page.picture(svg(figure, f"{kind} sigma", f"sd-{kind}"), f"{kind.capitalize()}: 1 sigma as stated.")
-            )
-    return out
-
-
-def bias_pictures(solution: Solution, start: float, spans: list[tuple[float, float]]) -> list[Raw]:
-    """Gyro and accelerometer biases with 3 sigma."""
-    sd = np.sqrt(np.maximum(np.diagonal(solution.covariance, axis1=1, axis2=2), 0.0))
-    t = solution.t - start
-    out = []
-    for words, value, sigma, unit, scale in (
-        ("Gyro bias", solution.states.bg, sd[:, 12:15], "deg/h", DEG_H),
-        ("Accelerometer bias", solution.states.ba, sd[:, 9:12], "mm/s²", 1000.0),
-    ):
-        series = {solution.solver: Series(t, value * scale, sigma * scale)}
-        figure = plots.bands(series, XYZ, unit, spans=spans, about_zero=False)
-        out.append(page.picture(svg(figure, words, words.split()[0].lower()), f"{words} and 3 sigma."))
-    return out
-
-
-def zoom_pictures(errors: Mapping[str, Errors], start: float, spans: list[tuple[float, float]]) -> list[Raw]:
-    """Horizontal error in and around each withheld span."""
-    if not spans or not errors:
-        return []
-    series = {}
-    for name, e in errors.items():
-        s = error_series(e, start)["position"]
-        series[name] = Series(s.t, np.hypot(s.value[:, 0], s.value[:, 1])[:, None])
-    figure = plots.span_zoom(series, spans)
+def accuracy_row(errors: Errors) -> list[float]:
+    """The numbers under `COMPARED`."""
+    rph = np.degrees(errors.rph)
     return [
-        page.picture(
-            svg(figure, "horizontal error in withheld spans", "zoom"),
-            "Horizontal error in and around each withheld span.",
-        )
+        _rms(errors.horizontal),
+        _largest(errors.horizontal),
+        _rms(errors.p[:, 2]),
+        _rms(np.linalg.norm(errors.v, axis=1)),
+        _rms(rph[:, :2]),
+        _rms(rph[:, 2]),
+        float(np.sqrt(_mean(errors.nees_axis))),
     ]
 
 
-def record_pictures(solution: Solution, start: float, spans: list[tuple[float, float]]) -> list[Raw]:
-    """Whitened residuals and NIS of every constraint."""
-    out = []
-    for kind, record in solution.records.items():
-        if not len(record.t):
-            continue
-        figure = plots.residuals(kind, record, start, solution.solver, spans=spans)
-        words = f"{kind}: {record.kind}s over their sigma"
-        caption = (
-            f"{words}, dashed at 3. NIS with the middle 99 % of the chi-square distribution with "
-            f"{record.residual.shape[1]} degrees of freedom, and its histogram beside the density."
-        )
-        out.append(page.picture(svg(figure, words, f"r-{kind}"), caption))
-    return out
+def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[float]:
+    """The numbers under `COMPARED_SPAN`, over a span in seconds from the recording's start."""
+    rows = np.flatnonzero((errors.t >= start + span[0]) & (errors.t <= start + span[1]))
+    rows = rows[np.isfinite(errors.horizontal[rows])]
+    if not len(rows):
+        return [float("nan")] * len(COMPARED_SPAN)
+    h = errors.horizontal[rows]
+    way = float(errors.distance[rows[-1]] - errors.distance[rows[0]])
+    return [
+        _rms(h),
+        _largest(h),
+        float(h[-1]),
+        100.0 * _largest(h) / way if way > 0 else float("nan"),
+        _largest(errors.p[rows, 2]),
+        float(np.degrees(_largest(errors.rph[rows, 2]))),
+        float(np.sqrt(_mean(errors.nees_axis[rows]))),
+    ]
+
+
+def accuracy_tables(errors: Mapping[str, Errors], withheld: Withheld, start: float) -> list[Raw]:
+    """A table of all solvers over everything, and one for each withheld span."""
+    if not errors:
+        return []
+    rows = [[page.solver(name), *accuracy_row(e)] for name, e in errors.items()]
+    out = [page.heading("Whole recording"), page.table(["solver", *COMPARED], rows, best=range(1, 7))]
+    for span in times_of(withheld):
+        rows = [[page.solver(name), *span_row(e, span, start)] for name, e in errors.items()]
+        out.append(page.heading(f"Withheld {span[0]:g} to {span[1]:g} s"))
+        out.append(page.table(["solver", *COMPARED_SPAN], rows, best=range(1, 7)))
+    notes = list(dict.fromkeys(note for e in errors.values() for note in e.notes))
+    return [*out, page.bullets(notes)] if notes else out
+
+
+def closure_note(name: str, metrics: Mapping[str, Any] | None) -> list[Raw]:
+    """How far from the start a loop ended, where that is the truth."""
+    if not metrics or metrics.get("closure_h_m") is None:
+        return []
+    h, up, way, share = (page.text(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))
+    words = f"the loop of {way} m closes to {h} m horizontally ({share} % of the way) and {up} m in height."
+    return [page.paragraph(Raw(f"{page.text(name)}: {words}"), "verdict")]
 
 
 def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Raw]:
@@ -367,9 +283,16 @@ def run_table(solutions: Mapping[str, Solution]) -> list[Raw]:
     return [page.table(head, rows), page.bullets(notes) if notes else Raw("")]
 
 
-def metric_tables(metrics: Mapping[str, Any] | None) -> list[Raw]:
-    """Whatever the evaluation measured, as a table that opens on demand."""
-    return [page.folded("All measures", page.pairs(page.flat(metrics)))] if metrics else []
+def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Raw]:
+    """Whatever the evaluation measured, as tables that open on demand."""
+    if not metrics:
+        return []
+    plain = {key: value for key, value in metrics.items() if key not in ("spans", "notes")}
+    inner = page.pairs({k: v if isinstance(v, float) else str(v) for k, v in page.flat(plain).items()})
+    spans = metrics.get("spans")
+    if isinstance(spans, Sequence) and spans and isinstance(spans[0], Mapping):
+        inner = Raw(inner + page.table(list(spans[0]), [[s.get(k) for k in spans[0]] for s in spans]))
+    return [page.folded(f"All measures{' of ' if name else ''}{name}", inner)]
 
 
 def odd(recording: Recording, findings: Sequence[str]) -> list[Raw]:
