@@ -179,11 +179,12 @@ def _shift_hint(trajectory: Trajectory, truth: Trajectory) -> str:
     """'; ...' naming a shift of clocks that would make the two overlap, when a usual one does."""
     middle = 0.5 * (truth.t[0] + truth.t[-1] - trajectory.t[0] - trajectory.t[-1])
     half = 0.5 * (truth.t[-1] - truth.t[0] + trajectory.t[-1] - trajectory.t[0])
+    unix = _GPS_TO_UNIX - _LEAP
     usual = [
         (_LEAP, "one may be in UTC and the other in GPS time, 18 s ahead"),
         (WEEK * round(middle / WEEK), "one may count GPS seconds of the week and the other continuously"),
+        (unix + WEEK * round((abs(middle) - unix) / WEEK), "one may be in Unix time and the other in GPS time"),
         (86400.0 * round(middle / 86400.0), "one may count seconds of the day"),
-        (_GPS_TO_UNIX - _LEAP, "one may be in Unix time and the other in GPS seconds"),
     ]
     for shift, sentence in usual:
         if shift and abs(abs(middle) - abs(shift)) < half:

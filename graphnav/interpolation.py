@@ -8,9 +8,9 @@ as the body sees it turned by the interpolated attitude, attitude along the shor
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graphnav import rotation
 from graphnav.earth import LocalFrame
@@ -22,13 +22,14 @@ _SAME_TIME = 1e-6  # s; what a text file rounds a time stamp to
 
 def interpolate(
     trajectory: Trajectory, t: Array, *, max_gap: float = 3.0, lever_arm: Array | None = None
-) -> tuple[Trajectory, NDArray[np.bool_]]:
+) -> tuple[Trajectory, Array]:
     """The trajectory at the times `t` (N,) it can be interpolated to, and the mask (N,) of those times.
 
     Never outside the trajectory, and never between two of its rows more than `max_gap` s apart; a time
     that falls on a row needs no neighbour. With `lever_arm` (3,), m, RFU, the position, velocity and
-    covariance are those of the point at its end; rows without attitude stay where they are. Biases are
-    dropped. Without a covariance one is made of the sigmas (NaN where there are none).
+    covariance are those of the point at its end; rows without attitude stay where they are, and
+    without an attitude sigma the sigmas stay what they are. Biases are dropped.
+    Without a covariance one is made of the sigmas (NaN where there are none).
     """
     k, s, ok = _bracket(trajectory.t, np.asarray(t, dtype=float), max_gap)
     k, s, t = k[ok], s[ok, None], np.asarray(t, dtype=float)[ok]
@@ -75,7 +76,8 @@ def interpolate(
         v_at = None if v_at is None else _apply(R_ln, v_at)
         R_at = None if R_at is None else R_ln @ R_at
     rph = None if R_at is None else rotation.to_rph(R_at)
-    if cov_at is not None and swing is not None and rph is not None and R_at is not None:
+    known = cov_at is not None and bool(np.isfinite(cov_at[:, 6:9, 6:9]).all((1, 2)).any())
+    if known and cov_at is not None and swing is not None and rph is not None and R_at is not None:
         cov_at = _at_point(cov_at, R_at, rph, np.asarray(lever_arm, dtype=float), swing)
     out = replace(
         trajectory, t=t, llh=p_at if frame is None else frame.to_llh(p_at), v=v_at, rph=rph,
@@ -137,7 +139,7 @@ def placed(trajectory: Trajectory, frame: LocalFrame, yaw: float, offset: Array)
     )  # fmt: skip
 
 
-def _bracket(times: Array, t: Array, max_gap: float) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_]]:
+def _bracket(times: Array, t: Array, max_gap: float) -> tuple[Any, Array, Any]:
     """The row before each time, the fraction of the way to the next, and whether it may be used."""
     k = np.clip(np.searchsorted(times, t, side="right") - 1, 0, max(len(times) - 2, 0))
     dt = times[np.minimum(k + 1, len(times) - 1)] - times[k]

@@ -211,7 +211,12 @@ def ensemble_nees(runs: Sequence[Errors], block: str = "p") -> tuple[Array, Arra
     dof = min(run.dof_p for run in runs) if block == "p" else 3
     rows = [getattr(run, f"nees_{block}")[np.searchsorted(s, shared)] for run, s in zip(runs, stamps, strict=True)]
     low, high = chi_square_band(dof, len(runs))
-    return shared * 1e-6, np.asarray(np.mean(rows, axis=0)) / dof, low, high
+    return (
+        np.asarray(shared * 1e-6, dtype=np.float64),
+        np.asarray(np.mean(rows, axis=0) / dof, dtype=np.float64),
+        low,
+        high,
+    )
 
 
 def _span(errors: Errors, start: float, end: float) -> Span:
