@@ -12,11 +12,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -118,6 +116,19 @@ def description(recording: oracle.Recording) -> str:
 
 
 # --------------------------------------------------------------------------------------------------------- measuring
+# Linux counts the memory of the process that forked into a program's peak (getrusage(2): it survives execve), so a
+# small interpreter of its own starts the program, not this one that has built the drives.
+WATCH = """
+import json, os, subprocess, sys, time
+start = time.perf_counter()
+process = subprocess.Popen(sys.argv[1:])
+_, status, usage = os.wait4(process.pid, 0)
+wall = time.perf_counter() - start
+print(json.dumps([wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss]), flush=True)
+sys.exit(0 if status == 0 else 1)
+"""
+
+
 @dataclass(frozen=True)
 class Run:
     """One run of the program on one drive."""
@@ -133,20 +144,15 @@ def measure(folder: Path, out: Path, hours: float, solvers: str) -> Run:
     """Run the program and wait for it; its own times by stage are read from what it wrote."""
     program = Path(sys.executable).with_name("graphnav")  # the one installed beside this interpreter
     command = [str(program), "compare", str(folder), "-o", str(out), "--solvers", solvers, "--quiet"]
-    start = time.perf_counter()
-    with tempfile.TemporaryFile() as said:
-        process = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT)
-        _, status, usage = os.wait4(process.pid, 0)
-        wall = time.perf_counter() - start
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode != 0:
-            said.seek(0)
-            sys.exit(f"{' '.join(command)} ended with {process.returncode}: {said.read().decode()[-2000:]}")
+    watched = subprocess.run([sys.executable, "-I", "-c", WATCH, *command], capture_output=True, text=True, check=False)
+    if watched.returncode != 0:
+        sys.exit(f"{' '.join(command)} failed: {(watched.stdout + watched.stderr)[-2000:]}")
+    wall, cpu, maxrss = json.loads(watched.stdout.splitlines()[-1])
     summaries = {
         solver: json.loads((out / solver / "summary.json").read_text(encoding="utf-8")) for solver in solvers.split(",")
     }
     per_mb = 1024.0**2 if sys.platform == "darwin" else 1024.0  # ru_maxrss is in bytes there, in KiB elsewhere
-    return Run(hours, wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / per_mb, summaries)
+    return Run(hours, wall, cpu, maxrss / per_mb, summaries)
 
 
 def table(runs: list[Run]) -> str:
