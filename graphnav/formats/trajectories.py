@@ -227,12 +227,12 @@ def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Traject
             f"{path}: an RTKLIB solution as east-north-up baseline to a base station whose place the columns do not "
             "give; write it again with out-solformat=llh"
         )
+    if "latitude(d'" in titles:
+        raise RecordingError(f"{path}: latitude in degrees, minutes, seconds; write it again with out-degform=deg")
     if "latitude(deg)" not in titles:
         raise RecordingError(
             f"{path}: an RTKLIB solution not in lat/lon/height degrees; write it again with out-solformat=llh"
         )
-    if "latitude(deg)" in titles and "d'" in titles:
-        raise RecordingError(f"{path}: latitude in degrees, minutes, seconds; write it again with out-degform=deg")
     scale_name = titles.strip().lstrip("%").split()[0]
     separator = "," if "," in rows[0][1] else None
     columns = re.findall(r"[A-Za-z]+(?=\(|\s|$|,)", titles.strip().lstrip("%"))[1:]

@@ -1,0 +1,292 @@
+"""What is written is read back; what other programs write is read as their documentation says."""
+
+from __future__ import annotations
+
+import gzip
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pymap3d
+import pytest
+
+from graphnav import exporters, rotation
+from graphnav.errors import RecordingError
+from graphnav.exporters import csv, kml, tum
+from graphnav.formats.trajectories import read_trajectory
+from graphnav.trajectory import Trajectory
+
+DEG = np.pi / 180
+
+
+def made(n: int = 200, seed: int = 0) -> Trajectory:
+    """A path across the southern and western hemispheres' signs, every column filled with its own numbers."""
+    rng = np.random.default_rng(seed)
+    t = 86400.0 * 5 + np.arange(n) * 0.005
+    llh = np.array([-33.9, -70.7, 512.0]) * [DEG, DEG, 1] + np.cumsum(rng.normal(size=(n, 3)) * [1e-8, 1e-8, 0.01], 0)
+    return Trajectory(
+        t, llh, v=rng.normal(size=(n, 3)) * 10, rph=rng.uniform([-3, -1.5, 0], [3, 1.5, 6.28], size=(n, 3)),
+        sd_p=rng.uniform(1e-4, 10, (n, 3)), sd_v=rng.uniform(1e-4, 1, (n, 3)), sd_rph=rng.uniform(1e-6, 0.1, (n, 3)),
+        gyro_bias=rng.normal(size=(n, 3)) * 1e-5, accel_bias=rng.normal(size=(n, 3)) * 1e-3, name="made",
+    )  # fmt: skip
+
+
+def test_csv_has_the_fixed_header_and_reads_back(tmp_path: Path) -> None:
+    source = made()
+    csv.write(source, tmp_path / "trajectory.csv")
+    head = (tmp_path / "trajectory.csv").read_text().splitlines()[0]
+    assert head == (
+        "t,lat,lon,h,ve,vn,vu,roll,pitch,heading,sd_e,sd_n,sd_u,sd_ve,sd_vn,sd_vu,sd_roll,sd_pitch,sd_heading,"
+        "bgx,bgy,bgz,bax,bay,baz"
+    )
+    back = read_trajectory(tmp_path / "trajectory.csv")
+    # Half a unit of the last digit written.
+    np.testing.assert_allclose(back.t, source.t, atol=0.51e-6)
+    np.testing.assert_allclose(back.llh[:, :2] / DEG, source.llh[:, :2] / DEG, atol=0.51e-11)
+    np.testing.assert_allclose(back.llh[:, 2], source.llh[:, 2], atol=0.51e-5)
+    np.testing.assert_allclose(back.v, source.v, atol=0.51e-5)
+    np.testing.assert_allclose(back.rph / DEG, source.rph / DEG, atol=0.51e-7)
+    for key in ("sd_p", "sd_v", "sd_rph", "gyro_bias", "accel_bias"):
+        np.testing.assert_allclose(getattr(back, key), getattr(source, key), rtol=5.1e-6, err_msg=key)
+
+
+def test_csv_units_are_those_of_the_page(tmp_path: Path) -> None:
+    one = Trajectory(
+        np.array([1.5]), np.array([[0.5, -1.0, 7.0]]), v=np.array([[1.0, 2.0, 3.0]]), rph=np.array([[0.1, -0.2, 3.0]]),
+        sd_rph=np.array([[0.01, 0.02, 0.03]]), gyro_bias=np.array([[1e-6, -2e-6, 0.0]]),
+    )  # fmt: skip
+    csv.write(one, tmp_path / "a.csv")
+    head, row = (line.split(",") for line in (tmp_path / "a.csv").read_text().splitlines())
+    value = dict(zip(head, row, strict=True))
+    assert float(value["lat"]) == pytest.approx(28.64788975654)
+    assert float(value["lon"]) == pytest.approx(-57.29577951308)
+    assert (float(value["ve"]), float(value["vn"]), float(value["vu"])) == (1.0, 2.0, 3.0)
+    assert float(value["pitch"]) == pytest.approx(-11.4591559)
+    assert float(value["sd_heading"]) == pytest.approx(1.71887, rel=1e-5)
+    assert float(value["bgy"]) == -2e-6
+    assert value["sd_e"] == value["baz"] == ""  # not known is blank, not zero
+
+
+def test_a_missing_value_is_blank_and_comes_back_as_missing(tmp_path: Path) -> None:
+    v = np.array([[1.0, 2.0, 3.0], [np.nan, np.nan, np.nan]])
+    pair = Trajectory(np.array([0.0, 1.0]), np.zeros((2, 3)), v=v)
+    csv.write(pair, tmp_path / "a.csv")
+    assert "nan" not in (tmp_path / "a.csv").read_text()
+    np.testing.assert_array_equal(read_trajectory(tmp_path / "a.csv").v, v)
+
+
+def test_tum_is_enu_about_the_first_point_with_the_body_quaternion(tmp_path: Path) -> None:
+    source = made()
+    tum.write(source, tmp_path / "a.tum")
+    table = np.loadtxt(tmp_path / "a.tum")
+    lat, lon, h = source.llh[:, 0] / DEG, source.llh[:, 1] / DEG, source.llh[:, 2]
+    expected = np.column_stack(pymap3d.geodetic2enu(lat, lon, h, lat[0], lon[0], h[0]))
+    np.testing.assert_allclose(table[:, 1:4], expected, atol=6e-6)
+    # Forward is +y of the body: heading 90 deg points it east, and the quaternion is about up by -90 deg.
+    east = Trajectory(np.array([0.0]), source.llh[:1], rph=np.array([[0.0, 0.0, np.pi / 2]]))
+    tum.write(east, tmp_path / "b.tum")
+    q = np.loadtxt(tmp_path / "b.tum")[4:]
+    np.testing.assert_allclose(q, [0, 0, -np.sqrt(0.5), np.sqrt(0.5)], atol=1e-9)
+
+    back = read_trajectory(tmp_path / "a.tum")
+    assert back.frame == "local"
+    np.testing.assert_allclose(back.llh, table[:, 1:4])
+    np.testing.assert_allclose(
+        rotation.from_rph(back.rph)[0], rotation.from_rph(source.rph)[0], atol=1e-9
+    )  # the first point's level is the frame
+
+
+def test_tum_without_attitude_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="attitude"):
+        tum.write(replace(made(), rph=None), tmp_path / "a.tum")
+
+
+def test_kml_is_a_thinned_path_with_both_ends(tmp_path: Path) -> None:
+    n = 60000
+    x = np.concatenate([np.zeros(n // 2), np.linspace(0.0, 0.01, n // 2)])  # stands, then drives 1.1 km north
+    source = Trajectory(
+        np.arange(n) * 0.01, np.column_stack([0.8 + x * DEG, np.full(n, 0.2), np.full(n, 100.0)]), name="a<b"
+    )
+    kml.write(source, tmp_path / "a.kml")
+    root = ET.parse(tmp_path / "a.kml").getroot()
+    ns = {"k": "http://www.opengis.net/kml/2.2"}
+    names = [e.text for e in root.findall(".//k:Placemark/k:name", ns)]
+    assert names == ["a<b", "start", "end"]
+    line = root.find(".//k:LineString/k:coordinates", ns)
+    points = np.array([[float(x) for x in row.split(",")] for row in line.text.split()])
+    lonlat = source.llh[:, [1, 0]] / DEG
+    np.testing.assert_allclose(points[[0, -1], :2], lonlat[[0, -1]], atol=1e-8)
+    assert len(points) < 20100
+    gaps = np.diff(points[:, 1]) * 111e3
+    assert gaps.max() < 0.2  # m: evenly spread over the drive
+    assert (points[:, 1] == points[0, 1]).sum() < 5  # the half that stands costs nothing
+
+
+def test_write_all(tmp_path: Path) -> None:
+    exporters.write_all(made(), tmp_path / "out")
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "trajectory.csv",
+        "trajectory.kml",
+        "trajectory.tum",
+    ]
+    with pytest.raises(RecordingError, match="local frame"):
+        exporters.write_all(replace(made(), frame="local"), tmp_path / "local")
+
+
+KF_GINS = """\
+0 456300.000 30.4447873622 114.4718632047 20.9117 0.0001 -3.0000 -0.5000 0.8541 -2.0375 185.7001
+0 456300.005 30.4447873623 114.4718632048 20.9118 0.0002 -3.1000 -0.6000 0.8542 -2.0376 185.7002
+"""
+
+
+def test_kf_gins(tmp_path: Path) -> None:
+    file = tmp_path / "KF_GINS_Navresult.nav"
+    file.write_text(KF_GINS)
+    found = read_trajectory(file)
+    np.testing.assert_allclose(found.t, [456300.0, 456300.005])
+    np.testing.assert_allclose(found.llh[0], [30.4447873622 * DEG, 114.4718632047 * DEG, 20.9117])
+    np.testing.assert_allclose(found.v[0], [-3.0, 0.0001, 0.5])  # north, east, down in the file
+    np.testing.assert_allclose(found.rph[0] / DEG, [0.8541, -2.0375, 185.7001])
+
+
+def test_kf_gins_angles_are_ours() -> None:
+    """ZYX yaw, pitch, roll of forward-right-down to north-east-down, built axis by axis, is our R_nb."""
+    roll, pitch, yaw = 0.3, -0.4, 2.5
+
+    def about(axis: int, angle: float) -> np.ndarray:
+        return rotation.exp(angle * np.eye(3)[axis])
+
+    R_ned_frd = about(2, yaw) @ about(1, pitch) @ about(0, roll)
+    swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # north-east-down <-> east-north-up
+    np.testing.assert_allclose(swap @ R_ned_frd @ swap, rotation.from_rph(np.array([roll, pitch, yaw])), atol=1e-12)
+
+
+def test_kf_gins_runs_on_over_the_end_of_a_week(tmp_path: Path) -> None:
+    file = tmp_path / "a.nav"
+    file.write_text("2017 604799.5 30 114 20 0 0 0 0 0 0\n2018 0.5 30 114 20 0 0 0 0 0 0\n")
+    np.testing.assert_allclose(read_trajectory(file).t, [604799.5, 604800.5])
+
+
+POS = """\
+% program   : RTKLIB ver.2.4.3 b34
+% inp file  : rover.obs
+% obs start : 2020/11/05 23:59:58.0 GPST (week2130 431998.0s)
+%
+% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)
+%  GPST                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio
+2020/11/05 23:59:58.000   35.666800000  -139.792200000    59.7500   1  12   0.0100   0.0200   0.0300   0.0010  -0.0010   0.0020   0.00   12.3
+2020/11/05 23:59:58.200   35.666800100  -139.792200100    59.7600   2  12   0.1100   0.1200   0.1300   0.0010  -0.0010   0.0020   0.00    1.3
+2020/11/06 00:00:00.400   35.666800200  -139.792200200    59.7700   5   9   1.1100   1.1200   1.1300   0.0010  -0.0010   0.0020   0.00    0.0
+"""  # noqa: E501
+
+
+def test_rtklib(tmp_path: Path) -> None:
+    file = tmp_path / "rover.pos"
+    file.write_text(POS)
+    found = read_trajectory(file)
+    # 2020-11-05 is a Thursday: four days into the week that starts on Sunday; the header says so too.
+    np.testing.assert_allclose(found.t, [431998.0, 431998.2, 432000.4], atol=1e-6)
+    np.testing.assert_allclose(found.llh[0], [35.6668 * DEG, -139.7922 * DEG, 59.75])
+    np.testing.assert_allclose(found.sd_p[0], [0.02, 0.01, 0.03])  # north first in the file
+    assert found.v is None
+    assert found.notes == ()
+
+
+def test_rtklib_with_week_and_seconds_velocity_and_utc(tmp_path: Path) -> None:
+    file = tmp_path / "rover.pos"
+    titles = "%  UTC   latitude(deg) longitude(deg)  height(m)   Q  ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m)"
+    titles += " sdun(m) age(s) ratio vn(m/s) ve(m/s) vu(m/s) sdvn sdve sdvu sdvne sdveu sdvun"
+    row = "2130 {} 35.0 139.0 50.0 1 12 0.01 0.02 0.03 0 0 0 0 9.9 1.5 -2.5 0.5 0.1 0.2 0.3 0 0 0"
+    file.write_text("\n".join([titles, row.format("604799.000"), row.format("604799.200")]) + "\n")
+    found = read_trajectory(file)
+    np.testing.assert_allclose(found.t, [604799.0, 604799.2])
+    np.testing.assert_allclose(found.v[0], [-2.5, 1.5, 0.5])
+    np.testing.assert_allclose(found.sd_v[0], [0.2, 0.1, 0.3])
+    assert any("UTC" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("titles", "reason"),
+    [
+        ("%  GPST          e-baseline(m)  n-baseline(m)  u-baseline(m)   Q  ns   sde(m)   sdn(m)   sdu(m)", "baseline"),
+        (
+            "%  GPST              x-ecef(m)      y-ecef(m)      z-ecef(m)   Q  ns   sdx(m)   sdy(m)   sdz(m)",
+            "solformat=llh",
+        ),
+        (
+            "%  GPST          latitude(d'\")   longitude(d'\")  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)",
+            "degform=deg",
+        ),
+        ("% program : RTKLIB", "names the columns"),
+    ],
+)
+def test_other_rtklib_solutions_are_refused_with_the_way_out(tmp_path: Path, titles: str, reason: str) -> None:
+    file = tmp_path / "rover.pos"
+    file.write_text(titles + "\n2020/11/05 23:59:58.000 1 2 3 1 12 0.01 0.02 0.03\n")
+    with pytest.raises(RecordingError, match=reason):
+        read_trajectory(file)
+
+
+def test_names_with_units_and_down_velocity(tmp_path: Path) -> None:
+    file = tmp_path / "truth.csv.gz"
+    rows = "t_s,lat_deg,lon_deg,h_m,vn_mps,ve_mps,vd_mps,heading_deg,extra\n1,30,114,20,1,2,3,90,x\n".replace("x", "7")
+    file.write_bytes(gzip.compress(rows.replace("e7tra", "extra").encode()))
+    found = read_trajectory(file)
+    np.testing.assert_allclose(found.v, [[2.0, 1.0, -3.0]])
+    assert found.rph[0, 2] == pytest.approx(np.pi / 2)
+    assert np.isnan(found.rph[0, :2]).all()
+
+
+def test_local_truth_in_two_dimensions(tmp_path: Path) -> None:
+    file = tmp_path / "truth.csv"
+    file.write_text("t_s,imu_row,x_m,y_m\n2.1,427,0.0,0.5\n3.0,615,0.6,0.2\n")
+    found = read_trajectory(file)
+    assert found.frame == "local"
+    np.testing.assert_array_equal(found.llh, [[0.0, 0.5, np.nan], [0.6, 0.2, np.nan]])
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("", "no rows"),
+        ("t,lat,lon,h\n", "no rows"),
+        ("t,lat,lon\n0,1,2\n", "no column 'h'"),
+        ("t,lat,lon,h\n0,30,114,20\n1,30,abc,20\n", "line 3, lon: 'abc'"),
+        ("t,lat,lon,h\n0,30,114,20\n1,30,114\n", "line 3: 3 fields where 4"),
+        ("t,lat,lon,h\n5,30,114,20\n4,30,114,20\n", r"line 3, t: 4\.0+ comes after 5"),
+        ("t,lat,lon,h\n0,114,30,20\n", "line 2, lat: 114"),
+        ("t,lat,lon,h\n,30,114,20\n", "line 2, t: not a finite"),
+        ("t,lat,lon,h\n1,,114,20\n", "no row has a position"),
+        ("# comment\n0 1 2 3\n", "line 2: 4 columns without a header"),
+        ("0 1 2 3 0 0 0 2\n", "line 1, qx qy qz qw: a norm of 2"),
+        ("0 456300.0 30 114 20 0 0 0 0 0 0\n0 456300.5 30 114 20 0 0 x 0 0 0\n", "line 2, vd: 'x'"),
+        ("2020/11/05 23:59:58.000 35 139 50 1 12\n", "without its header"),
+        (POS.replace("00:00:00.400", "00:00:61.400"), "line 9: '2020-11-06 00:00:61.400' is not a date"),
+        ("t,lat,lon,h\n\x00\x01\x02", "binary"),
+    ],
+)
+def test_bad_files_are_named_with_line_and_field(tmp_path: Path, content: str, reason: str) -> None:
+    file = tmp_path / "bad.txt"
+    file.write_text(content)
+    with pytest.raises(RecordingError, match=reason) as caught:
+        read_trajectory(file)
+    assert str(file) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_there_or_cut_short(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="cannot be read"):
+        read_trajectory(tmp_path / "none.csv")
+    (tmp_path / "cut.csv.gz").write_bytes(gzip.compress(b"t,lat,lon,h\n0,30,114,20\n" * 50)[:-12])
+    with pytest.raises(RecordingError, match="cannot be read"):
+        read_trajectory(tmp_path / "cut.csv.gz")
+
+
+def test_repeated_stamps_and_rows_without_position_are_left_out_and_counted(tmp_path: Path) -> None:
+    file = tmp_path / "a.csv"
+    file.write_text("t,lat,lon,h\n0,30,114,20\n0,30,114,21\n1,,,\n2,30,114,23\n")
+    found = read_trajectory(file)
+    np.testing.assert_allclose(found.llh[:, 2], [20, 23])
+    assert any(note.startswith("a.csv: 1 rows without") for note in found.notes)
+    assert any(note.startswith("a.csv: 1 rows that repeat") for note in found.notes)
