@@ -1,0 +1,233 @@
+"""What the sensors of one drive say about each other: clock, axes and units from regressions.
+
+Changes of GNSS speed are regressed on the integrated force, changes of course on the integrated rate, both on
+all three axes. The correlation as a function of a shift in time gives the clock error whatever the axes; the
+coefficients at the best shift give the axes and the scale whatever was assumed of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphnav.earth import LocalFrame
+from graphnav.recording import Gnss, Imu, Odometer
+from graphnav.rotation import Array, wrap
+
+MIN_PAIRS = 20
+_MIN_SPEED = 3.0  # m/s, below which a course means little
+_FASTEST_CHANGE = 8.0  # m/s^2; what exceeds it is an error of the fix
+WIDE = 30.0  # s searched for clock errors
+
+
+@dataclass(frozen=True)
+class Track:
+    """Velocity from GNSS, each the mean over `width` seconds around t (0: of the instant)."""
+
+    t: Array  # (K,) s
+    v: Array  # (K, 3) m/s, ENU
+    width: Array  # (K,) s
+    period: float  # s between fixes
+
+    @property
+    def speed(self) -> Array:
+        """Horizontal speed, m/s."""
+        return np.hypot(self.v[:, 0], self.v[:, 1])
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One regression: y = coefficients @ x, with x taken `lag` seconds later than y."""
+
+    lag: float  # s
+    spread: float  # s, 1-sigma of the lag from parts of the drive
+    correlation: float
+    at_zero: float  # the correlation without a shift
+    coefficients: Array  # (m,)
+
+
+def local_positions(gnss: Gnss) -> Array:
+    """Positions in ENU metres around the first fix, (M, 3)."""
+    return LocalFrame(gnss.llh[0]).from_llh(gnss.llh)
+
+
+def track(gnss: Gnss) -> Track | None:
+    """Velocities the receiver gave, or differences of positions about a second apart; None if too few."""
+    if len(gnss.t) < 5:
+        return None
+    period = float(np.median(np.diff(gnss.t)))
+    if gnss.v is not None:
+        there = ~np.isnan(gnss.v[:, 0])
+        if there.mean() > 0.3 and there.sum() >= 5:
+            return Track(gnss.t[there], gnss.v[there], np.zeros(there.sum()), period)
+    m = max(1, round(1.0 / period))
+    if len(gnss.t) <= m + 2:
+        return None
+    p = local_positions(gnss)
+    width = gnss.t[m:] - gnss.t[:-m]
+    near = width < 1.5 * m * period
+    t, v = 0.5 * (gnss.t[m:] + gnss.t[:-m]), (p[m:] - p[:-m]) / width[:, None]
+    return Track(t[near], v[near], width[near], period) if near.sum() >= 5 else None
+
+
+def _integral(t: Array, rate: Array) -> tuple[Array, Array]:
+    """Integral and its integral at the ends of the periods, of rows that are means over them."""
+    dt = np.diff(t, prepend=2 * t[0] - t[1])[:, None]
+    first = np.cumsum(rate * dt, axis=0)
+    second = np.cumsum((first - 0.5 * rate * dt) * dt, axis=0)
+    return first, second
+
+
+def _sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
+    """mean(at, width) of the integral of `rate`; width 0 is the value there."""
+    rate = rate - rate.mean(axis=0)  # only changes matter; keeps the second integral small
+    first, second = (np.ascontiguousarray(x.T) for x in _integral(t, rate))
+
+    def columns(at: Array, values: Array) -> Array:
+        return np.stack([np.interp(at, t, row) for row in values], -1)
+
+    def mean(at: Array, width: Array) -> Array:
+        if not width.any():
+            return columns(at, first)
+        return (columns(at + width / 2, second) - columns(at - width / 2, second)) / width[:, None]
+
+    return mean
+
+
+def _pairs(track: Track) -> tuple[Array, Array]:
+    """Rows about a second apart."""
+    m = max(1, round(1.0 / track.period))
+    i = np.arange(len(track.t) - m)
+    near = track.t[i + m] - track.t[i] < 1.5 * max(1.0, m * track.period)
+    return i[near], i[near] + m
+
+
+def _regress(x: Array, y: Array) -> tuple[float, Array]:
+    x, y = x - x.mean(0), y - y.mean()
+    b = np.linalg.lstsq(x, y, rcond=None)[0]
+    prediction, norm = x @ b, np.linalg.norm(y)  # the sign is in b: a reversed axis correlates as well
+    scale = np.linalg.norm(prediction) * norm
+    return (float(prediction @ y / scale) if scale > 0 else 0.0), b
+
+
+def _search(y: Array, x_at: Callable[[Array, float], Array], span: Array, valid: Callable[[float], Array]) -> Fit:
+    """The shift at which x explains y best; `x_at(rows, lag)`, `valid(lag)` a mask of the rows."""
+    every = np.arange(len(y))
+
+    def correlation(lag: float, rows: Array) -> float:
+        rows = rows[valid(lag)[rows]]
+        return _regress(x_at(rows, lag), y[rows])[0] if len(rows) >= MIN_PAIRS else 0.0
+
+    def best(rows: Array, lags: Array) -> float:
+        c = np.array([correlation(lag, rows) for lag in lags])
+        k = int(np.argmax(c))
+        if 0 < k < len(lags) - 1 and (curve := c[k - 1] - 2 * c[k] + c[k + 1]) < 0:
+            return float(lags[k] + 0.5 * (c[k - 1] - c[k + 1]) / curve * (lags[1] - lags[0]))
+        return float(lags[k])
+
+    few = every[:: max(1, len(y) // 800)]
+    many = every[:: max(1, len(y) // 4000)]
+    reach = min(WIDE, 0.3 * (span[-1] - span[0]))
+    coarse = best(few, np.arange(-reach, reach + 0.1, 0.2))
+    near = best(few, np.arange(-5.0, 5.01, 0.1))
+    # a far shift must explain clearly more than a near one, for there are many far ones
+    if abs(coarse) > 5.0 and correlation(coarse, few) < correlation(near, few) + 0.15:
+        coarse = near
+    fine = np.arange(-0.3, 0.301, 0.02) + coarse
+    lag = best(many, fine)
+    parts = [best(part, fine) for part in np.array_split(many, 4) if len(part) >= 2 * MIN_PAIRS]
+    spread = float(np.std(parts) / np.sqrt(len(parts))) if len(parts) > 1 else 0.1
+    rows = every[valid(lag)]
+    r, b = _regress(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
+    return Fit(lag, spread, r, correlation(0.0, every), b)
+
+
+def _imu_fit(imu: Imu, rate: Array, track: Track, i: Array, j: Array, y: Array) -> Fit | None:
+    if len(y) < MIN_PAIRS:
+        return None
+    mean = _sampler(imu.t, rate)
+    ti, tj, wi, wj = track.t[i], track.t[j], track.width[i], track.width[j]
+
+    def x_at(rows: Array, lag: float) -> Array:
+        return mean(tj[rows] + lag, wj[rows]) - mean(ti[rows] + lag, wi[rows])
+
+    def valid(lag: float) -> Array:
+        return (ti + lag - wi / 2 > imu.t[0]) & (tj + lag + wj / 2 < imu.t[-1])
+
+    return _search(y, x_at, track.t, valid)
+
+
+def up_of(imu: Imu) -> Array:
+    """Unit vector of the mean force: up, in body axes as loaded, (3,)."""
+    f = imu.accel.mean(axis=0)
+    return f / np.linalg.norm(f)
+
+
+def forward_fit(imu: Imu, track: Track) -> Fit | None:
+    """Change of GNSS speed on integrated level force: coefficients are the forward direction in body axes, (3,).
+
+    Level is square to the mean force, so nothing need be known of the axes. None where speed changes too little to say anything.
+    """
+    i, j = _pairs(track)
+    y = track.speed[j] - track.speed[i]
+    real = np.abs(y) < _FASTEST_CHANGE * (track.t[j] - track.t[i])
+    i, j, y = i[real], j[real], y[real]
+    if len(y) < MIN_PAIRS or y.std() < 0.25:
+        return None
+    level = np.linalg.svd(up_of(imu)[None, :])[2][1:]  # (2, 3)
+    fit = _imu_fit(imu, imu.accel @ level.T, track, i, j, y)
+    return None if fit is None else replace(fit, coefficients=fit.coefficients @ level)
+
+
+def yaw_fit(imu: Imu, track: Track) -> Fit | None:
+    """Change of course, counter-clockwise, on the integrated rate about the mean force: true over recorded, (1,).
+
+    None without turns.
+    """
+    i, j = _pairs(track)
+    course = np.arctan2(track.v[:, 1], track.v[:, 0])
+    y = wrap(course[j] - course[i])
+    speed = np.minimum(track.speed[i], track.speed[j])
+    real = (speed > _MIN_SPEED) & (np.abs(y) < 1.5 * (track.t[j] - track.t[i]))
+    i, j, y = i[real], j[real], y[real]
+    if len(y) < MIN_PAIRS or y.std() < 0.04:
+        return None
+    return _imu_fit(imu, imu.gyro @ up_of(imu)[:, None], track, i, j, y)
+
+
+def odometer_fit(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
+    """GNSS speed on odometer speed, and the scale (true over recorded, median); None without movement."""
+    if len(odometer.t) < 5 or track.speed.std() < 0.5:
+        return None
+    t = odometer.t
+    distance = np.r_[0.0, np.cumsum(0.5 * (odometer.speed[1:] + odometer.speed[:-1]) * np.diff(t))]
+    width = np.maximum(track.width, 4.0 * float(np.median(np.diff(t))))
+
+    def x_at(rows: Array, lag: float) -> Array:
+        at, w = track.t[rows] + lag, width[rows]
+        return ((np.interp(at + w / 2, t, distance) - np.interp(at - w / 2, t, distance)) / w)[:, None]
+
+    def valid(lag: float) -> Array:
+        inside = (track.t + lag - width / 2 > t[0]) & (track.t + lag + width / 2 < t[-1])
+        return inside & usable
+
+    usable = np.ones(len(track.t), dtype=bool)
+    every = np.arange(len(track.t))
+    inside = valid(0.0)
+    if inside.sum() < MIN_PAIRS:
+        return None
+    # spikes of the fix would pull the fit: leave out what lies far from a first line
+    x = x_at(every, 0.0)[:, 0]
+    slope = _regress(x[inside, None], track.speed[inside])[1][0]
+    off = track.speed - slope * x
+    off = np.abs(off - np.median(off[inside]))
+    usable = off < 6.0 * np.median(off[inside]) + 0.5
+    fit = _search(track.speed, x_at, track.t, valid)
+    rows = every[valid(fit.lag)]
+    x = x_at(rows, fit.lag)[:, 0]
+    moving = (np.abs(x) > 0.3 * np.abs(x).max()) & (track.speed[rows] > _MIN_SPEED)
+    if moving.sum() < MIN_PAIRS:
+        return None
+    return fit, float(np.median(track.speed[rows][moving] / x[moving]))
