@@ -24,8 +24,8 @@ h3{font-size:1rem;margin:1.2em 0 .4em}
 p{margin:.5em 0;max-width:75ch}
 ul{margin:.4em 0;padding-left:1.3em;max-width:75ch}
 .soft,figcaption{color:var(--soft);font-size:.9rem}
-nav{font-size:.9rem;margin:.8em 0}
-nav a{color:inherit;margin-right:1em;white-space:nowrap}
+nav{display:flex;flex-wrap:wrap;gap:.2em 1em;font-size:.9rem;margin:.8em 0}
+nav a{color:inherit}
 .tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(135px,1fr));gap:8px;margin:1em 0}
 .tile{background:var(--card);border:1px solid var(--edge);border-radius:8px;padding:8px 12px}
 .tile b{display:block;font-size:1.25rem;font-variant-numeric:tabular-nums;line-height:1.3}
@@ -33,8 +33,10 @@ nav a{color:inherit;margin-right:1em;white-space:nowrap}
 .wide{overflow-x:auto;margin:.6em 0}
 table{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums}
 th,td{padding:4px 12px 4px 0;text-align:right;border-bottom:1px solid var(--edge);vertical-align:top}
-th:first-child,td:first-child{text-align:left;overflow-wrap:anywhere}
-td.words{text-align:left}
+th:first-child,td:first-child{text-align:left;white-space:nowrap}
+.words{text-align:left!important;min-width:11em}
+.pairs td:first-child{white-space:normal;overflow-wrap:anywhere}
+.pairs td{overflow-wrap:anywhere}
 th{color:var(--soft);font-weight:600}
 td.best{font-weight:700}
 .figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,480px),1fr));gap:18px;margin:.8em 0}
@@ -110,14 +112,16 @@ def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int
                 kind = ' class="best"'
             cells.append(f"<td{kind}>{text(value)}</td>")
         body.append(f"<tr>{''.join(cells)}</tr>")
-    heads = "".join(f'<th scope="col">{text(h)}</th>' for h in head)
+    wordy = [k and any(isinstance(r[k], str) and not isinstance(r[k], Raw) for r in rows) for k in range(len(head))]
+    marks = [' class="words"' if w else "" for w in wordy]
+    heads = "".join(f'<th scope="col"{mark}>{text(h)}</th>' for h, mark in zip(head, marks, strict=True))
     return Raw(f'<div class="wide"><table><thead><tr>{heads}</tr></thead><tbody>{"".join(body)}</tbody></table></div>')
 
 
 def pairs(values: Mapping[str, Any]) -> Raw:
     """A table of two columns without a head."""
     rows = "".join(f'<tr><td>{text(k)}</td><td class="words">{text(v)}</td></tr>' for k, v in values.items())
-    return Raw(f'<div class="wide"><table><tbody>{rows}</tbody></table></div>')
+    return Raw(f'<div class="wide pairs"><table><tbody>{rows}</tbody></table></div>')
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

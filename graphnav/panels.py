@@ -36,7 +36,7 @@ PALETTE = {
     "grid": ("#c9c9ca", "#444445"),
 }
 WIDTH = 390.0  # points; near a phone's width, so that nothing shrinks there
-FONT = 9.0
+FONT = 9.5
 BINS = 450  # columns a line is thinned to: a little more than a panel has points
 
 
@@ -265,13 +265,14 @@ def legend(figure: Figure, entries: Sequence[tuple[str, str, str]], y: float, le
         "dots": {"ls": "none", "marker": "o", "markersize": 3.5, "markeredgewidth": 0.0},
         "cross": {"ls": "none", "marker": "x", "markersize": 5.0, "markeredgewidth": 1.2},
     }
-    x = left
-    for words, name, kind in entries:
-        at = [x, x + 14] if "ls" not in looks[kind] else [x + 7]
+    widths = [16 + 5.3 * len(words) + 9 for words, _, _ in entries]
+    x = max(4.0, min(left, width - sum(widths)))
+    for (words, name, kind), step in zip(entries, widths, strict=True):
+        at = [x, x + 12] if "ls" not in looks[kind] else [x + 6]
         line = Line2D(at, [y + 3] * len(at), color=colour(name), transform=page, label="_legend", **looks[kind])
         figure.add_artist(line, clip=False)
-        figure.text(x + 18, y, words, transform=page, color=colour("ink"), fontsize=FONT, parse_math=False)
-        x += 18 + 5.3 * len(words) + 12
+        figure.text(x + 16, y, words, transform=page, color=colour("ink"), fontsize=FONT, parse_math=False)
+        x += step
 
 
 _DROP = re.compile(r"<metadata>.*?</metadata>|<\?xml.*?\?>|<!DOCTYPE.*?>|<!--.*?-->|<g id=\"patch_1\">\s*</g>", re.S)

@@ -122,7 +122,12 @@ def bands(
     spans: Spans = (),
     about_zero: bool = True,
 ) -> Figure:
-    """One panel per component: the values, and 3 sigma about zero (errors) or about the value (biases)."""
+    """One panel per component: the values, and 3 sigma about zero (errors) or about the value (biases).
+
+    The bands of more than two series would hide each other; `sigmas` shows those side by side.
+    """
+    if len(series) > 2:
+        series = {name: Series(s.t, s.value) for name, s in series.items()}
     figure, boxes = _stack(len(components))
     xlim = _time_limits(series.values())
     for k, (box, component) in enumerate(zip(boxes, components, strict=True)):

@@ -68,7 +68,10 @@ def error_pictures(errors: Mapping[str, Errors], start: float, spans: list[tuple
         if chosen:
             figure = plots.bands(chosen, parts, unit, spans=spans)
             out.append(
-                page.picture(svg(figure, f"{kind} errors", f"e-{kind}"), f"{kind.capitalize()}: error and 3 sigma.")
+                page.picture(
+                    svg(figure, f"{kind} errors", f"e-{kind}"),
+                    f"{kind.capitalize()}: error{' and 3 sigma' if len(chosen) < 3 else ''}.",
+                )
             )
     return out
 

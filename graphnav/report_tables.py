@@ -228,7 +228,13 @@ def accuracy_tables(errors: Mapping[str, Errors], withheld: Withheld, start: flo
         return []
     rows = [[page.solver(name), *accuracy_row(e)] for name, e in errors.items()]
     out = [page.heading("Whole recording"), page.table(["solver", *COMPARED], rows, best=range(1, 7))]
-    for span in times_of(withheld):
+    spans = times_of(withheld)
+    if len(errors) == 1 and spans:
+        (only,) = errors.values()
+        rows = [[Raw(f"{a:g} to {b:g} s"), *span_row(only, (a, b), start)] for a, b in spans]
+        out += [page.heading("Withheld spans"), page.table(["span", *COMPARED_SPAN], rows)]
+        spans = []
+    for span in spans:
         rows = [[page.solver(name), *span_row(e, span, start)] for name, e in errors.items()]
         out.append(page.heading(f"Withheld {span[0]:g} to {span[1]:g} s"))
         out.append(page.table(["solver", *COMPARED_SPAN], rows, best=range(1, 7)))
