@@ -118,7 +118,7 @@ def evaluate_recording(
     `Recording.without`; each span of GNSS is reported by itself.
     """
     gnss_spans = [span for source, span in withheld if source == "gnss"]
-    spans = [(recording.start + a, recording.start + b) for a, b in (s for s in gnss_spans if s is not None)]
+    spans = [span for span in gnss_spans if span is not None]
     found = truth_of(recording)
     if found is None and recording.truth is not None and recording.truth.closed_loop_sigma is not None:
         sigma = recording.truth.closed_loop_sigma
@@ -129,7 +129,8 @@ def evaluate_recording(
     if found is None:
         return None
     truth, lever_arm = found
-    return measure(errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap), trajectory.name, spans)
+    found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap)
+    return measure(found_errors, trajectory.name, spans, start=recording.start)
 
 
 def evaluate(

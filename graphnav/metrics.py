@@ -82,7 +82,7 @@ class Nees:
 class Span:
     """What happened in a span of time, such as an outage; drift is of the largest horizontal error."""
 
-    start: float  # s
+    start: float  # s, as it was asked for
     end: float  # s
     n: int
     distance: float  # m, travelled in it
@@ -141,8 +141,10 @@ COMPONENTS = {
 _NEES = {"p": "position", "e": "east", "n": "north", "up": "up", "v": "velocity", "rph": "attitude"}
 
 
-def measure(errors: Errors, name: str = "", spans: Sequence[tuple[float, float]] = ()) -> Metrics:
-    """Statistics of errors, over all epochs and in each of `spans` (start, end in s on the errors' clock)."""
+def measure(
+    errors: Errors, name: str = "", spans: Sequence[tuple[float, float]] = (), *, start: float = 0.0
+) -> Metrics:
+    """Statistics of errors, over all epochs and in each of `spans` (from, to in s after `start`)."""
     deg = np.rad2deg(errors.rph)
     series = {
         "e": errors.p[:, 0], "n": errors.p[:, 1], "up": errors.p[:, 2], "h": errors.horizontal,
@@ -162,7 +164,7 @@ def measure(errors: Errors, name: str = "", spans: Sequence[tuple[float, float]]
         distance=float(errors.distance[-1]) if len(errors) else 0.0,
         components={key: found for key, x in series.items() if (found := statistic(x)) is not None},
         nees={key: mean for key, (x, dof) in values.items() if (mean := average_nees(x, dof)) is not None},
-        spans=tuple(_span(errors, start, end) for start, end in spans),
+        spans=tuple(_span(errors, a, b, start) for a, b in spans),
         notes=errors.notes,
         errors=errors,
     )
@@ -219,8 +221,9 @@ def ensemble_nees(runs: Sequence[Errors], block: str = "p") -> tuple[Array, Arra
     )
 
 
-def _span(errors: Errors, start: float, end: float) -> Span:
-    inside = np.flatnonzero((errors.t >= start) & (errors.t <= end) & np.isfinite(errors.horizontal))
+def _span(errors: Errors, start: float, end: float, origin: float) -> Span:
+    t = errors.t - origin
+    inside = np.flatnonzero((t >= start) & (t <= end) & np.isfinite(errors.horizontal))
     if not len(inside):
         return Span(start, end, 0, *[math.nan] * 8)
     h, p, last = errors.horizontal[inside], errors.p[inside], inside[-1]

@@ -47,12 +47,7 @@ def errors(
     if lever_arm is not None and trajectory.rph is None:
         arm = float(np.linalg.norm(lever_arm))
         notes.append(f"the estimate has no attitude, so the lever arm of {arm:.2f} m to the truth's point is left out")
-    if (
-        lever_arm is not None
-        and trajectory.covariance is None
-        and trajectory.sd_p is not None
-        and trajectory.sd_rph is None
-    ):
+    elif lever_arm is not None and trajectory.covariance is None and trajectory.sd_rph is None:
         notes.append("the estimate has no attitude sigma, so the lever arm adds nothing to its position sigma")
     if trajectory.covariance is None and trajectory.sd_p is not None:
         notes.append("NEES from the sigmas alone: the estimate comes without correlations between axes")

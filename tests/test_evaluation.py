@@ -382,7 +382,9 @@ def test_withheld_fixes_are_the_truth_of_their_span() -> None:
     metrics = evaluation.evaluate_recording(estimate, recording, withheld=[("gnss", (20.05, 30.05))])
     assert metrics is not None
     assert metrics.n == 10
-    assert metrics.spans[0].max_h == pytest.approx(1.0, abs=1e-5)
+    span = metrics.spans[0]
+    assert (span.start, span.end, span.n) == (20.05, 30.05, 10)  # in seconds from the start, as given
+    assert span.max_h == pytest.approx(1.0, abs=1e-5)
     assert metrics.components["up"].max < 1e-5  # the lever arm was used
     assert any("no attitude sigma" in note for note in metrics.notes)
     assert metrics.nees["p"].mean == pytest.approx(1.0 / (0.1**2 + 0.02**2) / 3, rel=1e-4)

@@ -206,6 +206,29 @@ def test_rtklib_with_week_and_seconds_velocity_and_utc(tmp_path: Path) -> None:
     assert any("UTC" in note for note in found.notes)
 
 
+def test_rtklib_with_commas_is_the_same(tmp_path: Path) -> None:
+    (tmp_path / "a.pos").write_text(POS)
+    # RTKLIB leaves the space between date and time whatever separates the columns.
+    lines = [
+        ",".join(line.split()).replace(",", " ", 1) if line[0] != "%" else line.replace(" latitude", ",latitude")
+        for line in POS.splitlines()
+    ]
+    (tmp_path / "b.pos").write_text("\n".join(lines).replace("(deg) ", "(deg),").replace("(m) ", "(m),"))
+    a, b = read_trajectory(tmp_path / "a.pos"), read_trajectory(tmp_path / "b.pos")
+    np.testing.assert_array_equal(a.t, b.t)
+    np.testing.assert_array_equal(a.llh, b.llh)
+    np.testing.assert_array_equal(a.sd_p, b.sd_p)
+
+
+def test_rtklib_heights_above_the_sea_are_said_and_another_datum_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "a.pos"
+    file.write_text(POS.replace("WGS84/ellipsoidal", "WGS84/geodetic"))
+    assert any("mean sea level" in note for note in read_trajectory(file).notes)
+    file.write_text(POS.replace("WGS84/ellipsoidal", "Tokyo/ellipsoidal"))
+    with pytest.raises(RecordingError, match="out-datum=wgs84"):
+        read_trajectory(file)
+
+
 @pytest.mark.parametrize(
     ("titles", "reason"),
     [

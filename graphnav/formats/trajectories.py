@@ -9,7 +9,7 @@ KF-GINS .nav       11 columns: GNSS week, seconds of week, lat, lon (deg), heigh
                    order (the project's README, section 2), which are our roll, pitch and heading
 TUM                8 columns: t x y z qx qy qz qw, a local frame
 RTKLIB .pos        header lines with %, then date and time (or week and seconds), lat, lon, height, Q, ns,
-                   sdn, sde, sdu, ... (RTKLIB manual 2.4.2, appendix B.1)
+                   sdn, sde, sdu, ... (written by outsolheads and outsols of RTKLIB 2.4.3, solution.c)
 =================  ====================================================================================
 
 Files with a GNSS week give t in seconds of the week of their first row, running on past its end.
@@ -233,14 +233,16 @@ def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Traject
         raise RecordingError(
             f"{path}: an RTKLIB solution not in lat/lon/height degrees; write it again with out-solformat=llh"
         )
-    scale_name = titles.strip().lstrip("%").split()[0]
+    scale_name = re.split(r"[\s,]+", titles.strip().lstrip("% "))[0]
     separator = "," if "," in rows[0][1] else None
     columns = re.findall(r"[A-Za-z]+(?=\(|\s|$|,)", titles.strip().lstrip("%"))[1:]
     names = ["date", "time", *columns]
     notes = []
     if scale_name != "GPST":
         notes.append(f"{path.name}: times are in {scale_name}, not GPS time (18 s ahead of UTC since 2017)")
-    if "mean sea" in " ".join(head) or "geodetic" in " ".join(head):
+    if any("lat/lon/height=Tokyo" in line for line in head):
+        raise RecordingError(f"{path}: coordinates on the Tokyo datum; write it again with out-datum=wgs84")
+    if any("lat/lon/height=WGS84/geodetic" in line for line in head):
         notes.append(f"{path.name}: heights are above mean sea level, not above the ellipsoid")
     dated = "/" in rows[0][1].split(separator)[0]
     t, numeric = _rtklib_times(path, rows, separator) if dated else (None, rows)
@@ -269,7 +271,7 @@ def _rtklib_times(
     joint = separator or " "
     stamps, rest = [], []
     for number, line in rows:
-        date, _, tail = line.strip().partition(joint)
+        date, _, tail = line.strip().partition(" ")  # a space whatever the separator of the columns
         clock, _, tail = tail.strip().partition(joint)
         stamps.append(f"{date.replace('/', '-')}T{clock.strip()}")
         rest.append((number, f"0{joint}0{joint}{tail}"))
