@@ -34,7 +34,7 @@ nav a{color:inherit}
 table{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums}
 th,td{padding:4px 12px 4px 0;text-align:right;border-bottom:1px solid var(--edge);vertical-align:top}
 th:first-child,td:first-child{text-align:left;white-space:nowrap}
-.words{text-align:left!important;min-width:11em}
+.words{text-align:left!important;min-width:19em}
 .pairs td:first-child{white-space:normal;overflow-wrap:anywhere}
 .pairs td{overflow-wrap:anywhere}
 th{color:var(--soft);font-weight:600}
@@ -45,7 +45,8 @@ figure svg{display:block;width:100%;height:auto;max-width:680px}
 svg text{font-family:system-ui,"Segoe UI",Roboto,sans-serif!important}
 .verdict{border-left:4px solid var(--ink);background:var(--card);padding:8px 12px;border-radius:0 8px 8px 0}
 .verdict.good{border-color:var(--incremental)} .verdict.bad{border-color:var(--alert)}
-.swatch{display:inline-block;width:.8em;height:.8em;border-radius:2px;margin-right:.45em;vertical-align:-.05em}
+.solver{white-space:nowrap}
+.solver i{display:inline-block;width:.8em;height:.8em;border-radius:2px;margin-right:.45em;vertical-align:-.05em}
 details{margin:.6em 0} summary{cursor:pointer}
 code{font-size:.85rem;overflow-wrap:anywhere}
 @media print{h2{break-after:avoid} figure{break-inside:avoid}}
@@ -93,7 +94,7 @@ def measured(value: float, sigma: float) -> str:
 def solver(name: str) -> Raw:
     """A solver's name with its colour."""
     key = name if name in PALETTE else "other"
-    return Raw(f'<span class="swatch" style="background:var(--{key})"></span>{escape(name)}')
+    return Raw(f'<span class="solver"><i style="background:var(--{key})"></i>{escape(name)}</span>')
 
 
 def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int] = ()) -> Raw:

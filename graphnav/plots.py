@@ -249,7 +249,7 @@ def _histogram(
     expected = np.exp(special.xlogy(m / 2 - 1, x / 2) - x / 2 - special.gammaln(m / 2)) / 2
     # for one degree of freedom the density has no bound at 0, so the first bin's mean stands for it
     ceiling = 1.15 * max(density.max(), float(np.diff(special.gammainc(m / 2, edges / 2)).max() / edges[1]))
-    panel = Panel(figure, box, (0.0, float(edges[-1])), (0.0, ceiling), xlabel="NIS", yticks=2)
+    panel = Panel(figure, box, (0.0, float(edges[-1])), (0.0, ceiling), xlabel="NIS", yticks=3)
     steps = np.repeat(density, 2)
     panel.band(np.repeat(edges, 2)[1:-1], np.zeros(len(steps)), steps, look, label="histogram", alpha=0.45)
     panel.line(x, expected, "truth", label="chi-square", lw=1.2)
@@ -325,7 +325,7 @@ def _time_panel(
 ) -> Panel:
     last = k == len(boxes) - 1
     xlabel = "time [s]" if last else ""
-    return Panel(figure, box, xlim, ylim, xlabel=xlabel, ylabel=ylabel, xlabels=last, log=log, yticks=4)
+    return Panel(figure, box, xlim, ylim, xlabel=xlabel, ylabel=ylabel, xlabels=last, log=log, yticks=5)
 
 
 def _time_legend(figure: Figure, entries: list[tuple[str, str, str]], spans: Spans) -> None:

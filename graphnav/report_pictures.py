@@ -134,9 +134,10 @@ def record_pictures(solution: Solution, start: float, spans: list[tuple[float, f
             continue
         figure = plots.residuals(kind, record, start, solution.solver, spans=spans)
         words = f"{kind}: {record.kind}s over their sigma"
+        dof = record.residual.shape[1]
         caption = (
-            f"{words}, dashed at 3. NIS with the middle 99 % of the chi-square distribution with "
-            f"{record.residual.shape[1]} degrees of freedom, and its histogram beside the density."
+            f"{words}, dashed at 3. NIS with the middle 99 % of the chi-square distribution with {dof} "
+            f"degree{'s' if dof > 1 else ''} of freedom, and its histogram beside that density."
         )
         out.append(page.picture(svg(figure, words, f"r-{kind}"), caption))
     return out

@@ -35,7 +35,7 @@ class Consistency:
     @property
     def verdict(self) -> str:
         """One sentence: can sigma be believed?"""
-        if self.count - self.rejected < 10:
+        if self.count - self.rejected < 10 or not np.isfinite(self.mean_nis):
             return "too few to judge"
         ratio = self.mean_nis / self.dof
         if self.kind == "residual":
@@ -54,18 +54,19 @@ def consistency(record: ConstraintRecord) -> Consistency:
     """Summarise a record."""
     used = record.weight > 1e-9
     white = np.abs(record.residual[used] / record.sigma[used])
+    white = white[np.isfinite(white)]
     return Consistency(
         count=len(record.t),
         rejected=int(np.sum(~used)),
         reduced=int(np.sum(used & (record.weight < 0.5))),
-        mean_nis=float(np.nanmean(record.nis[used])) if used.any() else float("nan"),
+        mean_nis=_mean(record.nis[used]),
         dof=record.residual.shape[1],
-        outside=float(np.mean(white > 3.0)) if used.any() else float("nan"),
+        outside=_mean((white > 3.0).astype(float)),
         kind=record.kind,
     )
 
 
-CONSISTENCY_HEAD = ("used", "rejected", "weight < 0.5", "mean NIS", "of", "outside 3 sigma", "what it says")
+CONSISTENCY_HEAD = ("used", "rejected", "weight < 0.5", "mean NIS", "components", "outside 3 sigma", "what it says")
 
 
 def consistency_row(c: Consistency) -> list[Any]:
@@ -83,9 +84,9 @@ def constraint_table(solution: Solution) -> list[Raw]:
         kinds = {r.kind for r in solution.records.values()}
         note = "A Gaussian leaves 0.27 % outside 3 sigma. "
         if "innovation" in kinds:
-            note += "The mean NIS of honest innovations is the number of components (column 'of'). "
+            note += "The mean NIS of honest innovations is the number of components. "
         if "residual" in kinds:
-            note += "A fit takes up part of the noise, so the mean NIS of its residuals lies below that number."
+            note += "A fit takes up part of the noise: the mean NIS of its residuals lies below the components."
         out.append(page.paragraph(note, "soft"))
     if solution.counts:
         counted = page.and_list([f"{count} {kind}" for kind, count in solution.counts.items()])
@@ -294,7 +295,7 @@ def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Raw
     if not metrics:
         return []
     plain = {key: value for key, value in metrics.items() if key not in ("spans", "notes")}
-    inner = page.pairs({k: v if isinstance(v, float) else str(v) for k, v in page.flat(plain).items()})
+    inner = page.pairs({k: v if v is None or isinstance(v, float) else str(v) for k, v in page.flat(plain).items()})
     spans = metrics.get("spans")
     if isinstance(spans, Sequence) and spans and isinstance(spans[0], Mapping):
         inner = Raw(inner + page.table(list(spans[0]), [[s.get(k) for k in spans[0]] for s in spans]))

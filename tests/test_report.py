@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -233,6 +234,8 @@ def test_consistency_counts_and_judges():
     assert c.mean_nis == pytest.approx((white[used] ** 2).sum(1).mean(), rel=1e-12)
     assert c.outside == pytest.approx((np.abs(white[used]) > 3).mean(), rel=1e-12)
     assert "can be believed" in c.verdict
+    assert consistency(replace(record(), weight=np.zeros(COUNT))).verdict == "too few to judge"
+    assert consistency(replace(record(), nis=np.full(COUNT, np.nan))).verdict == "too few to judge"
     assert "overconfident" in consistency(record(2.0)).verdict
     assert "wider" in consistency(record(0.5)).verdict
     assert "within" in consistency(record(0.5, "residual")).verdict
@@ -351,6 +354,14 @@ def test_ticks_are_inside_and_told_apart(lo, hi):
     assert values.min() >= lo - 1e-9 * (hi - lo)
     assert values.max() <= hi + 1e-9 * (hi - lo)
     assert len(set(names)) == len(names)
+
+
+def test_labels_keep_their_digits_in_svg():
+    t = np.arange(50.0)
+    figure = plots.sigmas({"rts": plots.Series(t, np.geomspace(0.002, 0.008, 50)[:, None])}, ("east",), "m")
+    text = panels.svg(figure, "x")
+    assert ">0.005<" in text
+    assert ">0.00<" not in text
 
 
 def test_drawing_never_touches_pyplot():
