@@ -481,3 +481,12 @@ def test_the_oracle_drive_against_a_perturbed_copy(shared_data: Path, tmp_path: 
     assert metrics.nees["p"].low < metrics.nees["p"].mean < metrics.nees["p"].high
     assert metrics.components["up"].rms == pytest.approx(2.0, rel=4 / np.sqrt(2 * metrics.n))
     assert metrics.components["heading"].max < 1e-4  # written with 1e-7 deg, read back the same
+
+
+def test_a_recording_is_a_truth_with_its_lever_arm(shared_data: Path, tmp_path: Path) -> None:
+    folder = shared_data / "oracle_drive"
+    csv.write(evaluation.read_trajectory(folder / "truth.csv.gz"), tmp_path / "a.csv")
+    assert evaluation.evaluate(tmp_path / "a.csv", folder).components["3d"].max < 2e-5
+    metrics = evaluation.evaluate(tmp_path / "a.csv", shared_data / "openshoe_loops" / "run02.toml")
+    assert metrics.closure is not None
+    assert metrics.n == 0

@@ -253,8 +253,8 @@ def test_other_rtklib_solutions_are_refused_with_the_way_out(tmp_path: Path, tit
 
 def test_names_with_units_and_down_velocity(tmp_path: Path) -> None:
     file = tmp_path / "truth.csv.gz"
-    rows = "t_s,lat_deg,lon_deg,h_m,vn_mps,ve_mps,vd_mps,heading_deg,extra\n1,30,114,20,1,2,3,90,x\n".replace("x", "7")
-    file.write_bytes(gzip.compress(rows.replace("e7tra", "extra").encode()))
+    rows = "t_s,lat_deg,lon_deg,h_m,vn_mps,ve_mps,vd_mps,heading_deg,quality\n1,30,114,20,1,2,3,90,fixed\n"
+    file.write_bytes(gzip.compress(rows.encode()))
     found = read_trajectory(file)
     np.testing.assert_allclose(found.v, [[2.0, 1.0, -3.0]])
     assert found.rph[0, 2] == pytest.approx(np.pi / 2)
@@ -276,6 +276,7 @@ def test_local_truth_in_two_dimensions(tmp_path: Path) -> None:
         ("t,lat,lon,h\n", "no rows"),
         ("t,lat,lon\n0,1,2\n", "no column 'h'"),
         ("t,lat,lon,h\n0,30,114,20\n1,30,abc,20\n", "line 3, lon: 'abc'"),
+        ("t,lat,lon,h,word\n0,30,114,20,a\n1,30,114,20,b,5\n", "line 3: 6 fields where 5"),
         ("t,lat,lon,h\n0,30,114,20\n1,30,114\n", "line 3: 3 fields where 4"),
         ("t,lat,lon,h\n5,30,114,20\n4,30,114,20\n", r"line 3, t: 4\.0+ comes after 5"),
         ("t,lat,lon,h\n0,114,30,20\n", "line 2, lat: 114"),

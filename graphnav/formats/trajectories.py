@@ -34,6 +34,8 @@ _UNITS = {"t": "s", "lat": "deg", "lon": "deg", "h": "m", "x": "m", "y": "m", "z
     ("ve", "vn", "vu", "vd"), "mps"
 )
 _UNITS |= dict.fromkeys(("roll", "pitch", "heading"), "deg")
+_SIGMAS = "sd_e sd_n sd_u sd_ve sd_vn sd_vu sd_roll sd_pitch sd_heading"
+_KNOWN = {*_UNITS, *_SIGMAS.split(), *"bgx bgy bgz bax bay baz".split()}  # read; others may hold anything
 _GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 
 
@@ -84,28 +86,40 @@ def _lines(path: Path) -> list[str]:
         raise RecordingError(f"{path}: not a text file (it is not UTF-8)") from None
 
 
-def _table(path: Path, rows: list[tuple[int, str]], names: list[str], delimiter: str | None) -> Array:
-    """Numbers (K, n) of text rows; a blank is NaN. Errors name the line and the column."""
+def _table(
+    path: Path, rows: list[tuple[int, str]], names: list[str], delimiter: str | None, wanted: set[str] | None = None
+) -> Array:
+    """Numbers (K, n) of text rows, NaN for a blank and in columns not `wanted`, which may hold words.
+
+    Errors name the line and the column.
+    """
     lines = [line for _, line in rows]
-    if delimiter == ",":
+    use = [k for k, name in enumerate(names) if wanted is None or name in wanted]
+    whole = delimiter is None or all(line.count(delimiter) == len(names) - 1 for line in lines)
+    if delimiter == "," and whole:
         lines = [
             _fill(line) if ",," in line or line.rstrip()[-1:] == "," or line[:1] == "," else line for line in lines
         ]
     try:
-        table = np.loadtxt(lines, delimiter=delimiter, ndmin=2, comments=None)
-        if table.shape[1] == len(names):
-            return table
+        if whole:
+            loaded = np.loadtxt(lines, delimiter=delimiter, ndmin=2, comments=None, usecols=use if wanted else None)
+            if loaded.shape[1] == len(use):
+                table = np.full((len(rows), len(names)), np.nan)
+                table[:, use] = loaded
+                return table
     except ValueError:
         pass
     for number, line in rows:  # only to say where; the fast reader does not
         fields = line.split(delimiter)
         if len(fields) != len(names):
             raise RecordingError(f"{path}, line {number}: {len(fields)} fields where {len(names)} were expected")
-        for name, text in zip(names, fields, strict=True):
+        for k in use:
             try:
-                float(text or "nan")
+                float(fields[k].strip() or "nan")
             except ValueError:
-                raise RecordingError(f"{path}, line {number}, {name}: '{text.strip()}' is not a number") from None
+                raise RecordingError(
+                    f"{path}, line {number}, {names[k]}: '{fields[k].strip()}' is not a number"
+                ) from None
     raise RecordingError(f"{path}: cannot be read as a table of numbers")
 
 
@@ -172,7 +186,8 @@ def _csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     needed = ("t", "x", "y") if local else ("t", "lat", "lon", "h")
     if missing := [name for name in needed if name not in columns]:
         raise RecordingError(f"{path}, line 1: no column '{missing[0]}'; found {', '.join(names)}")
-    table = _table(path, rows, names, ",")
+    wanted = {names[k] for name, k in columns.items() if name in _KNOWN}
+    table = _table(path, rows, names, ",", wanted)
 
     def take(*wanted: str, scale: float = 1.0) -> Array | None:
         if not any(name in columns for name in wanted):
