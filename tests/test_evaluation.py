@@ -490,3 +490,50 @@ def test_a_recording_is_a_truth_with_its_lever_arm(shared_data: Path, tmp_path: 
     metrics = evaluation.evaluate(tmp_path / "a.csv", shared_data / "openshoe_loops" / "run02.toml")
     assert metrics.closure is not None
     assert metrics.n == 0
+
+
+def test_covariance_at_the_end_of_a_lever_arm_follows_small_changes_of_the_state() -> None:
+    t = np.array([9.9, 10.0, 10.1])
+    base = circle(t)
+    base = replace(base, rph=base.rph + np.array([0.2, -0.3, 0.0]))
+    arm = np.array([2.0, 1.0, 0.5])
+    R = rotation.from_rph(base.rph)
+
+    def at_point(d: np.ndarray) -> np.ndarray:
+        """(p, v, rph) of the arm's end with the state changed by d; an attitude error keeps its axis in space."""
+        turned = rotation.from_rph(base.rph[1] + d[6:]) @ R[1].T @ R
+        llh = FRAME.to_llh(FRAME.from_llh(base.llh) + d[:3])
+        out, _ = interpolate(
+            replace(base, llh=llh, v=base.v + d[3:6], rph=rotation.to_rph(turned)), t[1:2], lever_arm=arm
+        )
+        return np.concatenate([FRAME.from_llh(out.llh[0]), out.v[0], out.rph[0]])
+
+    step = 1e-4
+    A = np.column_stack([(at_point(step * e) - at_point(-step * e)) / (2 * step) for e in np.eye(9)])
+    root = np.random.default_rng(8).normal(size=(9, 9)) * np.array([0.1] * 3 + [0.02] * 3 + [0.01] * 3)[:, None]
+    cov = root @ root.T
+    at, _ = interpolate(replace(base, covariance=np.tile(cov, (3, 1, 1))), t[1:2], lever_arm=arm)
+    expected = A @ cov @ A.T
+    sd = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(at.covariance[0] / np.outer(sd, sd), expected / np.outer(sd, sd), atol=2e-4)
+
+
+def test_an_estimate_in_a_local_frame_brings_velocity_and_covariance_along() -> None:
+    truth = circle(np.arange(0.0, 40.0, 0.1))
+    yaw = 2.0
+    R_nm = rotation.exp(np.array([0.0, 0.0, yaw]))
+    p, v = FRAME.from_llh(truth.llh), truth.v
+    cov = np.tile(np.diag([4.0, 1.0, 9.0, 0.4, 0.1, 0.9, 1e-4, 1e-4, 1e-4]), (len(truth), 1, 1))
+    local = Trajectory(truth.t, p @ R_nm, v=v @ R_nm, covariance=cov, frame="local", name="room")
+    found = evaluation.errors(local, truth)
+    np.testing.assert_allclose(found.v, 0.0, atol=2e-4)  # 100 m turn the local level by 2e-5 rad
+    c, s = np.cos(yaw) ** 2, np.sin(yaw) ** 2
+    np.testing.assert_allclose(found.sd_p[0], np.sqrt([4 * c + s, 4 * s + c, 9.0]), rtol=1e-4)
+    np.testing.assert_allclose(found.sd_v[0], np.sqrt([0.4 * c + 0.1 * s, 0.4 * s + 0.1 * c, 0.9]), rtol=1e-4)
+
+
+def test_no_direction_of_travel_is_taken_across_a_gap() -> None:
+    t = np.concatenate([np.arange(0.0, 10.0, 0.1), np.arange(20.0, 30.0, 0.1)])
+    bare = replace(circle(t), v=None, rph=None)
+    track = evaluation.errors(moved(circle(t), np.array([1.0, 0.0, 0.0])), bare).track
+    assert np.flatnonzero(np.isnan(track[:, 0])).tolist() == [99, 100]

@@ -314,3 +314,13 @@ def test_repeated_stamps_and_rows_without_position_are_left_out_and_counted(tmp_
     np.testing.assert_allclose(found.llh[:, 2], [20, 23])
     assert any(note.startswith("a.csv: 1 rows without") for note in found.notes)
     assert any(note.startswith("a.csv: 1 rows that repeat") for note in found.notes)
+
+
+def test_tum_attitude_is_in_the_frame_of_the_positions(tmp_path: Path) -> None:
+    """A level body 100 km east of the start is not level in the start's frame; its up axis must say so."""
+    llh = np.array([[0.0, 0.0, 0.0], [0.0, 100e3 / 6378137.0, 0.0]])
+    tum.write(Trajectory(np.array([0.0, 1.0]), llh, rph=np.zeros((2, 3))), tmp_path / "a.tum")
+    q = np.loadtxt(tmp_path / "a.tum")[1, 4:]
+    up = rotation.from_quaternion(q[[3, 0, 1, 2]])[:, 2]
+    angle = 100e3 / 6378137.0  # along the equator
+    np.testing.assert_allclose(up, [np.sin(angle), 0.0, np.cos(angle)], atol=1e-9)

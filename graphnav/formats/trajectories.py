@@ -35,7 +35,7 @@ _UNITS = {"t": "s", "lat": "deg", "lon": "deg", "h": "m", "x": "m", "y": "m", "z
 )
 _UNITS |= dict.fromkeys(("roll", "pitch", "heading"), "deg")
 _SIGMAS = "sd_e sd_n sd_u sd_ve sd_vn sd_vu sd_roll sd_pitch sd_heading"
-_KNOWN = {*_UNITS, *_SIGMAS.split(), *"bgx bgy bgz bax bay baz".split()}  # read; others may hold anything
+_KNOWN = {*_UNITS, *_SIGMAS.split(), *["bgx", "bgy", "bgz", "bax", "bay", "baz"]}  # read; others may hold anything
 _GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 
 
