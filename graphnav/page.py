@@ -34,7 +34,8 @@ nav a{color:inherit}
 table{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums}
 th,td{padding:4px 12px 4px 0;text-align:right;border-bottom:1px solid var(--edge);vertical-align:top}
 th:first-child,td:first-child{text-align:left;white-space:nowrap}
-.words{text-align:left!important;min-width:19em}
+.words{text-align:left!important}
+.words.long{min-width:19em}
 .pairs td:first-child{white-space:normal;overflow-wrap:anywhere}
 .pairs td{overflow-wrap:anywhere}
 th{color:var(--soft);font-weight:600}
@@ -108,15 +109,21 @@ def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int
     for row in rows:
         cells = []
         for k, value in enumerate(row):
-            kind = ' class="words"' if k and isinstance(value, str) and not isinstance(value, Raw) else ""
+            kind = _words(value) if k else ""
             if k in least and value == least[k]:
                 kind = ' class="best"'
             cells.append(f"<td{kind}>{text(value)}</td>")
         body.append(f"<tr>{''.join(cells)}</tr>")
-    wordy = [k and any(isinstance(r[k], str) and not isinstance(r[k], Raw) for r in rows) for k in range(len(head))]
-    marks = [' class="words"' if w else "" for w in wordy]
+    marks = [max((_words(row[k]) for row in rows), default="", key=len) if k else "" for k in range(len(head))]
     heads = "".join(f'<th scope="col"{mark}>{text(h)}</th>' for h, mark in zip(head, marks, strict=True))
     return Raw(f'<div class="wide"><table><thead><tr>{heads}</tr></thead><tbody>{"".join(body)}</tbody></table></div>')
+
+
+def _words(value: Any) -> str:
+    """The class attribute of a cell of words, wider for a sentence."""
+    if not isinstance(value, str) or isinstance(value, Raw):
+        return ""
+    return ' class="words long"' if len(value) > 24 else ' class="words"'
 
 
 def pairs(values: Mapping[str, Any]) -> Raw:

@@ -89,12 +89,16 @@ def trajectory(
         entries.append(("withheld", "withheld", "band"))
     if tracks:
         _, en = next(iter(tracks.values()))
-        for row, marker, words in ((0, "^", "start"), (-1, "s", "end")):
+        few = max(1, len(en) // 30)
+        for row, inner, marker, words in ((0, few, "^", "start"), (-1, -1 - few, "s", "end")):
             panel.marks(en[[row], 0], en[[row], 1], "truth", marker, label=words, size=6.5)
-            x = LEFT + (en[row, 0] - panel.xlim[0]) / scale
-            y = BOTTOM + (en[row, 1] - panel.ylim[0]) / scale
-            side = -1 if x > LEFT + 0.85 * w else 1
-            panel.text(x + 6 * side, y + 3, words, name="truth", ha="left" if side > 0 else "right")
+            # the words go to the side where the track does not
+            away = en[row] - en[min(inner, len(en) - 1) if inner > 0 else max(inner, -len(en))]
+            x, y = (en[row] - (panel.xlim[0], panel.ylim[0])) / scale
+            right = x < 0.1 * w or (away[0] >= 0 and x < 0.88 * w)
+            down = y > 0.05 * h and away[1] < 0
+            at = (LEFT + x + (6 if right else -6), BOTTOM + y + (-11 if down else 4))
+            panel.text(*at, words, name="truth", ha="left" if right else "right")
     _scale_bar(panel, scale, w)
     legend(figure, entries, h + BOTTOM + 7, LEFT)
     return figure

@@ -122,7 +122,7 @@ def what_was_done(recording: Recording, solutions: Mapping[str, Solution], withh
         listed = [f"{source} {span[0]:g} to {span[1]:g} s" if span else f"all of {source}" for source, span in withheld]
         words += f" Withheld: {page.and_list(listed)} (seconds from the start)."
     if not several and solution.stopped:
-        words += f" It stopped because {solution.stopped.rstrip('.')}."
+        words += f" How it ended: {solution.stopped.rstrip('.')}."
     return words
 
 
@@ -206,7 +206,8 @@ def accuracy_row(errors: Errors) -> list[float]:
 
 def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[float]:
     """The numbers under `COMPARED_SPAN`, over a span in seconds from the recording's start."""
-    rows = np.flatnonzero((errors.t >= start + span[0]) & (errors.t <= start + span[1]))
+    t = errors.t - start
+    rows = np.flatnonzero((t >= span[0]) & (t <= span[1]))
     rows = rows[np.isfinite(errors.horizontal[rows])]
     if not len(rows):
         return [float("nan")] * len(COMPARED_SPAN)
@@ -257,8 +258,8 @@ def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Raw]:
     rows = [
         [
             name if p.value.shape[1] == 1 else f"{name} [{k}]",
-            page.Raw(page.measured(float(p.value[-1, k]), float(p.sigma[-1, k]))),
-            float(p.sigma[-1, k]),
+            Raw(page.measured(float(p.value[-1, k]), float(p.sigma[-1, k]))),
+            Raw(page.measured(float(p.sigma[-1, k]), float(p.sigma[-1, k]))),
             float(p.prior_sigma[k]),
             p.unit or "-",
             len(p.t),
