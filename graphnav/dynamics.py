@@ -13,138 +13,166 @@ with G = g(p) + omega x (omega x p), and the Coriolis force is gone. Over an int
     v_j = E^T ((v_i + omega x p_i) + int E G + R_i dV) - omega x p_j
 
 E is integrated in closed form and G, which changes only with position, linearly: exact to a millimetre
-in ten minutes of free inertial. The residual is
+in ten minutes of free inertial. Constant scale errors s of the sensors act like biases b + s * mean
+rate (or force) of the interval, which is how they are estimated.
 
-    r_theta = Log(dR^T R_i^T E R_j)          r_ba = ba_j - ba_i
-    r_p = R_i^T (E p_j - ...) - dP           r_bg = bg_j - bg_i
-    r_v = R_i^T (E (v_j + omega x p_j) - ...) - dV
-
-in the frames of `Intervals.covariance`, so that its weight does not depend on the states. The filter
-predicts with, and the smoothers linearise, this one function.
+The residual of an interval is the end state minus this prediction. Its covariance is known in the frames
+of `Intervals.covariance`; there it does not depend on the states. Filter and smoothers use the one
+transition matrix F = d(end)/d(start) below.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from graphnav import earth, rotation
 from graphnav.earth import LocalFrame
 from graphnav.preintegration import Intervals
+from graphnav.recording import ImuNoise
 from graphnav.rotation import Array, mv
-from graphnav.state import DIM, States
+from graphnav.state import DIM, Parameter, States
+
+SCALE = "imu_scale"
+_I3 = np.eye(3)
 
 
-@dataclass(frozen=True)
-class _EarthTerms:
-    """E, the integrals of E G and their derivatives, per interval."""
-
-    E: Array  # (n, 3, 3)
-    gv: Array  # (n, 3) m/s
-    gp: Array  # (n, 3) m
-    gradient: Array  # (n, 3, 3) dG/dp, 1/s^2
-    omega: Array  # (3,)
+def scale_parameter(noise: ImuNoise) -> tuple[Parameter, ...]:
+    """The six scale errors (gyro x y z, accelerometer x y z), where the noise figures leave them open."""
+    if noise.gyro_scale_sigma <= 0 and noise.accel_scale_sigma <= 0:
+        return ()
+    sigma = np.repeat([max(noise.gyro_scale_sigma, 1e-9), max(noise.accel_scale_sigma, 1e-9)], 3)
+    return (Parameter(SCALE, np.zeros(6), sigma, "1"),)
 
 
-class EarthMotion:
-    """The Earth's part for fixed interval lengths: rotations are computed once, gravity where asked."""
+class Motion:
+    """Prediction over preintegrated intervals in a local frame; what does not depend on states is done once."""
 
-    def __init__(self, frame: LocalFrame, T: Array) -> None:
-        self.frame = frame
-        self.omega = frame.omega_n
+    def __init__(self, intervals: Intervals, frame: LocalFrame) -> None:
+        self.intervals, self.frame = intervals, frame
+        T = intervals.T[:, None]
+        h = T[..., None]
+        omega = frame.omega_n
+        W = rotation.skew(omega)
+        self.W, self.W2 = W, W @ W
+        E = rotation.exp(omega * T)
+        gamma1, gamma2 = rotation.integrals(omega * T)
+        self.back = np.swapaxes(E, -1, -2)
+        self.first, self.second = gamma1 * h, gamma2 * h * h  # int E, iint E
+        # Newtonian gradient of gravity, -(g/r)(I - 3 u u^T): small, but it is what makes long outages honest
+        g = frame.gravity_n(np.zeros(3))
+        size = float(np.linalg.norm(g))
+        up = -g / size
+        self.gradient = -size / earth.A * (_I3 - 3.0 * np.outer(up, up))
+        n = len(intervals)
+        self.post = np.zeros((n, 6, 6))  # from (E p, E u) to (p, v)
+        self.post[:, :3, :3] = self.post[:, 3:, 3:] = self.back
+        self.post[:, 3:, :3] = -W @ self.back
+        inner = np.zeros((n, 6, 6))
+        inner[:, :3, :3] = _I3 + h * W + 0.5 * h * h * (self.gradient + self.W2)
+        inner[:, :3, 3:] = h * (_I3 + h * h / 6.0 * self.gradient)
+        inner[:, 3:, :3] = W + h * (self.gradient + self.W2)
+        inner[:, 3:, 3:] = _I3 + 0.5 * h * h * self.gradient
+        self.inner = self.post @ inner
         self.T = T
-        self.E = rotation.exp(self.omega * T[:, None])
-        self.gamma1, self.gamma2 = rotation.integrals(self.omega * T[:, None])
-        self.W = rotation.skew(self.omega)
-        self.W2 = self.W @ self.W
+        # d(dP, dV) / d(ba, bg), (n, 6, 6)
+        self.bias = np.block([[intervals.p_ba, intervals.p_bg], [intervals.v_ba, intervals.v_bg]])
 
-    def terms(self, rows: slice, states: States) -> _EarthTerms:
-        """For intervals `rows` that start at `states`."""
-        T = self.T[rows, None]
-        g = self.frame.gravity_n(states.p)
-        # Newtonian gradient, -(g/r)(I - 3 u u^T): a small term that makes long outages honest (Schuler)
-        size = np.linalg.norm(g, axis=-1)[:, None, None]
-        up = -g[..., None] / size
-        gradient = -size / earth.A * (np.eye(3) - 3.0 * up @ np.swapaxes(up, -1, -2))
-        G = g + states.p @ self.W2.T
-        change = mv(gradient, states.v * T)
-        gv = mv(self.gamma1[rows], G) * T + 0.5 * change * T
-        gp = mv(self.gamma2[rows], G) * T * T + change * T * T / 6.0
-        return _EarthTerms(self.E[rows], gv, gp, gradient, self.omega)
+    def propagate(self, rows: slice, start: States, scale: Array | None = None) -> tuple[States, Array]:
+        """The states at the ends of intervals `rows` and F (n, 15, 15) there, from the states at their starts.
+
+        `scale` is (6,) or None.
+        """
+        iv, T, R = self.intervals, self.T[rows], start.R_nb
+        delta = np.concatenate([start.ba - iv.ba[rows], start.bg - iv.bg[rows]], -1)
+        if scale is not None:
+            delta = delta + np.concatenate([scale[3:] * iv.force[rows], scale[:3] * iv.rate[rows]], -1)
+        turn = mv(iv.theta_bg[rows], delta[:, 3:])
+        dR = iv.dR[rows] @ rotation.exp(turn)
+        moved = mv(self.bias[rows], delta)
+        dP, dV = iv.dP[rows] + moved[:, :3], iv.dV[rows] + moved[:, 3:]
+
+        back, W = self.back[rows], self.W
+        G = self.frame.gravity_n(start.p) + start.p @ self.W2.T
+        change = start.v @ self.gradient * T
+        rate = start.v + start.p @ W.T
+        p = mv(back, start.p + rate * T + mv(self.second[rows], G) + change * (T * T / 6.0) + mv(R, dP))
+        v = mv(back, rate + mv(self.first[rows], G) + change * (0.5 * T) + mv(R, dV)) - p @ W.T
+        end = States(back @ R @ dR, p, v, start.ba, start.bg)
+
+        n = len(T)
+        F = np.zeros((n, DIM, DIM))
+        F[:, 0:3, 0:3] = np.swapaxes(dR, -1, -2)
+        # right_jacobian(turn) is I - [turn]x/2 for the small turns this is used for
+        F[:, 0:3, 12:15] = (_I3 - 0.5 * rotation.skew(turn)) @ iv.theta_bg[rows]
+        F[:, 3:9, 3:9] = self.inner[rows]
+        across = np.empty((n, 6, 9))  # (p, v) from (theta, ba, bg), before the Earth turns it
+        across[:, :3, :3] = -rotation.skew(dP)
+        across[:, 3:, :3] = -rotation.skew(dV)
+        across[:, :, 3:] = self.bias[rows]
+        turned = (R[:, None] @ across.reshape(n, 2, 3, 9)).reshape(n, 6, 9)
+        turned = self.post[rows] @ turned
+        F[:, 3:9, 0:3], F[:, 3:9, 9:15] = turned[..., :3], turned[..., 3:]
+        F[:, 9:15, 9:15] = _I6
+        return end, F
+
+    def scale_columns(self, rows: slice, F: Array) -> Array:
+        """d(end) / d(scale), (n, 15, 6): the bias columns of F times what the scale multiplies."""
+        iv = self.intervals
+        out = np.zeros((len(F), DIM, 6))
+        out[:, :9, :3] = F[:, :9, 12:15] * iv.rate[rows][:, None]
+        out[:, :9, 3:] = F[:, :9, 9:12] * iv.force[rows][:, None]
+        return out
+
+    def frames(self, rows: slice, R_nb: Array) -> Array:
+        """(n, 15, 15) from the frames of `Intervals.covariance` to the error state at the end."""
+        n = len(R_nb)
+        L = np.zeros((n, DIM, DIM))
+        L[:, 0:3, 0:3] = _I3
+        L[:, 3:9, 3:9] = (self.post[rows].reshape(n, 6, 2, 3) @ R_nb[:, None]).reshape(n, 6, 6)
+        L[:, 9:15, 9:15] = _I6
+        return L
+
+    def noise(self, rows: slice, R_nb: Array) -> Array:
+        """Q (n, 15, 15), covariance of the end's error state, for starts with attitudes R_nb."""
+        L = self.frames(rows, R_nb)
+        return L @ self.intervals.covariance[rows] @ np.swapaxes(L, -1, -2)
+
+    def residual(self, states: States, scale: Array | None = None) -> Array:
+        """(n, 15) end minus prediction for all intervals, in the frames of `Intervals.covariance`."""
+        ahead, _ = self.propagate(slice(None), states[:-1], scale)
+        return self._body(states[1:].minus(ahead), states.R_nb[:-1])
+
+    def linearize(self, states: States, scale: Array | None = None) -> tuple[Array, Array, Array, Array]:
+        """`residual` of all intervals, its Jacobians by both ends (n, 15, 15) and by the scale (n, 15, 6)."""
+        rows, start = slice(None), states[:-1]
+        ahead, F = self.propagate(rows, start, scale)
+        r = states[1:].minus(ahead)
+        r_theta = r[:, :3]
+        inverse = rotation.right_jacobian_inverse(r_theta)
+        S = self.scale_columns(rows, F)
+        both = -np.concatenate([F, S], -1)
+        both[:, :3] = inverse @ rotation.exp(-r_theta) @ both[:, :3]
+        Jj = np.zeros_like(F)
+        Jj[:] = np.eye(DIM)
+        Jj[:, :3, :3] = inverse
+        value = self._body(r, start.R_nb)
+        both, Jj = self._body_rows(both, start.R_nb), self._body_rows(Jj, start.R_nb)
+        # the frame of p and v turns with the start's attitude
+        both[:, 3:6, :3] += rotation.skew(value[:, 3:6])
+        both[:, 6:9, :3] += rotation.skew(value[:, 6:9])
+        return value, both[:, :, :DIM], Jj, both[:, :, DIM:]
+
+    def _body_rows(self, J: Array, R_nb: Array) -> Array:
+        """Turn the p and v rows of (n, 15, k) back into the start's body axes: inverse of `frames`."""
+        Et = np.swapaxes(self.back, -1, -2)
+        Rt = np.swapaxes(R_nb, -1, -2) @ Et
+        out = J.copy()
+        out[:, 3:6] = Rt @ J[:, 3:6]
+        out[:, 6:9] = Rt @ (J[:, 6:9] + self.W @ J[:, 3:6])
+        return out
+
+    def _body(self, r: Array, R_nb: Array) -> Array:
+        return self._body_rows(r[..., None], R_nb)[..., 0]
 
 
-def predict(intervals: Intervals, rows: slice, start: States, motion: EarthMotion) -> States:
-    """The states at the ends of intervals from those at their starts."""
-    iv, e = intervals[rows], motion.terms(rows, start)
-    T = iv.T[:, None]
-    dR, dV, dP, _ = iv.corrected(start.ba, start.bg)
-    back = np.swapaxes(e.E, -1, -2)
-    rate = start.v + start.p @ motion.W.T
-    p = mv(back, start.p + rate * T + e.gp + mv(start.R_nb, dP))
-    v = mv(back, rate + e.gv + mv(start.R_nb, dV)) - p @ motion.W.T
-    return States(back @ start.R_nb @ dR, p, v, start.ba, start.bg)
-
-
-def linearize(
-    intervals: Intervals, rows: slice, start: States, end: States, motion: EarthMotion
-) -> tuple[Array, Array, Array]:
-    """Residual (n, 15) and its Jacobians (n, 15, 15) with respect to the states at both ends."""
-    iv, e = intervals[rows], motion.terms(rows, start)
-    n, T = len(iv), iv.T[:, None]
-    Rt = np.swapaxes(start.R_nb, -1, -2)
-    RtE = Rt @ e.E
-    seen = RtE @ end.R_nb  # R_i^T E R_j
-    value, a, b, turn = _residual(iv, e, start, end, motion, seen)
-    r_theta = value[:, :3]
-    Ji, Jj = np.zeros((n, DIM, DIM)), np.zeros((n, DIM, DIM))
-    th, p, v, ba, bg = (slice(3 * k, 3 * k + 3) for k in range(5))
-    inverse = rotation.right_jacobian_inverse(r_theta)
-    h = T[..., None]
-    Ji[:, th, th] = -inverse @ np.swapaxes(seen, -1, -2)
-    Ji[:, th, bg] = -inverse @ rotation.exp(-r_theta) @ rotation.right_jacobian(turn) @ iv.theta_bg
-    Jj[:, th, th] = inverse
-    Ji[:, p, th] = rotation.skew(b)
-    Ji[:, p, p] = -Rt @ (np.eye(3) + h * motion.W + 0.5 * h * h * (e.gradient + motion.W2))
-    Ji[:, p, v] = -h * Rt @ (np.eye(3) + h * h / 6.0 * e.gradient)
-    Ji[:, p, ba], Ji[:, p, bg] = -iv.p_ba, -iv.p_bg
-    Jj[:, p, p] = RtE
-    Ji[:, v, th] = rotation.skew(a)
-    Ji[:, v, p] = -Rt @ (motion.W + h * (e.gradient + motion.W2))
-    Ji[:, v, v] = -Rt @ (np.eye(3) + 0.5 * h * h * e.gradient)
-    Ji[:, v, ba], Ji[:, v, bg] = -iv.v_ba, -iv.v_bg
-    Jj[:, v, p], Jj[:, v, v] = RtE @ motion.W, RtE
-    for k in (ba, bg):
-        Ji[:, k, k], Jj[:, k, k] = -np.eye(3), np.eye(3)
-    return value, Ji, Jj
-
-
-def residual(intervals: Intervals, start: States, end: States, motion: EarthMotion) -> Array:
-    """Only the residual (n, 15) of `linearize`, for all intervals."""
-    e = motion.terms(slice(None), start)
-    seen = np.swapaxes(start.R_nb, -1, -2) @ e.E @ end.R_nb
-    return _residual(intervals, e, start, end, motion, seen)[0]
-
-
-def _residual(
-    iv: Intervals, e: _EarthTerms, start: States, end: States, motion: EarthMotion, seen: Array
-) -> tuple[Array, Array, Array, Array]:
-    """The residual, the measured-like velocity and position steps in it, and the bias turn of dR."""
-    T = iv.T[:, None]
-    dR, dV, dP, turn = iv.corrected(start.ba, start.bg)
-    Rt = np.swapaxes(start.R_nb, -1, -2)
-    rate = start.v + start.p @ motion.W.T
-    a = mv(Rt, mv(e.E, end.v + end.p @ motion.W.T) - rate - e.gv)
-    b = mv(Rt, mv(e.E, end.p) - start.p - rate * T - e.gp)
-    r_theta = rotation.log(np.swapaxes(dR, -1, -2) @ seen)
-    value = np.concatenate([r_theta, b - dP, a - dV, end.ba - start.ba, end.bg - start.bg], -1)
-    return value, a, b, turn
-
-
-def transition(
-    intervals: Intervals, rows: slice, start: States, end: States, motion: EarthMotion
-) -> tuple[Array, Array]:
-    """F and Q (n, 15, 15) with d_j = F d_i + noise, from the same linearisation."""
-    _, Ji, Jj = linearize(intervals, rows, start, end, motion)
-    inverse = np.linalg.inv(Jj)
-    return -inverse @ Ji, inverse @ intervals.covariance[rows] @ np.swapaxes(inverse, -1, -2)
+_I6 = np.eye(6)

@@ -61,6 +61,8 @@ class Intervals:
     p_bg: Array  # (n, 3, 3) m s
     ba: Array  # (n, 3) the biases they were computed with
     bg: Array  # (n, 3)
+    rate: Array  # (n, 3) mean rate and force less those biases: what scale errors multiply
+    force: Array  # (n, 3)
     covariance: Array  # (n, 15, 15)
 
     def __len__(self) -> int:
@@ -282,6 +284,10 @@ def _integrate(
     PB = summed(0.5 * h * (B[:, :-1] + B[:, 1:]))  # dP / d bg
 
     T = dt.sum(1)
+
+    def mean(x: Array) -> Array:
+        return np.einsum("nl,nli->ni", dt, x) / T[:, None]
+
     edge = summed(dt)
     left = T[:, None] - edge  # time left at each edge
     a_edge = V[:, -1:] - V
@@ -297,7 +303,7 @@ def _integrate(
     theta_bg = np.swapaxes(dR, -1, -2) @ A[:, -1]
     return Intervals(
         t[rows], t[rows + 1], dR, V[:, -1], P[:, -1], theta_bg, A[:, -1], B[:, -1], PA[:, -1], PB[:, -1],
-        np.array(ba), np.array(bg), Q,
+        np.array(ba), np.array(bg), mean(w), mean(f), Q,
     )  # fmt: skip
 
 

@@ -8,14 +8,14 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints import registered
-from graphnav.constraints.base import SAME_TIME, Constraint, Parameter, Scene
+from graphnav.constraints.base import SAME_TIME, Constraint, Scene
 from graphnav.constraints.prior import InitialPrior
-from graphnav.dynamics import EarthMotion
+from graphnav.dynamics import Motion, scale_parameter
 from graphnav.earth import LocalFrame
 from graphnav.preintegration import Intervals, Samples, bridge_gaps, preintegrate
 from graphnav.recording import Recording
 from graphnav.rotation import Array
-from graphnav.state import DIM, States
+from graphnav.state import DIM, Parameter, States
 
 NODE_SPACING = 30.0  # s between the nodes of a slowly moving parameter
 
@@ -45,7 +45,7 @@ class Problem:
     t: Array  # (K,) keyframe times, s
     samples: Samples
     intervals: Intervals
-    motion: EarthMotion
+    motion: Motion
     prior: InitialPrior
     constraints: tuple[Constraint, ...]
     chains: tuple[ParameterChain, ...] = ()
@@ -63,7 +63,8 @@ class Problem:
 
     def reintegrated(self, ba: Array, bg: Array) -> Problem:
         """The same problem with its intervals integrated anew about better biases, (K-1, 3) each."""
-        return replace(self, intervals=preintegrate(self.samples, self.recording.imu, self.t, ba, bg))
+        intervals = preintegrate(self.samples, self.recording.imu, self.t, ba, bg)
+        return replace(self, intervals=intervals, motion=Motion(intervals, self.frame))
 
 
 def pose(recording: Recording, settings: Settings, frame: LocalFrame, start: States, sigma: Array) -> Problem:
@@ -89,10 +90,10 @@ def pose(recording: Recording, settings: Settings, frame: LocalFrame, start: Sta
         t=t,
         samples=samples,
         intervals=intervals,
-        motion=EarthMotion(frame, intervals.T),
+        motion=Motion(intervals, frame),
         prior=prior,
         constraints=built,
-        chains=_chains(built, t),
+        chains=_chains((*scale_parameter(recording.imu.noise), *(p for rows in built for p in rows.parameters)), t),
         notes=_notes(samples, recording),
     )
 
@@ -108,10 +109,9 @@ def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Arra
     return np.append(np.repeat(fixed[:-1], parts) + within * step, fixed[-1])
 
 
-def _chains(constraints: tuple[Constraint, ...], t: Array) -> tuple[ParameterChain, ...]:
-    parameters = {p.name: p for rows in constraints for p in rows.parameters}
+def _chains(parameters: tuple[Parameter, ...], t: Array) -> tuple[ParameterChain, ...]:
     chains = []
-    for parameter in parameters.values():
+    for parameter in {p.name: p for p in parameters}.values():
         count = 1 if parameter.walk == 0.0 else max(1, round((t[-1] - t[0]) / NODE_SPACING))
         nodes = t[0] + (t[-1] - t[0]) / count * np.arange(count)
         chains.append(ParameterChain(parameter, nodes, np.searchsorted(nodes, t, side="right") - 1))

@@ -24,6 +24,8 @@ class ImuNoise:
     accel_bias_walk: float = 5.0e-5  # m/s^2/sqrt(s)
     gyro_bias_sigma: float = 5.0e-3  # rad/s at turn-on
     accel_bias_sigma: float = 1.0e-1  # m/s^2 at turn-on
+    gyro_scale_sigma: float = 3.0e-3  # 1, constant scale error per axis; 0 = none, not estimated
+    accel_scale_sigma: float = 3.0e-3
 
 
 @dataclass(frozen=True)

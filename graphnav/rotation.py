@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_I3 = np.eye(3)
+_TINY = 1e-300  # keeps sin(x)/x = 1 at x = 0 without a case of its own
+
 
 def skew(v: Array) -> Array:
     """Cross-product matrix: ``skew(a) @ b == cross(a, b)``; (..., 3) -> (..., 3, 3)."""
@@ -53,24 +56,30 @@ def coefficients(theta2: Array) -> tuple[Array, Array, Array, Array]:
 def _polynomial(v: Array, first: Array, second: Array) -> Array:
     """I + first [v]x + second [v]x^2."""
     S = skew(v)
-    return np.eye(3) + first[..., None, None] * S + second[..., None, None] * (S @ S)
+    return _I3 + first[..., None, None] * S + second[..., None, None] * (S @ S)
 
 
 def exp(v: Array) -> Array:
     """Exp of rotation vectors: (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, dtype=float)
-    a, b, _, _ = coefficients(np.sum(v * v, axis=-1))
-    return _polynomial(v, a, b)
+    x = np.sqrt(np.sum(v * v, axis=-1) + _TINY)
+    half = np.sin(0.5 * x) / x
+    return _polynomial(v, np.sin(x) / x, 2.0 * half * half)
 
 
 def log(R: Array) -> Array:
     """Rotation vectors in [0, pi] of rotation matrices: (..., 3, 3) -> (..., 3)."""
-    q = to_quaternion(R)
-    w, xyz = q[..., 0], q[..., 1:]
-    n = np.linalg.norm(xyz, axis=-1)
-    small = n < 1e-9
-    scale = np.where(small, 2.0 / np.where(w > 0.5, w, 1.0), 2.0 * np.arctan2(n, w) / np.where(small, 1.0, n))
-    return xyz * scale[..., None]
+    R = np.asarray(R, dtype=float)
+    w = 0.5 * np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
+    c = 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0)
+    s = np.sqrt(np.sum(w * w, axis=-1) + _TINY)
+    v = w * (np.arctan2(s, c) / s)[..., None]
+    if np.min(c, initial=1.0) < -0.5:  # towards pi the antisymmetric part vanishes; the quaternion does not
+        q = to_quaternion(R)
+        n = np.linalg.norm(q[..., 1:], axis=-1)
+        far = q[..., 1:] * (2.0 * np.arctan2(n, q[..., 0]) / np.maximum(n, 1e-9))[..., None]
+        v = np.where((c < -0.5)[..., None], far, v)
+    return v
 
 
 def right_jacobian(v: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -92,3 +92,43 @@ def to_trajectory(name: str, frame: LocalFrame, t: Array, states: States, covari
         covariance=cov,
         name=name,
     )
+
+
+def joined(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:
+    """Solutions of the pieces of one recording, put end to end in one frame."""
+    first = parts[0]
+    if len(parts) == 1:
+        return replace(first, notes=(*notes, *first.notes))
+
+    def rows(name: str) -> ConstraintRecord:
+        have = [part.records[name] for part in parts if name in part.records]
+        arrays = {
+            key: np.concatenate([getattr(r, key) for r in have]) for key in ("t", "residual", "sigma", "nis", "weight")
+        }
+        return replace(have[0], **arrays)
+
+    parameters = {}
+    for name in dict.fromkeys(key for part in parts for key in part.parameters):
+        own = [part.parameters[name] for part in parts if name in part.parameters]
+        parameters[name] = replace(
+            own[0], **{key: np.concatenate([getattr(p, key) for p in own]) for key in ("t", "value", "sigma")}
+        )
+    return replace(
+        first,
+        t=np.concatenate([p.t for p in parts]),
+        states=States.stack([p.states for p in parts]),
+        covariance=np.concatenate([p.covariance for p in parts]),
+        parameters=parameters,
+        records={name: rows(name) for name in dict.fromkeys(key for part in parts for key in part.records)},
+        counts=_summed([p.counts for p in parts]),
+        timings=_summed([p.timings for p in parts]),
+        iterations=sum(p.iterations for p in parts),
+        cost=sum(p.cost for p in parts),
+        stopped="; ".join(dict.fromkeys(p.stopped for p in parts)),
+        notes=(*notes, *dict.fromkeys(note for part in parts for note in part.notes)),
+        intervals=[p.intervals for p in parts],
+    )
+
+
+def _summed(tables: list[dict[str, Any]]) -> dict[str, Any]:
+    return {key: sum(table.get(key, 0) for table in tables) for key in dict.fromkeys(k for t in tables for k in t)}

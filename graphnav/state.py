@@ -29,6 +29,17 @@ DIM = 15
 
 
 @dataclass(frozen=True)
+class Parameter:
+    """Something estimated beside the states: a constant (walk 0) or a chain of slowly moving values."""
+
+    name: str
+    initial: Array  # (k,)
+    sigma: Array  # (k,) 1-sigma of the initial value
+    unit: str
+    walk: float = 0.0  # unit/sqrt(s); 0 = one constant for the whole recording
+
+
+@dataclass(frozen=True)
 class States:
     """K states; `states[index]` takes rows (a slice or an index array, so rows stay an axis)."""
 

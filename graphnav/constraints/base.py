@@ -19,18 +19,7 @@ from graphnav.config import Settings
 from graphnav.earth import LocalFrame
 from graphnav.recording import Recording
 from graphnav.rotation import Array
-from graphnav.state import BLOCKS, DIM, States
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """Something estimated beside the states: a constant (walk 0) or a chain of slowly moving values."""
-
-    name: str
-    initial: Array  # (k,)
-    sigma: Array  # (k,) 1-sigma of the initial value
-    unit: str
-    walk: float = 0.0  # unit/sqrt(s); 0 = one constant for the whole recording
+from graphnav.state import BLOCKS, DIM, Parameter, States
 
 
 @dataclass(frozen=True)

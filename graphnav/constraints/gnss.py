@@ -16,10 +16,10 @@ import numpy as np
 
 from graphnav import earth, rotation
 from graphnav.config import Settings
-from graphnav.constraints.base import Constraint, Linearized, Parameter, Scene
+from graphnav.constraints.base import Constraint, Linearized, Scene
 from graphnav.recording import Imu, Recording
 from graphnav.rotation import Array, mv
-from graphnav.state import States
+from graphnav.state import Parameter, States
 
 LEVER_ARM = "gnss_lever_arm"
 _RATE_WINDOW = 0.05  # s each side over which the turn rate at a fix is averaged

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav import dynamics
 from graphnav.constraints.base import Constraint, assemble
+from graphnav.dynamics import SCALE
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array, mv
 from graphnav.solution import ParameterEstimate, Solution
@@ -37,20 +37,33 @@ class _Point:
     states: States
     values: Values
 
+    @property
+    def scale(self) -> Array | None:
+        return self.values[SCALE][0] if SCALE in self.values else None
+
     def at_rows(self, problem: Problem, rows: Constraint) -> Values:
         chains = {c.parameter.name: c for c in problem.chains}
         return {p.name: self.values[p.name][chains[p.name].node[rows.keyframe]] for p in rows.parameters}
 
 
-def batch(problem: Problem, start: States, values: Values | None = None, progress: Progress | None = None) -> Solution:
-    """Solve a problem from any starting states (K rows) and parameter values."""
+def batch(
+    problem: Problem,
+    start: States,
+    values: Values | None = None,
+    progress: Progress | None = None,
+    covariances: tuple[int, ...] | None = None,
+) -> Solution:
+    """Solve a problem from any starting states (K rows) and parameter values.
+
+    `covariances` are the keyframes whose covariance is wanted, all when None; others are NaN.
+    """
     began = time.perf_counter()
     settings = problem.settings.solver
     values = values or {c.parameter.name: np.tile(c.parameter.initial, (len(c.t), 1)) for c in problem.chains}
     point = _Point(start, values)
     problem, renewed = _renew(problem, point)
     layout = _Layout(problem)
-    cost = _cost(problem, point)
+    cost = _cost(problem, point, layout)
     damping, tries, stopped = 0.0, 0, f"stopped at the limit of {settings.max_iterations} iterations"
     iteration = 0
     eliminated: Eliminated | None = None
@@ -64,7 +77,7 @@ def batch(problem: Problem, start: States, values: Values | None = None, progres
             if promised < settings.tolerance:
                 break
             candidate = _moved(point, step, layout)
-            new_cost = _cost(problem, candidate)
+            new_cost = _cost(problem, candidate, layout)
             if new_cost < cost:
                 break
             tries += 1
@@ -76,7 +89,7 @@ def batch(problem: Problem, start: States, values: Values | None = None, progres
         if promised < settings.tolerance:
             if damping == 0.0:
                 point = _moved(point, step, layout)  # the last small step is free
-                cost = _cost(problem, point)
+                cost = _cost(problem, point, layout)
                 stopped = f"converged: one more step would lower the cost by {promised:.1e}"
                 break
             damping = 0.0  # a damped step promises little by construction: judge by an undamped one
@@ -88,14 +101,17 @@ def batch(problem: Problem, start: States, values: Values | None = None, progres
         damping = 0.0 if damping <= 1e-4 else damping / 10.0
         problem, again = _renew(problem, point)
         if again:
-            cost = _cost(problem, point)
+            layout = _Layout(problem)
+            cost = _cost(problem, point, layout)
             renewed += again
     solved = time.perf_counter()
     if progress is not None:
         progress("covariances", 0.0)
     if damping or eliminated is None:
         eliminated = _graph(_whitened(problem, point, layout), layout, 0.0).eliminate(layout.order)
-    covariances = eliminated.covariances()
+    wanted = set(layout.keys) if covariances is None else {*covariances, *layout.keys[layout.K :]}
+    marginal = eliminated.covariances(wanted)
+    unknown = np.full((DIM, DIM), np.nan)
     done = time.perf_counter()
     per_keyframe = {c.parameter.name: point.values[c.parameter.name][c.node] for c in problem.chains}
     records = {}
@@ -111,8 +127,8 @@ def batch(problem: Problem, start: States, values: Values | None = None, progres
         frame=problem.frame,
         t=problem.t,
         states=point.states,
-        covariance=np.stack([covariances[k] for k in range(len(problem.t))]),
-        parameters=_estimates(problem, layout, point, covariances),
+        covariance=np.stack([marginal.get(k, unknown) for k in range(len(problem.t))]),
+        parameters=_estimates(problem, layout, point, marginal),
         records=records,
         counts={"initial_prior": 1, "imu": len(problem.t) - 1, **{c.name: len(c) for c in problem.constraints}},
         iterations=iteration,
@@ -160,9 +176,12 @@ Rows = list[tuple[list[tuple[Array, Array]], Array]]
 def _whitened(problem: Problem, point: _Point, layout: _Layout) -> Rows:
     """All factors at a point: blocks of (keys, A) and right-hand sides."""
     x = point.states
-    r, Ji, Jj = dynamics.linearize(problem.intervals, slice(None), x[:-1], x[1:], problem.motion)
+    r, Ji, Jj, Js = problem.motion.linearize(x, point.scale)
     W = layout.whitener
-    out: Rows = [([(layout.from_key, W @ Ji), (layout.to_key, W @ Jj)], -mv(W, r))]
+    links = [(layout.from_key, W @ Ji), (layout.to_key, W @ Jj)]
+    if SCALE in layout.node_key:
+        links.append((np.broadcast_to(layout.node_key[SCALE], layout.from_key.shape), W @ Js))
+    out: Rows = [(links, -mv(W, r))]
     chains = {c.parameter.name: c for c in problem.chains}
     for rows in (problem.prior, *problem.constraints):
         linear = rows.linearize(x[rows.keyframe], point.at_rows(problem, rows), slice(None))
@@ -232,11 +251,10 @@ def _promised(rows: Rows, layout: _Layout, step: tuple[Array, dict[str, Array]])
     return gain
 
 
-def _cost(problem: Problem, point: _Point) -> float:
+def _cost(problem: Problem, point: _Point, layout: _Layout) -> float:
     x = point.states
-    r = dynamics.residual(problem.intervals, x[:-1], x[1:], problem.motion)
-    root = np.linalg.cholesky(problem.intervals.covariance)
-    total = 0.5 * float(np.sum(np.linalg.solve(root, r[..., None]) ** 2))
+    r = problem.motion.residual(x, point.scale)
+    total = 0.5 * float(np.sum(mv(layout.whitener, r) ** 2))
     for rows in (problem.prior, *problem.constraints):
         linear = rows.linearize(x[rows.keyframe], point.at_rows(problem, rows), slice(None))
         s = np.linalg.norm(linear.residual / linear.sigma, axis=-1)
@@ -253,10 +271,14 @@ def _moved(point: _Point, step: tuple[Array, dict[str, Array]], layout: _Layout)
 
 def _renew(problem: Problem, point: _Point) -> tuple[Problem, int]:
     """Integrate again about the present biases where the first-order correction no longer holds."""
-    far = problem.intervals.out_of_range(point.states.bg[:-1])
+    ba, bg = point.states.ba[:-1], point.states.bg[:-1]
+    if point.scale is not None:
+        bg = bg + point.scale[:3] * problem.intervals.rate
+        ba = ba + point.scale[3:] * problem.intervals.force
+    far = problem.intervals.out_of_range(bg)
     if not far.any():
         return problem, 0
-    return problem.reintegrated(point.states.ba[:-1], point.states.bg[:-1]), int(far.sum())
+    return problem.reintegrated(ba, bg), int(far.sum())
 
 
 def _estimates(

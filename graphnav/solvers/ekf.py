@@ -24,8 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from graphnav import dynamics
 from graphnav.constraints.base import Constraint, assemble
+from graphnav.dynamics import SCALE
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
@@ -63,15 +63,18 @@ def ekf(problem: Problem, progress: Progress | None = None) -> Filtered:
     all_values = np.empty((K, D - DIM))
     states, predicted = [], []
     all_F[:] = np.eye(D)
+    scale_at = columns.get(SCALE)
     for k in range(K):
         if k:
             step = slice(k - 1, k)
-            ahead = dynamics.predict(problem.intervals, step, state, problem.motion)
-            F15, Q15 = dynamics.transition(problem.intervals, step, state, ahead, problem.motion)
+            scale = None if scale_at is None else values[_shift(scale_at)]
+            ahead, F15 = problem.motion.propagate(step, state, scale)
             F = all_F[k - 1]
             F[:DIM, :DIM] = F15[0]
+            if scale_at is not None:
+                F[:DIM, scale_at] = problem.motion.scale_columns(step, F15)[0]
             P = F @ P @ F.T
-            P[:DIM, :DIM] += Q15[0]
+            P[:DIM, :DIM] += problem.motion.noise(step, state.R_nb)[0]
             for chain in problem.chains:
                 if chain.node[k] != chain.node[k - 1]:
                     at = columns[chain.parameter.name]

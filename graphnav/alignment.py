@@ -1,0 +1,320 @@
+"""The first state of a drive: attitude, velocity, position and biases at the first IMU sample, with sigmas.
+
+A short smoothing problem, posed and solved with the same parts as the whole drive, over the first stretch in
+which the vehicle moves. Levelling (the mean specific force points up) and the median turn rate (a vehicle
+mostly goes straight or stands) start it; four headings, 90 degrees apart, are tried and the one that explains
+the fixes best wins, so neither "it drives forward" nor a standing start is assumed. From there the gyro carries
+the attitude back to the first sample.
+
+What the short problem learned, the long one will learn again from the same data. So the result enters as the
+point to start from, with a prior `prior_inflation` times wider than its own sigma: information counts once. Only
+what the fixes do not contain, that a vehicle's forward axis is roughly its course, enters at its own worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphnav import rotation
+from graphnav.config import Settings
+from graphnav.earth import LocalFrame
+from graphnav.errors import EstimationError
+from graphnav.preintegration import bridge_gaps, prefix
+from graphnav.problem import Problem, pose
+from graphnav.recording import Gnss, Imu, Recording
+from graphnav.rotation import Array
+from graphnav.solution import Solution
+from graphnav.state import States
+
+COURSE_SIGMA = np.radians(10.0)  # rad, a stated forward axis against the course: mounting, side slip
+_DISTANCE = 50.0  # m of travel the short problem wants to see
+_FIXES = 10  # and fixes
+
+Smoother = Callable[[Problem, States], Solution]
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The prior of the first keyframe: one state, 15 sigmas, and what was done in words."""
+
+    state: States
+    sigma: Array  # (15,) of the prior
+    own_sigma: Array  # (3,) rad, of roll, pitch, heading as the alignment itself believes them
+    notes: tuple[str, ...]
+
+    @property
+    def rph(self) -> Array:
+        """Roll, pitch, heading, rad."""
+        return rotation.to_rph(self.state.R_nb[0])
+
+
+def align(recording: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother) -> Alignment:
+    """Find the first state of a recording.
+
+    Parameters
+    ----------
+    smooth : solves a posed problem from start states; handed in because solvers stand behind this room.
+
+    Raises
+    ------
+    EstimationError
+        If nothing in the recording can give an attitude.
+    """
+    span = _motion(recording, settings)
+    if span is None:
+        found = _at_rest(recording, settings, frame)
+    else:
+        found = _in_motion(recording, settings, frame, smooth, span)
+    known = settings.alignment.heading
+    if known is None:
+        return found
+    rph = found.rph
+    rph[2] = np.radians(known)
+    sigma = found.sigma.copy()
+    # a wrong heading is an error about up; about a tilted body axis it leaks into all three
+    sigma[2] = np.radians(settings.alignment.heading_sigma)
+    return replace(
+        found,
+        state=replace(found.state, R_nb=rotation.from_rph(rph)[None]),
+        sigma=sigma,
+        notes=(f"start heading given: {known:g} deg, 1-sigma {settings.alignment.heading_sigma:g} deg",),
+    )
+
+
+def _motion(recording: Recording, settings: Settings) -> tuple[float, float] | None:
+    """The stretch (s) to align over: from just before the first motion until enough of it was seen."""
+    gnss = recording.gnss
+    if gnss is None:
+        return None
+    used = (gnss.t >= recording.start) & (gnss.t <= recording.end)
+    if np.count_nonzero(used) < 3:
+        return None
+    t, llh, sd = gnss.t[used], gnss.llh[used], gnss.sd[used]
+    p = LocalFrame(llh[0]).from_llh(llh)
+    noise = 5.0 * np.linalg.norm(np.median(sd[:, :2], axis=0))
+    away = np.linalg.norm(p[:, :2] - p[0, :2], axis=1) > 3.0 + noise
+    if not away.any():
+        return None
+    first = int(np.argmax(away))
+    begin = max(t[0], t[first] - 10.0)
+    # along the track in steps longer than the noise, so that jitter at rest is not distance
+    keep = np.arange(first, len(t))
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p[keep, :2], axis=0), axis=1))])
+    enough = (travelled > _DISTANCE + noise) & (t[keep] > t[first] + settings.alignment.window)
+    enough &= np.arange(len(keep)) >= _FIXES
+    end = t[keep][np.argmax(enough)] if enough.any() else t[-1]
+    return float(begin), float(end)
+
+
+def _level(recording: Recording, begin: float, seconds: float = 1.0) -> Array:
+    """(roll, pitch) from the mean specific force after `begin`, rad."""
+    imu = recording.imu
+    f = imu.accel[(imu.t > begin) & (imu.t <= begin + seconds)]
+    f = (f if len(f) else imu.accel[:1]).mean(axis=0)
+    return np.array([np.arctan2(-f[0], f[2]), np.arctan2(f[1], np.hypot(f[0], f[2]))])
+
+
+def _usual_rate(imu: Imu) -> Array:
+    """Median turn rate, kept within what the sensor's turn-on bias can be, rad/s."""
+    limit = 3.0 * imu.noise.gyro_bias_sigma
+    return np.clip(np.median(imu.gyro, axis=0), -limit, limit)
+
+
+def _at_rest(recording: Recording, settings: Settings, frame: LocalFrame) -> Alignment:
+    """Level only; the heading stays unknown."""
+    noise, gnss = recording.imu.noise, recording.gnss
+    roll, pitch = _level(recording, recording.start)
+    tilt = noise.accel_bias_sigma / 9.8 + np.radians(1.0)
+    own = np.array([tilt, tilt, np.pi])
+    if gnss is None or not len(gnss.t):
+        # without fixes the first pose defines the frame: position and heading are exact by definition
+        p, sd_p, sd_heading = np.zeros(3), np.full(3, 1e-3), 1e-4
+        note = "no GNSS: levelled at the start, position and heading count from zero there"
+    else:
+        p = frame.from_llh(gnss.llh[0]) - rotation.from_rph(np.array([roll, pitch, 0.0])) @ gnss.lever_arm
+        sd_p, sd_heading = 10.0 * gnss.sd[0] + 1.0, np.pi
+        note = "no motion in the GNSS fixes: levelled at the start, heading unknown"
+    state = States(
+        rotation.from_rph(np.array([roll, pitch, 0.0]))[None],
+        p[None],
+        np.zeros((1, 3)),
+        np.zeros((1, 3)),
+        np.zeros((1, 3)),
+    )
+    sigma = np.concatenate(
+        [
+            [settings.alignment.prior_inflation * tilt] * 2,
+            [sd_heading],
+            sd_p,
+            [0.5] * 3,
+            [noise.accel_bias_sigma] * 3,
+            [noise.gyro_bias_sigma] * 3,
+        ]
+    )
+    return Alignment(state, sigma, own, (note,))
+
+
+def _in_motion(
+    recording: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, span: tuple[float, float]
+) -> Alignment:
+    gnss, imu = recording.gnss, recording.imu
+    assert gnss is not None
+    begin, end = max(span[0], recording.start), span[1]
+    part = replace(
+        recording.crop(begin - recording.start, end - recording.start),
+        gnss=_thinned(gnss, begin, end),
+    )
+    bias = _usual_rate(imu)
+    rp = _level(recording, begin)
+    best: Solution | None = None
+    costs = []
+    for quarter in range(4):
+        rph = np.array([*rp, 0.5 * np.pi * quarter])
+        solution = _try(part, settings, frame, smooth, rph, bias)
+        costs.append(solution.cost)
+        if best is None or solution.cost < best.cost:
+            best = solution
+    if best is None or not np.isfinite(best.cost):
+        raise EstimationError(
+            f"'{recording.name}': no start attitude explains the GNSS fixes between {begin - recording.start:.0f} "
+            f"and {end - recording.start:.0f} s; check the axes, the units and the time stamps"
+        )
+    own = np.sqrt(np.diag(best.covariance[0])[:3])
+    wide = settings.alignment.prior_inflation * own
+    R = best.states.R_nb[0]
+    notes = [
+        f"aligned over {begin - recording.start:.0f} to {end - recording.start:.0f} s: roll and pitch to "
+        f"{np.degrees(own[:2].max()):.2g} deg, heading to {np.degrees(own[2]):.2g} deg"
+    ]
+    if recording.platform == "vehicle":
+        R, wide[2], said = _with_course(best, R, wide[2])
+        notes += said
+    return _carried_back(recording, settings, best, R, wide, own, begin, tuple(notes))
+
+
+def _thinned(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
+    """Fixes of a span at most about one a second: enough to align, and quick."""
+    inside = np.flatnonzero((gnss.t >= begin) & (gnss.t <= end))
+    keep, last = [], -np.inf
+    for i in inside:
+        if gnss.t[i] - last >= spacing:
+            keep.append(i)
+            last = gnss.t[i]
+    rows = np.array(keep)
+    pick = {"t": gnss.t[rows], "llh": gnss.llh[rows], "sd": gnss.sd[rows]}
+    if gnss.v is not None and gnss.sd_v is not None:
+        pick |= {"v": gnss.v[rows], "sd_v": gnss.sd_v[rows]}
+    return replace(gnss, **pick)
+
+
+def _try(part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, rph: Array, bias: Array) -> Solution:
+    """Solve the short problem from one start attitude."""
+    noise, gnss = part.imu.noise, part.gnss
+    assert gnss is not None
+    fixes = frame.from_llh(gnss.llh)
+    R0 = rotation.from_rph(rph)
+    start = States(R0[None], fixes[:1], np.zeros((1, 3)), np.zeros((1, 3)), bias[None])
+    sigma = np.concatenate(
+        [
+            [0.3, 0.3, np.pi],
+            [100.0] * 3,
+            [50.0] * 3,
+            [noise.accel_bias_sigma] * 3,
+            [noise.gyro_bias_sigma] * 3,
+        ]
+    )
+    # one bad fix or a burst must not decide the heading
+    robust = settings.gnss.model_copy(update={"robust": "cauchy", "lever_arm_sigma": None})
+    problem = pose(part, settings.model_copy(update={"gnss": robust}), frame, start, sigma)
+    dR, _, _ = prefix(problem.samples, problem.t[0], problem.t[1:], np.zeros(3), bias)
+    t = problem.t
+    p = np.stack([np.interp(t, gnss.t, fixes[:, k]) for k in range(3)], -1)
+    v = np.gradient(p, t, axis=0)
+    K = len(t)
+    R = R0 @ np.concatenate([np.eye(3)[None], dR])
+    return smooth(problem, States(R, p, v, np.zeros((K, 3)), np.tile(bias, (K, 1))))
+
+
+def _with_course(solution: Solution, R: Array, sigma: float) -> tuple[Array, float, list[str]]:
+    """Bring in that a vehicle's forward axis is its course, forwards or in reverse, to `COURSE_SIGMA`."""
+    v = solution.states.v
+    speed = np.linalg.norm(v[:, :2], axis=1)
+    moving = speed > max(1.0, 0.5 * speed.max())
+    forward = solution.states.R_nb[moving, :, 1]
+    heading = np.arctan2(forward[:, 0], forward[:, 1])
+    course = np.arctan2(v[moving, 0], v[moving, 1])
+    off = rotation.wrap(course - heading)
+    off = np.where(np.abs(off) > 0.5 * np.pi, rotation.wrap(off + np.pi), off)  # reverse
+    mean = float(np.median(off))
+    if abs(mean) > 3.0 * np.hypot(COURSE_SIGMA, sigma):
+        return (
+            R,
+            sigma,
+            [f"the body's forward axis is {abs(np.degrees(mean)):.0f} deg from the course: check the IMU's axes"],
+        )
+    gain = sigma**2 / (sigma**2 + COURSE_SIGMA**2)
+    turn = rotation.exp(np.array([0.0, 0.0, -gain * mean]))  # heading is clockwise, rotation about up is not
+    return turn @ R, float(np.sqrt(gain) * COURSE_SIGMA), []
+
+
+def _carried_back(
+    recording: Recording,
+    settings: Settings,
+    solution: Solution,
+    R: Array,
+    wide: Array,
+    own: Array,
+    begin: float,
+    notes: tuple[str, ...],
+) -> Alignment:
+    """From the start of the short problem to the first sample of the recording."""
+    imu, noise = recording.imu, recording.imu.noise
+    bg, ba = solution.states.bg[0], solution.states.ba[0]
+    p, v = solution.states.p[0], solution.states.v[0]
+    sd = np.sqrt(np.diag(solution.covariance[0]))
+    sd_bg = sd[12:15]
+    back = begin - recording.start
+    sd_p, sd_v = np.full(3, 1.0) + 10.0 * sd[3:6], np.full(3, 0.5) + 10.0 * sd[6:9]
+    if back > 0.05:
+        before = imu.t <= begin
+        if _stands(imu, before):
+            earth_rate = solution.frame.omega_n @ R
+            rest = imu.gyro[before].mean(axis=0) - earth_rate
+            drift = np.full(3, noise.gyro_noise_density * np.sqrt(back))
+            notes = (*notes, f"stands for the first {back:.0f} s; the attitude is that of the first motion")
+            v, bg = np.zeros(3), rest
+            sd_bg = np.full(3, noise.gyro_noise_density / np.sqrt(back) + noise.gyro_bias_walk * np.sqrt(back))
+        else:
+            samples = bridge_gaps(imu)
+            dR, dV, dP = prefix(samples, recording.start, np.array([begin]), ba, bg)
+            R = R @ dR[0].T
+            g = solution.frame.gravity_n(p)
+            v0 = v - g * back - R @ dV[0]
+            p = p - v0 * back - 0.5 * g * back**2 - R @ dP[0]
+            v = v0
+            drift = sd_bg * back
+            notes = (*notes, f"carried back {back:.1f} s by the gyro to the first sample")
+            tilt = 9.8 * float(np.max(wide[:2])) + float(np.max(sd[9:12]))
+            sd_v, sd_p = sd_v + tilt * back, sd_p + sd_v * back + 0.5 * tilt * back**2
+        wide = np.hypot(wide, settings.alignment.prior_inflation * drift)
+        own = np.hypot(own, drift)
+    sigma = np.concatenate(
+        [wide, sd_p, sd_v, [noise.accel_bias_sigma] * 3, np.maximum(noise.gyro_bias_sigma, 5.0 * sd_bg)]
+    )
+    state = States(R[None], p[None], v[None], ba[None], bg[None])
+    return Alignment(state, np.minimum(sigma, np.r_[[np.pi] * 3, [1e6] * 12]), own, notes)
+
+
+def _stands(imu: Imu, rows: Array) -> bool:
+    """Whether nothing but vibration is in some samples: one-second means hardly differ."""
+    t, count = imu.t[rows], int(np.count_nonzero(rows))
+    blocks = max(1, int(t[-1] - t[0]))
+    if count < 2 * blocks or blocks < 2:
+        return False
+    size = count // blocks
+    force = imu.accel[rows][: size * blocks].reshape(blocks, size, 3).mean(axis=1)
+    rate = imu.gyro[rows][: size * blocks].reshape(blocks, size, 3).mean(axis=1)
+    return bool(np.ptp(force, axis=0).max() < 0.25 and np.ptp(rate, axis=0).max() < 0.02)

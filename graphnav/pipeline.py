@@ -1,0 +1,129 @@
+"""From a recording to solutions: cut where it must be, align, pose, solve with each solver."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.alignment import align
+from graphnav.config import Settings
+from graphnav.earth import LocalFrame
+from graphnav.errors import EstimationError
+from graphnav.problem import Problem, pose
+from graphnav.recording import Recording
+from graphnav.solution import Solution, joined
+from graphnav.solvers.batch import batch
+from graphnav.solvers.ekf import Progress, ekf, rts
+from graphnav.state import States
+
+SOLVERS = ("ekf", "rts", "batch")
+_SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
+
+
+def run(
+    recording: Recording,
+    settings: Settings | None = None,
+    solvers: tuple[str, ...] = SOLVERS,
+    progress: Progress | None = None,
+) -> dict[str, Solution]:
+    """Solve a recording with several solvers on exactly the same information.
+
+    Parameters
+    ----------
+    recording : from `graphnav.load`.
+    settings : default settings when None.
+    solvers : out of "ekf", "rts", "batch".
+    progress : called now and then with a stage and its share done, 0 to 1.
+
+    Returns
+    -------
+    dict
+        Solver name to `Solution`, in the order asked for.
+
+    Raises
+    ------
+    EstimationError
+        If the recording does not determine a trajectory.
+    """
+    settings = settings or Settings()
+    unknown = [name for name in solvers if name not in SOLVERS]
+    if unknown:
+        raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(SOLVERS)}")
+    frame = LocalFrame(_origin(recording))
+    pieces, notes = _pieces(recording, settings)
+    found: list[dict[str, Solution]] = []
+    for piece in pieces:
+        try:
+            found.append(_solve(piece, settings, frame, solvers, progress))
+        except EstimationError as error:
+            if len(pieces) == 1:
+                raise
+            notes.append(f"{_span(recording, piece)} left out: {error}")
+    if not found:
+        raise EstimationError(f"'{recording.name}': no piece between its IMU gaps can be solved")
+    return {name: joined([one[name] for one in found], tuple(notes)) for name in solvers}
+
+
+def _solve(
+    recording: Recording, settings: Settings, frame: LocalFrame, solvers: tuple[str, ...], progress: Progress | None
+) -> dict[str, Solution]:
+    began = time.perf_counter()
+    aligned = align(recording, settings, frame, lambda problem, start: batch(problem, start, covariances=(0,)))
+    after = time.perf_counter()
+    problem = pose(recording, settings, frame, aligned.state, aligned.sigma)
+    timings = {"alignment": after - began, "preintegration": time.perf_counter() - after}
+    forward = ekf(problem, progress)
+    out = {"ekf": forward.solution}
+    if "rts" in solvers or "batch" in solvers:
+        out["rts"] = rts(problem, forward, progress)
+    if "batch" in solvers:
+        out["batch"] = batch(problem, *_start(problem, out["rts"]), progress=progress)
+        # what it took to get there is part of it
+        spent = {**out["rts"].timings, **out["batch"].timings}
+        out["batch"] = replace(out["batch"], timings=spent)
+    return {
+        name: replace(out[name], notes=(*aligned.notes, *out[name].notes), timings={**timings, **out[name].timings})
+        for name in solvers
+    }
+
+
+def _start(problem: Problem, smoothed: Solution) -> tuple[States, dict[str, np.ndarray]]:
+    """Where the batch solver begins: the smoothed filter."""
+    return smoothed.states, {name: p.value for name, p in smoothed.parameters.items()}
+
+
+def _origin(recording: Recording) -> np.ndarray:
+    """Origin of the navigation frame: the first fix, or 45 deg north at sea level without any."""
+    gnss = recording.gnss
+    if gnss is not None and len(gnss.t):
+        inside = np.flatnonzero((gnss.t >= recording.start) & (gnss.t <= recording.end))
+        return gnss.llh[inside[0] if len(inside) else 0]
+    return np.array([np.pi / 4, 0.0, 0.0])
+
+
+def _pieces(recording: Recording, settings: Settings) -> tuple[list[Recording], list[str]]:
+    """The recording cut at IMU gaps too long to bridge, and a sentence for each cut."""
+    t = recording.imu.t
+    cuts = np.flatnonzero(np.diff(t) > settings.keyframes.bridge)
+    if not len(cuts):
+        return [recording], []
+    notes = [
+        f"IMU gap of {t[i + 1] - t[i]:.1f} s at {t[i] - recording.start:.1f} s: cut there, the parts are solved apart"
+        for i in cuts
+    ]
+    edges = np.concatenate([[-1], cuts, [len(t) - 1]])
+    pieces = []
+    for lo, hi in itertools.pairwise(edges):
+        begin, end = t[lo + 1] - recording.start, t[hi] - recording.start
+        if end - begin < _SHORTEST:
+            notes.append(f"{begin:.1f} to {end:.1f} s left out: too short between two gaps to be aligned")
+        else:
+            pieces.append(recording.crop(begin - 1e-9, end + 1e-9))
+    return pieces, notes
+
+
+def _span(recording: Recording, piece: Recording) -> str:
+    return f"{piece.start - recording.start:.0f} to {piece.end - recording.start:.0f} s"
