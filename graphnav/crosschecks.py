@@ -9,12 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphnav.earth import LocalFrame
 from graphnav.recording import Gnss, Imu, Odometer
 from graphnav.rotation import Array, wrap
+
+Index = NDArray[Any]  # of row numbers
 
 MIN_PAIRS = 20
 _MIN_SPEED = 3.0  # m/s, below which a course means little
@@ -96,7 +100,7 @@ def _sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
     return mean
 
 
-def _pairs(track: Track) -> tuple[Array, Array]:
+def _pairs(track: Track) -> tuple[Index, Index]:
     """Rows about a second apart."""
     m = max(1, round(1.0 / track.period))
     i = np.arange(len(track.t) - m)
@@ -106,21 +110,32 @@ def _pairs(track: Track) -> tuple[Array, Array]:
 
 def _regress(x: Array, y: Array) -> tuple[float, Array]:
     x, y = x - x.mean(0), y - y.mean()
-    b = np.linalg.lstsq(x, y, rcond=None)[0]
+    b: Array = np.linalg.lstsq(x, y, rcond=None)[0]
     prediction, norm = x @ b, np.linalg.norm(y)  # the sign is in b: a reversed axis correlates as well
     scale = np.linalg.norm(prediction) * norm
     return (float(prediction @ y / scale) if scale > 0 else 0.0), b
 
 
-def _search(y: Array, x_at: Callable[[Array, float], Array], span: Array, valid: Callable[[float], Array]) -> Fit:
+def _regress_inliers(x: Array, y: Array) -> tuple[float, Array]:
+    """The same without what lies beyond 5 sigma (by the median), twice: spikes of a fix hide a good fit."""
+    x, y = x - np.median(x, axis=0), y - np.median(y)
+    keep = np.ones(len(y), dtype=bool)
+    for _ in range(2):
+        _, b = _regress(x[keep], y[keep])
+        off = np.abs(y - x @ b)
+        keep = off <= 5.0 * np.median(off) / 0.6745
+    return _regress(x[keep], y[keep]) if keep.sum() >= MIN_PAIRS else (0.0, b)
+
+
+def _search(y: Array, x_at: Callable[[Index, float], Array], span: Array, valid: Callable[[float], Array]) -> Fit:
     """The shift at which x explains y best; `x_at(rows, lag)`, `valid(lag)` a mask of the rows."""
     every = np.arange(len(y))
 
-    def correlation(lag: float, rows: Array) -> float:
+    def correlation(lag: float, rows: Index) -> float:
         rows = rows[valid(lag)[rows]]
         return _regress(x_at(rows, lag), y[rows])[0] if len(rows) >= MIN_PAIRS else 0.0
 
-    def best(rows: Array, lags: Array) -> float:
+    def best(rows: Index, lags: Array) -> float:
         c = np.array([correlation(lag, rows) for lag in lags])
         k = int(np.argmax(c))
         if 0 < k < len(lags) - 1 and (curve := c[k - 1] - 2 * c[k] + c[k + 1]) < 0:
@@ -140,17 +155,17 @@ def _search(y: Array, x_at: Callable[[Array, float], Array], span: Array, valid:
     parts = [best(part, fine) for part in np.array_split(many, 4) if len(part) >= 2 * MIN_PAIRS]
     spread = float(np.std(parts) / np.sqrt(len(parts))) if len(parts) > 1 else 0.1
     rows = every[valid(lag)]
-    r, b = _regress(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
+    r, b = _regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
     return Fit(lag, spread, r, correlation(0.0, every), b)
 
 
-def _imu_fit(imu: Imu, rate: Array, track: Track, i: Array, j: Array, y: Array) -> Fit | None:
+def _imu_fit(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) -> Fit | None:
     if len(y) < MIN_PAIRS:
         return None
     mean = _sampler(imu.t, rate)
     ti, tj, wi, wj = track.t[i], track.t[j], track.width[i], track.width[j]
 
-    def x_at(rows: Array, lag: float) -> Array:
+    def x_at(rows: Index, lag: float) -> Array:
         return mean(tj[rows] + lag, wj[rows]) - mean(ti[rows] + lag, wi[rows])
 
     def valid(lag: float) -> Array:
@@ -168,7 +183,8 @@ def up_of(imu: Imu) -> Array:
 def forward_fit(imu: Imu, track: Track) -> Fit | None:
     """Change of GNSS speed on integrated level force: coefficients are the forward direction in body axes, (3,).
 
-    Level is square to the mean force, so nothing need be known of the axes. None where speed changes too little to say anything.
+    Level is square to the mean force, so nothing need be known of the axes. None where speed
+    changes too little to say anything.
     """
     i, j = _pairs(track)
     y = track.speed[j] - track.speed[i]
@@ -205,7 +221,7 @@ def odometer_fit(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
     distance = np.r_[0.0, np.cumsum(0.5 * (odometer.speed[1:] + odometer.speed[:-1]) * np.diff(t))]
     width = np.maximum(track.width, 4.0 * float(np.median(np.diff(t))))
 
-    def x_at(rows: Array, lag: float) -> Array:
+    def x_at(rows: Index, lag: float) -> Array:
         at, w = track.t[rows] + lag, width[rows]
         return ((np.interp(at + w / 2, t, distance) - np.interp(at - w / 2, t, distance)) / w)[:, None]
 

@@ -62,10 +62,10 @@ def _imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
     R_bs = d.R_bs
     gyro = rows.stack("gx", "gy", "gz") * schema.RATE[d.units.gyro] @ R_bs.T
     accel = rows.stack("ax", "ay", "az") * schema.FORCE[d.units.accel] @ R_bs.T
-    stated = d.noise.model_dump(exclude_none=True) if d.noise else {}
+    stated: dict[str, float] = d.noise.model_dump(exclude_none=True) if d.noise else {}
     noise = replace(ImuNoise(), **stated)
-    missing = [key for key in ImuNoise.__dataclass_fields__ if key not in stated]
-    if missing and stated:
+    missing = [key for key in schema.NOISE_FIGURES if key not in stated]
+    if 0 < len(missing) < len(schema.NOISE_FIGURES):
         remarks.add(f"[imu.noise] says nothing of {', '.join(missing)}: defaults of a consumer IMU are used")
     elif missing:
         remarks.add(
@@ -73,7 +73,7 @@ def _imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
             f"(gyro {noise.gyro_noise_density:g} rad/s/sqrt(Hz), "
             f"accelerometer {noise.accel_noise_density:g} m/s2/sqrt(Hz))"
         )
-    return Imu(rows["t"], gyro, accel, noise, R_bs, noise_assumed=not stated)
+    return Imu(rows["t"], gyro, accel, noise, R_bs, noise_assumed=len(missing) == len(schema.NOISE_FIGURES))
 
 
 def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:

@@ -77,8 +77,8 @@ def read_kitti(source: str | Path = "kitti") -> Recording:
     return Recording(
         name="kitti",
         platform="vehicle",
-        imu=Imu(imu[:, 0], imu[:, 5:8] @ R_bs.T, imu[:, 2:5] @ R_bs.T, NOISE, R_bs),
-        gnss=Gnss(gps[:, 0], frame.to_llh(gps[:, 1:4]), np.tile(SD, (len(gps), 1))),
+        imu=Imu(imu[:, 0].copy(), imu[:, 5:8] @ R_bs.T, imu[:, 2:5] @ R_bs.T, NOISE, R_bs),
+        gnss=Gnss(gps[:, 0].copy(), frame.to_llh(gps[:, 1:4]), np.tile(SD, (len(gps), 1))),
         files=files,
         remarks=(
             f"the first IMU row, 1.92 s before the second, and {early.sum()} position before the second were dropped",

@@ -5,19 +5,32 @@ from __future__ import annotations
 import difflib
 import tomllib
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    create_model,
+    field_validator,
+    model_validator,
+)
 from pydantic.types import Strict
 
 from graphnav.config import explain, suggestion
 from graphnav.errors import RecordingError
+from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0)]
+
+NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0)]
 
 
 def _three_numbers(value: Any) -> Any:
@@ -108,15 +121,13 @@ class OdometerUnits(_Section):
     speed: SpeedUnit = "m/s"
 
 
-class Noise(_Section):
-    """[imu.noise]: 1-sigma, SI, as in `graphnav.recording.ImuNoise`; None where the file says nothing."""
-
-    gyro_noise_density: Positive | None = None
-    accel_noise_density: Positive | None = None
-    gyro_bias_walk: Positive | None = None
-    accel_bias_walk: Positive | None = None
-    gyro_bias_sigma: Positive | None = None
-    accel_bias_sigma: Positive | None = None
+# [imu.noise]: the fields of ImuNoise, None where the file says nothing; only a scale error may be stated as none
+NOISE_FIGURES = tuple(f.name for f in fields(ImuNoise) if not f.name.endswith("_scale_sigma"))
+Noise = create_model(  # type: ignore[call-overload]
+    "Noise",
+    __base__=_Section,
+    **{f.name: ((Positive if f.name in NOISE_FIGURES else NotNegative) | None, None) for f in fields(ImuNoise)},
+)
 
 
 class ImuTable(_Sensor):
@@ -128,7 +139,7 @@ class ImuTable(_Sensor):
     forward: Vector | None = None
     up: Vector | None = None
     units: ImuUnits = ImuUnits()
-    noise: Noise | None = None
+    noise: Noise | None = None  # type: ignore[valid-type]
 
     @model_validator(mode="after")
     def _one_mount(self) -> ImuTable:

@@ -1,0 +1,197 @@
+"""Checks of GNSS and odometer, and of the IMU against them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from graphnav import crosschecks
+from graphnav.crosschecks import Fit, Track
+from graphnav.findings import Finding, period_of
+from graphnav.recording import Imu, Recording
+from graphnav.rotation import Array
+
+
+def overlap_s(recording: Recording) -> float:
+    t = recording.gnss.t  # type: ignore[union-attr]
+    return float(min(t[-1], recording.end) - max(t[0], recording.start))
+
+
+def gnss_coverage(recording: Recording) -> Iterator[Finding]:
+    gnss = recording.gnss
+    assert gnss is not None
+    if not len(gnss.t):
+        yield Finding("warning", "no GNSS fix")
+        return
+    if overlap_s(recording) <= 0:
+        yield Finding(
+            "warning",
+            f"GNSS ({gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) "
+            f"do not overlap in time; if their clocks differ, say time_offset in [gnss] "
+            f"({recording.start - gnss.t[0]:.3f} would start both together)",
+        )
+        return
+    for late, what in ((gnss.t[0] - recording.start, "starts"), (recording.end - gnss.t[-1], "ends")):
+        if late > 5.0:
+            yield Finding("note", f"GNSS {what} {late:.1f} s {'after' if what == 'starts' else 'before'} the IMU")
+    if len(gnss.t) < 3:
+        return
+    step = np.diff(gnss.t)
+    inside = (gnss.t[1:] > recording.start) & (gnss.t[:-1] < recording.end)
+    gaps = np.flatnonzero((step > max(3.5 * period_of(gnss.t), 1.5)) & inside)
+    if len(gaps):
+        worst = gaps[np.argmax(step[gaps])]
+        count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+        at = gnss.t[worst] - recording.start
+        yield Finding("note", f"{count} in GNSS, the longest {step[worst]:.1f} s at {at:.1f} s from the start")
+
+
+def gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Finding]:
+    """Fixes that no motion explains: a step against the velocities, or an acceleration no vehicle has."""
+    gnss = recording.gnss
+    assert gnss is not None
+    if track is None or len(gnss.t) < 5:
+        return
+    p, dt = crosschecks.local_positions(gnss)[:, :2], np.diff(gnss.t)
+    sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
+    near = dt < 3.5 * track.period
+    if gnss.v is not None and not track.width.any():
+        v = np.stack([np.interp(gnss.t, track.t, track.v[:, k]) for k in (0, 1)], -1)
+        off = np.diff(p, axis=0) - 0.5 * (v[1:] + v[:-1]) * dt[:, None]
+        size = np.linalg.norm(off, axis=1)
+        limit = 1.0 + 5.0 * np.hypot(sd[1:], sd[:-1]) + 3.0 * dt
+    else:
+        off = p[2:] - p[1:-1] - (p[1:-1] - p[:-2]) * (dt[1:] / dt[:-1])[:, None]
+        size = np.r_[0.0, np.linalg.norm(off, axis=1)]
+        near &= np.r_[False, near[:-1]]
+        limit = 1.0 + 12.0 * sd[1:] + 10.0 * dt * dt
+    bad = np.flatnonzero(near & (size > limit))
+    if len(bad):
+        worst = bad[np.argmax(size[bad])]
+        count = "1 jump" if len(bad) == 1 else f"{len(bad)} jumps"
+        at = gnss.t[worst + 1] - recording.start
+        yield Finding(
+            "warning",
+            f"{count} in GNSS position that the motion and the sigmas do not explain, the largest {size[worst]:.1f} m "
+            f"at {at:.1f} s from the start; a robust kernel or a gate is advisable",
+        )
+
+
+def imu_clock(forward: Fit | None) -> Iterator[Finding]:
+    # 4 sigma, because the sigma comes from four parts only; the course, which leads or lags with the lever arm, is
+    # not asked
+    if forward is None or forward.correlation < 0.6 or abs(forward.lag) < 0.05 + 4.0 * forward.spread:
+        return
+    lag = forward.lag
+    leap = ", the leap seconds between GPS time and UTC" if abs(abs(lag) - 18.0) < 0.5 else ""
+    yield Finding(
+        "warning",
+        f"IMU stamps are {'late' if lag > 0 else 'early'} against GNSS by {abs(lag):.2f} s{leap} (forward force "
+        f"against speed, +-{max(forward.spread, 0.01):.2f} s): add {-lag:+.2f} to time_offset in [imu]",
+    )
+
+
+def imu_axes(imu: Imu, forward: Fit | None) -> Iterator[Finding]:
+    up = crosschecks.up_of(imu)
+    if up[2] > 0.8 and (forward is None or forward.correlation < 0.7):
+        return
+    if forward is None or forward.correlation < 0.7:
+        yield Finding("warning", f"the mean force points {_direction(up)}, not up: are the axes right?")
+        return
+    ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
+    if up[2] > 0.8 and ahead[1] > 0.7:
+        return
+    letters = _letters(imu.R_bs, ahead, up)
+    hint = f'; axes = "{letters}" would agree' if letters else ""
+    yield Finding(
+        "warning",
+        f"the axes contradict the drive: forward by the GNSS speed is {_direction(ahead)}, up by gravity is "
+        f"{_direction(up)} in the axes stated{hint}",
+    )
+
+
+def _direction(v: Array) -> str:
+    names = (("left", "right"), ("backward", "forward"), ("down", "up"))
+    k = int(np.argmax(np.abs(v)))
+    return names[k][int(v[k] > 0)]
+
+
+def _letters(R_bs: Array, forward: Array, up: Array) -> str | None:
+    """The three letters under which `forward` and `up` (body axes as loaded) would be so; None if none clearly does."""
+    f, u = R_bs.T @ forward, R_bs.T @ up  # in the file's axes
+    if np.abs(f).max() < 0.8 or np.abs(u).max() < 0.8 or np.argmax(np.abs(f)) == np.argmax(np.abs(u)):
+        return None
+    unit = [np.sign(x) * (np.abs(x) == np.abs(x).max()) for x in (f, u)]
+    rows = np.stack([np.cross(*unit), *unit])  # right, forward, up
+    return "".join(
+        "LBD"[k] if rows[k, axis] < 0 else "RFU"[k] for axis in range(3) for k in [np.argmax(np.abs(rows[:, axis]))]
+    )
+
+
+def reversed_sign(imu: Imu) -> Iterator[Finding]:
+    """The gyro about the mean force turns against the course: no choice of axes mends that."""
+    if crosschecks.up_of(imu)[2] < 0:
+        sentence = (
+            "the accelerometer's sign is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
+        )
+    else:
+        sentence = "the gyro's sign is reversed: it turns against the GNSS course while gravity points as stated"
+    yield Finding("warning", f"{sentence}; negate it in the file")
+
+
+def yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
+    if yaw is None or abs(yaw.correlation) < 0.8:
+        return
+    scale = abs(float(yaw.coefficients[0]))
+    if 40.0 < scale < 80.0:
+        yield Finding(
+            "warning",
+            "the gyro is 57 times too small for the GNSS course: it is in rad/s already, leave out units.gyro",
+        )
+    elif 1 / 80.0 < scale < 1 / 40.0:
+        yield Finding("warning", 'the gyro is 57 times too large for the GNSS course: say units = { gyro = "deg/s" }')
+    elif abs(scale - 1.0) > 0.1:
+        yield Finding("warning", f"the course turns {scale:.2f} times as much as the gyro about the vertical")
+
+
+def odometer_findings(recording: Recording, track: Track | None, facts: dict[str, Any]) -> Iterator[Finding]:
+    odometer = recording.odometer
+    assert odometer is not None
+    if min(odometer.t[-1], recording.end) <= max(odometer.t[0], recording.start):
+        yield Finding("warning", "odometer and IMU do not overlap in time")
+        return
+    found = crosschecks.odometer_fit(odometer, track) if track is not None else None
+    if found is None:
+        return
+    fit, scale = found
+    if fit.correlation < 0.9:
+        return
+    facts["true_over_recorded"] = round(scale, 4)
+    facts["late_by_s"] = round(fit.lag, 3)
+    units = {1 / 3.6: "km/h", 0.44704: "mph", 1852 / 3600: "knots", 3.6: "m/s already: leave out units.speed"}
+    for factor, unit in units.items():
+        if abs(scale / factor - 1.0) < 0.06:
+            say = (
+                f'the odometer is in {unit}: say units = {{ speed = "{unit}" }}'
+                if factor < 1
+                else f"the odometer is in {unit}"
+            )
+            yield Finding("warning", f"GNSS speed is {scale:.3f} times the odometer's: {say}")
+            break
+    else:
+        if scale < 0:
+            yield Finding("warning", f"the odometer's sign is reversed (GNSS speed is {scale:.3f} times it)")
+        elif abs(scale - 1.0) > max(2.0 * odometer.scale_sigma, 0.02):
+            yield Finding(
+                "warning",
+                f"GNSS speed is {scale:.3f} times the odometer's, "
+                f"which scale_sigma = {odometer.scale_sigma:g} does not cover",
+            )
+    if abs(fit.lag) > 0.1 + 4.0 * fit.spread:
+        yield Finding(
+            "warning",
+            f"odometer stamps are {'late' if fit.lag > 0 else 'early'} against GNSS by {abs(fit.lag):.2f} s: "
+            f"add {-fit.lag:+.2f} to time_offset in [odometer]",
+        )

@@ -1,0 +1,30 @@
+"""One thing worth knowing about a recording, and the small helpers that every check uses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.rotation import Array
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing worth knowing: a warning if results suffer from it, else a note."""
+
+    severity: Literal["note", "warning"]
+    sentence: str
+
+
+def period_of(t: Array) -> float:
+    """Median step of time stamps, s; NaN of fewer than two."""
+    return float(np.median(np.diff(t))) if len(t) > 1 else float("nan")
+
+
+def runs_of(mask: NDArray[Any]) -> list[tuple[int, int]]:
+    """[start, end) of every run of True."""
+    edges = np.flatnonzero(np.diff(np.r_[0, mask.astype(np.int8), 0]))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

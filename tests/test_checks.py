@@ -1,0 +1,240 @@
+"""The checks find what was broken in a real drive, and nothing in one that is as its README says."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphnav.checks import Inspection, inspect
+from graphnav.formats import read
+from graphnav.formats.schema import rotation_from_letters
+from graphnav.recording import Recording
+
+Change = Callable[[Recording], Recording]
+
+
+@functools.cache
+def load(source: str) -> Recording:
+    """A recording, read once for all tests; it is frozen."""
+    return read(source)
+
+
+@pytest.fixture
+def drive(shared_data: Path) -> Callable[[str], Recording]:
+    """Recordings by name: a folder of the shared data, or kitti."""
+    return lambda name: load(name if name == "kitti" else str(shared_data / name))
+
+
+def warned(recording: Recording, pattern: str) -> list[str]:
+    """The warnings that hold the pattern."""
+    return [w for w in inspect(recording).warnings if re.search(pattern, w)]
+
+
+def imu(**changes: Callable[..., np.ndarray]) -> Change:
+    """Change arrays of the IMU."""
+    return lambda r: replace(r, imu=replace(r.imu, **{k: f(getattr(r.imu, k)) for k, f in changes.items()}))
+
+
+def odometer(**changes: Callable[..., np.ndarray]) -> Change:
+    """Change arrays of the odometer."""
+    return lambda r: replace(
+        r, odometer=replace(r.odometer, **{k: f(getattr(r.odometer, k)) for k, f in changes.items()})
+    )
+
+
+def declared(axes: str) -> Change:
+    """The same file, with other axes stated."""
+    R = rotation_from_letters(axes)
+
+    def change(r: Recording) -> Recording:
+        turn = R @ r.imu.R_bs.T
+        return replace(r, imu=replace(r.imu, gyro=r.imu.gyro @ turn.T, accel=r.imu.accel @ turn.T, R_bs=R))
+
+    return change
+
+
+# ---- what is as it should be
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "boulder_drive_20250708",
+        "comma_highway_20180802",
+        "dresden_car_20140326",
+        "oracle_drive",
+        "tokyo_20201105",
+        "kitti",
+    ],
+)
+def test_no_false_alarm_on_a_drive(drive: Callable[[str], Recording], name: str) -> None:
+    assert inspect(drive(name)).warnings == ()
+
+
+def test_no_false_alarm_on_a_walk(shared_data: Path) -> None:
+    walks = [
+        f
+        for folder in ("gcp_walks", "openshoe_loops", "pyshoe_vicon", "xio_loops")
+        for f in (shared_data / folder).glob("*.toml")
+    ]
+    assert len(walks) == 22
+    for walk in walks:
+        assert inspect(read(walk)).warnings == (), walk
+
+
+def test_single_point_fixes_are_said_to_jump_and_nothing_else(drive: Callable[[str], Recording]) -> None:
+    # real multipath to tens of metres, as the README of the drive says
+    (warning,) = inspect(drive("tokyo_20201105/recording_spp.toml")).warnings
+    assert re.search(r"jumps in GNSS position .* robust kernel", warning)
+
+
+def test_facts_agree_with_what_was_measured_of_the_drives(drive: Callable[[str], Recording]) -> None:
+    boulder = inspect(drive("boulder_drive_20250708"))
+    assert boulder.facts["gnss"]["distance_m"] == pytest.approx(4050, rel=0.01)
+    assert boulder.facts["gnss"]["max_speed_mps"] == pytest.approx(16.3, abs=0.1)
+    assert boulder.facts["gnss"]["stops"] == 4
+    assert boulder.facts["imu"]["force_at_rest_mps2"] == pytest.approx(9.930, abs=0.01)
+    assert any("1138 IMU rows" in f.sentence and "repeat" in f.sentence for f in boulder.findings)
+    assert any(re.search(r"9\.797 \(\+1\.3 %\)", f.sentence) for f in boulder.findings)
+    tokyo = inspect(drive("tokyo_20201105"))
+    assert tokyo.facts["imu"]["force_at_rest_mps2"] == pytest.approx(9.60, abs=0.01)
+    assert tokyo.facts["odometer"]["true_over_recorded"] == pytest.approx(1.0025, abs=0.001)  # its README's median
+    assert abs(tokyo.facts["odometer"]["late_by_s"]) < 0.03  # the description applies the 0.65 s
+    comma = inspect(drive("comma_highway_20180802"))
+    assert comma.facts["odometer"]["true_over_recorded"] == pytest.approx(1.0088, abs=0.001)
+    assert comma.facts["gnss"]["stops"] == 0
+    assert "still_s" not in comma.facts["imu"]
+
+
+# ---- what is broken is found
+
+
+def test_a_known_clock_error_is_found_when_it_is_not_corrected(drive: Callable[[str], Recording]) -> None:
+    # the README of boulder: late by 0.10 +- 0.02 s; its description corrects it
+    (warning,) = warned(imu(t=lambda t: t + 0.10)(drive("boulder_drive_20250708")), "IMU stamps are late")
+    assert 0.08 <= float(re.search(r"by ([0-9.]+) s", warning)[1]) <= 0.12
+
+
+@pytest.mark.parametrize("name", ["boulder_drive_20250708", "tokyo_20201105", "oracle_drive", "kitti"])
+@pytest.mark.parametrize("shift", [18.0, -18.0])
+def test_leap_seconds_are_found(drive: Callable[[str], Recording], name: str, shift: float) -> None:
+    (warning,) = warned(imu(t=lambda t: t + shift)(drive(name)), "leap seconds")
+    assert ("late" if shift > 0 else "early") in warning
+    assert float(re.search(r"add ([-+0-9.]+) to", warning)[1]) == pytest.approx(-shift, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "name", ["boulder_drive_20250708", "tokyo_20201105", "dresden_car_20140326", "oracle_drive", "kitti"]
+)
+@pytest.mark.parametrize("axes", ["RFU", "FLU", "BRU", "FRD", "LBU"])
+def test_wrong_axes_are_found_and_the_right_ones_named(drive: Callable[[str], Recording], name: str, axes: str) -> None:
+    recording = drive(name)
+    found = warned(declared(axes)(recording), "axes contradict the drive")
+    right = np.array_equal(rotation_from_letters(axes), recording.imu.R_bs)
+    assert len(found) == (0 if right else 1)
+    if found:
+        named = re.search(r'axes = "([A-Z]{3})" would agree', found[0])[1]
+        assert np.array_equal(rotation_from_letters(named), recording.imu.R_bs)
+
+
+DEG = np.degrees(1.0)
+BROKEN: dict[str, tuple[Change, str]] = {
+    "gyro in deg/s": (imu(gyro=lambda x: x * DEG), r'57 times too large .*gyro = "deg/s"'),
+    "gyro taken as deg/s": (imu(gyro=lambda x: x / DEG), "57 times too small .*leave out units.gyro"),
+    "gyro scale": (imu(gyro=lambda x: x / 1.3), r"the course turns 1\.[23]\d times as much as the gyro"),
+    "accelerometer in g": (imu(accel=lambda x: x / 9.80665), r'accel = "g"'),
+    "accelerometer taken as g": (imu(accel=lambda x: x * 9.80665), r"leave out units\.accel"),
+    "gravity removed": (imu(accel=lambda x: x - [0, 0, 9.8]), "gravity seems to have been removed"),
+    "gyro reversed": (imu(gyro=lambda x: -x), "the gyro's sign is reversed"),
+    "accelerometer reversed": (imu(accel=lambda x: -x), "the accelerometer's sign is reversed"),
+    "no overlap": (imu(t=lambda t: t + 1e6), "do not overlap in time.*time_offset"),
+    "gyro clipped": (imu(gyro=lambda x: np.clip(x, -0.5, 0.5)), "gyro z .* is saturated"),
+    "stuck": (imu(gyro=lambda x: _stick(x), accel=lambda x: _stick(x)), r"repeats one value for [23]\.\d s"),
+    "gap": (lambda r: r.without("odometer") and _gap(r), r"1 gap in the IMU, the longest 3\.\d+ s at 50\.\d s"),
+}
+
+
+def _stick(x: np.ndarray) -> np.ndarray:
+    x = x.copy()
+    x[2000:2150] = x[2000]  # 3 s at 50 Hz
+    return x
+
+
+def _gap(r: Recording) -> Recording:
+    away = (r.imu.t > r.imu.t[0] + 50) & (r.imu.t < r.imu.t[0] + 53)
+    keep = ~away
+    return replace(r, imu=replace(r.imu, t=r.imu.t[keep], gyro=r.imu.gyro[keep], accel=r.imu.accel[keep]))
+
+
+@pytest.mark.parametrize("case", BROKEN, ids=lambda name: name.replace(" ", "-"))
+def test_a_broken_imu_is_found(drive: Callable[[str], Recording], case: str) -> None:
+    change, pattern = BROKEN[case]
+    tokyo = drive("tokyo_20201105")
+    assert not warned(tokyo, pattern)
+    assert len(warned(change(tokyo), pattern)) >= 1
+
+
+@pytest.mark.parametrize(
+    ("factor", "pattern"),
+    [
+        (3.6, r'speed = "km/h"'),
+        (1 / 0.44704, r'speed = "mph"'),
+        (3600 / 1852, r'speed = "knots"'),
+        (1 / 3.6, r"in m/s already"),
+        (-1.0, "sign is reversed"),
+        (1.15, r"0\.8\d+ times the odometer's, which scale_sigma = 0\.02 does not cover"),
+    ],
+)
+@pytest.mark.parametrize("name", ["tokyo_20201105", "comma_highway_20180802", "oracle_drive"])
+def test_an_odometer_in_another_unit_is_found(
+    drive: Callable[[str], Recording], name: str, factor: float, pattern: str
+) -> None:
+    assert len(warned(odometer(speed=lambda x: x * factor)(drive(name)), pattern)) == 1
+
+
+def test_a_late_odometer_is_found(drive: Callable[[str], Recording]) -> None:
+    # as recorded, before the description's time_offset of -0.65 s
+    (warning,) = warned(odometer(t=lambda t: t + 0.65)(drive("tokyo_20201105")), "odometer stamps are late")
+    assert 0.60 <= float(re.search(r"by ([0-9.]+) s", warning)[1]) <= 0.70
+
+
+@pytest.mark.parametrize("name", ["tokyo_20201105", "kitti", "oracle_drive"])
+def test_a_jump_of_30_m_is_found_where_it_is(drive: Callable[[str], Recording], name: str) -> None:
+    recording = drive(name)
+    llh = recording.gnss.llh.copy()
+    llh[200:203, 0] += 30.0 / 6.37e6
+    (warning,) = warned(replace(recording, gnss=replace(recording.gnss, llh=llh)), "jumps? in GNSS position")
+    at = float(re.search(r"at ([0-9.]+) s", warning)[1])
+    t = recording.gnss.t - recording.start
+    assert t[199] <= at <= t[204]
+
+
+def test_understated_noise_is_found(drive: Callable[[str], Recording]) -> None:
+    recording = drive("oracle_drive")
+    small = replace(recording.imu.noise, gyro_noise_density=1e-7)
+    assert (
+        len(warned(replace(recording, imu=replace(recording.imu, noise=small)), "gyro_noise_density = 1e-07 is small"))
+        == 1
+    )
+
+
+def test_a_recording_of_almost_nothing_is_inspected_without_a_word_of_axes(drive: Callable[[str], Recording]) -> None:
+    short = drive("tokyo_20201105").crop(0.0, 0.1)
+    found = inspect(short)
+    assert found.facts["imu"]["rows"] == len(short.imu.t)
+    assert not any("axes" in w or "stamps" in w for w in found.warnings)
+
+
+def test_the_text_names_sensors_units_and_findings(drive: Callable[[str], Recording]) -> None:
+    inspection = inspect(drive("oracle_drive"))
+    text = inspection.text()
+    assert isinstance(inspection, Inspection)
+    assert "rate 200 Hz" in text
+    assert "note: 1 gap in GNSS, the longest 61.0 s" in text
+    assert text.splitlines()[0] == "oracle drive, seed 20240612, rtk (vehicle)"
