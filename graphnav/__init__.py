@@ -38,7 +38,17 @@ _HOME = {
     "Trajectory": ("graphnav.trajectory", "Trajectory"),
     "GraphnavError": ("graphnav.errors", "GraphnavError"),
 }
-__all__ = ["__version__", *sorted(_HOME)]
+__all__ = [
+    "GraphnavError",
+    "Recording",
+    "Settings",
+    "Solution",
+    "Trajectory",
+    "__version__",
+    "load",
+    "read_settings",
+    "run",
+]
 
 if TYPE_CHECKING:
     from graphnav.config import Settings, read_settings

@@ -50,6 +50,9 @@ class GnssSettings(_Section):
     lever_arm_sigma: float | None = Field(
         None, gt=0, description="m, 1-sigma of the stated lever arm; given, the lever arm is estimated"
     )
+    time_offset_sigma: float = Field(
+        0.02, ge=0, description="s, 1-sigma of what the stamps of the fixes may be off; 0 = exact, not estimated"
+    )
 
 
 class SolverSettings(_Section):

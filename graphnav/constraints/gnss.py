@@ -3,14 +3,18 @@
 Groves (2013), eq. 14.103 and 14.104, without its small-angle approximations. Residuals are in the local
 ENU at the fix, where receivers state their sigmas::
 
-    r_p = R_ln (p + R_nb l - p_meas)
-    r_v = R_ln (v + R_nb (omega_nb x l)) - v_meas,     omega_nb = omega_b - b_g - R_nb^T omega_ie
+    r_p = R_ln (p + R_nb l + v d - p_meas)
+    r_v = R_ln (v + R_nb (omega_nb x l) + a d) - v_meas
+    omega_nb = omega_b - b_g - R_nb^T omega_ie,      a = R_nb (f_b - b_a) + g
+
+d is what must be added to the stamps of the fixes, one constant for positions and one for velocities: a
+receiver's filters delay them differently (boulder's differ by 0.1 s, dresden's by 0.7 s).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,7 +26,9 @@ from graphnav.rotation import Array, mv
 from graphnav.state import Parameter, States
 
 LEVER_ARM = "gnss_lever_arm"
-_RATE_WINDOW = 0.05  # s each side over which the turn rate at a fix is averaged
+TIME_OFFSET = "gnss_time_offset"
+VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
+_WINDOW = 0.05  # s each side over which turn rate and force at a fix are averaged
 
 
 def _empty(*shape: int) -> Array:
@@ -36,20 +42,20 @@ def _usable(recording: Recording) -> Array:
     return (t >= recording.start) & (t <= recording.end)
 
 
-def _lever_arm(scene: Scene) -> tuple[Parameter, ...]:
-    sigma, gnss = scene.settings.gnss.lever_arm_sigma, scene.recording.gnss
-    if sigma is None or gnss is None:
-        return ()
-    return (Parameter(LEVER_ARM, gnss.lever_arm, np.full(3, sigma), "m"),)
-
-
-def _common(scene: Scene) -> dict[str, object]:
-    s = scene.settings.gnss
+def _common(scene: Scene, offset: str) -> dict[str, Any]:
+    """Parameters and what the solvers want to know, from the settings."""
+    settings, gnss = scene.settings.gnss, scene.recording.gnss
+    assert gnss is not None
+    parameters: list[Parameter] = []
+    if settings.lever_arm_sigma is not None:
+        parameters.append(Parameter(LEVER_ARM, gnss.lever_arm, np.full(3, settings.lever_arm_sigma), "m"))
+    if settings.time_offset_sigma > 0:
+        parameters.append(Parameter(offset, np.zeros(1), np.full(1, settings.time_offset_sigma), "s"))
     return {
-        "parameters": _lever_arm(scene),
-        "robust": s.robust,
-        "robust_scale": s.robust_scale,
-        "gate": s.gate,
+        "parameters": tuple(parameters),
+        "robust": settings.robust,
+        "robust_scale": settings.robust_scale,
+        "gate": settings.gate,
     }
 
 
@@ -86,7 +92,7 @@ class GnssPosition(Constraint):
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
             sigma=gnss.sd[used],
             lever_arm=gnss.lever_arm,
-            **_common(scene),
+            **_common(scene, TIME_OFFSET),
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -97,6 +103,11 @@ class GnssPosition(Constraint):
         jacobians = {"theta": -CR @ rotation.skew(lever), "p": C}
         if LEVER_ARM in parameters:
             jacobians[LEVER_ARM] = CR
+        if TIME_OFFSET in parameters:
+            offset = parameters[TIME_OFFSET]
+            velocity = mv(C, states.v)
+            residual = residual + velocity * offset
+            jacobians |= {"v": C * offset[..., None], TIME_OFFSET: velocity[..., None]}
         return Linearized(residual, jacobians, self.sigma[rows])
 
 
@@ -112,6 +123,8 @@ class GnssVelocity(Constraint):
     R_ln: Array = field(default_factory=lambda: _empty(0, 3, 3))
     sigma: Array = field(default_factory=lambda: _empty(0, 3))
     gyro: Array = field(default_factory=lambda: _empty(0, 3))  # measured rate at the fix
+    accel: Array = field(default_factory=lambda: _empty(0, 3))  # measured force at the fix
+    g_n: Array = field(default_factory=lambda: _empty(0, 3))  # gravity there
     omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
 
@@ -136,10 +149,12 @@ class GnssVelocity(Constraint):
             v_l=gnss.v[used],
             R_ln=earth.enu_axes(gnss.llh[used]) @ scene.frame.R_ne.T,
             sigma=gnss.sd_v[used],
-            gyro=mean_rate(scene.recording.imu, gnss.t[used]),
+            gyro=around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
+            accel=around(scene.recording.imu, scene.recording.imu.accel, gnss.t[used]),
+            g_n=scene.frame.gravity_n(scene.frame.from_llh(gnss.llh[used])),
             omega_n=scene.frame.omega_n,
             lever_arm=gnss.lever_arm,
-            **_common(scene),
+            **_common(scene, VELOCITY_TIME_OFFSET),
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -158,13 +173,20 @@ class GnssVelocity(Constraint):
         }
         if LEVER_ARM in parameters:
             jacobians[LEVER_ARM] = CR @ rotation.skew(omega)
+        if VELOCITY_TIME_OFFSET in parameters:
+            offset = parameters[VELOCITY_TIME_OFFSET]
+            force = self.accel[rows] - states.ba
+            change = mv(CR, force) + mv(C, self.g_n[rows])
+            residual = residual + change * offset
+            jacobians["theta"] = jacobians["theta"] - CR @ rotation.skew(force) * offset[..., None]
+            jacobians |= {"ba": -CR * offset[..., None], VELOCITY_TIME_OFFSET: change[..., None]}
         return Linearized(residual, jacobians, self.sigma[rows])
 
 
-def mean_rate(imu: Imu, t: Array) -> Array:
-    """(N, 3) mean measured rate around times t: one sample's vibration would be noise times lever arm."""
-    lo = np.searchsorted(imu.t, t - _RATE_WINDOW)
-    hi = np.maximum(np.searchsorted(imu.t, t + _RATE_WINDOW), lo + 1)
+def around(imu: Imu, x: Array, t: Array) -> Array:
+    """(N, 3) mean of an IMU signal around times t: one sample's vibration would be noise times lever arm."""
+    lo = np.searchsorted(imu.t, t - _WINDOW)
+    hi = np.maximum(np.searchsorted(imu.t, t + _WINDOW), lo + 1)
     lo, hi = np.minimum(lo, len(imu.t) - 1), np.minimum(hi, len(imu.t))
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.gyro, axis=0)])
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(x, axis=0)])
     return (total[hi] - total[lo]) / (hi - lo)[:, None]
