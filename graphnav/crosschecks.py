@@ -110,7 +110,7 @@ def _pairs(track: Track) -> tuple[Index, Index]:
 
 def _regress(x: Array, y: Array) -> tuple[float, Array]:
     x, y = x - x.mean(0), y - y.mean()
-    b: Array = np.linalg.lstsq(x, y, rcond=None)[0]
+    b = np.asarray(np.linalg.lstsq(x, y, rcond=None)[0], dtype=float)
     prediction, norm = x @ b, np.linalg.norm(y)  # the sign is in b: a reversed axis correlates as well
     scale = np.linalg.norm(prediction) * norm
     return (float(prediction @ y / scale) if scale > 0 else 0.0), b
@@ -144,12 +144,14 @@ def _search(y: Array, x_at: Callable[[Index, float], Array], span: Array, valid:
 
     few = every[:: max(1, len(y) // 800)]
     many = every[:: max(1, len(y) // 4000)]
-    reach = min(WIDE, 0.3 * (span[-1] - span[0]))
-    coarse = best(few, np.arange(-reach, reach + 0.1, 0.2))
     near = best(few, np.arange(-5.0, 5.01, 0.1))
-    # a far shift must explain clearly more than a near one, for there are many far ones
-    if abs(coarse) > 5.0 and correlation(coarse, few) < correlation(near, few) + 0.15:
-        coarse = near
+    coarse, reached = near, correlation(near, few)
+    # far away only if nothing near explains y, and only for clearly more, for there are many far shifts
+    reach = min(WIDE, 0.3 * (span[-1] - span[0]))
+    if reached < 0.6 and reach > 5.0:
+        far = best(few, np.arange(-reach, reach + 0.1, 0.2))
+        if abs(far) > 5.0 and correlation(far, few) > reached + 0.15:
+            coarse = far
     fine = np.arange(-0.3, 0.301, 0.02) + coarse
     lag = best(many, fine)
     parts = [best(part, fine) for part in np.array_split(many, 4) if len(part) >= 2 * MIN_PAIRS]

@@ -16,6 +16,7 @@ from graphnav.formats import read
 from graphnav.formats.schema import rotation_from_letters
 from graphnav.recording import Recording
 
+TURNING = ["boulder_drive_20250708", "tokyo_20201105", "dresden_car_20140326", "oracle_drive", "kitti"]
 Change = Callable[[Recording], Recording]
 
 
@@ -175,9 +176,8 @@ def _gap(r: Recording) -> Recording:
 @pytest.mark.parametrize("case", BROKEN, ids=lambda name: name.replace(" ", "-"))
 def test_a_broken_imu_is_found(drive: Callable[[str], Recording], case: str) -> None:
     change, pattern = BROKEN[case]
-    tokyo = drive("tokyo_20201105")
-    assert not warned(tokyo, pattern)
-    assert len(warned(change(tokyo), pattern)) >= 1
+    # the whole drive gets no warning at all: test_no_false_alarm_on_a_drive
+    assert len(warned(change(drive("tokyo_20201105")), pattern)) >= 1
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_a_broken_imu_is_found(drive: Callable[[str], Recording], case: str) -> 
 def test_an_odometer_in_another_unit_is_found(
     drive: Callable[[str], Recording], name: str, factor: float, pattern: str
 ) -> None:
-    assert len(warned(odometer(speed=lambda x: x * factor)(drive(name)), pattern)) == 1
+    assert len(warned(odometer(speed=lambda x: x * factor)(drive(name).crop(0.0, 500.0)), pattern)) == 1
 
 
 def test_a_late_odometer_is_found(drive: Callable[[str], Recording]) -> None:
@@ -212,7 +212,7 @@ def test_a_jump_of_30_m_is_found_where_it_is(drive: Callable[[str], Recording], 
     (warning,) = warned(replace(recording, gnss=replace(recording.gnss, llh=llh)), "jumps? in GNSS position")
     at = float(re.search(r"at ([0-9.]+) s", warning)[1])
     t = recording.gnss.t - recording.start
-    assert t[199] <= at <= t[204]
+    assert t[199] - 0.05 <= at <= t[204] + 0.05  # it is said to a tenth of a second
 
 
 def test_understated_noise_is_found(drive: Callable[[str], Recording]) -> None:
