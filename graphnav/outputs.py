@@ -1,0 +1,276 @@
+"""What a run leaves on disk: trajectories, calibration, summary and report per solver, and the comparison."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import platform
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import graphnav
+from graphnav.errors import ConfigError
+from graphnav.solution import ParameterEstimate, Solution
+from graphnav.workflow import Outcome
+
+if TYPE_CHECKING:
+    from graphnav.metrics import Metrics
+
+DETECTIONS_HEADER = "start,end,detector"
+
+
+def output_folder(path: str | Path) -> Path:
+    """The folder `path`, made if need be.
+
+    Raises
+    ------
+    ConfigError
+        If it is a file, or cannot be made or written to.
+    """
+    folder = Path(path)
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"-o {folder}: is a file; name a folder to write into")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".graphnav-writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ConfigError(f"-o {folder}: cannot be written to ({error.strerror})") from None
+    return folder
+
+
+def write_run(outcome: Outcome, folder: Path) -> list[Path]:
+    """Everything of the only solver of a run, straight into `folder`; returns the files to look at first."""
+    ((name, _),) = outcome.solutions.items()
+    write_solver(outcome, name, folder, _provenance(outcome))
+    return [folder / "report.html", folder / "trajectory.csv", folder / "summary.json"]
+
+
+def write_comparison(outcome: Outcome, folder: Path) -> list[Path]:
+    """Everything per solver under its own name, and the table and page that compare them."""
+    from graphnav import report
+    from graphnav.metrics import summary, write_comparison_csv
+
+    provenance = _provenance(outcome)
+    for name in outcome.solutions:
+        write_solver(outcome, name, folder / name, provenance)
+    write_comparison_csv(folder / "comparison.csv", comparison(outcome))
+    report.write_comparison(
+        folder / "comparison.html",
+        outcome.recording,
+        outcome.solutions,
+        settings=outcome.request.settings.model_dump(),
+        metrics={name: summary(m) for name, m in outcome.metrics.items()},
+        errors={name: m.errors for name, m in outcome.metrics.items() if m.errors is not None},
+        withheld=outcome.used_withheld,
+        findings=_odd(outcome),
+        provenance=provenance,
+    )
+    return [folder / "comparison.html", folder / "comparison.csv"]
+
+
+def write_solver(outcome: Outcome, name: str, folder: Path, provenance: Mapping[str, Any]) -> None:
+    """The files of one solver; a folder that holds older ones keeps none of them under the same names."""
+    from graphnav import report
+    from graphnav.exporters import write_all
+    from graphnav.metrics import summary
+
+    solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
+    began = time.perf_counter()
+    trajectory = solution.trajectory()
+    write_all(replace(trajectory, name=f"{outcome.recording.name}, {name}"), folder)
+    write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
+    (folder / "detections.csv").write_text(DETECTIONS_HEADER + "\n", encoding="utf-8")
+    written = time.perf_counter()
+    report.write_report(
+        folder / "report.html",
+        outcome.recording,
+        solution,
+        settings=outcome.request.settings.model_dump(),
+        metrics=None if metrics is None else summary(metrics),
+        errors=None if metrics is None else metrics.errors,
+        withheld=outcome.used_withheld,
+        findings=_odd(outcome),
+        provenance=provenance,
+    )
+    spent = {"writing": written - began, "report": time.perf_counter() - written}
+    write_json(folder / "summary.json", solver_summary(outcome, name, spent, provenance))
+
+
+def solver_summary(
+    outcome: Outcome, name: str, spent: Mapping[str, float], provenance: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What summary.json holds; `spent` are the seconds of writing, which only the writer knows."""
+    from graphnav.metrics import summary
+
+    solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
+    errors = None if metrics is None else summary(metrics)
+    spans = [] if errors is None else errors.pop("spans", [])
+    notes = list(solution.notes) if errors is None else [*solution.notes, *errors.pop("notes", [])]
+    nees = None
+    if errors is not None:
+        nees = {key: value for key, value in errors.items() if key.startswith("nees_")}
+        errors = {key: value for key, value in errors.items() if key not in nees}
+    timings = {**solution.timings, "evaluation": outcome.timings["evaluation"], **spent}
+    rejected = {key: int(np.sum(r.weight <= 1e-9)) for key, r in solution.records.items()}
+    return {
+        "solver": name,
+        "recording": outcome.recording.name,
+        "duration_s": round(outcome.recording.duration, 6),
+        "keyframes": len(solution.t),
+        "counts": solution.counts,
+        "rejected": rejected,
+        "iterations": solution.iterations,
+        "stopped": solution.stopped,
+        "final_cost": solution.cost,
+        "timings": {stage: round(seconds, 4) for stage, seconds in timings.items()},
+        "peak_memory_mb": peak_memory_mb(),
+        "against": outcome.against,
+        "errors": errors,
+        "spans": [
+            {"missing": missing, **span, **{key: round(span[key] + outcome.zero, 6) for key in ("start_s", "end_s")}}
+            for missing, span in zip(outcome.span_names, spans, strict=True)
+        ],
+        "nees": nees or None,
+        "parameters": {
+            key: {"value": p.value[-1], "sigma": p.sigma[-1], "unit": p.unit} for key, p in solution.parameters.items()
+        },
+        "notes": list(dict.fromkeys(notes)),
+        "remarks": list(outcome.findings),
+        "settings": outcome.request.settings.model_dump(),
+        "provenance": provenance,
+    }
+
+
+def comparison(outcome: Outcome) -> list[dict[str, Any]]:
+    """One flat row per solver: errors where there are any, stated sigmas, seconds and iterations."""
+    from graphnav.metrics import comparison_rows
+
+    measured = {row["solver"]: row for row in comparison_rows(outcome.metrics)}
+    rows = []
+    for name, solution in outcome.solutions.items():
+        row = measured.get(name, {"solver": name})
+        row |= {key: _rounded(value) for key, value in stated(solution).items()}
+        row |= {"keyframes": len(solution.t), "iterations": solution.iterations, "final_cost": _rounded(solution.cost)}
+        row["run_time_s"] = _rounded(sum(solution.timings.values()))
+        for key in [k for k in row if k.startswith("span") and k.endswith(("_start_s", "_end_s"))]:
+            row[key] = round(row[key] + outcome.zero, 6)
+        rows.append(row)
+    return rows
+
+
+def stated(solution: Solution) -> dict[str, float]:
+    """Medians of the sigmas a solution states of itself: horizontal and up (m), heading (deg)."""
+    track = solution.trajectory()
+    out = {}
+    if track.sd_p is not None:
+        out["sd_h_median_m"] = float(np.median(np.hypot(track.sd_p[:, 0], track.sd_p[:, 1])))
+        out["sd_u_median_m"] = float(np.median(track.sd_p[:, 2]))
+    if track.sd_rph is not None:
+        out["sd_heading_median_deg"] = float(np.degrees(np.median(track.sd_rph[:, 2])))
+    return out
+
+
+def peak_memory_mb() -> float:
+    """The most memory this process ever held, MB of 2^20 bytes."""
+    try:
+        # where there is one: ru_maxrss of a process that was forked counts its parent's memory as well
+        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+            if line.startswith("VmHWM:"):
+                return round(int(line.split()[1]) / 1024.0, 1)
+    except (OSError, ValueError):
+        pass
+    import resource  # not on Windows
+
+    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(size / (1024.0**2 if sys.platform == "darwin" else 1024.0), 1)
+
+
+def write_json(path: Path, values: Any) -> None:
+    """Plain JSON: arrays as lists, whatever is not finite as null."""
+    path.write_text(json_text(values) + "\n", encoding="utf-8")
+
+
+def json_text(values: Any) -> str:
+    """Values as indented JSON, as `write_json` writes them."""
+    return json.dumps(_plain(values), indent=2, ensure_ascii=False)
+
+
+def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) -> None:
+    """evaluation.json, and errors.csv with a row per compared epoch where there are any."""
+    from graphnav.exporters.csv import rows_text
+
+    write_json(folder / "evaluation.json", values)
+    e = metrics.errors
+    if e is None:
+        return
+    columns = [e.t[:, None], e.p, e.track, e.v, np.degrees(e.rph), e.sd_p]
+    head = "t,east,north,up,along,across,ve,vn,vu,roll,pitch,heading,sd_e,sd_n,sd_u\n"
+    body = rows_text(np.concatenate(columns, axis=1), "%.6f" + 14 * ",%.6g")
+    (folder / "errors.csv").write_text(head + body, encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(one) for one in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, str | int | float | bool) else str(value)
+
+
+def _calibration(p: ParameterEstimate) -> dict[str, Any]:
+    """A constant as its value, a slow parameter as its nodes."""
+    nodes = slice(None) if len(p.t) > 1 else 0
+    return {
+        "unit": p.unit,
+        **({"t": p.t} if len(p.t) > 1 else {}),
+        "value": p.value[nodes],
+        "sigma": p.sigma[nodes],
+        "prior_sigma": p.prior_sigma,
+        "seen_by_the_data": p.observable,
+    }
+
+
+def _odd(outcome: Outcome) -> list[str]:
+    """What the report lists as odd."""
+    lines = list(outcome.findings)
+    if outcome.zero:
+        lines.append(f"only a part is used: times here count from {outcome.zero:.3f} s after the recording's start")
+    return lines
+
+
+def _provenance(outcome: Outcome) -> dict[str, Any]:
+    """Versions, what was read (with its sha256) and how the program was called."""
+    return {
+        "graphnav": graphnav.__version__,
+        "gtsam": version("gtsam"),
+        "numpy": np.__version__,
+        "scipy": version("scipy"),
+        "python": platform.python_version(),
+        "inputs": {str(path): _sha256(path) for path in outcome.recording.files},
+        "options": dict(outcome.request.options),
+    }
+
+
+def _sha256(path: Path) -> str:
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _rounded(x: float) -> float | None:
+    return float(f"{x:.5g}") if math.isfinite(x) else None

@@ -1,0 +1,140 @@
+"""What the command line shows: summaries as plain text, and progress on a terminal."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from graphnav.outputs import stated
+from graphnav.workflow import Outcome, Progress
+
+_ERRORS = (
+    ("hor. rms", "h", "rms", "m"), ("hor. max", "h", "max", "m"), ("up rms", "up", "rms", "m"),
+    ("roll rms", "roll", "rms", "deg"), ("pitch rms", "pitch", "rms", "deg"), ("head. rms", "heading", "rms", "deg"),
+)  # fmt: skip
+
+
+def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
+    """What was read, what is worth knowing, how good it is, and where to look."""
+    lines = [_read(outcome)]
+    lines += [f"  {source} withheld{'' if span is None else f' {span[0]:g}-{span[1]:g} s'}"
+              for source, span in outcome.request.withheld]  # fmt: skip
+    notes = [note for s in outcome.solutions.values() for note in s.notes]
+    lines += [f"  note: {note}" for note in dict.fromkeys([*outcome.findings, *notes])]
+    lines.append("")
+    lines += _whole(outcome)
+    lines += _spans(outcome)
+    lines += ["", "no stationary or stance detector has run: detections.csv holds its header only", "", "look at"]
+    return "\n".join([*lines, *(f"  {file}" for file in files)])
+
+
+def _read(outcome: Outcome) -> str:
+    recording = outcome.recording
+    rate = 1.0 / float(np.median(np.diff(recording.imu.t)))
+    parts = [f"{recording.duration:.1f} s", f"IMU {len(recording.imu.t)} rows at {rate:.4g} Hz"]
+    if recording.gnss is not None:
+        parts.append(f"GNSS {len(recording.gnss.t)} fixes")
+    if recording.odometer is not None:
+        parts.append(f"odometer {len(recording.odometer.t)} rows")
+    if recording.truth is not None:
+        parts.append("truth")
+    return f"{recording.name} ({recording.platform}): {', '.join(parts)}"
+
+
+def _whole(outcome: Outcome) -> list[str]:
+    """A row per solver: its errors, or the sigmas it states where there is nothing to compare with."""
+    if not outcome.metrics:
+        head = ["solver", "keyframes", "sd hor. (m)", "sd up (m)", "sd head. (deg)", "seconds"]
+        rows = [
+            [name, str(len(s.t)), *(short(x) for x in stated(s).values()), f"{sum(s.timings.values()):.2f}"]
+            for name, s in outcome.solutions.items()
+        ]
+        return ["no truth to compare with; medians of the sigmas stated:", *table(head, rows)]
+    if all(m.closure is not None for m in outcome.metrics.values()):
+        rows = [
+            [name, short(m.closure.horizontal), short(m.closure.vertical), short(m.closure.percent)]
+            for name, m in outcome.metrics.items()
+            if m.closure is not None
+        ]
+        return [f"errors against {outcome.against}:", *table(["solver", "hor. (m)", "up (m)", "% of way"], rows)]
+    shown = [one for one in _ERRORS if any(one[1] in m.components for m in outcome.metrics.values())]
+    head = ["solver", *(f"{title} ({unit})" for title, _, _, unit in shown), "NEES pos.", "seconds"]
+    rows = []
+    for name, m in outcome.metrics.items():
+        row = [short(getattr(m.components[key], what)) if key in m.components else "-" for _, key, what, _ in shown]
+        nees = short(m.nees["p"].mean) if "p" in m.nees else "-"
+        rows.append([name, *row, nees, f"{sum(outcome.solutions[name].timings.values()):.2f}"])
+    return [f"errors against {outcome.against}:", *table(head, rows)]
+
+
+def _spans(outcome: Outcome) -> list[str]:
+    """For every span without a source, a row per solver."""
+    lines: list[str] = []
+    for k, missing in enumerate(outcome.span_names):
+        every = {name: m.spans[k] for name, m in outcome.metrics.items()}
+        first = next(iter(every.values()))
+        lines += ["", f"{missing} {first.start + outcome.zero:.1f}-{first.end + outcome.zero:.1f} s:"]
+        if not any(s.n for s in every.values()):
+            lines.append("  nothing to compare with in it")
+            continue
+        head = ["solver", "hor. end (m)", "hor. max (m)", "up max (m)", "% of way", "NEES pos."]
+        lines += table(
+            head,
+            [
+                [name, *(short(x) for x in (s.end_h, s.max_h, s.max_up, s.drift_percent, s.nees))]
+                for name, s in every.items()
+            ],
+        )
+    return lines
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Columns aligned, the first to the left and numbers to the right."""
+    widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
+    return [
+        "  "
+        + "  ".join(
+            cell.ljust(w) if k == 0 else cell.rjust(w) for k, (cell, w) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in [head, *rows]
+    ]
+
+
+def short(x: float) -> str:
+    """Three significant digits, '-' where there is no number."""
+    if not np.isfinite(x):
+        return "-"
+    return f"{x:.0f}" if abs(x) >= 1000 else f"{x:.3g}" if abs(x) >= 1e-3 or x == 0 else f"{x:.1e}"
+
+
+@contextmanager
+def progress_bar(quiet: bool) -> Iterator[Progress | None]:
+    """A bar per stage with the time left, on stderr if that is a terminal; else nothing."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskID, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    with Bar(
+        TextColumn("{task.description:<14}"), BarColumn(), TimeRemainingColumn(elapsed_when_finished=True),
+        console=Console(stderr=True), transient=True,
+    ) as bar:  # fmt: skip
+        tasks: dict[str, TaskID] = {}
+        last: list[str] = []
+
+        def update(stage: str, share: float) -> None:
+            if last and last[-1] != stage:
+                bar.update(tasks[last[-1]], completed=1.0, total=1.0)
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=1.0 if share else None)
+            if share:
+                bar.update(tasks[stage], total=1.0, completed=share)
+            last[:] = [stage]
+
+        yield update

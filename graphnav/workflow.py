@@ -1,0 +1,241 @@
+"""One run as the command line and scripts need it: read, withhold, solve, score. Prints and writes nothing.
+
+`graphnav.outputs` writes what `run_request` returns.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from graphnav import rotation
+from graphnav.config import Settings
+from graphnav.errors import ConfigError, RecordingError
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+from graphnav.solution import Solution
+from graphnav.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from graphnav.metrics import Metrics
+
+Span = tuple[float, float]
+Withheld = tuple[str, Span | None]
+Progress = Callable[[str, float], None]
+
+SOURCES = ("gnss", "odometer")
+OUTAGE = 10.0  # s; fixes further apart than this are an outage worth a line of its own
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked for; times in s from the recording's start."""
+
+    source: str
+    solvers: tuple[str, ...]
+    settings: Settings = field(default_factory=Settings)
+    withheld: tuple[Withheld, ...] = ()
+    start: float | None = None
+    end: float | None = None
+    rate: float | None = None  # Hz of the output; None: at the keyframes
+    options: Mapping[str, Any] = field(default_factory=dict)  # as they were given, for provenance
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a request.
+
+    `recording` is the part asked for with nothing withheld; `zero` (s) is how far its start lies behind the start
+    of the whole recording, from which all times that people give or read are counted.
+    """
+
+    request: Request
+    recording: Recording
+    zero: float
+    solutions: dict[str, Solution]
+    metrics: dict[str, Metrics]  # empty where there is nothing to compare with
+    against: str | None  # what the metrics compare with, in words
+    span_names: tuple[str, ...]  # of the spans of every metrics: what is missing in each
+    findings: tuple[str, ...]
+    timings: dict[str, float]  # s by stage, of what all solvers share
+
+    @property
+    def used_withheld(self) -> tuple[Withheld, ...]:
+        """What was withheld, in s from the start of `recording`."""
+        return _moved(self.request.withheld, self.zero)
+
+
+def parse_withheld(text: str) -> Withheld:
+    """``gnss:600-660`` or ``odometer`` as (source, span in s or None).
+
+    Raises
+    ------
+    ConfigError
+        If it is not of that form, or no source of that name can be withheld.
+    """
+    found = re.fullmatch(r"([^:]*)(?::([^-]+)-([^-]+))?", text.strip())
+    usage = "write SOURCE or SOURCE:FROM-TO in seconds from the start, such as gnss:600-660"
+    if found is None:
+        raise ConfigError(f"--without {text}: not a source and a span; {usage}")
+    source, first, last = found.groups()
+    if source not in SOURCES:
+        close = difflib.get_close_matches(source, SOURCES, n=1)
+        hint = f"did you mean '{close[0]}'?" if close else f"one of {', '.join(SOURCES)}"
+        raise ConfigError(f"--without {text}: no source '{source}' can be withheld; {hint}")
+    if first is None:
+        return source, None
+    try:
+        span = float(first), float(last)
+    except ValueError:
+        raise ConfigError(f"--without {text}: '{first}-{last}' is not a span of two numbers; {usage}") from None
+    if not (np.isfinite(span).all() and span[0] < span[1]):
+        raise ConfigError(f"--without {text}: the span must end after it begins; {usage}")
+    return source, span
+
+
+def known_solvers(names: tuple[str, ...], option: str) -> tuple[str, ...]:
+    """The names, each once.
+
+    Raises
+    ------
+    ConfigError
+        If one is not a solver, listing those that are.
+    """
+    from graphnav.pipeline import SOLVERS
+
+    for name in names:
+        if name not in SOLVERS:
+            raise ConfigError(f"{option} {name}: no solver '{name}'; known: {', '.join(SOLVERS)}")
+    if not names:
+        raise ConfigError(f"{option}: names no solver; known: {', '.join(SOLVERS)}")
+    return tuple(dict.fromkeys(names))
+
+
+def run_request(request: Request, progress: Progress | None = None) -> Outcome:
+    """Read, check, withhold, solve and score.
+
+    Raises
+    ------
+    GraphnavError
+        In one plain sentence, for anything that cannot be used as it is.
+    """
+    from graphnav.checks import inspect
+    from graphnav.formats import read
+
+    if request.rate is not None:
+        raise ConfigError("--rate: output between the keyframes is not there yet; leave the option out")
+    timings: dict[str, float] = {}
+    with _timed(timings, "reading", progress):
+        whole = read(request.source)
+    recording = whole.crop(request.start, request.end)
+    zero = recording.start - whole.start if recording is not whole else 0.0
+    moved = _moved(request.withheld, zero)
+    used, notes = _withhold(recording, moved, zero)
+    with _timed(timings, "checks", progress):
+        findings = [f.sentence for f in inspect(recording).findings]
+
+    from graphnav.pipeline import run
+
+    solutions = run(used, request.settings, request.solvers, progress)
+    solutions = {
+        name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
+    }
+    own: dict[str, float] = {}
+    with _timed(own, "evaluation", progress):
+        metrics, against, names = _score(recording, used, solutions, moved)
+    for found in metrics.values():
+        if found.notes:
+            findings += [note for note in found.notes if note not in findings]
+    return Outcome(
+        request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)), timings | own
+    )
+
+
+@contextmanager
+def _timed(timings: dict[str, float], stage: str, progress: Progress | None) -> Iterator[None]:
+    if progress is not None:
+        progress(stage, 0.0)
+    began = time.perf_counter()
+    yield
+    timings[stage] = time.perf_counter() - began
+
+
+def _moved(withheld: tuple[Withheld, ...], by: float) -> tuple[Withheld, ...]:
+    return tuple((source, span and (span[0] - by, span[1] - by)) for source, span in withheld)
+
+
+def _withhold(recording: Recording, withheld: tuple[Withheld, ...], zero: float) -> tuple[Recording, list[str]]:
+    """The recording without what is withheld (s from its start), and sentences about what that did not change."""
+    used, notes = recording, []
+    for source, span in withheld:
+        name = source if span is None else f"{source}:{span[0] + zero:g}-{span[1] + zero:g}"
+        if span is not None and (span[1] <= 0.0 or span[0] >= recording.duration):
+            raise RecordingError(
+                f"--without {name}: lies outside '{recording.name}', which runs from {zero:.0f} to "
+                f"{zero + recording.duration:.1f} s"
+            )
+        if getattr(recording, source) is not None and getattr(used, source) is None:
+            continue  # all of it is gone already
+        before = used
+        used = used.without(source, span)
+        if span is not None and len(getattr(used, source).t) == len(getattr(before, source).t):
+            notes.append(f"--without {name}: there was no {source} row in that span anyway")
+    return used, notes
+
+
+def outages(recording: Recording) -> list[Span]:
+    """Spans of more than `OUTAGE` s without a fix, in s from the start; both ends of the recording count too."""
+    if recording.gnss is None:
+        return []
+    t = recording.gnss.t[np.isfinite(recording.gnss.llh).all(axis=1)] - recording.start
+    edges = np.concatenate([[0.0], t[(t >= 0.0) & (t <= recording.duration)], [recording.duration]])
+    wide = np.flatnonzero(np.diff(edges) > OUTAGE)
+    return [(float(edges[k]), float(edges[k + 1])) for k in wide]
+
+
+def _score(
+    recording: Recording, used: Recording, solutions: Mapping[str, Solution], withheld: tuple[Withheld, ...]
+) -> tuple[dict[str, Metrics], str | None, tuple[str, ...]]:
+    """Metrics per solver against the best truth there is, what that is, and what is missing in each of their spans."""
+    from graphnav.evaluation import evaluate_recording
+
+    spans = [(f"without {source}", span) for source, span in withheld if span is not None]
+    truth = recording.truth
+    gnss_withheld = any(source == "gnss" for source, _ in withheld)
+    if truth is not None and truth.closed_loop_sigma is not None:
+        against, spans = "the start, where the loop ends", []
+    elif truth is not None:
+        against = "the recording's truth"
+        taken = [span for _, span in spans]
+        spans += [("no GNSS", s) for s in outages(recording) if not any(a < s[1] and b > s[0] for a, b in taken)]
+    elif gnss_withheld and recording.gnss is not None:
+        against = "the withheld GNSS fixes"
+        spans = [(name, span) for name, span in spans if name == "without gnss"]
+    else:
+        return {}, None, ()
+    # the evaluation scores each span of GNSS by itself, whatever it is that is missing there
+    asked: list[Withheld] = [("gnss", span) for _, span in spans]
+    if truth is None and any(source == "gnss" and span is None for source, span in withheld):
+        asked.append(("gnss", None))
+    found = {}
+    for name, solution in solutions.items():
+        track = solution.trajectory() if used.gnss is not None else local(solution)
+        metrics = evaluate_recording(track, recording, withheld=asked)
+        if metrics is None:
+            return {}, None, ()
+        found[name] = metrics
+    return found, against, tuple(name for name, _ in spans)
+
+
+def local(solution: Solution) -> Trajectory:
+    """The keyframes in metres of the navigation frame: what a solution without any fix can say."""
+    track = solution.trajectory()
+    rph: Array = rotation.to_rph(solution.states.R_nb)
+    return replace(track, llh=solution.states.p, v=solution.states.v, rph=rph, frame="local")
