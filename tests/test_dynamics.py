@@ -1,0 +1,163 @@
+"""What an interval says of its ends: every Jacobian against differences, and the noise against its frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import FRAME, STEPS, Array, difference, random_imu, random_states
+
+from graphnav import rotation as ro
+from graphnav.dynamics import SCALE, Motion, scale_parameter
+from graphnav.preintegration import bridge_gaps, preintegrate
+from graphnav.recording import ImuNoise
+from graphnav.state import DIM, States
+
+N = 6
+
+
+def near(x: States, ba: float, bg: float) -> States:
+    """With biases where the intervals' first-order correction holds (`Intervals.out_of_range`)."""
+    return replace(x, ba=ba + 0.05 * x.ba, bg=bg + 0.01 * x.bg)
+
+
+@pytest.fixture(scope="module")
+def motion() -> Motion:
+    imu = random_imu(np.random.default_rng(1), 8.0, 200.0)
+    t = np.array([0.0, 0.01, 0.5, 1.503, 2.5, 4.0, 8.0])
+    return Motion(preintegrate(bridge_gaps(imu), imu, t, np.full(3, 0.05), np.full(3, 0.01)), FRAME)
+
+
+@pytest.fixture(scope="module")
+def start() -> States:
+    return near(random_states(np.random.default_rng(2), N), 0.05, 0.01)
+
+
+SCALES = np.array([2e-3, -1e-3, 3e-3, -2e-3, 1e-3, 2e-3])
+SCALE_STEPS = np.full(6, 1e-4)
+
+
+def sizes(J: Array) -> Array:
+    """Largest entry per 3 x 3 block, spread back: the yardstick of a comparison."""
+    n, m, k = J.shape
+    blocks = np.abs(J).reshape(n, m // 3, 3, k // 3, 3).max(axis=(2, 4))
+    return np.repeat(np.repeat(blocks, 3, axis=1), 3, axis=2)
+
+
+@pytest.mark.parametrize("scale", [None, SCALES])
+def test_transition_numerically(motion: Motion, start: States, scale: Array | None) -> None:
+    end, F = motion.propagate(slice(None), start, scale)
+
+    def moved(d: Array) -> Array:
+        return motion.propagate(slice(None), start.plus(np.tile(d, (N, 1))), scale)[0].minus(end)
+
+    numerical = difference(moved, STEPS)
+    # gravity's gradient is that at the origin, on a sphere: 1e-7 1/s^2, and the intervals last up to 4 s
+    assert np.all(np.abs(F - numerical) < 1e-6 * sizes(numerical) + 2e-7)
+
+
+def test_scale_columns_numerically(motion: Motion, start: States) -> None:
+    end, F = motion.propagate(slice(None), start, SCALES)
+    numerical = difference(
+        lambda d: motion.propagate(slice(None), start, SCALES + d)[0].minus(end), SCALE_STEPS
+    )  # fmt: skip
+    S = motion.scale_columns(slice(None), F)
+    assert np.all(np.abs(S - numerical) < 3e-6 * sizes(numerical) + 2e-7)
+
+
+def test_slices_are_rows_of_the_whole(motion: Motion, start: States) -> None:
+    end, F = motion.propagate(slice(None), start, SCALES)
+    for k in range(N):
+        rows = slice(k, k + 1)
+        one, F1 = motion.propagate(rows, start[rows], SCALES)
+        np.testing.assert_allclose(one.minus(end[rows]), 0.0, atol=1e-9)
+        np.testing.assert_allclose(F1[0], F[k], rtol=1e-12, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def torn() -> tuple[Motion, States]:
+    """A chain whose states do not fit together at all: residuals of radians and hundreds of metres."""
+    imu = random_imu(np.random.default_rng(4), 4.0, 200.0)
+    t = np.array([0.0, 1.0, 1.7, 3.0, 4.0])
+    motion = Motion(preintegrate(bridge_gaps(imu), imu, t, np.zeros(3), np.zeros(3)), FRAME)
+    return motion, near(random_states(np.random.default_rng(5), 5, span=300.0), 0.0, 0.0)
+
+
+def test_linearize_numerically_at_large_residuals(torn: tuple[Motion, States]) -> None:
+    motion, x = torn
+    value, Ji, Jj, Js = motion.linearize(x, SCALES)
+    assert np.linalg.norm(value[:, :3], axis=1).max() > 1.5
+    assert np.abs(value[:, 3:6]).max() > 100.0
+    np.testing.assert_allclose(value, motion.residual(x, SCALES), atol=1e-9)
+
+    def at(which: int, d: Array) -> Array:
+        # only even or only odd states move, so that every interval has one end still
+        moved = np.zeros((5, DIM))
+        moved[which::2] = d
+        return motion.residual(x.plus(moved), SCALES)
+
+    even, odd = (difference(lambda d, w=w: at(w, d), STEPS) for w in (0, 1))
+    first = np.arange(4) % 2 == 0
+    for J, numerical in (
+        (Ji, np.where(first[:, None, None], even, odd)),
+        (Jj, np.where(first[:, None, None], odd, even)),
+    ):
+        assert np.all(np.abs(J - numerical) < 1e-6 * sizes(numerical) + 1e-6)
+    numerical = difference(lambda d: motion.residual(x, SCALES + d), SCALE_STEPS)
+    assert np.all(np.abs(Js - numerical) < 1e-6 * sizes(numerical) + 1e-6)
+
+
+def test_residual_of_propagated_states_is_zero(motion: Motion) -> None:
+    state = random_states(np.random.default_rng(6), 1)
+    chain = [state]
+    for k in range(N):
+        chain.append(motion.propagate(slice(k, k + 1), chain[-1], SCALES)[0])
+    x = States.stack(chain)
+    np.testing.assert_allclose(motion.residual(x, SCALES), 0.0, atol=1e-9)
+    np.testing.assert_allclose(motion.linearize(x, SCALES)[0], 0.0, atol=1e-9)
+    assert np.abs(motion.residual(x)).max() > 1e-4  # and the scale matters
+
+
+def test_transition_is_the_linearization_where_the_residual_is_zero(motion: Motion, start: States) -> None:
+    """The filter's F and Q against the graph's Ji and Jj: at zero residual they say the same of every interval."""
+    end, F = motion.propagate(slice(None), start)
+    Q = motion.noise(slice(None), start.R_nb)
+    for k in range(N):
+        one = Motion(motion.intervals[k : k + 1], FRAME)
+        _, Ji, Jj, _ = one.linearize(States.stack([start[k : k + 1], end[k : k + 1]]))
+        Jinv = np.linalg.inv(Jj[0])
+        np.testing.assert_allclose(-Jinv @ Ji[0], F[k], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            Jinv @ motion.intervals.covariance[k] @ Jinv.T, Q[k], rtol=1e-9, atol=1e-9 * np.abs(Q[k]).max()
+        )
+
+
+def test_noise_by_monte_carlo(motion: Motion, start: States) -> None:
+    """Perturb the interval's dR, dV, dP and see where the end goes: the frames and the signs of Q."""
+    k, runs = 3, 4000
+    row = motion.intervals[k : k + 1]
+    C = row.covariance[0]
+    d = np.random.default_rng(7).multivariate_normal(np.zeros(15), C, runs, method="cholesky")
+    many = row[np.zeros(runs, dtype=int)]
+    # an interval that says too little by d predicts an end from which the true one differs by +d
+    disturbed = replace(many, dR=many.dR @ ro.exp(d[:, :3]), dP=many.dP + d[:, 3:6], dV=many.dV + d[:, 6:9])
+    x = start[np.full(runs, k)]
+    exact = motion.propagate(slice(k, k + 1), start[k : k + 1])[0]
+    end = Motion(disturbed, FRAME).propagate(slice(None), x)[0]
+    e = end.minus(exact[np.zeros(runs, dtype=int)])
+    e[:, 9:] += d[:, 9:]  # the biases walk by themselves
+    Q = motion.noise(slice(k, k + 1), start.R_nb[k : k + 1])[0]
+    white = np.linalg.solve(np.linalg.cholesky(Q), e.T)
+    values = np.linalg.eigvalsh(white @ white.T / runs)
+    ratio = np.sqrt(15 / runs)
+    assert values.min() > (1 - ratio) ** 2 * 0.98
+    assert values.max() < (1 + ratio) ** 2 * 1.02
+
+
+def test_scale_parameter() -> None:
+    assert scale_parameter(ImuNoise(gyro_scale_sigma=0.0, accel_scale_sigma=0.0)) == ()
+    (p,) = scale_parameter(ImuNoise(gyro_scale_sigma=1e-3, accel_scale_sigma=2e-3))
+    assert p.name == SCALE
+    assert p.walk == 0.0
+    np.testing.assert_allclose(p.sigma, [1e-3] * 3 + [2e-3] * 3)
