@@ -80,9 +80,13 @@ def inspect(recording: Recording) -> Inspection:
     Findings are in order of the checks, remarks of the loader first.
     """
     findings = [Finding("note", remark) for remark in recording.remarks]
+    for name in ("gnss", "odometer"):
+        if (sensor := getattr(recording, name)) is not None and not len(sensor.t):
+            findings.append(Finding("warning", f"[{name}] holds no rows in this part of the recording"))
+            recording = recording.without(name)
     facts: dict[str, dict[str, Any]] = {"imu": _imu_facts(recording)}
     vehicle = recording.platform == "vehicle"
-    overlap = recording.gnss is not None and len(recording.gnss.t) and overlap_s(recording) > 0
+    overlap = recording.gnss is not None and overlap_s(recording) > 0
     track = crosschecks.track(recording.gnss) if recording.gnss is not None else None
     rest = _at_rest(recording, track if overlap else None)
     findings += imu_time(recording.imu)
@@ -135,8 +139,6 @@ def _imu_facts(recording: Recording) -> dict[str, Any]:
 def _gnss_facts(recording: Recording, track: Track | None) -> dict[str, Any]:
     gnss = recording.gnss
     assert gnss is not None
-    if not len(gnss.t):
-        return {"rows": 0}
     facts: dict[str, Any] = {"rows": 1} if len(gnss.t) == 1 else _sensor_facts(gnss.t)
     facts["velocities"] = 0 if gnss.v is None else int((~np.isnan(gnss.v[:, 0])).sum())
     if track is not None:

@@ -22,10 +22,7 @@ def overlap_s(recording: Recording) -> float:
 def gnss_coverage(recording: Recording) -> Iterator[Finding]:
     gnss = recording.gnss
     assert gnss is not None
-    if not len(gnss.t):
-        yield Finding("warning", "no GNSS fix")
-        return
-    if overlap_s(recording) <= 0:
+    if overlap_s(recording) < 0:
         yield Finding(
             "warning",
             f"GNSS ({gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) "

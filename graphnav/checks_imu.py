@@ -53,7 +53,7 @@ def saturation(imu: Imu) -> Iterator[Finding]:
             for sign in (1.0, -1.0):
                 signed = sign * x[:, axis]
                 top = signed.max()
-                if top < smallest or top < 3.0 * signed.std():
+                if top < smallest or top < 3.0 * signed.std() or top == np.median(signed):
                     continue
                 runs = [b - a for a, b in runs_of(signed > top - 1e-6 * top) if b - a >= 3]
                 if len(runs) >= 2 or max(runs, default=0) >= 5:
@@ -89,7 +89,7 @@ def force_at_rest(recording: Recording, rest: Array, facts: dict[str, Any]) -> I
     if recording.platform == "foot":  # every stance has another attitude
         f = float(np.linalg.norm(recording.imu.accel[rest], axis=1).mean())
     place, g = "standard", STANDARD_GRAVITY
-    if recording.gnss is not None and len(recording.gnss.t):
+    if recording.gnss is not None:
         place, g = "local", float(gravity(*recording.gnss.llh[0, [0, 2]]))
     facts["force_at_rest_mps2"] = round(f, 4)
     facts[f"{place}_gravity_mps2"] = round(g, 4)

@@ -179,7 +179,7 @@ def _imu_fit(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) 
 def up_of(imu: Imu) -> Array:
     """Unit vector of the mean force: up, in body axes as loaded, (3,)."""
     f = imu.accel.mean(axis=0)
-    return f / np.linalg.norm(f)
+    return f / np.linalg.norm(f) if f.any() else np.array([0.0, 0.0, 1.0])
 
 
 def forward_fit(imu: Imu, track: Track) -> Fit | None:

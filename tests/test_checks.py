@@ -231,6 +231,25 @@ def test_a_recording_of_almost_nothing_is_inspected_without_a_word_of_axes(drive
     assert not any("axes" in w or "stamps" in w for w in found.warnings)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda r: r.without("gnss"),
+        lambda r: r.without("gnss", (1.0, 1e9)),
+        lambda r: r.without("odometer", (-1e9, 1e9)),
+        lambda r: r.crop(0.0, 0.05),
+        lambda r: r.crop(0.0, 20.0),
+        lambda r: replace(r, platform="foot"),
+        imu(gyro=np.zeros_like, accel=np.zeros_like),
+    ],
+    ids=["no-gnss", "gnss-start-only", "odometer-without-rows", "3-rows", "20-s", "as-foot", "imu-of-zeros"],
+)
+@pytest.mark.filterwarnings("error")
+def test_parts_of_a_recording_are_inspected_too(drive: Callable[[str], Recording], change: Change) -> None:
+    part = change(drive("tokyo_20201105"))
+    assert inspect(part).facts["imu"]["rows"] == len(part.imu.t)
+
+
 def test_the_text_names_sensors_units_and_findings(drive: Callable[[str], Recording]) -> None:
     inspection = inspect(drive("oracle_drive"))
     text = inspection.text()

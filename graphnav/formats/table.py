@@ -134,12 +134,14 @@ def _open_bytes(path: Path) -> IO[bytes]:
         raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
     magic = plain.read(2)
     plain.seek(0)
+    if path.suffix == ".gz" or magic in (b"", b"\x1f\x8b"):
+        plain.close()
     if not magic:
         raise RecordingError(f"{path}: is empty")
     if path.suffix == ".gz":
         if magic != b"\x1f\x8b":
             raise RecordingError(f"{path}: is not gzip-compressed although its name ends in .gz")
-        return gzip.GzipFile(fileobj=plain)  # type: ignore[return-value]
+        return gzip.open(path)  # type: ignore[return-value]
     if magic == b"\x1f\x8b":
         raise RecordingError(f"{path}: is gzip-compressed; its name must end in .gz")
     return plain
