@@ -2,9 +2,10 @@
 
 A short smoothing problem, posed and solved with the same parts as the whole drive, over the first stretch in
 which the vehicle moves. Levelling (the mean specific force points up) and the median turn rate (a vehicle
-mostly goes straight or stands) start it; four headings, 90 degrees apart, are tried and the one that explains
-the fixes best wins, so neither "it drives forward" nor a standing start is assumed. From there the gyro carries
-the attitude back to the first sample.
+mostly goes straight or stands) start it, and the heading that turns the felt accelerations into those of the
+fixes. If that does not explain the fixes, the three headings 90 degrees apart from it are tried and the best
+wins, so neither "it drives forward" nor a standing start is assumed. From there the gyro carries the attitude
+back to the first sample.
 
 What the short problem learned, the long one will learn again from the same data. So the result enters as the
 point to start from, with a prior `prior_inflation` times wider than its own sigma: information counts once. Only
@@ -32,6 +33,7 @@ from graphnav.state import States
 COURSE_SIGMA = np.radians(10.0)  # rad, a stated forward axis against the course: mounting, side slip
 _DISTANCE = 50.0  # m of travel the short problem wants to see
 _FIXES = 10  # and fixes
+_GOOD_FIT = 2.0  # squared sigmas per row below which no other start heading is tried
 
 Smoother = Callable[[Problem, States], Solution]
 
@@ -169,14 +171,16 @@ def _in_motion(
     )
     bias = _usual_rate(imu)
     rp = _level(recording, begin)
+    heading = _heading_of_accelerations(part, frame, rp, bias)
     best: Solution | None = None
-    costs = []
-    for quarter in range(4):
-        rph = np.array([*rp, 0.5 * np.pi * quarter])
+    for quarter in (0, 2, 1, 3):
+        rph = np.array([*rp, heading + 0.5 * np.pi * quarter])
         solution = _try(part, settings, frame, smooth, rph, bias)
-        costs.append(solution.cost)
         if best is None or solution.cost < best.cost:
             best = solution
+        rows = sum(record.residual.size for record in best.records.values())
+        if best.cost < 0.5 * _GOOD_FIT * rows:
+            break
     if best is None or not np.isfinite(best.cost):
         raise EstimationError(
             f"'{recording.name}': no start attitude explains the GNSS fixes between {begin - recording.start:.0f} "
@@ -193,6 +197,26 @@ def _in_motion(
         R, wide[2], said = _with_course(best, R, wide[2])
         notes += said
     return _carried_back(recording, settings, best, R, wide, own, begin, tuple(notes))
+
+
+def _heading_of_accelerations(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> float:
+    """Heading (rad) at the start of `part` by which levelled accelerations become those of the fixes.
+
+    With both horizontal accelerations as complex numbers east + i north, fixes = z * felt + d by least squares;
+    the argument of z is the turn from the heading-zero frame, d takes up tilt.
+    """
+    gnss = part.gnss
+    assert gnss is not None
+    t = gnss.t
+    p = frame.from_llh(gnss.llh)
+    v = gnss.v if gnss.v is not None and np.isfinite(gnss.v).all() else np.gradient(p, t, axis=0)
+    change = np.diff(v, axis=0) / np.diff(t)[:, None]
+    _, dV, _ = prefix(bridge_gaps(part.imu), part.start, t[1:], np.zeros(3), bias)
+    felt = np.diff(dV @ rotation.from_rph(np.array([*rp, 0.0])).T, axis=0) / np.diff(t[1:])[:, None]
+    a = felt[:, 0] + 1j * felt[:, 1]
+    b = change[1:, 0] + 1j * change[1:, 1]
+    z = np.vdot(a - a.mean(), b - b.mean())
+    return float(-np.angle(z))
 
 
 def _thinned(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:

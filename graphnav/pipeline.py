@@ -71,7 +71,9 @@ def _solve(
     recording: Recording, settings: Settings, frame: LocalFrame, solvers: tuple[str, ...], progress: Progress | None
 ) -> dict[str, Solution]:
     began = time.perf_counter()
-    aligned = align(recording, settings, frame, lambda problem, start: batch(problem, start, covariances=(0,)))
+    aligned = align(
+        recording, settings, frame, lambda problem, start: batch(problem, start, covariances=(0,), reintegrate=False)
+    )
     after = time.perf_counter()
     problem = pose(recording, settings, frame, aligned.state, aligned.sigma)
     timings = {"alignment": after - began, "preintegration": time.perf_counter() - after}

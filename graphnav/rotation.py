@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _I3 = np.eye(3)
+_GENERATORS = np.array(
+    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float
+)
 _TINY = 1e-300  # keeps sin(x)/x = 1 at x = 0 without a case of its own
 
 
 def skew(v: Array) -> Array:
     """Cross-product matrix: ``skew(a) @ b == cross(a, b)``; (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, dtype=float)
-    out = np.zeros((*v.shape, 3))
-    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
-    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
-    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
-    return out
+    return (v @ _GENERATORS).reshape(*v.shape, 3)
 
 
 def mv(M: Array, v: Array) -> Array:

@@ -52,16 +52,18 @@ def batch(
     values: Values | None = None,
     progress: Progress | None = None,
     covariances: tuple[int, ...] | None = None,
+    reintegrate: bool = True,
 ) -> Solution:
     """Solve a problem from any starting states (K rows) and parameter values.
 
-    `covariances` are the keyframes whose covariance is wanted, all when None; others are NaN.
+    `covariances` are the keyframes whose covariance is wanted, all when None; others are NaN. `reintegrate`
+    allows intervals to be integrated again when the gyro bias moves far.
     """
     began = time.perf_counter()
     settings = problem.settings.solver
     values = values or {c.parameter.name: np.tile(c.parameter.initial, (len(c.t), 1)) for c in problem.chains}
     point = _Point(start, values)
-    problem, renewed = _renew(problem, point)
+    problem, renewed = _renew(problem, point) if reintegrate else (problem, 0)
     layout = _Layout(problem)
     cost = _cost(problem, point, layout)
     damping, tries, stopped = 0.0, 0, f"stopped at the limit of {settings.max_iterations} iterations"
@@ -99,11 +101,12 @@ def batch(
             break
         point, cost = candidate, new_cost
         damping = 0.0 if damping <= 1e-4 else damping / 10.0
-        problem, again = _renew(problem, point)
-        if again:
-            layout = _Layout(problem)
-            cost = _cost(problem, point, layout)
-            renewed += again
+        if reintegrate:
+            problem, again = _renew(problem, point)
+            if again:
+                layout = _Layout(problem)
+                cost = _cost(problem, point, layout)
+                renewed += again
     solved = time.perf_counter()
     if progress is not None:
         progress("covariances", 0.0)

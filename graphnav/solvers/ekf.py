@@ -22,7 +22,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dposv
 
 from graphnav.constraints.base import Constraint, assemble
 from graphnav.dynamics import SCALE
@@ -128,13 +128,14 @@ def _update(
     r, sigma = linear.residual.ravel(), linear.sigma.ravel()
     PHt = P @ H.T
     S = H @ PHt + np.diag(sigma * sigma)
-    factor = cho_factor(S, check_finite=False)
-    nis = float(r @ cho_solve(factor, r, check_finite=False))
+    # LAPACK called directly: for matrices this small the checks around it would cost more than the work
+    _, solved, _ = dposv(S, np.column_stack([r, PHt.T]))
+    nis = float(r @ solved[:, 0])
     used = rows.gate is None or nis <= rows.gate**2
     record.set(slice(lo, hi), linear.residual, np.sqrt(np.diag(S)).reshape(n, -1), nis / n, float(used))
     if not used:
         return state, values, P
-    K = cho_solve(factor, PHt.T, check_finite=False).T
+    K = solved[:, 1:].T
     d = -K @ r
     IKH = -K @ H
     IKH.flat[:: len(P) + 1] += 1.0
@@ -152,7 +153,7 @@ def rts(problem: Problem, forward: Filtered, progress: Progress | None = None) -
     all_P[-1], all_values[-1] = P, values
     for k in range(K - 2, -1, -1):
         Pp = forward.P_predicted[k + 1]
-        C = cho_solve(cho_factor(Pp, check_finite=False), forward.F[k] @ forward.P[k], check_finite=False).T
+        C = dposv(Pp, forward.F[k] @ forward.P[k])[1].T
         d = C @ np.concatenate([state.minus(forward.predicted[k + 1])[0], values - forward.values[k]])
         state, values = forward.states[k].plus(d[None, :DIM]), forward.values[k] + d[DIM:]
         P = forward.P[k] + C @ (P - Pp) @ C.T
