@@ -1,0 +1,262 @@
+"""The contract of every constraint, driven over all that are registered; and the GNSS rows against GTSAM's own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+import oracle
+import pytest
+from helpers import STEPS, Array, difference, random_states, truth_states
+
+from graphnav import rotation as ro
+from graphnav.config import Settings, settings_from
+from graphnav.constraints import registered
+from graphnav.constraints.base import Constraint, Scene, assemble
+from graphnav.constraints.gnss import LEVER_ARM, GnssPosition
+from graphnav.constraints.prior import InitialPrior
+from graphnav.earth import LocalFrame
+from graphnav.problem import Problem, keyframe_times, pose
+from graphnav.recording import Recording
+from graphnav.solvers.ekf import ekf
+from graphnav.solvers.graph import LinearGraph
+from graphnav.state import BLOCKS, DIM, States
+
+SIGMA = np.repeat([0.05, 1.0, 0.5, 0.05, 1e-3], 3)
+
+
+@dataclass(frozen=True)
+class Case:
+    rows: Constraint
+    states: States  # one per row
+    values: dict[str, Array]  # (N, k) per parameter
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    path = oracle.vehicle_path(180.0)
+    made, _ = oracle.drive(path, seed=3, gnss_rate=2.0, gnss_velocity_sd=(0.05, 0.06, 0.1), odometer_rate=10.0)
+    return made
+
+
+def with_parameters() -> Settings:
+    """Everything that can be estimated is estimated."""
+    return settings_from({"gnss": {"lever_arm_sigma": 0.5}})
+
+
+def prior_row(rng: np.random.Generator) -> InitialPrior:
+    return InitialPrior(keyframe=np.zeros(1, dtype=int), mean=random_states(rng, 1), sigma=SIGMA[None])
+
+
+def build(name: str, recording: Recording, settings: Settings) -> Case:
+    rng = np.random.default_rng(1)
+    if name == InitialPrior.name:
+        rows: Constraint | None = prior_row(rng)
+    else:
+        cls = next(c for c in registered() if c.name == name)
+        frame = LocalFrame(recording.gnss.llh[0])
+        t = keyframe_times(recording.start, recording.end, cls.epochs(recording, settings), 1.0)
+        rows = cls.build(Scene(recording, settings, frame, t))
+    assert rows is not None, f"the drive holds nothing for '{name}': extend it"
+    n = len(rows)
+    values = {p.name: p.initial + p.sigma * rng.standard_normal((n, len(p.initial))) for p in rows.parameters}
+    return Case(rows, random_states(rng, n, span=500.0), values)
+
+
+NAMES = tuple(cls.name for cls in registered())
+
+
+@pytest.fixture(scope="module", params=[(n, p) for n in NAMES for p in (False, True)], ids=lambda x: f"{x[0]}-{x[1]}")
+def case(request: pytest.FixtureRequest, recording: Recording) -> Case:
+    name, estimated = request.param
+    return build(name, recording, with_parameters() if estimated else Settings())
+
+
+def test_the_prior_and_both_gnss_constraints_are_registered() -> None:
+    assert {"initial_prior", "gnss_position", "gnss_velocity"} <= set(NAMES)
+    assert len(set(NAMES)) == len(NAMES)
+
+
+def test_shapes_and_units(case: Case) -> None:
+    rows = case.rows
+    linear = rows.linearize(case.states, case.values, slice(None))
+    n, m = len(rows), len(rows.axes)
+    assert linear.residual.shape == linear.sigma.shape == (n, m)
+    assert np.all(linear.sigma > 0)
+    assert np.all(np.diff(rows.keyframe) >= 0)
+    assert rows.unit
+    for key, J in linear.jacobians.items():
+        width = 3 if key in BLOCKS else len(next(p for p in rows.parameters if p.name == key).initial)
+        assert J.shape == (n, m, width), key
+    assert {p.name for p in rows.parameters} <= set(linear.jacobians), "a parameter that no row depends on"
+
+
+def test_jacobians_numerically(case: Case) -> None:
+    linear = case.rows.linearize(case.states, case.values, slice(None))
+
+    def at(delta: Array) -> Array:
+        moved = case.states.plus(np.tile(delta, (len(case.rows), 1)))
+        return case.rows.linearize(moved, case.values, slice(None)).residual
+
+    numerical = difference(at, STEPS)
+    np.testing.assert_allclose(assemble(linear), numerical, atol=1e-6 * max(1.0, np.abs(numerical).max()))
+    for p in case.rows.parameters:
+
+        def along(delta: Array, name: str = p.name) -> Array:
+            values = {**case.values, name: case.values[name] + delta}
+            return case.rows.linearize(case.states, values, slice(None)).residual
+
+        numerical = difference(along, 1e-3 * p.sigma)
+        scale = max(1.0, np.abs(numerical).max())
+        np.testing.assert_allclose(linear.jacobians[p.name], numerical, atol=1e-6 * scale, err_msg=p.name)
+
+
+def test_n_rows_are_n_single_rows(case: Case) -> None:
+    whole = case.rows.linearize(case.states, case.values, slice(None))
+    for k in range(0, len(case.rows), 17):
+        for rows in (slice(k, k + 1), np.array([k])):
+            one = case.rows.linearize(case.states[rows], {n: v[rows] for n, v in case.values.items()}, rows)
+            np.testing.assert_allclose(one.residual, whole.residual[rows], rtol=1e-12, atol=1e-9)
+            np.testing.assert_array_equal(one.sigma, whole.sigma[rows])
+            assert set(one.jacobians) == set(whole.jacobians)
+            for key, J in one.jacobians.items():
+                np.testing.assert_allclose(J, whole.jacobians[key][rows], rtol=1e-12, atol=1e-12)
+
+
+def test_filter_update_is_one_linear_graph_step(case: Case) -> None:
+    """Mean and covariance after one update: Kalman's formula against prior and row as a Gaussian factor graph."""
+    rng = np.random.default_rng(2)
+    k = len(case.rows) // 2
+    here = {n: v[k : k + 1] for n, v in case.values.items()}
+    linear = case.rows.linearize(case.states[k : k + 1], here, slice(k, k + 1))
+    parameters = {p.name: p for p in case.rows.parameters}
+    columns, at = {}, DIM
+    for name, p in parameters.items():
+        columns[name] = slice(at, at + len(p.initial))
+        at += len(p.initial)
+    root = rng.standard_normal((at, at)) * np.concatenate([SIGMA, *(p.sigma for p in parameters.values())])[:, None]
+    P = root @ root.T / at
+    # Kalman
+    H, r, sigma = assemble(linear, columns, at)[0], linear.residual[0], linear.sigma[0]
+    S = H @ P @ H.T + np.diag(sigma**2)
+    gain = np.linalg.solve(S, H @ P).T
+    mean, covariance = -gain @ r, P - gain @ S @ gain.T
+    # graph: the state and its parameters are separate variables, joined by the prior
+    graph = LinearGraph()
+    W = np.linalg.inv(np.linalg.cholesky(P))
+    parts = [slice(0, DIM), *columns.values()]
+    graph.add([(np.array([i]), W[None, :, part]) for i, part in enumerate(parts)], np.zeros((1, at)))
+    white = H / sigma[:, None]
+    graph.add([(np.array([i]), white[None, :, part]) for i, part in enumerate(parts)], (-r / sigma)[None])
+    solved = graph.eliminate(range(len(parts)))
+    np.testing.assert_allclose(np.concatenate(solved.solve(range(len(parts)))), mean, rtol=1e-7, atol=1e-9)
+    for i, C in solved.covariances().items():
+        d = np.sqrt(np.diag(covariance)[parts[i]])
+        np.testing.assert_allclose(C / np.outer(d, d), covariance[parts[i], parts[i]] / np.outer(d, d), atol=1e-7)
+
+
+@pytest.mark.parametrize("copies", [1, 2])
+def test_the_filter_itself_does_that_update(recording: Recording, copies: int) -> None:
+    """The filter's update at its first fix against the formula, lever arm included; several rows are stacked."""
+    problem = tiny_problem(recording, with_parameters())
+    rows = problem.constraints[0]
+    assert isinstance(rows, GnssPosition)
+    k = int(rows.keyframe[1])
+    pick = np.array([1, 2][:copies])
+    rows = replace(rows, keyframe=np.full(copies, k), **{n: getattr(rows, n)[pick] for n in ("p_n", "R_ln", "sigma")})
+    problem = replace(problem, constraints=(rows,))
+    forward = ekf(problem)
+    lever = problem.chains[-1].parameter
+    assert lever.name == LEVER_ARM
+    P, state = forward.P_predicted[k], forward.predicted[k]
+    linear = rows.linearize(state[np.zeros(copies, int)], {LEVER_ARM: np.tile(lever.initial, (copies, 1))}, slice(None))
+    H = np.concatenate(assemble(linear, problem.columns, len(P)))
+    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(linear.sigma.ravel() ** 2))
+    d = -gain @ linear.residual.ravel()
+    np.testing.assert_allclose(forward.states[k].minus(state.plus(d[None, :DIM])), 0.0, atol=1e-9)
+    np.testing.assert_allclose(forward.values[k][-3:], lever.initial + d[problem.columns[LEVER_ARM]], atol=1e-9)
+    expected = P - gain @ H @ P
+    sd = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(forward.P[k] / np.outer(sd, sd), expected / np.outer(sd, sd), atol=1e-6)
+
+
+def tiny_problem(recording: Recording, settings: Settings) -> Problem:
+    frame = LocalFrame(recording.gnss.llh[0])
+    start = States(ro.exp(np.array([[0.1, 0.05, 0.8]])), *(np.full((1, 3), x) for x in (0.3, 0.1, 0.01, 1e-4)))
+    return pose(recording.crop(0.0, 4.0), settings, frame, start, SIGMA)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_epochs_lie_within_the_imu(name: str, recording: Recording) -> None:
+    """Measurements before the first and after the last IMU sample ask for no keyframes and make no rows."""
+    cls = next(c for c in registered() if c.name == name)
+    settings = Settings()
+    imu = recording.imu
+    inside = (imu.t > recording.start + 50.3) & (imu.t < recording.start + 81.7)
+    short = replace(recording, imu=replace(imu, t=imu.t[inside], gyro=imu.gyro[inside], accel=imu.accel[inside]))
+    epochs = cls.epochs(short, settings)
+    assert np.all((epochs >= short.start) & (epochs <= short.end))
+    t = keyframe_times(short.start, short.end, epochs, 1.0)
+    rows = cls.build(Scene(short, settings, LocalFrame(recording.gnss.llh[0]), t))
+    if rows is None:
+        assert len(epochs) == 0
+        return
+    assert 0 < len(rows) == len(epochs) < len(cls.epochs(recording, settings))
+    np.testing.assert_allclose(t[rows.keyframe], epochs, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_recording_without_the_sensor_has_no_rows(name: str, recording: Recording) -> None:
+    cls = next(c for c in registered() if c.name == name)
+    bare = replace(recording, gnss=None, odometer=None)
+    assert len(cls.epochs(bare, Settings())) == 0
+    frame = LocalFrame(recording.gnss.llh[0])
+    assert cls.build(Scene(bare, Settings(), frame, np.array([bare.start, bare.end]))) is None
+
+
+@pytest.mark.parametrize("kind", ["position", "velocity"])
+def test_a_switched_off_measurement_has_no_rows(kind: str, recording: Recording) -> None:
+    cls = next(c for c in registered() if c.name == f"gnss_{kind}")
+    off = settings_from({"gnss": {kind: False}})
+    assert len(cls.epochs(recording, off)) == 0
+    t = recording.gnss.t[:5]
+    assert cls.build(Scene(recording, off, LocalFrame(recording.gnss.llh[0]), t)) is None
+
+
+def test_gnss_rows_are_the_measurement_of_the_truth(recording: Recording) -> None:
+    """With exact fixes and the true states the rows are zero, so frames, signs and lever arm are the simulator's."""
+    path = oracle.vehicle_path(180.0, lat=-45.0)
+    # no turn rate of the IMU enters where it is exact, but the mean over 0.1 s does
+    made, truth = oracle.drive(path, imu_noise=None, gnss_exact=True, gnss_velocity_sd=(0.1, 0.1, 0.1))
+    frame = LocalFrame(made.gnss.llh[40])
+    for cls in registered():
+        if not cls.name.startswith("gnss"):
+            continue
+        t = cls.epochs(made, Settings())
+        rows = cls.build(Scene(made, Settings(), frame, t))
+        residual = rows.linearize(truth_states(truth, t, frame), {}, slice(None)).residual
+        assert np.abs(residual).max() < (2e-6 if cls is GnssPosition else 2e-3), cls.name
+
+
+def test_gnss_position_is_gtsams_gps_factor_with_a_lever_arm(recording: Recording) -> None:
+    """GPSFactorArm linearised: the same error and Jacobian, where Pose3's tangent is [rotation, position in body]."""
+    case = build("gnss_position", recording, Settings())
+    rows = case.rows
+    assert isinstance(rows, GnssPosition)
+    # GTSAM measures in the navigation frame itself; take rows there
+    rows = replace(rows, R_ln=np.broadcast_to(np.eye(3), rows.R_ln.shape))
+    linear = rows.linearize(case.states, {}, slice(None))
+    for k in range(0, len(rows), 40):
+        R, p = case.states.R_nb[k], case.states.p[k]
+        model = gtsam.noiseModel.Diagonal.Sigmas(rows.sigma[k])
+        factor = gtsam.GPSFactorArm(0, rows.p_n[k], rows.lever_arm, model)
+        values = gtsam.Values()
+        values.insert(0, gtsam.Pose3(gtsam.Rot3(R), p))
+        graph = gtsam.NonlinearFactorGraph()
+        graph.push_back(factor)
+        A, b = graph.linearize(values).jacobian()
+        white = 1.0 / rows.sigma[k]
+        np.testing.assert_allclose(b, -linear.residual[k] * white, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(A[:, :3], linear.jacobians["theta"][k] * white[:, None], atol=1e-8)
+        np.testing.assert_allclose(A[:, 3:], linear.jacobians["p"][k] @ R * white[:, None], atol=1e-8)
