@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import platform
 import sys
 import time
@@ -28,23 +29,22 @@ DETECTIONS_HEADER = "start,end,detector"
 
 
 def output_folder(path: str | Path) -> Path:
-    """The folder `path`, made if need be.
+    """`path`, sure to be a folder that can be written to or made; it is not made yet.
 
     Raises
     ------
     ConfigError
-        If it is a file, or cannot be made or written to.
+        If it cannot.
     """
     folder = Path(path)
-    if folder.exists() and not folder.is_dir():
-        raise ConfigError(f"-o {folder}: is a file; name a folder to write into")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".graphnav-writable"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ConfigError(f"-o {folder}: cannot be written to ({error.strerror})") from None
+    there = folder
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir():
+        what = "is a file; name a folder to write into" if there == folder else f"cannot be made, {there} is a file"
+        raise ConfigError(f"-o {folder}: {what}")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ConfigError(f"-o {folder}: no permission to write into {there}")
     return folder
 
 
@@ -209,6 +209,7 @@ def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) 
     """evaluation.json, and errors.csv with a row per compared epoch where there are any."""
     from graphnav.exporters.csv import rows_text
 
+    folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "evaluation.json", values)
     e = metrics.errors
     if e is None:

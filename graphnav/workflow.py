@@ -134,7 +134,7 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
     timings: dict[str, float] = {}
     with _timed(timings, "reading", progress):
         whole = read(request.source)
-    recording = whole.crop(request.start, request.end)
+    recording = _cropped(whole, request)
     zero = recording.start - whole.start if recording is not whole else 0.0
     moved = _moved(request.withheld, zero)
     used, notes = _withhold(recording, moved, zero)
@@ -167,6 +167,14 @@ def _timed(timings: dict[str, float], stage: str, progress: Progress | None) -> 
     timings[stage] = time.perf_counter() - began
 
 
+def _cropped(whole: Recording, request: Request) -> Recording:
+    """The part of the recording that is asked for."""
+    if (request.start or 0.0) >= whole.duration or (request.end is not None and request.end <= 0.0):
+        option = f"--start {request.start:g}" if (request.start or 0.0) >= whole.duration else f"--end {request.end:g}"
+        raise RecordingError(f"{option}: lies outside '{whole.name}', which runs from 0 to {whole.duration:.1f} s")
+    return whole.crop(request.start, request.end)
+
+
 def _moved(withheld: tuple[Withheld, ...], by: float) -> tuple[Withheld, ...]:
     return tuple((source, span and (span[0] - by, span[1] - by)) for source, span in withheld)
 
@@ -191,13 +199,17 @@ def _withhold(recording: Recording, withheld: tuple[Withheld, ...], zero: float)
 
 
 def outages(recording: Recording) -> list[Span]:
-    """Spans of more than `OUTAGE` s without a fix, in s from the start; both ends of the recording count too."""
-    if recording.gnss is None:
+    """Spans of more than `OUTAGE` s without a fix, s from the start; both ends of the recording count too.
+
+    Each lasts from the last fix to one period before the next: at its end there is still none.
+    """
+    if recording.gnss is None or not len(recording.gnss.t):
         return []
     t = recording.gnss.t[np.isfinite(recording.gnss.llh).all(axis=1)] - recording.start
-    edges = np.concatenate([[0.0], t[(t >= 0.0) & (t <= recording.duration)], [recording.duration]])
-    wide = np.flatnonzero(np.diff(edges) > OUTAGE)
-    return [(float(edges[k]), float(edges[k + 1])) for k in wide]
+    t = t[(t >= 0.0) & (t <= recording.duration)]
+    period = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    begin, end = np.concatenate([[0.0], t]), np.concatenate([t - period, [recording.duration]])
+    return [(float(a), float(b)) for a, b in zip(begin, end, strict=True) if b - a > OUTAGE]
 
 
 def _score(
