@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from graphnav.metrics import Span
 from graphnav.outputs import stated
 from graphnav.workflow import Outcome, Progress
 
@@ -85,11 +86,16 @@ def _spans(outcome: Outcome) -> list[str]:
         lines += table(
             head,
             [
-                [name, *(short(x) for x in (s.end_h, s.max_h, s.max_up, s.drift_percent, s.nees))]
+                [name, *(short(x) for x in (s.end_h, s.max_h, s.max_up)), _share(s), short(s.nees)]
                 for name, s in every.items()
             ],
         )
     return lines
+
+
+def _share(span: Span) -> str:
+    """Drift as a share of the way; of a vehicle that stands it means nothing."""
+    return short(span.drift_percent) if span.distance >= 1.0 else "-"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -12,14 +12,14 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "graphnav"
 
 # Modules and packages of graphnav, left to right. A new one needs a place here, as far left as it can stand.
-ROOMS = """
-    errors rotation earth state config recording trajectory
-    formats findings crosschecks checks_imu checks_aiding checks
-    preintegration dynamics constraints problem solution alignment solvers pipeline
-    interpolation metrics scoring evaluation exporters
-    panels page plots report_tables report_pictures report
-    workflow outputs terminal cli
-""".split()
+ROOMS = [
+    "errors", "rotation", "earth", "state", "config", "recording", "trajectory",
+    "formats", "findings", "crosschecks", "checks_imu", "checks_aiding", "checks",
+    "preintegration", "dynamics", "constraints", "problem", "solution", "alignment", "solvers", "pipeline",
+    "interpolation", "metrics", "scoring", "evaluation", "exporters",
+    "panels", "page", "plots", "report_tables", "report_pictures", "report",
+    "workflow", "outputs", "terminal", "cli",
+]  # fmt: skip
 
 GTSAM_ROOMS = {"solvers"}
 MATPLOTLIB_ROOMS = {"panels", "plots"}
@@ -89,4 +89,4 @@ def test_help_loads_nothing_heavy():
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = ast.literal_eval(run.stdout.splitlines()[-1])
     assert "graphnav.cli" in loaded
-    assert not {"gtsam", "matplotlib", "numpy", "scipy", "pydantic"} & set(loaded)
+    assert not {"gtsam", "matplotlib", "numpy", "scipy", "rich"} & set(loaded)
