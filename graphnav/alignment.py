@@ -251,7 +251,9 @@ def _try(part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoothe
         ]
     )
     # one bad fix or a burst must not decide the heading
-    robust = settings.gnss.model_copy(update={"robust": "cauchy", "lever_arm_sigma": None, "time_offset_sigma": 0.0})
+    robust = settings.gnss.model_copy(
+        update={"robust": "cauchy", "lever_arm_sigma": None, "time_offset_sigma": 0.0, "slow_share": 0.0}
+    )
     problem = pose(part, settings.model_copy(update={"gnss": robust}), frame, start, sigma)
     dR, _, _ = prefix(problem.samples, problem.t[0], problem.t[1:], np.zeros(3), bias)
     t = problem.t

@@ -50,6 +50,13 @@ class GnssSettings(_Section):
     lever_arm_sigma: float | None = Field(
         None, gt=0, description="m, 1-sigma of the stated lever arm; given, the lever arm is estimated"
     )
+    slow_share: float | None = Field(
+        None, ge=0, lt=1, description="share of a position's variance that changes slowly; found from the data if unset"
+    )
+    slow_time: float = Field(100.0, gt=0, description="s, correlation time of that slow part")
+    sd_factor: float | None = Field(
+        None, gt=0, description="factor on the stated position sigmas; found from the data if unset, never below 1"
+    )
     time_offset_sigma: float = Field(
         0.02, ge=0, description="s, 1-sigma of what the stamps of the fixes may be off; 0 = exact, not estimated"
     )

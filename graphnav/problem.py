@@ -17,22 +17,21 @@ from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.state import DIM, Parameter, States
 
-NODE_SPACING = 30.0  # s between the nodes of a slowly moving parameter
+NODE_SPACING = 20.0  # s between the nodes of a slowly moving parameter
 
 
 @dataclass(frozen=True)
 class ParameterChain:
-    """A parameter and its nodes: one for a constant, one every half minute for a slow one."""
+    """A parameter and its nodes: one for a constant, one every `NODE_SPACING` for a slow one."""
 
     parameter: Parameter
     t: Array  # (n,) s
     node: Array  # (K,) int, the node in force at each keyframe
 
     @property
-    def step_sigma(self) -> Array:
-        """(n-1, k) how far the value may move from node to node."""
-        width = len(self.parameter.initial)
-        return self.parameter.walk * np.sqrt(np.diff(self.t))[:, None] * np.ones(width)
+    def steps(self) -> tuple[Array, Array]:
+        """Decay (n-1,) and sigma (n-1, k) from node to node."""
+        return self.parameter.step(np.diff(self.t))
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,7 @@ def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Arra
 def _chains(parameters: tuple[Parameter, ...], t: Array) -> tuple[ParameterChain, ...]:
     chains = []
     for parameter in {p.name: p for p in parameters}.values():
-        count = 1 if parameter.walk == 0.0 else max(1, round((t[-1] - t[0]) / NODE_SPACING))
+        count = 1 if parameter.constant else max(1, round((t[-1] - t[0]) / NODE_SPACING))
         nodes = t[0] + (t[-1] - t[0]) / count * np.arange(count)
         chains.append(ParameterChain(parameter, nodes, np.searchsorted(nodes, t, side="right") - 1))
     return tuple(chains)

@@ -30,13 +30,26 @@ DIM = 15
 
 @dataclass(frozen=True)
 class Parameter:
-    """Something estimated beside the states: a constant (walk 0) or a chain of slowly moving values."""
+    """Something estimated beside the states: a constant, a random walk, or a stationary Gauss-Markov process."""
 
     name: str
     initial: Array  # (k,)
     sigma: Array  # (k,) 1-sigma of the initial value
     unit: str
-    walk: float = 0.0  # unit/sqrt(s); 0 = one constant for the whole recording
+    walk: float = 0.0  # unit/sqrt(s) of a random walk; 0 = one constant for the whole recording
+    correlation_time: float | None = None  # s; given, a Gauss-Markov process about zero with `sigma` at all times
+
+    @property
+    def constant(self) -> bool:
+        """One value for the whole recording."""
+        return self.walk == 0.0 and self.correlation_time is None
+
+    def step(self, dt: Array) -> tuple[Array, Array]:
+        """Decay (n,) and sigma (n, k) of what is added over times dt (n,)."""
+        if self.correlation_time is None:
+            return np.ones_like(dt), self.walk * np.sqrt(dt)[:, None] * np.ones_like(self.sigma)
+        decay = np.exp(-dt / self.correlation_time)
+        return decay, np.sqrt(1.0 - decay**2)[:, None] * self.sigma
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,16 @@
 Groves (2013), eq. 14.103 and 14.104, without its small-angle approximations. Residuals are in the local
 ENU at the fix, where receivers state their sigmas::
 
-    r_p = R_ln (p + R_nb l + v d - p_meas)
+    r_p = R_ln (p + R_nb l + v d - p_meas) + e
     r_v = R_ln (v + R_nb (omega_nb x l) + a d) - v_meas
     omega_nb = omega_b - b_g - R_nb^T omega_ie,      a = R_nb (f_b - b_a) + g
 
 d is what must be added to the stamps of the fixes, one constant for positions and one for velocities: a
 receiver's filters delay them differently (boulder's differ by 0.1 s, dresden's by 0.7 s).
+
+e is the slow part of a position's error (orbits, atmosphere, multipath, ambiguities): fixes of one receiver
+seconds apart are wrong alike, and a thousand of them are not worth a thousand. It is a Gauss-Markov process in
+units of the stated sigma, of variance `slow_share`; the rest, 1 - slow_share, is white.
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ from graphnav.state import Parameter, States
 
 LEVER_ARM = "gnss_lever_arm"
 TIME_OFFSET = "gnss_time_offset"
+SLOW_ERROR = "gnss_slow_error"
 VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
 _WINDOW = 0.05  # s each side over which turn rate and force at a fix are averaged
 
@@ -71,6 +76,7 @@ class GnssPosition(Constraint):
     R_ln: Array = field(default_factory=lambda: _empty(0, 3, 3))
     sigma: Array = field(default_factory=lambda: _empty(0, 3))
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
+    stated: Array = field(default_factory=lambda: _empty(0, 3))  # sigma of the whole error
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings) -> Array:
@@ -86,13 +92,21 @@ class GnssPosition(Constraint):
         keyframe = scene.keyframe_at(gnss.t)
         used = keyframe >= 0
         llh = gnss.llh[used]
+        s = scene.settings.gnss
+        stated = (s.sd_factor or 1.0) * gnss.sd[used]
+        common = _common(scene, TIME_OFFSET)
+        share = s.slow_share or 0.0
+        if share > 0:
+            slow = Parameter(SLOW_ERROR, np.zeros(3), np.full(3, np.sqrt(share)), "sd", correlation_time=s.slow_time)
+            common["parameters"] = (*common["parameters"], slow)
         return cls(
             keyframe=keyframe[used],
             p_n=scene.frame.from_llh(llh),
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
-            sigma=gnss.sd[used],
+            sigma=np.sqrt(1.0 - share) * stated,
+            stated=stated,
             lever_arm=gnss.lever_arm,
-            **_common(scene, TIME_OFFSET),
+            **common,
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -108,6 +122,9 @@ class GnssPosition(Constraint):
             velocity = mv(C, states.v)
             residual = residual + velocity * offset
             jacobians |= {"v": C * offset[..., None], TIME_OFFSET: velocity[..., None]}
+        if SLOW_ERROR in parameters:
+            residual = residual + self.stated[rows] * parameters[SLOW_ERROR]
+            jacobians[SLOW_ERROR] = self.stated[rows][..., None] * np.eye(3)
         return Linearized(residual, jacobians, self.sigma[rows])
 
 

@@ -41,6 +41,7 @@ class Filtered:
     solution: Solution
     states: list[States]  # K filtered states of one row each
     values: Array  # (K, D-15) parameter values
+    values_predicted: Array  # (K, D-15)
     P: Array  # (K, D, D) filtered
     predicted: list[States]  # K predicted states
     P_predicted: Array  # (K, D, D)
@@ -60,10 +61,11 @@ def ekf(problem: Problem, progress: Progress | None = None) -> Filtered:
     first = {rows.name: np.searchsorted(rows.keyframe, np.arange(K + 1)) for rows in problem.constraints}
 
     all_P, all_Pp, all_F = np.empty((K, D, D)), np.empty((K, D, D)), np.empty((K - 1, D, D))
-    all_values = np.empty((K, D - DIM))
+    all_values, all_vp = np.empty((K, D - DIM)), np.empty((K, D - DIM))
     states, predicted = [], []
     all_F[:] = np.eye(D)
     scale_at = columns.get(SCALE)
+    steps, added = _node_steps(problem), np.zeros(D)
     for k in range(K):
         if k:
             step = slice(k - 1, k)
@@ -73,14 +75,18 @@ def ekf(problem: Problem, progress: Progress | None = None) -> Filtered:
             F[:DIM, :DIM] = F15[0]
             if scale_at is not None:
                 F[:DIM, scale_at] = problem.motion.scale_columns(step, F15)[0]
+            for at, decay, sigma in steps.get(k, ()):
+                F[at, at] *= decay
+                values[_shift(at)] *= decay
+                added[at] = sigma**2
             P = F @ P @ F.T
             P[:DIM, :DIM] += problem.motion.noise(step, state.R_nb)[0]
-            for chain in problem.chains:
-                if chain.node[k] != chain.node[k - 1]:
-                    at = columns[chain.parameter.name]
-                    P[at, at] += np.diag(chain.step_sigma[chain.node[k] - 1] ** 2)
+            if k in steps:
+                P.flat[:: D + 1] += added
+                added[:] = 0.0
             state = ahead
         predicted.append(state)
+        all_vp[k] = values
         all_Pp[k] = P
         for rows in problem.constraints:
             lo, hi = first[rows.name][k], first[rows.name][k + 1]
@@ -106,7 +112,7 @@ def ekf(problem: Problem, progress: Progress | None = None) -> Filtered:
         notes=problem.notes,
         intervals=problem.intervals,
     )
-    return Filtered(solution, states, all_values, all_P, predicted, all_Pp, all_F)
+    return Filtered(solution, states, all_values, all_vp, all_P, predicted, all_Pp, all_F)
 
 
 def _update(
@@ -154,7 +160,7 @@ def rts(problem: Problem, forward: Filtered, progress: Progress | None = None) -
     for k in range(K - 2, -1, -1):
         Pp = forward.P_predicted[k + 1]
         C = dposv(Pp, forward.F[k] @ forward.P[k])[1].T
-        d = C @ np.concatenate([state.minus(forward.predicted[k + 1])[0], values - forward.values[k]])
+        d = C @ np.concatenate([state.minus(forward.predicted[k + 1])[0], values - forward.values_predicted[k + 1]])
         state, values = forward.states[k].plus(d[None, :DIM]), forward.values[k] + d[DIM:]
         P = forward.P[k] + C @ (P - Pp) @ C.T
         P = 0.5 * (P + P.T)
@@ -210,6 +216,17 @@ class _Innovations:
         return ConstraintRecord(
             "innovation", t, self.residual, self.sigma, self.nis, self.weight, self.rows.axes, self.rows.unit
         )
+
+
+def _node_steps(problem: Problem) -> dict[int, list[tuple[slice, float, Array]]]:
+    """At keyframes where a parameter moves on to its next node: its columns, decay and added sigma."""
+    out: dict[int, list[tuple[slice, float, Array]]] = {}
+    for chain in problem.chains:
+        decay, sigma = chain.steps
+        for k in np.flatnonzero(np.diff(chain.node)) + 1:
+            j = chain.node[k] - 1
+            out.setdefault(int(k), []).append((problem.columns[chain.parameter.name], float(decay[j]), sigma[j]))
+    return out
 
 
 def _shift(columns: slice) -> slice:

@@ -1,0 +1,192 @@
+"""A problem linearised at a point: whitened rows over graph variables, and its cost there.
+
+Variables are one fifteen-dimensional error state per keyframe, one vector of all constant parameters, and one
+vector of all slow parameters per node; so no row touches more than three of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.constraints.base import Constraint, assemble
+from graphnav.dynamics import SCALE
+from graphnav.problem import ParameterChain, Problem
+from graphnav.rotation import Array, mv
+from graphnav.solvers.robust import weight_and_cost
+from graphnav.state import DIM, States
+
+Values = dict[str, Array]  # parameter name -> (nodes, k)
+Rows = list[tuple[list[tuple[Array, Array]], Array]]  # blocks of (keys, A (N, m, k)), and b (N, m)
+Step = tuple[Array, Values]  # (K, 15) and per parameter
+
+
+@dataclass(frozen=True)
+class Point:
+    """States of all keyframes and values of all parameter nodes."""
+
+    states: States
+    values: Values
+
+    @property
+    def scale(self) -> Array | None:
+        """The scale errors of the IMU, (6,), where they are parameters."""
+        return self.values[SCALE][0] if SCALE in self.values else None
+
+    def moved(self, step: Step) -> Point:
+        """Move by a step."""
+        return Point(self.states.plus(step[0]), {name: v + step[1][name] for name, v in self.values.items()})
+
+    def at_keyframes(self, problem: Problem) -> Values:
+        """(K, k) per parameter."""
+        return {c.parameter.name: self.values[c.parameter.name][c.node] for c in problem.chains}
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Parameters with common nodes, side by side in one variable per node."""
+
+    keys: Array  # (n,)
+    node: Array  # (K,) the node in force at each keyframe
+    columns: dict[str, slice]
+    width: int
+
+
+class Layout:
+    """Keys, their widths, and the order of elimination: along time, each node after its last keyframe."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.K = K = len(problem.t)
+        self.groups: list[_Group] = []
+        self.group_of: dict[str, _Group] = {}
+        after: dict[int, list[int]] = {}
+        self.width = [DIM] * K
+        for constant in (False, True):
+            chains = [c for c in problem.chains if c.parameter.constant is constant]
+            if not chains:
+                continue
+            columns, at = {}, 0
+            for chain in chains:
+                size = len(chain.parameter.initial)
+                columns[chain.parameter.name] = slice(at, at + size)
+                at += size
+            node = chains[0].node
+            n = len(chains[0].t)
+            keys = np.arange(len(self.width), len(self.width) + n)
+            group = _Group(keys, node, columns, at)
+            self.groups.append(group)
+            self.group_of |= dict.fromkeys(columns, group)
+            self.width += [at] * n
+            for j, last in enumerate(np.searchsorted(node, np.arange(n), side="right") - 1):
+                after.setdefault(int(last), []).append(int(keys[j]))
+        self.keys = range(len(self.width))
+        self.order = [key for k in range(K) for key in (k, *after.get(k, ()))]
+        # the root of an interval's information does not depend on the states
+        self.whitener = np.linalg.inv(np.linalg.cholesky(problem.intervals.covariance))
+
+    def unpack(self, vectors: list[Array]) -> Step:
+        """Steps per state and parameter from one vector per key."""
+        nodes = {}
+        for group in self.groups:
+            stacked = np.stack([vectors[k] for k in group.keys])
+            nodes |= {name: stacked[:, at] for name, at in group.columns.items()}
+        return np.stack(vectors[: self.K]), nodes
+
+    def flat(self, step: Step) -> Array:
+        """(keys, widest) with zeros behind narrower variables."""
+        out = np.zeros((len(self.keys), max(self.width)))
+        out[: self.K, :DIM] = step[0]
+        for group in self.groups:
+            for name, at in group.columns.items():
+                out[group.keys, at] = step[1][name]
+        return out
+
+    def parameter_blocks(self, keyframe: Array, jacobians: dict[str, Array]) -> list[tuple[Array, Array]]:
+        """Blocks of the parameter variables that rows at `keyframe` touch."""
+        blocks = []
+        for group in self.groups:
+            names = [name for name in group.columns if name in jacobians]
+            if names:
+                n, m, _ = jacobians[names[0]].shape
+                A = np.zeros((n, m, group.width))
+                for name in names:
+                    A[:, :, group.columns[name]] = jacobians[name]
+                blocks.append((group.keys[group.node[keyframe]], A))
+        return blocks
+
+
+def whitened(problem: Problem, point: Point, layout: Layout) -> Rows:
+    """All factors at a point."""
+    x, at_keyframes = point.states, point.at_keyframes(problem)
+    r, Ji, Jj, Js = problem.motion.linearize(x, point.scale)
+    W, first = layout.whitener, np.arange(layout.K - 1)
+    links = [(first, W @ Ji), (first + 1, W @ Jj)]
+    if point.scale is not None:
+        links += layout.parameter_blocks(first, {SCALE: W @ Js})
+    out: Rows = [(links, -mv(W, r))]
+    for rows in (problem.prior, *problem.constraints):
+        linear = rows.linearize(x[rows.keyframe], _of_rows(rows, at_keyframes), slice(None))
+        weight, _ = weight_and_cost(rows.robust, norms(linear.residual, linear.sigma), rows.robust_scale)
+        scale = np.sqrt(weight)[:, None] / linear.sigma
+        weighted = {p.name: scale[..., None] * linear.jacobians[p.name] for p in rows.parameters}
+        blocks = [(rows.keyframe, scale[..., None] * assemble(linear))]
+        out.append((blocks + layout.parameter_blocks(rows.keyframe, weighted), -scale * linear.residual))
+    for chain in problem.chains:
+        out += _chain_rows(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name])
+    return out
+
+
+def cost(problem: Problem, point: Point, layout: Layout) -> float:
+    """Half the squared whitened residuals of everything, through the robust kernels."""
+    x, at_keyframes = point.states, point.at_keyframes(problem)
+    total = 0.5 * float(np.sum(mv(layout.whitener, problem.motion.residual(x, point.scale)) ** 2))
+    for rows in (problem.prior, *problem.constraints):
+        linear = rows.linearize(x[rows.keyframe], _of_rows(rows, at_keyframes), slice(None))
+        total += float(np.sum(weight_and_cost(rows.robust, norms(linear.residual, linear.sigma), rows.robust_scale)[1]))
+    for chain in problem.chains:
+        for _, b in _chain_rows(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name]):
+            total += 0.5 * float(np.sum(b * b))
+    return total
+
+
+def promised(rows: Rows, layout: Layout, step: Step) -> float:
+    """How much the quadratic model falls by a step."""
+    flat = layout.flat(step)
+    gain = 0.0
+    for blocks, b in rows:
+        moved = b - sum(mv(A, flat[keys, : A.shape[-1]]) for keys, A in blocks)
+        gain += 0.5 * float(np.sum(b * b) - np.sum(moved * moved))
+    return gain
+
+
+def column_norms(rows: Rows, layout: Layout) -> Array:
+    """(keys, widest) root of the diagonal of A^T A."""
+    total = np.zeros((len(layout.keys), max(layout.width)))
+    for blocks, _ in rows:
+        for keys, A in blocks:
+            np.add.at(total[:, : A.shape[-1]], keys, np.sum(A * A, axis=1))
+    return np.sqrt(total)
+
+
+def norms(residual: Array, sigma: Array) -> Array:
+    """Whitened norm (N,) of whole measurements."""
+    return np.linalg.norm(residual / sigma, axis=-1)
+
+
+def _of_rows(rows: Constraint, at_keyframes: Values) -> Values:
+    return {p.name: at_keyframes[p.name][rows.keyframe] for p in rows.parameters}
+
+
+def _chain_rows(chain: ParameterChain, group: _Group, value: Array) -> Rows:
+    """The prior on a parameter's first node and its way from node to node."""
+    p = chain.parameter
+    pick = np.eye(group.width)[group.columns[p.name]]  # (k, width)
+    keys = group.keys
+    out: Rows = [([(keys[:1], (pick / p.sigma[:, None])[None])], ((p.initial - value[0]) / p.sigma)[None])]
+    if len(keys) > 1:
+        decay, sigma = chain.steps
+        A = pick / sigma[..., None]
+        out.append(([(keys[:-1], -decay[:, None, None] * A), (keys[1:], A)],
+                    (decay[:, None] * value[:-1] - value[1:]) / sigma))  # fmt: skip
+    return out
