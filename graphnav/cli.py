@@ -221,9 +221,10 @@ def _usage(error: Any) -> str:
 
 
 def _internal(error: Exception) -> str:
+    """The error and the last line of graphnav that led to it."""
     frames = traceback.extract_tb(error.__traceback__)
-    own = [f for f in frames if Path(f.filename).parts[-2:-1] != ("cli.py",) and "graphnav" in Path(f.filename).parts]
-    at = (own or list(frames))[-1]
+    package = Path(__file__).parent
+    at = ([frame for frame in frames if package in Path(frame.filename).parents] or list(frames))[-1]
     return (
         f"internal error: {type(error).__name__}: {error} in {Path(at.filename).name}:{at.lineno}; "
         f"please report this with the command ({DEBUG}=1 shows a traceback)"

@@ -1,0 +1,318 @@
+"""The program as people run it: exit codes, sentences, and the files with the columns and keys they are promised."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphnav import cli, workflow
+
+PROGRAM = Path(sys.executable).with_name("graphnav")
+SOLVERS = ("ekf", "rts", "batch")
+TRAJECTORY_COLUMNS = (
+    "t,lat,lon,h,ve,vn,vu,roll,pitch,heading,sd_e,sd_n,sd_u,sd_ve,sd_vn,sd_vu,sd_roll,sd_pitch,sd_heading,"
+    "bgx,bgy,bgz,bax,bay,baz"
+)
+WITHHELD = (30.0, 45.0)  # s from the start, long before the drive's own outage
+FILES = {
+    "trajectory.csv", "trajectory.kml", "trajectory.tum", "calibration.json", "detections.csv", "summary.json",
+    "report.html",
+}  # fmt: skip
+
+
+def program(*arguments, **kwargs):
+    """Run the installed program."""
+    command = [str(PROGRAM), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, **kwargs)
+
+
+def rows(path):
+    with Path(path).open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def summary(folder):
+    return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="session")
+def benchmark():
+    """scripts/benchmark.py, which writes drives of another simulator as recording folders."""
+    path = Path(__file__).resolve().parents[1] / "scripts" / "benchmark.py"
+    spec = importlib.util.spec_from_file_location("benchmark", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["benchmark"] = module  # its dataclasses look themselves up
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="session")
+def drive(benchmark, tmp_path_factory):
+    """240 s with 60 s without fixes, wheel speed and truth."""
+    return benchmark.build(tmp_path_factory.mktemp("drives"), 240 / 3600)
+
+
+@pytest.fixture(scope="session")
+def compared(drive, tmp_path_factory):
+    """One run of compare that several tests look at: (folder, the finished process)."""
+    out = tmp_path_factory.mktemp("out") / "deep" / "compared"
+    span = f"gnss:{WITHHELD[0]:g}-{WITHHELD[1]:g}"
+    return out, program("compare", drive, "--without", span, "--without", "odometer", "-o", out)
+
+
+# ------------------------------------------------------------------------------------------------------------- compare
+def test_compare_succeeds_and_says_where_to_look(compared):
+    out, run = compared
+    assert run.returncode == 0, run.stderr
+    assert run.stderr == ""
+    assert f"  {out / 'comparison.html'}" in run.stdout.splitlines()
+    for solver in SOLVERS:
+        assert any(line.split()[:1] == [solver] for line in run.stdout.splitlines())
+    assert "detections.csv holds its header only" in run.stdout
+
+
+def test_compare_writes_what_it_promises(compared):
+    out, _ = compared
+    assert {p.name for p in out.iterdir()} == {*SOLVERS, "comparison.csv", "comparison.html"}
+    for solver in SOLVERS:
+        assert {p.name for p in (out / solver).iterdir()} == FILES
+        assert (out / solver / "trajectory.csv").read_text().splitlines()[0] == TRAJECTORY_COLUMNS
+        assert (out / solver / "detections.csv").read_text() == "start,end,detector\n"
+        assert "<html" in (out / solver / "report.html").read_text(encoding="utf-8")
+
+
+def test_trajectory_has_a_full_row_for_every_keyframe(compared):
+    out, _ = compared
+    for solver in SOLVERS:
+        table = rows(out / solver / "trajectory.csv")
+        values = np.array([[float(x) for x in row.values()] for row in table])
+        assert len(table) == summary(out / solver)["keyframes"]
+        assert np.isfinite(values).all()
+        assert (np.diff(values[:, 0]) > 0).all()
+
+
+def test_summary_holds_its_keys_and_agrees_with_the_other_files(compared, drive):
+    out, _ = compared
+    for solver in SOLVERS:
+        s = summary(out / solver)
+        assert set(s) >= {
+            "solver", "recording", "duration_s", "keyframes", "counts", "iterations", "stopped", "final_cost",
+            "timings", "peak_memory_mb", "errors", "spans", "nees", "parameters", "notes", "remarks", "settings",
+            "provenance",
+        }  # fmt: skip
+        assert s["solver"] == solver
+        assert s["duration_s"] == pytest.approx(240.0, abs=1e-6)
+        assert set(s["timings"]) >= {"reading", "alignment", "preintegration", "filter", "writing", "report"}
+        assert s["peak_memory_mb"] > 50
+        assert not any("odometer" in kind for kind in s["counts"])  # it was withheld
+        files = {Path(path).name: digest for path, digest in s["provenance"]["inputs"].items()}
+        for name in ("recording.toml", "imu.csv", "gnss.csv", "odometer.csv", "truth.csv"):
+            assert files[name] == hashlib.sha256((drive / name).read_bytes()).hexdigest()
+        assert s["provenance"]["options"]["without"] == ["gnss:30-45", "odometer"]
+    assert summary(out / "batch")["iterations"] >= 1
+    assert "covariances" in summary(out / "batch")["timings"]
+
+
+def test_spans_are_the_withheld_one_and_the_outage_that_was_there(compared, drive):
+    out, _ = compared
+    t = np.array([float(row["t"]) for row in rows(drive / "gnss.csv")])
+    start = float(rows(drive / "imu.csv")[0]["t"]) - 1 / 200
+    last = t[np.argmax(np.diff(t))] - start
+    spans = summary(out / "batch")["spans"]
+    assert [s["missing"] for s in spans] == ["without gnss", "no GNSS"]
+    assert (spans[0]["start_s"], spans[0]["end_s"]) == WITHHELD
+    assert spans[1]["start_s"] == pytest.approx(last, abs=1e-4)
+    assert spans[1]["end_s"] == pytest.approx(last + np.diff(t).max() - 1.0, abs=1e-4)
+    for span in spans:
+        assert 0 < span["end_h_m"] <= span["max_h_m"]
+
+
+def test_comparison_csv_has_a_row_per_solver_with_the_numbers_of_the_summaries(compared):
+    out, _ = compared
+    table = rows(out / "comparison.csv")
+    assert [row["solver"] for row in table] == list(SOLVERS)
+    for row in table:
+        s = summary(out / row["solver"])
+        assert float(row["h_rms_m"]) == s["errors"]["h_rms_m"]
+        assert float(row["span2_max_h_m"]) == s["spans"][1]["max_h_m"]
+        assert float(row["run_time_s"]) > 0
+
+
+def test_solvers_differ_where_they_should(compared):
+    """The same information, but only the filter has not seen the other side of the outage."""
+    out, _ = compared
+    worst = {solver: summary(out / solver)["spans"][1]["max_h_m"] for solver in SOLVERS}
+    assert worst["batch"] < worst["ekf"]
+    assert worst["rts"] < worst["ekf"]
+
+
+# ------------------------------------------------------------------------------------------------------------ evaluate
+def test_evaluate_of_the_written_file_finds_what_the_run_found(compared, drive, tmp_path):
+    out, _ = compared
+    run = program("evaluate", out / "batch" / "trajectory.csv", drive, "--json", "-o", tmp_path / "e")
+    assert run.returncode == 0, run.stderr
+    values = json.loads(run.stdout)
+    for key in ("h_rms_m", "up_rms_m", "heading_rms_deg"):
+        assert values[key] == pytest.approx(summary(out / "batch")["errors"][key], rel=1e-3)
+    assert json.loads((tmp_path / "e" / "evaluation.json").read_text()) == values
+    east = np.array([float(row["east"]) for row in rows(tmp_path / "e" / "errors.csv")])
+    assert np.sqrt(np.mean(east**2)) == pytest.approx(values["e_rms_m"], rel=1e-3)
+
+
+def test_evaluate_prints_a_table_and_writes_nothing_unasked(compared, tmp_path):
+    out, _ = compared
+    one = out / "batch" / "trajectory.csv"
+    run = program("evaluate", one, one, cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert "horizontal" in run.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+# -------------------------------------------------------------------------------------------------------------- smooth
+def test_smooth_a_part_of_a_real_drive_without_fixes_in_a_span(tmp_path):
+    run = program(
+        "smooth", "kitti", "--start", 100, "--end", 220, "--without", "gnss:150-170", "-o", tmp_path, "--solver", "rts"
+    )
+    assert run.returncode == 0, run.stderr
+    assert {p.name for p in tmp_path.iterdir()} == FILES
+    s = summary(tmp_path)
+    assert (s["solver"], s["against"]) == ("rts", "the withheld GNSS fixes")
+    (span,) = s["spans"]
+    assert (span["missing"], span["start_s"], span["end_s"]) == ("without gnss", 150.0, 170.0)
+    assert s["errors"]["n"] == span["n"] == 20  # one fix a second
+    t = [float(row["t"]) for row in rows(tmp_path / "trajectory.csv")]
+    assert t[-1] - t[0] == pytest.approx(120.0, abs=1.0)
+
+
+def test_quiet_is_silent_and_a_config_file_counts(drive, tmp_path):
+    config = tmp_path / "settings.toml"
+    config.write_text("[keyframes]\nrate = 2.0\n")
+    run = program("smooth", drive, "--quiet", "--config", config, "--end", 120, "--solver", "ekf", "-o", tmp_path / "o")
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+    s = summary(tmp_path / "o")
+    assert s["settings"]["keyframes"]["rate"] == 2.0
+    assert s["keyframes"] == pytest.approx(240, abs=5)
+
+
+def test_without_a_truth_the_summary_says_so(tmp_path):
+    assert cli.run(["smooth", "kitti", "--end", "90", "--solver", "ekf", "--quiet", "-o", str(tmp_path)]) == 0
+    s = summary(tmp_path)
+    assert (s["errors"], s["against"], s["spans"], s["nees"]) == (None, None, [], None)
+
+
+# ---------------------------------------------------------------------------------------------------------------- info
+def test_info_of_a_real_drive():
+    run = program("info", "kitti")
+    assert run.returncode == 0
+    assert run.stdout.startswith("kitti (vehicle)")
+    assert "rate 100" in run.stdout
+
+
+# ----------------------------------------------------------------------------------------------------------- bad input
+BAD = {
+    "no such recording": (["info", "nothing/here"], "nothing/here: no such file or folder"),
+    "unknown command": (["smoth", "kitti"], "smoth"),
+    "not there yet": (["detect", "kitti", "-o", "o"], "No such command"),
+    "unknown option": (["smooth", "kitti", "-o", "o", "--solvr", "ekf"], "--solvr"),
+    "no output": (["smooth", "kitti"], "-o"),
+    "no number": (["smooth", "kitti", "-o", "o", "--start", "soon"], "--start"),
+    "output is a file": (["smooth", "kitti", "-o", "file"], "-o file: is a file"),
+    "output under a file": (["smooth", "kitti", "-o", "file/o"], "-o file/o: cannot be made, file is a file"),
+    "unknown solver": (["smooth", "kitti", "-o", "o", "--solver", "incremental"], "known: ekf, rts, batch"),
+    "unknown among solvers": (["compare", "kitti", "-o", "o", "--solvers", "ekf,ukf"], "no solver 'ukf'"),
+    "no solvers": (["compare", "kitti", "-o", "o", "--solvers", ","], "names no solver"),
+    "unknown source": (["smooth", "kitti", "-o", "o", "--without", "gns:1-2"], "did you mean 'gnss'?"),
+    "half a span": (["smooth", "kitti", "-o", "o", "--without", "gnss:5"], "such as gnss:600-660"),
+    "words in a span": (["smooth", "kitti", "-o", "o", "--without", "gnss:a-b"], "not a span of two numbers"),
+    "backward span": (["smooth", "kitti", "-o", "o", "--without", "gnss:9-5"], "must end after it begins"),
+    "span outside": (["smooth", "kitti", "-o", "o", "--without", "gnss:900-960"], "lies outside 'kitti'"),
+    "no such sensor": (["smooth", "kitti", "-o", "o", "--without", "odometer"], "has none"),
+    "end before start": (["smooth", "kitti", "-o", "o", "--start", "9", "--end", "5"], "--end 5"),
+    "start after the end": (["smooth", "kitti", "-o", "o", "--start", "9999"], "--start 9999: lies outside"),
+    "no rate": (["smooth", "kitti", "-o", "o", "--rate", "0"], "--rate 0"),
+    "no config": (["smooth", "kitti", "-o", "o", "--config", "no.toml"], "no.toml: cannot be read"),
+    "unknown key": (["smooth", "kitti", "-o", "o", "--config", "bad.toml"], "did you mean 'rate'?"),
+    "not a trajectory": (["evaluate", "file", "file"], "file"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "reason"), BAD.values(), ids=BAD)
+def test_bad_input_is_one_line_and_exit_code_2(arguments, reason, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("")
+    Path("bad.toml").write_text("[keyframes]\nrat = 1.0\n")
+    assert cli.run(arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("graphnav: ")
+    assert reason in printed.err
+    assert printed.err.count("\n") == 1
+    assert {p.name for p in tmp_path.iterdir()} == {"file", "bad.toml"}  # nothing was written
+
+
+def test_exit_code_and_sentence_of_the_installed_program():
+    run = program("smooth", "nothing-here", "-o", os.devnull)
+    assert (run.returncode, run.stdout) == (2, "")
+    assert run.stderr == f"graphnav: -o {os.devnull}: is a file; name a folder to write into\n"
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (TypeError("what\nis this"), 1, "internal error: TypeError: what is this in cli.py:"),
+        (MemoryError(), 1, "out of memory"),
+        (OSError(28, "No space left on device", "o/summary.json"), 2, "o/summary.json: No space left on device"),
+    ],
+    ids=["ctrl-c", "internal", "memory", "disk full"],
+)
+def test_no_traceback_reaches_a_user(error, code, words, tmp_path, monkeypatch, capsys):
+    def failing(*_):
+        raise error
+
+    monkeypatch.setattr(workflow, "run_request", failing)
+    monkeypatch.delenv(cli.DEBUG, raising=False)
+    assert cli.run(["smooth", "kitti", "-o", str(tmp_path / "o")]) == code
+    printed = capsys.readouterr()
+    assert printed.err.startswith("graphnav: ")
+    assert words in printed.err
+    assert printed.err.count("\n") == 1
+    monkeypatch.setenv(cli.DEBUG, "1")
+    assert cli.run(["smooth", "kitti", "-o", str(tmp_path / "o")]) == code
+    shown = "Traceback" in capsys.readouterr().err
+    assert shown == (code != 130)
+
+
+def test_a_reader_that_stops_early_is_no_error():
+    with subprocess.Popen([PROGRAM, "info", "kitti"], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+        run.stdout.close()
+        assert run.stderr.read() == b""
+        assert run.wait(timeout=60) == cli.PIPE_CLOSED
+
+
+# ---------------------------------------------------------------------------------------------------------------- help
+@pytest.mark.parametrize("command", ["info", "smooth", "compare", "evaluate"])
+def test_every_command_has_help_with_an_example(command, capsys):
+    assert cli.run([command, "--help"]) == 0
+    printed = capsys.readouterr().out
+    assert f"  graphnav {command} " in printed.split("Example:")[1]
+
+
+def test_no_command_shows_help(capsys):
+    assert cli.run([]) == 2
+    assert "Commands:" in capsys.readouterr().out
+
+
+# ------------------------------------------------------------------------------------------------------------- details
+def test_spans_of_the_command_line():
+    assert workflow.parse_withheld("gnss:600-660.5") == ("gnss", (600.0, 660.5))
+    assert workflow.parse_withheld("odometer") == ("odometer", None)
