@@ -46,6 +46,7 @@ class Alignment:
     sigma: Array  # (15,) of the prior
     own_sigma: Array  # (3,) rad, of roll, pitch, heading as the alignment itself believes them
     notes: tuple[str, ...]
+    motion: float | None = None  # s, about when the vehicle first moves; None when it never does
 
     @property
     def rph(self) -> Array:
@@ -69,7 +70,7 @@ def align(recording: Recording, settings: Settings, frame: LocalFrame, smooth: S
     if span is None:
         found = _at_rest(recording, settings, frame)
     else:
-        found = _in_motion(recording, settings, frame, smooth, span)
+        found = replace(_in_motion(recording, settings, frame, smooth, span), motion=span[0])
     known = settings.alignment.heading
     if known is None:
         return found

@@ -8,7 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.alignment import align
+from graphnav import receiver
+from graphnav.alignment import Alignment, align
 from graphnav.config import Settings
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
@@ -75,8 +76,14 @@ def _solve(
         recording, settings, frame, lambda problem, start: batch(problem, start, covariances=(0,), reintegrate=False)
     )
     after = time.perf_counter()
+    settings, said = _receiver(recording, settings, frame, aligned)
+    judged = time.perf_counter()
     problem = pose(recording, settings, frame, aligned.state, aligned.sigma)
-    timings = {"alignment": after - began, "preintegration": time.perf_counter() - after}
+    timings = {
+        "alignment": after - began,
+        "receiver": judged - after,
+        "preintegration": time.perf_counter() - judged,
+    }
     forward = ekf(problem, progress)
     out = {"ekf": forward.solution}
     if "rts" in solvers or "batch" in solvers:
@@ -87,9 +94,26 @@ def _solve(
         spent = {**out["rts"].timings, **out["batch"].timings}
         out["batch"] = replace(out["batch"], timings=spent)
     return {
-        name: replace(out[name], notes=(*aligned.notes, *out[name].notes), timings={**timings, **out[name].timings})
+        name: replace(
+            out[name], notes=(*aligned.notes, *said, *out[name].notes), timings={**timings, **out[name].timings}
+        )
         for name in solvers
     }
+
+
+def _receiver(
+    recording: Recording, settings: Settings, frame: LocalFrame, aligned: Alignment
+) -> tuple[Settings, tuple[str, ...]]:
+    """Settings with the fixes judged by a plain solution of the first part of the drive."""
+    gnss = settings.gnss
+    if aligned.motion is None or not gnss.position or (gnss.sd_factor is not None and gnss.slow_share is not None):
+        return settings, ()
+    plain = settings.model_copy(update={"gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0})})
+    problem = pose(receiver.stretch(recording, aligned.motion), plain, frame, aligned.state, aligned.sigma)
+    judgement = receiver.judge(problem, rts(problem, ekf(problem)))
+    if judgement is None:
+        return settings, ()
+    return judgement.applied(settings), (judgement.note,) if judgement.note else ()
 
 
 def _start(problem: Problem, smoothed: Solution) -> tuple[States, dict[str, np.ndarray]]:
