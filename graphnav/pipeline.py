@@ -73,7 +73,7 @@ def _solve(
 ) -> dict[str, Solution]:
     began = time.perf_counter()
     aligned = align(
-        recording, settings, frame, lambda problem, start: batch(problem, start, covariances=(0,), reintegrate=False)
+        recording, settings, frame, lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)
     )
     after = time.perf_counter()
     settings, said = _receiver(recording, settings, frame, aligned)

@@ -175,18 +175,36 @@ def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array) -> 
 
 
 def prefix(samples: Samples, t0: float, t: Array, ba: Array, bg: Array) -> tuple[Array, Array, Array]:
-    """dR (M, 3, 3), dV (M, 3), dP (M, 3) from one keyframe to each of the times t > t0 after it."""
-    pieces = _pieces(samples, np.concatenate([[t0], t]))
-    w, f = samples.gyro[pieces.index] - bg, samples.accel[pieces.index] - ba
-    R, V, P, _ = _means(w[None], f[None], pieces.dt[None])
-    ends = np.cumsum(pieces.count)
-    return R[0, ends], V[0, ends], P[0, ends]
+    """dR (M, 3, 3), dV (M, 3), dP (M, 3) from one keyframe to each of the ascending times t > t0 after it."""
+    return within(samples, np.array([t0, t[-1]]), t, ba[None], bg[None])
+
+
+def within(samples: Samples, keyframes: Array, t: Array, ba: Array, bg: Array) -> tuple[Array, Array, Array]:
+    """dR (M, 3, 3), dV (M, 3), dP (M, 3) from the keyframe before (never at) each of the times t to that time.
+
+    `ba`, `bg` are (K-1, 3), the biases of each interval; t (M,) ascending, after the first keyframe and not
+    after the last.
+    """
+    pieces = _pieces(samples, keyframes, t)
+    edge = np.searchsorted(pieces.edges, t)
+    interval = np.searchsorted(keyframes, t, side="left") - 1
+    dR, dV, dP = np.empty((len(t), 3, 3)), np.empty((len(t), 3)), np.empty((len(t), 3))
+    for rows in _chunks(pieces.count):
+        dt, index = pieces.padded(rows)
+        R, V, P, _ = _means(samples.gyro[index] - bg[rows, None], samples.accel[index] - ba[rows, None], dt)
+        place = np.full(len(pieces.count), -1)
+        place[rows] = np.arange(len(rows))
+        here = np.flatnonzero(place[interval] >= 0)
+        row, column = place[interval[here]], edge[here] - pieces.first[interval[here]]
+        dR[here], dV[here], dP[here] = R[row, column], V[row, column], P[row, column]
+    return dR, dV, dP
 
 
 @dataclass(frozen=True)
 class _Pieces:
     """Sample periods split at keyframes: interval i owns pieces first[i] .. first[i] + count[i]."""
 
+    edges: Array  # (pieces + 1,) s
     dt: Array
     index: Array  # the sample each piece belongs to
     first: Array
@@ -201,12 +219,13 @@ class _Pieces:
         return np.where(inside, self.dt[at], 0.0), self.index[at]
 
 
-def _pieces(samples: Samples, t: Array) -> _Pieces:
+def _pieces(samples: Samples, t: Array, extra: Array | None = None) -> _Pieces:
+    """Pieces between keyframes t, split at the `extra` times too."""
     inner = samples.t[(samples.t > t[0]) & (samples.t < t[-1])]
-    edges = np.union1d(inner, t)
+    edges = np.union1d(inner, t if extra is None else np.concatenate([t, extra]))
     index = np.minimum(np.searchsorted(samples.t, edges[1:], side="left"), len(samples.t) - 1)
     starts = np.searchsorted(edges, t)
-    return _Pieces(np.diff(edges), index, starts[:-1], np.diff(starts))
+    return _Pieces(edges, np.diff(edges), index, starts[:-1], np.diff(starts))
 
 
 def _chunks(count: Array) -> Iterator[Array]:

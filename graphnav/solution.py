@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -12,6 +12,21 @@ from graphnav.earth import LocalFrame
 from graphnav.rotation import Array
 from graphnav.state import States
 from graphnav.trajectory import Trajectory
+
+
+class Between(Protocol):
+    """States between the keyframes of one piece of a recording."""
+
+    start: float
+    end: float
+
+    def times(self, rate: float) -> Array:
+        """Times at a rate, ends included."""
+        ...
+
+    def __call__(self, t: Array) -> tuple[States, Array]:
+        """States and covariances at times inside."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -61,11 +76,24 @@ class Solution:
     stopped: str = ""  # why it stopped, a sentence
     timings: dict[str, float] = field(default_factory=dict)  # s by stage
     notes: tuple[str, ...] = ()
-    intervals: Any = None  # the preintegrated intervals, for output between keyframes
+    between: tuple[Between, ...] = ()  # gives states between keyframes, one for each piece of the recording
 
-    def trajectory(self) -> Trajectory:
-        """The keyframes in geodetic coordinates and local axes, with full 9 x 9 covariance."""
-        return to_trajectory(self.solver, self.frame, self.t, self.states, self.covariance)
+    def trajectory(self, rate: float | None = None) -> Trajectory:
+        """In geodetic coordinates and local axes, with 9 x 9 covariances: at the keyframes, or at `rate` (Hz)."""
+        t, states, covariance = self.t, self.states, self.covariance
+        if rate is not None:
+            t, states, covariance = self.at(np.concatenate([b.times(rate) for b in self.between]))
+        return to_trajectory(self.solver, self.frame, t, states, covariance)
+
+    def at(self, t: Array) -> tuple[Array, States, Array]:
+        """Times (M,), states and covariances (M, 15, 15) at ascending times; those in no piece are left out."""
+        parts = []
+        for piece in self.between:
+            inside = t[(t >= piece.start) & (t <= piece.end)]
+            if len(inside):
+                parts.append((inside, *piece(inside)))
+        times, states, covariances = zip(*parts, strict=True)
+        return np.concatenate(times), States.stack(list(states)), np.concatenate(covariances)
 
 
 def to_trajectory(name: str, frame: LocalFrame, t: Array, states: States, covariance: Array) -> Trajectory:
@@ -126,7 +154,7 @@ def joined(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:
         cost=sum(p.cost for p in parts),
         stopped="; ".join(dict.fromkeys(p.stopped for p in parts)),
         notes=(*notes, *dict.fromkeys(note for part in parts for note in part.notes)),
-        intervals=[p.intervals for p in parts],
+        between=tuple(b for p in parts for b in p.between),
     )
 
 

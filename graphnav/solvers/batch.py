@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphnav.dense import dense
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
@@ -35,12 +36,12 @@ def batch(
     start: States,
     values: Values | None = None,
     progress: Progress | None = None,
-    covariances: tuple[int, ...] | None = None,
+    wanted: tuple[int, ...] | None = None,
     reintegrate: bool = True,
 ) -> Solution:
     """Solve a problem from any starting states (K rows) and parameter values.
 
-    `covariances` are the keyframes whose covariance is wanted, all when None; others are NaN. `reintegrate`
+    `wanted` are the keyframes whose covariance is wanted, all when None; others are NaN. `reintegrate`
     allows intervals to be integrated again when the gyro bias moves far.
     """
     began = time.perf_counter()
@@ -50,9 +51,10 @@ def batch(
     solved = time.perf_counter()
     if progress is not None:
         progress("covariances", 0.0)
-    wanted = set(layout.keys) if covariances is None else {*covariances, *layout.keys[layout.K :]}
-    marginal = found.eliminated.covariances(wanted)
+    keys = set(layout.keys) if wanted is None else {*wanted, *layout.keys[layout.K :]}
+    marginal = found.eliminated.covariances(keys)
     unknown = np.full((DIM, DIM), np.nan)
+    covariance = np.stack([marginal.get(k, unknown) for k in range(layout.K)])
     done = time.perf_counter()
     at_keyframes = point.at_keyframes(problem)
     records = {}
@@ -65,7 +67,7 @@ def batch(
         frame=problem.frame,
         t=problem.t,
         states=point.states,
-        covariance=np.stack([marginal.get(k, unknown) for k in range(layout.K)]),
+        covariance=covariance,
         parameters=_estimates(problem, layout, point, marginal),
         records=records,
         counts={"initial_prior": 1, "imu": layout.K - 1, **{c.name: len(c) for c in problem.constraints}},
@@ -74,7 +76,7 @@ def batch(
         stopped=found.stopped,
         timings={"batch": solved - began, "covariances": done - solved},
         notes=(*problem.notes, *found.notes),
-        intervals=problem.intervals,
+        between=(dense(problem, point.states, covariance, point.scale, smooth=True),),
     )
 
 

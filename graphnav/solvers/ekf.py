@@ -25,6 +25,7 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from graphnav.constraints.base import Constraint, assemble
+from graphnav.dense import dense
 from graphnav.dynamics import SCALE
 from graphnav.problem import Problem
 from graphnav.rotation import Array
@@ -97,11 +98,12 @@ def ekf(problem: Problem, progress: Progress | None = None) -> Filtered:
         if progress is not None and k % 256 == 0:
             progress("filter", k / K)
     seconds = time.perf_counter() - began
+    filtered = States.stack(states)
     solution = Solution(
         solver="ekf",
         frame=problem.frame,
         t=problem.t,
-        states=States.stack(states),
+        states=filtered,
         covariance=all_P[:, :DIM, :DIM],
         parameters=_parameters(problem, all_values, all_P),
         records={name: r.record(problem) for name, r in records.items()},
@@ -110,7 +112,7 @@ def ekf(problem: Problem, progress: Progress | None = None) -> Filtered:
         stopped="one pass forward over all keyframes",
         timings={"filter": seconds},
         notes=problem.notes,
-        intervals=problem.intervals,
+        between=(dense(problem, filtered, all_P[:, :DIM, :DIM], _scale(problem, all_values), smooth=False),),
     )
     return Filtered(solution, states, all_values, all_vp, all_P, predicted, all_Pp, all_F)
 
@@ -184,7 +186,7 @@ def rts(problem: Problem, forward: Filtered, progress: Progress | None = None) -
         stopped="one pass forward and one back",
         timings={**forward.solution.timings, "smoother": seconds},
         notes=problem.notes,
-        intervals=problem.intervals,
+        between=(dense(problem, smoothed, all_P[:, :DIM, :DIM], _scale(problem, all_values), smooth=True),),
     )
 
 
@@ -227,6 +229,12 @@ def _node_steps(problem: Problem) -> dict[int, list[tuple[slice, float, Array]]]
             j = chain.node[k] - 1
             out.setdefault(int(k), []).append((problem.columns[chain.parameter.name], float(decay[j]), sigma[j]))
     return out
+
+
+def _scale(problem: Problem, values: Array) -> Array | None:
+    """(K, 6) scale errors of the IMU at each keyframe."""
+    at = problem.columns.get(SCALE)
+    return None if at is None else values[:, _shift(at)]
 
 
 def _shift(columns: slice) -> slice:

@@ -1,0 +1,121 @@
+"""States between keyframes, at any rate: the IMU's own samples integrated from the keyframe before.
+
+A filter's state between keyframes is that prediction. A smoother knows the next keyframe too; what the
+prediction misses it by is laid over the interval so that position, velocity and attitude stay one motion: the
+position's share is the cubic that begins with nothing and ends with the miss in position and velocity, the
+velocity's is its derivative, attitude and biases go linearly. Covariances are interpolated linearly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.dynamics import Motion
+from graphnav.earth import LocalFrame
+from graphnav.preintegration import Intervals, Samples, within
+from graphnav.problem import Problem
+from graphnav.rotation import Array
+from graphnav.state import States
+
+
+@dataclass(frozen=True)
+class Dense:
+    """Callable for `Solution.between`."""
+
+    samples: Samples
+    frame: LocalFrame
+    t: Array  # (K,)
+    states: States
+    covariance: Array  # (K, 15, 15)
+    ba: Array  # (K-1, 3) biases with scale errors, as each interval saw them
+    bg: Array  # (K-1, 3)
+    smooth: bool
+
+    @property
+    def start(self) -> float:
+        """First keyframe, s."""
+        return float(self.t[0])
+
+    @property
+    def end(self) -> float:
+        """Last keyframe, s."""
+        return float(self.t[-1])
+
+    def times(self, rate: float) -> Array:
+        """Multiples of 1/rate on the recording's clock, with both ends."""
+        steps = np.arange(np.ceil(self.start * rate), np.floor(self.end * rate) + 1) / rate
+        inner = steps[(steps > self.start + 1e-6) & (steps < self.end - 1e-6)]
+        return np.concatenate([[self.start], inner, [self.end]])
+
+    def __call__(self, t: Array) -> tuple[States, Array]:
+        """States and covariances (M, 15, 15) at ascending times from `start` to `end`."""
+        k = np.clip(np.searchsorted(self.t, t, side="left") - 1, 0, len(self.t) - 2)
+        T = np.diff(self.t)[k]
+        s = (t - self.t[k]) / T
+        # every target is reached from its keyframe, and so is every keyframe's end, for the miss
+        targets = np.unique(np.concatenate([t[t > self.t[0]], self.t[1:]]))
+        ahead = self._predicted(targets)
+        states = self.states[k].plus(np.zeros((len(t), 15)))
+        moved = t > self.t[0]
+        at = np.searchsorted(targets, t[moved])
+        reached = ahead[at]
+        if self.smooth:
+            ends = ahead[np.searchsorted(targets, self.t[1:])]
+            miss = self.states[1:].minus(ends)[k[moved]]
+            reached = reached.plus(_laid(miss, s[moved, None], T[moved, None]))
+        else:
+            exact = np.isclose(s[moved], 1.0, rtol=0.0, atol=1e-9)
+            reached = _choose(exact, self.states[k[moved] + 1], reached)
+        states = _choose(moved, _spread(reached, moved, states), states)
+        w = s[:, None, None]
+        return states, (1.0 - w) * self.covariance[k] + w * self.covariance[k + 1]
+
+    def _predicted(self, t: Array) -> States:
+        """Prediction from the keyframe before each time."""
+        k = np.searchsorted(self.t, t, side="left") - 1
+        dR, dV, dP = within(self.samples, self.t, t, self.ba, self.bg)
+        n = len(t)
+        none = np.zeros((n, 3, 3))
+        start = self.states[k]
+        intervals = Intervals(
+            self.t[k], t, dR, dV, dP, none, none, none, none, none, start.ba, start.bg,
+            np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 15, 15)),
+        )  # fmt: skip
+        return Motion(intervals, self.frame).propagate(slice(None), start)[0]
+
+
+def _laid(miss: Array, s: Array, T: Array) -> Array:
+    """The share (M, 15) of a miss at the fraction s of intervals T long."""
+    out = miss * s
+    p, v = miss[:, 3:6], miss[:, 6:9]
+    out[:, 3:6] = p * (3 * s**2 - 2 * s**3) + v * T * (s**3 - s**2)
+    out[:, 6:9] = p * (6 * s - 6 * s**2) / T + v * (3 * s**2 - 2 * s)
+    return out
+
+
+def _choose(mask: Array, yes: States, no: States) -> States:
+    """Rows of one struct or another."""
+    return States(
+        np.where(mask[:, None, None], yes.R_nb, no.R_nb),
+        *(np.where(mask[:, None], getattr(yes, f), getattr(no, f)) for f in ("p", "v", "ba", "bg")),
+    )
+
+
+def _spread(rows: States, mask: Array, like: States) -> States:
+    """`rows` put where `mask` is true; elsewhere as in `like`."""
+    out = like[np.arange(len(like))]
+    for name in ("R_nb", "p", "v", "ba", "bg"):
+        getattr(out, name)[mask] = getattr(rows, name)
+    return out
+
+
+def dense(problem: Problem, states: States, covariance: Array, scale: Array | None, smooth: bool) -> Dense:
+    """For a solution of a problem; `scale` is (6,) or, as a filter knew it at each keyframe, (K, 6)."""
+    ba, bg = states.ba[:-1], states.bg[:-1]
+    if scale is not None:
+        scale = np.broadcast_to(scale, (len(states), 6))[:-1]
+        bg = bg + scale[:, :3] * problem.intervals.rate
+        ba = ba + scale[:, 3:] * problem.intervals.force
+    return Dense(problem.samples, problem.frame, problem.t, states, covariance, ba, bg, smooth)
