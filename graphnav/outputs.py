@@ -86,7 +86,7 @@ def write_solver(outcome: Outcome, name: str, folder: Path, provenance: Mapping[
 
     solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
     began = time.perf_counter()
-    trajectory = solution.trajectory()
+    trajectory = solution.trajectory(outcome.request.rate)
     write_all(replace(trajectory, name=f"{outcome.recording.name}, {name}"), folder)
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
     (folder / "detections.csv").write_text(DETECTIONS_HEADER + "\n", encoding="utf-8")

@@ -129,8 +129,6 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
     from graphnav.checks import inspect
     from graphnav.formats import read
 
-    if request.rate is not None:
-        raise ConfigError("--rate: output between the keyframes is not there yet; leave the option out")
     timings: dict[str, float] = {}
     with _timed(timings, "reading", progress):
         whole = read(request.source)

@@ -203,6 +203,15 @@ def test_quiet_is_silent_and_a_config_file_counts(drive, tmp_path):
     assert s["keyframes"] == pytest.approx(240, abs=5)
 
 
+def test_rate_is_that_of_the_output(tmp_path):
+    out = str(tmp_path)
+    assert cli.run(["smooth", "kitti", "--end", "60", "--rate", "20", "--solver", "rts", "--quiet", "-o", out]) == 0
+    t = np.array([float(row["t"]) for row in rows(tmp_path / "trajectory.csv")])
+    assert np.diff(t)[1:-1] == pytest.approx(0.05, abs=1e-5)  # both ends of the drive are there as well
+    assert t[-1] - t[0] == pytest.approx(60.0, abs=0.1)
+    assert summary(tmp_path)["keyframes"] < 100
+
+
 def test_without_a_truth_the_summary_says_so(tmp_path):
     assert cli.run(["smooth", "kitti", "--end", "90", "--solver", "ekf", "--quiet", "-o", str(tmp_path)]) == 0
     s = summary(tmp_path)
