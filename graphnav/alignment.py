@@ -68,22 +68,28 @@ def align(recording: Recording, settings: Settings, frame: LocalFrame, smooth: S
     """
     span = _motion(recording, settings)
     if span is None:
-        found = _at_rest(recording, settings, frame)
-    else:
-        found = replace(_in_motion(recording, settings, frame, smooth, span), motion=span[0])
+        return _at_rest(recording, settings, frame)
+    return replace(_in_motion(recording, settings, frame, smooth, span), motion=span[0])
+
+
+def with_known_heading(found: Alignment, settings: Settings) -> Alignment:
+    """The alignment with the start heading the user states, where there is one."""
     known = settings.alignment.heading
     if known is None:
         return found
     rph = found.rph
     rph[2] = np.radians(known)
     sigma = found.sigma.copy()
-    # a wrong heading is an error about up; about a tilted body axis it leaks into all three
     sigma[2] = np.radians(settings.alignment.heading_sigma)
     return replace(
         found,
         state=replace(found.state, R_nb=rotation.from_rph(rph)[None]),
         sigma=sigma,
-        notes=(f"start heading given: {known:g} deg, 1-sigma {settings.alignment.heading_sigma:g} deg",),
+        notes=(
+            *found.notes,
+            f"start heading stated: {known:g} deg, 1-sigma {settings.alignment.heading_sigma:g} deg "
+            f"(found: {np.degrees(found.rph[2]):.1f} deg)",
+        ),
     )
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from graphnav import receiver
-from graphnav.alignment import Alignment, align
+from graphnav.alignment import Alignment, align, with_known_heading
 from graphnav.config import Settings
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
@@ -21,6 +21,7 @@ from graphnav.solvers.ekf import Progress, ekf, rts
 from graphnav.state import States
 
 SOLVERS = ("ekf", "rts", "batch")
+_FAR = 0.5  # rad between the stated and the found start attitude
 _SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
 
 
@@ -78,7 +79,8 @@ def _solve(
     after = time.perf_counter()
     settings, said = _receiver(recording, settings, frame, aligned)
     judged = time.perf_counter()
-    problem = pose(recording, settings, frame, aligned.state, aligned.sigma)
+    stated = with_known_heading(aligned, settings)
+    problem = pose(recording, settings, frame, stated.state, stated.sigma)
     timings = {
         "alignment": after - began,
         "receiver": judged - after,
@@ -89,13 +91,13 @@ def _solve(
     if "rts" in solvers or "batch" in solvers:
         out["rts"] = rts(problem, forward, progress)
     if "batch" in solvers:
-        out["batch"] = batch(problem, *_start(problem, out["rts"]), progress=progress)
+        out["batch"] = batch(problem, *_start(problem, out["rts"], aligned, stated), progress=progress)
         # what it took to get there is part of it
         spent = {**out["rts"].timings, **out["batch"].timings}
         out["batch"] = replace(out["batch"], timings=spent)
     return {
         name: replace(
-            out[name], notes=(*aligned.notes, *said, *out[name].notes), timings={**timings, **out[name].timings}
+            out[name], notes=(*stated.notes, *said, *out[name].notes), timings={**timings, **out[name].timings}
         )
         for name in solvers
     }
@@ -116,8 +118,18 @@ def _receiver(
     return judgement.applied(settings), (judgement.note,) if judgement.note else ()
 
 
-def _start(problem: Problem, smoothed: Solution) -> tuple[States, dict[str, np.ndarray]]:
-    """Where the batch solver begins: the smoothed filter."""
+def _start(
+    problem: Problem, smoothed: Solution, aligned: Alignment, stated: Alignment
+) -> tuple[States, dict[str, np.ndarray]]:
+    """Where the batch solver begins: the smoothed filter.
+
+    A stated heading far from the one found would send the filter, and the linearisation with it, astray for a
+    while. The statement stays in the problem as its prior, but the solver sets out from what was found.
+    """
+    turn = np.linalg.norm(aligned.state.minus(stated.state)[0, :3])
+    if turn > _FAR:
+        other = replace(problem, prior=replace(problem.prior, mean=aligned.state, sigma=aligned.sigma[None]))
+        smoothed = rts(other, ekf(other))
     return smoothed.states, {name: p.value for name, p in smoothed.parameters.items()}
 
 
