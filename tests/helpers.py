@@ -12,7 +12,7 @@ from graphnav.earth import LocalFrame
 from graphnav.problem import Problem
 from graphnav.recording import Imu, ImuNoise
 from graphnav.solution import Solution
-from graphnav.state import DIM, States
+from graphnav.state import BLOCKS, DIM, States
 from graphnav.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -84,50 +84,66 @@ def errors(solution: Solution, truth: Trajectory) -> tuple[Array, Array, Array, 
     return position, mine.sd_p, rotation.wrap(mine.rph - truth.rph[i]), mine.sd_rph
 
 
-def dense_rows(problem: Problem, states: States, values: dict[str, Array]) -> tuple[Array, Array]:
-    """All rows of a problem, whitened, as one dense system A d = b, assembled on its own in NumPy.
+Factor = tuple[dict[int, Array], Array]  # {key: A (m, k)}, b (m,)
 
-    Columns: 15 per keyframe, then each parameter (constants only). Written from `Constraint.linearize` and
-    `Motion.linearize`, with none of the solvers' code.
+
+def factors(problem: Problem, states: States, values: dict[str, Array]) -> tuple[list[Factor], list[int]]:
+    """All rows of a problem, whitened, factor by factor, and the width of every variable.
+
+    Key k for keyframe k, then one per node of each parameter. Written from `Constraint.linearize` and
+    `Motion.linearize` with none of the solvers' code. `values` holds (nodes, k) per parameter.
     """
     K = len(problem.t)
-    at, columns = DIM * K, {}
+    key, node, widths = {}, {}, [DIM] * K
     for chain in problem.chains:
-        assert len(chain.t) == 1
-        k = len(chain.parameter.initial)
-        columns[chain.parameter.name] = slice(at, at + k)
-        at += k
-    rows, right = [], []
-    scale = values.get("imu_scale")
+        key[chain.parameter.name], node[chain.parameter.name] = len(widths), chain.node
+        widths += [len(chain.parameter.initial)] * len(chain.t)
+    out: list[Factor] = []
+    scale = values["imu_scale"][0] if "imu_scale" in key else None
     r, Ji, Jj, Js = problem.motion.linearize(states, scale)
     for k in range(K - 1):
         W = np.linalg.inv(np.linalg.cholesky(problem.intervals.covariance[k]))
-        A = np.zeros((DIM, at))
-        A[:, DIM * k : DIM * k + DIM] = W @ Ji[k]
-        A[:, DIM * k + DIM : DIM * k + 2 * DIM] = W @ Jj[k]
-        if "imu_scale" in columns:
-            A[:, columns["imu_scale"]] = W @ Js[k]
-        rows.append(A)
-        right.append(-W @ r[k])
-    for constraint in (problem.prior, *problem.constraints):
-        n = len(constraint)
-        given = {p.name: np.tile(values[p.name], (n, 1)) for p in constraint.parameters}
-        linear = constraint.linearize(states[constraint.keyframe], given, slice(None))
-        for i in range(n):
-            A = np.zeros((linear.residual.shape[1], at))
+        blocks = {k: W @ Ji[k], k + 1: W @ Jj[k]}
+        if "imu_scale" in key:
+            blocks[key["imu_scale"]] = W @ Js[k]
+        out.append((blocks, -W @ r[k]))
+    for rows in (problem.prior, *problem.constraints):
+        given = {p.name: values[p.name][node[p.name][rows.keyframe]] for p in rows.parameters}
+        linear = rows.linearize(states[rows.keyframe], given, slice(None))
+        for i in range(len(rows)):
+            white = 1.0 / linear.sigma[i][:, None]
+            state = np.zeros((len(white), DIM))
+            blocks = {int(rows.keyframe[i]): state}
             for name, J in linear.jacobians.items():
-                block = {"theta": 0, "p": 3, "v": 6, "ba": 9, "bg": 12}.get(name)
-                where = columns.get(name) if block is None else slice(0, 3)
-                if block is not None:
-                    first = DIM * constraint.keyframe[i] + block
-                    where = slice(first, first + 3)
-                A[:, where] = J[i]
-            rows.append(A / linear.sigma[i][:, None])
-            right.append(-linear.residual[i] / linear.sigma[i])
+                if name in BLOCKS:
+                    state[:, BLOCKS[name]] = white * J[i]
+                else:
+                    blocks[key[name] + int(node[name][rows.keyframe[i]])] = white * J[i]
+            out.append((blocks, -linear.residual[i] * white[:, 0]))
     for chain in problem.chains:
-        name, sigma = chain.parameter.name, chain.parameter.sigma
-        A = np.zeros((len(sigma), at))
-        A[:, columns[name]] = np.diag(1.0 / sigma)
-        rows.append(A)
-        right.append((chain.parameter.initial - values[name]) / sigma)
-    return np.concatenate(rows), np.concatenate(right)
+        p, x, first = chain.parameter, values[chain.parameter.name], key[chain.parameter.name]
+        out.append(({first: np.diag(1.0 / p.sigma)}, (p.initial - x[0]) / p.sigma))
+        for j in range(len(chain.t) - 1):
+            # a Gauss-Markov process, exact between any two times (Gelb 1974, eq. 3.8-8)
+            dt = chain.t[j + 1] - chain.t[j]
+            decay = np.exp(-dt / p.correlation_time) if p.correlation_time else 1.0
+            q = p.sigma**2 * (1 - decay**2) if p.correlation_time else p.walk**2 * dt * np.ones_like(p.sigma)
+            W = np.diag(1.0 / np.sqrt(q))
+            out.append(({first + j: -decay * W, first + j + 1: W}, W @ (decay * x[j] - x[j + 1])))
+    return out, widths
+
+
+def dense(parts: list[Factor], widths: list[int]) -> tuple[Array, Array]:
+    """Solution and covariance of a small system by one dense QR, columns scaled to keep its digits."""
+    edge = np.cumsum([0, *widths])
+    A = np.zeros((sum(len(b) for _, b in parts), edge[-1]))
+    right = np.concatenate([b for _, b in parts])
+    at = 0
+    for blocks, b in parts:
+        for key, block in blocks.items():
+            A[at : at + len(b), edge[key] : edge[key + 1]] = block
+        at += len(b)
+    size = np.linalg.norm(A, axis=0)
+    Q, R = np.linalg.qr(A / size)
+    root = np.linalg.inv(R) / size[:, None]
+    return root @ (Q.T @ right), root @ root.T

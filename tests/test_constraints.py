@@ -170,7 +170,8 @@ def test_the_filter_itself_does_that_update(recording: Recording, copies: int) -
     (lever,) = (c.parameter for c in problem.chains if c.parameter.name == LEVER_ARM)
     at = problem.columns[LEVER_ARM]
     P, state = forward.P_predicted[k], forward.predicted[k]
-    linear = rows.linearize(state[np.zeros(copies, int)], {LEVER_ARM: np.tile(lever.initial, (copies, 1))}, slice(None))
+    given = {p.name: np.tile(p.initial, (copies, 1)) for p in rows.parameters}
+    linear = rows.linearize(state[np.zeros(copies, int)], given, slice(None))
     H = np.concatenate(assemble(linear, problem.columns, len(P)))
     gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(linear.sigma.ravel() ** 2))
     d = -gain @ linear.residual.ravel()
