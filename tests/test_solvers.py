@@ -19,6 +19,7 @@ from graphnav.formats import read
 from graphnav.pipeline import run
 from graphnav.problem import Problem, pose
 from graphnav.recording import Gnss, Recording
+from graphnav.rotation import exp
 from graphnav.solution import Solution
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf, rts
@@ -331,6 +332,27 @@ def test_a_wrong_start_heading_is_found_out(shipped: Recording, reference: Solut
     d = solution.states.minus(reference.states)
     assert np.abs(d[:, 3:6]).max() < 2e-3
     assert np.degrees(np.abs(d[:, :3]).max()) < 2e-3
+
+
+@pytest.mark.parametrize("off", [90.0, -90.0])
+def test_batch_converges_from_a_wrong_heading(lap: tuple[Recording, Trajectory], off: float) -> None:
+    """Filter, smoother and batch all set out with it; a prior of 180 deg lets the data decide."""
+    recording, truth = lap
+    frame = LocalFrame(recording.gnss.llh[0])
+    true = truth_states(truth, np.zeros(1), frame)
+    sigma = np.repeat([0.05, 1.0, 0.5, 0.1, 5e-3], 3)
+    sigma[2] = np.pi
+    found = []
+    for heading in (0.0, off):
+        start = replace(true, R_nb=exp(np.array([0.0, 0.0, np.radians(heading)])) @ true.R_nb, ba=0 * true.ba)
+        problem = pose(recording, settings_from({"gnss": WHITE}), frame, start, sigma)
+        smoothed = rts(problem, ekf(problem))
+        found.append(batch(problem, smoothed.states, {n: p.value for n, p in smoothed.parameters.items()}))
+    assert "converged" in found[1].stopped
+    assert worst(found[0], truth) < 0.15
+    d = found[1].states.minus(found[0].states) / sigmas(found[0])
+    # the two priors differ by `off` of a sigma of 180 deg, on a heading known to some hundredths of a degree
+    assert np.abs(d).max() < 0.05
 
 
 def test_a_wrong_lever_arm_is_found(shipped: Recording) -> None:

@@ -1,0 +1,166 @@
+"""The first state against the truth and its own sigma: standing, moving, backing out, with a large gyro bias."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import oracle
+import pytest
+from helpers import Array, truth_states
+
+from graphnav import rotation as ro
+from graphnav.alignment import Alignment, align, with_known_heading
+from graphnav.config import Settings, settings_from
+from graphnav.earth import LocalFrame
+from graphnav.recording import Recording
+from graphnav.solvers.batch import batch
+from graphnav.trajectory import Trajectory
+
+DEG = np.pi / 180.0
+
+
+def aligned(recording: Recording, settings: Settings | None = None) -> tuple[Alignment, LocalFrame]:
+    frame = LocalFrame(recording.gnss.llh[0])
+    smooth = lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)  # noqa: E731
+    return align(recording, settings or Settings(), frame, smooth), frame
+
+
+def judged(recording: Recording, truth: Trajectory, body: Array | None = None) -> tuple[Array, Array, Array]:
+    """(attitude error about body axes, own sigma, prior errors over prior sigmas) at the first sample.
+
+    `body` re-mounts the truth.
+    """
+    found, frame = aligned(recording)
+    t = np.array([np.round(recording.start, 6)])
+    true = truth_states(truth, t, frame)
+    if body is not None:
+        turn = body.T
+        true = replace(true, R_nb=true.R_nb @ turn, ba=true.ba @ turn, bg=true.bg @ turn)
+    assert found.sigma.shape == (15,)
+    error = found.state.minus(true)[0]
+    return error[:3], found.own_sigma, error / found.sigma
+
+
+def assert_good(error: Array, own: Array, over: Array) -> None:
+    assert np.all(np.abs(error) < 4.0 * own), f"{error / DEG} deg against {own / DEG}"
+    # the prior that the solvers start from is wider than that, and must cover every block
+    assert np.all(np.abs(over) < 4.0), over
+    assert abs(error[2]) < 10.0 * DEG
+    assert np.all(np.abs(error[:2]) < 2.0 * DEG)
+
+
+@pytest.mark.xfail(strict=True, reason="own_sigma is about the body axes x, y, z: pitch first, roll second")
+def test_own_sigma_is_of_roll_pitch_heading(path: oracle.ExactPath) -> None:
+    recording, truth = oracle.drive(path, seed=2)
+    found, frame = aligned(recording)
+    true = truth_states(truth, np.array([0.0]), frame)
+    error = ro.wrap(found.rph - ro.to_rph(true.R_nb[0]))
+    assert np.all(np.abs(error) < 4.0 * found.own_sigma), f"{error / DEG} against {found.own_sigma / DEG}"
+
+
+@pytest.fixture(scope="module")
+def path() -> oracle.ExactPath:
+    return oracle.vehicle_path(240.0, seed=1)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_drive_that_stands_first(path: oracle.ExactPath, seed: int) -> None:
+    recording, truth = oracle.drive(path, seed=seed)
+    assert path.speed[: round(10 / path.dt)].max() == 0
+    assert_good(*judged(recording, truth))
+
+
+@pytest.mark.parametrize("begin", [35.0, 52.0, 75.0, 95.0])
+@pytest.mark.parametrize("sd", [oracle.RTK_SD, oracle.SPP_SD], ids=["rtk", "spp"])
+def test_a_drive_cut_in_motion(path: oracle.ExactPath, begin: float, sd: tuple[float, float, float]) -> None:
+    recording, truth = oracle.drive(path, seed=2, gnss_sd=sd)
+    assert path.speed[round(begin / path.dt)] > 3.0
+    assert_good(*judged(recording.crop(begin), truth))
+
+
+def remounted(recording: Recording, R: Array) -> Recording:
+    """The same drive with the IMU's axes turned: new = R old."""
+    imu, gnss = recording.imu, recording.gnss
+    return replace(
+        recording,
+        imu=replace(imu, gyro=imu.gyro @ R.T, accel=imu.accel @ R.T),
+        gnss=replace(gnss, lever_arm=R @ gnss.lever_arm),
+    )
+
+
+@pytest.mark.parametrize("begin", [0.0, 52.0])
+def test_a_drive_in_reverse(path: oracle.ExactPath, begin: float) -> None:
+    """With the axes turned by half a circle about up the vehicle backs all the way."""
+    recording, truth = oracle.drive(path, seed=3)
+    R = np.diag([-1.0, -1.0, 1.0])
+    assert_good(*judged(remounted(recording, R).crop(begin), truth, R))
+
+
+@pytest.mark.parametrize("begin", [0.0, 52.0])
+def test_a_gyro_bias_of_four_degrees_a_second(path: oracle.ExactPath, begin: float) -> None:
+    noise = replace(oracle.MEMS, gyro_bias_sigma=0.05)
+    recording, truth = oracle.drive(path, seed=4, imu_noise=replace(noise, gyro_bias_sigma=0.0))
+    bias = np.array([0.7, -0.5, 1.0]) * 4.0 * DEG / np.linalg.norm([0.7, -0.5, 1.0])
+    recording = replace(recording, imu=replace(recording.imu, gyro=recording.imu.gyro + bias, noise=noise))
+    assert truth.gyro_bias is not None
+    truth = replace(truth, gyro_bias=truth.gyro_bias + bias)
+    assert_good(*judged(recording.crop(begin), truth))
+
+
+EARTH = pytest.mark.xfail(strict=True, reason="carried back without the Earth's rate, 0.17 deg in 40 s")
+
+
+@pytest.mark.parametrize("late", [2.4, pytest.param(40.0, marks=EARTH)])
+def test_fixes_that_come_late(path: oracle.ExactPath, late: float) -> None:
+    """The first sample is before the first fix, on the move: the answer is carried back to it, and says so."""
+    recording, truth = oracle.drive(path, seed=5)
+    part = recording.crop(52.0)
+    part = part.without("gnss", (0.0, late))
+    error, own, over = judged(part, truth)
+    assert_good(error, own, over)
+    found, _ = aligned(part)
+    assert any("carried back" in note for note in found.notes)
+
+
+def test_own_sigma_is_honest_over_many_drives(path: oracle.ExactPath) -> None:
+    """Squared errors about the three body axes over their own variances average one, within chi-square's 99.9 %."""
+    over = []
+    for seed in range(12):
+        recording, truth = oracle.drive(path, seed=100 + seed)
+        error, own, _ = judged(recording.crop(30.0 + 5 * seed), truth)
+        over.append((error / own) ** 2)
+    # 12 draws of one axis: 99.9 % of chi-square with 12 degrees of freedom lies below 32.9, 0.1 % below 2.2
+    assert np.all(np.sum(over, axis=0) < 32.9), np.mean(over, axis=0)
+    assert np.all(np.sum(over, axis=0) > 2.2 / 10), np.mean(over, axis=0)
+
+
+def test_a_known_heading_is_taken(path: oracle.ExactPath) -> None:
+    recording, _ = oracle.drive(path, seed=0)
+    found, _ = aligned(recording)
+    stated = with_known_heading(found, settings_from({"alignment": {"heading": 123.0, "heading_sigma": 7.0}}))
+    np.testing.assert_allclose(stated.rph / DEG, [*found.rph[:2] / DEG, 123.0], atol=1e-9)
+    assert stated.sigma[2] / DEG == pytest.approx(7.0)
+    assert with_known_heading(found, Settings()) is found
+
+
+def test_a_recording_at_rest_is_levelled_and_its_heading_unknown(path: oracle.ExactPath) -> None:
+    recording, truth = oracle.drive(path, seed=0)
+    found, frame = aligned(recording.crop(0.0, 8.0))
+    true = truth_states(truth, np.array([0.0]), frame)
+    error = ro.wrap(found.rph - ro.to_rph(true.R_nb[0]))
+    # accelerometer biases of 0.03 m/s^2 are 0.18 deg
+    assert np.all(np.abs(error[:2]) < 4 * 0.18 * DEG)
+    assert np.all(np.abs(error[:2]) < found.own_sigma[:2] * 4)
+    assert np.all(np.abs((found.state.minus(true)[0] / found.sigma)[3:]) < 4.0)
+    assert found.sigma[2] == pytest.approx(np.pi)
+
+
+def test_without_gnss_heading_and_position_count_from_zero(path: oracle.ExactPath) -> None:
+    recording, _ = oracle.drive(path, seed=0)
+    frame = LocalFrame(recording.gnss.llh[0])
+    found = align(recording.without("gnss"), Settings(), frame, batch)
+    assert found.rph[2] == pytest.approx(0.0)
+    assert found.sigma[2] < 1e-3
+    np.testing.assert_array_equal(found.state.p, 0.0)
+    assert any("no GNSS" in note for note in found.notes)

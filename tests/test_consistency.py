@@ -1,0 +1,82 @@
+"""Is the stated uncertainty true? Squared errors over their own variances, averaged over drives made anew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import oracle
+import pytest
+from helpers import Array, errors
+
+from graphnav.config import settings_from
+from graphnav.pipeline import SOLVERS, run
+from graphnav.recording import Recording
+from graphnav.trajectory import Trajectory
+
+SEEDS = 10
+AXES = ("east", "north", "up", "roll", "pitch", "heading")
+# Errors of smoothers stay alike for a minute, of attitude and biases for the whole drive, so ten drives of ten minutes
+# are some tens of independent samples: chi-square with 40 degrees of freedom over 40 has its 3 % tails at 0.63 and 1.45
+LOW, HIGH = 0.7, 1.4
+SETTLED = 30.0  # s, while the filter still turns to its heading, and linear algebra does not hold
+
+
+@dataclass(frozen=True)
+class Score:
+    nees: Array  # (6,) per axis
+    whole: float  # of position, e n u together, over 3
+    outage: float  # of horizontal position inside the outage, over 2
+
+
+def scored(drives: list[tuple[Recording, Trajectory]], settings: dict) -> dict[str, Score]:
+    per_axis: dict[str, list[Array]] = {name: [] for name in SOLVERS}
+    whole: dict[str, list[float]] = {name: [] for name in SOLVERS}
+    dark: dict[str, list[float]] = {name: [] for name in SOLVERS}
+    for recording, truth in drives:
+        for name, solution in run(recording, settings_from(settings)).items():
+            position, sd_p, rph, sd_rph = errors(solution, truth)
+            ratio = np.concatenate([position / sd_p, rph / sd_rph], axis=1) ** 2
+            late = solution.t > solution.t[0] + SETTLED
+            per_axis[name].append(ratio[late].mean(axis=0))
+            C = solution.trajectory().covariance
+            assert C is not None
+            full = np.einsum("ki,kij,kj->k", position, np.linalg.inv(C[:, :3, :3]), position)
+            whole[name].append(float(full[late].mean() / 3))
+            inside = (solution.t > 425.0) & (solution.t < 465.0)
+            dark[name].append(float(ratio[inside, :2].mean()))
+    return {n: Score(np.mean(per_axis[n], axis=0), float(np.mean(whole[n])), float(np.mean(dark[n]))) for n in SOLVERS}
+
+
+@pytest.fixture(scope="module")
+def positions(shared_data: Path) -> dict[str, Score]:
+    drives = [oracle.oracle_drive(shared_data, seed, odometer=False) for seed in range(SEEDS)]
+    return scored(drives, {})
+
+
+@pytest.fixture(scope="module")
+def velocities(shared_data: Path) -> dict[str, Score]:
+    path = oracle.oracle_truth_path(shared_data)
+    drives = [
+        oracle.drive(path, seed=50 + seed, gnss_velocity_sd=(0.05, 0.05, 0.08), outages=((415.0, 475.0),))
+        for seed in range(SEEDS)
+    ]
+    return scored(drives, {})
+
+
+def assert_consistent(score: Score) -> None:
+    assert np.all((score.nees > LOW) & (score.nees < HIGH)), dict(zip(AXES, score.nees.round(2), strict=True))
+    assert LOW < score.whole < HIGH
+    # one outage a drive: ten drives, two axes, so chi-square with 20 degrees of freedom, 99 % of it in 0.37 .. 2.0
+    assert 0.37 < score.outage < 2.0
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_with_positions(positions: dict[str, Score], solver: str) -> None:
+    assert_consistent(positions[solver])
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_with_positions_and_velocities(velocities: dict[str, Score], solver: str) -> None:
+    assert_consistent(velocities[solver])
