@@ -39,6 +39,7 @@ from graphnav.rotation import Array, mv
 
 _CHUNK = 40_000  # pieces handled at once: keeps the working arrays in the processor's cache
 _WALK_POINTS = 6  # quadrature points for the effect of bias walk inside an interval
+_CELL, _MANY = 4, 64  # Jacobians and noise of intervals of many pieces are summed over cells of a few; means never
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,7 @@ def within(samples: Samples, keyframes: Array, t: Array, ba: Array, bg: Array) -
     dR, dV, dP = np.empty((len(t), 3, 3)), np.empty((len(t), 3)), np.empty((len(t), 3))
     for rows in _chunks(pieces.count):
         dt, index = pieces.padded(rows)
-        R, V, P, _ = _means(samples.gyro[index] - bg[rows, None], samples.accel[index] - ba[rows, None], dt)
+        R, V, P = _means(samples.gyro[index] - bg[rows, None], samples.accel[index] - ba[rows, None], dt)
         place = np.full(len(pieces.count), -1)
         place[rows] = np.arange(len(rows))
         here = np.flatnonzero(place[interval] >= 0)
@@ -239,6 +240,7 @@ def _chunks(count: Array) -> Iterator[Array]:
             mid = (lo + hi + 1) // 2
             fits = (mid - start) * count[order[mid - 1]] <= _CHUNK
             alike = count[order[mid - 1]] <= 2 * count[order[start]] + 16
+            alike &= (count[order[mid - 1]] >= _MANY) == (count[order[start]] >= _MANY)
             lo, hi = (mid, hi) if fits and alike else (lo, mid - 1)
         yield order[start:lo]
         start = lo
@@ -251,15 +253,17 @@ def _cross(a: Array, b: Array) -> Array:
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
 
 
-def _means(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Array, Array]:
-    """R, V, P at the L+1 edges of (n, L) pieces, and dV of each piece (start frame)."""
+def _means(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Array]:
+    """R, V, P (start frame) at the L+1 edges of (n, L) pieces."""
     n, L = dt.shape
     phi = w * dt[..., None]
     x2 = np.einsum("nli,nli->nl", phi, phi)
     a, b, c, d = rotation.coefficients(x2)
     S = rotation.skew(phi)
     step = a[..., None, None] * S + b[..., None, None] * (phi[..., :, None] * phi[..., None, :])
-    step[..., [0, 1, 2], [0, 1, 2]] += (1.0 - b * x2)[..., None]
+    cosine = 1.0 - b * x2
+    for i in range(3):
+        step[..., i, i] += cosine
     R = np.empty((L + 1, n, 3, 3))
     R[0] = np.eye(3)
     step = np.ascontiguousarray(np.swapaxes(step, 0, 1))
@@ -276,12 +280,11 @@ def _means(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Array, Array]:
         -1,
     )
     turned = R[:, :-1] @ body
-    dv = turned[..., 0]
     V = np.zeros((n, L + 1, 3))
-    np.cumsum(dv, axis=1, out=V[:, 1:])
+    np.cumsum(turned[..., 0], axis=1, out=V[:, 1:])
     P = np.zeros((n, L + 1, 3))
     np.cumsum(V[:, :-1] * dt[..., None] + turned[..., 1], axis=1, out=P[:, 1:])
-    return R, V, P, dv
+    return R, V, P
 
 
 def _integrate(
@@ -289,29 +292,29 @@ def _integrate(
 ) -> Intervals:
     n, L = dt.shape
     w, f = samples.gyro[index] - bg[:, None], samples.accel[index] - ba[:, None]
-    R, V, P, dv = _means(w, f, dt)
-
-    def summed(terms: Array) -> Array:
-        out = np.zeros((n, L + 1, *terms.shape[2:]))
-        np.cumsum(terms, axis=1, out=out[:, 1:])
-        return out
-
-    h = dt[..., None, None]
-    A = summed(-0.5 * h * (R[:, :-1] + R[:, 1:]))
-    B = summed(-rotation.skew(dv) @ (0.5 * (A[:, :-1] + A[:, 1:])))  # dV / d bg
-    PA = summed(0.5 * h * (A[:, :-1] + A[:, 1:]))  # dP / d ba
-    PB = summed(0.5 * h * (B[:, :-1] + B[:, 1:]))  # dP / d bg
-
+    R, V, P = _means(w, f, dt)
     T = dt.sum(1)
 
     def mean(x: Array) -> Array:
         return np.einsum("nl,nli->ni", dt, x) / T[:, None]
 
-    edge = summed(dt)
+    A = _summed((-0.5 * dt)[..., None, None] * (R[:, :-1] + R[:, 1:]))
+    # the rest in cells of a few pieces, within which A is a straight line
+    cut = np.append(np.arange(0, L, _CELL if L >= _MANY else 1), L)
+    A, R, V, P = A[:, cut], R[:, cut], V[:, cut], P[:, cut]
+    edge, qg, qa = (_summed(x)[:, cut] for x in (dt, *_white_noise(samples, imu, dt, index)))
+    h = np.diff(edge)[..., None, None]
+    # dV / d bg = -int [dV]x A, exactly for A linear in a cell: int (t - t_start) dV = h dV - int (V - V_start) dt
+    dv, hv = np.diff(V, axis=1), h[..., 0]
+    late = hv * dv - (np.diff(P, axis=1) - V[:, :-1] * hv)
+    slope = np.diff(A, axis=1) / np.maximum(h, 1e-12)
+    B = _summed(-rotation.skew(dv) @ A[:, :-1] - rotation.skew(late) @ slope)
+    PA = _summed(0.5 * h * (A[:, :-1] + A[:, 1:]))  # dP / d ba
+    PB = _summed(0.5 * h * (B[:, :-1] + B[:, 1:]))  # dP / d bg
     left = T[:, None] - edge  # time left at each edge
     a_edge = V[:, -1:] - V
     b_edge = P[:, -1:] - P - V * left[..., None]
-    Q = _white(samples, imu, dt, index, left, a_edge, b_edge)
+    Q = _white(np.diff(qg), np.diff(qa), left, a_edge, b_edge)
     Q += _walk(imu, edge, left, A, B, PA, PB, a_edge, b_edge)
 
     dR = R[:, -1]
@@ -326,15 +329,27 @@ def _integrate(
     )  # fmt: skip
 
 
-def _white(samples: Samples, imu: Imu, dt: Array, index: Array, left: Array, a_edge: Array, b_edge: Array) -> Array:
-    """Covariance (n, 15, 15), start frame, of white rate and force noise."""
-    noise = imu.noise
-    qg = (noise.gyro_noise_density**2 + samples.extra_gyro[index]) * dt
-    qa = (noise.accel_noise_density**2 + samples.extra_accel[index]) * dt
+def _summed(terms: Array) -> Array:
+    """Running sums along the second axis, from zero: one more than there are terms."""
+    out = np.zeros((terms.shape[0], terms.shape[1] + 1, *terms.shape[2:]))
+    np.cumsum(terms, axis=1, out=out[:, 1:])
+    return out
+
+
+def _white_noise(samples: Samples, imu: Imu, dt: Array, index: Array) -> tuple[Array, Array]:
+    """Variances (n, L) of the integrals of white rate and force noise over each piece."""
+    qg, qa = imu.noise.gyro_noise_density**2 * dt, imu.noise.accel_noise_density**2 * dt
+    if len(samples.bridged):
+        qg, qa = qg + samples.extra_gyro[index] * dt, qa + samples.extra_accel[index] * dt
+    return qg, qa
+
+
+def _white(qg: Array, qa: Array, left: Array, a_edge: Array, b_edge: Array) -> Array:
+    """Covariance (n, 15, 15), start frame, of white noise with variances qg, qa (n, L) in each cell."""
     a, b = 0.5 * (a_edge[:, :-1] + a_edge[:, 1:]), 0.5 * (b_edge[:, :-1] + b_edge[:, 1:])
-    s = 0.5 * (left[:, :-1] + left[:, 1:])
+    s, dt = 0.5 * (left[:, :-1] + left[:, 1:]), left[:, :-1] - left[:, 1:]
     eye = np.eye(3)
-    Q = np.zeros((len(dt), 15, 15))
+    Q = np.zeros((len(qg), 15, 15))
     theta, p, v = slice(0, 3), slice(3, 6), slice(6, 9)
 
     def outer(x: Array, y: Array) -> Array:
@@ -347,7 +362,7 @@ def _white(samples: Samples, imu: Imu, dt: Array, index: Array, left: Array, a_e
     Q[:, theta, p] = rotation.skew(np.einsum("nl,nli->ni", qg, b))
     Q[:, v, v] = outer(a, a) + qa.sum(1)[:, None, None] * eye
     Q[:, v, p] = outer(a, b) + (qa * s).sum(1)[:, None, None] * eye
-    # force noise inside a piece also moves the position: dt^2/12 keeps one-piece intervals regular
+    # force noise inside a cell also moves the position: dt^2/12 keeps one-cell intervals regular
     Q[:, p, p] = outer(b, b) + (qa * (s * s + dt * dt / 12.0)).sum(1)[:, None, None] * eye
     for x, y in ((theta, v), (theta, p), (v, p)):
         Q[:, y, x] = np.swapaxes(Q[:, x, y], -1, -2)

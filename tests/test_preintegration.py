@@ -76,7 +76,8 @@ def test_bias_jacobians_as_differences_of_gtsam() -> None:
             (iv.p_ba[k], J[6:, :3], T**2 / 2),
             (iv.p_bg[k], J[6:, 3:], 10 * T**3 / 6),
         ):
-            np.testing.assert_allclose(mine, numerical, atol=size / pieces**2)
+            # cells of four pieces: 2e-4 of a quantity that is itself only a first-order correction
+            np.testing.assert_allclose(mine, numerical, atol=max(2e-4, 1.0 / pieces**2) * size)
 
 
 def test_first_order_correction_holds_as_stated(imu: Imu, samples: Samples) -> None:

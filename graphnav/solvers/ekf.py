@@ -151,9 +151,17 @@ def _update(
     return state.plus(d[None, :DIM]), values + d[DIM:], P
 
 
-def rts(problem: Problem, forward: Filtered, progress: Progress | None = None) -> Solution:
-    """Smooth a forward pass backwards; residuals are those of the smoothed states."""
-    began = time.perf_counter()
+@dataclass(frozen=True)
+class Smoothed:
+    """A backward pass: states, parameter values and their joint covariance at every keyframe."""
+
+    states: States
+    values: Array  # (K, D-15)
+    P: Array  # (K, D, D)
+
+
+def backward(problem: Problem, forward: Filtered, progress: Progress | None = None) -> Smoothed:
+    """Smooth a forward pass."""
     K, D = len(problem.t), forward.P.shape[-1]
     state, values, P = forward.states[-1], forward.values[-1], forward.P[-1]
     states: list[States] = [state]
@@ -170,7 +178,14 @@ def rts(problem: Problem, forward: Filtered, progress: Progress | None = None) -
         all_P[k], all_values[k] = P, values
         if progress is not None and k % 256 == 0:
             progress("smoother", 1.0 - k / K)
-    smoothed = States.stack(states[::-1])
+    return Smoothed(States.stack(states[::-1]), all_values, all_P)
+
+
+def rts(problem: Problem, forward: Filtered, progress: Progress | None = None) -> Solution:
+    """The smoothed solution; residuals are those of the smoothed states."""
+    began = time.perf_counter()
+    found = backward(problem, forward, progress)
+    smoothed, all_values, all_P = found.states, found.values, found.P
     seconds = time.perf_counter() - began
     chains = {c.parameter.name: all_values[:, _shift(problem.columns[c.parameter.name])] for c in problem.chains}
     return Solution(
