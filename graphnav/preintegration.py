@@ -306,11 +306,13 @@ def _integrate(
     h = np.diff(edge)[..., None, None]
     # dV / d bg = -int [dV]x A, exactly for A linear in a cell: int (t - t_start) dV = h dV - int (V - V_start) dt
     dv, hv = np.diff(V, axis=1), h[..., 0]
-    late = hv * dv - (np.diff(P, axis=1) - V[:, :-1] * hv)
+    gain = np.diff(P, axis=1) - V[:, :-1] * hv
+    late = hv * dv - gain
     slope = np.diff(A, axis=1) / np.maximum(h, 1e-12)
     B = _summed(-rotation.skew(dv) @ A[:, :-1] - rotation.skew(late) @ slope)
     PA = _summed(0.5 * h * (A[:, :-1] + A[:, 1:]))  # dP / d ba
-    PB = _summed(0.5 * h * (B[:, :-1] + B[:, 1:]))  # dP / d bg
+    # dP / d bg = int B, in a cell B_start h - int [(t_end - t) dV]x A
+    PB = _summed(h * B[:, :-1] - rotation.skew(gain) @ (A[:, :-1] + (h / 3.0) * slope))
     left = T[:, None] - edge  # time left at each edge
     a_edge = V[:, -1:] - V
     b_edge = P[:, -1:] - P - V * left[..., None]
