@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphnav.errors import RecordingError
 from graphnav.rotation import Array
@@ -118,10 +120,12 @@ class Recording:
         sensor = getattr(self, source)
         if sensor is None:
             raise RecordingError(f"cannot withhold '{source}': the recording '{self.name}' has none")
-        if span is None:
-            return replace(self, **{source: None})
-        t = sensor.t - self.start
-        return replace(self, **{source: _rows(sensor, ~((t >= span[0]) & (t <= span[1])))})
+        left = None
+        if span is not None:
+            t = sensor.t - self.start
+            left = _rows(sensor, ~((t >= span[0]) & (t <= span[1])))
+        changed: dict[str, Any] = {source: left}
+        return replace(self, **changed)
 
     def crop(self, start: float | None = None, end: float | None = None) -> Recording:
         """The part between two times in seconds from the start; the clock keeps its epoch."""
@@ -139,7 +143,7 @@ class Recording:
         return replace(self, **parts)
 
 
-def _rows(sensor, mask: Array):
+def _rows(sensor: Any, mask: NDArray[np.bool_]) -> Any:
     """A sensor with only the rows of `mask`."""
     parts = {
         key: value[mask]

@@ -17,8 +17,15 @@ from graphnav.trajectory import Trajectory
 class Between(Protocol):
     """States between the keyframes of one piece of a recording."""
 
-    start: float
-    end: float
+    @property
+    def start(self) -> float:
+        """First time, s."""
+        ...
+
+    @property
+    def end(self) -> float:
+        """Last time, s."""
+        ...
 
     def times(self, rate: float) -> Array:
         """Times at a rate, ends included."""
@@ -130,7 +137,7 @@ def joined(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:
 
     def rows(name: str) -> ConstraintRecord:
         have = [part.records[name] for part in parts if name in part.records]
-        arrays = {
+        arrays: dict[str, Any] = {
             key: np.concatenate([getattr(r, key) for r in have]) for key in ("t", "residual", "sigma", "nis", "weight")
         }
         return replace(have[0], **arrays)
@@ -138,9 +145,8 @@ def joined(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:
     parameters = {}
     for name in dict.fromkeys(key for part in parts for key in part.parameters):
         own = [part.parameters[name] for part in parts if name in part.parameters]
-        parameters[name] = replace(
-            own[0], **{key: np.concatenate([getattr(p, key) for p in own]) for key in ("t", "value", "sigma")}
-        )
+        nodes: dict[str, Any] = {key: np.concatenate([getattr(p, key) for p in own]) for key in ("t", "value", "sigma")}
+        parameters[name] = replace(own[0], **nodes)
     return replace(
         first,
         t=np.concatenate([p.t for p in parts]),

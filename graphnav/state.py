@@ -12,8 +12,10 @@ Error state of one keyframe, 15 numbers in this order::
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphnav import rotation
 from graphnav.rotation import Array
@@ -65,7 +67,7 @@ class States:
     def __len__(self) -> int:
         return len(self.p)
 
-    def __getitem__(self, index: slice | Array) -> States:
+    def __getitem__(self, index: slice | NDArray[Any]) -> States:
         return States(self.R_nb[index], self.p[index], self.v[index], self.ba[index], self.bg[index])
 
     def plus(self, delta: Array) -> States:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class Trajectory:
 
     def take(self, index: Array | slice) -> Trajectory:
         """The rows of `index` (a mask, an index array or a slice)."""
-        values = {
+        values: dict[str, Any] = {
             key: (value[index] if isinstance(value, np.ndarray) else value) for key, value in self.__dict__.items()
         }
         return Trajectory(**values)
