@@ -20,7 +20,7 @@ from graphnav.config import Settings
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.recording import Recording
 from graphnav.rotation import Array
-from graphnav.solution import Solution
+from graphnav.solution import Solution, to_trajectory
 from graphnav.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ Withheld = tuple[str, Span | None]
 Progress = Callable[[str, float], None]
 
 SOURCES = ("gnss", "odometer")
+_DENSEST, _MOST = 0.1, 20_000  # s between, and number of, the epochs of a truth that are met exactly
 OUTAGE = 10.0  # s; fixes further apart than this are an outage worth a line of its own
 
 
@@ -234,9 +235,10 @@ def _score(
     asked: list[Withheld] = [("gnss", span) for _, span in spans]
     if truth is None and any(source == "gnss" and span is None for source, span in withheld):
         asked.append(("gnss", None))
+    reference = truth.t if truth is not None else recording.gnss.t if recording.gnss is not None else np.empty(0)
     found = {}
     for name, solution in solutions.items():
-        track = solution.trajectory() if used.gnss is not None else local(solution)
+        track = _scored(solution, reference, placed=used.gnss is not None)
         metrics = evaluate_recording(track, recording, withheld=asked)
         if metrics is None:
             return {}, None, ()
@@ -244,8 +246,16 @@ def _score(
     return found, against, tuple(name for name, _ in spans)
 
 
-def local(solution: Solution) -> Trajectory:
-    """The keyframes in metres of the navigation frame: what a solution without any fix can say."""
-    track = solution.trajectory()
-    rph: Array = rotation.to_rph(solution.states.R_nb)
-    return replace(track, llh=solution.states.p, v=solution.states.v, rph=rph, frame="local")
+def _scored(solution: Solution, t: Array, placed: bool) -> Trajectory:
+    """The solution at its keyframes and at the truth's epochs `t`, in metres of the navigation frame if not `placed`.
+
+    Interpolated between keyframes, a filter would seem to know in an outage what the fix after it will tell.
+    """
+    t = t[np.isfinite(t)]
+    spacing = max(_DENSEST, (solution.t[-1] - solution.t[0]) / _MOST)
+    _, apart = np.unique(np.floor(t / spacing), return_index=True)
+    times, states, covariance = solution.at(np.union1d(solution.t, t[apart]))
+    track = to_trajectory(solution.solver, solution.frame, times, states, covariance)
+    if placed:
+        return track
+    return replace(track, llh=states.p, v=states.v, rph=rotation.to_rph(states.R_nb), frame="local")

@@ -1,0 +1,133 @@
+"""The documentation does what it says: its commands and its Python run, its links lead somewhere."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import oracle
+import pytest
+from helpers import STEPS, difference, random_states
+
+from graphnav.config import Settings, read_settings
+from graphnav.constraints import registered
+from graphnav.constraints.base import Scene, assemble
+from graphnav.earth import LocalFrame
+from graphnav.formats import read
+from graphnav.pipeline import SOLVERS
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+# a fence may be indented, as in a list
+FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
+
+
+def blocks(kind):
+    """(page, text) of every fenced block of a kind."""
+    return [
+        (page, re.sub(rf"^{indent}", "", text, flags=re.MULTILINE))
+        for page in PAGES
+        for indent, found, text in FENCE.findall(page.read_text(encoding="utf-8"))
+        if found == kind
+    ]
+
+
+COMMANDS = sorted({line for _, text in blocks("console") for line in text.splitlines() if not line.startswith("make ")})
+PYTHON = blocks("python")
+
+
+def test_the_pages_show_commands_and_python():
+    assert any(line.startswith("graphnav compare ") for line in COMMANDS)
+    assert any(page.name == "README.md" for page, _ in PYTHON)
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_commands_run(line, tmp_path):
+    program, *arguments = shlex.split(line)
+    assert program == "graphnav", "a console block holds commands of graphnav and make; use another kind for others"
+    run = subprocess.run(
+        [Path(sys.executable).with_name(program), *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.parametrize(("page", "text"), PYTHON, ids=[f"{page.stem}-{k}" for k, (page, _) in enumerate(PYTHON)])
+def test_python_runs(page, text, tmp_path):
+    environment = {**os.environ, "MPLBACKEND": "Agg", "PYTHONWARNINGS": "error::DeprecationWarning:__main__"}
+    run = subprocess.run(
+        [sys.executable, "-c", text], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert run.returncode == 0, run.stderr
+    for name in re.findall(r'savefig\("(.+?)"\)', text):
+        assert (tmp_path / name).stat().st_size > 5000
+
+
+def test_the_readme_goes_from_a_recording_to_a_plot_in_five_lines():
+    (text,) = [text for page, text in PYTHON if page.name == "README.md"]
+    assert len([line for line in text.splitlines() if line.strip()]) == 5
+
+
+def test_the_example_of_a_constraint_keeps_the_contract():
+    (text,) = [text for page, text in PYTHON if page.name == "constraints.md"]
+    module = types.ModuleType("road")
+    sys.modules["road"] = module
+    exec(compile(text, "constraints.md", "exec"), module.__dict__)
+    recording, _ = oracle.drive(oracle.vehicle_path(120.0, 50.0))
+    t = np.arange(recording.start, recording.end, 5.0)
+    rows = module.NotSteep.build(Scene(recording, Settings(), LocalFrame(recording.gnss.llh[0]), t))
+    states = random_states(np.random.default_rng(0), len(rows))
+    found = rows.linearize(states, {}, slice(None))
+    assert found.residual.shape == found.sigma.shape == (len(t), 1)
+
+    def moved(delta):
+        return rows.linearize(states.plus(np.tile(delta, (len(rows), 1))), {}, slice(None)).residual
+
+    assert assemble(found) == pytest.approx(difference(moved, STEPS), abs=1e-8)
+
+
+def test_toml_examples_are_valid(tmp_path):
+    shown = [text for _, text in blocks("toml")]
+    settings = [text for text in shown if "format = " not in text]
+    assert settings
+    for text in settings:
+        (tmp_path / "settings.toml").write_text(text, encoding="utf-8")
+        read_settings(tmp_path / "settings.toml")
+    (recording,) = [text for text in shown if "format = " in text]
+    (tmp_path / "recording.toml").write_text(recording, encoding="utf-8")
+    t = np.arange(1, 3001) / 100.0
+    columns = {
+        "imu": ("t,gx,gy,gz,ax,ay,az", [t, *np.zeros((5, len(t))), np.full(len(t), -9.8)]),
+        "gnss": ("t,lat,lon,h", [t[99::100], np.full(30, 48.0), np.full(30, 11.0), np.full(30, 500.0)]),
+        "odometer": ("t,speed", [t[9::10], np.zeros(300)]),
+        "truth": ("t,lat,lon,h", [t[99::100], np.full(30, 48.0), np.full(30, 11.0), np.full(30, 500.0)]),
+    }
+    for name, (header, values) in columns.items():
+        np.savetxt(tmp_path / f"{name}.csv", np.column_stack(values), delimiter=",", header=header, comments="")
+    found = read(tmp_path)
+    assert found.imu.accel[0] == pytest.approx([0.0, 0.0, 9.8])  # FRD at rest, turned to RFU
+    assert found.gnss.lever_arm == pytest.approx([0.3, 0.5, 1.2])
+
+
+def test_every_constraint_and_every_solver_has_its_line():
+    constraints = (ROOT / "docs" / "constraints.md").read_text(encoding="utf-8")
+    solvers = (ROOT / "docs" / "solvers.md").read_text(encoding="utf-8")
+    for cls in registered():
+        assert re.search(rf"^\| `{cls.name}` \|", constraints, re.MULTILINE), f"docs/constraints.md: no row {cls.name}"
+    for name in SOLVERS:
+        assert re.search(rf"^\| `{name}` \|", solvers, re.MULTILINE)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_and_files_named_exist(page):
+    text = page.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
+        assert target.startswith("https://") or (page.parent / target).exists(), f"{page.name}: {target}"
+    for name in re.findall(r"`((?:graphnav|scripts|tests|docs)/[\w/]+\.\w+)", text):
+        if name != "graphnav/constraints/road.py":  # the one the reader writes
+            assert (ROOT / name).exists(), f"{page.name}: {name}"
