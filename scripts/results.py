@@ -12,6 +12,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from graphnav.terminal import short
+
 # folder among the recordings (or built-in name), further options, which span of comparison.csv it is about
 DRIVES = (
     ("tokyo_20201105", ["--without", "gnss:1140-1200"], 1),
@@ -28,7 +30,7 @@ def main() -> None:
     options = parser.parse_args()
     program = Path(sys.executable).with_name("graphnav")
     with tempfile.TemporaryDirectory() as scratch:
-        rows = [["drive", "solver", *(f"{name} (m)" for name, _ in SPAN_COLUMNS), "NEES", "run time (s)"]]
+        rows = [["drive", "solver", *(f"{name} (m)" for name, _ in SPAN_COLUMNS), "NEES"]]
         rows.append(["---", "---", *["---:"] * (len(rows[0]) - 2)])
         for name, extra, span in DRIVES:
             source = name if name == "kitti" else str(options.recordings / name)
@@ -38,9 +40,8 @@ def main() -> None:
             with (out / "comparison.csv").open(newline="", encoding="utf-8") as file:
                 for row in csv.DictReader(file):
                     values = [row[f"span{span}_{key}"] for _, key in SPAN_COLUMNS]
-                    nees, seconds = row[f"span{span}_nees_p"], float(row["run_time_s"])
-                    shown = [f"{float(x):.3g}" if x else "-" for x in (*values, nees)]
-                    rows.append([name, row["solver"], *shown, f"{seconds:.1f}"])
+                    values.append(row[f"span{span}_nees_p"])
+                    rows.append([name, row["solver"], *(short(float(x)) if x else "-" for x in values)])
     print("\n".join("| " + " | ".join(row) + " |" for row in rows))
 
 
