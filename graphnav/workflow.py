@@ -64,7 +64,8 @@ class Outcome:
     metrics: dict[str, Metrics]  # empty where there is nothing to compare with
     against: str | None  # what the metrics compare with, in words
     span_names: tuple[str, ...]  # of the spans of every metrics: what is missing in each
-    findings: tuple[str, ...]
+    findings: tuple[str, ...]  # everything worth knowing about the recording and the comparison
+    warnings: tuple[str, ...]  # those of the findings that results suffer from
     timings: dict[str, float]  # s by stage, of what all solvers share
 
     @property
@@ -138,7 +139,8 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
     moved = _moved(request.withheld, zero)
     used, notes = _withhold(recording, moved, zero)
     with _timed(timings, "checks", progress):
-        findings = [f.sentence for f in inspect(recording).findings]
+        inspection = inspect(recording)
+    findings = [f.sentence for f in inspection.findings]
 
     from graphnav.pipeline import run
 
@@ -153,8 +155,9 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
         if found.notes:
             findings += [note for note in found.notes if note not in findings]
     return Outcome(
-        request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)), timings | own
-    )
+        request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
+        inspection.warnings, timings | own,
+    )  # fmt: skip
 
 
 @contextmanager
