@@ -39,6 +39,14 @@ class AlignmentSettings(_Section):
     heading_sigma: float = Field(10.0, gt=0, description="deg, 1-sigma of the known start heading")
 
 
+class ImuSettings(_Section):
+    """How the IMU's figures are used."""
+
+    as_stated: bool = Field(
+        False, description="take the noise figures as stated, even where the drive shows them to be too small"
+    )
+
+
 class GnssSettings(_Section):
     """How fixes are used."""
 
@@ -76,6 +84,7 @@ class Settings(_Section):
 
     keyframes: KeyframeSettings = KeyframeSettings()
     alignment: AlignmentSettings = AlignmentSettings()
+    imu: ImuSettings = ImuSettings()
     gnss: GnssSettings = GnssSettings()
     solver: SolverSettings = SolverSettings()
 

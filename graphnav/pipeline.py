@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav import receiver
+from graphnav import judgement
 from graphnav.alignment import Alignment, align, with_known_heading
 from graphnav.config import Settings
 from graphnav.earth import LocalFrame
@@ -17,7 +17,7 @@ from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.solution import Solution, joined
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import Progress, ekf, rts
+from graphnav.solvers.ekf import Progress, backward, ekf, rts
 from graphnav.state import States
 
 SOLVERS = ("ekf", "rts", "batch")
@@ -77,13 +77,13 @@ def _solve(
         recording, settings, frame, lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)
     )
     after = time.perf_counter()
-    settings, said = _receiver(recording, settings, frame, aligned)
+    recording, settings, said = _judged(recording, settings, frame, aligned)
     judged = time.perf_counter()
     stated = with_known_heading(aligned, settings)
     problem = pose(recording, settings, frame, stated.state, stated.sigma)
     timings = {
         "alignment": after - began,
-        "receiver": judged - after,
+        "judgement": judged - after,
         "preintegration": time.perf_counter() - judged,
     }
     forward = ekf(problem, progress)
@@ -103,19 +103,31 @@ def _solve(
     }
 
 
-def _receiver(
+def _judged(
     recording: Recording, settings: Settings, frame: LocalFrame, aligned: Alignment
-) -> tuple[Settings, tuple[str, ...]]:
-    """Settings with the fixes judged by a plain solution of the first part of the drive."""
-    gnss = settings.gnss
-    if aligned.motion is None or not gnss.position or (gnss.sd_factor is not None and gnss.slow_share is not None):
-        return settings, ()
+) -> tuple[Recording, Settings, tuple[str, ...]]:
+    """Recording and settings with the figures of IMU and fixes judged by the first part of the drive."""
+    gnss, stated = settings.gnss, recording.imu.noise
+    if aligned.motion is None or not gnss.position:
+        return recording, settings, ()
     plain = settings.model_copy(update={"gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0})})
-    problem = pose(receiver.stretch(recording, aligned.motion), plain, frame, aligned.state, aligned.sigma)
-    judgement = receiver.judge(problem, rts(problem, ekf(problem)))
-    if judgement is None:
-        return settings, ()
-    return judgement.applied(settings), (judgement.note,) if judgement.note else ()
+    part = judgement.stretch(recording, aligned.motion)
+    noise, fixes = stated, None
+    for _ in range(judgement.ROUNDS):
+        part = replace(part, imu=replace(part.imu, noise=noise))
+        problem = pose(part, plain, frame, aligned.state, aligned.sigma)
+        forward = ekf(problem)
+        smoothed = backward(problem, forward)
+        fixes = judgement.judge_fixes(problem, smoothed)
+        factors = {} if settings.imu.as_stated else judgement.judge_imu(problem, forward, smoothed)
+        if not factors:
+            break
+        noise = judgement.raised(noise, factors)
+    recording = replace(recording, imu=replace(recording.imu, noise=noise))
+    notes = judgement.imu_notes(stated, noise)
+    if fixes is None:
+        return recording, settings, notes
+    return recording, fixes.applied(settings), (*notes, *fixes.notes)
 
 
 def _start(

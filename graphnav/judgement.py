@@ -1,0 +1,191 @@
+"""How good the sensors really are: what a smoothed first part of the drive says against the stated figures.
+
+Two questions, both answered by medians, so that outliers and bad stretches do not decide, and acted on only
+where the answer is clear (three standard deviations of what chance would do).
+
+*Fixes.* A smoothed inertial trajectory follows what the fixes do slowly and refuses what they do fast, so its
+residuals show the fast part of the receiver's error. With f the ratio of their square to what the stated sigmas
+promise: f > 1, the sigmas are multiplied by sqrt(f) (a variance factor); f < 1, either they are too large or,
+far more often, the rest of the error changes slowly and has gone into the trajectory. A stated sigma is meant to
+hold for the whole error, so the missing share 1 - f is taken to be slow. Read otherwise, a thousand fixes wrong
+alike would promise thirty times too much.
+
+*IMU.* The smoother also says what the process noise of every interval was (de Jong and Koopman's disturbance
+smoother). With d the smoothed minus the predicted state at its end and P-, P^s their covariances,
+
+    w = Q P-^-1 d        var w = Q P-^-1 (P- - P^s) P-^-1 Q
+
+and the ratio of the two is a variance factor for rate noise, force noise and both bias walks (Koch, *Parameter
+Estimation and Hypothesis Testing in Linear Models*, 3.6). Vibration, aliasing and temperature make real drives
+several times noisier than a data sheet; figures are only ever raised, and the estimate repeated with them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from graphnav.config import Settings
+from graphnav.constraints.gnss import GnssPosition
+from graphnav.problem import Problem
+from graphnav.recording import ImuNoise, Recording
+from graphnav.rotation import Array
+from graphnav.solution import ConstraintRecord
+from graphnav.solvers.ekf import Filtered, Smoothed, residual_record
+from graphnav.state import DIM, States
+
+FIXES = 600  # fixes the judgement is made on, from the first motion
+ROUNDS = 3
+_SIGNIFICANT = 3.0  # standard deviations of the estimate of a factor that it must differ from 1
+_MOST = 0.98  # the largest share called slow
+_FEWEST = 30  # fixes or intervals that say anything
+_FIGURES = {
+    "gyro_noise_density": slice(0, 3),
+    "accel_noise_density": slice(6, 9),
+    "accel_bias_walk": slice(9, 12),
+    "gyro_bias_walk": slice(12, 15),
+}
+_WORDS = {
+    "gyro_noise_density": "gyro noise",
+    "accel_noise_density": "accelerometer noise",
+    "accel_bias_walk": "accelerometer bias walk",
+    "gyro_bias_walk": "gyro bias walk",
+}
+
+
+@dataclass(frozen=True)
+class FixQuality:
+    """Factor on the stated position sigmas, and share of the variance that is slow."""
+
+    sd_factor: float = 1.0
+    slow_share: float = 0.0
+
+    def applied(self, settings: Settings) -> Settings:
+        """Settings with what the user left open filled in."""
+        gnss = settings.gnss
+        found = {
+            "sd_factor": self.sd_factor if gnss.sd_factor is None else gnss.sd_factor,
+            "slow_share": self.slow_share if gnss.slow_share is None else gnss.slow_share,
+        }
+        return settings.model_copy(update={"gnss": gnss.model_copy(update=found)})
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was found, in words."""
+        if self.sd_factor > 1.0:
+            return (f"the fixes scatter {self.sd_factor:.1f} times as much as they state: their sigmas were raised",)
+        if self.slow_share > 0.0:
+            fast = 100 * (1 - self.slow_share)
+            return (f"{fast:.0f} % of the fixes' stated variance is seen to be fast; the rest is taken to be slow",)
+        return ()
+
+
+def stretch(recording: Recording, begin: float) -> Recording:
+    """The part of a recording to judge on: from its start to `FIXES` fixes after `begin` (s, its clock)."""
+    gnss = recording.gnss
+    assert gnss is not None
+    later = gnss.t[gnss.t > begin]
+    if len(later) <= FIXES:
+        return recording
+    return recording.crop(0.0, float(later[FIXES]) - recording.start)
+
+
+def judge_fixes(problem: Problem, smoothed: Smoothed) -> FixQuality | None:
+    """Judge the fixes by a smoothed solution that took their sigmas as stated, all white.
+
+    None when there are too few to say anything.
+    """
+    rows = next((c for c in problem.constraints if isinstance(c, GnssPosition)), None)
+    if rows is None or len(rows) < _FEWEST:
+        return None
+    residual = _record(problem, rows, smoothed).residual
+    C = rows.R_ln
+    P = C @ smoothed.P[rows.keyframe][:, 3:6, 3:6] @ np.swapaxes(C, -1, -2)
+    # a residual is smaller than the error by what the trajectory took up of it
+    left = 1.0 - np.diagonal(P, axis1=-2, axis2=-1) / rows.sigma**2
+    usable = np.all(left > 0.2, axis=1)
+    if np.count_nonzero(usable) < _FEWEST:
+        return None
+    squared = np.sum((residual / rows.sigma) ** 2 / np.maximum(left, 0.2), axis=1)[usable]
+    f = float(np.median(squared)) / _median(3)
+    if abs(np.log(f)) < _SIGNIFICANT * _scatter(3.0 * len(squared)):
+        return FixQuality()
+    if f > 1.0:
+        return FixQuality(sd_factor=float(np.sqrt(f)))
+    return FixQuality(slow_share=min(1.0 - f, _MOST))
+
+
+def judge_imu(problem: Problem, forward: Filtered, smoothed: Smoothed) -> dict[str, float]:
+    """Variance factors above 1 for the IMU's noise figures, by their names in `ImuNoise`."""
+    predicted = States.stack(forward.predicted)
+    moved = np.concatenate([smoothed.states.minus(predicted), smoothed.values - forward.values_predicted], axis=1)[1:]
+    before, after = forward.P_predicted[1:], smoothed.P[1:]
+    inverse = np.linalg.inv(before)
+    pull = (inverse @ moved[..., None])[:, :DIM]
+    gained = (inverse @ (before - after) @ inverse)[:, :DIM, :DIM]
+    frames = problem.motion.frames(slice(None), States.stack(forward.states[:-1]).R_nb)
+    Q = problem.intervals.covariance
+    QL = Q @ np.swapaxes(frames, -1, -2)
+    noise = (QL @ pull)[..., 0]
+    variance = np.diagonal(QL @ gained @ np.swapaxes(QL, -1, -2), axis1=-2, axis2=-1)
+    stated = np.diagonal(Q, axis1=-2, axis2=-1)
+    factors = {}
+    for name, at in _FIGURES.items():
+        seen = np.all(variance[:, at] > 1e-7 * stated[:, at], axis=1)  # elsewhere the data say nothing of it
+        if np.count_nonzero(seen) < _FEWEST:
+            continue
+        z = noise[seen, at] / np.sqrt(variance[seen, at])
+        f = float(np.median(z * z)) / _median(1)
+        if np.log(f) > _SIGNIFICANT * _scatter(_independent(z)):
+            factors[name] = f
+    return factors
+
+
+def raised(noise: ImuNoise, factors: dict[str, float]) -> ImuNoise:
+    """Noise figures with variances multiplied."""
+    return replace(noise, **{name: getattr(noise, name) * float(np.sqrt(f)) for name, f in factors.items()})
+
+
+def imu_notes(stated: ImuNoise, used: ImuNoise) -> tuple[str, ...]:
+    """A sentence on figures that were raised."""
+    ratios = {words: getattr(used, name) / getattr(stated, name) for name, words in _WORDS.items()}
+    up = [f"{words} {ratio:.1f}" for words, ratio in ratios.items() if ratio > 1.0]
+    return (f"the IMU is noisier on this drive than stated; figures were multiplied: {', '.join(up)}",) if up else ()
+
+
+def _record(problem: Problem, rows: GnssPosition, smoothed: Smoothed) -> ConstraintRecord:
+    values = {
+        chain.parameter.name: smoothed.values[:, at.start - DIM : at.stop - DIM]
+        for chain in problem.chains
+        for at in [problem.columns[chain.parameter.name]]
+    }
+    return residual_record(problem, rows, smoothed.states, values)
+
+
+def _median(degrees: int) -> float:
+    """Median of a chi-square variable."""
+    return 2.0 * float(gammaincinv(0.5 * degrees, 0.5))
+
+
+def _scatter(count: float) -> float:
+    """Standard deviation of the logarithm of a median chi-square of `count` independent values.
+
+    That of a mean, sqrt(2/n), times about 1.25 for a median.
+    """
+    return 1.25 * float(np.sqrt(2.0 / max(count, 2.0)))
+
+
+def _independent(z: Array) -> float:
+    """How many independent values (N, m) time-correlated columns are worth."""
+    total = 0.0
+    for x in z.T:
+        power, length = float(np.mean(x * x)), 1.0
+        for lag in range(1, len(x) // 4):
+            r = float(np.mean(x[lag:] * x[:-lag])) / power
+            if r < 0.05:
+                break
+            length += 2.0 * r
+        total += len(x) / length
+    return total
