@@ -16,7 +16,7 @@ ROOMS = [
     "errors", "rotation", "earth", "state", "config", "recording", "trajectory",
     "formats", "findings", "crosschecks", "checks_imu", "checks_aiding", "checks",
     "preintegration", "dynamics", "constraints", "problem", "solution", "alignment",
-    "judgement", "dense", "solvers", "pipeline",
+    "dense", "solvers", "judgement", "pipeline",
     "interpolation", "metrics", "scoring", "evaluation", "exporters",
     "panels", "page", "plots", "report_tables", "report_pictures", "report",
     "workflow", "outputs", "terminal", "cli",
