@@ -193,9 +193,10 @@ def _in_motion(
             f"'{recording.name}': no start attitude explains the GNSS fixes between {begin - recording.start:.0f} "
             f"and {end - recording.start:.0f} s; check the axes, the units and the time stamps"
         )
-    own = np.sqrt(np.diag(best.covariance[0])[:3])
-    wide = settings.alignment.prior_inflation * own
-    R = best.states.R_nb[0]
+    R, P = best.states.R_nb[0], best.covariance[0][:3, :3]
+    wide = settings.alignment.prior_inflation * np.sqrt(np.diag(P))
+    J = rotation.rph_jacobian(rotation.to_rph(R))
+    own = np.sqrt(np.diag(J @ P @ J.T))
     notes = [
         f"aligned over {begin - recording.start:.0f} to {end - recording.start:.0f} s: roll and pitch to "
         f"{np.degrees(own[:2].max()):.2g} deg, heading to {np.degrees(own[2]):.2g} deg"
@@ -323,7 +324,7 @@ def _carried_back(
         else:
             samples = bridge_gaps(imu)
             dR, dV, dP = prefix(samples, recording.start, np.array([begin]), ba, bg)
-            R = R @ dR[0].T
+            R = rotation.exp(solution.frame.omega_n * back) @ R @ dR[0].T  # the Earth turned meanwhile
             g = solution.frame.gravity_n(p)
             v0 = v - g * back - R @ dV[0]
             p = p - v0 * back - 0.5 * g * back**2 - R @ dP[0]
@@ -333,7 +334,7 @@ def _carried_back(
             tilt = 9.8 * float(np.max(wide[:2])) + float(np.max(sd[9:12]))
             sd_v, sd_p = sd_v + tilt * back, sd_p + sd_v * back + 0.5 * tilt * back**2
         wide = np.hypot(wide, settings.alignment.prior_inflation * drift)
-        own = np.hypot(own, drift)
+        own = np.hypot(own, np.abs(rotation.rph_jacobian(rotation.to_rph(R))) @ drift)
     sigma = np.concatenate(
         [wide, sd_p, sd_v, [noise.accel_bias_sigma] * 3, np.maximum(noise.gyro_bias_sigma, 5.0 * sd_bg)]
     )

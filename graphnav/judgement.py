@@ -28,17 +28,20 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from graphnav.config import Settings
+from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import GnssPosition
 from graphnav.problem import Problem
 from graphnav.recording import ImuNoise, Recording
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord
-from graphnav.solvers.ekf import Filtered, Smoothed, residual_record
+from graphnav.solvers.batch import batch
+from graphnav.solvers.ekf import Filtered, Smoothed, backward, ekf, residual_record
 from graphnav.state import DIM, States
 
 FIXES = 600  # fixes the judgement is made on, from the first motion
 ROUNDS = 3
 _SIGNIFICANT = 3.0  # standard deviations of the estimate of a factor that it must differ from 1
+_OUTLIER = 6.0  # whitened norm of a fix that no Gaussian would have
 _MOST = 0.98  # the largest share called slow
 _FEWEST = 30  # fixes or intervals that say anything
 _FIGURES = {
@@ -92,14 +95,34 @@ def stretch(recording: Recording, begin: float) -> Recording:
     return recording.crop(0.0, float(later[FIXES]) - recording.start)
 
 
+def smooth(problem: Problem) -> tuple[Problem, Filtered, Smoothed]:
+    """Filter and smooth a problem; if there are outliers, again with their weight taken away.
+
+    What one outlier does to the states around it would otherwise pass for noise of the IMU. Its weight is the one
+    that a batch solution with Cauchy's kernel leaves it.
+    """
+    forward = ekf(problem)
+    smoothed = backward(problem, forward)
+    rows = _fixes(problem)
+    if rows is None or np.sqrt(_record(problem, rows, smoothed).nis.max(initial=0.0)) < _OUTLIER:
+        return problem, forward, smoothed
+    robust = replace(problem, constraints=_with(problem, replace(rows, robust="cauchy")))
+    solved = batch(robust, smoothed.states, wanted=(), reintegrate=False)
+    weight = np.maximum(solved.records[rows.name].weight, 1e-8)[:, None]
+    weighted = replace(problem, constraints=_with(problem, replace(rows, sigma=rows.sigma / np.sqrt(weight))))
+    forward = ekf(weighted)
+    return weighted, forward, backward(weighted, forward)
+
+
 def judge_fixes(problem: Problem, smoothed: Smoothed) -> FixQuality | None:
     """Judge the fixes by a smoothed solution that took their sigmas as stated, all white.
 
     None when there are too few to say anything.
     """
-    rows = next((c for c in problem.constraints if isinstance(c, GnssPosition)), None)
+    rows = _fixes(problem)
     if rows is None or len(rows) < _FEWEST:
         return None
+    rows = replace(rows, sigma=rows.stated)
     residual = _record(problem, rows, smoothed).residual
     C = rows.R_ln
     P = C @ smoothed.P[rows.keyframe][:, 3:6, 3:6] @ np.swapaxes(C, -1, -2)
@@ -153,6 +176,15 @@ def imu_notes(stated: ImuNoise, used: ImuNoise) -> tuple[str, ...]:
     ratios = {words: getattr(used, name) / getattr(stated, name) for name, words in _WORDS.items()}
     up = [f"{words} {ratio:.1f}" for words, ratio in ratios.items() if ratio > 1.0]
     return (f"the IMU is noisier on this drive than stated; figures were multiplied: {', '.join(up)}",) if up else ()
+
+
+def _fixes(problem: Problem) -> GnssPosition | None:
+    return next((c for c in problem.constraints if isinstance(c, GnssPosition)), None)
+
+
+def _with(problem: Problem, rows: GnssPosition) -> tuple[Constraint, ...]:
+    """The constraints with other rows for the fixes."""
+    return tuple(rows if isinstance(c, GnssPosition) else c for c in problem.constraints)
 
 
 def _record(problem: Problem, rows: GnssPosition, smoothed: Smoothed) -> ConstraintRecord:

@@ -17,7 +17,7 @@ from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.solution import Solution, joined
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import Progress, backward, ekf, rts
+from graphnav.solvers.ekf import Progress, ekf, rts
 from graphnav.state import States
 
 SOLVERS = ("ekf", "rts", "batch")
@@ -115,9 +115,8 @@ def _judged(
     noise, fixes = stated, None
     for _ in range(judgement.ROUNDS):
         part = replace(part, imu=replace(part.imu, noise=noise))
-        problem = pose(part, plain, frame, aligned.state, aligned.sigma)
-        forward = ekf(problem)
-        smoothed = backward(problem, forward)
+        posed = pose(part, plain, frame, aligned.state, aligned.sigma)
+        problem, forward, smoothed = judgement.smooth(posed)
         fixes = judgement.judge_fixes(problem, smoothed)
         factors = {} if settings.imu.as_stated else judgement.judge_imu(problem, forward, smoothed)
         if not factors:

@@ -8,10 +8,12 @@ estimation in robotics" (2018), eq. 132-147.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 _I3 = np.eye(3)
 _GENERATORS = np.array(

@@ -164,7 +164,11 @@ def test_the_filter_itself_does_that_update(recording: Recording, copies: int) -
     assert isinstance(rows, GnssPosition)
     k = int(rows.keyframe[1])
     pick = np.array([1, 2][:copies])
-    rows = replace(rows, keyframe=np.full(copies, k), **{n: getattr(rows, n)[pick] for n in ("p_n", "R_ln", "sigma")})
+    rows = replace(
+        rows,
+        keyframe=np.full(copies, k),
+        **{n: getattr(rows, n)[pick] for n in ("p_n", "R_ln", "sigma", "stated", "gyro")},
+    )
     problem = replace(problem, constraints=(rows,))
     forward = ekf(problem)
     (lever,) = (c.parameter for c in problem.chains if c.parameter.name == LEVER_ARM)

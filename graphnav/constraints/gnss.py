@@ -3,9 +3,9 @@
 Groves (2013), eq. 14.103 and 14.104, without its small-angle approximations. Residuals are in the local
 ENU at the fix, where receivers state their sigmas::
 
-    r_p = R_ln (p + R_nb l + v d - p_meas) + e
-    r_v = R_ln (v + R_nb (omega_nb x l) + a d) - v_meas
-    omega_nb = omega_b - b_g - R_nb^T omega_ie,      a = R_nb (f_b - b_a) + g
+    r_p = R_ln (p + R_nb l + u d - p_meas) + e       u = v + R_nb (omega_nb x l)
+    r_v = R_ln (u + a d) - v_meas                    a = R_nb (f_b - b_a) + g
+    omega_nb = omega_b - b_g - R_nb^T omega_ie
 
 d is what must be added to the stamps of the fixes, one constant for positions and one for velocities: a
 receiver's filters delay them differently (boulder's differ by 0.1 s, dresden's by 0.7 s).
@@ -24,7 +24,7 @@ import numpy as np
 
 from graphnav import earth, rotation
 from graphnav.config import Settings
-from graphnav.constraints.base import Constraint, Linearized, Scene
+from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
 from graphnav.recording import Imu, Recording
 from graphnav.rotation import Array, mv
 from graphnav.state import Parameter, States
@@ -44,7 +44,7 @@ def _usable(recording: Recording) -> Array:
     """Mask of the fixes the IMU covers."""
     assert recording.gnss is not None
     t = recording.gnss.t
-    return (t >= recording.start) & (t <= recording.end)
+    return (t >= recording.start - SAME_TIME) & (t <= recording.end + SAME_TIME)
 
 
 def _common(scene: Scene, offset: str) -> dict[str, Any]:
@@ -76,6 +76,8 @@ class GnssPosition(Constraint):
     R_ln: Array = field(default_factory=lambda: _empty(0, 3, 3))
     sigma: Array = field(default_factory=lambda: _empty(0, 3))
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
+    gyro: Array = field(default_factory=lambda: _empty(0, 3))  # measured rate at the fix
+    omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
     stated: Array = field(default_factory=lambda: _empty(0, 3))  # sigma of the whole error
 
     @classmethod
@@ -106,6 +108,8 @@ class GnssPosition(Constraint):
             sigma=np.sqrt(1.0 - share) * stated,
             stated=stated,
             lever_arm=gnss.lever_arm,
+            gyro=around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
+            omega_n=scene.frame.omega_n,
             **common,
         )
 
@@ -119,9 +123,12 @@ class GnssPosition(Constraint):
             jacobians[LEVER_ARM] = CR
         if TIME_OFFSET in parameters:
             offset = parameters[TIME_OFFSET]
-            velocity = mv(C, states.v)
-            residual = residual + velocity * offset
-            jacobians |= {"v": C * offset[..., None], TIME_OFFSET: velocity[..., None]}
+            velocity, moved = _antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
+            residual = residual + mv(C, velocity) * offset
+            for block in ("theta", "v", "bg", LEVER_ARM):
+                if block != LEVER_ARM or LEVER_ARM in parameters:
+                    jacobians[block] = jacobians.get(block, 0.0) + C @ moved[block] * offset[..., None]
+            jacobians[TIME_OFFSET] = mv(C, velocity)[..., None]
         if SLOW_ERROR in parameters:
             residual = residual + self.stated[rows] * parameters[SLOW_ERROR]
             jacobians[SLOW_ERROR] = self.stated[rows][..., None] * np.eye(3)
@@ -175,29 +182,34 @@ class GnssVelocity(Constraint):
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        C, R = self.R_ln[rows], states.R_nb
-        CR = C @ R
+        C = self.R_ln[rows]
         lever = parameters.get(LEVER_ARM, np.broadcast_to(self.lever_arm, states.p.shape))
-        omega_ie_b = self.omega_n @ R
-        omega = self.gyro[rows] - states.bg - omega_ie_b
-        L = rotation.skew(lever)
-        swing = -mv(L, omega)  # omega x lever
-        residual = mv(C, states.v) + mv(CR, swing) - self.v_l[rows]
-        jacobians = {
-            "theta": CR @ (L @ rotation.skew(omega_ie_b) - rotation.skew(swing)),
-            "v": C,
-            "bg": CR @ L,
-        }
-        if LEVER_ARM in parameters:
-            jacobians[LEVER_ARM] = CR @ rotation.skew(omega)
+        velocity, moved = _antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
+        residual = mv(C, velocity) - self.v_l[rows]
+        jacobians = {block: C @ J for block, J in moved.items() if block != LEVER_ARM or LEVER_ARM in parameters}
         if VELOCITY_TIME_OFFSET in parameters:
             offset = parameters[VELOCITY_TIME_OFFSET]
-            force = self.accel[rows] - states.ba
+            CR, force = C @ states.R_nb, self.accel[rows] - states.ba
             change = mv(CR, force) + mv(C, self.g_n[rows])
             residual = residual + change * offset
             jacobians["theta"] = jacobians["theta"] - CR @ rotation.skew(force) * offset[..., None]
             jacobians |= {"ba": -CR * offset[..., None], VELOCITY_TIME_OFFSET: change[..., None]}
         return Linearized(residual, jacobians, self.sigma[rows])
+
+
+def _antenna_velocity(states: States, gyro: Array, omega_n: Array, lever: Array) -> tuple[Array, dict[str, Array]]:
+    """v + R_nb (omega_nb x l) in n, (N, 3), and its derivatives by theta, v, bg and the lever arm."""
+    R = states.R_nb
+    omega_ie_b = omega_n @ R
+    omega = gyro - states.bg - omega_ie_b
+    L = rotation.skew(lever)
+    swing = -mv(L, omega)  # omega x lever
+    return states.v + mv(R, swing), {
+        "theta": R @ (L @ rotation.skew(omega_ie_b) - rotation.skew(swing)),
+        "v": np.broadcast_to(np.eye(3), R.shape),
+        "bg": R @ L,
+        LEVER_ARM: R @ rotation.skew(omega),
+    }
 
 
 def around(imu: Imu, x: Array, t: Array) -> Array:

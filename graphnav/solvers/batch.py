@@ -14,7 +14,7 @@ then within sqrt(2 tolerance) sigma in every direction at once.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from graphnav.solvers.robust import weight_and_cost
 from graphnav.solvers.rows import Layout, Point, Rows, Values, column_norms, cost, promised, whitened
 from graphnav.state import DIM, States
 
+_REDESCENDING = ("geman-mcclure", "tukey", "welsch")
 _MIN_DAMPING, _MAX_DAMPING = 1e-4, 1e8
 
 
@@ -46,7 +47,12 @@ def batch(
     """
     began = time.perf_counter()
     values = values or {c.parameter.name: np.tile(c.parameter.initial, (len(c.t), 1)) for c in problem.chains}
-    found = _minimise(problem, Point(start, values), progress, reintegrate)
+    point, notes = Point(start, values), []
+    if any(c.robust in _REDESCENDING for c in problem.constraints):
+        # such a kernel gives up on whatever is far from the start; Cauchy's never quite does, and leads there
+        gentle = [replace(c, robust="cauchy") if c.robust in _REDESCENDING else c for c in problem.constraints]
+        point = _minimise(replace(problem, constraints=tuple(gentle)), point, progress, reintegrate).point
+    found = _minimise(problem, point, progress, reintegrate)
     problem, point, layout = found.problem, found.point, found.layout
     solved = time.perf_counter()
     if progress is not None:
@@ -62,6 +68,8 @@ def batch(
         s = np.sqrt(residual_record(problem, constraint, point.states, at_keyframes).nis)
         weight, _ = weight_and_cost(constraint.robust, s, constraint.robust_scale)
         records[constraint.name] = residual_record(problem, constraint, point.states, at_keyframes, weight)
+        if np.mean(weight < 0.1) > 0.5:
+            notes.append(f"most rows of {constraint.name} were given up as outliers: do not trust this solution")
     return Solution(
         solver="batch",
         frame=problem.frame,
@@ -75,7 +83,7 @@ def batch(
         cost=found.cost,
         stopped=found.stopped,
         timings={"batch": solved - began, "covariances": done - solved},
-        notes=(*problem.notes, *found.notes),
+        notes=(*problem.notes, *found.notes, *notes),
         between=(dense(problem, point.states, covariance, point.scale, smooth=True),),
     )
 

@@ -27,6 +27,7 @@ from scipy.linalg.lapack import dposv
 from graphnav.constraints.base import Constraint, assemble
 from graphnav.dense import dense
 from graphnav.dynamics import SCALE
+from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
@@ -137,7 +138,9 @@ def _update(
     PHt = P @ H.T
     S = H @ PHt + np.diag(sigma * sigma)
     # LAPACK called directly: for matrices this small the checks around it would cost more than the work
-    _, solved, _ = dposv(S, np.column_stack([r, PHt.T]))
+    _, solved, info = dposv(S, np.column_stack([r, PHt.T]))
+    if info:
+        raise EstimationError(f"the filter's covariance broke down at '{rows.name}' row {lo}: check sigmas and units")
     nis = float(r @ solved[:, 0])
     used = rows.gate is None or nis <= rows.gate**2
     record.set(slice(lo, hi), linear.residual, np.sqrt(np.diag(S)).reshape(n, -1), nis / n, float(used))
@@ -169,7 +172,10 @@ def backward(problem: Problem, forward: Filtered, progress: Progress | None = No
     all_P[-1], all_values[-1] = P, values
     for k in range(K - 2, -1, -1):
         Pp = forward.P_predicted[k + 1]
-        C = dposv(Pp, forward.F[k] @ forward.P[k])[1].T
+        _, gain, info = dposv(Pp, forward.F[k] @ forward.P[k])
+        if info:
+            raise EstimationError(f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas")
+        C = gain.T
         d = C @ np.concatenate([state.minus(forward.predicted[k + 1])[0], values - forward.values_predicted[k + 1]])
         state, values = forward.states[k].plus(d[None, :DIM]), forward.values[k] + d[DIM:]
         P = forward.P[k] + C @ (P - Pp) @ C.T

@@ -87,7 +87,7 @@ class Layout:
 
     def unpack(self, vectors: list[Array]) -> Step:
         """Steps per state and parameter from one vector per key."""
-        nodes = {}
+        nodes: Values = {}
         for group in self.groups:
             stacked = np.stack([vectors[k] for k in group.keys])
             nodes |= {name: stacked[:, at] for name, at in group.columns.items()}
