@@ -7,6 +7,7 @@ frames as in Groves, *Principles of GNSS, Inertial, and Multisensor Integrated N
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -76,6 +77,22 @@ def _gravity(s2: Array, h: Array) -> Array:
     return surface * (1.0 - 2.0 / A * (1.0 + F + _M - 2.0 * F * s2) * h + 3.0 * (h / A) ** 2)
 
 
+def _gravity_one(x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Gravity (m/s^2) at one point, both in ECEF: `_normal` and `_gravity` in plain numbers."""
+    p = math.sqrt(x * x + y * y)
+    za, pb = z * A, p * B
+    size = math.sqrt(za * za + pb * pb)
+    up, out = z + _EP2 * B * (za / size) ** 3, p - E2 * A * (pb / size) ** 3
+    size = math.sqrt(up * up + out * out)
+    s, c = up / size, out / size
+    s2 = s * s
+    root = math.sqrt(1.0 - E2 * s2)
+    h = p * c + z * s - A * root
+    g = -_GAMMA_E * (1.0 + _K_SOMIGLIANA * s2) / root
+    g *= 1.0 - 2.0 / A * (1.0 + F + _M - 2.0 * F * s2) * h + 3.0 * (h / A) ** 2
+    return g * c / p * x, g * c / p * y, g * s
+
+
 @dataclass(frozen=True)
 class LocalFrame:
     """One fixed ENU tangent frame (n) with its origin at `origin` = (lat, lon, h) in rad, rad, m."""
@@ -116,6 +133,8 @@ class LocalFrame:
         most) is left out.
         """
         r = self.r_e + np.asarray(p_n, dtype=float) @ self.R_ne
+        if r.size == 3:  # a filter asks for one at a time
+            return (np.array(_gravity_one(*r.ravel().tolist())) @ self.R_ne.T).reshape(r.shape)
         s, c, p = _normal(r)
         h = p * c + r[..., 2] * s - A * np.sqrt(1.0 - E2 * s * s)
         size = -_gravity(s * s, h)

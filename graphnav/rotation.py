@@ -8,6 +8,7 @@ estimation in robotics" (2018), eq. 132-147.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,9 @@ _TINY = 1e-300  # keeps sin(x)/x = 1 at x = 0 without a case of its own
 def skew(v: Array) -> Array:
     """Cross-product matrix: ``skew(a) @ b == cross(a, b)``; (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, dtype=float)
+    if v.size == 3:  # a filter asks for one at a time, where the array machinery would cost more than the work
+        x, y, z = v.ravel().tolist()
+        return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]).reshape(*v.shape, 3)
     return (v @ _GENERATORS).reshape(*v.shape, 3)
 
 
@@ -63,9 +67,26 @@ def _polynomial(v: Array, first: Array, second: Array) -> Array:
 def exp(v: Array) -> Array:
     """Exp of rotation vectors: (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, dtype=float)
+    if v.size == 3:
+        return _exp_one(*v.ravel().tolist()).reshape(*v.shape, 3)
     x = np.sqrt(np.sum(v * v, axis=-1) + _TINY)
     half = np.sin(0.5 * x) / x
     return _polynomial(v, np.sin(x) / x, 2.0 * half * half)
+
+
+def _exp_one(x: float, y: float, z: float) -> Array:
+    """`exp` of a single vector."""
+    n = math.sqrt(x * x + y * y + z * z + _TINY)
+    half = math.sin(0.5 * n) / n
+    a, b = math.sin(n) / n, 2.0 * half * half
+    xy, xz, yz = b * x * y, b * x * z, b * y * z
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), xy - a * z, xz + a * y],
+            [xy + a * z, 1.0 - b * (x * x + z * z), yz - a * x],
+            [xz - a * y, yz + a * x, 1.0 - b * (x * x + y * y)],
+        ]
+    )
 
 
 def log(R: Array) -> Array:

@@ -33,6 +33,7 @@ LEVER_ARM = "gnss_lever_arm"
 TIME_OFFSET = "gnss_time_offset"
 SLOW_ERROR = "gnss_slow_error"
 VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
+_I3 = np.eye(3)
 _WINDOW = 0.05  # s each side over which turn rate and force at a fix are averaged
 
 
@@ -116,7 +117,7 @@ class GnssPosition(Constraint):
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         C = self.R_ln[rows]
         CR = C @ states.R_nb
-        lever = parameters.get(LEVER_ARM, np.broadcast_to(self.lever_arm, states.p.shape))
+        lever = parameters.get(LEVER_ARM, self.lever_arm)
         residual = mv(C, states.p - self.p_n[rows]) + mv(CR, lever)
         jacobians = {"theta": -CR @ rotation.skew(lever), "p": C}
         if LEVER_ARM in parameters:
@@ -183,7 +184,7 @@ class GnssVelocity(Constraint):
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         C = self.R_ln[rows]
-        lever = parameters.get(LEVER_ARM, np.broadcast_to(self.lever_arm, states.p.shape))
+        lever = parameters.get(LEVER_ARM, self.lever_arm)
         velocity, moved = _antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
         residual = mv(C, velocity) - self.v_l[rows]
         jacobians = {block: C @ J for block, J in moved.items() if block != LEVER_ARM or LEVER_ARM in parameters}
@@ -206,7 +207,7 @@ def _antenna_velocity(states: States, gyro: Array, omega_n: Array, lever: Array)
     swing = -mv(L, omega)  # omega x lever
     return states.v + mv(R, swing), {
         "theta": R @ (L @ rotation.skew(omega_ie_b) - rotation.skew(swing)),
-        "v": np.broadcast_to(np.eye(3), R.shape),
+        "v": _I3,
         "bg": R @ L,
         LEVER_ARM: R @ rotation.skew(omega),
     }

@@ -131,19 +131,24 @@ def _update(
     """One measurement update with rows lo..hi of a constraint."""
     n = hi - lo
     here = state if n == 1 else state[np.zeros(n, dtype=int)]
-    given = {p.name: np.broadcast_to(values[_shift(columns[p.name])], (n, len(p.initial))) for p in rows.parameters}
+    given = {p.name: values[None, _shift(columns[p.name])] for p in rows.parameters}
+    if n > 1:
+        given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
     linear = rows.linearize(here, given, slice(lo, hi))
     H = assemble(linear, columns, len(P)).reshape(-1, len(P))
     r, sigma = linear.residual.ravel(), linear.sigma.ravel()
     PHt = P @ H.T
-    S = H @ PHt + np.diag(sigma * sigma)
+    S = H @ PHt
+    S.flat[:: len(r) + 1] += sigma * sigma
     # LAPACK called directly: for matrices this small the checks around it would cost more than the work
-    _, solved, info = dposv(S, np.column_stack([r, PHt.T]))
+    right = np.empty((len(r), len(P) + 1))
+    right[:, 0], right[:, 1:] = r, PHt.T
+    _, solved, info = dposv(S, right)
     if info:
         raise EstimationError(f"the filter's covariance broke down at '{rows.name}' row {lo}: check sigmas and units")
     nis = float(r @ solved[:, 0])
     used = rows.gate is None or nis <= rows.gate**2
-    record.set(slice(lo, hi), linear.residual, np.sqrt(np.diag(S)).reshape(n, -1), nis / n, float(used))
+    record.set(slice(lo, hi), linear.residual, np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1), nis / n, float(used))
     if not used:
         return state, values, P
     K = solved[:, 1:].T
