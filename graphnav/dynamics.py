@@ -57,60 +57,61 @@ class Motion:
         E = rotation.exp(omega * T)
         gamma1, gamma2 = rotation.integrals(omega * T)
         self.back = np.swapaxes(E, -1, -2)
-        self.first, self.second = gamma1 * h, gamma2 * h * h  # int E, iint E
+        self.force = np.concatenate([gamma2 * h * h, gamma1 * h], axis=1)  # iint E, int E: (n, 6, 3)
         # Newtonian gradient of gravity, -(g/r)(I - 3 u u^T): small, but it is what makes long outages honest
         g = frame.gravity_n(np.zeros(3))
         size = float(np.linalg.norm(g))
         up = -g / size
-        self.gradient = -size / earth.A * (_I3 - 3.0 * np.outer(up, up))
+        gradient = -size / earth.A * (_I3 - 3.0 * np.outer(up, up))
         n = len(intervals)
         self.post = np.zeros((n, 6, 6))  # from (E p, E u) to (p, v)
         self.post[:, :3, :3] = self.post[:, 3:, 3:] = self.back
         self.post[:, 3:, :3] = -W @ self.back
-        inner = np.zeros((n, 6, 6))
-        inner[:, :3, :3] = _I3 + h * W + 0.5 * h * h * (self.gradient + self.W2)
-        inner[:, :3, 3:] = h * (_I3 + h * h / 6.0 * self.gradient)
-        inner[:, 3:, :3] = W + h * (self.gradient + self.W2)
-        inner[:, 3:, 3:] = _I3 + 0.5 * h * h * self.gradient
-        self.inner = self.post @ inner
-        self.T = T
+        coast = np.zeros((n, 6, 6))  # (E p, E u) at the end from (p, v) at the start, without force
+        coast[:, :3, :3] = _I3 + h * W
+        coast[:, :3, 3:] = h * (_I3 + h * h / 6.0 * gradient)
+        coast[:, 3:, :3] = W
+        coast[:, 3:, 3:] = _I3 + 0.5 * h * h * gradient
+        self.coast = self.post @ coast
+        # and what gravity at the start changes with its position
+        coast[:, :3, :3] += 0.5 * h * h * (gradient + self.W2)
+        coast[:, 3:, :3] += h * (gradient + self.W2)
+        self.inner = self.post @ coast
         # d(dP, dV) / d(ba, bg), (n, 6, 6)
         self.bias = np.block([[intervals.p_ba, intervals.p_bg], [intervals.v_ba, intervals.v_bg]])
+        self.step = np.concatenate([intervals.dP, intervals.dV], axis=-1)
+        self.expected = np.concatenate([intervals.ba, intervals.bg], axis=-1)
+        self.mean = np.concatenate([intervals.force, intervals.rate], axis=-1)
 
     def propagate(self, rows: slice, start: States, scale: Array | None = None) -> tuple[States, Array]:
         """The states at the ends of intervals `rows` and F (n, 15, 15) there, from the states at their starts.
 
         `scale` is (6,) or None.
         """
-        iv, T, R = self.intervals, self.T[rows], start.R_nb
-        delta = np.concatenate([start.ba - iv.ba[rows], start.bg - iv.bg[rows]], -1)
+        iv, R = self.intervals, start.R_nb
+        n = len(R)
+        delta = np.concatenate([start.ba, start.bg], -1) - self.expected[rows]
         if scale is not None:
-            delta = delta + np.concatenate([scale[3:] * iv.force[rows], scale[:3] * iv.rate[rows]], -1)
+            delta += scale[[3, 4, 5, 0, 1, 2]] * self.mean[rows]
         turn = mv(iv.theta_bg[rows], delta[:, 3:])
         dR = iv.dR[rows] @ rotation.exp(turn)
-        moved = mv(self.bias[rows], delta)
-        dP, dV = iv.dP[rows] + moved[:, :3], iv.dV[rows] + moved[:, 3:]
+        moved = self.step[rows] + mv(self.bias[rows], delta)  # dP, dV
 
-        back, W = self.back[rows], self.W
+        post, R2 = self.post[rows], R[:, None]
         G = self.frame.gravity_n(start.p) + start.p @ self.W2.T
-        change = start.v @ self.gradient * T
-        rate = start.v + start.p @ W.T
-        p = mv(back, start.p + rate * T + mv(self.second[rows], G) + change * (T * T / 6.0) + mv(R, dP))
-        v = mv(back, rate + mv(self.first[rows], G) + change * (0.5 * T) + mv(R, dV)) - p @ W.T
-        end = States(back @ R @ dR, p, v, start.ba, start.bg)
+        felt = (R2 @ moved.reshape(n, 2, 3, 1)).reshape(n, 6) + mv(self.force[rows], G)
+        pv = mv(self.coast[rows], np.concatenate([start.p, start.v], -1)) + mv(post, felt)
+        end = States(self.back[rows] @ R @ dR, pv[:, :3], pv[:, 3:], start.ba, start.bg)
 
-        n = len(T)
         F = np.zeros((n, DIM, DIM))
         F[:, 0:3, 0:3] = np.swapaxes(dR, -1, -2)
         # right_jacobian(turn) is I - [turn]x/2 for the small turns this is used for
         F[:, 0:3, 12:15] = (_I3 - 0.5 * rotation.skew(turn)) @ iv.theta_bg[rows]
         F[:, 3:9, 3:9] = self.inner[rows]
         across = np.empty((n, 6, 9))  # (p, v) from (theta, ba, bg), before the Earth turns it
-        across[:, :3, :3] = -rotation.skew(dP)
-        across[:, 3:, :3] = -rotation.skew(dV)
+        across[:, :, :3] = -rotation.skew(moved.reshape(n, 2, 3)).reshape(n, 6, 3)
         across[:, :, 3:] = self.bias[rows]
-        turned = (R[:, None] @ across.reshape(n, 2, 3, 9)).reshape(n, 6, 9)
-        turned = self.post[rows] @ turned
+        turned = post @ (R2 @ across.reshape(n, 2, 3, 9)).reshape(n, 6, 9)
         F[:, 3:9, 0:3], F[:, 3:9, 9:15] = turned[..., :3], turned[..., 3:]
         F[:, 9:15, 9:15] = _I6
         return end, F
