@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 .PHONY: demo test clean
 
 demo: $(VENV)/installed
-	$(BIN)/graphnav compare kitti --without gnss:200-260 -o out/demo
+	$(BIN)/graphnav compare kitti --without gnss:400-460 -o out/demo
 	@echo
 	@echo "The drive that GTSAM carries, with 60 s of GNSS withheld, through every solver. Open"
 	@echo "  out/demo/comparison.html    the solvers side by side"

@@ -24,7 +24,7 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
     help="Smooths recorded drives with a factor graph, beside the Kalman filter it replaces.",
-    epilog="\b\nExample:\n  graphnav compare kitti --without gnss:200-260 -o out",
+    epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out",
 )
 
 Source = Annotated[
@@ -84,7 +84,7 @@ def smooth(
     _solve((solver,), "--solver", out, recording, config, without, rate, start, end, quiet)
 
 
-@app.command(epilog="\b\nExample:\n  graphnav compare kitti --without gnss:200-260 -o out/kitti")
+@app.command(epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out/kitti")
 def compare(
     recording: Source,
     out: Out,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -87,10 +88,12 @@ def _integral(t: Array, rate: Array) -> tuple[Array, Array]:
 def _sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
     """mean(at, width) of the integral of `rate`; width 0 is the value there."""
     rate = rate - rate.mean(axis=0)  # only changes matter; keeps the second integral small
-    first, second = (np.ascontiguousarray(x.T) for x in _integral(t, rate))
+    first, second = _integral(t, rate)
 
     def columns(at: Array, values: Array) -> Array:
-        return np.stack([np.interp(at, t, row) for row in values], -1)
+        k = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
+        s = np.clip((at - t[k - 1]) / (t[k] - t[k - 1]), 0.0, 1.0)[:, None]
+        return np.asarray((1.0 - s) * values[k - 1] + s * values[k])
 
     def mean(at: Array, width: Array) -> Array:
         if not width.any():
@@ -127,35 +130,60 @@ def _regress_inliers(x: Array, y: Array) -> tuple[float, Array]:
     return _regress(x[keep], y[keep]) if keep.sum() >= MIN_PAIRS else (0.0, b)
 
 
+def _peak(lags: Array, c: Array) -> float:
+    """Where evenly spaced values are highest, by the parabola through the highest and its neighbours."""
+    k = int(np.argmax(c))
+    if 0 < k < len(lags) - 1 and (curve := c[k - 1] - 2 * c[k] + c[k + 1]) < 0 and np.isfinite(curve):
+        return float(lags[k] + 0.5 * (c[k - 1] - c[k + 1]) / curve * (lags[1] - lags[0]))
+    return float(lags[k])
+
+
 def _search(y: Array, x_at: Callable[[Index, float], Array], span: Array, valid: Callable[[float], Array]) -> Fit:
     """The shift at which x explains y best; `x_at(rows, lag)`, `valid(lag)` a mask of the rows."""
     every = np.arange(len(y))
 
-    def correlation(lag: float, rows: Index) -> float:
-        rows = rows[valid(lag)[rows]]
-        return _regress(x_at(rows, lag), y[rows])[0] if len(rows) >= MIN_PAIRS else 0.0
+    def correlations(rows: Index, lags: Array, parts: int = 0) -> Array:
+        """(len(lags), 1 + parts) with all rows, and with each of as many parts of them."""
+        edges = [every[-1] + 1, *(part[0] for part in np.array_split(rows, parts)[1:])] if parts else []
+        out = np.zeros((len(lags), 1 + parts))
+        for k, lag in enumerate(lags):
+            some = rows[valid(lag)[rows]]
+            if len(some) < MIN_PAIRS:
+                continue
+            x, of = x_at(some, lag), y[some]
+            out[k, 0] = _regress(x, of)[0]
+            cuts = [0, *np.searchsorted(some, edges[1:]), len(some)]
+            for m, (a, b) in enumerate(pairwise(cuts), 1) if parts else ():
+                out[k, m] = _regress(x[a:b], of[a:b])[0] if b - a >= MIN_PAIRS else 0.0
+        return out
 
-    def best(rows: Index, lags: Array) -> float:
-        c = np.array([correlation(lag, rows) for lag in lags])
-        k = int(np.argmax(c))
-        if 0 < k < len(lags) - 1 and (curve := c[k - 1] - 2 * c[k] + c[k + 1]) < 0:
-            return float(lags[k] + 0.5 * (c[k - 1] - c[k + 1]) / curve * (lags[1] - lags[0]))
-        return float(lags[k])
+    def correlation(lag: float, rows: Index) -> float:
+        return float(correlations(rows, np.array([lag]))[0, 0])
 
     few = every[:: max(1, len(y) // 800)]
     many = every[:: max(1, len(y) // 4000)]
-    near = best(few, np.arange(-5.0, 5.01, 0.1))
+    # changes over a second stay alike for about as long: where they may fit best is seen from every fourth shift
+    lags = np.arange(-5.0, 5.01, 0.1)
+    rough = np.argsort(correlations(few, lags[::4])[:, 0])[-3:] * 4
+    close = np.unique(np.clip(rough[:, None] + np.arange(-4, 5), 0, len(lags) - 1))
+    c = np.full(len(lags), -np.inf)
+    c[close] = correlations(few, lags[close])[:, 0]
+    near = _peak(lags, c)
     coarse, reached = near, correlation(near, few)
     # far away only if nothing near explains y, and only for clearly more, for there are many far shifts
     reach = min(WIDE, 0.3 * (span[-1] - span[0]))
     if reached < 0.6 and reach > 5.0:
-        far = best(few, np.arange(-reach, reach + 0.1, 0.2))
+        wide = np.arange(-reach, reach + 0.1, 0.2)
+        far = _peak(wide, correlations(few, wide)[:, 0])
         if abs(far) > 5.0 and correlation(far, few) > reached + 0.15:
             coarse = far
     fine = np.arange(-0.3, 0.301, 0.02) + coarse
-    lag = best(many, fine)
-    parts = [best(part, fine) for part in np.array_split(many, 4) if len(part) >= 2 * MIN_PAIRS]
-    spread = float(np.std(parts) / np.sqrt(len(parts))) if len(parts) > 1 else 0.1
+    # array_split makes the last of four parts the shortest
+    parts = 4 if len(many) // 4 >= 2 * MIN_PAIRS else 0
+    c = correlations(many, fine, parts)
+    lag = _peak(fine, c[:, 0])
+    own = [_peak(fine, column) for column in c[:, 1:].T]
+    spread = float(np.std(own) / np.sqrt(len(own))) if own else 0.1
     rows = every[valid(lag)]
     r, b = _regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
     return Fit(lag, spread, r, correlation(0.0, every), b)

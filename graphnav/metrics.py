@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv  # scipy.stats would take a second to import
 
 from graphnav.rotation import Array
 
@@ -191,13 +191,17 @@ def average_nees(x: Array, dof: int) -> Nees | None:
     if not len(x):
         return None
     low, high = chi_square_band(dof, len(x))
-    return Nees(float(x.mean()) / dof, dof, len(x), low, high, float(np.mean(x <= chi2.ppf(0.95, dof))))
+    return Nees(float(x.mean()) / dof, dof, len(x), low, high, float(np.mean(x <= chi_square_quantile(0.95, dof))))
 
 
 def chi_square_band(dof: int, n: int) -> tuple[float, float]:
     """The two-sided 95 % band of the mean of n independent chi-square values, per degree of freedom."""
-    low, high = chi2.ppf([0.025, 0.975], dof * n) / (dof * n)
-    return float(low), float(high)
+    return chi_square_quantile(0.025, dof * n) / (dof * n), chi_square_quantile(0.975, dof * n) / (dof * n)
+
+
+def chi_square_quantile(probability: float, dof: float) -> float:
+    """Where the chi-square distribution function, the regularised incomplete gamma function, is `probability`."""
+    return 2.0 * float(gammaincinv(0.5 * dof, probability))
 
 
 def ensemble_nees(runs: Sequence[Errors], block: str = "p") -> tuple[Array, Array, float, float]:
