@@ -61,7 +61,9 @@ class GnssSettings(_Section):
     slow_share: float | None = Field(
         None, ge=0, lt=1, description="share of a position's variance that changes slowly; found from the data if unset"
     )
-    slow_time: float = Field(100.0, gt=0, description="s, correlation time of that slow part")
+    slow_times: tuple[float, float] = Field(
+        (100.0, 3600.0), description="s, correlation times of the two halves of that slow part"
+    )
     sd_factor: float | None = Field(
         None, gt=0, description="factor on the stated position sigmas; found from the data if unset, never below 1"
     )

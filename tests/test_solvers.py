@@ -12,7 +12,7 @@ import pytest
 from helpers import Array, Factor, dense, errors, factors, truth_states
 
 from graphnav.config import Settings, settings_from
-from graphnav.constraints.gnss import LEVER_ARM, SLOW_ERROR
+from graphnav.constraints.gnss import LEVER_ARM, SLOW_ERRORS
 from graphnav.dynamics import SCALE
 from graphnav.earth import LocalFrame
 from graphnav.formats import read
@@ -70,7 +70,7 @@ def nearly_linear(kind: str) -> Trio:
     return Trio(problem, smoothed, batch(problem, smoothed.states), truth)
 
 
-NODES = {"states": {}, "constants": {SCALE: 1, LEVER_ARM: 1}, "slow": {SLOW_ERROR: 4}}
+NODES = {"states": {}, "constants": {SCALE: 1, LEVER_ARM: 1}, "slow": dict.fromkeys(SLOW_ERRORS, 14)}
 
 
 @pytest.fixture(scope="module", params=list(NODES))

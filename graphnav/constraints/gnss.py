@@ -10,9 +10,11 @@ ENU at the fix, where receivers state their sigmas::
 d is what must be added to the stamps of the fixes, one constant for positions and one for velocities: a
 receiver's filters delay them differently (boulder's differ by 0.1 s, dresden's by 0.7 s).
 
-e is the slow part of a position's error (orbits, atmosphere, multipath, ambiguities): fixes of one receiver
-seconds apart are wrong alike, and a thousand of them are not worth a thousand. It is a Gauss-Markov process in
-units of the stated sigma, of variance `slow_share`; the rest, 1 - slow_share, is white.
+e is the slow part of a position's error: fixes of one receiver seconds apart are wrong alike, and a thousand of
+them are not worth a thousand. It is the sum of two Gauss-Markov processes in units of the stated sigma, one that
+changes over minutes (multipath, satellites coming and going) and one over hours (orbits, atmosphere, the base's
+coordinates). Together they have the share `slow_share` of the variance, half each, since nothing in a drive tells
+them apart; the rest is white.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from graphnav import earth, rotation
 from graphnav.config import Settings
@@ -31,9 +34,10 @@ from graphnav.state import Parameter, States
 
 LEVER_ARM = "gnss_lever_arm"
 TIME_OFFSET = "gnss_time_offset"
-SLOW_ERROR = "gnss_slow_error"
+SLOW_ERRORS = ("gnss_error_of_minutes", "gnss_error_of_hours")
 VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
 _I3 = np.eye(3)
+_MINUTE = 60.0  # s
 _WINDOW = 0.05  # s each side over which turn rate and force at a fix are averaged
 
 
@@ -80,6 +84,7 @@ class GnssPosition(Constraint):
     gyro: Array = field(default_factory=lambda: _empty(0, 3))  # measured rate at the fix
     omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
     stated: Array = field(default_factory=lambda: _empty(0, 3))  # sigma of the whole error
+    usual: Array = field(default_factory=lambda: _empty(0, 3))  # the same, smoothed: the unit of slow errors
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings) -> Array:
@@ -100,14 +105,17 @@ class GnssPosition(Constraint):
         common = _common(scene, TIME_OFFSET)
         share = s.slow_share or 0.0
         if share > 0:
-            slow = Parameter(SLOW_ERROR, np.zeros(3), np.full(3, np.sqrt(share)), "sd", correlation_time=s.slow_time)
-            common["parameters"] = (*common["parameters"], slow)
+            sigma = np.full(3, np.sqrt(0.5 * share))
+            for name, time in zip(SLOW_ERRORS, s.slow_times, strict=True):
+                slow = Parameter(name, np.zeros(3), sigma, "sd", correlation_time=time)
+                common["parameters"] = (*common["parameters"], slow)
         return cls(
             keyframe=keyframe[used],
             p_n=scene.frame.from_llh(llh),
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
             sigma=np.sqrt(1.0 - share) * stated,
             stated=stated,
+            usual=_usual(gnss.t[used], stated),
             lever_arm=gnss.lever_arm,
             gyro=around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
             omega_n=scene.frame.omega_n,
@@ -130,9 +138,10 @@ class GnssPosition(Constraint):
                 if block != LEVER_ARM or LEVER_ARM in parameters:
                     jacobians[block] = jacobians.get(block, 0.0) + C @ moved[block] * offset[..., None]
             jacobians[TIME_OFFSET] = mv(C, velocity)[..., None]
-        if SLOW_ERROR in parameters:
-            residual = residual + self.stated[rows] * parameters[SLOW_ERROR]
-            jacobians[SLOW_ERROR] = self.stated[rows][..., None] * np.eye(3)
+        for name in SLOW_ERRORS:
+            if name in parameters:
+                residual = residual + self.usual[rows] * parameters[name]
+                jacobians[name] = self.usual[rows][..., None] * _I3
         return Linearized(residual, jacobians, self.sigma[rows])
 
 
@@ -196,6 +205,16 @@ class GnssVelocity(Constraint):
             jacobians["theta"] = jacobians["theta"] - CR @ rotation.skew(force) * offset[..., None]
             jacobians |= {"ba": -CR * offset[..., None], VELOCITY_TIME_OFFSET: change[..., None]}
         return Linearized(residual, jacobians, self.sigma[rows])
+
+
+def _usual(t: Array, sigma: Array) -> Array:
+    """Running median of sigmas over a minute.
+
+    A slow error times a sigma that jumps from fix to fix would jump with it, and so give itself away.
+    """
+    period = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
+    size = 2 * int(np.clip(_MINUTE / max(period, 1e-3) / 2, 0, (len(t) - 1) // 2)) + 1
+    return median_filter(sigma, size=(size, 1), mode="nearest")
 
 
 def _antenna_velocity(states: States, gyro: Array, omega_n: Array, lever: Array) -> tuple[Array, dict[str, Array]]:
