@@ -144,7 +144,7 @@ def _search(y: Array, x_at: Callable[[Index, float], Array], span: Array, valid:
 
     def correlations(rows: Index, lags: Array, parts: int = 0) -> Array:
         """(len(lags), 1 + parts) with all rows, and with each of as many parts of them."""
-        edges = [every[-1] + 1, *(part[0] for part in np.array_split(rows, parts)[1:])] if parts else []
+        edges = [part[0] for part in np.array_split(rows, parts)[1:]] if parts else []
         out = np.zeros((len(lags), 1 + parts))
         for k, lag in enumerate(lags):
             some = rows[valid(lag)[rows]]
@@ -152,8 +152,8 @@ def _search(y: Array, x_at: Callable[[Index, float], Array], span: Array, valid:
                 continue
             x, of = x_at(some, lag), y[some]
             out[k, 0] = _regress(x, of)[0]
-            cuts = [0, *np.searchsorted(some, edges[1:]), len(some)]
-            for m, (a, b) in enumerate(pairwise(cuts), 1) if parts else ():
+            cuts = [0, *np.searchsorted(some, edges), len(some)] if parts else []
+            for m, (a, b) in enumerate(pairwise(cuts), 1):
                 out[k, m] = _regress(x[a:b], of[a:b])[0] if b - a >= MIN_PAIRS else 0.0
         return out
 
@@ -178,7 +178,6 @@ def _search(y: Array, x_at: Callable[[Index, float], Array], span: Array, valid:
         if abs(far) > 5.0 and correlation(far, few) > reached + 0.15:
             coarse = far
     fine = np.arange(-0.3, 0.301, 0.02) + coarse
-    # array_split makes the last of four parts the shortest
     parts = 4 if len(many) // 4 >= 2 * MIN_PAIRS else 0
     c = correlations(many, fine, parts)
     lag = _peak(fine, c[:, 0])

@@ -54,16 +54,18 @@ class Dense:
         k = np.clip(np.searchsorted(self.t, t, side="left") - 1, 0, len(self.t) - 2)
         T = np.diff(self.t)[k]
         s = (t - self.t[k]) / T
-        # every target is reached from its keyframe, and so is every keyframe's end, for the miss
-        targets = np.unique(np.concatenate([t[t > self.t[0]], self.t[1:]]))
+        # every target is reached from its keyframe, and for the miss so is the end of every interval with one in it
+        touched = np.unique(k)
+        ends = self.t[touched + 1] if self.smooth else self.t[:0]
+        targets = np.unique(np.concatenate([t[t > self.t[0]], ends]))
         ahead = self._predicted(targets)
         states = self.states[k].plus(np.zeros((len(t), 15)))
         moved = t > self.t[0]
         at = np.searchsorted(targets, t[moved])
         reached = ahead[at]
         if self.smooth:
-            ends = ahead[np.searchsorted(targets, self.t[1:])]
-            miss = self.states[1:].minus(ends)[k[moved]]
+            predicted = ahead[np.searchsorted(targets, ends)]
+            miss = self.states[touched + 1].minus(predicted)[np.searchsorted(touched, k[moved])]
             reached = reached.plus(_laid(miss, s[moved, None], T[moved, None]))
         else:
             exact = np.isclose(s[moved], 1.0, rtol=0.0, atol=1e-9)

@@ -110,12 +110,13 @@ def evaluate_recording(
     *,
     withheld: Sequence[tuple[str, tuple[float, float] | None]] = (),
     max_gap: float = MAX_GAP,
+    at: Array | None = None,
 ) -> Metrics | None:
     """Metrics of a solution of `recording` (the full one, nothing withheld) against the best truth there is.
 
     That is the recording's own truth, or the end being the start, or the GNSS that was withheld; None if
     there is none of these. `withheld` holds (source, span in s from the start or None) as given to
-    `Recording.without`; each span of GNSS is reported by itself.
+    `Recording.without`; each span of GNSS is reported by itself. `at` is that of `errors`.
     """
     gnss_spans = [span for source, span in withheld if source == "gnss"]
     spans = [span for span in gnss_spans if span is not None]
@@ -129,7 +130,7 @@ def evaluate_recording(
     if found is None:
         return None
     truth, lever_arm = found
-    found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap)
+    found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, at=at)
     return measure(found_errors, trajectory.name, spans, start=recording.start)
 
 

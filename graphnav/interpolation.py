@@ -37,6 +37,9 @@ def interpolate(
     dt = (trajectory.t[nxt] - trajectory.t[k])[:, None]
 
     frame = LocalFrame(trajectory.llh[0]) if trajectory.frame == "geodetic" else None
+    if lever_arm is None and 4 * len(t) < len(trajectory):  # with one, the rows around are needed for rates
+        rows = np.union1d(k, nxt)
+        trajectory, k, nxt = trajectory.take(rows), np.searchsorted(rows, k), np.searchsorted(rows, nxt)
     p = trajectory.llh if frame is None else frame.from_llh(trajectory.llh)
     R_nl = None if frame is None else np.swapaxes(frame.R_ln(p), -1, -2)
     v = trajectory.v if R_nl is None or trajectory.v is None else np.einsum("kij,kj->ki", R_nl, trajectory.v)

@@ -276,7 +276,7 @@ def legend(figure: Figure, entries: Sequence[tuple[str, str, str]], y: float, le
 
 
 _DROP = re.compile(r"<metadata>.*?</metadata>|<\?xml.*?\?>|<!DOCTYPE.*?>|<!--.*?-->|<g id=\"patch_1\">\s*</g>", re.S)
-_NUMBER = re.compile(r"(\.\d\d)\d+")
+_NUMBER = re.compile(r"(?<=\.\d\d)\d+")  # replaced by nothing: a template would be expanded match by match
 _PATH = re.compile(r' d="[^"]*"')
 _GROUP_ID = re.compile(r'<g id="[^"]*"')
 _HEX = re.compile(r"#[0-9a-f]{6}\b")
@@ -299,7 +299,7 @@ def svg(figure: Figure, words: str, key: str = "figure") -> str:
         FigureCanvasSVG(figure).print_svg(out, metadata={"Date": None})
     text = out.getvalue().replace(" \nL ", " ")
     text = _GROUP_ID.sub("<g", _DROP.sub("", text))
-    text = _PATH.sub(lambda m: _NUMBER.sub(r"\1", m.group()), text)  # paths only: labels keep their digits
+    text = _PATH.sub(lambda m: _NUMBER.sub("", m.group()), text)  # paths only: labels keep their digits
     text = _HEX.sub(lambda m: _VARIABLE.get(m.group(), m.group()), text)
     start = text.index("<svg")
     box = re.search(r'viewBox="[^"]*"', text)

@@ -19,7 +19,12 @@ _SLOW = 0.5  # m/s; slower than this a direction of travel means little
 
 
 def errors(
-    trajectory: Trajectory, truth: Trajectory, *, lever_arm: Array | None = None, max_gap: float = MAX_GAP
+    trajectory: Trajectory,
+    truth: Trajectory,
+    *,
+    lever_arm: Array | None = None,
+    max_gap: float = MAX_GAP,
+    at: Array | None = None,
 ) -> Errors:
     """Estimate minus truth at every epoch of the sparser of the two that the other can be interpolated to.
 
@@ -35,6 +40,8 @@ def errors(
         (3,) m, RFU: from the estimate's point to the truth's.
     max_gap
         s; the estimate is not interpolated over wider gaps.
+    at
+        (M,) s; compare at these times only, where the estimate has rows and is not interpolated at all.
 
     Raises
     ------
@@ -53,9 +60,9 @@ def errors(
         notes.append("NEES from the sigmas alone: the estimate comes without correlations between axes")
     flat = truth.frame == "local" and bool(np.isnan(truth.llh[:, 2]).all())
     if trajectory.frame == "local" or truth.frame == "local":
-        trajectory, truth = _fitted(trajectory, truth, lever_arm, max_gap, notes)
-    estimate, seen, travel, epochs = _paired(trajectory, truth, lever_arm, max_gap)
-    if _spacing(truth) < _spacing(trajectory):
+        trajectory, truth = _fitted(trajectory, truth, lever_arm, max_gap, at, notes)
+    estimate, seen, travel, epochs = _paired(trajectory, truth, lever_arm, max_gap, at)
+    if _spacing(truth) < _spacing(trajectory) if at is None else _apart(seen.t, truth.t):
         notes.append("compared at the estimate's own epochs, to which the denser truth is interpolated")
 
     R_le = enu_axes(seen.llh)
@@ -131,13 +138,18 @@ def travelled(t: Array, llh: Array) -> Array:
 
 
 def _fitted(
-    trajectory: Trajectory, truth: Trajectory, lever_arm: Array | None, max_gap: float, notes: list[str]
+    trajectory: Trajectory,
+    truth: Trajectory,
+    lever_arm: Array | None,
+    max_gap: float,
+    at: Array | None,
+    notes: list[str],
 ) -> tuple[Trajectory, Trajectory]:
     """Both on the Earth, the local one turned and moved onto the other (the truth onto the estimate if both are)."""
     if trajectory.frame == truth.frame:
         # Neither knows where it is: anywhere will do, and lengths stay what they are.
         trajectory = placed(trajectory, LocalFrame(np.zeros(3)), 0.0, np.zeros(3))
-    estimate, seen, _, _ = _paired(trajectory, truth, lever_arm, max_gap)
+    estimate, seen, _, _ = _paired(trajectory, truth, lever_arm, max_gap, at)
     mine, theirs = estimate.llh, seen.llh
     frame = LocalFrame(mine[0] if trajectory.frame == "geodetic" else theirs[0])
     truth_is_local = truth.frame == "local"
@@ -162,11 +174,14 @@ def _fitted(
 
 
 def _paired(
-    trajectory: Trajectory, truth: Trajectory, lever_arm: Array | None, max_gap: float
+    trajectory: Trajectory, truth: Trajectory, lever_arm: Array | None, max_gap: float, at: Array | None
 ) -> tuple[Trajectory, Trajectory, Array, int]:
     """Estimate and truth at the epochs they share, the truth's horizontal velocity there (N, 2), and of how many."""
     moving = truth if truth.v is not None else replace(truth, v=_derived_velocity(truth, max_gap))
-    if _spacing(truth) < _spacing(trajectory):
+    if at is not None:
+        seen, _ = interpolate(moving, at[np.isin(at, trajectory.t)], max_gap=max_gap)
+        epochs = len(at)
+    elif _spacing(truth) < _spacing(trajectory):
         seen, _ = interpolate(moving, trajectory.t, max_gap=max_gap)
         epochs = len(trajectory)
     else:
@@ -182,6 +197,12 @@ def _paired(
 def _spacing(trajectory: Trajectory) -> float:
     """Usual time between rows, s, to 0.1 ms so that rounding decides nothing; infinite for one row."""
     return float(np.round(np.median(np.diff(trajectory.t)), 4)) if len(trajectory) > 1 else np.inf
+
+
+def _apart(t: Array, rows: Array) -> bool:
+    """Whether some of the times are no row's, to 0.1 ms."""
+    k = np.clip(np.searchsorted(rows, t), 1, len(rows) - 1) if len(rows) > 1 else np.zeros(len(t), dtype=int)
+    return bool((np.minimum(np.abs(t - rows[k]), np.abs(t - rows[k - 1])) > 1e-4).any())
 
 
 def _derived_velocity(truth: Trajectory, max_gap: float) -> Array:

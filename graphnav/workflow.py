@@ -31,7 +31,10 @@ Withheld = tuple[str, Span | None]
 Progress = Callable[[str, float], None]
 
 SOURCES = ("gnss", "odometer")
-_DENSEST, _MOST = 0.1, 20_000  # s between, and number of, the epochs of a truth that are met exactly
+_DENSEST, _MOST = 0.1, 5_000  # s between, and number of, the epochs of a truth that are met exactly
+_MOST_TURNING = 20_000  # the same where a point at the end of a lever arm swings between them
+_ENOUGH = 1000  # keyframes that make other epochs needless
+_SAME, _NEAR = 1e-4, 0.02  # s; between epochs that are one, and between rows where nothing else can happen
 OUTAGE = 10.0  # s; fixes further apart than this are an outage worth a line of its own
 
 
@@ -218,7 +221,7 @@ def _score(
     recording: Recording, used: Recording, solutions: Mapping[str, Solution], withheld: tuple[Withheld, ...]
 ) -> tuple[dict[str, Metrics], str | None, tuple[str, ...]]:
     """Metrics per solver against the best truth there is, what that is, and what is missing in each of their spans."""
-    from graphnav.evaluation import evaluate_recording
+    from graphnav.evaluation import evaluate_recording, truth_of, withheld_truth
 
     spans = [(f"without {source}", span) for source, span in withheld if span is not None]
     truth = recording.truth
@@ -238,26 +241,54 @@ def _score(
     asked: list[Withheld] = [("gnss", span) for _, span in spans]
     if truth is None and any(source == "gnss" and span is None for source, span in withheld):
         asked.append(("gnss", None))
-    reference = truth.t if truth is not None else recording.gnss.t if recording.gnss is not None else np.empty(0)
+    reference, swings = np.empty(0), False
+    compared = truth_of(recording)
+    if compared is None and truth is None:
+        compared = withheld_truth(recording, "gnss", [span for _, span in asked])
+    if compared is not None:
+        reference, arm = compared[0].t, compared[1]
+        swings = compared[0].v is not None and arm is not None and bool(np.any(arm))
     found = {}
     for name, solution in solutions.items():
-        track = _scored(solution, reference, placed=used.gnss is not None)
-        metrics = evaluate_recording(track, recording, withheld=asked)
+        at = _epochs(solution, reference)
+        wanted = np.union1d(np.union1d(solution.t, at), _thinned(reference, solution, _MOST_TURNING)) if swings else at
+        track = _scored(solution, wanted, placed=used.gnss is not None)
+        metrics = evaluate_recording(track, recording, withheld=asked, at=at if len(at) else None)
         if metrics is None:
             return {}, None, ()
         found[name] = metrics
     return found, against, tuple(name for name, _ in spans)
 
 
-def _scored(solution: Solution, t: Array, placed: bool) -> Trajectory:
-    """The solution at its keyframes and at the truth's epochs `t`, in metres of the navigation frame if not `placed`.
+def _epochs(solution: Solution, truth: Array) -> Array:
+    """Epochs to compare at: the keyframes where the truth has them and they are many, else (some of) the truth's.
 
-    Interpolated between keyframes, a filter would seem to know in an outage what the fix after it will tell.
+    Never others: interpolated between keyframes, a filter would seem to know in an outage what the fix after it
+    will tell.
     """
-    t = t[np.isfinite(t)]
-    spacing = max(_DENSEST, (solution.t[-1] - solution.t[0]) / _MOST)
+    truth = truth[np.isfinite(truth)]
+    if len(truth) > 1:
+        t = solution.t[(solution.t >= truth[0] - _SAME) & (solution.t <= truth[-1] + _SAME)]
+        k = np.clip(np.searchsorted(truth, t), 1, len(truth) - 1)
+        before, after = t - truth[k - 1], truth[k] - t
+        there = (np.minimum(np.abs(before), np.abs(after)) <= _SAME) | (before + after <= _NEAR)
+        if there.sum() >= max(_ENOUGH, 0.99 * len(t)):
+            return np.asarray(t[there])
+    return _thinned(truth, solution, _MOST)
+
+
+def _thinned(t: Array, solution: Solution, most: int) -> Array:
+    """At most so many of some times over the length of a solution, and none closer than `_DENSEST`."""
+    spacing = max(_DENSEST, (solution.t[-1] - solution.t[0]) / most)
     _, apart = np.unique(np.floor(t / spacing), return_index=True)
-    times, states, covariance = solution.at(np.union1d(solution.t, t[apart]))
+    return np.asarray(t[apart])
+
+
+def _scored(solution: Solution, t: Array, placed: bool) -> Trajectory:
+    """The solution at the times, or at all keyframes where these will do; in metres of its frame if not `placed`."""
+    times, states, covariance = solution.t, solution.states, solution.covariance
+    if not np.isin(t, times).all():
+        times, states, covariance = solution.at(np.union1d(times[[0, -1]], t))
     track = to_trajectory(solution.solver, solution.frame, times, states, covariance)
     if placed:
         return track
