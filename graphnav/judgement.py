@@ -1,14 +1,14 @@
 """How good the sensors really are: what a smoothed first part of the drive says against the stated figures.
 
-Two questions, both answered by medians, so that outliers and bad stretches do not decide, and acted on only
-where the answer is clear (three standard deviations of what chance would do).
+Two questions, both answered so that outliers and bad stretches do not decide, and acted on only where the answer
+is clear (three standard deviations of what chance would do).
 
 *Fixes.* A smoothed inertial trajectory follows what the fixes do slowly and refuses what they do fast, so its
 residuals show the fast part of the receiver's error. With f the ratio of their square to what the stated sigmas
-promise: f > 1, the sigmas are multiplied by sqrt(f) (a variance factor); f < 1, either they are too large or,
-far more often, the rest of the error changes slowly and has gone into the trajectory. A stated sigma is meant to
-hold for the whole error, so the missing share 1 - f is taken to be slow. Read otherwise, a thousand fixes wrong
-alike would promise thirty times too much.
+promise, by medians: f > 1, the sigmas are multiplied by sqrt(f) (a variance factor); f < 1, either they are too
+large or, far more often, the rest of the error changes slowly and has gone into the trajectory. A stated sigma is
+meant to hold for the whole error, so the missing share 1 - f is taken to be slow. Read otherwise, a thousand fixes
+wrong alike would promise thirty times too much.
 
 *IMU.* The smoother also says what the process noise of every interval was (de Jong and Koopman's disturbance
 smoother). With d the smoothed minus the predicted state at its end and P-, P^s their covariances,
@@ -25,7 +25,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import gammaincinv
+from scipy.special import chdtr, chdtri, gammaincinv
 
 from graphnav.config import Settings
 from graphnav.constraints.base import Constraint
@@ -43,6 +43,7 @@ ROUNDS = 3
 _SIGNIFICANT = 3.0  # standard deviations of the estimate of a factor that it must differ from 1
 _OUTLIER = 6.0  # whitened norm of a fix that no Gaussian would have
 _MOST = 0.98  # the largest share called slow
+_TRIMMED = 0.01
 _FEWEST = 30  # fixes or intervals that say anything
 _FIGURES = {
     "gyro_noise_density": slice(0, 3),
@@ -160,7 +161,7 @@ def judge_imu(problem: Problem, forward: Filtered, smoothed: Smoothed) -> dict[s
         if np.count_nonzero(seen) < _FEWEST:
             continue
         z = noise[seen, at] / np.sqrt(variance[seen, at])
-        f = float(np.median(z * z)) / _median(1)
+        f = _trimmed(z * z)
         if np.log(f) > _SIGNIFICANT * _scatter(_independent(z)):
             factors[name] = f
     return factors
@@ -201,10 +202,22 @@ def _median(degrees: int) -> float:
     return 2.0 * float(gammaincinv(0.5 * degrees, 0.5))
 
 
+def _trimmed(squared: Array) -> float:
+    """Mean of squared standard normals without the largest hundredth, over what it would be for a true sigma.
+
+    Not the median: what noise adds up to over a minute is its mean square, bumps in the road included.
+    """
+    most = np.quantile(squared, 1.0 - _TRIMMED)
+    kept = float(chdtr(3.0, chdtri(1.0, _TRIMMED))) / (
+        1.0 - _TRIMMED
+    )  # E[z^2 | z^2 < q] = P(chi2_3 < q) / P(chi2_1 < q)
+    return float(np.mean(squared[squared <= most])) / kept
+
+
 def _scatter(count: float) -> float:
     """Standard deviation of the logarithm of a median chi-square of `count` independent values.
 
-    That of a mean, sqrt(2/n), times about 1.25 for a median.
+    That of a mean, sqrt(2/n), times about 1.25 for a median; a trimmed mean lies between.
     """
     return 1.25 * float(np.sqrt(2.0 / max(count, 2.0)))
 

@@ -119,6 +119,12 @@ def limits(values: Sequence[Array], floor: float = 0.0, symmetric: bool = False)
     return lo - margin, hi + margin
 
 
+def load() -> None:
+    """Import what drawing needs, which takes half a second: once, before anything that is done side by side."""
+    import matplotlib.backends.backend_svg
+    import matplotlib.figure  # noqa: F401
+
+
 def new_figure(height: float, width: float = WIDTH) -> Figure:
     """An empty transparent figure, points."""
     from matplotlib.figure import Figure

@@ -119,6 +119,10 @@ def _judged(
         problem, forward, smoothed = judgement.smooth(posed)
         fixes = judgement.judge_fixes(problem, smoothed)
         factors = {} if settings.imu.as_stated else judgement.judge_imu(problem, forward, smoothed)
+        if factors and fixes is not None and fixes.slow_share:
+            # fixes that wander would pass for noise of the IMU: ask again with their wandering in the problem
+            posed = pose(part, fixes.applied(settings), frame, aligned.state, aligned.sigma)
+            factors = judgement.judge_imu(*judgement.smooth(posed))
         if not factors:
             break
         noise = judgement.raised(noise, factors)
