@@ -48,10 +48,10 @@ def repeats(imu: Imu) -> Iterator[Finding]:
 def saturation(imu: Imu) -> Iterator[Finding]:
     # in the file's axes: a tilted mount would spread a clipped axis over three
     for what, values, smallest, unit in (("gyro", imu.gyro, 0.5, "rad/s"), ("accelerometer", imu.accel, 5.0, "m/s2")):
-        x = values @ imu.R_bs
+        x = np.ascontiguousarray((values @ imu.R_bs).T)
         for axis in range(3):
             for sign in (1.0, -1.0):
-                signed = sign * x[:, axis]
+                signed = sign * x[axis]
                 top = signed.max()
                 if top < smallest or top < 3.0 * signed.std() or top == np.median(signed):
                     continue
@@ -75,7 +75,8 @@ def imu_units(recording: Recording) -> Iterator[Finding]:
     for low, high, sentence in guesses:
         if low <= f < high:
             yield Finding("warning", f"the force has a median of {f:.3g} m/s2, not 9.8: {sentence}")
-    rate = float(np.percentile(np.abs(recording.imu.gyro).max(axis=1), 99.0))
+    x, y, z = np.abs(recording.imu.gyro).T
+    rate = float(np.percentile(np.maximum(np.maximum(x, y), z), 99.0))
     if rate > (4.0 if recording.platform == "vehicle" else 35.0):  # 35 rad/s = 2000 deg/s, the usual full scale
         yield Finding(
             "warning",

@@ -89,9 +89,14 @@ def _sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
     """mean(at, width) of the integral of `rate`; width 0 is the value there."""
     rate = rate - rate.mean(axis=0)  # only changes matter; keeps the second integral small
     first, second = _integral(t, rate)
+    period = (t[-1] - t[0]) / (len(t) - 1)
 
     def columns(at: Array, values: Array) -> Array:
-        k = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
+        # rows are where even steps put them, but for those behind a gap
+        k = np.clip(np.ceil((at - t[0]) / period).astype(int), 1, len(t) - 1)
+        off = (t[k - 1] > at) | (t[k] < at)
+        if off.any():
+            k[off] = np.clip(np.searchsorted(t, at[off]), 1, len(t) - 1)
         s = np.clip((at - t[k - 1]) / (t[k] - t[k - 1]), 0.0, 1.0)[:, None]
         return np.asarray((1.0 - s) * values[k - 1] + s * values[k])
 
@@ -195,7 +200,11 @@ def _imu_fit(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) 
     ti, tj, wi, wj = track.t[i], track.t[j], track.width[i], track.width[j]
 
     def x_at(rows: Index, lag: float) -> Array:
-        return mean(tj[rows] + lag, wj[rows]) - mean(ti[rows] + lag, wi[rows])
+        used = np.zeros(len(track.t), dtype=bool)  # most ends of one pair begin another
+        used[i[rows]] = used[j[rows]] = True
+        place = np.cumsum(used) - 1
+        values = mean(track.t[used] + lag, track.width[used])
+        return np.asarray(values[place[j[rows]]] - values[place[i[rows]]])
 
     def valid(lag: float) -> Array:
         return (ti + lag - wi / 2 > imu.t[0]) & (tj + lag + wj / 2 < imu.t[-1])

@@ -65,6 +65,18 @@ def test_a_known_offset_is_the_error_and_every_number_made_of_it() -> None:
     assert "nees_p" not in numbers  # without sigmas there is none
 
 
+def test_compared_at_given_times_only_and_never_between_rows_of_the_estimate() -> None:
+    truth = circle(TIMES)
+    rows = np.arange(0, len(truth), 10)
+    estimate = moved(truth.take(rows), np.column_stack([TIMES[rows], *np.zeros((2, len(rows)))]))
+    at = np.append(estimate.t[5:20], 7.25)  # the last is no row of the estimate
+    found = evaluation.errors(estimate, truth, at=np.sort(at))
+    np.testing.assert_array_equal(found.t, estimate.t[5:20])
+    np.testing.assert_allclose(found.p[:, 0], found.t, atol=1e-6)
+    assert found.epochs == 16
+    assert not found.notes  # every time is a row of the truth
+
+
 def test_rms_and_percentile_of_a_ramp() -> None:
     s = evaluation.measure(_errors_with(east=np.arange(101.0) - 100.0)).components["e"]
     assert s.rms == pytest.approx(np.sqrt(100 * 101 * 201 / 6 / 101))  # sum of squares of 0..100
