@@ -17,7 +17,8 @@ smoother). With d the smoothed minus the predicted state at its end and P-, P^s 
 
 and the ratio of the two is a variance factor for rate noise, force noise and both bias walks (Koch, *Parameter
 Estimation and Hypothesis Testing in Linear Models*, 3.6). Vibration, aliasing and temperature make real drives
-several times noisier than a data sheet; figures are only ever raised, and the estimate repeated with them.
+several times noisier than a data sheet. Once one figure is clearly too small all four are estimated, in rounds,
+because noise that one lacks looks like noise of its neighbours; none is set below what is stated.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from graphnav.solvers.ekf import Filtered, Smoothed, backward, ekf, residual_rec
 from graphnav.state import DIM, States
 
 FIXES = 600  # fixes the judgement is made on, from the first motion
-ROUNDS = 3
+ROUNDS = 5
 _SIGNIFICANT = 3.0  # standard deviations of the estimate of a factor that it must differ from 1
 _OUTLIER = 6.0  # whitened norm of a fix that no Gaussian would have
 _MOST = 0.98  # the largest share called slow
@@ -141,8 +142,29 @@ def judge_fixes(problem: Problem, smoothed: Smoothed) -> FixQuality | None:
     return FixQuality(slow_share=min(1.0 - f, _MOST))
 
 
-def judge_imu(problem: Problem, forward: Filtered, smoothed: Smoothed) -> dict[str, float]:
-    """Variance factors above 1 for the IMU's noise figures, by their names in `ImuNoise`."""
+@dataclass(frozen=True)
+class ImuQuality:
+    """Variance factors for the IMU's noise figures, by their names in `ImuNoise`, and those clearly above 1."""
+
+    factors: dict[str, float]
+    clear: tuple[str, ...]
+
+    @property
+    def settled(self) -> bool:
+        """Nothing left to change by a tenth."""
+        return all(abs(np.log(f)) < 0.2 for f in self.factors.values())
+
+    def applied(self, noise: ImuNoise, stated: ImuNoise) -> ImuNoise:
+        """Figures multiplied, none below what is stated."""
+        found = {
+            name: max(getattr(noise, name) * float(np.sqrt(f)), getattr(stated, name))
+            for name, f in self.factors.items()
+        }
+        return replace(noise, **found)
+
+
+def judge_imu(problem: Problem, forward: Filtered, smoothed: Smoothed) -> ImuQuality:
+    """Judge the IMU's noise figures by what the smoother says the noise of every interval was."""
     predicted = States.stack(forward.predicted)
     moved = np.concatenate([smoothed.states.minus(predicted), smoothed.values - forward.values_predicted], axis=1)[1:]
     before, after = forward.P_predicted[1:], smoothed.P[1:]
@@ -155,21 +177,16 @@ def judge_imu(problem: Problem, forward: Filtered, smoothed: Smoothed) -> dict[s
     noise = (QL @ pull)[..., 0]
     variance = np.diagonal(QL @ gained @ np.swapaxes(QL, -1, -2), axis1=-2, axis2=-1)
     stated = np.diagonal(Q, axis1=-2, axis2=-1)
-    factors = {}
+    factors, clear = {}, []
     for name, at in _FIGURES.items():
         seen = np.all(variance[:, at] > 1e-7 * stated[:, at], axis=1)  # elsewhere the data say nothing of it
         if np.count_nonzero(seen) < _FEWEST:
             continue
         z = noise[seen, at] / np.sqrt(variance[seen, at])
-        f = _trimmed(z * z)
-        if np.log(f) > _SIGNIFICANT * _scatter(_independent(z)):
-            factors[name] = f
-    return factors
-
-
-def raised(noise: ImuNoise, factors: dict[str, float]) -> ImuNoise:
-    """Noise figures with variances multiplied."""
-    return replace(noise, **{name: getattr(noise, name) * float(np.sqrt(f)) for name, f in factors.items()})
+        factors[name] = _trimmed(z * z)
+        if np.log(factors[name]) > _SIGNIFICANT * _scatter(_independent(z)):
+            clear.append(name)
+    return ImuQuality(factors, tuple(clear))
 
 
 def imu_notes(stated: ImuNoise, used: ImuNoise) -> tuple[str, ...]:

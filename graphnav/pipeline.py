@@ -118,14 +118,16 @@ def _judged(
         posed = pose(part, plain, frame, aligned.state, aligned.sigma)
         problem, forward, smoothed = judgement.smooth(posed)
         fixes = judgement.judge_fixes(problem, smoothed)
-        factors = {} if settings.imu.as_stated else judgement.judge_imu(problem, forward, smoothed)
-        if factors and fixes is not None and fixes.slow_share:
+        if settings.imu.as_stated:
+            break
+        imu = judgement.judge_imu(problem, forward, smoothed)
+        if (imu.clear or noise != stated) and fixes is not None and fixes.slow_share:
             # fixes that wander would pass for noise of the IMU: ask again with their wandering in the problem
             posed = pose(part, fixes.applied(settings), frame, aligned.state, aligned.sigma)
-            factors = judgement.judge_imu(*judgement.smooth(posed))
-        if not factors:
+            imu = judgement.judge_imu(*judgement.smooth(posed))
+        if (noise == stated and not imu.clear) or imu.settled:
             break
-        noise = judgement.raised(noise, factors)
+        noise = imu.applied(noise, stated)
     recording = replace(recording, imu=replace(recording.imu, noise=noise))
     notes = judgement.imu_notes(stated, noise)
     if fixes is None:

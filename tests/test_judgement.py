@@ -1,0 +1,113 @@
+"""What the sensors are judged to be, on drives whose true figures are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import oracle
+import pytest
+
+from graphnav.config import Settings, settings_from
+from graphnav.judgement import _trimmed, imu_notes
+from graphnav.pipeline import run
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+from graphnav.scoring import errors
+from graphnav.trajectory import Trajectory
+
+
+@pytest.fixture(scope="module")
+def path() -> oracle.ExactPath:
+    return oracle.vehicle_path(duration=420, seed=11)
+
+
+def notes(recording: Recording, settings: Settings | None = None) -> tuple[str, ...]:
+    return run(recording, settings, ("ekf",))["ekf"].notes
+
+
+def stating(recording: Recording, imu: float = 1.0, fixes: float = 1.0) -> Recording:
+    """The same measurements with noise figures or sigmas divided by a factor."""
+    noise = recording.imu.noise
+    figures = ("gyro_noise_density", "accel_noise_density")
+    noise = replace(noise, **{name: getattr(noise, name) / imu for name in figures})
+    return replace(
+        recording, imu=replace(recording.imu, noise=noise), gnss=replace(recording.gnss, sd=recording.gnss.sd / fixes)
+    )
+
+
+def wandering(recording: Recording, share: float, seed: int) -> Recording:
+    """Fixes whose error has the stated size, but a share of its variance in a Gauss-Markov process of 100 s."""
+    gnss, rng = recording.gnss, np.random.default_rng(seed)
+    decay = np.exp(-np.diff(gnss.t) / 100.0)
+    slow = np.empty((len(gnss.t), 3))
+    slow[0] = rng.normal(size=3)
+    for k, d in enumerate(decay):
+        slow[k + 1] = d * slow[k] + np.sqrt(1 - d * d) * rng.normal(size=3)
+    moved = gnss.llh.copy()
+    east, north, up = (np.sqrt(share) * gnss.sd * slow).T
+    moved[:, 0] += north / 6.36e6
+    moved[:, 1] += east / (6.378e6 * np.cos(gnss.llh[:, 0]))
+    moved[:, 2] += up
+    return replace(recording, gnss=replace(gnss, llh=moved))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_true_figures_are_left_alone(path: oracle.ExactPath, seed: int) -> None:
+    recording, _ = oracle.drive(path, seed=seed)
+    said = notes(recording)
+    assert not any("noisier" in note or "stated variance" in note or "scatter" in note for note in said), said
+
+
+def test_fixes_that_scatter_more_than_they_state(path: oracle.ExactPath) -> None:
+    recording, _ = oracle.drive(path, seed=3)
+    (said,) = (note for note in notes(stating(recording, fixes=3.0)) if "scatter" in note)
+    assert 2.4 < float(said.split("scatter ")[1].split()[0]) < 4.0
+
+
+def test_an_imu_noisier_than_stated(path: oracle.ExactPath) -> None:
+    """Both noise densities four times what is stated: at least half of that is seen, part goes to the bias walks."""
+    recording, _ = oracle.drive(path, seed=4, gnss_rate=4.0, gnss_velocity_sd=(0.02, 0.02, 0.03))
+    (said,) = (note for note in notes(stating(recording, imu=4.0)) if "noisier" in note)
+    factors = dict(part.rsplit(" ", 1) for part in said.split(": ")[1].split(", "))
+    for name in ("gyro noise", "accelerometer noise"):
+        assert 2.0 < float(factors[name]) < 5.0, said
+    as_stated = settings_from({"imu": {"as_stated": True}})
+    assert not any("noisier" in note for note in notes(stating(recording, imu=4.0), as_stated))
+
+
+def nees(recording: Recording, truth: Trajectory, settings: Settings | None = None) -> Array:
+    """Position NEES per degree of freedom, averaged over the drive."""
+    solution = run(recording, settings, ("rts",))["rts"]
+    found = errors(solution.trajectory(), truth)
+    assert found.nees_p is not None
+    return np.nanmean(found.nees_p) / 3.0
+
+
+def test_sigma_holds_when_fixes_are_wrong_alike(path: oracle.ExactPath) -> None:
+    """Seven tenths of the variance wander: taken as white, the sigma is several times too small; judged, it holds."""
+    plain = settings_from({"gnss": {"slow_share": 0.0, "sd_factor": 1.0}})
+    judged, white = [], []
+    for seed in range(6):
+        recording, truth = oracle.drive(path, seed=20 + seed, gnss_sd=tuple(np.sqrt(0.3) * np.array(oracle.RTK_SD)))
+        recording = replace(recording, gnss=replace(recording.gnss, sd=recording.gnss.sd / np.sqrt(0.3)))
+        recording = wandering(recording, 0.7, seed)
+        judged.append(nees(recording, truth))
+        white.append(nees(recording, truth, plain))
+    assert np.mean(white) > 3.0
+    assert 0.5 < np.mean(judged) < 1.6
+
+
+def test_trimmed_mean_is_one_for_a_normal_and_sees_bursts() -> None:
+    z = np.random.default_rng(0).normal(size=(100_000, 3))
+    assert abs(_trimmed(z * z) - 1.0) < 0.01
+    z[::20] *= 5.0  # a twentieth of the time five times noisier: variance 2.2
+    assert 1.5 < _trimmed(z * z) < 2.2
+
+
+def test_notes_say_only_what_was_raised() -> None:
+    noise = oracle.MEMS
+    assert imu_notes(noise, noise) == ()
+    (said,) = imu_notes(noise, replace(noise, gyro_noise_density=2 * noise.gyro_noise_density))
+    assert "gyro noise 2.0" in said
+    assert "accelerometer" not in said
