@@ -41,6 +41,7 @@ from graphnav.state import DIM, States
 
 FIXES = 600  # fixes the judgement is made on, from the first motion
 ROUNDS = 5
+MOST_RAISED = 10.0  # an IMU ten times worse than stated is not the explanation: the fixes are, and are judged next
 _SIGNIFICANT = 3.0  # standard deviations of the estimate of a factor that it must differ from 1
 _OUTLIER = 6.0  # whitened norm of a fix that no Gaussian would have
 _MOST = 0.98  # the largest share called slow
@@ -155,10 +156,11 @@ class ImuQuality:
         return all(abs(np.log(f)) < 0.2 for f in self.factors.values())
 
     def applied(self, noise: ImuNoise, stated: ImuNoise) -> ImuNoise:
-        """Figures multiplied, none below what is stated."""
+        """Figures multiplied, none below what is stated nor beyond `MOST_RAISED` times that."""
         found = {
-            name: max(getattr(noise, name) * float(np.sqrt(f)), getattr(stated, name))
+            name: float(np.clip(getattr(noise, name) * np.sqrt(f), figure, MOST_RAISED * figure))
             for name, f in self.factors.items()
+            for figure in [getattr(stated, name)]
         }
         return replace(noise, **found)
 

@@ -127,7 +127,9 @@ def _judged(
             imu = judgement.judge_imu(*judgement.smooth(posed))
         if (noise == stated and not imu.clear) or imu.settled:
             break
-        noise = imu.applied(noise, stated)
+        before, noise = noise, imu.applied(noise, stated)
+        if noise == before:
+            break
     recording = replace(recording, imu=replace(recording.imu, noise=noise))
     notes = judgement.imu_notes(stated, noise)
     if fixes is None:
