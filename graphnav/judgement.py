@@ -36,11 +36,11 @@ from graphnav.recording import ImuNoise, Recording
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import Filtered, Smoothed, backward, ekf, residual_record
+from graphnav.solvers.ekf import Filtered, Smoothed, residual_record
 from graphnav.state import DIM, States
 
 FIXES = 600  # fixes the judgement is made on, from the first motion
-ROUNDS = 5
+ROUNDS = 4
 MOST_RAISED = 10.0  # an IMU ten times worse than stated is not the explanation: the fixes are, and are judged next
 _SIGNIFICANT = 3.0  # standard deviations of the estimate of a factor that it must differ from 1
 _OUTLIER = 6.0  # whitened norm of a fix that no Gaussian would have
@@ -98,23 +98,26 @@ def stretch(recording: Recording, begin: float) -> Recording:
     return recording.crop(0.0, float(later[FIXES]) - recording.start)
 
 
-def smooth(problem: Problem) -> tuple[Problem, Filtered, Smoothed]:
-    """Filter and smooth a problem; if there are outliers, again with their weight taken away.
+def outliers(problem: Problem, smoothed: Smoothed) -> Array | None:
+    """Weights (N,) of the fixes if there are outliers among them, None if not.
 
-    What one outlier does to the states around it would otherwise pass for noise of the IMU. Its weight is the one
+    What one outlier does to the states around it would otherwise pass for noise of the IMU. The weight is the one
     that a batch solution with Cauchy's kernel leaves it.
     """
-    forward = ekf(problem)
-    smoothed = backward(problem, forward)
     rows = _fixes(problem)
     if rows is None or np.sqrt(_record(problem, rows, smoothed).nis.max(initial=0.0)) < _OUTLIER:
-        return problem, forward, smoothed
+        return None
     robust = replace(problem, constraints=_with(problem, replace(rows, robust="cauchy")))
     solved = batch(robust, smoothed.states, wanted=(), reintegrate=False)
-    weight = np.maximum(solved.records[rows.name].weight, 1e-8)[:, None]
-    weighted = replace(problem, constraints=_with(problem, replace(rows, sigma=rows.sigma / np.sqrt(weight))))
-    forward = ekf(weighted)
-    return weighted, forward, backward(weighted, forward)
+    return np.maximum(solved.records[rows.name].weight, 1e-8)
+
+
+def weighted(problem: Problem, weight: Array | None) -> Problem:
+    """A problem with its fixes weighted."""
+    rows = _fixes(problem)
+    if weight is None or rows is None:
+        return problem
+    return replace(problem, constraints=_with(problem, replace(rows, sigma=rows.sigma / np.sqrt(weight)[:, None])))
 
 
 def judge_fixes(problem: Problem, smoothed: Smoothed) -> FixQuality | None:

@@ -17,7 +17,7 @@ from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.solution import Solution, joined
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import Progress, ekf, rts
+from graphnav.solvers.ekf import Filtered, Progress, Smoothed, backward, ekf, rts
 from graphnav.state import States
 
 SOLVERS = ("ekf", "rts", "batch")
@@ -112,24 +112,31 @@ def _judged(
         return recording, settings, ()
     plain = settings.model_copy(update={"gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0})})
     part = judgement.stretch(recording, aligned.motion)
-    noise, fixes = stated, None
-    for _ in range(judgement.ROUNDS):
-        part = replace(part, imu=replace(part.imu, noise=noise))
-        posed = pose(part, plain, frame, aligned.state, aligned.sigma)
-        problem, forward, smoothed = judgement.smooth(posed)
-        fixes = judgement.judge_fixes(problem, smoothed)
-        if settings.imu.as_stated:
-            break
-        imu = judgement.judge_imu(problem, forward, smoothed)
-        if (imu.clear or noise != stated) and fixes is not None and fixes.slow_share:
-            # fixes that wander would pass for noise of the IMU: ask again with their wandering in the problem
-            posed = pose(part, fixes.applied(settings), frame, aligned.state, aligned.sigma)
-            imu = judgement.judge_imu(*judgement.smooth(posed))
-        if (noise == stated and not imu.clear) or imu.settled:
-            break
-        before, noise = noise, imu.applied(noise, stated)
-        if noise == before:
-            break
+    noise, weight = stated, None
+
+    def smoothed(how: Settings) -> tuple[Problem, Filtered, Smoothed]:
+        noisy = replace(part, imu=replace(part.imu, noise=noise))
+        problem = judgement.weighted(pose(noisy, how, frame, aligned.state, aligned.sigma), weight)
+        forward = ekf(problem)
+        return problem, forward, backward(problem, forward)
+
+    problem, forward, back = smoothed(plain)
+    weight = judgement.outliers(problem, back)
+    if weight is not None:
+        problem, forward, back = smoothed(plain)
+    fixes = judgement.judge_fixes(problem, back)
+    if not settings.imu.as_stated and judgement.judge_imu(problem, forward, back).clear:
+        # fixes that wander would pass for noise of the IMU: it is judged with their wandering in the problem
+        judged = plain if fixes is None else fixes.applied(settings)
+        for _ in range(judgement.ROUNDS):
+            imu = judgement.judge_imu(*smoothed(judged))
+            better = imu.applied(noise, stated)
+            if (noise == stated and not imu.clear) or imu.settled or better == noise:
+                break
+            noise = better
+        if noise != stated:
+            problem, _, back = smoothed(plain)
+            fixes = judgement.judge_fixes(problem, back)
     recording = replace(recording, imu=replace(recording.imu, noise=noise))
     notes = judgement.imu_notes(stated, noise)
     if fixes is None:
