@@ -35,7 +35,7 @@ import numpy as np
 
 from graphnav import rotation
 from graphnav.recording import Imu
-from graphnav.rotation import Array, mv
+from graphnav.rotation import Array
 
 _CHUNK = 40_000  # pieces handled at once: keeps the working arrays in the processor's cache
 _WALK_POINTS = 6  # quadrature points for the effect of bias walk inside an interval
@@ -76,17 +76,6 @@ class Intervals:
     def T(self) -> Array:
         """Lengths, s."""
         return self.t1 - self.t0
-
-    def corrected(self, ba: Array, bg: Array) -> tuple[Array, Array, Array, Array]:
-        """dR, dV, dP for other biases to first order, and the rotation-vector correction of dR."""
-        da, dg = ba - self.ba, bg - self.bg
-        turn = mv(self.theta_bg, dg)
-        return (
-            self.dR @ rotation.exp(turn),
-            self.dV + mv(self.v_ba, da) + mv(self.v_bg, dg),
-            self.dP + mv(self.p_ba, da) + mv(self.p_bg, dg),
-            turn,
-        )
 
     def out_of_range(self, bg: Array, angle: float = 1e-3) -> Array:
         """(n,) whether the gyro bias moved so far that the first-order correction is not enough.
