@@ -182,6 +182,10 @@ class Settings(_Section):
     vehicle: VehicleSettings = VehicleSettings()
     solver: SolverSettings = SolverSettings()
 
+    def without_wheels(self) -> Settings:
+        """The same with nothing assumed of wheels."""
+        return self.model_copy(update={"vehicle": self.vehicle.model_copy(update={"nhc": False, "odometer": False})})
+
 
 def settings_from(values: Mapping[str, Any], source: str = "settings") -> Settings:
     """Validate a nested mapping.
