@@ -17,6 +17,7 @@ from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.rotation import Array
 
 _SIGMAS = 3.0
+_SIGMAS_APART = 6.0  # of positions compared: their errors wander by more than receivers state
 _MEDIAN = 3  # epochs over which the median is taken
 _LONGEST = 2.0  # s between epochs that a span of motion leads across
 _BASE = 4.0  # s over which positions are compared
@@ -30,6 +31,7 @@ class Speeds:
     speed: Array  # (K,) m/s
     limit: Array  # (K,) m/s
     late: float = 0.0  # s, by which the stamps may be late
+    silent_at_rest: bool = False  # reads zero whatever happens when it is unplugged
 
 
 def speeds(recording: Recording, settings: FusionSettings) -> list[Speeds]:
@@ -75,7 +77,7 @@ def quantum(values: Array) -> float:
 def _odometer(o: Odometer, settings: FusionSettings) -> Speeds:
     # one pulse in a period may be the jitter of a wheel that stands on a tooth
     limit = max(settings.max_speed, 1.5 * quantum(o.speed))
-    return Speeds(o.t, np.abs(o.speed), np.full(len(o.t), limit), settings.odometer_delay)
+    return Speeds(o.t, np.abs(o.speed), np.full(len(o.t), limit), settings.odometer_delay, True)
 
 
 def _gnss(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:
@@ -99,7 +101,7 @@ def _gnss(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:
         if len(k):
             apart = t[later] - t[k]
             speed = np.linalg.norm(p[later] - p[k], axis=1) / apart
-            limit = _SIGMAS * np.hypot(sd[later], sd[k]) / apart
+            limit = _SIGMAS_APART * np.hypot(sd[later], sd[k]) / apart
             middle = 0.5 * (t[later] + t[k])
             found.append(Speeds(middle, speed, np.maximum(settings.max_speed, limit)))
     return found

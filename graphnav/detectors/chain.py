@@ -1,0 +1,112 @@
+"""What the IMU says of the speed between one still stretch and the next.
+
+A stretch in which nothing changes is a stop or a smooth cruise: an IMU by itself cannot tell. But no vehicle comes
+from one to the other without a push. The force between two such stretches, levelled with the tilt that the gyro
+saw, integrates to the difference of their speeds:
+
+    dv = integral (f_y - f_y0 + g dpitch) dt,     dpitch = integral (omega_x - bias) dt
+
+so that from one known speed those of all linked stretches follow, and where none is known the faster of two cannot
+be a stop. The same integral decides whether a disturbance between two stops moved the vehicle or shook it only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.detectors.windows import Blocks
+from graphnav.rotation import Array
+
+_INNER = 1.5  # s of a stretch that say what its force and rate are
+_LONGEST = 60.0  # s between stretches over which a difference of speed still means something
+_LEAST = 0.15  # m/s, difference of speed that is never called one
+_TURN_ON = 1.0e-4  # rad/s, of what a gyro's bias may differ from its mean over the stretches
+_CROSS = 0.01  # of the yaw that a gyro's scale and axes turn into tilt
+_STRAIGHT = 0.3  # rad of yaw; beyond, what biases looked like before points elsewhere
+_MISALIGNED = 0.1  # rad, of the body's axes against the vehicle's
+
+
+@dataclass(frozen=True)
+class Link:
+    """Between one still stretch and the next."""
+
+    change: float  # m/s, forward
+    tolerance: float  # m/s, what the change may be off; infinite when nothing can be said
+    peak: float  # m/s, largest horizontal speed between them if both are stops
+
+
+_UNKNOWN = Link(0.0, float("inf"), float("inf"))
+
+
+def link(b: Blocks, before: Array, after: Array) -> Link:
+    """Change of speed between two still spans, each (2,) s; unknown across a turn. Horizontal: right + i forward."""
+    T = float(after[0] - before[1])
+    i = int(np.searchsorted(b.t, max(before[0], before[1] - _INNER)))
+    j = int(np.searchsorted(b.t, min(after[1], after[0] + _INNER)))
+    first, last = (int(k) for k in np.searchsorted(b.t, [before[1], after[0]]))
+    if T > _LONGEST or first - i < 3 or j - last < 3 or not b.whole[i + 1 : j].all():
+        return _UNKNOWN
+    force, rate = b.force[i:j], b.rate[i:j]
+    n0, n1 = first - i, last - i
+    up = force[:n0].mean(axis=0)
+    g = float(np.linalg.norm(up))
+    up = up / g
+    forward = np.array([0.0, 1.0, 0.0]) - up[1] * up
+    forward /= np.linalg.norm(forward)
+    level = np.stack([np.cross(forward, up), forward], -1) @ np.array([1.0, 1.0j])
+    omega = rate - 0.5 * (rate[:n0].mean(axis=0) + rate[n1:].mean(axis=0))
+    yaw = np.cumsum(omega @ up) * b.period
+    if np.abs(yaw).max() > _STRAIGHT:
+        return _UNKNOWN
+    turned = np.exp(1j * yaw)
+    # the tilt, summed in the axes of the beginning and seen in those of each row
+    tilt = np.cumsum((omega @ level) * turned) * b.period / turned
+    # up leans by -tilt x up as the body sees it
+    left = force @ level - 1j * g * tilt
+    if n1 <= n0:
+        return Link(0.0, _LEAST, 0.0)
+    off = left[n1:].mean()
+    left = left[n0:n1]
+    v = left.sum() * b.period
+    doubt = (
+        0.5 * g * _TURN_ON * T**2,
+        g * _CROSS * float(np.abs(yaw[n0:n1]).sum()) * b.period,
+        _MISALIGNED * float(np.abs(left.real).sum()) * b.period,
+    )
+    # what is left at the other end belongs to biases and to a tilt that the gyro did not see
+    share = np.linspace(0.0, 1.0, len(left))
+    way = np.cumsum(left - share * off) * b.period
+    peak = float(np.abs(way - share * way[-1]).max())
+    return Link(float(v.imag), float(np.hypot(_LEAST, np.linalg.norm(doubt))), peak)
+
+
+def moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
+    """Which of M stretches move, given the M - 1 links between them and the speeds known of some.
+
+    Parameters
+    ----------
+    known : (M,) m/s, NaN where no sensor knows a speed; 0 where it is none.
+    """
+    M = len(known)
+    out = np.nan_to_num(known) > 0.0
+    groups = np.split(np.arange(M), [k + 1 for k, one in enumerate(links) if not np.isfinite(one.tolerance)])
+    for group in groups:
+        change = np.r_[0.0, np.cumsum([links[k].change for k in group[:-1]])]
+        # independent errors: their squares add
+        doubt = np.r_[0.0, np.cumsum([links[k].tolerance ** 2 for k in group[:-1]])]
+        sure = np.flatnonzero(np.isfinite(known[group]))
+        for m in range(len(group)):
+            if np.isfinite(known[group[m]]):
+                continue
+            of = sure if len(sure) else np.arange(len(group))
+            apart = np.sqrt(np.abs(doubt[m] - doubt[of]))
+            speed = change[m] - change[of]
+            if len(sure):
+                nearest = int(np.argmin(apart))
+                out[group[m]] = abs(known[group[of[nearest]]] + speed[nearest]) > max(apart[nearest], _LEAST)
+            else:
+                # nobody knows a speed: whoever is faster than another one in the chain moves
+                out[group[m]] = bool((speed > np.maximum(apart, _LEAST)).any())
+    return out
