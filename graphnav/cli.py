@@ -125,6 +125,35 @@ def evaluate(
     say(outputs.json_text(values) if json else text(metrics))
 
 
+@app.command(epilog="\b\nExample:\n  graphnav simulate urban -o out/urban --seed 1")
+def simulate(
+    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help="Its name; none lists them.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Folder for the recording; made if need be.")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", help="The same seed gives the same recording.")] = 0,
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="An option of the scenario; may be repeated. See --list."),
+    ] = None,
+    listing: Annotated[bool, typer.Option("--list", help="List the scenarios and their options.")] = False,
+) -> None:
+    """Make a recording with truth: a simulated drive, with the errors of simulated sensors."""
+    from graphnav import outputs
+    from graphnav.simulation import catalogue, options_from
+    from graphnav.simulation import simulate as simulated
+
+    if listing or scenario is None:
+        say(catalogue())
+        return
+    if out is None:
+        raise ConfigError("say where to write the recording: -o DIR")
+    folder = outputs.output_folder(out)
+    made = simulated(scenario, seed, **options_from(scenario, option or []))
+    files = made.write(folder)
+    say("\n".join([made.text(), *(f"  {file}" for file in files)]))
+
+
 def _solve(
     solvers: tuple[str, ...],
     option: str,
