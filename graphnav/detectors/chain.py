@@ -21,7 +21,8 @@ from graphnav.rotation import Array
 
 _INNER = 1.5  # s of a stretch that say what its force and rate are
 _LONGEST = 60.0  # s between stretches over which a difference of speed still means something
-_LEAST = 0.15  # m/s, difference of speed that is never called one
+_LEAST = 0.05  # m/s, 1-sigma of any such difference
+_SIGMAS = 3.0
 _TURN_ON = 1.0e-4  # rad/s, of what a gyro's bias may differ from its mean over the stretches
 _CROSS = 0.01  # of the yaw that a gyro's scale and axes turn into tilt
 _STRAIGHT = 0.3  # rad of yaw; beyond, what biases looked like before points elsewhere
@@ -33,7 +34,7 @@ class Link:
     """Between one still stretch and the next."""
 
     change: float  # m/s, forward
-    tolerance: float  # m/s, what the change may be off; infinite when nothing can be said
+    tolerance: float  # m/s, 3 sigma of the change; infinite when nothing can be said
     peak: float  # m/s, largest horizontal speed between them if both are stops
 
 
@@ -66,7 +67,7 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
     # up leans by -tilt x up as the body sees it
     left = force @ level - 1j * g * tilt
     if n1 <= n0:
-        return Link(0.0, _LEAST, 0.0)
+        return Link(0.0, _SIGMAS * _LEAST, 0.0)
     off = left[n1:].mean()
     left = left[n0:n1]
     v = left.sum() * b.period
@@ -79,7 +80,7 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
     share = np.linspace(0.0, 1.0, len(left))
     way = np.cumsum(left - share * off) * b.period
     peak = float(np.abs(way - share * way[-1]).max())
-    return Link(float(v.imag), float(np.hypot(_LEAST, np.linalg.norm(doubt))), peak)
+    return Link(float(v.imag), _SIGMAS * float(np.hypot(_LEAST, np.linalg.norm(doubt))), peak)
 
 
 def moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
@@ -105,8 +106,8 @@ def moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
             speed = change[m] - change[of]
             if len(sure):
                 nearest = int(np.argmin(apart))
-                out[group[m]] = abs(known[group[of[nearest]]] + speed[nearest]) > max(apart[nearest], _LEAST)
+                out[group[m]] = abs(known[group[of[nearest]]] + speed[nearest]) > max(apart[nearest], _SIGMAS * _LEAST)
             else:
                 # nobody knows a speed: whoever is faster than another one in the chain moves
-                out[group[m]] = bool((speed > np.maximum(apart, _LEAST)).any())
+                out[group[m]] = bool((speed > np.maximum(apart, _SIGMAS * _LEAST)).any())
     return out

@@ -99,22 +99,9 @@ def _count(n: int) -> str:
 
 
 def _known_speed(speeds: list[Speeds], span: Array) -> float:
-    """Speed in a span in which nothing changes, m/s: 0 where the sensors see none, NaN where none of them looked.
-
-    A sensor that reads zero does not make another one that sees motion silent; an odometer's zero is no proof at all.
-    """
-    out = np.nan
-    for s in speeds:
-        # what a late sensor says first belongs to the time before
-        first = min(span[0] + s.late, 0.5 * (span[0] + span[1]) + s.late)
-        there = (s.t >= first) & (s.t <= span[1] + s.late)
-        if there.sum() < 3:
-            continue
-        if np.median(s.speed[there] - s.limit[there]) > 0.0:
-            out = np.nanmax([out, float(np.median(s.speed[there]))])
-        elif not s.silent_at_rest:
-            out = np.nanmax([out, 0.0])
-    return float(out)
+    """Speed in a span in which nothing changes, by the sensor that sees most; NaN if none looked."""
+    found = [s.over(span) for s in speeds]
+    return float(np.nanmax(found)) if not np.isnan(found).all() else float("nan")
 
 
 def bridged(b: Blocks, spans: Array, certain: Array, settings: FusionSettings) -> tuple[Array, Array]:
