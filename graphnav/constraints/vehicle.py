@@ -1,4 +1,4 @@
-"""What wheels allow: no sideways or upward speed where the wheels do not slip, and forward speed as the odometer has it.
+"""What wheels allow: no sideways or upward speed where they do not slip, and forward speed as the odometer has it.
 
 Zhu 2020, eq. 10-19, with two differences. First, the constraint is on the mean velocity over the whole interval
 that ends at a keyframe, not on the velocity of one moment. Seen from the state at the end, s seconds later, with
