@@ -40,10 +40,12 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
     still, notes = candidates(b, sway.intervals, s, float(np.max(sway.threshold)), known, certain)
     in_motion = spans_of(sway.statistic > _CLEARLY * sway.threshold, sway.t, 0.5 * d.sway.window)
     found = [sway, *detect_windows(b, imu.noise, d.glrt, still, in_motion, _gravity(recording))]
+    idling = NONE
     if recording.platform == "vehicle":
         found.append(detect_fft(imu, period, d.fft, still, known))
         notes += found[-1].notes
-    spans, filled = fuse(b, still, certain, d.fusion)
+        idling = found[-1].intervals
+    spans, filled = fuse(b, still, idling, certain, d.fusion)
     mask = inside(sway.t, spans)
     found.append(Detection("fused", sway.t, sway.statistic, sway.threshold, mask, spans, notes, {"bridged": filled}))
     return Detections(spans, tuple(found), notes)

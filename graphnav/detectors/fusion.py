@@ -17,7 +17,7 @@ import numpy as np
 
 from graphnav.config import FusionSettings
 from graphnav.detectors.base import NONE, longer_than, merged, without
-from graphnav.detectors.chain import Link, link, moving_by_chain
+from graphnav.detectors.chain import Link, at_rest_until, link, moving_by_chain
 from graphnav.detectors.motion import Speeds
 from graphnav.detectors.sway import Scale
 from graphnav.detectors.windows import Blocks, kernel, smooth
@@ -25,6 +25,9 @@ from graphnav.rotation import Array
 
 _LOOK = 3.0  # s about an end in which the edge is sought
 _INNER = 1.5  # s inside a candidate that say what is normal in it
+_WORTH = 1.0  # s, the least that the FFT detector may add to an end
+_FURTHEST = 10.0  # s, the most
+_REACH = 0.3  # s, of the low-pass: nearer to the recording's ends no edge can be seen
 
 
 def edges(b: Blocks, spans: Array, s: Scale, threshold: float) -> Array:
@@ -122,9 +125,31 @@ def bridged(b: Blocks, spans: Array, certain: Array, settings: FusionSettings) -
     return np.array(out), np.array(filled) if filled else NONE
 
 
-def fuse(b: Blocks, spans: Array, certain: Array, settings: FusionSettings) -> tuple[Array, Array]:
-    """Stationary intervals from the candidates, and the disturbances bridged in them."""
+def joined(b: Blocks, spans: Array, idling: Array, settings: FusionSettings) -> Array:
+    """The spans with what the FFT detector calls stationary at their ends, as far as the force says rest as well."""
+    out = spans.copy()
+    limit = 0.5 * settings.bridge_speed
+    for k, span in enumerate(spans):
+        for side, way in ((0, -1), (1, 1)):
+            over = idling[(idling[:, 0] <= span[side]) & (idling[:, 1] >= span[side])]
+            further = way * (over[0, side] - span[side]) if len(over) else 0.0
+            if further < _WORTH:
+                continue
+            until = at_rest_until(b, span, way, min(further, _FURTHEST), limit)
+            # a second is left to the push that the integral has only begun to feel
+            if way * (until - span[side]) > _WORTH:
+                out[k, side] = until - way * _WORTH
+    return merged(out)
+
+
+def fuse(b: Blocks, spans: Array, idling: Array, certain: Array, settings: FusionSettings) -> tuple[Array, Array]:
+    """Stationary intervals from the candidates and the FFT detector's answer, and the disturbances bridged in them."""
+    if len(spans) and len(idling):
+        spans = without(joined(b, spans, idling, settings), certain)
     spans, filled = bridged(b, spans, certain, settings)
     if len(spans):
-        spans = np.stack([spans[:, 0] + settings.margin, spans[:, 1] - settings.margin], -1)
+        # a recording that begins or ends in a stop has no edge there
+        first = np.where(spans[:, 0] - b.t[0] < _REACH, b.t[0], spans[:, 0] + settings.margin)
+        last = np.where(b.end[-1] - spans[:, 1] < _REACH, b.end[-1], spans[:, 1] - settings.margin)
+        spans = np.stack([first, last], -1)
     return longer_than(spans, settings.min_duration), filled

@@ -119,7 +119,7 @@ def idle_line(windows: Windows, still: Array) -> IdleLine | None:
     line = np.sort(clear, axis=0)[-quarter:].mean(axis=0)
     # noise alone reaches something too; a line lies above what half the bins do
     line = np.maximum(line - np.median(line), 0.0)
-    inside = np.flatnonzero((f >= _LOWEST) & (f <= min(_HIGHEST, f[-1] - 2.0 * f[1])))
+    inside = np.flatnonzero((f > _LOWEST - f[1]) & (f <= min(_HIGHEST, f[-1] - 2.0 * f[1])))
     peak = [int(k) for k in inside if line[k] >= line[k - 1] and line[k] >= line[k + 1] and line[k] > _CLEAR]
     if not peak:
         return None
