@@ -103,6 +103,33 @@ def compare(
     _solve(names, "--solvers", out, recording, config, without, rate, start, end, quiet)
 
 
+@app.command(epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")
+def detect(
+    recording: Source,
+    out: Out,
+    config: Config = None,
+    without: Without = None,
+    start: Start = None,
+    end: End = None,
+    quiet: Quiet = False,
+) -> None:
+    """Find where the vehicle stands, and write the intervals, the statistics they come from and a picture."""
+    from graphnav import detection_report, outputs, workflow
+    from graphnav.config import Settings, read_settings
+    from graphnav.detectors import detect as detected
+
+    withheld = tuple(workflow.parse_withheld(one) for one in without or ())
+    if start is not None and end is not None and not start < end:
+        raise ConfigError(f"--end {end:g}: must be later than --start {start:g}")
+    settings = Settings() if config is None else read_settings(config)
+    folder = outputs.output_folder(out)
+    used = workflow.read_part(recording, start, end, withheld)
+    found = detected(used, settings)
+    files = detection_report.write(used, found, folder)
+    if not quiet:
+        say(detection_report.text(used, found, files))
+
+
 @app.command(epilog="\b\nExample:\n  graphnav evaluate out/kitti/trajectory.csv truth.csv --json")
 def evaluate(
     trajectory: Annotated[Path, typer.Argument(metavar="TRAJECTORY", help="CSV, TUM, KF-GINS .nav or RTKLIB .pos.")],

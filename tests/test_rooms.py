@@ -19,11 +19,11 @@ ROOMS = [
     "dense", "solvers", "judgement", "pipeline",
     "interpolation", "metrics", "scoring", "evaluation", "exporters",
     "panels", "page", "plots", "report_tables", "report_pictures", "report",
-    "workflow", "outputs", "terminal", "cli",
+    "workflow", "outputs", "terminal", "detection_pictures", "detection_report", "cli",
 ]  # fmt: skip
 
 GTSAM_ROOMS = {"solvers"}
-MATPLOTLIB_ROOMS = {"panels", "plots"}
+MATPLOTLIB_ROOMS = {"panels", "plots", "detection_pictures"}
 PRINTING_ROOMS = {"cli"}
 
 FILES = sorted(PACKAGE.rglob("*.py"))
