@@ -147,9 +147,7 @@ class MeanSpeed:
         if len(self.t) < 2:
             return np.full(np.shape(a), np.nan), np.full(np.shape(a), np.nan)
         ka, kb = self._segment(a), self._segment(b)
-        kb = np.where(
-            (b == self.t[kb]) & (kb > ka), kb - 1, kb
-        )
+        kb = np.where((b == self.t[kb]) & (kb > ka), kb - 1, kb)
         (way_a, v_a), (way_b, v_b) = self._at(ka, a), self._at(kb, b)
         mean, slope = (way_b - way_a) / (b - a), (v_b - v_a) / (b - a)
         covered = (a >= self.t[0]) & (b <= self.t[-1]) & (self.bad[kb + 1] == self.bad[ka])
