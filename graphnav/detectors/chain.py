@@ -22,7 +22,7 @@ from graphnav.rotation import Array
 
 _INNER = 1.5  # s of a stretch that say what its force and rate are
 _LONGEST = 60.0  # s between stretches over which a difference of speed still means something
-_LEAST = 0.05  # m/s, 1-sigma of any such difference
+_LEAST = 0.02  # m/s, 1-sigma of any such difference
 _SIGMAS = 3.0
 _G = 9.81  # m/s^2
 _TURN_ON = 1.0e-4  # rad/s, of what a gyro's bias may differ from its mean over the stretches
@@ -38,9 +38,10 @@ class Link:
     change: float  # m/s, forward
     tolerance: float  # m/s, 3 sigma of the change; infinite when nothing can be said
     peak: float  # m/s, largest horizontal speed between them if both are stops
+    mean: float  # m/s, size of the mean velocity between them if both are stops
 
 
-_UNKNOWN = Link(0.0, float("inf"), float("inf"))
+_UNKNOWN = Link(0.0, float("inf"), float("inf"), float("inf"))
 
 
 def link(b: Blocks, before: Array, after: Array) -> Link:
@@ -57,7 +58,7 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
     if np.abs(yaw).max() > _STRAIGHT:
         return _UNKNOWN
     if n1 <= n0:
-        return Link(0.0, _SIGMAS * _LEAST, 0.0)
+        return Link(0.0, _SIGMAS * _LEAST, 0.0, 0.0)
     off = left[n1:].mean()
     left = left[n0:n1]
     v = left.sum() * b.period
@@ -69,8 +70,9 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
     # what is left at the other end belongs to biases and to a tilt that the gyro did not see
     share = np.linspace(0.0, 1.0, len(left))
     way = np.cumsum(left - share * off) * b.period
-    peak = float(np.abs(way - share * way[-1]).max())
-    return Link(float(v.imag), _SIGMAS * float(np.hypot(_LEAST, np.linalg.norm(doubt))), peak)
+    way -= share * way[-1]
+    tolerance = _SIGMAS * float(np.hypot(_LEAST, np.linalg.norm(doubt)))
+    return Link(float(v.imag), tolerance, float(np.abs(way).max()), float(np.abs(way.mean())))
 
 
 def at_rest_until(b: Blocks, span: Array, way: int, most: float, limit: float) -> float:

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 
 from graphnav.config import FusionSettings
-from graphnav.detectors.base import NONE, longer_than, merged, without
+from graphnav.detectors.base import NONE, Detection, longer_than, merged, within, without
 from graphnav.detectors.chain import Link, at_rest_until, link, moving_by_chain
 from graphnav.detectors.motion import Speeds
 from graphnav.detectors.sway import Scale
@@ -27,6 +27,10 @@ _LOOK = 3.0  # s about an end in which the edge is sought
 _INNER = 1.5  # s inside a candidate that say what is normal in it
 _WORTH = 1.0  # s, the least that the FFT detector may add to an end
 _FURTHEST = 10.0  # s, the most
+_AWAY = 0.3  # of the speed that a disturbance may reach, on average over it
+_BLIND = 0.02  # of the moving windows that may look still before stillness means little
+_AROUND = 60.0  # s about a stretch in which an odometer must have moved for its zero to count
+_ENOUGH = 20.0  # s of certain motion from which that share is known
 _REACH = 0.3  # s, of the low-pass: nearer to the recording's ends no edge can be seen
 
 
@@ -73,28 +77,53 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
 
 
 def candidates(
-    b: Blocks, still: Array, s: Scale, threshold: float, speeds: list[Speeds], certain: Array
+    b: Blocks, sway: Detection, s: Scale, speeds: list[Speeds], certain: Array
 ) -> tuple[Array, tuple[str, ...]]:
-    """Still stretches with their edges found, without those that move; and a sentence about these.
+    """Still stretches with their edges found, without those that move; and sentences about these.
 
     Parameters
     ----------
-    still : (M, 2) s, from the sway detector with this scale and threshold.
+    s : of the sway detector.
     certain : (L, 2) s, spans of certain motion.
     """
-    spans = merged(longer_than(edges(b, still, s, threshold), 3.0 * b.period))
+    threshold = float(np.max(sway.threshold))
+    spans = merged(longer_than(edges(b, sway.intervals, s, threshold), 3.0 * b.period))
     if not len(spans):
         return NONE, ()
     known = np.array([_known_speed(speeds, span) for span in spans])
-    links = [link(b, before, after) for before, after in pairwise(spans)]
-    moves = moving_by_chain(links, known)
+    moves = moving_by_chain([link(b, one, next_one) for one, next_one in pairwise(spans)], known)
     notes = []
     measured = int((np.nan_to_num(known) > 0.0).sum())
     if measured:
         notes.append(f"{_count(measured)} smooth but no stop: odometer or GNSS say that the vehicle moved")
     if moves.sum() > measured:
         notes.append(f"{_count(int(moves.sum()) - measured)} smooth but no stop: the force before or after shows speed")
+    share = _still_in_motion(sway, certain)
+    if share > _BLIND:
+        unseen = ~moves & np.isnan(known) & np.array([not _zero(speeds, span) for span in spans])
+        moves |= unseen
+        notes.append(
+            f"{100.0 * share:.0f} % of the seconds in certain motion are as still as a stop (a simulation without "
+            f"road?): a stop needs a measured speed as well, which {_count(int(unseen.sum()))} without"
+        )
     return without(spans[~moves], certain), tuple(notes)
+
+
+def _still_in_motion(sway: Detection, certain: Array) -> float:
+    """Share of the windows in certain motion that look still; 0 where there are too few to tell."""
+    half = 0.5 * (sway.t[1] - sway.t[0]) if len(sway.t) > 1 else 0.0
+    moving = within(sway.t, certain, _INNER) & np.isfinite(sway.statistic)
+    return float(sway.mask[moving].mean()) if moving.sum() * 2.0 * half > _ENOUGH else 0.0
+
+
+def _zero(speeds: list[Speeds], span: Array) -> bool:
+    """Whether an odometer that is alive reads zero all along a span."""
+    for s in speeds:
+        near = (s.t >= span[0] - _AROUND) & (s.t <= span[1] + _AROUND)
+        inner = (s.t >= span[0] + s.late) & (s.t <= span[1])
+        if s.silent_at_rest and inner.sum() and near.any() and s.speed[near].max() > s.speed[inner].max() == 0.0:
+            return True
+    return False
 
 
 def _count(n: int) -> str:
@@ -116,13 +145,19 @@ def bridged(b: Blocks, spans: Array, certain: Array, settings: FusionSettings) -
         before = out[-1]
         moved = bool(((certain[:, 0] < span[0]) & (certain[:, 1] > before[1])).any())
         near = span[0] - before[1] <= settings.bridge
-        one = link(b, before, span) if near and not moved else Link(0.0, np.inf, np.inf)
-        if one.peak < settings.bridge_speed and abs(one.change) < one.tolerance:
+        one = link(b, before, span) if near and not moved else None
+        if one is not None and _shaken_only(one, settings):
             filled.append((before[1], span[0]))
             out[-1] = np.array([before[0], span[1]])
         else:
             out.append(span)
     return np.array(out), np.array(filled) if filled else NONE
+
+
+def _shaken_only(one: Link, settings: FusionSettings) -> bool:
+    """Whether what lies between two stops shook the vehicle without moving it: to and fro, but not away."""
+    away = one.mean > _AWAY * settings.bridge_speed
+    return one.peak < settings.bridge_speed and not away and abs(one.change) < one.tolerance
 
 
 def joined(b: Blocks, spans: Array, idling: Array, settings: FusionSettings) -> Array:
