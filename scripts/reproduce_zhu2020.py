@@ -11,7 +11,6 @@ position, means over the seeds and the worst seed.
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +50,9 @@ def settings_of(case: str) -> Settings:
 def errors(solution: Solution, made: Simulated) -> tuple[Array, Array]:
     """Times (K,) and errors (K, 6) in the order of the tables, at the keyframes."""
     truth = made.recording.truth
-    assert truth is not None and truth.llh is not None and truth.v is not None
+    assert truth is not None
+    assert truth.llh is not None
+    assert truth.v is not None
     frame = LocalFrame(solution.frame.origin)
     t = solution.t
 
