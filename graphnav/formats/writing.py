@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.formats.schema import ANGLE
+from graphnav.formats.schema import ANGLE, WHEELS
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 
@@ -32,12 +32,13 @@ def rounded(recording: Recording) -> Recording:
             v=None if v is None else _cut(v, _M_S), sd_v=None if sd_v is None else _cut(sd_v, _M_S),
         )  # fmt: skip
     if odometer is not None:
-        odometer = replace(odometer, t=_cut(odometer.t, _T), speed=_cut(odometer.speed, _M_S))
+        wheels = None if odometer.wheels is None else _cut(odometer.wheels, _M_S)
+        odometer = replace(odometer, t=_cut(odometer.t, _T), speed=_cut(odometer.speed, _M_S), wheels=wheels)
     if truth is not None and truth.llh is not None:
         v, rph = truth.v, truth.rph
         truth = replace(
             truth, t=_cut(truth.t, _T), llh=_cut_llh(truth.llh), v=None if v is None else _cut(v, _M_S),
-            rph=None if rph is None else _cut(np.mod(rph / ANGLE["deg"], 360.0), _DEG) * ANGLE["deg"],
+            rph=None if rph is None else _degrees(rph) * ANGLE["deg"],
         )  # fmt: skip
     return replace(recording, imu=imu, gnss=gnss, odometer=odometer, truth=truth)
 
@@ -68,9 +69,18 @@ def write_folder(recording: Recording, folder: str | Path, notes: Sequence[str] 
         lines += ["[gnss]", 'file = "gnss.csv.gz"', f"lever_arm = {_numbers(gnss.lever_arm)}", ""]
         files.append(folder / "gnss.csv.gz")
     if odometer is not None:
-        _write(folder / "odometer.csv.gz", "t,speed", [(odometer.t, _T), (odometer.speed, _M_S)])
+        header, columns = "t,speed", [(odometer.t, _T), (odometer.speed, _M_S)]
         lines += ["[odometer]", 'file = "odometer.csv.gz"', f"lever_arm = {_numbers(odometer.lever_arm)}"]
-        lines += [f"scale_sigma = {float(odometer.scale_sigma)!r}", ""]
+        if odometer.way is not None:
+            header, columns = header + ",pulses", [*columns, (np.round(odometer.way / odometer.pulse), 0)]
+            lines += [f"metres_per_pulse = {float(odometer.pulse)!r}", 'pulses = "cumulative"']
+        if odometer.wheels is not None:
+            header, columns = ",".join([header, *WHEELS]), [*columns, (odometer.wheels, _M_S)]
+        _write(folder / "odometer.csv.gz", header, columns)
+        lines += [f"scale_sigma = {float(odometer.scale_sigma)!r}", f"signed = {str(odometer.signed).lower()}"]
+        if odometer.speed_sigma is not None:
+            lines.append(f"speed_sigma = {float(odometer.speed_sigma)!r}")
+        lines += [f"delay_sigma = {float(odometer.delay_sigma)!r}", ""]
         files.append(folder / "odometer.csv.gz")
     if truth is not None and truth.llh is not None:
         header, columns = "t,lat,lon,h", [(truth.t, _T), *_place(truth.llh)]
@@ -78,7 +88,7 @@ def write_folder(recording: Recording, folder: str | Path, notes: Sequence[str] 
             header, columns = header + ",ve,vn,vu", [*columns, (truth.v, _M_S)]
         if truth.rph is not None:
             header += ",roll,pitch,heading"
-            columns = [*columns, (np.mod(truth.rph / ANGLE["deg"], 360.0), _DEG)]
+            columns = [*columns, (_degrees(truth.rph), _DEG)]
         _write(folder / "truth.csv.gz", header, columns)
         lines += ["[truth]", 'file = "truth.csv.gz"', f'of = "{truth.of}"', ""]
         files.append(folder / "truth.csv.gz")
@@ -92,6 +102,13 @@ def _cut(values: Array, digits: int) -> Array:
 
 def _cut_llh(llh: Array) -> Array:
     return np.column_stack([np.round(llh[:, :2] / ANGLE["deg"], _LAT_LON) * ANGLE["deg"], np.round(llh[:, 2], _M)])
+
+
+def _degrees(rph: Array) -> Array:
+    """Roll and pitch as they are, heading from 0 to below 360."""
+    degrees = _cut(rph / ANGLE["deg"], _DEG)
+    degrees[:, 2] = _cut(np.mod(degrees[:, 2], 360.0), _DEG) % 360.0
+    return degrees
 
 
 def _place(llh: Array) -> list[tuple[Array, int]]:

@@ -93,7 +93,7 @@ class OdometerModel:
     scale: float = 0.01  # 1-sigma of the scale error
     white: float = 0.03  # m/s, while the wheels turn
     pulse: float = 0.0  # m per pulse; 0: not counted in pulses
-    delay: float = 0.0  # s by which readings come late
+    delay: float = 0.0  # s by which readings come late; a recording states it as the 1-sigma of its stamps
     signed: bool = True
     stuck: tuple[Span, ...] = ()  # reads zero whatever the wheels do
     unplugged: tuple[Span, ...] = ()  # no readings
@@ -121,4 +121,7 @@ class OdometerModel:
             kept &= ~((t >= a) & (t <= b))
         # a recording states what its scale may be wrong by; a scale that is exact still has a tyre's wear
         stated = max(self.scale, 0.001)
-        return Odometer(t[kept], speed[kept], mount.axle_lever_arm, stated), float(scale)
+        readings = Odometer(
+            t[kept], speed[kept], mount.axle_lever_arm, stated, signed=self.signed, delay_sigma=self.delay
+        )
+        return readings, float(scale)

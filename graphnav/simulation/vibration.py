@@ -113,8 +113,9 @@ class Engine:
             for value, other in zip((accel, turn), _amplitudes(idle, len(t)), strict=True):
                 value += weight.reshape(-1, *(1,) * (value.ndim - 1)) * (other - value)
         omega = 2.0 * np.pi * f[:, None] * np.array(self.orders)
-        # what the mean over a sample leaves of the line, which beyond Nyquist stays as it is there
-        seen = np.sinc(np.minimum(omega / (2.0 * np.pi * rate), 0.5))
+        # The mean over a sample weakens a line; beyond Nyquist an IMU's own low-pass leaves little of it.
+        share = omega / (2.0 * np.pi * rate)
+        seen = np.sinc(np.minimum(share, 0.5)) * np.sqrt(1.0 + (2.0 * share) ** 16)
         amplitude = np.zeros((len(t), len(self.orders), 5))
         amplitude[:, :, :3] = accel * (load[:, None] / seen / omega**2)[:, :, None]
         amplitude[:, :, PITCH] = turn * load[:, None] / seen / omega

@@ -26,7 +26,7 @@ RTK = GnssModel(white=(0.01, 0.01, 0.02), slow=(0.008, 0.008, 0.015), lever_arm=
 SINGLE = GnssModel(
     white=(0.5, 0.5, 1.0), slow=(1.5, 1.5, 3.0), slow_time=100.0, velocity=(0.1, 0.1, 0.15), lever_arm=(0.1, -0.3, 0.8)
 )
-PULSE = 2.0 * np.pi * 0.31 / 48.0  # m of way: 48 teeth on a wheel of 0.31 m
+PULSE = 2.0 * np.pi * 0.31 / 48.0 / 4.0  # m of way: 48 teeth on each of four wheels of 0.31 m
 
 
 def urban(
@@ -80,7 +80,7 @@ def _town(
     return record(
         name, seed, path,
         origin=(45.46, 9.19, 20.0), imu=MEMS.at(rate), mount=mount, shake=Shake(tuple(parts)), exact=exact,
-        gnss=receiver, odometer=OdometerModel(rate=25.0, scale=0.01, white=0.0, pulse=PULSE) if odometer else None,
+        gnss=receiver, odometer=OdometerModel(rate=10.0, scale=0.01, white=0.0, pulse=PULSE) if odometer else None,
         facts={"tunnels_s": [list(gap) for gap in gaps], "engine_hz": idle_hz},
     )  # fmt: skip
 
