@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from graphnav import crosschecks
+from graphnav import crosschecks, wheels
 from graphnav.crosschecks import Fit, Track
 from graphnav.findings import Finding, period_of
-from graphnav.recording import Imu, Recording
+from graphnav.recording import Imu, Odometer, Recording
 from graphnav.rotation import Array
+from graphnav.wheels.faults import FROZEN, GAP, STUCK, WILD
+
+_MIN_SPEED = 5.0  # m/s, at which wheels are compared
 
 
 def overlap_s(recording: Recording) -> float:
@@ -153,12 +156,69 @@ def yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
         yield Finding("warning", f"the course turns {scale:.2f} times as much as the gyro about the vertical")
 
 
+_WORD = {GAP: "gives no readings", STUCK: "is stuck at zero", FROZEN: "is frozen", WILD: "reads against the motion"}
+_COARSE = 0.1  # m/s, a step that is worth a word
+_WHEEL = 0.02  # of the speed by which a wheel may differ: worn tyres differ by half of that
+_WHEELS = ("front left", "front right", "rear left", "rear right")
+
+
+def odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iterator[Finding]:
+    """What the readings say of themselves, and the IMU of them."""
+    odometer = recording.odometer
+    assert odometer is not None
+    step = wheels.quantum(odometer.speed)
+    facts["sigma_mps"] = round(wheels.reading_sigma(odometer), 4)
+    if step > 0.0:
+        facts["step_mps"] = round(step, 5)
+    if odometer.pulse:
+        facts["pulse_m"] = odometer.pulse
+    elif step > _COARSE:
+        yield Finding("note", f"the odometer reads in steps of {step:.3g} m/s")
+    if not odometer.signed:
+        yield Finding("note", "the odometer never reads below zero: it is taken to read backward as forward")
+    found = wheels.faults(odometer, recording.imu)
+    for reason in dict.fromkeys(found.reasons):
+        spans = found.spans[[r == reason for r in found.reasons]]
+        longest = spans[np.argmax(spans[:, 1] - spans[:, 0])]
+        size, at = longest[1] - longest[0], longest[0] - recording.start
+        where = f"for {size:.2f} s at {at:.1f} s from the start"
+        if len(spans) > 1:
+            where = f"in {len(spans)} spans, the longest of {size:.2f} s at {at:.1f} s from the start"
+        yield Finding("note" if reason == GAP else "warning", f"the odometer {_WORD[reason]} {where}: not used there")
+    if odometer.wheels is not None:
+        yield from _wheels_apart(odometer, recording.imu)
+
+
+def _wheels_apart(odometer: Odometer, imu: Imu) -> Iterator[Finding]:
+    """A wheel that is faster or slower than the others where the vehicle goes straight."""
+    assert odometer.wheels is not None
+    turn = imu.gyro @ crosschecks.up_of(imu)
+    turn = np.abs(np.interp(odometer.t, imu.t, turn - np.median(turn)))
+    # a turn of 0.02 rad/s moves a wheel by 0.02 m/s against the middle
+    straight = (np.abs(odometer.speed) > _MIN_SPEED) & (turn < 0.02)
+    there = ~np.isnan(odometer.wheels).all(axis=0)
+    speeds = odometer.wheels[straight][:, there]
+    speeds = speeds[~np.isnan(speeds).any(axis=1)]
+    if there.sum() < 2 or len(speeds) < crosschecks.MIN_PAIRS:
+        return
+    share = np.median(speeds, axis=0) / np.median(speeds)
+    for name, ratio in zip(np.array(_WHEELS)[there], share, strict=True):
+        if abs(ratio - 1.0) > _WHEEL:
+            more = "faster" if ratio > 1.0 else "slower"
+            yield Finding(
+                "warning",
+                f"the {name} wheel is {100 * abs(ratio - 1):.1f} % {more} than the others on the straight: "
+                "say use in [odometer], to leave its axle out",
+            )
+
+
 def odometer_findings(recording: Recording, track: Track | None, facts: dict[str, Any]) -> Iterator[Finding]:
     odometer = recording.odometer
     assert odometer is not None
     if min(odometer.t[-1], recording.end) <= max(odometer.t[0], recording.start):
         yield Finding("warning", "odometer and IMU do not overlap in time")
         return
+    yield from odometer_readings(recording, facts)
     found = crosschecks.odometer_fit(odometer, track) if track is not None else None
     if found is None:
         return

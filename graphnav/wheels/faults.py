@@ -23,7 +23,7 @@ from scipy.ndimage import median_filter
 from graphnav.findings import period_of, runs_of
 from graphnav.recording import Imu, Odometer
 from graphnav.rotation import Array
-from graphnav.wheels.mean import gaps, quantum, reading_sigma
+from graphnav.wheels.mean import gaps, longest_step, quantum, reading_sigma
 
 GAP, STUCK, FROZEN, WILD = "no readings", "stuck at zero", "frozen", "against the motion"
 
@@ -37,6 +37,7 @@ _BACKWARD = 6.0  # m/s, the fastest that anyone reverses
 _WINDOWS = (0.0, 0.5, 1.0, 2.0, 4.0)  # s over which x is compared; 0: neighbours
 _USUAL = 6.0  # times the 90th percentile of the drive itself: an IMU or axes that are worse than thought
 _LATEST = 1.5  # s an odometer may be late (or a third of it early)
+_ALIKE = 0.05  # m/s in a second, on average: as good as no change
 _STAYS = 0.5  # s of equal readings (five at least) that may be stuck
 _SPIKE = 1.0  # s
 _ISLAND = 10.0  # s that can be bridged with the IMU
@@ -98,12 +99,15 @@ def _motion(odometer: Odometer, imu: Imu) -> _Motion | None:
         off = change - gain
         return off, median_filter(off, size=min(31, len(off) // 2 * 2 - 1), mode="nearest")
 
-    def misfit(lag: float) -> float:
-        off, slow = missing(lag)
-        return float(np.mean(np.minimum(np.abs(off - slow), 1.0)))  # what is wrong has no more say than 1 m/s
+    def size(off: Array) -> float:
+        return float(np.mean(np.minimum(np.abs(off), 1.0)))  # what is wrong has no more say than 1 m/s
 
     lags = np.arange(-_LATEST / 3.0, _LATEST + 0.01, 0.05)
-    lag = float(lags[int(np.argmin([misfit(x) for x in lags]))])
+    misfits = [size(np.subtract(*missing(lag))) for lag in lags]
+    lag, left = float(lags[int(np.argmin(misfits))]), min(misfits)
+    # clocks far apart, wrong axes: the force explains nothing of the changes of speed
+    if left > max(0.5 * size(change), _ALIKE) and size(change) > _ALIKE:
+        return None
     slow = missing(lag)[1]
     # the sum of c, at the middles of the seconds; beyond them it goes on as it was
     at = t - lag
@@ -122,11 +126,13 @@ def _breaks(odometer: Odometer, motion: _Motion | None) -> list[tuple[int, int]]
     t, v = odometer.t, odometer.speed
     error = quantum(v) + 6.0 * reading_sigma(odometer)
     period = period_of(t)
+    part = np.r_[0, np.cumsum(np.diff(t) > longest_step(t))]
     found: list[tuple[int, int]] = []
     for window in _WINDOWS:
         i = np.arange(len(t) - 1)
         j = np.maximum(np.searchsorted(t, t[i] + window - 1e-9), i + 1)
         i, j = i[j < len(t)], j[j < len(t)]
+        i, j = i[part[i] == part[j]], j[part[i] == part[j]]
         dt = t[j] - t[i]
         fast = np.maximum(np.abs(v[i]), np.abs(v[j]))
         allowed = error + _RADIUS * fast + np.where((v[i] == 0.0) | (v[j] == 0.0), _DEAF, 0.0)
@@ -175,12 +181,21 @@ def _wrong(odometer: Odometer, imu: Imu | None) -> list[tuple[float, float, str]
     stays = [(a - 1, b - 1) for a, b in stays]
     bad: list[tuple[int, int, str]] = []  # first bad reading, first good one
     bad += _islands(t, v, motion, breaks, stays, _SPIKE)
-    bad += _stuck(v, breaks, stays)
+    bad += _stuck(t, v, motion, breaks, stays)
     if motion is not None and imu is not None:
         bad += _moves(odometer, imu, motion.lag, stays)
     bad += _islands(t, v, motion, breaks, stays, _ISLAND)
     bad += [(k + 1, max(m, k + 2), WILD) for k, m in breaks]  # nobody knows which side is right
     return _merged(t, bad)
+
+
+def _agree(t: Array, v: Array, motion: _Motion | None, i: int, j: int) -> bool:
+    """Whether the motion can have led from one reading to another."""
+    apart = t[j] - t[i]
+    gained = 0.0 if motion is None else motion.force[j] - motion.force[i]
+    if motion is None or abs(gained) > 1e5:
+        return bool(abs(v[j] - v[i]) <= _GRIP * apart)
+    return bool(abs(v[j] - v[i] - gained) <= _SLOPE * max(apart, _LAG_ERROR) + _RADIUS * max(v[i], v[j]) + 1e-9)
 
 
 def _islands(
@@ -195,12 +210,7 @@ def _islands(
     out, k = [], 0
     while k + 1 < len(breaks):
         (before, begin), (end, after) = breaks[k], breaks[k + 1]
-        apart = t[after] - t[before]
-        gained = 0.0 if motion is None else motion.force[after] - motion.force[before]
-        allowed = _SLOPE * max(apart, _LAG_ERROR) + _RADIUS * abs(v[before]) + 1e-9
-        if motion is None or abs(gained) > 1e5:
-            gained, allowed = 0.0, _GRIP * apart
-        if apart <= longest and abs(v[after] - v[before] - gained) <= allowed:
+        if t[after] - t[before] <= longest and _agree(t, v, motion, before, after):
             still = any(a <= begin and end <= b for a, b in stays)
             out.append((before + 1, after, WILD if not still else STUCK if v[begin] == 0.0 else FROZEN))
             del breaks[k : k + 2]
@@ -209,12 +219,15 @@ def _islands(
     return out
 
 
-def _stuck(v: Array, breaks: list[tuple[int, int]], stays: list[tuple[int, int]]) -> list[tuple[int, int, str]]:
+def _stuck(
+    t: Array, v: Array, motion: _Motion | None, breaks: list[tuple[int, int]], stays: list[tuple[int, int]]
+) -> list[tuple[int, int, str]]:
     """Equal readings with a break at either end or within; the breaks are taken off the list."""
     out = []
     for a, b in stays:
         mine = [(i, j) for i, j in breaks if i <= b and j >= a]
-        if not mine:
+        # a break at the end alone: what comes then is wild, if the motion cannot have led there from the first of them
+        if not mine or (mine[0][0] >= b and not _agree(t, v, motion, a, mine[-1][1])):
             continue
         for one in mine:
             breaks.remove(one)

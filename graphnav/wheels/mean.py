@@ -32,16 +32,19 @@ def quantum(speed: Array) -> float:
     size = size[np.isfinite(size) & (size > _FINEST)]
     if len(size) < 10:
         return 0.0
-    least = float(np.percentile(size, 1.0))
-    for parts in (1, 2, 3):  # the smallest seen may be two or three steps
-        step = least / parts
-        few = size[size < 20.5 * step]
-        for _ in range(3):  # sums over many steps tell one of them better than one does
-            count = np.round(few / step)
-            step = float(count @ few / (count @ count))
-        # without a step the remainders are spread evenly, three in ten below 0.15
-        if (np.abs(few / step - np.round(few / step)) < 0.15).mean() > 0.95:
-            return step
+    # the coarsest that explains them: below it there may be the digits of a file, or a unit converted
+    for share in (50.0, 25.0, 10.0, 5.0, 1.0):
+        for parts in (1, 2, 3):  # the smallest seen may be two or three steps
+            step = float(np.percentile(size, share)) / parts
+            few = size[size < 20.5 * step]
+            for _ in range(3):  # sums over many steps tell one of them better than one does
+                count = np.round(few / step)
+                if not count.any():
+                    break
+                step = float(count @ few / (count @ count))
+            # without a step the remainders are spread evenly, three in ten below 0.15
+            if (np.abs(few / step - np.round(few / step)) < 0.15).mean() > 0.95 and len(few) > 0.5 * len(size):
+                return step
     return 0.0
 
 
