@@ -10,7 +10,7 @@ from graphnav.detectors.fft import detect_fft
 from graphnav.detectors.fusion import candidates, fuse
 from graphnav.detectors.glrt import detect_windows, glrt_statistic
 from graphnav.detectors.motion import moving, speeds
-from graphnav.detectors.sway import detect_sway, scale
+from graphnav.detectors.sway import detect_sway
 from graphnav.detectors.windows import blocks, low_pass
 from graphnav.earth import gravity
 from graphnav.findings import period_of
@@ -35,10 +35,10 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
         return Detections(NONE, (), (f"no detection: an IMU at {1.0 / period:.3g} Hz is too slow",))
     known = speeds(recording, d.fusion)
     certain = moving(known)
-    sway = detect_sway(low, imu.noise, d.sway, certain)
-    s = scale(low, imu.noise, d.sway)
+    sway, s = detect_sway(low, imu.noise, d.sway, certain)
     still, notes = candidates(b, sway, s, known, certain)
     in_motion = spans_of(sway.statistic > _CLEARLY * sway.threshold, sway.t, 0.5 * d.sway.window)
+    notes = (*sway.notes, *notes)
     found = [sway, *detect_windows(b, imu.noise, d.glrt, still, in_motion, _gravity(recording))]
     idling = NONE
     if recording.platform == "vehicle":

@@ -29,6 +29,7 @@ from graphnav.rotation import Array
 MG = 9.80665e-3  # m/s^2
 LINE_OF_THE_PAPER = 12.495  # Hz, to which its bands belong
 _MET = 0.7  # share of still windows that meet a ratio for it to be asked for
+_STRETCH = 0.05  # by which a window may last longer than its rows should: then its frequencies are wrong
 _STRAY = 0.05  # of its frequency that an idle line may lie outside of what was seen of it
 _COLUMNS = 600  # of the spectrogram that is kept for a picture
 _SHOWN = 60.0  # Hz of it
@@ -57,7 +58,7 @@ def detect_fft(imu: Imu, period: float, settings: FftSettings, still: Array, spe
     if not w.count or rate < _SLOWEST:
         reason = "the recording is shorter than a window" if rate >= _SLOWEST else f"{rate:.3g} Hz are too few"
         return Detection("fft", t, np.full(len(t), np.nan), 1.0, t < t, NONE, (f"no FFT detection: {reason}",))
-    whole = t_last - t_first < 1.05 * length * period
+    whole = t_last - t_first < (1.0 + _STRETCH) * length * period
     half = 0.5 * length * period
     inner = within(t, still, half) & whole
     line = idle_line(w, np.flatnonzero(inner)) if settings.find_line else None

@@ -25,10 +25,11 @@ from graphnav.rotation import Array
 
 _LOOK = 3.0  # s about an end in which the edge is sought
 _INNER = 1.5  # s inside a candidate that say what is normal in it
+_EDGE = 3.0  # of S of a single row
 _WORTH = 1.0  # s, the least that the FFT detector may add to an end
 _FURTHEST = 10.0  # s, the most
 _AWAY = 0.3  # of the speed that a disturbance may reach, on average over it
-_BLIND = 0.02  # of the moving windows that may look still before stillness means little
+_BLIND = 0.2  # of the moving windows that may look still before stillness means little
 _AROUND = 60.0  # s about a stretch in which an odometer must have moved for its zero to count
 _ENOUGH = 20.0  # s of certain motion from which that share is known
 _REACH = 0.3  # s, of the low-pass: nearer to the recording's ends no edge can be seen
@@ -71,7 +72,7 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
     begin = int(np.argmax(normal))
     beyond = np.flatnonzero(off[begin:] > limit)
     # a gap in the recording ends every interval
-    torn = np.flatnonzero(np.abs(np.diff(t[begin:])) > 3.0 * b.period)
+    torn = np.flatnonzero(np.abs(np.diff(t[begin:])) > 0.2 + 2.0 * b.period)
     stop = min([begin + int(x[0]) for x in (beyond, torn + 1) if len(x)], default=len(t))
     return float(t[max(stop - 1, begin)])
 
@@ -86,8 +87,9 @@ def candidates(
     s : of the sway detector.
     certain : (L, 2) s, spans of certain motion.
     """
-    threshold = float(np.max(sway.threshold))
-    spans = merged(longer_than(edges(b, sway.intervals, s, threshold), 3.0 * b.period))
+    # a threshold that the data moved up is for windows; an edge is where the noise and sway of a row end
+    spans = edges(b, sway.intervals, s, min(float(np.max(sway.threshold)), _EDGE))
+    spans = merged(longer_than(spans, 3.0 * b.period))
     if not len(spans):
         return NONE, ()
     known = np.array([_known_speed(speeds, span) for span in spans])

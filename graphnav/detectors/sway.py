@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.config import SwaySettings
-from graphnav.detectors.base import Detection, inside, longer_than, spans_of
+from graphnav.detectors.base import NONE, Detection, longer_than, spans_of, within
 from graphnav.detectors.glrt import log_statistic
 from graphnav.detectors.thresholds import valley
 from graphnav.detectors.windows import LowPassed, running, unbroken, window_times
@@ -25,7 +25,11 @@ from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 
 _DOWN, _UP = 1.5, 0.7  # decades that the data may move the threshold down and up
-_FEWEST = 3.0  # s of a population that the data may tell of
+_MISLABELLED = 0.2  # of the moving windows that other sensors may be wrong about
+_FEWEST = 1.0  # s of a population that the data may tell of
+_QUIETEST = 1.0  # s that say how much noise there can be at most
+_TRUSTED = 0.05  # of the stated noise is the least that is believed
+_OVERSTATED = 2.0  # times what the quietest windows allow
 _MOVING = 30.0  # s of certain motion that say where the threshold must not be
 
 
@@ -35,27 +39,44 @@ class Scale:
 
     force: float
     rate: float
+    stated: float = 1.0  # S of what the stated noise would make of a row at rest
+    overstated: bool = False  # the recording knows windows far below that
 
 
-def scale(low: LowPassed, noise: ImuNoise, settings: SwaySettings) -> Scale:
-    """What sensor noise and sway make of a low-passed row of a standing vehicle."""
-    return Scale(
-        float(np.hypot(low.gain * noise.accel_noise_density, settings.force)),
-        float(np.hypot(low.gain * noise.gyro_noise_density, settings.rate)),
-    )
+def spreads(low: LowPassed, window: int) -> Array:
+    """Variance per axis of force and of rate in every window of low-passed rows, (W, 2); NaN where a gap lies in it."""
+    rows = low.rows - low.rows.mean(axis=0)
+    sums = running(np.concatenate([rows, rows**2], axis=1)).means(window)
+    spread = np.maximum(sums[:, 6:] - sums[:, :6] ** 2, 0.0)
+    each = np.stack([spread[:, :3].mean(axis=1), spread[:, 3:].mean(axis=1)], -1)
+    return np.where(unbroken(low.whole, window)[:, None], each, np.nan)
 
 
-def statistic(low: LowPassed, window: int, s: Scale) -> Array:
-    """S of every window of low-passed rows, (W,); NaN where a gap lies in it."""
-    rows = low.rows
-    sums = running(np.concatenate([rows, (rows - rows.mean(axis=0)) ** 2], axis=1)).means(window)
-    spread = sums[:, 6:] - (sums[:, :6] - rows.mean(axis=0)) ** 2
-    found = spread[:, :3].sum(axis=1) / (6.0 * s.force**2) + spread[:, 3:].sum(axis=1) / (6.0 * s.rate**2)
-    return np.where(unbroken(low.whole, window), np.maximum(found, 0.0), np.nan)
+def scale(low: LowPassed, noise: ImuNoise, settings: SwaySettings, spread: Array) -> Scale:
+    """What sensor noise and sway make of a low-passed row of a standing vehicle.
+
+    Noise is in every window, so the quietest ones bound it from above: figures stated too large must not hide motion.
+    """
+    stated = low.gain * np.array([noise.accel_noise_density, noise.gyro_noise_density])
+    there = spread[np.isfinite(spread).all(axis=1)]
+    floor = stated
+    if len(there):
+        few = min(round(_QUIETEST / low.period), len(there) - 1)
+        floor = np.sqrt(np.partition(there, few, axis=0)[few])
+    used = np.clip(floor, _TRUSTED * stated, stated)
+    sway = np.array([settings.force, settings.rate])
+    force, rate = np.hypot(used, sway)
+    expected = float(np.mean((stated**2 + sway**2) / (used**2 + sway**2)))
+    return Scale(float(force), float(rate), expected, bool((stated > _OVERSTATED * np.hypot(floor, sway)).any()))
 
 
-def detect_sway(low: LowPassed, noise: ImuNoise, settings: SwaySettings, moving: Array) -> Detection:
-    """Windows in which nothing but noise and sway is left below the engine's frequencies.
+def statistic(spread: Array, s: Scale) -> Array:
+    """S of windows with these variances per axis, (W,)."""
+    return np.asarray(0.5 * (spread[:, 0] / s.force**2 + spread[:, 1] / s.rate**2))
+
+
+def detect_sway(low: LowPassed, noise: ImuNoise, settings: SwaySettings, moving: Array) -> tuple[Detection, Scale]:
+    """Windows in which nothing but noise and sway is left below the engine's frequencies, and the scale used.
 
     Parameters
     ----------
@@ -64,29 +85,36 @@ def detect_sway(low: LowPassed, noise: ImuNoise, settings: SwaySettings, moving:
     window = max(3, round(settings.window / low.period))
     if len(low.t) < window:
         empty = np.zeros(0)
-        return Detection("sway", empty, empty, settings.threshold, empty > 0, np.zeros((0, 2)))
+        nothing = Detection("sway", empty, empty, settings.threshold, empty > 0, NONE)
+        return nothing, scale(low, noise, settings, np.zeros((0, 2)))
     t = window_times(low.t, window)
-    found = statistic(low, window, scale(low, noise, settings))
-    threshold, notes = _threshold(t, found, settings, moving, low.period)
+    spread = spreads(low, window)
+    s = scale(low, noise, settings, spread)
+    found = statistic(spread, s)
+    threshold, notes = _threshold(t, found, settings, moving, low.period, s)
     mask = found < threshold
     # a window says nothing of where in it motion began: only what all windows over it call still is
-    half = 0.5 * settings.window
-    spans = spans_of(mask, t, half)
-    return Detection("sway", t, found, threshold, mask, longer_than(spans, settings.window), notes)
+    spans = spans_of(mask, t, 0.5 * settings.window)
+    return Detection("sway", t, found, threshold, mask, longer_than(spans, settings.window), notes), s
 
 
 def _threshold(
-    t: Array, found: Array, settings: SwaySettings, moving: Array, period: float
+    t: Array, found: Array, settings: SwaySettings, moving: Array, period: float, s: Scale
 ) -> tuple[float, tuple[str, ...]]:
     if not settings.from_data:
         return settings.threshold, ()
     x, start = log_statistic(found), float(np.log10(settings.threshold))
-    fewest = round(_FEWEST / period)
-    split = valley(x, start - _DOWN, start + _UP, fewest)
-    chosen = start if split is None else split
-    label = inside(t, np.stack([moving[:, 0] + settings.window, moving[:, 1] - settings.window], -1)[
-        moving[:, 1] - moving[:, 0] > 2.0 * settings.window]) & np.isfinite(x)  # fmt: skip
+    swaying = 0.5 * ((settings.force / s.force) ** 2 + (settings.rate / s.rate) ** 2)
+    label = within(t, moving, settings.window) & np.isfinite(x)
+    split = valley(x, start - _DOWN, start + _UP + float(np.log10(s.stated)), round(_FEWEST / period))
+    if split is not None and not (label.any() and np.mean(x[label] < split) > _MISLABELLED):
+        return float(10.0**split), ()
+    notes: tuple[str, ...] = ()
+    if s.overstated and np.mean(found < settings.threshold) < 0.5:
+        # noise that hides so much is not believed, and no population stands out: what is left is 3 sigma of the sway
+        start = min(start, float(np.log10(9.0 * swaying)))
+        notes = ("the IMU's stated noise is too large to tell stops by it: only the stillest stretches count",)
     if label.sum() * period >= _MOVING:
-        # 1 of 100 moving windows may be mislabelled; half of what the next reach keeps clear of them
-        chosen = min(chosen, max(float(np.quantile(x[label], 0.01)) - np.log10(2.0), start - _DOWN))
-    return float(10.0**chosen), ()
+        # some of these windows may be mislabelled; the threshold keeps clear of the others
+        start = min(start, max(float(np.quantile(x[label], 0.05)) - np.log10(2.0), start - _DOWN))
+    return float(10.0**start), notes

@@ -15,6 +15,8 @@ from graphnav.rotation import Array
 _BIN = 0.1  # decades
 _SPREAD = np.array([0.05, 0.25, 0.4, 0.25, 0.05])  # smoothing, bins
 _DEPTH = 4.0  # how many times lower than both sides a valley is
+_FEW = 10.0  # times the fewest values: a population below that must stand apart by more than chance
+_APART = 4  # bins that then must be empty
 
 
 def valley(log_values: Array, low: float, high: float, fewest: int) -> float | None:
@@ -42,6 +44,9 @@ def valley(log_values: Array, low: float, high: float, fewest: int) -> float | N
     # of a wide valley the middle
     bottom = inside[lowest[len(lowest) // 2]]
     below = x < middle[bottom]
-    if contrast.max() < _DEPTH or min(below.sum(), (~below).sum()) < fewest:
+    smaller = min(below.sum(), (~below).sum())
+    if contrast.max() < _DEPTH or smaller < fewest:
+        return None
+    if smaller < _FEW * fewest and len(lowest) < _APART:
         return None
     return float(middle[bottom])

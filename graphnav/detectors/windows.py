@@ -18,7 +18,7 @@ from graphnav.rotation import Array
 BLOCK_RATE = 50.0  # Hz, at least, of the blocks
 _KERNEL = 0.4  # s, length of the low-pass
 _LOW_RATE = 10.0  # Hz, of the low-passed rows
-_LONGEST_GAP = 3.0  # nominal lengths that a block or kernel may cover and still count
+_LONGEST_GAP = 0.2  # s that a block may last longer than it should and still count
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def blocks(imu: Imu, row_period: float) -> Blocks:
             mean[:, 6] = np.sqrt(norms).reshape(count, size).mean(axis=1)
     end = imu.t[size - 1 : n : size]
     start = np.r_[imu.t[0] - row_period, end[:-1]]
-    whole = end - start < _LONGEST_GAP * size * row_period
+    whole = end - start < size * row_period + max(_LONGEST_GAP, row_period)
     return Blocks(end - 0.5 * size * row_period, end, mean, size * row_period, row_period, whole)
 
 
