@@ -8,11 +8,14 @@ walks beside loose priors.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import gtsam
 import numpy as np
+from scipy.linalg.lapack import dtrtri
 
+from graphnav.errors import EstimationError
 from graphnav.rotation import Array
 
 Blocks = Sequence[tuple[Array, Array]]  # (keys (N,), A (N, m, k)) per variable a factor touches
@@ -77,26 +80,33 @@ class Eliminated:
 
         The parents of a variable are among the next variable and its parents, because the order runs along a
         chain; so only that one joint block is ever kept (Kaess and Dellaert 2009, eq. 20-21).
+
+        Raises
+        ------
+        EstimationError
+            If a variable is not determined.
         """
         out: dict[int, Array] = {}
-        where: dict[int, Array] = {}  # columns of the joint block, per variable in it
+        where: dict[int, range] = {}  # columns of the joint block, per variable in it
         joint = np.zeros((0, 0))
         for i in range(self._net.size() - 1, -1, -1):
             conditional = self._net.at(i)
             key, *parents = conditional.keys()
-            R_inverse = np.linalg.inv(conditional.R())
+            R_inverse, singular = dtrtri(conditional.R())
+            if singular:
+                raise EstimationError("the data leave something undetermined: there is no covariance")
             n = len(R_inverse)
+            index = [column for p in parents for column in where[p]]
+            below, joint = joint, np.empty((n + len(index), n + len(index)))
+            joint[:n, :n] = R_inverse @ R_inverse.T
             if parents:
-                index = np.concatenate([where[p] for p in parents])
-                P_s = joint[np.ix_(index, index)]
+                P_s = below if index == list(range(len(below))) else below[np.array(index)[:, None], index]
                 U = -R_inverse @ conditional.S()
                 P_xs = U @ P_s
-                joint = np.block([[R_inverse @ R_inverse.T + P_xs @ U.T, P_xs], [P_xs.T, P_s]])
-            else:
-                joint = R_inverse @ R_inverse.T
-            widths = [n, *(len(where[p]) for p in parents)]
-            edges = np.cumsum([0, *widths])
-            where = {k: np.arange(lo, hi) for k, lo, hi in zip([key, *parents], edges[:-1], edges[1:], strict=True)}
+                joint[:n, :n] += P_xs @ U.T
+                joint[:n, n:], joint[n:, :n], joint[n:, n:] = P_xs, P_xs.T, P_s
+            edges = list(itertools.accumulate([n, *(len(where[p]) for p in parents)], initial=0))
+            where = {k: range(lo, hi) for k, lo, hi in zip([key, *parents], edges, edges[1:], strict=False)}
             if keys is None or key in keys:
-                out[key] = joint[:n, :n]
+                out[key] = joint[:n, :n].copy()
         return out
