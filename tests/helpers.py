@@ -97,7 +97,7 @@ def factors(problem: Problem, states: States, values: dict[str, Array]) -> tuple
     key, node, widths = {}, {}, [DIM] * K
     for chain in problem.chains:
         key[chain.parameter.name], node[chain.parameter.name] = len(widths), chain.node
-        widths += [len(chain.parameter.initial)] * len(chain.t)
+        widths += [chain.parameter.size] * len(chain.t)
     out: list[Factor] = []
     scale = values["imu_scale"][0] if "imu_scale" in key else None
     r, Ji, Jj, Js = problem.motion.linearize(states, scale)
@@ -122,6 +122,9 @@ def factors(problem: Problem, states: States, values: dict[str, Array]) -> tuple
             out.append((blocks, -linear.residual[i] * white[:, 0]))
     for chain in problem.chains:
         p, x, first = chain.parameter, values[chain.parameter.name], key[chain.parameter.name]
+        if p.begins is not None:
+            out += [({first + j: np.diag(1 / p.sigma[j])}, (p.initial[j] - x[j]) / p.sigma[j]) for j in range(len(x))]
+            continue
         out.append(({first: np.diag(1.0 / p.sigma)}, (p.initial - x[0]) / p.sigma))
         for j in range(len(chain.t) - 1):
             # a Gauss-Markov process, exact between any two times (Gelb 1974, eq. 3.8-8)

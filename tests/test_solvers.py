@@ -13,6 +13,7 @@ from helpers import Array, Factor, dense, errors, factors, truth_states
 
 from graphnav.config import Settings, settings_from
 from graphnav.constraints.gnss import LEVER_ARM, SLOW_ERRORS
+from graphnav.constraints.standstill import PLACE
 from graphnav.dynamics import SCALE
 from graphnav.earth import LocalFrame
 from graphnav.formats import read
@@ -65,13 +66,20 @@ def nearly_linear(kind: str) -> Trio:
     start = truth_states(truth, np.array([recording.start]), frame)
     start = replace(start, ba=np.zeros((1, 3)), bg=np.zeros((1, 3)))
     sigma = np.repeat([1e-5, 0.05, 1e-3, 1e-3, 1e-6], 3)
-    problem = pose(recording, settings_from({"gnss": gnss, "vehicle": NO_WHEELS}), frame, start, sigma)
+    settings = settings_from({"gnss": gnss, "vehicle": NO_WHEELS})
+    stops = np.array([[0.5, 2.0], [3.0, 4.5]]) if kind == "stops" else None
+    problem = pose(recording, settings, frame, start, sigma, stops)
     forward = ekf(problem)
     smoothed = rts(problem, forward)
     return Trio(problem, smoothed, batch(problem, smoothed.states), truth)
 
 
-NODES = {"states": {}, "constants": {SCALE: 1, LEVER_ARM: 1}, "slow": dict.fromkeys(SLOW_ERRORS, 14)}
+NODES = {
+    "states": {},
+    "constants": {SCALE: 1, LEVER_ARM: 1},
+    "slow": dict.fromkeys(SLOW_ERRORS, 14),
+    "stops": {PLACE: 2},
+}
 
 
 @pytest.fixture(scope="module", params=list(NODES))
@@ -105,7 +113,7 @@ def test_both_are_the_dense_least_squares_solution(trio: Trio) -> None:
     """One Gauss-Newton step from the truth, all rows in one matrix: nothing of the solvers in it."""
     problem = trio.problem
     x = truth_states(trio.truth, problem.t, problem.frame)
-    values = {c.parameter.name: np.tile(c.parameter.initial, (len(c.t), 1)) for c in problem.chains}
+    values = {c.parameter.name: c.mean for c in problem.chains}
     parts, widths = factors(problem, x, values)
     step, covariance = dense(parts, widths)
     K = len(problem.t)
@@ -118,15 +126,17 @@ def test_both_are_the_dense_least_squares_solution(trio: Trio) -> None:
         np.testing.assert_allclose(normalised(solution.covariance, blocks), normalised(blocks, blocks), atol=1e-3)
     at = DIM * K
     for chain in problem.chains:
-        shape = (len(chain.t), len(chain.parameter.initial))
+        shape = (len(chain.t), chain.parameter.size)
         part = slice(at, at + shape[0] * shape[1])
         sigma = np.sqrt(np.diag(covariance)[part]).reshape(shape)
-        expected_value = chain.parameter.initial + step[part].reshape(shape)
+        expected_value = chain.mean + step[part].reshape(shape)
+        at = part.stop
+        if chain.parameter.begins is not None:
+            continue  # places of stops are no result
         for solution in (trio.rts, trio.batch):
             p = solution.parameters[chain.parameter.name]
             np.testing.assert_allclose((p.value - expected_value) / sigma, 0.0, atol=1e-3, err_msg=solution.solver)
             np.testing.assert_allclose(p.sigma, sigma, rtol=1e-3, err_msg=solution.solver)
-        at = part.stop
 
 
 # --------------------------------------------------------------------------------------------------- covariances

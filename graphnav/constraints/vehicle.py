@@ -39,7 +39,7 @@ from graphnav.preintegration import Intervals
 from graphnav.recording import Recording
 from graphnav.rotation import Array, mv
 from graphnav.state import Parameter, States
-from graphnav.wheels import MeanSpeed
+from graphnav.wheels import MeanSpeed, faults
 
 MOUNTING = "mounting"
 AXLE = "axle"
@@ -257,7 +257,7 @@ class OdometerSpeed(Wheels):
         s, odometer = scene.settings.vehicle, scene.recording.odometer
         if scene.recording.platform != "vehicle" or odometer is None or not s.odometer:
             return None
-        speed = MeanSpeed.of(odometer)
+        speed = MeanSpeed.of(odometer, faults(odometer, scene.recording.imu).spans)
         rows = moving_rows(scene)
         begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
         reach = _REACH * odometer.delay_sigma

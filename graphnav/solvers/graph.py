@@ -78,8 +78,9 @@ class Eliminated:
 
             P_x = R^-1 R^-T + U P_s U^T        P_xs = U P_s
 
-        The parents of a variable are among the next variable and its parents, because the order runs along a
-        chain; so only that one joint block is ever kept (Kaess and Dellaert 2009, eq. 20-21).
+        Of the joint covariance of what is done only the block is kept that variables still to come have among their
+        parents (Kaess and Dellaert 2009, eq. 20-21): the order runs along a chain, so that is one keyframe and the
+        parameters in force.
 
         Raises
         ------
@@ -89,24 +90,30 @@ class Eliminated:
         out: dict[int, Array] = {}
         where: dict[int, range] = {}  # columns of the joint block, per variable in it
         joint = np.zeros((0, 0))
-        for i in range(self._net.size() - 1, -1, -1):
-            conditional = self._net.at(i)
+        conditionals = [self._net.at(i) for i in range(self._net.size())]
+        first: dict[int, int] = {}  # the first to be eliminated that has a variable as parent: the last to ask for it
+        for i, conditional in enumerate(conditionals):
+            for parent in conditional.keys()[1:]:
+                first.setdefault(parent, i)
+        for i in range(len(conditionals) - 1, -1, -1):
+            conditional = conditionals[i]
             key, *parents = conditional.keys()
             R_inverse, singular = dtrtri(conditional.R())
             if singular:
                 raise EstimationError("the data leave something undetermined: there is no covariance")
             n = len(R_inverse)
-            index = [column for p in parents for column in where[p]]
+            kept = [*parents, *(k for k in where if first.get(k, i) < i and k not in parents)]
+            index = [column for p in kept for column in where[p]]
             below, joint = joint, np.empty((n + len(index), n + len(index)))
             joint[:n, :n] = R_inverse @ R_inverse.T
-            if parents:
+            if index:
                 P_s = below if index == list(range(len(below))) else below[np.array(index)[:, None], index]
                 U = -R_inverse @ conditional.S()
-                P_xs = U @ P_s
-                joint[:n, :n] += P_xs @ U.T
+                P_xs = U @ P_s[: U.shape[1]]
+                joint[:n, :n] += P_xs[:, : U.shape[1]] @ U.T
                 joint[:n, n:], joint[n:, :n], joint[n:, n:] = P_xs, P_xs.T, P_s
-            edges = list(itertools.accumulate([n, *(len(where[p]) for p in parents)], initial=0))
-            where = {k: range(lo, hi) for k, lo, hi in zip([key, *parents], edges, edges[1:], strict=False)}
+            edges = list(itertools.accumulate([n, *(len(where[p]) for p in kept)], initial=0))
+            where = {k: range(lo, hi) for k, lo, hi in zip([key, *kept], edges, edges[1:], strict=False)}
             if keys is None or key in keys:
                 out[key] = joint[:n, :n].copy()
         return out
