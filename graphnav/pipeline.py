@@ -86,7 +86,7 @@ def _solve(
         "judgement": judged - after,
         "preintegration": time.perf_counter() - judged,
     }
-    forward = ekf(problem, progress)
+    forward = ekf(problem, progress, aligned.until)
     out = {"ekf": forward.solution}
     if "rts" in solvers or "batch" in solvers:
         out["rts"] = rts(problem, forward, progress)
@@ -117,7 +117,7 @@ def _judged(
     def smoothed(how: Settings) -> tuple[Problem, Filtered, Smoothed]:
         noisy = replace(part, imu=replace(part.imu, noise=noise))
         problem = judgement.weighted(pose(noisy, how, frame, aligned.state, aligned.sigma), weight)
-        forward = ekf(problem)
+        forward = ekf(problem, opening=aligned.until)
         return problem, forward, backward(problem, forward)
 
     problem, forward, back = smoothed(plain)
@@ -155,7 +155,7 @@ def _start(
     turn = np.linalg.norm(aligned.state.minus(stated.state)[0, :3])
     if turn > _FAR:
         other = replace(problem, prior=replace(problem.prior, mean=aligned.state, sigma=aligned.sigma[None]))
-        smoothed = rts(other, ekf(other))
+        smoothed = rts(other, ekf(other, opening=aligned.until))
     return smoothed.states, {name: p.value for name, p in smoothed.parameters.items()}
 
 

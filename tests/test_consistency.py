@@ -22,7 +22,7 @@ AXES = ("east", "north", "up", "roll", "pitch", "heading")
 LOW, HIGH = 0.7, 1.4
 # s from which a solver is judged. A filter linearises about the attitude of the moment, and its smoother keeps those
 # Jacobians: around the first motion its pitch is several sigmas off. The batch solver linearises at the answer.
-SETTLED = {"ekf": 30.0, "rts": 90.0, "batch": 0.0}
+SETTLED = {"ekf": 30.0, "rts": 0.0, "batch": 0.0}
 
 
 @dataclass(frozen=True)
