@@ -72,6 +72,95 @@ class GnssSettings(_Section):
     )
 
 
+class StandstillSettings(_Section):
+    """What is used where the platform stands still."""
+
+    zero_velocity: bool = Field(True, description="no velocity")
+    zero_rate: bool = Field(True, description="no turn rate (vehicles only: a foot rolls over its stance)")
+    held_position: bool = Field(True, description="one place for a whole stop")
+
+
+class VehicleSettings(_Section):
+    """What is used of a vehicle's wheels."""
+
+    nhc: bool = Field(True, description="no speed sideways and up where the wheels do not slip")
+    odometer: bool = Field(True, description="use the odometer where there is one")
+    nhc_density: tuple[float, float] = Field(
+        (0.03, 0.03), description="m/s/sqrt(Hz), noise of sideways and upward speed"
+    )
+    mounting: tuple[float, float] = Field(
+        (0.0, 0.0), description="deg, expected pitch and heading of the IMU against the vehicle"
+    )
+    mounting_sigma: float = Field(6.0, ge=0, description="deg, 1-sigma of those; 0 = exact, not estimated")
+    mounting_walk: float = Field(0.05, ge=0, description="deg in a minute, how they wander: load, wind, road crown")
+    axle_sigma: float = Field(
+        0.3, ge=0, description="m, 1-sigma of where along the vehicle the point lies that does not slip"
+    )
+    unstated_axle_sigma: float = Field(1.5, ge=0, description="m, the same where no odometer lever arm is given")
+    body_sigma: float = Field(
+        0.006, ge=0, description="rad per m/s^2, 1-sigma of side slip and squat; 0 = none, not estimated"
+    )
+    scale_walk: float = Field(1e-4, ge=0, description="1 in a minute, how the odometer's scale wanders: tyres, load")
+    robust: Kernel = Field("none", description="robust kernel of the smoother")
+    robust_scale: float = Field(3.0, gt=0, description="whitened norm of a row at which the kernel bends")
+    gate: float | None = Field(None, gt=0, description="whitened norm above which the filter rejects a row")
+
+
+class SwaySettings(_Section):
+    """The stillness detector: the GLRT below the engine's frequencies."""
+
+    window: float = Field(2.0, gt=0.3, le=30, description="s, length of a window")
+    threshold: float = Field(3.0, gt=0, description="of the statistic; 1 is the sensor's noise and a body that sways")
+    from_data: bool = Field(True, description="move the threshold into the valley between still and moving windows")
+    force: float = Field(0.005, gt=0, description="m/s^2, 1-sigma per axis that a standing vehicle sways with")
+    rate: float = Field(2.5e-4, gt=0, description="rad/s, 1-sigma per axis that a standing vehicle sways with")
+
+
+class GlrtSettings(_Section):
+    """The GLRT and its relatives."""
+
+    window: float = Field(1.0, gt=0, le=30, description="s, length of a window")
+    threshold: float | None = Field(None, gt=0, description="of the GLRT; found from the recording if unset")
+
+
+class FftSettings(_Section):
+    """The detector of an engine's idle line; the paper's values (Li 2024, section 4.2)."""
+
+    window: float = Field(3.0, ge=1, le=30, description="s, length of a window")
+    step: float = Field(1.0, ge=0.1, le=30, description="s between the starts of windows")
+    bands: tuple[float, float, float] = Field(
+        (10.0, 20.0, 30.0), description="Hz, upper ends of the bands of Peak-0, Peak-1 and Peak-2"
+    )
+    force_limit: float = Field(15.0, gt=0, description="mg, above which no peak of the force may rise")
+    rate_limit: float = Field(0.7, gt=0, description="deg/s, above which no peak of the pitch rate may rise")
+    force_ratio: float = Field(1.5, gt=0, description="that times Peak-1 and Peak-2 must exceed Peak-0 of the force")
+    rate_ratio: float = Field(7.0, gt=0, description="times Peak-0 that Peak-1 of the pitch rate must reach")
+    max_speed: float = Field(0.5, gt=0, description="m/s, of a known speed above which nothing is stationary")
+    find_line: bool = Field(True, description="find the idle line from 8 to 50 Hz and move the bands with it")
+
+
+class FusionSettings(_Section):
+    """From the detectors' answers to stationary intervals."""
+
+    min_duration: float = Field(1.0, gt=0, description="s, the shortest interval")
+    margin: float = Field(0.1, ge=0, description="s, taken off both ends of every interval")
+    bridge: float = Field(
+        30.0, ge=0, description="s, the longest disturbance that is bridged where the force integrates to no motion"
+    )
+    bridge_speed: float = Field(0.1, gt=0, description="m/s, of that integral above which the vehicle did move")
+    max_speed: float = Field(0.15, gt=0, description="m/s, of a measured speed that is not yet motion")
+    odometer_delay: float = Field(0.7, ge=0, description="s, by which an odometer may be late")
+
+
+class DetectorSettings(_Section):
+    """Where the vehicle stands."""
+
+    sway: SwaySettings = SwaySettings()
+    glrt: GlrtSettings = GlrtSettings()
+    fft: FftSettings = FftSettings()
+    fusion: FusionSettings = FusionSettings()
+
+
 class SolverSettings(_Section):
     """The batch solver's outer loop."""
 
@@ -88,7 +177,14 @@ class Settings(_Section):
     alignment: AlignmentSettings = AlignmentSettings()
     imu: ImuSettings = ImuSettings()
     gnss: GnssSettings = GnssSettings()
+    detectors: DetectorSettings = DetectorSettings()
+    standstill: StandstillSettings = StandstillSettings()
+    vehicle: VehicleSettings = VehicleSettings()
     solver: SolverSettings = SolverSettings()
+
+    def without_wheels(self) -> Settings:
+        """The same with nothing assumed of wheels."""
+        return self.model_copy(update={"vehicle": self.vehicle.model_copy(update={"nhc": False, "odometer": False})})
 
 
 def settings_from(values: Mapping[str, Any], source: str = "settings") -> Settings:

@@ -11,6 +11,7 @@ import numpy as np
 from graphnav import judgement
 from graphnav.alignment import Alignment, align, with_known_heading
 from graphnav.config import Settings
+from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.problem import Problem, pose
@@ -73,16 +74,19 @@ def _solve(
     recording: Recording, settings: Settings, frame: LocalFrame, solvers: tuple[str, ...], progress: Progress | None
 ) -> dict[str, Solution]:
     began = time.perf_counter()
+    stationary = detect(recording, settings).stationary
+    detected = time.perf_counter()
     aligned = align(
         recording, settings, frame, lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)
     )
     after = time.perf_counter()
-    recording, settings, said = _judged(recording, settings, frame, aligned)
+    recording, settings, said = _judged(recording, settings, frame, aligned, stationary)
     judged = time.perf_counter()
     stated = with_known_heading(aligned, settings)
-    problem = pose(recording, settings, frame, stated.state, stated.sigma)
+    problem = pose(recording, settings, frame, stated.state, stated.sigma, stationary)
     timings = {
-        "alignment": after - began,
+        "detection": detected - began,
+        "alignment": after - detected,
         "judgement": judged - after,
         "preintegration": time.perf_counter() - judged,
     }
@@ -104,19 +108,20 @@ def _solve(
 
 
 def _judged(
-    recording: Recording, settings: Settings, frame: LocalFrame, aligned: Alignment
+    recording: Recording, settings: Settings, frame: LocalFrame, aligned: Alignment, stationary: np.ndarray
 ) -> tuple[Recording, Settings, tuple[str, ...]]:
     """Recording and settings with the figures of IMU and fixes judged by the first part of the drive."""
     gnss, stated = settings.gnss, recording.imu.noise
     if aligned.motion is None or not gnss.position:
         return recording, settings, ()
-    plain = settings.model_copy(update={"gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0})})
+    free = settings.without_wheels()  # wheels are judged by what comes of this, so they have no say in it
+    plain = free.model_copy(update={"gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0})})
     part = judgement.stretch(recording, aligned.motion)
     noise, weight = stated, None
 
     def smoothed(how: Settings) -> tuple[Problem, Filtered, Smoothed]:
         noisy = replace(part, imu=replace(part.imu, noise=noise))
-        problem = judgement.weighted(pose(noisy, how, frame, aligned.state, aligned.sigma), weight)
+        problem = judgement.weighted(pose(noisy, how, frame, aligned.state, aligned.sigma, stationary), weight)
         forward = ekf(problem, opening=aligned.until)
         return problem, forward, backward(problem, forward)
 
@@ -127,7 +132,7 @@ def _judged(
     fixes = judgement.judge_fixes(problem, back)
     if not settings.imu.as_stated and judgement.judge_imu(problem, forward, back).clear:
         # fixes that wander would pass for noise of the IMU: it is judged with their wandering in the problem
-        judged = plain if fixes is None else fixes.applied(settings)
+        judged = plain if fixes is None else fixes.applied(free)
         for _ in range(judgement.ROUNDS):
             imu = judgement.judge_imu(*smoothed(judged))
             better = imu.applied(noise, stated)

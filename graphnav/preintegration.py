@@ -65,6 +65,12 @@ class Intervals:
     rate: Array  # (n, 3) mean rate and force less those biases: what scale errors multiply
     force: Array  # (n, 3)
     covariance: Array  # (n, 15, 15)
+    past_turn: (
+        Array  # (n, 3, 3) means over the interval, s before its end: C(s) from the axes at its end to those at s,
+    )
+    past_late: Array  # (n, 3, 3) s C(s), s
+    past_dV: Array  # (n, 3) C(s) times the force integrated from s to the end (in the axes there), m/s
+    past_ba: Array  # (n, 3, 3) and its derivative by ba, s
 
     def __len__(self) -> int:
         return len(self.t0)
@@ -316,8 +322,24 @@ def _integrate(
     theta_bg = np.swapaxes(dR, -1, -2) @ A[:, -1]
     return Intervals(
         t[rows], t[rows + 1], dR, V[:, -1], P[:, -1], theta_bg, A[:, -1], B[:, -1], PA[:, -1], PB[:, -1],
-        np.array(ba), np.array(bg), mean(w), mean(f), Q,
+        np.array(ba), np.array(bg), mean(w), mean(f), Q, *_past(edge, R, V, A),
     )  # fmt: skip
+
+
+def _past(edge: Array, R: Array, V: Array, A: Array) -> tuple[Array, Array, Array, Array]:
+    """What the mean velocity over an interval is made of, seen from its end; by the trapezoidal rule."""
+    T = edge[:, -1:]
+    h = np.diff(edge, axis=1)
+    weight = np.zeros_like(edge)
+    weight[:, 1:] += h
+    weight[:, :-1] += h
+    weight /= 2.0 * T
+    turned = np.einsum("nl,nlji->nij", weight, R)  # mean of R(t)^T
+    late = np.einsum("nl,nlji->nij", weight * (T - edge), R)
+    left = np.concatenate([V[:, -1:] - V, np.swapaxes(A[:, -1:] - A, -1, -2).reshape(*edge.shape, 9)], -1)
+    left = left.reshape(*edge.shape, 4, 3) @ R  # rows times R: columns times R^T
+    left = np.einsum("nl,nlki->nik", weight, left)
+    return turned @ R[:, -1], late @ R[:, -1], left[..., 0], left[..., 1:]
 
 
 def _summed(terms: Array) -> Array:

@@ -22,16 +22,17 @@ NODE_SPACING = 5.0  # s between the nodes of a slowly moving parameter: a twenti
 
 @dataclass(frozen=True)
 class ParameterChain:
-    """A parameter and its nodes: one for a constant, one every `NODE_SPACING` for a slow one."""
+    """A parameter and its nodes: one for a constant, one every `NODE_SPACING` for a slow one.
+
+    From node to node: value - mean -> decay (value - mean) + white noise of `sigma`.
+    """
 
     parameter: Parameter
     t: Array  # (n,) s
     node: Array  # (K,) int, the node in force at each keyframe
-
-    @property
-    def steps(self) -> tuple[Array, Array]:
-        """Decay (n-1,) and sigma (n-1, k) from node to node."""
-        return self.parameter.step(np.diff(self.t))
+    mean: Array  # (n, k)
+    sigma: Array  # (n, k): of the first node, and of what is added on the way to each other
+    decay: Array  # (n,), that of the first means nothing
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Problem:
         """Where each parameter stands behind the fifteen states in an augmented error state."""
         out, at = {}, DIM
         for chain in self.chains:
-            width = len(chain.parameter.initial)
+            width = chain.parameter.size
             out[chain.parameter.name] = slice(at, at + width)
             at += width
         return out
@@ -66,21 +67,30 @@ class Problem:
         return replace(self, intervals=intervals, motion=Motion(intervals, self.frame))
 
 
-def pose(recording: Recording, settings: Settings, frame: LocalFrame, start: States, sigma: Array) -> Problem:
+def pose(
+    recording: Recording,
+    settings: Settings,
+    frame: LocalFrame,
+    start: States,
+    sigma: Array,
+    stationary: Array | None = None,
+) -> Problem:
     """Pose the estimation problem for a recording.
 
     Parameters
     ----------
     start : one state at the start of the recording: mean of the prior and where biases are expected.
     sigma : (15,) 1-sigma of the prior.
+    stationary : (M, 2) spans in which the platform stands still, s; none when None.
     """
     classes = registered()
-    wanted = [cls.epochs(recording, settings) for cls in classes]
+    stops = _inside(stationary, recording)
+    wanted = [cls.epochs(recording, settings, stops) for cls in classes]
     t = keyframe_times(recording.start, recording.end, np.concatenate([*wanted, np.empty(0)]), settings.keyframes.rate)
-    scene = Scene(recording, settings, frame, t)
-    built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
     samples = bridge_gaps(recording.imu)
     intervals = preintegrate(samples, recording.imu, t, start.ba[0], start.bg[0])
+    scene = Scene(recording, settings, frame, t, stops, intervals)
+    built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
     prior = InitialPrior(keyframe=np.zeros(1, dtype=int), mean=start, sigma=np.asarray(sigma)[None])
     return Problem(
         recording=recording,
@@ -108,12 +118,27 @@ def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Arra
     return np.append(np.repeat(fixed[:-1], parts) + within * step, fixed[-1])
 
 
+def _inside(stationary: Array | None, recording: Recording) -> Array:
+    """The parts of stationary spans that a recording covers, (M, 2)."""
+    if stationary is None or not len(stationary):
+        return np.empty((0, 2))
+    cut = np.clip(stationary, recording.start, recording.end)
+    return cut[cut[:, 1] - cut[:, 0] > SAME_TIME]
+
+
 def _chains(parameters: tuple[Parameter, ...], t: Array) -> tuple[ParameterChain, ...]:
     chains = []
-    for parameter in {p.name: p for p in parameters}.values():
-        count = 1 if parameter.constant else max(1, round((t[-1] - t[0]) / NODE_SPACING))
-        nodes = t[0] + (t[-1] - t[0]) / count * np.arange(count)
-        chains.append(ParameterChain(parameter, nodes, np.searchsorted(nodes, t, side="right") - 1))
+    for p in {p.name: p for p in parameters}.values():
+        if p.begins is not None:
+            nodes, mean, sigma, decay = p.begins, p.initial, p.sigma, np.zeros(len(p.begins))
+        else:
+            count = 1 if p.constant else max(1, round((t[-1] - t[0]) / NODE_SPACING))
+            nodes = t[0] + (t[-1] - t[0]) / count * np.arange(count)
+            ahead, added = p.step(np.diff(nodes))
+            mean = np.tile(p.initial, (count, 1))
+            sigma, decay = np.concatenate([p.sigma[None], added]), np.concatenate([[0.0], ahead])
+        node = np.maximum(np.searchsorted(nodes, t + SAME_TIME, side="right") - 1, 0)
+        chains.append(ParameterChain(p, nodes, node, mean, sigma, decay))
     return tuple(chains)
 
 

@@ -32,24 +32,32 @@ DIM = 15
 
 @dataclass(frozen=True)
 class Parameter:
-    """Something estimated beside the states: a constant, a random walk, or a stationary Gauss-Markov process."""
+    """Something estimated beside the states: a constant, a random walk, a stationary Gauss-Markov process, or a
+    constant that begins anew at given times.
+    """
 
     name: str
-    initial: Array  # (k,)
-    sigma: Array  # (k,) 1-sigma of the initial value
+    initial: Array  # (k,), or (n, k) for one that begins anew
+    sigma: Array  # the same shape, 1-sigma of the initial value
     unit: str
-    walk: float = 0.0  # unit/sqrt(s) of a random walk; 0 = one constant for the whole recording
+    walk: float | Array = 0.0  # unit/sqrt(s) of a random walk, (k,) or one for all; 0 = constant
     correlation_time: float | None = None  # s; given, a Gauss-Markov process about zero with `sigma` at all times
+    begins: Array | None = None  # (n,) s; given, `initial` and `sigma` hold anew from each of these times on
+
+    @property
+    def size(self) -> int:
+        """k"""
+        return int(np.shape(self.initial)[-1])
 
     @property
     def constant(self) -> bool:
         """One value for the whole recording."""
-        return self.walk == 0.0 and self.correlation_time is None
+        return self.begins is None and self.correlation_time is None and not np.any(self.walk)
 
     def step(self, dt: Array) -> tuple[Array, Array]:
         """Decay (n,) and sigma (n, k) of what is added over times dt (n,)."""
         if self.correlation_time is None:
-            return np.ones_like(dt), self.walk * np.sqrt(dt)[:, None] * np.ones_like(self.sigma)
+            return np.ones_like(dt), np.sqrt(dt)[:, None] * np.broadcast_to(self.walk, self.sigma.shape)
         decay = np.exp(-dt / self.correlation_time)
         return decay, np.sqrt(1.0 - decay**2)[:, None] * self.sigma
 

@@ -17,12 +17,14 @@ from graphnav.constraints.base import Constraint, Scene, assemble
 from graphnav.constraints.gnss import LEVER_ARM, GnssPosition
 from graphnav.constraints.prior import InitialPrior
 from graphnav.earth import LocalFrame
+from graphnav.preintegration import bridge_gaps, preintegrate
 from graphnav.problem import Problem, keyframe_times, pose
 from graphnav.recording import Recording
 from graphnav.solvers.ekf import ekf
 from graphnav.solvers.graph import LinearGraph
 from graphnav.state import BLOCKS, DIM, States
 
+STANDING = np.array([[3.0, 14.0], [88.0, 104.0]])  # parts of two stops of the path below, s
 SIGMA = np.repeat([0.05, 1.0, 0.5, 0.05, 1e-3], 3)
 
 
@@ -45,6 +47,15 @@ def with_parameters() -> Settings:
     return settings_from({"gnss": {"lever_arm_sigma": 0.5}})
 
 
+def scene_of(cls: type[Constraint], recording: Recording, settings: Settings, frame: LocalFrame) -> Scene:
+    """A scene with the keyframes one constraint asks for."""
+    inside = STANDING[(STANDING[:, 0] >= recording.start) & (STANDING[:, 1] <= recording.end)]
+    t = keyframe_times(recording.start, recording.end, cls.epochs(recording, settings, inside), 1.0)
+    imu = recording.imu
+    intervals = preintegrate(bridge_gaps(imu), imu, t, np.full(3, 0.02), np.full(3, 1e-3))
+    return Scene(recording, settings, frame, t, inside, intervals)
+
+
 def prior_row(rng: np.random.Generator) -> InitialPrior:
     return InitialPrior(keyframe=np.zeros(1, dtype=int), mean=random_states(rng, 1), sigma=SIGMA[None])
 
@@ -56,11 +67,13 @@ def build(name: str, recording: Recording, settings: Settings) -> Case:
     else:
         cls = next(c for c in registered() if c.name == name)
         frame = LocalFrame(recording.gnss.llh[0])
-        t = keyframe_times(recording.start, recording.end, cls.epochs(recording, settings), 1.0)
-        rows = cls.build(Scene(recording, settings, frame, t))
+        rows = cls.build(scene_of(cls, recording, settings, frame))
     assert rows is not None, f"the drive holds nothing for '{name}': extend it"
     n = len(rows)
-    values = {p.name: p.initial + p.sigma * rng.standard_normal((n, len(p.initial))) for p in rows.parameters}
+    values = {}
+    for p in rows.parameters:
+        initial, sigma = (x if p.begins is None else x[0] for x in (p.initial, p.sigma))
+        values[p.name] = initial + sigma * rng.standard_normal((n, p.size))
     return Case(rows, random_states(rng, n, span=500.0), values)
 
 
@@ -87,7 +100,7 @@ def test_shapes_and_units(case: Case) -> None:
     assert np.all(np.diff(rows.keyframe) >= 0)
     assert rows.unit
     for key, J in linear.jacobians.items():
-        width = 3 if key in BLOCKS else len(next(p for p in rows.parameters if p.name == key).initial)
+        width = 3 if key in BLOCKS else next(p for p in rows.parameters if p.name == key).size
         assert J.shape == (n, m, width), key
     assert {p.name for p in rows.parameters} <= set(linear.jacobians), "a parameter that no row depends on"
 
@@ -107,7 +120,7 @@ def test_jacobians_numerically(case: Case) -> None:
             values = {**case.values, name: case.values[name] + delta}
             return case.rows.linearize(case.states, values, slice(None)).residual
 
-        numerical = difference(along, 1e-3 * p.sigma)
+        numerical = difference(along, 1e-3 * p.sigma.reshape(-1, p.size)[0])
         scale = max(1.0, np.abs(numerical).max())
         np.testing.assert_allclose(linear.jacobians[p.name], numerical, atol=1e-6 * scale, err_msg=p.name)
 
@@ -133,19 +146,20 @@ def test_filter_update_is_one_linear_graph_step(case: Case) -> None:
     parameters = {p.name: p for p in case.rows.parameters}
     columns, at = {}, DIM
     for name, p in parameters.items():
-        columns[name] = slice(at, at + len(p.initial))
-        at += len(p.initial)
-    root = rng.standard_normal((at, at)) * np.concatenate([SIGMA, *(p.sigma for p in parameters.values())])[:, None]
+        columns[name] = slice(at, at + p.size)
+        at += p.size
+    sigma_p = [p.sigma.reshape(-1, p.size)[0] for p in parameters.values()]
+    root = rng.standard_normal((at, at)) * np.concatenate([SIGMA, *sigma_p])[:, None]
     P = root @ root.T / at
     # Kalman
     H, r, sigma = assemble(linear, columns, at)[0], linear.residual[0], linear.sigma[0]
     S = H @ P @ H.T + np.diag(sigma**2)
     gain = np.linalg.solve(S, H @ P).T
     mean, covariance = -gain @ r, P - gain @ S @ gain.T
-    # graph: the state and its parameters are separate variables, joined by the prior
+    # graph: the state and its parameters are two variables, joined by the prior
     graph = LinearGraph()
     W = np.linalg.inv(np.linalg.cholesky(P))
-    parts = [slice(0, DIM), *columns.values()]
+    parts = [slice(0, DIM), slice(DIM, at)][: 1 + bool(columns)]
     graph.add([(np.array([i]), W[None, :, part]) for i, part in enumerate(parts)], np.zeros((1, at)))
     white = H / sigma[:, None]
     graph.add([(np.array([i]), white[None, :, part]) for i, part in enumerate(parts)], (-r / sigma)[None])
@@ -200,33 +214,30 @@ def test_epochs_lie_within_the_imu(name: str, recording: Recording) -> None:
     imu = recording.imu
     inside = (imu.t > recording.start + 50.3) & (imu.t < recording.start + 81.7)
     short = replace(recording, imu=replace(imu, t=imu.t[inside], gyro=imu.gyro[inside], accel=imu.accel[inside]))
-    epochs = cls.epochs(short, settings)
+    epochs = cls.epochs(short, settings, np.empty((0, 2)))
     assert np.all((epochs >= short.start) & (epochs <= short.end))
-    t = keyframe_times(short.start, short.end, epochs, 1.0)
-    rows = cls.build(Scene(short, settings, LocalFrame(recording.gnss.llh[0]), t))
-    if rows is None:
-        assert len(epochs) == 0
-        return
-    assert 0 < len(rows) == len(epochs) < len(cls.epochs(recording, settings))
-    np.testing.assert_allclose(t[rows.keyframe], epochs, atol=1e-6)
+    scene = scene_of(cls, short, settings, LocalFrame(recording.gnss.llh[0]))
+    rows = cls.build(scene)
+    if len(epochs):
+        assert 0 < len(rows) == len(epochs) < len(cls.epochs(recording, settings, STANDING))
+        np.testing.assert_allclose(scene.t[rows.keyframe], epochs, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_recording_without_the_sensor_has_no_rows(name: str, recording: Recording) -> None:
     cls = next(c for c in registered() if c.name == name)
-    bare = replace(recording, gnss=None, odometer=None)
-    assert len(cls.epochs(bare, Settings())) == 0
-    frame = LocalFrame(recording.gnss.llh[0])
-    assert cls.build(Scene(bare, Settings(), frame, np.array([bare.start, bare.end]))) is None
+    bare = replace(recording, gnss=None, odometer=None, platform="foot")
+    assert len(cls.epochs(bare, Settings(), np.empty((0, 2)))) == 0
+    scene = scene_of(cls, bare, Settings(), LocalFrame(recording.gnss.llh[0]))
+    assert cls.build(replace(scene, stationary=np.empty((0, 2)))) is None
 
 
 @pytest.mark.parametrize("kind", ["position", "velocity"])
 def test_a_switched_off_measurement_has_no_rows(kind: str, recording: Recording) -> None:
     cls = next(c for c in registered() if c.name == f"gnss_{kind}")
     off = settings_from({"gnss": {kind: False}})
-    assert len(cls.epochs(recording, off)) == 0
-    t = recording.gnss.t[:5]
-    assert cls.build(Scene(recording, off, LocalFrame(recording.gnss.llh[0]), t)) is None
+    assert len(cls.epochs(recording, off, STANDING)) == 0
+    assert cls.build(scene_of(cls, recording, off, LocalFrame(recording.gnss.llh[0]))) is None
 
 
 def test_gnss_rows_are_the_measurement_of_the_truth(recording: Recording) -> None:
@@ -238,9 +249,9 @@ def test_gnss_rows_are_the_measurement_of_the_truth(recording: Recording) -> Non
     for cls in registered():
         if not cls.name.startswith("gnss"):
             continue
-        t = cls.epochs(made, Settings())
-        rows = cls.build(Scene(made, Settings(), frame, t))
-        residual = rows.linearize(truth_states(truth, t, frame), {}, slice(None)).residual
+        scene = scene_of(cls, made, Settings(), frame)
+        rows = cls.build(scene)
+        residual = rows.linearize(truth_states(truth, scene.t[rows.keyframe], frame), {}, slice(None)).residual
         assert np.abs(residual).max() < (2e-6 if cls is GnssPosition else 2e-3), cls.name
 
 

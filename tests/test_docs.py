@@ -19,6 +19,7 @@ from graphnav.config import Settings, read_settings
 from graphnav.constraints import registered
 from graphnav.constraints.base import Scene, assemble
 from graphnav.earth import LocalFrame
+from graphnav.preintegration import bridge_gaps, preintegrate
 from graphnav.formats import read
 from graphnav.pipeline import SOLVERS
 
@@ -80,7 +81,9 @@ def test_the_example_of_a_constraint_keeps_the_contract():
     exec(compile(text, "constraints.md", "exec"), module.__dict__)
     recording, _ = oracle.drive(oracle.vehicle_path(120.0, 50.0))
     t = np.arange(recording.start, recording.end, 5.0)
-    rows = module.NotSteep.build(Scene(recording, Settings(), LocalFrame(recording.gnss.llh[0]), t))
+    intervals = preintegrate(bridge_gaps(recording.imu), recording.imu, t, np.zeros(3), np.zeros(3))
+    frame = LocalFrame(recording.gnss.llh[0])
+    rows = module.NotSteep.build(Scene(recording, Settings(), frame, t, np.empty((0, 2)), intervals))
     states = random_states(np.random.default_rng(0), len(rows))
     found = rows.linearize(states, {}, slice(None))
     assert found.residual.shape == found.sigma.shape == (len(t), 1)

@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "graphnav"
 # Modules and packages of graphnav, left to right. A new one needs a place here, as far left as it can stand.
 ROOMS = [
     "errors", "rotation", "earth", "state", "config", "recording", "trajectory",
-    "formats", "findings", "crosschecks", "checks_imu", "checks_aiding", "checks",
+    "formats", "findings", "crosschecks", "checks_imu", "checks_aiding", "checks", "detectors",
     "preintegration", "dynamics", "constraints", "problem", "solution", "alignment",
     "dense", "solvers", "judgement", "pipeline",
     "interpolation", "metrics", "scoring", "evaluation", "exporters",

@@ -28,6 +28,7 @@ from graphnav.state import DIM
 from graphnav.trajectory import Trajectory
 
 KERNELS = ("none", "huber", "cauchy", "geman-mcclure", "tukey", "welsch")
+NO_WHEELS = {"nhc": False, "odometer": False}
 WHITE = {"time_offset_sigma": 0.0, "sd_factor": 1.0, "slow_share": 0.0}  # fixes are what they are simulated as
 
 
@@ -64,7 +65,7 @@ def nearly_linear(kind: str) -> Trio:
     start = truth_states(truth, np.array([recording.start]), frame)
     start = replace(start, ba=np.zeros((1, 3)), bg=np.zeros((1, 3)))
     sigma = np.repeat([1e-5, 0.05, 1e-3, 1e-3, 1e-6], 3)
-    problem = pose(recording, settings_from({"gnss": gnss}), frame, start, sigma)
+    problem = pose(recording, settings_from({"gnss": gnss, "vehicle": NO_WHEELS}), frame, start, sigma)
     forward = ekf(problem)
     smoothed = rts(problem, forward)
     return Trio(problem, smoothed, batch(problem, smoothed.states), truth)
@@ -138,7 +139,7 @@ def lap() -> tuple[Recording, Trajectory]:
 def solved_lap(lap: tuple[Recording, Trajectory]) -> tuple[Problem, Solution]:
     """Half a minute with turns, lever arm, time offset and scale estimated; from a start with ordinary doubt."""
     recording, truth = lap
-    settings = settings_from({"gnss": {"lever_arm_sigma": 0.3}})
+    settings = settings_from({"gnss": {"lever_arm_sigma": 0.3}, "vehicle": NO_WHEELS})
     part = recording.crop(30.0, 60.0)
     frame = LocalFrame(part.gnss.llh[0])
     start = truth_states(truth, np.round(np.array([part.start]), 6), frame)
@@ -250,7 +251,7 @@ def worst(a: Solution, truth: Trajectory) -> float:
 
 
 def solve(recording: Recording, kernel: str) -> Solution:
-    return run(recording, settings_from({"gnss": {**WHITE, "robust": kernel}}), solvers=("batch",))["batch"]
+    return run(recording, settings_from({"gnss": {**WHITE, "robust": kernel}, "vehicle": NO_WHEELS}), solvers=("batch",))["batch"]
 
 
 def without(recording: Recording, rows: Array) -> Recording:

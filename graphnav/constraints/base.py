@@ -17,6 +17,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.earth import LocalFrame
+from graphnav.preintegration import Intervals
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.state import BLOCKS, DIM, Parameter, States
@@ -39,6 +40,8 @@ class Scene:
     settings: Settings
     frame: LocalFrame
     t: Array  # (K,) keyframe times, s
+    stationary: Array  # (M, 2) spans in which the platform stands still, s
+    intervals: Intervals  # (K-1) between the keyframes
 
     def keyframe_at(self, t: Array) -> Array:
         """Index of the keyframe at each time, -1 where there is none."""
@@ -70,7 +73,7 @@ class Constraint(ABC):
 
     @classmethod
     @abstractmethod
-    def epochs(cls, recording: Recording, settings: Settings) -> Array:
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
         """Times (s) at which this constraint wants keyframes."""
 
     @classmethod

@@ -87,7 +87,7 @@ class GnssPosition(Constraint):
     usual: Array = field(default_factory=lambda: _empty(0, 3))  # the same, smoothed: the unit of slow errors
 
     @classmethod
-    def epochs(cls, recording: Recording, settings: Settings) -> Array:
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
         if recording.gnss is None or not settings.gnss.position:
             return _empty(0)
         return recording.gnss.t[_usable(recording)]
@@ -163,7 +163,7 @@ class GnssVelocity(Constraint):
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
-    def epochs(cls, recording: Recording, settings: Settings) -> Array:
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
         gnss = recording.gnss
         if gnss is None or gnss.v is None or not settings.gnss.velocity:
             return _empty(0)

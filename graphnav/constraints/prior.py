@@ -32,7 +32,7 @@ class InitialPrior(Constraint):
     sigma: Array = field(default_factory=lambda: np.ones((1, 15)))
 
     @classmethod
-    def epochs(cls, recording: Recording, settings: Settings) -> Array:
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
         return np.empty(0)
 
     @classmethod

@@ -46,7 +46,7 @@ def batch(
     allows intervals to be integrated again when the gyro bias moves far.
     """
     began = time.perf_counter()
-    values = values or {c.parameter.name: np.tile(c.parameter.initial, (len(c.t), 1)) for c in problem.chains}
+    values = {c.parameter.name: c.mean for c in problem.chains} | (values or {})
     point, notes = Point(start, values), []
     if any(c.robust in _REDESCENDING for c in problem.constraints):
         # such a kernel gives up on whatever is far from the start; Cauchy's never quite does, and leads there
@@ -187,6 +187,8 @@ def _estimates(
     out = {}
     for chain in problem.chains:
         p = chain.parameter
+        if p.begins is not None:
+            continue
         group = layout.group_of[p.name]
         at = group.columns[p.name]
         sigma = np.sqrt(np.stack([np.diag(covariances[int(k)])[at] for k in group.keys]))

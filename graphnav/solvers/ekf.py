@@ -39,7 +39,7 @@ from graphnav.constraints.base import Constraint, assemble
 from graphnav.dense import dense
 from graphnav.dynamics import SCALE
 from graphnav.errors import EstimationError
-from graphnav.problem import Problem
+from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.state import DIM, States
@@ -112,8 +112,8 @@ def _forward(problem: Problem, K: int, about: Smoothed | None = None, progress: 
     D = DIM + sum(s.stop - s.start for s in columns.values())
     state = problem.prior.mean
     assert state is not None
-    values = np.concatenate([np.empty(0), *(c.parameter.initial for c in problem.chains)])
-    P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.parameter.sigma for c in problem.chains)]) ** 2)
+    values = np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)])
+    P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
     records = {rows.name: _Innovations(rows) for rows in problem.constraints}
     first = {rows.name: np.searchsorted(rows.keyframe, np.arange(K + 1)) for rows in problem.constraints}
 
@@ -134,10 +134,11 @@ def _forward(problem: Problem, K: int, about: Smoothed | None = None, progress: 
             if scale_at is not None:
                 F[:DIM, scale_at] = problem.motion.scale_columns(step, F15)[0]
             at_values = at_values.copy()
-            for column, decay, sigma in steps.get(k, ()):
-                F[column, column] *= decay
-                at_values[_shift(column)] *= decay
-                added[column] = sigma**2
+            for column, chain, j in steps.get(k, ()):
+                F[column, column] *= chain.decay[j]
+                at_values[_shift(column)] -= chain.mean[j - 1]
+                at_values[_shift(column)] = chain.mean[j] + chain.decay[j] * at_values[_shift(column)]
+                added[column] = chain.sigma[j] ** 2
             P = F @ P @ F.T
             P[:DIM, :DIM] += problem.motion.noise(step, at.R_nb)[0]
             if k in steps:
@@ -327,14 +328,12 @@ class _Innovations:
         )
 
 
-def _node_steps(problem: Problem) -> dict[int, list[tuple[slice, float, Array]]]:
-    """At keyframes where a parameter moves on to its next node: its columns, decay and added sigma."""
-    out: dict[int, list[tuple[slice, float, Array]]] = {}
+def _node_steps(problem: Problem) -> dict[int, list[tuple[slice, ParameterChain, int]]]:
+    """At keyframes where a parameter moves on to its next node: its columns, its chain and that node."""
+    out: dict[int, list[tuple[slice, ParameterChain, int]]] = {}
     for chain in problem.chains:
-        decay, sigma = chain.steps
         for k in np.flatnonzero(np.diff(chain.node)) + 1:
-            j = chain.node[k] - 1
-            out.setdefault(int(k), []).append((problem.columns[chain.parameter.name], float(decay[j]), sigma[j]))
+            out.setdefault(int(k), []).append((problem.columns[chain.parameter.name], chain, int(chain.node[k])))
     return out
 
 
@@ -352,6 +351,8 @@ def _parameters(problem: Problem, values: Array, P: Array) -> dict[str, Paramete
     """At each node: the value after the last keyframe that it governs."""
     out = {}
     for chain in problem.chains:
+        if chain.parameter.begins is not None:
+            continue  # a place of a stop is no calibration
         at = problem.columns[chain.parameter.name]
         last = np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
         sigma = np.sqrt(np.maximum(np.diagonal(P[last][:, at, at], axis1=-2, axis2=-1), 0.0))

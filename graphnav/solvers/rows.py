@@ -1,7 +1,7 @@
 """A problem linearised at a point: whitened rows over graph variables, and its cost there.
 
-Variables are one fifteen-dimensional error state per keyframe, one vector of all constant parameters, and one
-vector of all slow parameters per node; so no row touches more than three of them.
+Variables are one fifteen-dimensional error state per keyframe, and one vector per node of all parameters with the
+same nodes: one for the constants, one for the slow ones, one for what begins anew at stops.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ class Layout:
         self.group_of: dict[str, _Group] = {}
         after: dict[int, list[int]] = {}
         self.width = [DIM] * K
-        for constant in (False, True):
-            chains = [c for c in problem.chains if c.parameter.constant is constant]
-            if not chains:
-                continue
+        alike: dict[bytes, list[ParameterChain]] = {}
+        for chain in problem.chains:
+            alike.setdefault(chain.t.tobytes(), []).append(chain)
+        for chains in sorted(alike.values(), key=lambda some: len(some[0].t), reverse=True):
             columns, at = {}, 0
             for chain in chains:
-                size = len(chain.parameter.initial)
+                size = chain.parameter.size
                 columns[chain.parameter.name] = slice(at, at + size)
                 at += size
             node = chains[0].node
@@ -180,13 +180,12 @@ def _of_rows(rows: Constraint, at_keyframes: Values) -> Values:
 
 def _chain_rows(chain: ParameterChain, group: _Group, value: Array) -> Rows:
     """The prior on a parameter's first node and its way from node to node."""
-    p = chain.parameter
-    pick = np.eye(group.width)[group.columns[p.name]]  # (k, width)
-    keys = group.keys
-    out: Rows = [([(keys[:1], (pick / p.sigma[:, None])[None])], ((p.initial - value[0]) / p.sigma)[None])]
+    pick = np.eye(group.width)[group.columns[chain.parameter.name]]  # (k, width)
+    keys, off = group.keys, value - chain.mean
+    A = pick / chain.sigma[..., None]
+    out: Rows = [([(keys[:1], A[:1])], -off[:1] / chain.sigma[:1])]
     if len(keys) > 1:
-        decay, sigma = chain.steps
-        A = pick / sigma[..., None]
-        out.append(([(keys[:-1], -decay[:, None, None] * A), (keys[1:], A)],
-                    (decay[:, None] * value[:-1] - value[1:]) / sigma))  # fmt: skip
+        decay = chain.decay[1:]
+        out.append(([(keys[:-1], -decay[:, None, None] * A[1:]), (keys[1:], A[1:])],
+                    (decay[:, None] * off[:-1] - off[1:]) / chain.sigma[1:]))  # fmt: skip
     return out

@@ -1,0 +1,174 @@
+"""What standing still says: no velocity, no turn rate, and the place where the platform stopped.
+
+Skog et al. 2010 (zero velocity), Li 2024 (the same, found by the engine's idling). While the wheels stand::
+
+    zero velocity:   v
+    zero rate:       omega_b - b_g - R_nb^T omega_n        mean over the interval that ends at the keyframe
+    held position:   p - a                                 a: one unknown place for each stop
+
+A body on springs is not perfectly still: passengers move it, the engine shakes it. How much, the recording says
+itself: the scatter of the one-interval means of force and rate around their median, over a few intervals, is what
+the sigmas are made of, on top of the sensors' own noise. A force that scatters by s moves a body that sways at 1 Hz
+or more by no more than s / (2 pi) in velocity and s / (2 pi)^2 in position.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d
+
+from graphnav import rotation
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
+from graphnav.recording import Recording
+from graphnav.rotation import Array, mv
+from graphnav.state import Parameter, States
+
+PLACE = "stop_position"
+_NEIGHBOURS = 5  # intervals over which unrest is looked for
+_SWAY = 2.0 * np.pi  # rad/s, the slowest swaying of a body on springs
+_STILL_V, _STILL_P = 1e-3, 1e-3  # m/s, m: no body stands stiller than this
+_FAR = 60.0  # m/s; times the seconds without a fix: how far from the last one a stop may be
+_I3 = np.eye(3)
+
+
+def standing_intervals(scene: Scene) -> tuple[Array, Array]:
+    """Indices of the intervals inside stationary spans, and of the span each lies in."""
+    iv, spans = scene.intervals, scene.stationary
+    if not len(spans):
+        return np.empty(0, dtype=int), np.empty(0, dtype=int)
+    stop = np.searchsorted(spans[:, 0], iv.t0 + SAME_TIME, side="right") - 1
+    inside = (stop >= 0) & (iv.t1 <= spans[np.maximum(stop, 0), 1] + SAME_TIME)
+    rows = np.flatnonzero(inside)
+    return rows, stop[rows]
+
+
+def unrest(scene: Scene, rows: Array, stop: Array) -> tuple[Array, Array]:
+    """Scatter (N, 3) of force (m/s^2) and rate (rad/s) around each interval, sensors' own noise not included."""
+    iv, noise = scene.intervals, scene.recording.imu.noise
+    T = iv.T[rows][:, None]
+    out = []
+    for means, density in ((iv.force, noise.accel_noise_density), (iv.rate, noise.gyro_noise_density)):
+        off = np.zeros((len(rows), 3))
+        for one in np.unique(stop):
+            here = stop == one
+            x = means[rows[here]]
+            change = np.abs(x - np.median(x, axis=0))
+            off[here] = maximum_filter1d(change, min(_NEIGHBOURS, len(x)), axis=0, mode="nearest")
+        out.append(np.sqrt(np.maximum(off**2 - density**2 / T, 0.0)))
+    return out[0], out[1]
+
+
+class _Standing(Constraint):
+    """Rows at the ends of the intervals in which the platform stands."""
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        return stationary.ravel()
+
+
+@dataclass(frozen=True)
+class ZeroVelocity(_Standing):
+    """The platform does not move (ZUPT)."""
+
+    name: ClassVar[str] = "zero_velocity"
+    axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
+    unit: ClassVar[str] = "m/s"
+
+    sigma: Array = field(default_factory=lambda: np.empty((0, 3)))
+
+    @classmethod
+    def build(cls, scene: Scene) -> ZeroVelocity | None:
+        rows, stop = standing_intervals(scene)
+        if not len(rows) or not scene.settings.standstill.zero_velocity:
+            return None
+        force, _ = unrest(scene, rows, stop)
+        # the sway of a body is not known by axis in n: its largest for all
+        sigma = np.hypot(_STILL_V, force.max(axis=1, keepdims=True) / _SWAY)
+        return cls(keyframe=rows + 1, sigma=np.broadcast_to(sigma, (len(rows), 3)))
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        return Linearized(states.v, {"v": np.broadcast_to(_I3, (len(states), 3, 3))}, self.sigma[rows])
+
+
+@dataclass(frozen=True)
+class ZeroRate(_Standing):
+    """The platform does not turn: the gyro reads its bias and the Earth (ZARU)."""
+
+    name: ClassVar[str] = "zero_rate"
+    axes: ClassVar[tuple[str, ...]] = ("right", "forward", "up")
+    unit: ClassVar[str] = "rad/s"
+
+    rate: Array = field(default_factory=lambda: np.empty((0, 3)))  # measured mean
+    omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
+    sigma: Array = field(default_factory=lambda: np.empty((0, 3)))
+
+    @classmethod
+    def build(cls, scene: Scene) -> ZeroRate | None:
+        rows, stop = standing_intervals(scene)
+        if not len(rows) or not scene.settings.standstill.zero_rate or scene.recording.platform != "vehicle":
+            return None
+        _, rate = unrest(scene, rows, stop)
+        own = scene.recording.imu.noise.gyro_noise_density / np.sqrt(scene.intervals.T[rows])
+        return cls(
+            keyframe=rows + 1,
+            rate=scene.intervals.rate[rows] + scene.intervals.bg[rows],
+            omega_n=scene.frame.omega_n,
+            sigma=np.hypot(own[:, None], rate),
+        )
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        earth = mv(np.swapaxes(states.R_nb, -1, -2), self.omega_n)
+        residual = states.bg + earth - self.rate[rows]
+        J = {"theta": rotation.skew(earth), "bg": np.broadcast_to(_I3, (len(states), 3, 3))}
+        return Linearized(residual, J, self.sigma[rows])
+
+
+@dataclass(frozen=True)
+class HeldPosition(_Standing):
+    """The platform is where it stopped."""
+
+    name: ClassVar[str] = "held_position"
+    axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
+    unit: ClassVar[str] = "m"
+
+    sigma: Array = field(default_factory=lambda: np.empty((0, 3)))
+
+    @classmethod
+    def build(cls, scene: Scene) -> HeldPosition | None:
+        rows, stop = standing_intervals(scene)
+        if not len(rows) or not scene.settings.standstill.held_position:
+            return None
+        force, _ = unrest(scene, rows, stop)
+        sigma = np.hypot(_STILL_P, force.max(axis=1, keepdims=True) / _SWAY**2)
+        # a row for the start of each stop, which is the end of an interval in motion
+        first = np.flatnonzero(np.diff(stop, prepend=-1))
+        keyframe = np.concatenate([rows[first], rows + 1])
+        order = np.argsort(keyframe, kind="stable")
+        return cls(
+            keyframe=keyframe[order],
+            sigma=np.repeat(np.concatenate([sigma[first], sigma])[order], 3, axis=1),
+            parameters=(_places(scene, np.unique(stop)),),
+        )
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        one = np.broadcast_to(_I3, (len(states), 3, 3))
+        return Linearized(states.p - parameters[PLACE], {"p": one, PLACE: -one}, self.sigma[rows])
+
+
+def _places(scene: Scene, stops: Array) -> Parameter:
+    """One unknown place per stop: about where the fixes around it say, as far off as a vehicle can go meanwhile."""
+    begins = scene.stationary[stops, 0]
+    gnss = scene.recording.gnss
+    if gnss is None or len(gnss.t) < 2:
+        away, place = begins - scene.t[0], np.zeros((len(begins), 3))
+    else:
+        p = scene.frame.from_llh(gnss.llh)
+        place = np.stack([np.interp(begins, gnss.t, axis) for axis in p.T], -1)
+        after = np.clip(np.searchsorted(gnss.t, begins), 1, len(gnss.t) - 1)
+        away = np.minimum(np.abs(gnss.t[after] - begins), np.abs(begins - gnss.t[after - 1]))
+    sigma = np.repeat((100.0 + _FAR * away)[:, None], 3, axis=1)
+    return Parameter(PLACE, place, sigma, "m", begins=begins)

@@ -1,0 +1,96 @@
+"""Zero-velocity statistics over short windows: generalised likelihood ratio test and its relatives.
+
+For a window of N rows of specific force f_k and turn rate omega_k, with window mean f_bar (Skog et al. 2010, "Zero-
+Velocity Detection - An Algorithm Evaluation", IEEE Trans. Biomed. Eng. 57(11), eq. 9, 13, 15, 18; Ren 2021, eq. 3-5):
+
+    glrt                         1/N sum |f_k - g f_bar/|f_bar||^2 / sigma_a^2 + |omega_k|^2 / sigma_w^2
+    acceleration_variance        1/N sum |f_k - f_bar|^2 / sigma_a^2
+    acceleration_magnitude       1/N sum (|f_k| - g)^2 / sigma_a^2
+    angular_rate_energy          1/N sum |omega_k|^2 / sigma_w^2
+
+Multiplied out, all of them need no more than the window's means of f, |f|, |f|^2 and |omega|^2:
+|f_k - g u|^2 = |f_k|^2 - 2 g f_k.u + g^2 with u = f_bar/|f_bar|, hence mean |f|^2 - 2 g |f_bar| + g^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from graphnav.detectors.windows import running
+from graphnav.rotation import Array
+
+_TINY = 1e-300
+Statistic = Callable[[Array, float, float, float], Array]
+
+
+def rows_for(accel: Array, gyro: Array) -> Array:
+    """[force, rate, |force|, |force|^2, |rate|^2], (N, 9): what the statistics need the means of."""
+    squares = np.einsum("nj,nj->n", accel, accel)
+    turning = np.einsum("nj,nj->n", gyro, gyro)
+    return np.column_stack([accel, gyro, np.sqrt(squares), squares, turning])
+
+
+def glrt(means: Array, sigma_a: float, sigma_w: float, g: float) -> Array:
+    """Generalised likelihood ratio of windows with these means, (W, 9) -> (W,); Skog et al. 2010, eq. 9."""
+    along = np.linalg.norm(means[:, :3], axis=1)
+    force = means[:, 7] - 2.0 * g * along + g * g
+    return np.asarray(np.maximum(force, 0.0) / sigma_a**2 + means[:, 8] / sigma_w**2)
+
+
+def acceleration_variance(means: Array, sigma_a: float, sigma_w: float, g: float) -> Array:
+    """Variance of the force in each window over sigma_a^2; eq. 13."""
+    spread = means[:, 7] - np.einsum("wj,wj->w", means[:, :3], means[:, :3])
+    return np.asarray(np.maximum(spread, 0.0) / sigma_a**2)
+
+
+def acceleration_magnitude(means: Array, sigma_a: float, sigma_w: float, g: float) -> Array:
+    """How far the size of the force is from gravity, over sigma_a^2; eq. 15."""
+    off = means[:, 7] - 2.0 * g * means[:, 6] + g * g
+    return np.asarray(np.maximum(off, 0.0) / sigma_a**2)
+
+
+def angular_rate_energy(means: Array, sigma_a: float, sigma_w: float, g: float) -> Array:
+    """Mean square turn rate over sigma_w^2; eq. 18."""
+    return np.asarray(means[:, 8] / sigma_w**2)
+
+
+STATISTICS: dict[str, Statistic] = {
+    "glrt": glrt,
+    "acceleration_variance": acceleration_variance,
+    "acceleration_magnitude": acceleration_magnitude,
+    "angular_rate_energy": angular_rate_energy,
+}
+
+
+def glrt_statistic(
+    accel: Array, gyro: Array, window: int, sigma_a: float, sigma_w: float, g: float, name: str = "glrt"
+) -> Array:
+    """The statistic of every window of `window` rows: entry k covers rows k ... k + window - 1, (N - window + 1,).
+
+    Parameters
+    ----------
+    accel, gyro : (N, 3) m/s^2, rad/s.
+    window : N of the equations, rows, at least 1.
+    sigma_a, sigma_w : m/s^2, rad/s, 1-sigma noise of a row.
+    g : m/s^2, size of gravity.
+    name : one of `STATISTICS`.
+    """
+    if len(accel) < window:
+        return np.zeros(0)
+    return STATISTICS[name](running(rows_for(accel, gyro)).means(window), sigma_a, sigma_w, g)
+
+
+def stance_mask(statistic: Array, threshold: float, window: int) -> np.ndarray:
+    """Rows that lie in a window below the threshold (Ren 2021, eq. 5), (N,) bool for N - window + 1 statistics."""
+    n = len(statistic) + window - 1
+    below = np.r_[0, np.cumsum(statistic < threshold), 0]
+    row = np.arange(n)
+    first, last = np.maximum(row - window + 1, 0), np.minimum(row + 1, len(statistic))
+    return np.asarray(below[last] > below[first])
+
+
+def log_statistic(statistic: Array) -> Array:
+    """log10, where populations of a statistic are told apart; zero becomes very small, NaN stays."""
+    return np.log10(np.maximum(statistic, _TINY))

@@ -1,0 +1,135 @@
+"""What all windowed statistics share: blocks of rows, running sums over them, and a low-passed copy of the IMU.
+
+Sums of windows are differences of one running sum (O(1) per window, whatever its length). The rows are first summed
+in blocks, so that an hour at 200 Hz leaves 180 000 of them; a low-pass far below an engine's lowest line then
+leaves what the body itself does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from graphnav.recording import Imu
+from graphnav.rotation import Array
+
+BLOCK_RATE = 50.0  # Hz, at least, of the blocks
+_KERNEL = 0.4  # s, length of the low-pass
+_LOW_RATE = 10.0  # Hz, of the low-passed rows
+_LONGEST_GAP = 3.0  # nominal lengths that a block or kernel may cover and still count
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Means over blocks of rows, [force, rate, |force|, |force|^2, |rate|^2] with force (3) and rate (3)."""
+
+    t: Array  # (K,) s, middle of each block
+    end: Array  # (K,) s, its end
+    mean: Array  # (K, 9)
+    period: float  # s per block
+    row_period: float  # s per row of the IMU
+    whole: Array  # (K,) bool, False where a gap lies in the block or before it
+
+    @property
+    def force(self) -> Array:
+        """(K, 3) m/s^2"""
+        return self.mean[:, :3]
+
+    @property
+    def rate(self) -> Array:
+        """(K, 3) rad/s"""
+        return self.mean[:, 3:6]
+
+
+def blocks(imu: Imu, row_period: float) -> Blocks:
+    """Blocks of at most 1/`BLOCK_RATE` s; the rows after the last whole block are left out."""
+    size = max(1, int(1.0 / (BLOCK_RATE * row_period) + 1e-6))
+    count = len(imu.t) // size
+    n = count * size
+    mean = np.empty((count, 9))
+    for values, at, square in ((imu.accel, 0, 7), (imu.gyro, 3, 8)):
+        rows = values[:n].reshape(count, size, 3)
+        mean[:, at : at + 3] = np.einsum("kij->kj", rows) / size
+        norms = np.einsum("nj,nj->n", values[:n], values[:n])
+        mean[:, square] = norms.reshape(count, size).mean(axis=1)
+        if square == 7:
+            mean[:, 6] = np.sqrt(norms).reshape(count, size).mean(axis=1)
+    end = imu.t[size - 1 : n : size]
+    start = np.r_[imu.t[0] - row_period, end[:-1]]
+    whole = end - start < _LONGEST_GAP * size * row_period
+    return Blocks(end - 0.5 * size * row_period, end, mean, size * row_period, row_period, whole)
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Running sums of rows: means over any window for the price of one subtraction."""
+
+    total: Array  # (K + 1, c)
+    offset: Array  # (c,) taken off before summing, so that sums of many hours keep their digits
+
+    def means(self, length: int, step: int = 1) -> Array:
+        """(W, c) means over windows of `length` rows that begin every `step` rows."""
+        last = self.total[length::step]
+        return np.asarray((last - self.total[: -length or None : step][: len(last)]) / length + self.offset)
+
+
+def running(rows: Array) -> Sums:
+    """Running sums down the rows, (K, c)."""
+    offset = rows.mean(axis=0) if len(rows) else np.zeros(rows.shape[1])
+    total = np.zeros((len(rows) + 1, rows.shape[1]))
+    np.cumsum(rows - offset, axis=0, out=total[1:])
+    return Sums(total, offset)
+
+
+def window_times(t: Array, length: int, step: int = 1) -> Array:
+    """Centres of the windows of `Sums.means`."""
+    first = t[: len(t) - length + 1 : step]
+    return np.asarray(0.5 * (first + t[length - 1 :: step]))
+
+
+def unbroken(whole: Array, length: int, step: int = 1) -> Array:
+    """Which of those windows no gap crosses; `whole` as in `Blocks`."""
+    broken = np.r_[0, np.cumsum(~whole)]
+    begin = np.arange(0, len(whole) - length + 1, step)
+    # a gap before the first row of a window does not matter to it
+    return np.asarray(broken[begin + length] - broken[begin + 1] == 0)
+
+
+@dataclass(frozen=True)
+class LowPassed:
+    """The IMU below about 2 Hz: what the body does, without what an engine adds from 8 Hz on."""
+
+    t: Array  # (K,) s, centre of the kernel
+    rows: Array  # (K, 6) force, rate
+    gain: float  # 1/sqrt(s): noise density -> 1-sigma of a row
+    period: float  # s
+    whole: Array  # (K,) bool, False where a gap lies under the kernel
+
+
+def kernel(period: float) -> Array:
+    """A Blackman window of `_KERNEL` s, sum 1: -6 dB at 3 Hz, below -58 dB from 7.5 Hz on."""
+    n = max(2, round(_KERNEL / period))
+    h = np.blackman(n + 2)[1:-1]
+    return np.asarray(h / h.sum())
+
+
+def low_pass(b: Blocks) -> LowPassed:
+    """Low-pass the blocks and keep every tenth of a second."""
+    h = kernel(b.period)
+    step = max(1, int(1.0 / (_LOW_RATE * b.period) + 1e-6))
+    count = max(0, (len(b.t) - len(h)) // step + 1)
+    rows = np.zeros((count, 6))
+    stop = step * (count - 1) + 1
+    for i, weight in enumerate(h if count else ()):
+        rows += weight * b.mean[i : i + stop : step, :6]
+    gain = float(np.sqrt((h**2).sum() / b.period))
+    t = window_times(b.t, len(h), step)[:count] if count else np.zeros(0)
+    whole = unbroken(b.whole, len(h), step)[:count] if count else np.zeros(0, dtype=bool)
+    return LowPassed(t, rows, gain, step * b.period, whole)
+
+
+def smooth(rows: Array, h: Array) -> Array:
+    """Every row low-passed by h, (K - len(h) + 1, c): for a short stretch."""
+    return np.asarray(sliding_window_view(rows, len(h), axis=0) @ h)
