@@ -103,6 +103,33 @@ def compare(
     _solve(names, "--solvers", out, recording, config, without, rate, start, end, quiet)
 
 
+@app.command(epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")
+def detect(
+    recording: Source,
+    out: Out,
+    config: Config = None,
+    without: Without = None,
+    start: Start = None,
+    end: End = None,
+    quiet: Quiet = False,
+) -> None:
+    """Find where the vehicle stands, and write the intervals, the statistics they come from and a picture."""
+    from graphnav import detection_report, outputs, workflow
+    from graphnav.config import Settings, read_settings
+    from graphnav.detectors import detect as detected
+
+    withheld = tuple(workflow.parse_withheld(one) for one in without or ())
+    if start is not None and end is not None and not start < end:
+        raise ConfigError(f"--end {end:g}: must be later than --start {start:g}")
+    settings = Settings() if config is None else read_settings(config)
+    folder = outputs.output_folder(out)
+    used = workflow.read_part(recording, start, end, withheld)
+    found = detected(used, settings)
+    files = detection_report.write(used, found, folder)
+    if not quiet:
+        say(detection_report.text(used, found, files))
+
+
 @app.command(epilog="\b\nExample:\n  graphnav evaluate out/kitti/trajectory.csv truth.csv --json")
 def evaluate(
     trajectory: Annotated[Path, typer.Argument(metavar="TRAJECTORY", help="CSV, TUM, KF-GINS .nav or RTKLIB .pos.")],
@@ -123,6 +150,35 @@ def evaluate(
     if folder is not None:
         outputs.write_evaluation(folder, values, metrics)
     say(outputs.json_text(values) if json else text(metrics))
+
+
+@app.command(epilog="\b\nExample:\n  graphnav simulate urban -o out/urban --seed 1")
+def simulate(
+    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help="Its name; none lists them.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Folder for the recording; made if need be.")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", help="The same seed gives the same recording.")] = 0,
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="An option of the scenario; may be repeated. See --list."),
+    ] = None,
+    listing: Annotated[bool, typer.Option("--list", help="List the scenarios and their options.")] = False,
+) -> None:
+    """Make a recording with truth: a simulated drive, with the errors of simulated sensors."""
+    from graphnav import outputs
+    from graphnav.simulation import catalogue, options_from
+    from graphnav.simulation import simulate as simulated
+
+    if listing or scenario is None:
+        say(catalogue())
+        return
+    if out is None:
+        raise ConfigError("say where to write the recording: -o DIR")
+    folder = outputs.output_folder(out)
+    made = simulated(scenario, seed, **options_from(scenario, option or []))
+    files = made.write(folder)
+    say("\n".join([made.text(), *(f"  {file}" for file in files)]))
 
 
 def _solve(

@@ -88,6 +88,9 @@ class VehicleSettings(_Section):
     nhc_density: tuple[float, float] = Field(
         (0.03, 0.03), description="m/s/sqrt(Hz), noise of sideways and upward speed"
     )
+    odometer_density: float = Field(
+        0.01, ge=0, description="m/s/sqrt(Hz), noise of the speed on top of what its readings show: slip of tyres"
+    )
     mounting: tuple[float, float] = Field(
         (0.0, 0.0), description="deg, expected pitch and heading of the IMU against the vehicle"
     )

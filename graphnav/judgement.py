@@ -29,8 +29,9 @@ import numpy as np
 from scipy.special import chdtr, chdtri, gammaincinv
 
 from graphnav.config import Settings
-from graphnav.constraints.base import Constraint
+from graphnav.constraints.base import Constraint, assemble
 from graphnav.constraints.gnss import GnssPosition
+from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.problem import Problem
 from graphnav.recording import ImuNoise, Recording
 from graphnav.rotation import Array
@@ -46,6 +47,7 @@ _SIGNIFICANT = 3.0  # standard deviations of the estimate of a factor that it mu
 _OUTLIER = 6.0  # whitened norm of a fix that no Gaussian would have
 _MOST = 0.98  # the largest share called slow
 _TRIMMED = 0.01
+_BLOCK = 10.0  # s
 _FEWEST = 30  # fixes or intervals that say anything
 _FIGURES = {
     "gyro_noise_density": slice(0, 3),
@@ -146,6 +148,39 @@ def judge_fixes(problem: Problem, smoothed: Smoothed) -> FixQuality | None:
     return FixQuality(slow_share=min(1.0 - f, _MOST))
 
 
+def judge_wheels(problem: Problem, smoothed: Smoothed) -> tuple[Problem, tuple[str, ...]]:
+    """The problem with the sigmas of wheel constraints raised where their residuals ask for it, and sentences.
+
+    What matters is what errors add up to: camber, wind and load push a vehicle aside for many seconds. So the sums
+    of whitened residuals over `_BLOCK` s are judged, against what white noise of the sigmas used would sum up to.
+    """
+    raised: dict[str, Constraint] = {}
+    notes = []
+    for rows in problem.constraints:
+        if not isinstance(rows, NonHolonomic | OdometerSpeed) or len(rows) < _FEWEST:
+            continue
+        at = rows.keyframe
+        linear = rows.linearize(smoothed.states[at], _values_at(problem, smoothed, rows), slice(None))
+        H = assemble(linear, problem.columns, smoothed.P.shape[-1])
+        left = linear.sigma**2 - np.einsum("nij,njk,nik->ni", H, smoothed.P[at], H, optimize=True)
+        usable = np.all(left > 0.2 * linear.sigma**2, axis=1)
+        block = np.unique(np.floor(problem.t[at[usable]] / _BLOCK), return_inverse=True)[1]
+        factor = np.ones(len(rows.axes))
+        for axis, name in enumerate(rows.axes):
+            weight = 1.0 / linear.sigma[usable, axis] ** 2
+            total = np.bincount(block, weight * linear.residual[usable, axis])
+            variance = np.bincount(block, weight**2 * left[usable, axis])
+            if len(total) < _FEWEST:
+                continue
+            f = _trimmed(total**2 / variance)
+            if np.log(f) > _SIGNIFICANT * _scatter(len(total)):
+                factor[axis] = min(np.sqrt(f), MOST_RAISED)
+                notes.append(f"{rows.name}, {name}: its sigma was multiplied by {factor[axis]:.1f}, as residuals ask")
+        if np.any(factor > 1.0):
+            raised[rows.name] = replace(rows, sigma=rows.sigma * factor)
+    return replace(problem, constraints=tuple(raised.get(c.name, c) for c in problem.constraints)), tuple(notes)
+
+
 @dataclass(frozen=True)
 class ImuQuality:
     """Variance factors for the IMU's noise figures, by their names in `ImuNoise`, and those clearly above 1."""
@@ -211,12 +246,18 @@ def _with(problem: Problem, rows: GnssPosition) -> tuple[Constraint, ...]:
 
 
 def _record(problem: Problem, rows: GnssPosition, smoothed: Smoothed) -> ConstraintRecord:
-    values = {
-        chain.parameter.name: smoothed.values[:, at.start - DIM : at.stop - DIM]
-        for chain in problem.chains
-        for at in [problem.columns[chain.parameter.name]]
-    }
-    return residual_record(problem, rows, smoothed.states, values)
+    return residual_record(problem, rows, smoothed.states, _values(problem, smoothed))
+
+
+def _values(problem: Problem, smoothed: Smoothed) -> dict[str, Array]:
+    """(K, k) per parameter."""
+    return {name: smoothed.values[:, at.start - DIM : at.stop - DIM] for name, at in problem.columns.items()}
+
+
+def _values_at(problem: Problem, smoothed: Smoothed, rows: Constraint) -> dict[str, Array]:
+    """(N, k) per parameter of some rows."""
+    values = _values(problem, smoothed)
+    return {p.name: values[p.name][rows.keyframe] for p in rows.parameters}
 
 
 def _median(degrees: int) -> float:

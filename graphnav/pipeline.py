@@ -11,6 +11,7 @@ import numpy as np
 from graphnav import judgement
 from graphnav.alignment import Alignment, align, with_known_heading
 from graphnav.config import Settings
+from graphnav.constraints.vehicle import Wheels
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
@@ -91,9 +92,16 @@ def _solve(
         "preintegration": time.perf_counter() - judged,
     }
     forward = ekf(problem, progress, aligned.until)
+    began, smoothed = time.perf_counter(), None
+    if any(isinstance(rows, Wheels) for rows in problem.constraints):
+        smoothed = backward(problem, forward, progress)
+        problem, raised = judgement.judge_wheels(problem, smoothed)
+        timings["smoother"] = time.perf_counter() - began
+        if raised:
+            forward, smoothed, said = ekf(problem, progress, aligned.until), None, (*said, *raised)
     out = {"ekf": forward.solution}
     if "rts" in solvers or "batch" in solvers:
-        out["rts"] = rts(problem, forward, progress)
+        out["rts"] = rts(problem, forward, progress, smoothed)
     if "batch" in solvers:
         out["batch"] = batch(problem, *_start(problem, out["rts"], aligned, stated), progress=progress)
         # what it took to get there is part of it
@@ -101,7 +109,9 @@ def _solve(
         out["batch"] = replace(out["batch"], timings=spent)
     return {
         name: replace(
-            out[name], notes=(*stated.notes, *said, *out[name].notes), timings={**timings, **out[name].timings}
+            out[name],
+            notes=(*stated.notes, *said, *out[name].notes),
+            timings={k: timings.get(k, 0.0) + out[name].timings.get(k, 0.0) for k in (*timings, *out[name].timings)},
         )
         for name in solvers
     }

@@ -56,12 +56,21 @@ class Gnss:
 
 @dataclass(frozen=True)
 class Odometer:
-    """Signed forward speed of the point that does not slip sideways."""
+    """Forward speed of the point that does not slip sideways.
+
+    Where pulses were counted, `way` is what the readings are and `speed` its slope at t.
+    """
 
     t: Array  # (M,) s
     speed: Array  # (M,) m/s
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
     scale_sigma: float = 0.02
+    way: Array | None = None  # (M,) m counted up to t
+    pulse: float = 0.0  # m per count of `way`
+    wheels: Array | None = None  # (M, 4) m/s, front left, front right, rear left, rear right; NaN where unknown
+    signed: bool = True  # False: backward reads positive
+    speed_sigma: float | None = None  # m/s, of one reading; None: told from the readings
+    delay_sigma: float = 0.0  # s, of the stamps; 0: they are exact
 
 
 @dataclass(frozen=True)

@@ -163,6 +163,24 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
     )  # fmt: skip
 
 
+def read_part(
+    source: str, start: float | None = None, end: float | None = None, withheld: tuple[Withheld, ...] = ()
+) -> Recording:
+    """The part asked for of a recording, without what is withheld; times in s from the recording's start.
+
+    Raises
+    ------
+    GraphnavError
+        In one plain sentence, if it cannot be read or there is no such part.
+    """
+    from graphnav.formats import read
+
+    whole = read(source)
+    part = _cropped(whole, Request(source, (), start=start, end=end))
+    zero = part.start - whole.start if part is not whole else 0.0
+    return _withhold(part, _moved(withheld, zero), zero)[0]
+
+
 @contextmanager
 def _timed(timings: dict[str, float], stage: str, progress: Progress | None) -> Iterator[None]:
     if progress is not None:

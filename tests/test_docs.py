@@ -19,9 +19,9 @@ from graphnav.config import Settings, read_settings
 from graphnav.constraints import registered
 from graphnav.constraints.base import Scene, assemble
 from graphnav.earth import LocalFrame
-from graphnav.preintegration import bridge_gaps, preintegrate
 from graphnav.formats import read
 from graphnav.pipeline import SOLVERS
+from graphnav.preintegration import bridge_gaps, preintegrate
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

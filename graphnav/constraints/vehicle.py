@@ -1,4 +1,4 @@
-"""What wheels allow: no sideways or upward speed where the wheels do not slip, and forward speed as the odometer has it.
+"""What wheels allow: no sideways or upward speed where they do not slip, and forward speed as the odometer has it.
 
 Zhu 2020, eq. 10-19, with two differences. First, the constraint is on the mean velocity over the whole interval
 that ends at a keyframe, not on the velocity of one moment. Seen from the state at the end, s seconds later, with
@@ -39,12 +39,14 @@ from graphnav.preintegration import Intervals
 from graphnav.recording import Recording
 from graphnav.rotation import Array, mv
 from graphnav.state import Parameter, States
+from graphnav.wheels import MeanSpeed
 
 MOUNTING = "mounting"
 AXLE = "axle"
 BODY = "slip_squat"
 ODOMETER_SCALE = "odometer_scale"
 ODOMETER_DELAY = "odometer_delay"
+_REACH = 4.0  # sigmas of the delay that rows are prepared for
 _SHORTEST = 0.02  # s; a mean over less says nothing
 _LINEAR = 3.0  # m/s^2, lateral force up to which tyres behave linearly
 _BEYOND = 0.1  # m/s of sideways speed per m/s^2 beyond that
@@ -119,7 +121,7 @@ def _turned(u: Array, mounting: Array) -> tuple[Array, Array, Array]:
 
 
 @dataclass(frozen=True)
-class _Wheels(Constraint):
+class Wheels(Constraint):
     """What both constraints share: where rows are, and u_v with its derivatives."""
 
     past: Past | None = None
@@ -172,7 +174,7 @@ def shared_parameters(scene: Scene) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class NonHolonomic(_Wheels):
+class NonHolonomic(Wheels):
     """The vehicle moves neither sideways nor up (NHC)."""
 
     name: ClassVar[str] = "nhc"
@@ -232,4 +234,70 @@ class NonHolonomic(_Wheels):
             jacobians["theta"][:, 0] += by_w * rotation.skew(mv(Rt, self.past.frame.omega_n))[:, 2]
             if SCALE in parameters:
                 jacobians[SCALE][:, 0, 2] += by_w[:, 0] * self.past.rate[rows][:, 2]
+        return Linearized(residual, jacobians, self.sigma[rows])
+
+
+@dataclass(frozen=True)
+class OdometerSpeed(Wheels):
+    """The vehicle moved as fast as its odometer read."""
+
+    name: ClassVar[str] = "odometer"
+    axes: ClassVar[tuple[str, ...]] = ("forward",)
+    unit: ClassVar[str] = "m/s"
+
+    begin: Array = field(default_factory=lambda: np.empty(0))  # the interval of each row, s
+    end: Array = field(default_factory=lambda: np.empty(0))
+    speed: MeanSpeed | None = None
+    signed: bool = True  # False: it cannot tell forwards from backwards
+    reach: float = 0.0  # s, the longest delay for which the readings of all rows are there
+    sigma: Array = field(default_factory=lambda: np.empty((0, 1)))
+
+    @classmethod
+    def build(cls, scene: Scene) -> OdometerSpeed | None:
+        s, odometer = scene.settings.vehicle, scene.recording.odometer
+        if scene.recording.platform != "vehicle" or odometer is None or not s.odometer:
+            return None
+        speed = MeanSpeed.of(odometer)
+        rows = moving_rows(scene)
+        begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
+        reach = _REACH * odometer.delay_sigma
+        good = np.all([np.isfinite(speed(begin, end, d)[0]) for d in {-reach, 0.0, reach}], axis=0)
+        rows, begin, end = rows[good], begin[good], end[good]
+        shared = shared_parameters(scene)
+        walk = s.scale_walk / np.sqrt(60.0)
+        shared["parameters"].append(
+            Parameter(ODOMETER_SCALE, np.zeros(1), np.full(1, odometer.scale_sigma), "1", walk=walk)
+        )
+        if odometer.delay_sigma > 0:
+            shared["parameters"].append(Parameter(ODOMETER_DELAY, np.zeros(1), np.full(1, odometer.delay_sigma), "s"))
+        shared["parameters"] = tuple(shared["parameters"])
+        sigma = np.hypot(speed.sigma(begin, end), s.odometer_density / np.sqrt(end - begin))
+        return cls(
+            keyframe=rows + 1,
+            past=Past.of(scene.intervals, rows, scene.frame),
+            begin=begin,
+            end=end,
+            speed=speed,
+            signed=odometer.signed,
+            sigma=sigma[:, None],
+            reach=reach,
+            robust=s.robust,
+            robust_scale=s.robust_scale,
+            gate=s.gate,
+            **shared,
+        )
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        assert self.speed is not None
+        u, J, *_ = self._velocity(states, parameters, rows)
+        delay = parameters[ODOMETER_DELAY][:, 0] if ODOMETER_DELAY in parameters else np.zeros(len(states))
+        # what is true now is read `delay` later
+        read, by_delay = self.speed(self.begin[rows], self.end[rows], np.clip(delay, -self.reach, self.reach))
+        scale = 1.0 + parameters[ODOMETER_SCALE][:, 0]
+        sign = np.ones(len(states)) if self.signed else np.where(u[:, 1] < 0.0, -1.0, 1.0)
+        residual = (sign * u[:, 1] - scale * read)[:, None]
+        jacobians = {name: sign[:, None, None] * x[:, 1:2] for name, x in J.items()}
+        jacobians[ODOMETER_SCALE] = -read[:, None, None]
+        if ODOMETER_DELAY in parameters:
+            jacobians[ODOMETER_DELAY] = -(scale * by_delay)[:, None, None]
         return Linearized(residual, jacobians, self.sigma[rows])

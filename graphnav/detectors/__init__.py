@@ -5,37 +5,56 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.detectors.base import NONE, Detection, Detections
-from graphnav.detectors.fusion import fuse
-from graphnav.detectors.glrt import glrt_statistic
+from graphnav.detectors.base import NONE, Detection, Detections, inside, spans_of
+from graphnav.detectors.fft import detect_fft
+from graphnav.detectors.fusion import candidates, fuse
+from graphnav.detectors.glrt import detect_windows, glrt_statistic
 from graphnav.detectors.motion import moving, speeds
 from graphnav.detectors.sway import detect_sway, scale
 from graphnav.detectors.windows import blocks, low_pass
+from graphnav.earth import gravity
 from graphnav.findings import period_of
 from graphnav.recording import Recording
 
 __all__ = ["Detection", "Detections", "detect", "glrt_statistic"]
 
 _SHORTEST = 3.0  # s, of a recording in which anything can be told
+_CLEARLY = 10.0  # times its threshold a statistic is where the vehicle clearly moves
+_STANDARD_GRAVITY = 9.80665
 
 
 def detect(recording: Recording, settings: Settings | None = None) -> Detections:
     """Stationary intervals and the statistics they come from; never fails, and says what could not be done."""
     d = (settings or Settings()).detectors
-    period = period_of(recording.imu.t)
+    imu, period = recording.imu, period_of(recording.imu.t)
     if not recording.duration >= _SHORTEST or not period > 0.0:
         return Detections(NONE, (), (f"no detection: the recording is shorter than {_SHORTEST:g} s",))
-    b = blocks(recording.imu, period)
+    b = blocks(imu, period)
     low = low_pass(b)
     if not len(low.t):
-        return Detections(NONE, (), ("no detection: the IMU has too few rows",))
-    found = speeds(recording, d.fusion)
-    certain = moving(found)
-    sway = detect_sway(low, recording.imu.noise, d.sway, certain)
-    s = scale(low, recording.imu.noise, d.sway)
-    spans, filled, notes = fuse(b, sway, s, found, certain, d.fusion)
-    mask = np.zeros(len(sway.t), dtype=bool)
-    for start, end in spans:
-        mask |= (sway.t >= start) & (sway.t <= end)
-    fused = Detection("fused", sway.t, sway.statistic, sway.threshold, mask, spans, notes, {"bridged": filled})
-    return Detections(spans, (sway, fused), notes)
+        return Detections(NONE, (), (f"no detection: an IMU at {1.0 / period:.3g} Hz is too slow",))
+    known = speeds(recording, d.fusion)
+    certain = moving(known)
+    sway = detect_sway(low, imu.noise, d.sway, certain)
+    s = scale(low, imu.noise, d.sway)
+    still, notes = candidates(b, sway, s, known, certain)
+    in_motion = spans_of(sway.statistic > _CLEARLY * sway.threshold, sway.t, 0.5 * d.sway.window)
+    found = [sway, *detect_windows(b, imu.noise, d.glrt, still, in_motion, _gravity(recording))]
+    idling = NONE
+    if recording.platform == "vehicle":
+        found.append(detect_fft(imu, period, d.fft, still, known))
+        notes += found[-1].notes
+        idling = found[-1].intervals
+    spans, filled = fuse(b, still, idling, certain, d.fusion)
+    mask = inside(sway.t, spans)
+    found.append(Detection("fused", sway.t, sway.statistic, sway.threshold, mask, spans, notes, {"bridged": filled}))
+    return Detections(spans, tuple(found), notes)
+
+
+def _gravity(recording: Recording) -> float:
+    """Gravity at the first fix, m/s^2."""
+    if recording.gnss is not None:
+        there = np.flatnonzero(np.isfinite(recording.gnss.llh).all(axis=1))
+        if len(there):
+            return float(gravity(*recording.gnss.llh[there[0], [0, 2]]))
+    return _STANDARD_GRAVITY

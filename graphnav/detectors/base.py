@@ -95,6 +95,14 @@ def inside(t: Array, spans: Array) -> Mask:
     return np.asarray((k >= 0) & (t <= spans[np.maximum(k, 0), 1]))
 
 
+def within(t: Array, spans: Array, half: float) -> Mask:
+    """Which windows of `half` s on either side of t lie wholly in one of the spans."""
+    if not len(spans):
+        return np.zeros(len(t), dtype=bool)
+    k = np.searchsorted(spans[:, 0], t - half, side="right") - 1
+    return np.asarray((k >= 0) & (t + half <= spans[np.maximum(k, 0), 1]))
+
+
 def union(parts: Sequence[Array]) -> Array:
     """All spans of several sets, merged."""
     return merged(np.concatenate(parts)) if parts else NONE

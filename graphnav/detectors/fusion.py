@@ -2,26 +2,36 @@
 
 1. Stretches that the sway detector calls still are candidates; their ends are moved to where the low-passed force
    and rate leave what they are inside (never outwards past a disturbance).
-2. Nothing changed in a candidate, so neither did its speed: if the speeds known inside say motion, all of it moves.
-3. Two candidates are one stop if the force between them, integrated with the tilt the gyro saw, leads from rest to
-   rest without reaching a speed in between: a passenger moved, not the vehicle.
+2. Nothing changed in a candidate, so neither did its speed: if the speeds known inside say motion, all of it moves,
+   and so does what the force links to it (`graphnav.detectors.chain`).
+3. Two candidates are one stop if the force between them, integrated, leads from rest to rest without reaching a
+   speed in between: a passenger moved, not the vehicle. What the FFT detector calls stationary next to a stop
+   joins it under the same condition.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from graphnav.config import FusionSettings
-from graphnav.detectors.base import NONE, Detection, inside, longer_than, merged, without
+from graphnav.detectors.base import NONE, Detection, longer_than, merged, within, without
+from graphnav.detectors.chain import Link, at_rest_until, link, moving_by_chain
 from graphnav.detectors.motion import Speeds
 from graphnav.detectors.sway import Scale
 from graphnav.detectors.windows import Blocks, kernel, smooth
-from graphnav.rotation import Array, exp
+from graphnav.rotation import Array
 
 _LOOK = 3.0  # s about an end in which the edge is sought
 _INNER = 1.5  # s inside a candidate that say what is normal in it
-_SHARE = 0.5  # of the speeds inside a candidate that must exceed their limits to reject it as a whole
-_G = 9.81
+_WORTH = 1.0  # s, the least that the FFT detector may add to an end
+_FURTHEST = 10.0  # s, the most
+_AWAY = 0.3  # of the speed that a disturbance may reach, on average over it
+_BLIND = 0.02  # of the moving windows that may look still before stillness means little
+_AROUND = 60.0  # s about a stretch in which an odometer must have moved for its zero to count
+_ENOUGH = 20.0  # s of certain motion from which that share is known
+_REACH = 0.3  # s, of the low-pass: nearer to the recording's ends no edge can be seen
 
 
 def edges(b: Blocks, spans: Array, s: Scale, threshold: float) -> Array:
@@ -66,23 +76,64 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
     return float(t[max(stop - 1, begin)])
 
 
-def veto(spans: Array, found: list[Speeds], certain: Array) -> tuple[Array, int]:
-    """The spans without those, and without the parts, that odometer or GNSS say are motion; and how many went."""
-    keep = []
-    for span in spans:
-        keep.append(not any(_moves(s, span) for s in found))
-    kept = spans[np.array(keep, dtype=bool)] if len(spans) else NONE
-    return without(kept, certain), len(spans) - len(kept)
+def candidates(
+    b: Blocks, sway: Detection, s: Scale, speeds: list[Speeds], certain: Array
+) -> tuple[Array, tuple[str, ...]]:
+    """Still stretches with their edges found, without those that move; and sentences about these.
+
+    Parameters
+    ----------
+    s : of the sway detector.
+    certain : (L, 2) s, spans of certain motion.
+    """
+    threshold = float(np.max(sway.threshold))
+    spans = merged(longer_than(edges(b, sway.intervals, s, threshold), 3.0 * b.period))
+    if not len(spans):
+        return NONE, ()
+    known = np.array([_known_speed(speeds, span) for span in spans])
+    moves = moving_by_chain([link(b, one, next_one) for one, next_one in pairwise(spans)], known)
+    notes = []
+    measured = int((np.nan_to_num(known) > 0.0).sum())
+    if measured:
+        notes.append(f"{_count(measured)} smooth but no stop: odometer or GNSS say that the vehicle moved")
+    if moves.sum() > measured:
+        notes.append(f"{_count(int(moves.sum()) - measured)} smooth but no stop: the force before or after shows speed")
+    share = _still_in_motion(sway, certain)
+    if share > _BLIND:
+        unseen = ~moves & np.isnan(known) & np.array([not _zero(speeds, span) for span in spans])
+        moves |= unseen
+        notes.append(
+            f"{100.0 * share:.0f} % of the seconds in certain motion are as still as a stop (a simulation without "
+            f"road?): a stop needs a measured speed as well, which {_count(int(unseen.sum()))} without"
+        )
+    return without(spans[~moves], certain), tuple(notes)
 
 
-def _moves(s: Speeds, span: Array) -> bool:
-    """Whether the speeds of one sensor inside say motion: nothing changed in the span, so their median is its speed."""
-    there = (s.t >= span[0]) & (s.t <= span[1] + s.late)
-    if s.late:
-        there &= s.t >= min(span[0] + s.late, 0.5 * (span[0] + span[1]) + s.late)
-    if there.sum() < 3:
-        return False
-    return bool(np.median(s.speed[there] - s.limit[there]) > 0.0)
+def _still_in_motion(sway: Detection, certain: Array) -> float:
+    """Share of the windows in certain motion that look still; 0 where there are too few to tell."""
+    half = 0.5 * (sway.t[1] - sway.t[0]) if len(sway.t) > 1 else 0.0
+    moving = within(sway.t, certain, _INNER) & np.isfinite(sway.statistic)
+    return float(sway.mask[moving].mean()) if moving.sum() * 2.0 * half > _ENOUGH else 0.0
+
+
+def _zero(speeds: list[Speeds], span: Array) -> bool:
+    """Whether an odometer that is alive reads zero all along a span."""
+    for s in speeds:
+        near = (s.t >= span[0] - _AROUND) & (s.t <= span[1] + _AROUND)
+        inner = (s.t >= span[0] + s.late) & (s.t <= span[1])
+        if s.silent_at_rest and inner.sum() and near.any() and s.speed[near].max() > s.speed[inner].max() == 0.0:
+            return True
+    return False
+
+
+def _count(n: int) -> str:
+    return "1 stretch is" if n == 1 else f"{n} stretches are"
+
+
+def _known_speed(speeds: list[Speeds], span: Array) -> float:
+    """Speed in a span in which nothing changes, by the sensor that sees most; NaN if none looked."""
+    found = [s.over(span) for s in speeds]
+    return float(np.nanmax(found)) if not np.isnan(found).all() else float("nan")
 
 
 def bridged(b: Blocks, spans: Array, certain: Array, settings: FusionSettings) -> tuple[Array, Array]:
@@ -92,11 +143,10 @@ def bridged(b: Blocks, spans: Array, certain: Array, settings: FusionSettings) -
     out, filled = [spans[0]], []
     for span in spans[1:]:
         before = out[-1]
-        gap = span[0] - before[1]
-        moved = inside(np.array([0.5 * (before[1] + span[0])]), certain)[0] or (
-            len(certain) and bool(((certain[:, 0] < span[0]) & (certain[:, 1] > before[1])).any())
-        )
-        if gap <= settings.bridge and not moved and _speed_between(b, before, span) < settings.bridge_speed:
+        moved = bool(((certain[:, 0] < span[0]) & (certain[:, 1] > before[1])).any())
+        near = span[0] - before[1] <= settings.bridge
+        one = link(b, before, span) if near and not moved else None
+        if one is not None and _shaken_only(one, settings):
             filled.append((before[1], span[0]))
             out[-1] = np.array([before[0], span[1]])
         else:
@@ -104,48 +154,37 @@ def bridged(b: Blocks, spans: Array, certain: Array, settings: FusionSettings) -
     return np.array(out), np.array(filled) if filled else NONE
 
 
-def _speed_between(b: Blocks, before: Array, after: Array) -> float:
-    """Largest horizontal speed, m/s, reached between two standstills; infinite where a gap lies between them.
-
-    The tilt comes from the gyro, whose bias the standstills tell; what is left of the force after taking gravity
-    away is made to lead from rest to rest, which takes off what the biases and a tilt could do.
-    """
-    i = int(np.searchsorted(b.t, max(before[0], before[1] - _INNER)))
-    j = int(np.searchsorted(b.t, min(after[1], after[0] + _INNER)))
-    first, last = (int(k) for k in np.searchsorted(b.t, [before[1], after[0]]))
-    if first - i < 3 or j - last < 3 or not b.whole[i + 1 : j].all():
-        return float("inf")
-    force, rate = b.force[i:j], b.rate[i:j]
-    n0, n1 = first - i, last - i
-    level0, level1 = force[:n0].mean(axis=0), force[n1:].mean(axis=0)
-    w0, w1 = rate[:n0].mean(axis=0), rate[n1:].mean(axis=0)
-    # the mean of both: its error of a fraction of the noise matters less than a bias
-    turn = np.cumsum(rate - 0.5 * (w0 + w1), axis=0) * b.period
-    R = exp(turn)  # small: the order of turns does not matter
-    level = np.einsum("kij,kj->ki", R, force)
-    up = level0 / np.linalg.norm(level0)
-    end = np.einsum("ij,j->i", R[-1], level1)
-    # from the mean force of one standstill to that of the other, in proportion to time
-    share = np.clip((np.arange(len(level)) - n0) / max(1, n1 - n0), 0.0, 1.0)[:, None]
-    left = level - ((1.0 - share) * level0 + share * end)
-    left = left[n0:n1] - np.outer(left[n0:n1] @ up, up)
-    v = np.cumsum(left, axis=0) * b.period
-    v -= np.linspace(0.0, 1.0, len(v))[:, None] * v[-1]
-    return float(np.sqrt((v**2).sum(axis=1).max())) if len(v) else 0.0
+def _shaken_only(one: Link, settings: FusionSettings) -> bool:
+    """Whether what lies between two stops shook the vehicle without moving it: to and fro, but not away."""
+    away = one.mean > _AWAY * settings.bridge_speed
+    return one.peak < settings.bridge_speed and not away and abs(one.change) < one.tolerance
 
 
-def fuse(
-    b: Blocks, sway: Detection, s: Scale, found: list[Speeds], certain: Array, settings: FusionSettings
-) -> tuple[Array, Array, tuple[str, ...]]:
-    """Stationary intervals, the disturbances bridged in them, and sentences about what was rejected."""
-    spans = edges(b, sway.intervals, s, float(np.max(sway.threshold)))
-    spans = merged(longer_than(spans, 3.0 * b.period))
-    spans, rejected = veto(spans, found, certain)
+def joined(b: Blocks, spans: Array, idling: Array, settings: FusionSettings) -> Array:
+    """The spans with what the FFT detector calls stationary at their ends, as far as the force says rest as well."""
+    out = spans.copy()
+    limit = 0.5 * settings.bridge_speed
+    for k, span in enumerate(spans):
+        for side, way in ((0, -1), (1, 1)):
+            over = idling[(idling[:, 0] <= span[side]) & (idling[:, 1] >= span[side])]
+            further = way * (over[0, side] - span[side]) if len(over) else 0.0
+            if further < _WORTH:
+                continue
+            until = at_rest_until(b, span, way, min(further, _FURTHEST), limit)
+            # a second is left to the push that the integral has only begun to feel
+            if way * (until - span[side]) > _WORTH:
+                out[k, side] = until - way * _WORTH
+    return merged(out)
+
+
+def fuse(b: Blocks, spans: Array, idling: Array, certain: Array, settings: FusionSettings) -> tuple[Array, Array]:
+    """Stationary intervals from the candidates and the FFT detector's answer, and the disturbances bridged in them."""
+    if len(spans) and len(idling):
+        spans = without(joined(b, spans, idling, settings), certain)
     spans, filled = bridged(b, spans, certain, settings)
     if len(spans):
-        spans = np.stack([spans[:, 0] + settings.margin, spans[:, 1] - settings.margin], -1)
-    spans = longer_than(spans, settings.min_duration)
-    notes = ()
-    if rejected:
-        notes = (f"{rejected} smooth stretches are no stops: odometer or GNSS say that the vehicle moved",)
-    return spans, filled, notes
+        # a recording that begins or ends in a stop has no edge there
+        first = np.where(spans[:, 0] - b.t[0] < _REACH, b.t[0], spans[:, 0] + settings.margin)
+        last = np.where(b.end[-1] - spans[:, 1] < _REACH, b.end[-1], spans[:, 1] - settings.margin)
+        spans = np.stack([first, last], -1)
+    return longer_than(spans, settings.min_duration), filled

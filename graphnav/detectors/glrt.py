@@ -18,10 +18,19 @@ from collections.abc import Callable
 
 import numpy as np
 
-from graphnav.detectors.windows import running
+from graphnav.config import GlrtSettings
+from graphnav.detectors.base import Detection, spans_of, within
+from graphnav.detectors.windows import Blocks, running, unbroken, window_times
+from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 
 _TINY = 1e-300
+_STEP = 0.1  # s between windows
+_SCALE = 0.05  # of g that a sensor's scale and bias may be off
+# twice the expectation under noise alone: three axes of each sensor, one direction of the magnitude
+_AT_NOISE = {
+    "glrt": 12.0, "acceleration_variance": 6.0, "acceleration_magnitude": 2.0, "angular_rate_energy": 6.0,
+}  # fmt: skip
 Statistic = Callable[[Array, float, float, float], Array]
 
 
@@ -89,6 +98,66 @@ def stance_mask(statistic: Array, threshold: float, window: int) -> np.ndarray:
     row = np.arange(n)
     first, last = np.maximum(row - window + 1, 0), np.minimum(row + 1, len(statistic))
     return np.asarray(below[last] > below[first])
+
+
+def detect_windows(
+    b: Blocks, noise: ImuNoise, settings: GlrtSettings, still: Array, moving: Array, g: float
+) -> list[Detection]:
+    """Every statistic of the recording with a threshold of its own.
+
+    The threshold lies where the fewest windows are called wrongly, of those that another detector finds still and
+    those that it finds moving: an idling engine may lift the statistic far above the sensors' noise. Without any
+    still ones it is twice what the sensors' noise makes of the statistic.
+
+    Parameters
+    ----------
+    still, moving : (M, 2) s, spans that are clearly one or the other.
+    g : m/s^2, gravity at the place; replaced by the mean force of what is still, which holds the sensor's scale.
+    """
+    window = max(2, round(settings.window / b.period))
+    step = max(1, round(_STEP / b.period))
+    t = window_times(b.t, window, step) if len(b.t) >= window else np.zeros(0)
+    if not len(t):
+        return []
+    means = running(b.mean).means(window, step)
+    half = 0.5 * settings.window
+    at_rest, in_motion = within(t, still, half), within(t, moving, half)
+    reference = at_rest if at_rest.any() else np.ones(len(t), dtype=bool)
+    bias = np.median(means[reference, 3:6], axis=0)
+    means[:, 8] += bias @ bias - 2.0 * means[:, 3:6] @ bias
+    measured = float(np.median(np.linalg.norm(means[reference, :3], axis=1)))
+    if at_rest.any() and abs(measured / g - 1.0) < _SCALE:
+        g = measured
+    per_row = 1.0 / np.sqrt(b.row_period)
+    sigma_a, sigma_w = noise.accel_noise_density * per_row, noise.gyro_noise_density * per_row
+    whole = unbroken(b.whole, window, step)
+    out = []
+    for name, statistic in STATISTICS.items():
+        values = np.where(whole, statistic(means, sigma_a, sigma_w, g), np.nan)
+        threshold = _AT_NOISE[name]
+        if name == "glrt" and settings.threshold is not None:
+            threshold = settings.threshold
+        elif at_rest.any():
+            threshold = fewest_errors(values[at_rest & whole], values[in_motion & whole], threshold)
+        mask = values < threshold
+        out.append(Detection(name, t, values, threshold, mask, spans_of(mask, t, half)))
+    return out
+
+
+def fewest_errors(still: Array, moving: Array, least: float) -> float:
+    """Threshold that calls the smallest share of still windows moving plus of moving windows still, at least `least`.
+
+    Of several that do equally well, the middle one by their logarithm.
+    """
+    if not len(still):
+        return least
+    x, y = np.sort(log_statistic(still)), np.sort(log_statistic(moving))
+    if not len(y):
+        return max(least, float(10.0 ** x[-1]) * 2.0)
+    grid = np.linspace(min(x[0], y[0]), max(x[-1], y[-1]), 400)
+    wrong = 1.0 - np.searchsorted(x, grid) / len(x) + np.searchsorted(y, grid) / len(y)
+    best = np.flatnonzero(wrong <= wrong.min() + 1e-12)
+    return max(least, float(10.0 ** grid[best[len(best) // 2]]))
 
 
 def log_statistic(statistic: Array) -> Array:

@@ -17,6 +17,7 @@ from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.rotation import Array
 
 _SIGMAS = 3.0
+_SIGMAS_APART = 6.0  # of positions compared: their errors wander by more than receivers state
 _MEDIAN = 3  # epochs over which the median is taken
 _LONGEST = 2.0  # s between epochs that a span of motion leads across
 _BASE = 4.0  # s over which positions are compared
@@ -27,9 +28,35 @@ class Speeds:
     """Speeds with what they must exceed to mean motion, from one sensor."""
 
     t: Array  # (K,) s
-    speed: Array  # (K,) m/s
+    v: Array  # (K, 1) m/s forward, or (K, 2) horizontal
     limit: Array  # (K,) m/s
     late: float = 0.0  # s, by which the stamps may be late
+    half: float = 0.0  # s on either side of t of which v is the mean
+    silent_at_rest: bool = False  # reads zero whatever happens when it is unplugged
+
+    @property
+    def speed(self) -> Array:
+        """(K,) m/s, without a sign."""
+        return np.asarray(np.linalg.norm(self.v, axis=1))
+
+    def over(self, span: Array) -> float:
+        """Speed in a span in which nothing changes, m/s: 0 if it may be none, NaN if the sensor did not look.
+
+        The velocity is the same all along such a span. So its median over the epochs counts, and what wanders by as
+        much as it says is not motion.
+        """
+        # what a late sensor says first belongs to the time before
+        first = min(span[0] + self.late, 0.5 * (span[0] + span[1]) + self.late)
+        there = (self.t - self.half >= first) & (self.t + self.half <= span[1] + self.late)
+        if there.sum() < _MEDIAN:
+            return float("nan")
+        v = self.v[there]
+        middle = np.median(v, axis=0)
+        wander = float(np.linalg.norm(np.median(np.abs(v - middle), axis=0))) / 0.6745
+        speed = float(np.linalg.norm(middle))
+        if speed > max(float(np.median(self.limit[there])), 2.0 * wander):
+            return speed
+        return float("nan") if self.silent_at_rest else 0.0
 
 
 def speeds(recording: Recording, settings: FusionSettings) -> list[Speeds]:
@@ -43,7 +70,7 @@ def speeds(recording: Recording, settings: FusionSettings) -> list[Speeds]:
 
 
 def moving(found: list[Speeds]) -> Array:
-    """(M, 2) s, spans of certain motion; at their late ends only what is left after the stamps' possible delay."""
+    """(M, 2) s, spans of certain motion: less at the ends by what the stamps may be late and the speeds are blurred."""
     parts = []
     for s in found:
         excess = s.speed - s.limit
@@ -54,7 +81,7 @@ def moving(found: list[Speeds]) -> Array:
         spans = [spans_of(fast[a:b], s.t[a:b]) for a, b in _pieces(breaks)]
         one = union([p for p in spans if len(p)]) if any(len(p) for p in spans) else NONE
         if len(one):
-            one = np.stack([one[:, 0], one[:, 1] - s.late], -1)
+            one = np.stack([one[:, 0] + s.half, one[:, 1] - s.half - s.late], -1)
             parts.append(one[one[:, 1] > one[:, 0]])
     return merged(np.concatenate(parts)) if parts else NONE
 
@@ -75,7 +102,7 @@ def quantum(values: Array) -> float:
 def _odometer(o: Odometer, settings: FusionSettings) -> Speeds:
     # one pulse in a period may be the jitter of a wheel that stands on a tooth
     limit = max(settings.max_speed, 1.5 * quantum(o.speed))
-    return Speeds(o.t, np.abs(o.speed), np.full(len(o.t), limit), settings.odometer_delay)
+    return Speeds(o.t, o.speed[:, None], np.full(len(o.t), limit), settings.odometer_delay, True)
 
 
 def _gnss(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:
@@ -87,8 +114,7 @@ def _gnss(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:
         if gnss.sd_v is not None:
             stated = gnss.sd_v[there, :2].max(axis=1)
             sigma = np.where(np.isfinite(stated), stated, sigma)
-        speed = np.hypot(v[:, 0], v[:, 1])
-        found.append(Speeds(gnss.t[there], speed, np.maximum(settings.max_speed, _SIGMAS * sigma)))
+        found.append(Speeds(gnss.t[there], v[:, :2], np.maximum(settings.max_speed, _SIGMAS * sigma)))
     there = np.isfinite(gnss.llh).all(axis=1)
     if there.sum() > _MEDIAN and not (found and len(found[0].t) > 0.5 * there.sum()):
         t, p, sd = gnss.t[there], local_positions(gnss)[there, :2], gnss.sd[there, :2].max(axis=1)
@@ -98,8 +124,8 @@ def _gnss(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:
         k, later = k[t[later] - t[k] < 2.0 * _BASE], later[t[later] - t[k] < 2.0 * _BASE]
         if len(k):
             apart = t[later] - t[k]
-            speed = np.linalg.norm(p[later] - p[k], axis=1) / apart
-            limit = _SIGMAS * np.hypot(sd[later], sd[k]) / apart
+            v = (p[later] - p[k]) / apart[:, None]
+            limit = _SIGMAS_APART * np.hypot(sd[later], sd[k]) / apart
             middle = 0.5 * (t[later] + t[k])
-            found.append(Speeds(middle, speed, np.maximum(settings.max_speed, limit)))
+            found.append(Speeds(middle, v, np.maximum(settings.max_speed, limit), half=0.5 * _BASE))
     return found

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from graphnav.errors import RecordingError
 from graphnav.formats import schema
+from graphnav.formats.pulses import counted
 from graphnav.formats.registry import Format
 from graphnav.formats.repair import Remarks, geodetic, sigmas, usable_rows
 from graphnav.formats.table import Table, read_table
@@ -44,11 +46,15 @@ def read_folder(source: str | Path) -> Recording:
             position = ("x", "y") if section.frame == "local" else ("lat", "lon", "h")
             required, optional = (*required, *position), tuple(c for c in optional if c not in position)
         rows = read_table(file, required, optional, section.columns, keep.column if keep else None)
+        if name == "odometer":  # which columns it needs depends on which it has
+            required = (*required, *section.readings(tuple(rows.columns)))
+            if not all(column in rows for column in required):
+                read_table(file, required, (), section.columns)  # says what is missing
         return usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
 
     imu = _imu(d.imu, table("imu"), remarks)
     gnss = _gnss(d.gnss, table("gnss"), remarks) if d.gnss else None
-    odometer = _odometer(d.odometer, table("odometer")) if d.odometer else None
+    odometer = _odometer(d.odometer, table("odometer"), remarks) if d.odometer else None
     truth = None
     if d.truth and d.truth.closed_loop_sigma:
         truth = Truth(imu.t[[0, -1]], of=d.truth.of, closed_loop_sigma=d.truth.closed_loop_sigma)
@@ -99,9 +105,34 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     return Gnss(rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm))
 
 
-def _odometer(d: schema.OdometerTable, rows: Table) -> Odometer:
-    speed = rows["speed"] * schema.SPEED[d.units.speed]
-    return Odometer(rows["t"], speed, np.array(d.lever_arm), d.scale_sigma)
+def _odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odometer:
+    t, scale = rows["t"], schema.SPEED[d.units.speed]
+    used = d.readings(tuple(rows.columns))
+    wheels = way = None
+    if any(name in rows for name in schema.WHEELS):
+        wheels = np.stack([rows.get(name, np.full(len(t), np.nan)) for name in schema.WHEELS], -1) * scale
+    if d.metres_per_pulse is not None:
+        if len(t) < 2:
+            raise RecordingError(f"{rows.path}: {len(t)} usable row; pulses need at least 2 to make a speed")
+        way = d.metres_per_pulse * counted(rows["pulses"], d.pulses, d.signed, remarks)
+        # over both neighbouring periods, so that it is the speed at t and not half a period before
+        ahead, behind = np.minimum(np.arange(len(t)) + 1, len(t) - 1), np.maximum(np.arange(len(t)) - 1, 0)
+        speed = (way[ahead] - way[behind]) / (t[ahead] - t[behind])
+    else:
+        speed = rows.stack(*used).mean(axis=-1) * scale
+    signed = bool((speed < 0.0).any()) if d.signed is None else d.signed
+    return Odometer(
+        t,
+        speed,
+        np.array(d.lever_arm),
+        d.scale_sigma,
+        way=way,
+        pulse=d.metres_per_pulse or 0.0,
+        wheels=wheels,
+        signed=signed,
+        speed_sigma=d.speed_sigma,
+        delay_sigma=d.delay_sigma,
+    )
 
 
 def _truth(d: schema.TruthTable, rows: Table, remarks: Remarks) -> Truth:

@@ -169,14 +169,42 @@ class GnssTable(_Sensor):
     sd_v: Sigmas | None = None
 
 
-class OdometerTable(_Sensor):
-    """[odometer]"""
+WHEELS = ("speed_fl", "speed_fr", "speed_rl", "speed_rr")
 
-    required = ("t", "speed")
+
+class OdometerTable(_Sensor):
+    """[odometer]: a speed, or pulses counted, or the speeds of the wheels"""
+
+    required = ("t",)
+    optional = ("speed", "pulses", *WHEELS)
 
     units: OdometerUnits = OdometerUnits()
     lever_arm: Vector = (0.0, 0.0, 0.0)
     scale_sigma: Positive = 0.02
+    metres_per_pulse: Positive | None = None  # given, the pulses are used
+    pulses: Literal["cumulative", "per_row"] | None = None  # None: told from the counts
+    use: Literal["rear", "front", "all"] | None = None  # wheels; None: the rear ones if there is no `speed`
+    speed_sigma: Positive | None = None
+    signed: Annotated[bool, Strict()] | None = None  # None: told from the readings
+    delay_sigma: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _one_source(self) -> OdometerTable:
+        if self.metres_per_pulse is not None and self.use is not None:
+            raise ValueError("say either metres_per_pulse (pulses are used) or use (the speeds of wheels are)")
+        for key, needs in (("pulses", self.pulses is not None), ("columns.pulses", "pulses" in self.columns)):
+            if needs and self.metres_per_pulse is None:
+                raise ValueError(f"{key} says nothing without metres_per_pulse, the way of one pulse in m")
+        return self
+
+    def readings(self, there: Sequence[str]) -> tuple[str, ...]:
+        """The columns the speed comes from, out of those that are there; what is wanted and not there is named too."""
+        if self.metres_per_pulse is not None:
+            return ("pulses",)
+        wanted = {"front": WHEELS[:2], "rear": WHEELS[2:], "all": WHEELS}[self.use or "rear"]
+        if self.use is not None or ("speed" not in there and any(name in there for name in WHEELS)):
+            return wanted
+        return ("speed",)
 
 
 class TruthTable(_Sensor):

@@ -274,10 +274,12 @@ def backward(problem: Problem, forward: Forward, progress: Progress | None = Non
     return Smoothed(States.stack(states[::-1]), all_values, all_P)
 
 
-def rts(problem: Problem, forward: Filtered, progress: Progress | None = None) -> Solution:
-    """The smoothed solution; residuals are those of the smoothed states."""
+def rts(
+    problem: Problem, forward: Filtered, progress: Progress | None = None, found: Smoothed | None = None
+) -> Solution:
+    """The smoothed solution; residuals are its own. `found` is the backward pass where it was done before."""
     began = time.perf_counter()
-    found = backward(problem, forward, progress)
+    found = found or backward(problem, forward, progress)
     smoothed, all_values, all_P = found.states, found.values, found.P
     seconds = time.perf_counter() - began
     chains = {c.parameter.name: all_values[:, _shift(problem.columns[c.parameter.name])] for c in problem.chains}

@@ -1,0 +1,79 @@
+"""What `graphnav detect` leaves on disk and says: detections.csv, statistics.csv.gz, detections.png, a summary."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+
+from graphnav.detection_pictures import picture
+from graphnav.detectors import Detections
+from graphnav.exporters.csv import rows_text
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+
+HEADER = "start,end,detector"
+_LISTED = 30  # stops
+
+
+def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
+    """All files; times are on the recording's clock, as in trajectory.csv."""
+    folder.mkdir(parents=True, exist_ok=True)
+    intervals, statistics, plot = (folder / n for n in ("detections.csv", "statistics.csv.gz", "detections.png"))
+    intervals.write_text(intervals_text(found), encoding="utf-8")
+    # no name and no time in the header: the same recording gives the same bytes
+    with statistics.open("wb") as raw, gzip.GzipFile("", "wb", 5, raw, mtime=0) as file:
+        file.write(statistics_text(found).encode())
+    picture(recording, found).savefig(plot, dpi=110, metadata={"Software": None})
+    return [plot, intervals, statistics]
+
+
+def intervals_text(found: Detections) -> str:
+    """A row per interval and detector, the fused answer last."""
+    rows = [f"{start:.4f},{end:.4f},{d.name}" for d in found.all for start, end in d.intervals]
+    return "\n".join([HEADER, *rows]) + "\n"
+
+
+def statistics_text(found: Detections) -> str:
+    """Every detector's statistic, threshold and mask at the windows of the first; a blank where there is none."""
+    detections = [d for d in found.all if len(d.t)]
+    if not detections:
+        return "t\n"
+    t = max(detections, key=lambda d: len(d.t)).t
+    head, columns = ["t"], [t]
+    for d in detections:
+        k, near = _nearest(d.t, t)
+        threshold = np.broadcast_to(d.threshold, d.t.shape)
+        for values in (d.statistic, threshold, d.mask.astype(float)):
+            columns.append(np.where(near, values[k], np.nan))
+        head += [d.name, f"{d.name}_threshold", f"{d.name}_stationary"]
+    form = ",".join(["%.4f", *["%.5g", "%.5g", "%.0f"] * len(detections)])
+    return ",".join(head) + "\n" + rows_text(np.stack(columns, -1), form)
+
+
+def _nearest(of: Array, t: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Row of `of` nearest to each time, and whether it is as near as its own spacing lets it be."""
+    if len(of) == 1:
+        return np.zeros(len(t), dtype=int), np.abs(t - of[0]) < 1.0
+    k = np.clip(np.searchsorted(of, t), 1, len(of) - 1)
+    k = k - (t - of[k - 1] < of[k] - t)
+    return k, np.abs(of[k] - t) <= 0.51 * float(np.median(np.diff(of))) + 1e-6
+
+
+def text(recording: Recording, found: Detections, files: list[Path]) -> str:
+    """Stops, seconds, the idle line or why there is none, and where to look."""
+    spans = found.stationary - recording.start
+    seconds = float(np.diff(spans).sum()) if len(spans) else 0.0
+    many = "1 stop" if len(spans) == 1 else f"{len(spans)} stops"
+    lines = [
+        f"{recording.name} ({recording.platform}): {recording.duration:.1f} s",
+        f"  {many}, {seconds:.1f} s in total" + (f" ({100.0 * seconds / recording.duration:.1f} %)" if seconds else ""),
+    ]
+    lines += [f"    {a:9.2f} - {b:9.2f}  {b - a:8.2f} s" for a, b in spans[:_LISTED]]
+    if len(spans) > _LISTED:
+        lines.append(f"    ... and {len(spans) - _LISTED} more in detections.csv")
+    each = [f"{d.name} {float(np.diff(d.intervals).sum()) if len(d.intervals) else 0.0:.1f}" for d in found.all]
+    lines.append(f"  seconds by detector: {', '.join(each)}" if each else "  no detector has run")
+    lines += [f"  note: {note}" for note in found.notes]
+    return "\n".join([*lines, "", "look at", *(f"  {file}" for file in files)])

@@ -1,0 +1,148 @@
+"""What the IMU says of the speed between one still stretch and the next.
+
+A stretch in which nothing changes is a stop or a smooth cruise: an IMU by itself cannot tell. But no vehicle comes
+from one to the other without a push. The force between two such stretches, levelled with the tilt that the gyro
+saw, integrates to the difference of their speeds:
+
+    dv = integral (f_y - f_y0 + g dpitch) dt,     dpitch = integral (omega_x - bias) dt
+
+so that from one known speed those of all linked stretches follow, and where none is known the faster of two cannot
+be a stop. The same integral decides whether a disturbance between two stops moved the vehicle or shook it only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.detectors.windows import Blocks
+from graphnav.rotation import Array
+
+_INNER = 1.5  # s of a stretch that say what its force and rate are
+_LONGEST = 60.0  # s between stretches over which a difference of speed still means something
+_LEAST = 0.02  # m/s, 1-sigma of any such difference
+_SIGMAS = 3.0
+_G = 9.81  # m/s^2
+_TURN_ON = 1.0e-4  # rad/s, of what a gyro's bias may differ from its mean over the stretches
+_CROSS = 0.01  # of the yaw that a gyro's scale and axes turn into tilt
+_STRAIGHT = 0.3  # rad of yaw; beyond, what biases looked like before points elsewhere
+_MISALIGNED = 0.1  # rad, of the body's axes against the vehicle's
+
+
+@dataclass(frozen=True)
+class Link:
+    """Between one still stretch and the next."""
+
+    change: float  # m/s, forward
+    tolerance: float  # m/s, 3 sigma of the change; infinite when nothing can be said
+    peak: float  # m/s, largest horizontal speed between them if both are stops
+    mean: float  # m/s, size of the mean velocity between them if both are stops
+
+
+_UNKNOWN = Link(0.0, float("inf"), float("inf"), float("inf"))
+
+
+def link(b: Blocks, before: Array, after: Array) -> Link:
+    """Change of speed between two still spans, each (2,) s; unknown across a turn or a gap."""
+    T = float(after[0] - before[1])
+    i = int(np.searchsorted(b.t, max(before[0], before[1] - _INNER)))
+    j = int(np.searchsorted(b.t, min(after[1], after[0] + _INNER)))
+    n0, n1 = (int(k) - i for k in np.searchsorted(b.t, [before[1], after[0]]))
+    if T > _LONGEST or n0 < 3 or j - i - n1 < 3 or not b.whole[i + 1 : j].all():
+        return _UNKNOWN
+    rate = b.rate[i:j]
+    bias = 0.5 * (rate[:n0].mean(axis=0) + rate[n1:].mean(axis=0))
+    left, yaw = _levelled(b.force[i:j], rate - bias, n0, b.period)
+    if np.abs(yaw).max() > _STRAIGHT:
+        return _UNKNOWN
+    if n1 <= n0:
+        return Link(0.0, _SIGMAS * _LEAST, 0.0, 0.0)
+    off = left[n1:].mean()
+    left = left[n0:n1]
+    v = left.sum() * b.period
+    doubt = (
+        0.5 * _G * _TURN_ON * T**2,
+        _G * _CROSS * float(np.abs(yaw[n0:n1]).sum()) * b.period,
+        _MISALIGNED * float(np.abs(left.real).sum()) * b.period,
+    )
+    # what is left at the other end belongs to biases and to a tilt that the gyro did not see
+    share = np.linspace(0.0, 1.0, len(left))
+    way = np.cumsum(left - share * off) * b.period
+    way -= share * way[-1]
+    tolerance = _SIGMAS * float(np.hypot(_LEAST, np.linalg.norm(doubt)))
+    return Link(float(v.imag), tolerance, float(np.abs(way).max()), float(np.abs(way.mean())))
+
+
+def at_rest_until(b: Blocks, span: Array, way: int, most: float, limit: float) -> float:
+    """Time up to which the force, integrated outwards from one end of a stop, stays below a speed.
+
+    Parameters
+    ----------
+    span : (2,) s, the stop.
+    way : 1 goes on from its end, -1 back from its start.
+    most : s to go; limit : m/s.
+    """
+    end = float(span[1] if way > 0 else span[0])
+    inner = min(_INNER, float(span[1] - span[0]))
+    i, k, j = np.searchsorted(b.t, sorted((end - way * inner, end, end + way * most)))
+    n0 = int(k - i if way > 0 else j - k)
+    if n0 < 3 or not b.whole[i + 1 : j].all():
+        return end
+    force, rate, t = b.force[i:j][::way], b.rate[i:j][::way], b.t[i:j][::way]
+    # backwards in time everything turns the other way
+    left, _ = _levelled(force, way * (rate - rate[:n0].mean(axis=0)), n0, b.period)
+    speed = np.abs(np.cumsum(left[n0:]) * b.period)
+    over = np.flatnonzero(speed > limit)
+    last = n0 + (int(over[0]) if len(over) else len(speed)) - 1
+    return float(t[last])
+
+
+def _levelled(force: Array, omega: Array, still: int, period: float) -> tuple[NDArray[np.complex128], Array]:
+    """Horizontal force (n,), right + i forward, without gravity and without what it was at first; and the yaw.
+
+    The first `still` rows stand; `omega` (n, 3) is without bias.
+    """
+    up = force[:still].mean(axis=0)
+    g = float(np.linalg.norm(up))
+    up = up / g
+    forward = np.array([0.0, 1.0, 0.0]) - up[1] * up
+    forward /= np.linalg.norm(forward)
+    level = np.stack([np.cross(forward, up), forward], -1) @ np.array([1.0, 1.0j])
+    yaw = np.cumsum(omega @ up) * period
+    turned = np.exp(1j * yaw)
+    # the tilt, summed in the axes of the beginning and seen in those of each row; up then leans by -tilt x up
+    tilt = np.cumsum((omega @ level) * turned) * period / turned
+    tilt -= tilt[:still].mean()
+    return force @ level - 1j * g * tilt, yaw
+
+
+def moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
+    """Which of M stretches move, given the M - 1 links between them and the speeds known of some.
+
+    Parameters
+    ----------
+    known : (M,) m/s, NaN where no sensor knows a speed; 0 where it is none.
+    """
+    M = len(known)
+    out = np.nan_to_num(known) > 0.0
+    groups = np.split(np.arange(M), [k + 1 for k, one in enumerate(links) if not np.isfinite(one.tolerance)])
+    for group in groups:
+        change = np.r_[0.0, np.cumsum([links[k].change for k in group[:-1]])]
+        # independent errors: their squares add
+        doubt = np.r_[0.0, np.cumsum([links[k].tolerance ** 2 for k in group[:-1]])]
+        sure = np.flatnonzero(np.isfinite(known[group]))
+        for m in range(len(group)):
+            if np.isfinite(known[group[m]]):
+                continue
+            of = sure if len(sure) else np.arange(len(group))
+            apart = np.sqrt(np.abs(doubt[m] - doubt[of]))
+            speed = change[m] - change[of]
+            if len(sure):
+                nearest = int(np.argmin(apart))
+                out[group[m]] = abs(known[group[of[nearest]]] + speed[nearest]) > max(apart[nearest], _SIGMAS * _LEAST)
+            else:
+                # nobody knows a speed: whoever is faster than another one in the chain moves
+                out[group[m]] = bool((speed > np.maximum(apart, _SIGMAS * _LEAST)).any())
+    return out

@@ -1,0 +1,187 @@
+"""Stationary where the engine's idle line rules the spectrum: Li 2024, section 4.2, for any engine.
+
+In windows of 3 s every second, of forward force, up force and pitch rate, Peak-0, Peak-1 and Peak-2 are the highest
+amplitudes from 0 to 10, 10 to 20 and 20 to 30 Hz. A window is stationary if
+
+    speed < 0.5 m/s, where a speed is known;
+    no peak exceeds 15 mg or 0.7 deg/s;
+    1.5 Peak-1 > Peak-0 and 1.5 Peak-2 > Peak-0 of both forces, and Peak-1 >= 7 Peak-0 of the pitch rate.
+
+The statistic is the largest of these quotients, so that it is below 1 where all hold. The paper's bands belong to an
+idle line at 12.5 Hz. Here the line is found in what else is known to be still, and the bands move with it. A ratio
+that this engine does not meet while it idles (no second harmonic, no pitch) is not asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from graphnav.config import FftSettings
+from graphnav.detectors.base import NONE, Detection, Mask, spans_of, within
+from graphnav.detectors.motion import Speeds
+from graphnav.detectors.spectrum import IdleLine, Windows, idle_line, peaks
+from graphnav.recording import Imu
+from graphnav.rotation import Array
+
+MG = 9.80665e-3  # m/s^2
+LINE_OF_THE_PAPER = 12.495  # Hz, to which its bands belong
+_MET = 0.7  # share of still windows that meet a ratio for it to be asked for
+_STRAY = 0.05  # of its frequency that an idle line may lie outside of what was seen of it
+_COLUMNS = 600  # of the spectrogram that is kept for a picture
+_SHOWN = 60.0  # Hz of it
+_SLOWEST = 49.0  # Hz, below which the detector has nothing to look at
+CONDITIONS = (
+    "forward limit", "up limit", "pitch limit",
+    "forward Peak-1", "forward Peak-2", "up Peak-1", "up Peak-2", "pitch Peak-1",
+)  # fmt: skip
+
+
+def detect_fft(imu: Imu, period: float, settings: FftSettings, still: Array, speeds: Sequence[Speeds]) -> Detection:
+    """Windows ruled by the idle line.
+
+    Parameters
+    ----------
+    still : spans (M, 2), s, in which another detector finds the vehicle still: where the line is looked for.
+    speeds : of odometer and GNSS, for the speed condition.
+    """
+    rate = 1.0 / period
+    length, step = round(settings.window * rate), max(1, round(settings.step * rate))
+    columns = (imu.accel[:, 1], imu.accel[:, 2], imu.gyro[:, 0])
+    w = Windows(columns, length, step, rate)
+    begin = np.arange(w.count) * step
+    t_first, t_last = imu.t[begin], imu.t[begin + length - 1] if w.count else imu.t[:0]
+    t = 0.5 * (t_first + t_last) - 0.5 * period
+    if not w.count or rate < _SLOWEST:
+        reason = "the recording is shorter than a window" if rate >= _SLOWEST else f"{rate:.3g} Hz are too few"
+        return Detection("fft", t, np.full(len(t), np.nan), 1.0, t < t, NONE, (f"no FFT detection: {reason}",))
+    whole = t_last - t_first < 1.05 * length * period
+    half = 0.5 * length * period
+    inner = within(t, still, half) & whole
+    line = idle_line(w, np.flatnonzero(inner)) if settings.find_line else None
+    notes: list[str] = []
+    if settings.find_line and line is None:
+        notes.append(_no_line(int(inner.sum()), settings))
+    factor = 1.0 if line is None else line.frequency / LINE_OF_THE_PAPER
+    bands, clipped = _bands(settings, factor, w.frequencies)
+    if clipped:
+        notes.append(clipped)
+    height, where, picture = _measure(w, bands)
+    quotient = _quotients(height, settings)
+    asked: Mask = np.asarray(np.isfinite(quotient).any(axis=0))
+    if line is not None:
+        notes.append(_found(line))
+        idling = inner & _shows(height, where, line)
+        met = np.asarray((quotient[idling] < 1.0).mean(axis=0) >= _MET) if idling.any() else asked
+        left_out = [name for name, ok, seen in zip(CONDITIONS, met, asked, strict=True) if seen and not ok]
+        asked = asked & met
+        quotient = np.column_stack([quotient, _off_line(where, asked, line)])
+        asked = np.append(asked, True)
+        if left_out:
+            notes.append(f"not asked for, because this engine does not meet it at idle: {', '.join(left_out)}")
+    usable = asked[3:8].any() and (line is not None or not settings.find_line)
+    found = np.full(w.count, np.nan)
+    if usable:
+        found = np.where(whole, np.nanmax(np.where(asked, quotient, np.nan), axis=1), np.nan)
+        found = np.maximum(found, _speed_quotient(t, settings, speeds))
+    mask = found < 1.0
+    details = {"peak_frequency": where, "peak_amplitude": height, "bands": np.array(bands), **picture}
+    if line is not None:
+        details["idle_line"] = np.array([line.frequency, line.lowest, line.highest])
+    spans = spans_of(mask, t, half)
+    return Detection("fft", t, found, 1.0, mask, spans, tuple(notes), details)
+
+
+def _shows(height: Array, where: Array, line: IdleLine) -> Mask:
+    """Windows in which the line rules the band of Peak-1 or Peak-2 of one channel at least."""
+    near = np.zeros(len(height), dtype=bool)
+    for k in (1, 2):
+        at = np.abs(where[:, :, k] / (k * line.frequency) - 1.0) < 0.1
+        near |= (at & (height[:, :, k] > height[:, :, 0])).any(axis=1)
+    return near
+
+
+def _off_line(where: Array, asked: Mask, line: IdleLine) -> Array:
+    """How far the line of each window is from where it was seen while idling; above 1 it is another.
+
+    While driving an engine's lines move with its speed. Of the channels whose Peak-1 is asked for the nearest counts.
+    """
+    channels = [c for c, k in ((0, 3), (1, 5), (2, 7)) if asked[k]] or [0, 1, 2]
+    middle = 0.5 * (line.lowest + line.highest)
+    reach = 0.5 * (line.highest - line.lowest) + _STRAY * middle
+    return np.asarray(np.nanmin(np.abs(where[:, channels, 1] - middle), axis=1) / reach)
+
+
+def _bands(settings: FftSettings, factor: float, frequencies: Array) -> tuple[list[tuple[float, float]], str]:
+    ends = [0.0, *(factor * end for end in settings.bands)]
+    top = float(frequencies[-1])
+    bands = [(min(a, top), min(b, top)) for a, b in pairwise(ends)]
+    note = ""
+    if ends[-1] > top + frequencies[1]:
+        lost = [f"Peak-{k}" for k, (a, b) in enumerate(bands) if b - a < 2.0 * frequencies[1]]
+        note = f"the bands up to {ends[-1]:.3g} Hz are cut at {top:.3g} Hz, half the IMU's rate" + (
+            f": {' and '.join(lost)} cannot be seen" if lost else ""
+        )
+    return bands, note
+
+
+def _measure(w: Windows, bands: Sequence[tuple[float, float]]) -> tuple[Array, Array, dict[str, Array]]:
+    """Amplitude and frequency of the peaks (W, 3 channels, 3 bands), and a thinned spectrogram of the up force."""
+    height, where = np.full((w.count, 3, 3), np.nan), np.full((w.count, 3, 3), np.nan)
+    f = w.frequencies
+    shown = int(np.searchsorted(f, _SHOWN))
+    keep = np.unique(np.linspace(0, w.count - 1, _COLUMNS).astype(int))
+    rows = []
+    for part, a in w.amplitudes():
+        for k, (low, high) in enumerate(bands):
+            where[part, :, k], height[part, :, k] = peaks(a, f, low, high)
+        inside = keep[(keep >= part.start) & (keep < part.stop)] - part.start
+        rows.append(a[inside, 1, :shown])
+    picture = {"spectrogram": np.concatenate(rows), "spectrogram_rows": keep, "spectrogram_frequency": f[:shown]}
+    return height, where, picture
+
+
+def _quotients(height: Array, settings: FftSettings) -> Array:
+    """(W, 8) as in `CONDITIONS`: all below 1 is stationary, NaN what cannot be seen."""
+    limit = np.array([settings.force_limit * MG, settings.force_limit * MG, np.radians(settings.rate_limit)])
+    # fmax leaves out a peak that cannot be seen
+    size = np.fmax(np.fmax(height[..., 0], height[..., 1]), height[..., 2]) / limit
+    peak0 = height[:, :, 0]
+    ratios = [peak0[:, c] / (settings.force_ratio * np.maximum(height[:, c, k], 1e-12)) for c in (0, 1) for k in (1, 2)]
+    ratios.append(settings.rate_ratio * peak0[:, 2] / np.maximum(height[:, 2, 1], 1e-12))
+    return np.column_stack([size, *ratios])
+
+
+def _speed_quotient(t: Array, settings: FftSettings, speeds: Sequence[Speeds]) -> Array:
+    """Speed over the limit, the largest of all sensors; 0 where none is known."""
+    out = np.zeros(len(t))
+    half = 0.5 * settings.window
+    for s in speeds:
+        k = np.clip(np.searchsorted(s.t, t), 1, len(s.t) - 1)
+        k -= (t - s.t[k - 1]) < (s.t[k] - t)
+        near = np.abs(s.t[k] - t) < half
+        three = np.clip(k[:, None] + [-1, 0, 1], 0, len(s.t) - 1)
+        excess = np.median(s.speed[three] / np.maximum(settings.max_speed, s.limit[three]), axis=1)
+        out = np.where(near, np.maximum(out, excess), out)
+    return out
+
+
+def _found(line: IdleLine) -> str:
+    drift = "" if line.highest - line.lowest < 0.5 else f" (from {line.lowest:.1f} to {line.highest:.1f})"
+    if np.isnan(line.harmonic):
+        second = "its second harmonic lies above half the IMU's rate"
+    else:
+        second = "with its second harmonic" if line.harmonic > 1.0 else "without a second harmonic"
+    rest = "" if line.share > 0.9 else f", in {100.0 * line.share:.0f} % of the still windows"
+    return f"idle line at {line.frequency:.2f} Hz{drift}, {second}{rest}"
+
+
+def _no_line(windows: int, settings: FftSettings) -> str:
+    if windows < 3:
+        return f"no idle line: no {settings.window + 2 * settings.step:.3g} s are still enough to look for one"
+    return (
+        "no idle line from 8 to 50 Hz where the vehicle stands: engine off, electric, or out of the IMU's sight; "
+        "the other detectors do without"
+    )

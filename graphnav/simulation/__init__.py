@@ -1,0 +1,105 @@
+"""Simulated recordings with exact truth: `simulate("li2024", seed=1)`.
+
+A scenario is a function of a seed and a few options; `scenarios()` lists them. Every number that comes from here is
+called simulated, in the recording's name too.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import tomllib
+from collections.abc import Sequence
+from typing import Any
+
+from graphnav.errors import ConfigError
+from graphnav.simulation.result import Simulated
+from graphnav.simulation.scenarios import Scenario, scenarios
+
+__all__ = ["Scenario", "Simulated", "catalogue", "options_from", "scenario", "scenarios", "simulate"]
+
+
+def scenario(name: str) -> Scenario:
+    """The scenario of a name.
+
+    Raises
+    ------
+    ConfigError
+        If there is none.
+    """
+    known = scenarios()
+    if name not in known:
+        raise ConfigError(f"no scenario '{name}'{_nearest(name, list(known))}")
+    return known[name]
+
+
+def simulate(name: str, seed: int = 0, **options: Any) -> Simulated:
+    """Run the scenario `name`; the same name, seed and options give the same recording.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown scenario or option, or an option's impossible value.
+    """
+    one = scenario(name)
+    known = defaults(one)
+    for key, value in options.items():
+        if key not in known:
+            raise ConfigError(f"scenario '{name}' has no option '{key}'{_nearest(key, list(known))}")
+        if not _alike(value, known[key]):
+            raise ConfigError(f"scenario '{name}': {key} = {value!r} is not of the kind of its default {known[key]!r}")
+    if not 0 <= seed < 2**32:
+        raise ConfigError(f"seed {seed}: must be from 0 to {2**32 - 1}")
+    return one.run(seed, **options)
+
+
+def defaults(one: Scenario) -> dict[str, Any]:
+    """A scenario's options and their defaults."""
+    return {p.name: p.default for p in inspect.signature(one.run).parameters.values() if p.name != "seed"}
+
+
+def _alike(value: Any, default: Any) -> bool:
+    """Whether a value may stand for a default: numbers for numbers, of which True is none."""
+    if isinstance(default, bool) or isinstance(value, bool):
+        return isinstance(default, bool) and isinstance(value, bool)
+    if isinstance(default, float | int):
+        return isinstance(value, float | int) and value == value and abs(value) != float("inf")
+    return isinstance(value, type(default))
+
+
+def options_from(name: str, settings: Sequence[str]) -> dict[str, Any]:
+    """Options from the command line's KEY=VALUE; values are written as in TOML, text without quotes.
+
+    Raises
+    ------
+    ConfigError
+        If one is not of that form, or its value is no value.
+    """
+    known = defaults(scenario(name))
+    out: dict[str, Any] = {}
+    for setting in settings:
+        key, sign, text = (part.strip() for part in setting.partition("="))
+        if not sign or not key:
+            raise ConfigError(f"--set {setting}: must be KEY=VALUE")
+        if isinstance(known.get(key), str):
+            out[key] = text.strip('"')
+            continue
+        try:
+            out[key] = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            raise ConfigError(f"--set {setting}: '{text}' is not a number, true or false") from None
+    return out
+
+
+def catalogue() -> str:
+    """Every scenario with its sentence and its options."""
+    lines = []
+    for name, one in scenarios().items():
+        options = ", ".join(f"{key}={str(value).lower()}" for key, value in defaults(one).items())
+        lines += [f"{name:<9} {one.about}", f"{'':<9}   --set {options}"]
+    return "\n".join(lines)
+
+
+def _nearest(name: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"; did you mean '{close[0]}'?" if close else f"; known are {', '.join(known) or 'none'}"

@@ -1,0 +1,137 @@
+"""What the driver does: manoeuvres one after another, turned into smooth functions of time.
+
+The motion is that of the point that does not slip sideways (the middle of the rear axle), and of the road under it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from graphnav.errors import ConfigError
+from graphnav.findings import runs_of
+from graphnav.rotation import Array
+from graphnav.simulation.splines import centres, spline
+
+STEP = 0.1  # s between coefficients: a driver's foot and hands do not move faster
+DEGREE = 3  # the acceleration is smooth, the jerk continuous
+SETTLE = (DEGREE - 1) / 2 * STEP  # s by which the spline of a speed that ends on the grid reaches beyond its end
+
+SPEED, HEADING, SLOPE, BANK, SLIP = range(5)  # channels of Path.spline
+
+
+@dataclass(frozen=True)
+class Manoeuvre:
+    """One thing a driver does. The speed changes evenly through it; turn and slope follow the way covered.
+
+    `speed` is the speed at its end, m/s, negative in reverse; `turn` the change of heading, deg, to the right
+    positive; `grade` the slope at its end, rise over run; `bank` the road's fall to the right at its end, deg.
+    None keeps what was.
+    """
+
+    duration: float  # s
+    speed: float
+    turn: float = 0.0
+    grade: float | None = None
+    bank: float | None = None
+
+
+def stand(duration: float) -> Manoeuvre:
+    """Do not move."""
+    return Manoeuvre(duration, 0.0)
+
+
+def cruise(duration: float, speed: float, turn: float = 0.0, grade: float | None = None) -> Manoeuvre:
+    """Keep (or reach evenly) a speed, perhaps bending and climbing."""
+    return Manoeuvre(duration, speed, turn, grade)
+
+
+@dataclass(frozen=True)
+class Path:
+    """Speed (m/s, signed), heading, slope, bank and side-slip (rad) as one spline of five channels."""
+
+    spline: BSpline
+    start: float  # s
+    end: float
+
+    def sampled(self, channel: int, t: Array) -> Array:
+        """One channel at times within the path (the nearest end beyond it)."""
+        return self.spline(np.clip(t, self.start, self.end))[..., channel]
+
+    def speed(self, t: Array) -> Array:
+        """Signed speed of the rear axle, m/s."""
+        return self.sampled(SPEED, t)
+
+    def travelled(self, t: Array) -> Array:
+        """Metres along the way from the start, backward ones counted negative."""
+        whole = self.spline.antiderivative()
+        return whole(np.clip(t, self.start, self.end))[..., SPEED] - whole(self.start)[SPEED]
+
+    def stops(self) -> Array:
+        """(M, 2) s: the spans in which the wheels do not turn at all."""
+        zero = np.asarray(self.spline.c[:, SPEED] == 0.0)
+        whole = np.asarray(np.lib.stride_tricks.sliding_window_view(zero, DEGREE + 1).all(axis=1))
+        spans = [(self.start + a * STEP, min(self.start + b * STEP, self.end)) for a, b in runs_of(whole)]
+        return np.array(spans, dtype=float).reshape(-1, 2)
+
+
+def drive(
+    manoeuvres: Sequence[Manoeuvre], *, start: float = 0.0, heading: float = 0.0, slip_per_accel: float = 0.0
+) -> Path:
+    """The path of `manoeuvres` from a standstill at `start` s, facing `heading` deg from north.
+
+    `slip_per_accel`, rad/(m/s^2): by how much the rear axle moves outward of where the vehicle points, per
+    lateral acceleration.
+
+    Raises
+    ------
+    ConfigError
+        If a manoeuvre turns on the spot, changes between forward and reverse, or takes no time.
+    """
+    durations = np.array([m.duration for m in manoeuvres], dtype=float)
+    if len(durations) == 0 or durations.min() <= 0:
+        raise ConfigError("a drive needs manoeuvres that each take some time")
+    edges = start + np.r_[0.0, np.cumsum(durations)]
+    v1 = np.array([m.speed for m in manoeuvres], dtype=float)
+    v0 = np.r_[0.0, v1[:-1]]
+    way = 0.5 * (v0 + v1) * durations
+    for k, m in enumerate(manoeuvres):
+        if v0[k] * v1[k] < 0:
+            raise ConfigError(f"manoeuvre {k}: stop before changing between forward and reverse")
+        if m.turn and way[k] == 0:
+            raise ConfigError(f"manoeuvre {k}: cannot turn on the spot")
+
+    t = centres(start, float(edges[-1]), STEP, DEGREE)
+    i = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(durations) - 1)
+    u = np.clip((t - edges[i]) / durations[i], 0.0, 1.0)
+    gain = v1[i] - v0[i]
+    speed = v0[i] + gain * u * u * (3.0 - 2.0 * u)
+    speed[np.abs(speed) < 1e-9] = 0.0  # of a manoeuvre whose end rounding puts beside the grid
+    covered = (v0[i] * u + gain * (u**3 - 0.5 * u**4)) * durations[i]
+    share = np.divide(covered, way[i], out=np.zeros_like(t), where=way[i] != 0)
+    share = share * share * (3.0 - 2.0 * share)
+
+    def along(ends: Sequence[float], first: float) -> Array:
+        last, before = np.array(ends, dtype=float), np.r_[first, ends[:-1]]
+        # where nothing is covered, nothing can change
+        last = np.where(way == 0, before, last)
+        return before[i] + (last - before)[i] * share
+
+    turned = heading + np.cumsum([m.turn for m in manoeuvres])
+    psi = np.deg2rad(along(list(turned), heading))
+    slope = np.arctan(along(_kept([m.grade for m in manoeuvres]), 0.0))
+    bank = np.deg2rad(along(_kept([m.bank for m in manoeuvres]), 0.0))
+    slip = slip_per_accel * speed * np.gradient(psi, STEP)
+    return Path(spline(start, STEP, np.column_stack([speed, psi, slope, bank, slip]), DEGREE), start, float(edges[-1]))
+
+
+def _kept(values: Sequence[float | None]) -> list[float]:
+    """Values with None replaced by the one before, 0 at first."""
+    out, last = [], 0.0
+    for value in values:
+        last = last if value is None else float(value)
+        out.append(last)
+    return out

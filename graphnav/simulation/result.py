@@ -1,0 +1,89 @@
+"""What a scenario returns, and how a drive's parts become a recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from graphnav.formats.writing import rounded, write_facts, write_folder
+from graphnav.recording import Imu, Recording, Truth
+from graphnav.rotation import Array
+from graphnav.simulation.aiding import GnssModel, OdometerModel
+from graphnav.simulation.inertial import ImuModel
+from graphnav.simulation.kinematics import Motion, Mount, move
+from graphnav.simulation.motion import Path
+from graphnav.simulation.vibration import Shake
+from graphnav.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A recording as its files would hold it, and everything about it that no sensor tells."""
+
+    recording: Recording
+    truth: Trajectory  # of the IMU at the start and every sample, biases included (of the period that ends there)
+    stops: Array  # (M, 2) s: the wheels do not turn
+    facts: dict[str, Any] = field(default_factory=dict)  # what was put in, for JSON
+    motion: Motion | None = field(default=None, repr=False)  # with the error-free samples
+
+    def text(self) -> str:
+        """One line for people."""
+        imu, stopped = self.recording.imu, float(np.sum(np.diff(self.stops)))
+        return (
+            f"{self.recording.name}: {self.recording.duration:.1f} s, IMU at {1.0 / np.median(np.diff(imu.t)):.4g} Hz, "
+            f"{len(self.stops)} stops ({stopped:.1f} s)"
+        )
+
+    def write(self, folder: str | FilePath) -> list[FilePath]:
+        """The recording folder, with `simulated.json` beside it for the stops and facts; returns the files."""
+        notes = ("Simulated by graphnav: made data, not a measurement.", *(f"{k}: {v}" for k, v in self.facts.items()))
+        files = write_folder(self.recording, folder, [" ".join(note.split()) for note in notes])
+        facts = {"simulated": True, "stops": self.stops.tolist(), **self.facts}
+        return [*files, write_facts(FilePath(folder) / "simulated.json", facts)]
+
+
+def record(
+    name: str,
+    seed: int,
+    path: Path,
+    *,
+    origin: tuple[float, float, float],
+    imu: ImuModel,
+    mount: Mount,
+    shake: Shake,
+    gnss: GnssModel | None = None,
+    odometer: OdometerModel | None = None,
+    exact: bool = False,
+    truth_rate: float = 10.0,
+    facts: dict[str, Any] | None = None,
+) -> Simulated:
+    """Drive `path` and read the sensors. `exact` leaves out the IMU's errors and keeps its stated figures."""
+    motion = move(path, origin, mount, shake, imu.rate)
+    gyro, accel = motion.gyro, motion.accel
+    b_g, b_a = np.zeros_like(gyro), np.zeros_like(accel)
+    if not exact:
+        gyro, accel, b_g, b_a = imu.read(gyro, accel, seed)
+    rph = motion.rph
+    every = slice(None, None, max(1, round(imu.rate / truth_rate)))
+    known: dict[str, Any] = {"scenario": name, "seed": seed, "imu": imu.name, **(facts or {})}
+    known["mounting_deg"] = {"roll": mount.angles[0], "pitch": mount.angles[1], "heading": mount.angles[2]}
+    wheels = None
+    if odometer is not None:
+        wheels, scale = odometer.read(path, mount, seed)
+        known["odometer_scale_error"] = scale
+    recording = Recording(
+        name=f"{name} (simulated, seed {seed})",
+        platform="vehicle",
+        imu=Imu(motion.t[1:], gyro, accel, imu.noise),
+        gnss=None if gnss is None else gnss.read(motion, seed),
+        odometer=wheels,
+        truth=Truth(motion.t[every], motion.llh[every], None, motion.v[every], rph[every]),
+    )
+    truth = Trajectory(
+        motion.t, motion.llh, motion.v, rph, name="truth",
+        gyro_bias=np.vstack([b_g[:1], b_g]), accel_bias=np.vstack([b_a[:1], b_a]),
+    )  # fmt: skip
+    return Simulated(rounded(recording), truth, path.stops(), known, motion)

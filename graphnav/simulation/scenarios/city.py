@@ -1,0 +1,112 @@
+"""Towns: lights, corners, hills, tunnels and parking; with an engine, and electric."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.errors import ConfigError
+from graphnav.rotation import Array
+from graphnav.simulation.aiding import GnssModel, OdometerModel, Span
+from graphnav.simulation.inertial import MEMS
+from graphnav.simulation.kinematics import Mount
+from graphnav.simulation.motion import Manoeuvre, Path, drive
+from graphnav.simulation.passengers import Boarding, Fidget, movement
+from graphnav.simulation.result import Simulated, record
+from graphnav.simulation.scenarios.registry import Scenario
+from graphnav.simulation.scenarios.town import streets
+from graphnav.simulation.splines import stream
+from graphnav.simulation.vibration import Engine, Idle, Shake, Springs, idle_floor, road_noise
+
+# a four-cylinder: its second order is the strong one
+FOUR_CYLINDERS = Idle(((0.4, 0.5, 0.8), (1.5, 3.0, 6.0), (0.5, 1.0, 2.0)), (0.02, 0.15, 0.02))
+ORDERS = (1.0, 2.0, 4.0)
+RTK = GnssModel(white=(0.01, 0.01, 0.02), slow=(0.008, 0.008, 0.015), lever_arm=(0.1, -0.3, 0.8))
+SINGLE = GnssModel(
+    white=(0.5, 0.5, 1.0), slow=(1.5, 1.5, 3.0), slow_time=100.0, velocity=(0.1, 0.1, 0.15), lever_arm=(0.1, -0.3, 0.8)
+)
+PULSE = 2.0 * np.pi * 0.31 / 48.0 / 4.0  # m of way: 48 teeth on each of four wheels of 0.31 m
+
+
+def urban(
+    seed: int, *, duration: float = 1200.0, tunnels: int = 2, gnss: str = "rtk", odometer: bool = True,
+    engine: bool = True, idle_hz: float = 13.3, exact: bool = False, rate: float = 100.0,
+) -> Simulated:  # fmt: skip
+    """A consumer IMU through a town of `duration` s with `tunnels` gaps in GNSS, and backwards into a parking place.
+
+    `gnss` is "rtk" or "single"; the odometer counts wheel pulses; `idle_hz` is the crankshaft's, whose strong line is
+    at twice this.
+    """
+    return _town("urban", seed, duration, tunnels, gnss, odometer, idle_hz if engine else 0.0, exact, rate)
+
+
+def electric(
+    seed: int, *, duration: float = 900.0, tunnels: int = 1, gnss: str = "rtk", odometer: bool = True,
+    exact: bool = False, rate: float = 100.0,
+) -> Simulated:  # fmt: skip
+    """The same sort of town in a car whose stops are silent."""
+    return _town("electric", seed, duration, tunnels, gnss, odometer, 0.0, exact, rate)
+
+
+def _town(
+    name: str, seed: int, duration: float, tunnels: int, gnss: str, odometer: bool, idle_hz: float, exact: bool,
+    rate: float,
+) -> Simulated:  # fmt: skip
+    if duration < 240.0:
+        raise ConfigError(f"duration = {duration:g}: a town takes at least 240 s")
+    if gnss not in ("rtk", "single"):
+        raise ConfigError(f"gnss = '{gnss}': must be rtk or single")
+    rng = stream(seed, "way")
+    parking = [
+        Manoeuvre(4.0, 4.0), Manoeuvre(4.0, 0.0, 15.0), Manoeuvre(3.0, 0.0),
+        Manoeuvre(2.0, -1.2), Manoeuvre(4.0, -1.2, 50.0), Manoeuvre(4.0, -1.0, -65.0), Manoeuvre(2.0, 0.0),
+        Manoeuvre(2.0, 0.0), Manoeuvre(2.0, 0.5), Manoeuvre(1.0, 0.0), Manoeuvre(15.0, 0.0),
+    ]  # fmt: skip
+    way = duration - 20.0 - sum(m.duration for m in parking)
+    plan = [Manoeuvre(20.0, 0.0), *streets(way, rng, hills=0.06, pause=0.5), *parking]
+    path = drive(plan, heading=float(rng.uniform(0.0, 360.0)), slip_per_accel=0.005)
+    mount = Mount(above_axle=(0.1, 1.4, 0.6), angles=(0.8, -1.2, 1.5))
+    parts = [
+        road_noise(path, stream(seed, "road")),
+        Springs(height=0.4).lean(path),
+        movement(path, _sitting(path, seed), (0.0, 0.0, 0.4), stream(seed, "passengers")),
+    ]
+    if idle_hz:
+        motor = Engine(FOUR_CYLINDERS, idle_hz, ORDERS, wander_hz=0.06)
+        parts += [motor.lines(path, rate, stream(seed, "engine")), idle_floor(path, stream(seed, "idling"))]
+    gaps = spread(path, tunnels, (20.0, 45.0), stream(seed, "tunnels"))
+    receiver = replace(RTK if gnss == "rtk" else SINGLE, outages=gaps, dropouts=0.01)
+    return record(
+        name, seed, path,
+        origin=(45.46, 9.19, 20.0), imu=MEMS.at(rate), mount=mount, shake=Shake(tuple(parts)), exact=exact,
+        gnss=receiver, odometer=OdometerModel(rate=10.0, scale=0.01, white=0.0, pulse=PULSE) if odometer else None,
+        facts={"tunnels_s": [list(gap) for gap in gaps], "engine_hz": idle_hz},
+    )  # fmt: skip
+
+
+def _sitting(path: Path, seed: int) -> list[Boarding | Fidget]:
+    """People on their seats all along, and the driver getting out at the end."""
+    rng = stream(seed, "events")
+    times = np.sort(rng.uniform(path.start, path.end, rng.poisson((path.end - path.start) / 60.0)))
+    fidgets = [Fidget(float(t), float(rng.uniform(0.02, 0.15))) for t in times]
+    return [*fidgets, Boarding(path.end - 9.0, -1.0, -1.0, 1.0)]
+
+
+def spread(path: Path, count: int, length: Span, rng: np.random.Generator) -> tuple[Span, ...]:
+    """`count` gaps over the drive, each where the vehicle moves most, of a length between the two given, s."""
+    t = np.arange(path.start, path.end)
+    moved: Array = np.abs(path.speed(t))
+    gaps = []
+    for part in np.array_split(np.arange(len(t))[90:], max(count, 1))[:count]:
+        seconds = int(rng.uniform(*length))
+        way = np.convolve(moved[part], np.ones(seconds), "valid")
+        first = float(t[part[int(np.argmax(way))]])
+        gaps.append((first + 0.5, first + seconds + 0.5))
+    return tuple(gaps)
+
+
+SCENARIOS = [
+    Scenario("urban", "20 min of town: lights, corners, slopes, two tunnels, parking backwards, wheel pulses", urban),
+    Scenario("electric", "a quarter of an hour of town in a car without an engine: its stops are silent", electric),
+]

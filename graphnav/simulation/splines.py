@@ -1,0 +1,33 @@
+"""Uniform B-splines as the one kind of function a simulated motion is made of.
+
+Their coefficients are values of the wanted function at the splines' centres. Where neighbouring coefficients
+are equal the spline is constant exactly, so a vehicle that is told to stand stands; the derivative and the
+integral are splines again, so motion, rate and force belong together exactly.
+De Boor, *A Practical Guide to Splines* (2001), ch. IX-XI.
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from graphnav.rotation import Array
+
+
+def centres(start: float, end: float, step: float, degree: int) -> Array:
+    """The times (J,), s, at which the coefficients of a spline on [start, end] are taken."""
+    count = int(np.ceil((end - start) / step - 1e-9)) + degree
+    return start + (np.arange(count) - (degree - 1) / 2) * step
+
+
+def spline(start: float, step: float, coefficients: Array, degree: int) -> BSpline:
+    """The spline with coefficients (J, ...) at `centres(start, ..., step, degree)`."""
+    knots = start + (np.arange(len(coefficients) + degree + 1) - degree) * step
+    return BSpline(knots, np.asarray(coefficients, dtype=float), degree)
+
+
+def stream(seed: int, part: str) -> np.random.Generator:
+    """The random numbers of one part of a simulation: other parts may change without changing these."""
+    return np.random.default_rng([seed, zlib.crc32(part.encode())])

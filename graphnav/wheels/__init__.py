@@ -1,0 +1,8 @@
+"""Odometers as they are: what a reading is worth, where readings are wrong, and the mean speed over any window."""
+
+from __future__ import annotations
+
+from graphnav.wheels.faults import Faults, faults
+from graphnav.wheels.mean import MeanSpeed, gaps, longest_step, quantum, reading_sigma
+
+__all__ = ["Faults", "MeanSpeed", "faults", "gaps", "longest_step", "quantum", "reading_sigma"]
