@@ -47,6 +47,7 @@ class Alignment:
     own_sigma: Array  # (3,) rad, of roll, pitch, heading as the alignment itself believes them
     notes: tuple[str, ...]
     motion: float | None = None  # s, about when the vehicle first moves; None when it never does
+    until: float | None = None  # s, the end of the stretch it was found from, None when without motion
 
     @property
     def rph(self) -> Array:
@@ -69,7 +70,7 @@ def align(recording: Recording, settings: Settings, frame: LocalFrame, smooth: S
     span = _motion(recording, settings)
     if span is None:
         return _at_rest(recording, settings, frame)
-    return replace(_in_motion(recording, settings, frame, smooth, span), motion=span[0])
+    return replace(_in_motion(recording, settings, frame, smooth, span), motion=span[0], until=span[1])
 
 
 def with_known_heading(found: Alignment, settings: Settings) -> Alignment:

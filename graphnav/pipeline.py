@@ -91,14 +91,14 @@ def _solve(
         "judgement": judged - after,
         "preintegration": time.perf_counter() - judged,
     }
-    forward = ekf(problem, progress)
+    forward = ekf(problem, progress, aligned.until)
     began, smoothed = time.perf_counter(), None
     if any(isinstance(rows, Wheels) for rows in problem.constraints):
         smoothed = backward(problem, forward, progress)
         problem, raised = judgement.judge_wheels(problem, smoothed)
         timings["smoother"] = time.perf_counter() - began
         if raised:
-            forward, smoothed, said = ekf(problem, progress), None, (*said, *raised)
+            forward, smoothed, said = ekf(problem, progress, aligned.until), None, (*said, *raised)
     out = {"ekf": forward.solution}
     if "rts" in solvers or "batch" in solvers:
         out["rts"] = rts(problem, forward, progress, smoothed)
@@ -132,7 +132,7 @@ def _judged(
     def smoothed(how: Settings) -> tuple[Problem, Filtered, Smoothed]:
         noisy = replace(part, imu=replace(part.imu, noise=noise))
         problem = judgement.weighted(pose(noisy, how, frame, aligned.state, aligned.sigma, stationary), weight)
-        forward = ekf(problem)
+        forward = ekf(problem, opening=aligned.until)
         return problem, forward, backward(problem, forward)
 
     problem, forward, back = smoothed(plain)
@@ -170,7 +170,7 @@ def _start(
     turn = np.linalg.norm(aligned.state.minus(stated.state)[0, :3])
     if turn > _FAR:
         other = replace(problem, prior=replace(problem.prior, mean=aligned.state, sigma=aligned.sigma[None]))
-        smoothed = rts(other, ekf(other))
+        smoothed = rts(other, ekf(other, opening=aligned.until))
     return smoothed.states, {name: p.value for name, p in smoothed.parameters.items()}
 
 

@@ -107,7 +107,7 @@ def _minimise(problem: Problem, point: Point, progress: Progress | None, reinteg
         problem, renewed = _renew(problem, point)
     layout = Layout(problem)
     now = cost(problem, point, layout)
-    damping = 0.0
+    damping, gentlest = 0.0, _MIN_DAMPING
     stopped = f"stopped at the limit of {settings.max_iterations} iterations"
     eliminated: Eliminated | None = None
     iteration = 0
@@ -125,7 +125,7 @@ def _minimise(problem: Problem, point: Point, progress: Progress | None, reinteg
             if ahead < now or gain < settings.tolerance:
                 break
             refused += 1
-            damping = max(_MIN_DAMPING, 10.0 * damping)
+            damping = max(gentlest, 10.0 * damping)
             if damping > _MAX_DAMPING:
                 break
         if damping > _MAX_DAMPING:
@@ -140,6 +140,8 @@ def _minimise(problem: Problem, point: Point, progress: Progress | None, reinteg
             point, now = candidate, ahead
         eliminated = None
         # a damped step promises little by construction: convergence is judged by an undamped one
+        if damping == gentlest:
+            gentlest /= 10.0  # more would have been possible: a long valley is not crept along
         damping = 0.0 if damping <= _MIN_DAMPING or gain < settings.tolerance else damping / 10.0
         if reintegrate:
             problem, again = _renew(problem, point)

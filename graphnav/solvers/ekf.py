@@ -13,6 +13,16 @@ and updates with the rows of every constraint there, nu = -r,
 Backwards, with C = P_k F^T P^-_{k+1}^-1 (Rauch, Tung, Striebel 1965),
 
     x^s_k = x_k [+] C (x^s_{k+1} [-] x^-_{k+1})     P^s_k = P_k + C (P^s_{k+1} - P^-_{k+1}) C^T
+
+The opening, the part that the alignment has seen, is run through twice. Before a vehicle moves nothing tells its
+heading, the filter's wanders by degrees until the first motion puts it right, and Jacobians taken along the way
+contradict those taken afterwards: heading, tilt and accelerometer bias get correlations that were never measured.
+So the opening is filtered and smoothed, and filtered again from the same prior, linearised at points X that the first
+pass left (Bell 1994: one step of the iterated smoother, over these keyframes only),
+
+    x_k = X_k [+] e_k     e_{k+1} <- f(X_k) [-] X_{k+1} + F e_k     nu = -(r(X) + H e)
+
+Later keyframes are linearised where the filter is.
 """
 
 from __future__ import annotations
@@ -24,6 +34,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.lapack import dposv
 
+from graphnav import rotation
 from graphnav.constraints.base import Constraint, assemble
 from graphnav.dense import dense
 from graphnav.dynamics import SCALE
@@ -37,10 +48,9 @@ Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class Filtered:
-    """A forward pass, with what the backward pass needs."""
+class Forward:
+    """A forward pass over the first K keyframes, with what the backward pass needs."""
 
-    solution: Solution
     states: list[States]  # K filtered states of one row each
     values: Array  # (K, D-15) parameter values
     values_predicted: Array  # (K, D-15)
@@ -48,12 +58,57 @@ class Filtered:
     predicted: list[States]  # K predicted states
     P_predicted: Array  # (K, D, D)
     F: Array  # (K-1, D, D)
+    records: dict[str, _Innovations]
+    about: Smoothed | None  # points at which the first keyframes were linearised; their P is of errors about these
 
 
-def ekf(problem: Problem, progress: Progress | None = None) -> Filtered:
-    """Run the filter over all keyframes."""
+@dataclass(frozen=True)
+class Filtered(Forward):
+    """A forward pass over the whole problem."""
+
+    solution: Solution
+
+
+def ekf(problem: Problem, progress: Progress | None = None, opening: float | None = None) -> Filtered:
+    """Run the filter over all keyframes.
+
+    Parameters
+    ----------
+    opening : s, the end of what the alignment has seen of the recording; up to there the filter runs twice. Estimates
+        after it depend on nothing later than themselves.
+    """
     began = time.perf_counter()
-    K, columns = len(problem.t), problem.columns
+    K, about = len(problem.t), None
+    if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
+        about = backward(problem, _forward(problem, n))
+    one = _forward(problem, K, about, progress)
+    seconds = time.perf_counter() - began
+    filtered, P = States.stack(one.states), one.P[:, :DIM, :DIM]
+    if about is not None:
+        n = len(about.values) - 1
+        P = P.copy()
+        P[:n] = _about_own(P[:n], filtered[:n].minus(about.states[:n]))
+    solution = Solution(
+        solver="ekf",
+        frame=problem.frame,
+        t=problem.t,
+        states=filtered,
+        covariance=P,
+        parameters=_parameters(problem, one.values, one.P),
+        records={name: r.record(problem) for name, r in one.records.items()},
+        counts={"imu": K - 1, **{rows.name: len(rows) for rows in problem.constraints}},
+        iterations=1,
+        stopped="one pass forward over all keyframes",
+        timings={"filter": seconds},
+        notes=problem.notes,
+        between=(dense(problem, filtered, P, _scale(problem, one.values), smooth=False),),
+    )
+    return Filtered(**vars(one), solution=solution)
+
+
+def _forward(problem: Problem, K: int, about: Smoothed | None = None, progress: Progress | None = None) -> Forward:
+    """Filter the first K keyframes, of which the first few are linearised at given points."""
+    columns, n = problem.columns, 0 if about is None else len(about.values)
     D = DIM + sum(s.stop - s.start for s in columns.values())
     state = problem.prior.mean
     assert state is not None
@@ -71,51 +126,43 @@ def ekf(problem: Problem, progress: Progress | None = None) -> Filtered:
     for k in range(K):
         if k:
             step = slice(k - 1, k)
-            scale = None if scale_at is None else values[_shift(scale_at)]
-            ahead, F15 = problem.motion.propagate(step, state, scale)
+            at, at_values = (state, values) if about is None or k >= n else about.at(k - 1)
+            scale = None if scale_at is None else at_values[_shift(scale_at)]
+            ahead, F15 = problem.motion.propagate(step, at, scale)
             F = all_F[k - 1]
             F[:DIM, :DIM] = F15[0]
             if scale_at is not None:
                 F[:DIM, scale_at] = problem.motion.scale_columns(step, F15)[0]
-            for at, chain, j in steps.get(k, ()):
-                F[at, at] *= chain.decay[j]
-                values[_shift(at)] = chain.mean[j] + chain.decay[j] * (values[_shift(at)] - chain.mean[j - 1])
-                added[at] = chain.sigma[j] ** 2
+            at_values = at_values.copy()
+            for column, chain, j in steps.get(k, ()):
+                F[column, column] *= chain.decay[j]
+                at_values[_shift(column)] -= chain.mean[j - 1]
+                at_values[_shift(column)] = chain.mean[j] + chain.decay[j] * at_values[_shift(column)]
+                added[column] = chain.sigma[j] ** 2
             P = F @ P @ F.T
-            P[:DIM, :DIM] += problem.motion.noise(step, state.R_nb)[0]
+            P[:DIM, :DIM] += problem.motion.noise(step, at.R_nb)[0]
             if k in steps:
                 P.flat[:: D + 1] += added
                 added[:] = 0.0
-            state = ahead
+            if about is not None and k < n:
+                e = F @ about.offset(k - 1, state, values)
+                ahead, at_values = ahead.plus(e[None, :DIM]), at_values + e[DIM:]
+            state, values = ahead, at_values
         predicted.append(state)
         all_vp[k] = values
         all_Pp[k] = P
         for rows in problem.constraints:
             lo, hi = first[rows.name][k], first[rows.name][k + 1]
             if hi > lo:
-                state, values, P = _update(rows, lo, hi, state, values, P, columns, records[rows.name])
+                x, record = (state, values, P), records[rows.name]
+                state, values, P = _update(rows, lo, hi, *x, columns, record, about if k < n else None, k)
+        if about is not None and k == n - 1:
+            P = _about_own(P, about.offset(k, state, values)[:3])  # from here on linearised where the filter is
         states.append(state)
         all_P[k], all_values[k] = P, values
         if progress is not None and k % 256 == 0:
             progress("filter", k / K)
-    seconds = time.perf_counter() - began
-    filtered = States.stack(states)
-    solution = Solution(
-        solver="ekf",
-        frame=problem.frame,
-        t=problem.t,
-        states=filtered,
-        covariance=all_P[:, :DIM, :DIM],
-        parameters=_parameters(problem, all_values, all_P),
-        records={name: r.record(problem) for name, r in records.items()},
-        counts={"imu": K - 1, **{rows.name: len(rows) for rows in problem.constraints}},
-        iterations=1,
-        stopped="one pass forward over all keyframes",
-        timings={"filter": seconds},
-        notes=problem.notes,
-        between=(dense(problem, filtered, all_P[:, :DIM, :DIM], _scale(problem, all_values), smooth=False),),
-    )
-    return Filtered(solution, states, all_values, all_vp, all_P, predicted, all_Pp, all_F)
+    return Forward(states, all_values, all_vp, all_P, predicted, all_Pp, all_F, records, about)
 
 
 def _update(
@@ -127,16 +174,22 @@ def _update(
     P: Array,
     columns: dict[str, slice],
     record: _Innovations,
+    about: Smoothed | None,
+    k: int,
 ) -> tuple[States, Array, Array]:
-    """One measurement update with rows lo..hi of a constraint."""
+    """One measurement update with rows lo..hi of a constraint at keyframe k."""
     n = hi - lo
-    here = state if n == 1 else state[np.zeros(n, dtype=int)]
-    given = {p.name: values[None, _shift(columns[p.name])] for p in rows.parameters}
+    at, at_values = (state, values) if about is None else about.at(k)
+    here = at if n == 1 else at[np.zeros(n, dtype=int)]
+    given = {p.name: at_values[None, _shift(columns[p.name])] for p in rows.parameters}
     if n > 1:
         given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
     linear = rows.linearize(here, given, slice(lo, hi))
     H = assemble(linear, columns, len(P)).reshape(-1, len(P))
-    r, sigma = linear.residual.ravel(), linear.sigma.ravel()
+    r, sigma, e = linear.residual.ravel(), linear.sigma.ravel(), np.zeros(len(P))
+    if about is not None:
+        e = about.offset(k, state, values)
+        r = r + H @ e
     PHt = P @ H.T
     S = H @ PHt
     S.flat[:: len(r) + 1] += sigma * sigma
@@ -148,15 +201,27 @@ def _update(
         raise EstimationError(f"the filter's covariance broke down at '{rows.name}' row {lo}: check sigmas and units")
     nis = float(r @ solved[:, 0])
     used = rows.gate is None or nis <= rows.gate**2
-    record.set(slice(lo, hi), linear.residual, np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1), nis / n, float(used))
+    record.set(slice(lo, hi), r.reshape(n, -1), np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1), nis / n, float(used))
     if not used:
         return state, values, P
     K = solved[:, 1:].T
-    d = -K @ r
+    d = e - K @ r
     IKH = -K @ H
     IKH.flat[:: len(P) + 1] += 1.0
     P = IKH @ P @ IKH.T + (K * (sigma * sigma)) @ K.T
-    return state.plus(d[None, :DIM]), values + d[DIM:], P
+    return at.plus(d[None, :DIM]), at_values + d[DIM:], P
+
+
+def _about_own(P: Array, e: Array) -> Array:
+    """Covariances (..., D, D) of errors about points turned into those about states e away from them.
+
+    Exp(e + x) = Exp(e) Exp(J_r(e) x) to first order in x.
+    """
+    J = rotation.right_jacobian(e[..., :3])
+    P = P.copy()
+    P[..., :3, :] = J @ P[..., :3, :]
+    P[..., :3] = P[..., :3] @ np.swapaxes(J, -1, -2)
+    return P
 
 
 @dataclass(frozen=True)
@@ -167,10 +232,20 @@ class Smoothed:
     values: Array  # (K, D-15)
     P: Array  # (K, D, D)
 
+    def at(self, k: int) -> tuple[States, Array]:
+        """State (one row) and parameter values of a keyframe."""
+        return self.states[k : k + 1], self.values[k]
 
-def backward(problem: Problem, forward: Filtered, progress: Progress | None = None) -> Smoothed:
+    def offset(self, k: int, state: States, values: Array) -> Array:
+        """The error state (D,) that leads from here to another state."""
+        return np.concatenate([state.minus(self.states[k : k + 1])[0], values - self.values[k]])
+
+
+def backward(problem: Problem, forward: Forward, progress: Progress | None = None) -> Smoothed:
     """Smooth a forward pass."""
-    K, D = len(problem.t), forward.P.shape[-1]
+    K, D = forward.P.shape[:2]
+    about = forward.about
+    n = 0 if about is None else len(about.values)
     state, values, P = forward.states[-1], forward.values[-1], forward.P[-1]
     states: list[States] = [state]
     all_P, all_values = np.empty((K, D, D)), np.empty((K, D - DIM))
@@ -181,8 +256,15 @@ def backward(problem: Problem, forward: Filtered, progress: Progress | None = No
         if info:
             raise EstimationError(f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas")
         C = gain.T
-        d = C @ np.concatenate([state.minus(forward.predicted[k + 1])[0], values - forward.values_predicted[k + 1]])
-        state, values = forward.states[k].plus(d[None, :DIM]), forward.values[k] + d[DIM:]
+        moved = np.concatenate([state.minus(forward.predicted[k + 1])[0], values - forward.values_predicted[k + 1]])
+        at, at_values, e = forward.states[k], forward.values[k], np.zeros(D)
+        if about is not None and k + 1 < n:
+            # both ends are steps from points, and only such steps add up
+            before = about.offset(k + 1, forward.predicted[k + 1], forward.values_predicted[k + 1])
+            moved, e = about.offset(k + 1, state, values) - before, about.offset(k, at, at_values)
+            at, at_values = about.at(k)
+        d = e + C @ moved
+        state, values = at.plus(d[None, :DIM]), at_values + d[DIM:]
         P = forward.P[k] + C @ (P - Pp) @ C.T
         P = 0.5 * (P + P.T)
         states.append(state)

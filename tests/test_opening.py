@@ -1,0 +1,88 @@
+"""The opening is filtered twice: what that changes, and what it must not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import oracle
+import pytest
+from helpers import Array
+from test_solvers import NO_WHEELS, WHITE, nearly_linear, sigmas
+
+from graphnav.alignment import align
+from graphnav.config import settings_from
+from graphnav.earth import LocalFrame
+from graphnav.problem import Problem, pose
+from graphnav.solvers.batch import batch
+from graphnav.solvers.ekf import ekf, rts
+
+
+@dataclass(frozen=True)
+class Start:
+    problem: Problem  # of 200 s, of which the vehicle stands for 89
+    cut: Problem  # of the first 150 s
+    opening: float
+
+
+def posed(shared_data: Path, seed: int) -> Start:
+    recording, _ = oracle.oracle_drive(shared_data, seed, odometer=False)
+    settings = settings_from({"gnss": WHITE, "vehicle": NO_WHEELS})
+    frame = LocalFrame(recording.gnss.llh[0])
+    aligned = align(recording, settings, frame, lambda p, x: batch(p, x, wanted=(0,), reintegrate=False))
+    assert aligned.until is not None
+    assert aligned.motion < recording.start + 90.0 < aligned.until < recording.start + 140.0
+    long, short = (
+        pose(recording.crop(0.0, seconds), settings, frame, aligned.state, aligned.sigma) for seconds in (200.0, 150.0)
+    )
+    return Start(long, short, aligned.until)
+
+
+@pytest.fixture(scope="module")
+def start(shared_data: Path) -> Start:
+    return posed(shared_data, 0)
+
+
+def test_the_smoother_is_the_batch_solution_where_the_vehicle_stood(shared_data: Path) -> None:
+    """The filter's heading wanders by degrees there; linearised along the way, the smoother may be sigmas off."""
+
+    def off(start: Start, opening: float | None) -> float:
+        smoothed = rts(start.problem, ekf(start.problem, opening=opening))
+        solved = batch(start.problem, smoothed.states, {n: p.value for n, p in smoothed.parameters.items()})
+        return float(np.abs(smoothed.states.minus(solved.states) / sigmas(solved)).max())
+
+    drives = [posed(shared_data, seed) for seed in range(4)]
+    assert max(off(drive, None) for drive in drives) > 1.0  # or the test would show nothing
+    assert max(off(drive, drive.opening) for drive in drives) < 0.2
+
+
+def test_after_the_opening_the_filter_depends_on_nothing_later(start: Start) -> None:
+    long, short = (ekf(p, opening=start.opening).solution for p in (start.problem, start.cut))
+    K = len(short.t) - 1  # the last keyframe is the end of the recording
+    np.testing.assert_array_equal(long.t[:K], short.t[:K])
+    assert short.t[K - 1] > start.opening + 20.0
+    np.testing.assert_allclose(long.states[:K].minus(short.states[:K]) / sigmas(short)[:K], 0.0, atol=1e-6)
+
+
+def test_innovations_are_as_large_as_stated(start: Start) -> None:
+    """Three axes, some hundred fixes: their mean is 3 to a standard deviation of 0.25."""
+    record = ekf(start.problem, opening=start.opening).solution.records["gnss_position"]
+    inside = record.t <= start.opening
+    assert np.count_nonzero(inside) > 100
+    assert 2.3 < np.mean(record.nis[inside]) < 3.7
+
+
+@pytest.mark.parametrize("kind", ["states", "constants", "slow"])
+def test_it_changes_nothing_where_the_problem_is_linear(kind: str) -> None:
+    problem = nearly_linear(kind).problem
+    once = rts(problem, ekf(problem))
+    for share in (0.5, 1.0):
+        twice = rts(problem, ekf(problem, opening=problem.t[0] + share * (problem.t[-1] - problem.t[0])))
+        np.testing.assert_allclose(twice.states.minus(once.states) / sigmas(once), 0.0, atol=1e-3)
+        np.testing.assert_allclose(sigmas(twice), sigmas(once), rtol=1e-4)
+
+
+def test_an_opening_before_the_first_keyframe_is_none(start: Start) -> None:
+    a, b = ekf(start.cut), ekf(start.cut, opening=start.cut.t[0] - 1.0)
+    np.testing.assert_array_equal(a.P, b.P)
