@@ -45,9 +45,11 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
         found.append(detect_fft(imu, period, d.fft, still, known))
         notes += found[-1].notes
         idling = found[-1].intervals
-    spans, filled = fuse(b, still, idling, certain, d.fusion)
+    spans, disturbed = fuse(b, still, idling, certain, d.fusion)
     mask = inside(sway.t, spans)
-    found.append(Detection("fused", sway.t, sway.statistic, sway.threshold, mask, spans, notes, {"bridged": filled}))
+    found.append(
+        Detection("fused", sway.t, sway.statistic, sway.threshold, mask, spans, notes, {"disturbed": disturbed})
+    )
     return Detections(spans, tuple(found), notes)
 
 

@@ -138,22 +138,19 @@ def _known_speed(speeds: list[Speeds], span: Array) -> float:
     return float(np.nanmax(found)) if not np.isnan(found).all() else float("nan")
 
 
-def bridged(b: Blocks, spans: Array, certain: Array, settings: FusionSettings) -> tuple[Array, Array]:
-    """The spans with the disturbances between them filled where the vehicle did not move, and what was filled."""
-    if len(spans) < 2:
-        return spans, NONE
-    out, filled = [spans[0]], []
+def bridged(b: Blocks, spans: Array, certain: Array, settings: FusionSettings) -> Array:
+    """The spans with the disturbances between them filled where the vehicle did not move."""
+    out = list(spans[:1])
     for span in spans[1:]:
         before = out[-1]
         moved = bool(((certain[:, 0] < span[0]) & (certain[:, 1] > before[1])).any())
         near = span[0] - before[1] <= settings.bridge
         one = link(b, before, span) if near and not moved else None
         if one is not None and _shaken_only(one, settings):
-            filled.append((before[1], span[0]))
             out[-1] = np.array([before[0], span[1]])
         else:
             out.append(span)
-    return np.array(out), np.array(filled) if filled else NONE
+    return np.array(out) if out else NONE
 
 
 def _shaken_only(one: Link, settings: FusionSettings) -> bool:
@@ -180,13 +177,15 @@ def joined(b: Blocks, spans: Array, idling: Array, settings: FusionSettings) -> 
 
 
 def fuse(b: Blocks, spans: Array, idling: Array, certain: Array, settings: FusionSettings) -> tuple[Array, Array]:
-    """Stationary intervals from the candidates and the FFT detector's answer, and the disturbances bridged in them."""
+    """Stationary intervals from candidates and the FFT detector's answer, and what in them is disturbed."""
+    still = spans
     if len(spans) and len(idling):
         spans = without(joined(b, spans, idling, settings), certain)
-    spans, filled = bridged(b, spans, certain, settings)
+    spans = bridged(b, spans, certain, settings)
     if len(spans):
         # a recording that begins or ends in a stop has no edge there
         first = np.where(spans[:, 0] - b.t[0] < _REACH, b.t[0], spans[:, 0] + settings.margin)
         last = np.where(b.end[-1] - spans[:, 1] < _REACH, b.end[-1], spans[:, 1] - settings.margin)
         spans = np.stack([first, last], -1)
-    return longer_than(spans, settings.min_duration), filled
+    spans = longer_than(spans, settings.min_duration)
+    return spans, longer_than(without(spans, still), settings.margin + _REACH)
