@@ -201,7 +201,7 @@ def _wheels_apart(odometer: Odometer, imu: Imu) -> Iterator[Finding]:
     speeds = speeds[~np.isnan(speeds).any(axis=1)]
     if there.sum() < 2 or len(speeds) < crosschecks.MIN_PAIRS:
         return
-    share = np.median(speeds, axis=0) / np.median(speeds)
+    share = np.median(speeds / np.median(speeds, axis=1)[:, None], axis=0)
     for name, ratio in zip(np.array(_WHEELS)[there], share, strict=True):
         if abs(ratio - 1.0) > _WHEEL:
             more = "faster" if ratio > 1.0 else "slower"

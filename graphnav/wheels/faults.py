@@ -232,11 +232,23 @@ def _stuck(
         for one in mine:
             breaks.remove(one)
         first, last = mine[0][0], max(j for _, j in mine)
-        # where it stood before it was stuck, its zeros were true
-        within = first < a or (v[a] == 0.0 and mine[0][1] <= b)
-        begin = first + 1 if within else a + (v[a] != 0.0)
+        begin = a + (v[a] != 0.0)
+        if first < a:
+            begin = first + 1
+        elif v[a] == 0.0 and mine[0][1] <= b:  # where it stood before it was stuck, its zeros were true
+            begin = 1 + (first if motion is None else _pulled_away(t, motion.force, a, first))
         out.append((begin, max(last, b + 1), STUCK if v[a] == 0.0 else FROZEN))
     return out
+
+
+def _pulled_away(t: Array, force: Array, earliest: int, k: int) -> int:
+    """The reading at which what moves at k began to move: back while the force of the second before says so."""
+    while k > earliest:
+        before = max(int(np.searchsorted(t, t[k] - 1.0)), earliest)
+        if abs(force[k] - force[before]) <= _SLOPE * (t[k] - t[before]):
+            break
+        k -= 1
+    return k
 
 
 def _moves(odometer: Odometer, imu: Imu, lag: float, stays: list[tuple[int, int]]) -> list[tuple[int, int, str]]:

@@ -43,7 +43,7 @@ def quantum(speed: Array) -> float:
                     break
                 step = float(count @ few / (count @ count))
             # without a step the remainders are spread evenly, three in ten below 0.15
-            if (np.abs(few / step - np.round(few / step)) < 0.15).mean() > 0.95 and len(few) > 0.5 * len(size):
+            if (np.abs(few / step - np.round(few / step)) < 0.15).mean() > 0.95 and len(few) >= 10:
                 return step
     return 0.0
 
@@ -66,6 +66,34 @@ def reading_sigma(odometer: Odometer) -> float:
     third = np.abs(np.diff(speed, 3))[even & moving]
     scatter = _MAD * float(np.median(third)) / np.sqrt(20.0) if len(third) >= 10 else 0.0
     return max(scatter, rounding)
+
+
+def counts(odometer: Odometer) -> float:
+    """Metres per pulse where the speeds are pulses counted from row to row, else 0.
+
+    The rounding errors of such readings telescope: the mean of n of them is wrong by 1/n of what one is wrong by, and
+    by 1/sqrt(n) were they new with every reading. Third differences tell, as in `reading_sigma`.
+    """
+    t, speed = odometer.t, odometer.speed
+    step = quantum(speed)
+    if odometer.way is not None or step == 0.0:
+        return odometer.pulse
+    even = np.r_[True, np.diff(t) < 1.5 * period_of(t)] & (speed != 0.0)
+
+    def scatter(n: int) -> float:
+        rows = len(t) // n * n
+        whole = np.lib.stride_tricks.sliding_window_view(even[:rows].reshape(-1, n).all(axis=1), 4).all(axis=1)
+        third = np.abs(np.diff(speed[:rows].reshape(-1, n).mean(axis=1), 3))[whole]
+        return float(third.mean()) if len(third) >= 50 else np.inf
+
+    if len(t) < 800:
+        return 0.0
+    one = scatter(1)
+    # counts change to and fro by their step from row to row; what is counted over many periods hardly changes
+    if not step < one < np.inf:
+        return 0.0
+    telescopes = any(scatter(n) < one * n**-0.75 for n in (2, 4))  # half-way between
+    return step * period_of(t) if telescopes else 0.0
 
 
 def longest_step(t: Array) -> float:
@@ -107,14 +135,14 @@ class MeanSpeed:
             good &= (t < begin) | (t >= end)
             across |= (t[:-1] < end) & (t[1:] > begin)
         bad = across | ~good[1:] | ~good[:-1]
-        counted = odometer.way is not None
+        counted, pulse = odometer.way is not None, counts(odometer)
         way = odometer.way if odometer.way is not None else np.r_[0.0, np.cumsum(0.5 * (speed[1:] + speed[:-1]) * step)]
         sigma, rounding = reading_sigma(odometer), _STEP * quantum(speed)
-        if odometer.speed_sigma is not None or counted:
-            rounding = 0.0
-        white = np.sqrt(max(sigma**2 - rounding**2, 0.0)) if odometer.speed_sigma is not None or not counted else 0.0
-        # each end of a count is wrong by up to one pulse, evenly: a difference of two
-        ends = np.sqrt(2.0) * _STEP * odometer.pulse if odometer.speed_sigma is None else 0.0
+        white, ends = np.sqrt(max(sigma**2 - rounding**2, 0.0)), 0.0
+        if odometer.speed_sigma is not None:
+            white, rounding = sigma, 0.0
+        elif pulse:  # each end of a count is wrong by up to one pulse, evenly: a difference of two
+            white, rounding, ends = 0.0, 0.0, np.sqrt(2.0) * _STEP * pulse
         return cls(
             t,
             speed,
@@ -122,9 +150,9 @@ class MeanSpeed:
             counted,
             np.r_[0, np.cumsum(bad)],
             np.r_[0, np.cumsum(speed[1:] != speed[:-1])],
-            float(white),
-            rounding,
-            float(ends),
+            white=float(white),
+            rounding=rounding,
+            ends=float(ends),
         )
 
     def _segment(self, x: Array) -> NDArray[np.intp]:
