@@ -11,7 +11,6 @@ import numpy as np
 from graphnav import judgement
 from graphnav.alignment import Alignment, align, with_known_heading
 from graphnav.config import Settings
-from graphnav.constraints.vehicle import Wheels
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
@@ -20,7 +19,6 @@ from graphnav.recording import Recording
 from graphnav.solution import Solution, joined
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import Filtered, Progress, Smoothed, backward, ekf, rts
-from graphnav.state import States
 
 SOLVERS = ("ekf", "rts", "batch")
 _FAR = 0.5  # rad between the stated and the found start attitude
@@ -91,22 +89,31 @@ def _solve(
         "judgement": judged - after,
         "preintegration": time.perf_counter() - judged,
     }
+    # A stated heading far from the one found sends the filter, and its linearisation with it, astray for a while. It
+    # stays in the problem as its prior, but wheels are judged, and the smoother sets out, from what was found.
+    astray = bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
+    prior = problem.prior
+    if astray:
+        problem = replace(problem, prior=replace(prior, mean=aligned.state, sigma=aligned.sigma[None]))
     forward = ekf(problem, progress, aligned.until)
-    began, smoothed = time.perf_counter(), None
-    if any(isinstance(rows, Wheels) for rows in problem.constraints):
+    began, smoothed = time.perf_counter(), backward(problem, forward, progress)
+    problem, raised = judgement.judge_wheels(problem, smoothed)
+    if raised:
+        forward = ekf(problem, progress, aligned.until)
+        smoothed, said = backward(problem, forward, progress), (*said, *raised)
+    timings["smoother"] = time.perf_counter() - began
+    start = smoothed
+    if astray:
+        problem = replace(problem, prior=prior)
+        forward = ekf(problem, progress, aligned.until)
         smoothed = backward(problem, forward, progress)
-        problem, raised = judgement.judge_wheels(problem, smoothed)
-        timings["smoother"] = time.perf_counter() - began
-        if raised:
-            forward, smoothed, said = ekf(problem, progress, aligned.until), None, (*said, *raised)
     out = {"ekf": forward.solution}
-    if "rts" in solvers or "batch" in solvers:
-        out["rts"] = rts(problem, forward, progress, smoothed)
+    if "rts" in solvers:
+        out["rts"] = rts(problem, forward, smoothed)
     if "batch" in solvers:
-        out["batch"] = batch(problem, *_start(problem, out["rts"], aligned, stated), progress=progress)
+        out["batch"] = batch(problem, start.states, start.nodes(problem), progress=progress)
         # what it took to get there is part of it
-        spent = {**out["rts"].timings, **out["batch"].timings}
-        out["batch"] = replace(out["batch"], timings=spent)
+        out["batch"] = replace(out["batch"], timings={**forward.solution.timings, **out["batch"].timings})
     return {
         name: replace(
             out[name],
@@ -157,21 +164,6 @@ def _judged(
     if fixes is None:
         return recording, settings, notes
     return recording, fixes.applied(settings), (*notes, *fixes.notes)
-
-
-def _start(
-    problem: Problem, smoothed: Solution, aligned: Alignment, stated: Alignment
-) -> tuple[States, dict[str, np.ndarray]]:
-    """Where the batch solver begins: the smoothed filter.
-
-    A stated heading far from the one found would send the filter, and the linearisation with it, astray for a
-    while. The statement stays in the problem as its prior, but the solver sets out from what was found.
-    """
-    turn = np.linalg.norm(aligned.state.minus(stated.state)[0, :3])
-    if turn > _FAR:
-        other = replace(problem, prior=replace(problem.prior, mean=aligned.state, sigma=aligned.sigma[None]))
-        smoothed = rts(other, ekf(other, opening=aligned.until))
-    return smoothed.states, {name: p.value for name, p in smoothed.parameters.items()}
 
 
 def _origin(recording: Recording) -> np.ndarray:

@@ -236,6 +236,12 @@ class Smoothed:
         """State (one row) and parameter values of a keyframe."""
         return self.states[k : k + 1], self.values[k]
 
+    def nodes(self, problem: Problem) -> dict[str, Array]:
+        """(n, k) per parameter: the value of each node after the last keyframe that it governs."""
+        return {
+            c.parameter.name: self.values[_last(c), _shift(problem.columns[c.parameter.name])] for c in problem.chains
+        }
+
     def offset(self, k: int, state: States, values: Array) -> Array:
         """The error state (D,) that leads from here to another state."""
         return np.concatenate([state.minus(self.states[k : k + 1])[0], values - self.values[k]])
@@ -274,15 +280,14 @@ def backward(problem: Problem, forward: Forward, progress: Progress | None = Non
     return Smoothed(States.stack(states[::-1]), all_values, all_P)
 
 
-def rts(
-    problem: Problem, forward: Filtered, progress: Progress | None = None, found: Smoothed | None = None
-) -> Solution:
+def rts(problem: Problem, forward: Filtered, found: Smoothed | None = None) -> Solution:
     """The smoothed solution; residuals are its own. `found` is the backward pass where it was done before."""
     began = time.perf_counter()
-    found = found or backward(problem, forward, progress)
+    found = found or backward(problem, forward)
     smoothed, all_values, all_P = found.states, found.values, found.P
-    seconds = time.perf_counter() - began
     chains = {c.parameter.name: all_values[:, _shift(problem.columns[c.parameter.name])] for c in problem.chains}
+    records = {rows.name: residual_record(problem, rows, smoothed, chains) for rows in problem.constraints}
+    seconds = time.perf_counter() - began
     return Solution(
         solver="rts",
         frame=problem.frame,
@@ -290,7 +295,7 @@ def rts(
         states=smoothed,
         covariance=all_P[:, :DIM, :DIM],
         parameters=_parameters(problem, all_values, all_P),
-        records={rows.name: residual_record(problem, rows, smoothed, chains) for rows in problem.constraints},
+        records=records,
         counts=forward.solution.counts,
         iterations=1,
         stopped="one pass forward and one back",
@@ -349,6 +354,11 @@ def _shift(columns: slice) -> slice:
     return slice(columns.start - DIM, columns.stop - DIM)
 
 
+def _last(chain: ParameterChain) -> Array:
+    """(n,) the last keyframe that each node governs."""
+    return np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
+
+
 def _parameters(problem: Problem, values: Array, P: Array) -> dict[str, ParameterEstimate]:
     """At each node: the value after the last keyframe that it governs."""
     out = {}
@@ -356,7 +366,7 @@ def _parameters(problem: Problem, values: Array, P: Array) -> dict[str, Paramete
         if chain.parameter.begins is not None:
             continue  # a place of a stop is no calibration
         at = problem.columns[chain.parameter.name]
-        last = np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
+        last = _last(chain)
         sigma = np.sqrt(np.maximum(np.diagonal(P[last][:, at, at], axis1=-2, axis2=-1), 0.0))
         out[chain.parameter.name] = ParameterEstimate(
             chain.t, values[last][:, _shift(at)], sigma, chain.parameter.sigma, chain.parameter.unit
