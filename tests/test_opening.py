@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from helpers import Array
 from test_solvers import NO_WHEELS, WHITE, nearly_linear, sigmas
 
 from graphnav.alignment import align
