@@ -114,12 +114,17 @@ def detect_windows(
     still, moving : (M, 2) s, spans that are clearly one or the other.
     g : m/s^2, gravity at the place; replaced by the mean force of what is still, which holds the sensor's scale.
     """
-    window = max(2, round(settings.window / b.period))
-    step = max(1, round(_STEP / b.period))
-    t = window_times(b.t, window, step) if len(b.t) >= window else np.zeros(0)
-    if not len(t):
+    # windows begin a tenth of a second apart: the blocks between are summed once, for all of them
+    group = max(1, min(round(_STEP / b.period), round(0.5 * settings.window / b.period)))
+    count = len(b.t) // group
+    rows = b.mean[: count * group].reshape(count, group, -1).mean(axis=1)
+    middle = b.t[: count * group].reshape(count, group).mean(axis=1)
+    unbroken_rows = np.asarray(b.whole[: count * group].reshape(count, group).all(axis=1))
+    window = max(2, round(settings.window / (group * b.period)))
+    if count < window:
         return []
-    means = running(b.mean).means(window, step)
+    t = window_times(middle, window)
+    means = running(rows).means(window)
     half = 0.5 * settings.window
     at_rest, in_motion = within(t, still, half), within(t, moving, half)
     reference = at_rest if at_rest.any() else np.ones(len(t), dtype=bool)
@@ -130,7 +135,7 @@ def detect_windows(
         g = measured
     per_row = 1.0 / np.sqrt(b.row_period)
     sigma_a, sigma_w = noise.accel_noise_density * per_row, noise.gyro_noise_density * per_row
-    whole = unbroken(b.whole, window, step)
+    whole = unbroken(unbroken_rows, window)
     out = []
     for name, statistic in STATISTICS.items():
         values = np.where(whole, statistic(means, sigma_a, sigma_w, g), np.nan)
