@@ -327,6 +327,19 @@ def test_a_frozen_odometer_is_found(town: Callable[[int], Recording], seed: int)
     assert np.allclose(found.spans, [[o.t[i], o.t[j]]], atol=0.25)
 
 
+def test_a_noisy_odometer_that_freezes_at_even_speed_is_found_by_its_silence() -> None:
+    t = np.arange(0.0, 300.0, 0.05)
+    speed = 20.0 + 0.05 * np.random.default_rng(2).standard_normal(len(t))
+    assert faults(Odometer(t, speed)).reasons == ()
+    speed[1000:1040] = speed[999]
+    found = faults(Odometer(t, speed))
+    assert found.reasons == (FROZEN,)
+    assert np.allclose(found.spans, [[t[1000], t[1040]]])
+    # every reading logged five times over, as a fast logger does with a slow sensor
+    slow = np.repeat(20.0 + 0.05 * np.random.default_rng(2).standard_normal(1200), 5)
+    assert faults(Odometer(t, slow)).reasons == ()
+
+
 def test_spikes_and_gaps(town: Callable[[int], Recording]) -> None:
     o, imu = odometer_of(town(2)), town(2).imu
     i = moving_at(o, 4.0, 10.0, np.random.default_rng(0))

@@ -39,6 +39,7 @@ _USUAL = 6.0  # times the 90th percentile of the drive itself: an IMU or axes th
 _LATEST = 1.5  # s an odometer may be late (or a third of it early)
 _ALIKE = 0.05  # m/s in a second, on average: as good as no change
 _STAYS = 0.5  # s of equal readings (five at least) that may be stuck
+_LONGER = 5.0  # times what all but one in a hundred readings are repeated
 _SPIKE = 1.0  # s
 _ISLAND = 10.0  # s that can be bridged with the IMU
 _TURN = 0.05  # rad/s for a second: nothing that stands turns like that
@@ -173,15 +174,12 @@ def _wrong(odometer: Odometer, imu: Imu | None) -> list[tuple[float, float, str]
     t, v = odometer.t, odometer.speed
     motion = _motion(odometer, imu) if imu is not None and len(imu.t) > 10 else None
     breaks = _breaks(odometer, motion)
-    stays = [
-        (a, b)
-        for a, b in runs_of(np.r_[False, v[1:] == v[:-1]])  # readings a-1 to b-1 are equal
-        if b - a >= 4 and t[b - 1] - t[a - 1] >= _STAYS
-    ]
-    stays = [(a - 1, b - 1) for a, b in stays]
+    equal = [(a - 1, b - 1) for a, b in runs_of(np.r_[False, v[1:] == v[:-1]])]  # first and last of equal readings
+    stays = [(a, b) for a, b in equal if b - a >= 4 and t[b] - t[a] >= _STAYS]
     bad: list[tuple[int, int, str]] = []  # first bad reading, first good one
     bad += _islands(t, v, motion, breaks, stays, _SPIKE)
     bad += _stuck(t, v, motion, breaks, stays)
+    bad += _noiseless(odometer, equal, stays)
     if motion is not None and imu is not None:
         bad += _moves(odometer, imu, motion.lag, stays)
     bad += _islands(t, v, motion, breaks, stays, _ISLAND)
@@ -239,6 +237,19 @@ def _stuck(
             begin = 1 + (first if motion is None else _pulled_away(t, motion.force, a, first))
         out.append((begin, max(last, b + 1), STUCK if v[a] == 0.0 else FROZEN))
     return out
+
+
+def _noiseless(
+    odometer: Odometer, equal: list[tuple[int, int]], stays: list[tuple[int, int]]
+) -> list[tuple[int, int, str]]:
+    """Readings that stay the same while moving, of a sensor whose noise is above its step: it never is so still."""
+    v = odometer.speed
+    if reading_sigma(odometer) < 2.0 * quantum(v):
+        return []
+    repeats = np.array([b - a for a, b in equal if v[a] != 0.0])
+    single: int = max(int((v != 0.0).sum()) - int(np.sum(repeats + 1)), 0)
+    usual = np.percentile(np.r_[repeats, np.zeros(single)], 99.0) if len(repeats) + single > 0 else 0.0
+    return [(a + 1, b + 1, FROZEN) for a, b in stays if v[a] != 0.0 and b - a > _LONGER * (usual + 1.0)]
 
 
 def _pulled_away(t: Array, force: Array, earliest: int, k: int) -> int:
