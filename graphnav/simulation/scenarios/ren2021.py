@@ -1,0 +1,124 @@
+"""Ren 2021: thirteen closed walks with an IMU on the foot; and any other walk."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.errors import ConfigError
+from graphnav.simulation.footsteps import Cadence, footsteps, rectangle, way
+from graphnav.simulation.gait import Sole, Style
+from graphnav.simulation.gait import walk as walk_over
+from graphnav.simulation.inertial import DEG_H, DEG_SQRT_H, ImuModel, Triad, accelerometer, gyroscope
+from graphnav.simulation.pedestrian import record_walk
+from graphnav.simulation.result import Simulated
+from graphnav.simulation.scenarios.registry import Scenario
+from graphnav.simulation.splines import stream
+
+DEG = np.pi / 180.0
+# Table 2: perimeter (m), laps, duration (s)
+WALKS = (
+    (30.0, 1, 38.0), (58.0, 1, 68.0), (58.0, 1, 67.0), (86.0, 1, 94.0), (86.0, 1, 92.0), (86.0, 2, 159.0),
+    (86.0, 2, 176.0), (86.0, 3, 248.0), (86.0, 3, 255.0), (86.0, 3, 278.0), (86.0, 4, 365.0), (86.0, 4, 355.0),
+    (86.0, 4, 353.0),
+)  # fmt: skip
+# Table 1 as printed; what it does not give is of the size usual for the sensor: 2 mg and 0.02 deg/s at turn-on,
+# scale errors of 500 ppm.
+ELLIPSE2 = ImuModel(
+    "SBG Ellipse2 of Ren 2021, table 1", 100.0,
+    Triad(0.15 * DEG_SQRT_H, 72.0 * DEG_H, 7.0 * DEG_H, scale=5e-4, misalignment=5e-4, limit=450.0 * DEG),
+    Triad(5.7e-5, 0.02, 1.4e-5, scale=5e-4, misalignment=5e-4, limit=160.0),
+)  # fmt: skip
+# Of the noise that the recordings of OpenShoe (3DM-GX2) and x-io (NGIMU) have at rest.
+SHOE = ImuModel(
+    "MEMS in a shoe", 200.0,
+    gyroscope(1.0, 1800.0, instability_deg_h=20.0, scale_ppm=3000.0, misalignment_mrad=3.0, range_deg_s=1200.0),
+    accelerometer(100.0, 6.0, instability_mg=0.05, scale_ppm=3000.0, misalignment_mrad=3.0, range_g=18.0),
+)  # fmt: skip
+PRESETS = {"ellipse2": ELLIPSE2, "shoe": SHOE}
+PACES = {"slow": 0.8, "normal": 1.25, "fast": 1.75}  # m/s
+_ORIGIN = (32.06, 118.79, 20.0)
+
+
+def ren2021(
+    seed: int, *, walk: int = 10, exact: bool = False, compensated: bool = False, rate: float = 100.0
+) -> Simulated:
+    """Walk `walk` (1 to 13) of table 2: laps to the left around a rectangle, back onto the first footprint."""
+    if not (isinstance(walk, int) and 1 <= walk <= len(WALKS)):
+        raise ConfigError(f"walk = {walk}: must be from 1 to {len(WALKS)}")
+    perimeter, laps, duration = WALKS[walk - 1]
+    return _walked(
+        "ren2021", seed, duration, rectangle(perimeter, laps), ELLIPSE2.at(_usable(rate)), exact, compensated, True,
+        {"walk": walk, "laps": laps},
+    )  # fmt: skip
+
+
+def free(
+    seed: int, *, pace: str = "normal", duration: float = 60.0, imu: str = "shoe", course: str = "laps",
+    exact: bool = False, compensated: bool = False, rate: float = 200.0,
+) -> Simulated:  # fmt: skip
+    """A walk of `duration` s at a `pace` (slow, normal, fast) with an `imu` (shoe, ellipse2).
+
+    `course` is "laps" (to the left around a rectangle of some 40 m, closed), "bends" (to and fro, with corners and
+    turning round) or "straight".
+    """
+    for key, value, known in (("pace", pace, PACES), ("imu", imu, PRESETS)):
+        if value not in known:
+            raise ConfigError(f"{key} = '{value}': must be {', '.join(known)}")
+    if not 20.0 <= duration <= 7200.0:
+        raise ConfigError(f"duration = {duration:g}: must be from 20 to 7200 s")
+    length = PACES[pace] * (duration - _rest(seed).sum())
+    rng = stream(seed, "course")
+    if course == "laps":
+        laps = max(1, round(length / 40.0))
+        parts = rectangle(length / laps, laps)
+    elif course == "straight":
+        parts = [(length, 0.0)]
+    elif course == "bends":
+        parts, left = [], length
+        while left > 12.0:
+            side, turn = rng.uniform(3.0, 9.0), rng.choice([-180.0, -90.0, -90.0, -45.0, 45.0, 90.0, 90.0, 180.0])
+            parts += [(side, 0.0), (0.6 * abs(turn) * DEG, turn)]
+            left -= side + parts[-1][0]
+        parts.append((left, 0.0))
+    else:
+        raise ConfigError(f"course = '{course}': must be laps, bends or straight")
+    return _walked(
+        "gait", seed, duration, parts, PRESETS[imu].at(_usable(rate)), exact, compensated, course == "laps",
+        {"pace": pace, "course": course},
+    )  # fmt: skip
+
+
+def _usable(rate: float) -> float:
+    if not 50.0 <= rate <= 2000.0:
+        raise ConfigError(f"rate = {rate:g}: must be from 50 to 2000 Hz")
+    return rate
+
+
+def _rest(seed: int) -> np.ndarray:
+    """s at rest before and after the walk."""
+    return stream(seed, "rest").uniform([2.0, 1.5], [6.0, 4.0])
+
+
+def _walked(
+    name: str, seed: int, duration: float, parts: list[tuple[float, float]], imu: ImuModel, exact: bool,
+    compensated: bool, closed: bool, facts: dict[str, object],
+) -> Simulated:  # fmt: skip
+    rest = _rest(seed)
+    rng = stream(seed, "course")
+    along = way(parts, float(rng.uniform(0.0, 360.0)))
+    walked = duration - float(rest.sum())
+    speed = along.length / walked
+    steps = footsteps(along, Cadence.of(speed), float(rest[0]), walked, duration, stream(seed, "steps"), closed=closed)
+    foot = walk_over(steps, Style.of(speed), Sole(), duration, stream(seed, "gait"))
+    angles = stream(seed, "mounting").normal(0.0, [3.0, 4.0, 4.0])
+    mounting = (float(angles[0]), float(angles[1]), float(angles[2]))
+    return record_walk(
+        name, seed, foot, origin=_ORIGIN, imu=imu, mounting=mounting, exact=exact, compensated=compensated,
+        facts={**facts, "distance_m": round(along.length, 3), "closed": closed},
+    )  # fmt: skip
+
+
+SCENARIOS = [
+    Scenario("ren2021", "walks of 30 to 344 m around a rectangle, an IMU on the foot at 100 Hz, no GNSS", ren2021),
+    Scenario("gait", "a foot's walk at a slow, normal or fast pace, no GNSS", free),
+]
