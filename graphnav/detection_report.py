@@ -9,11 +9,11 @@ import numpy as np
 
 from graphnav.detection_pictures import picture
 from graphnav.detectors import Detections
+from graphnav.detectors.base import intervals_text
 from graphnav.exporters.csv import rows_text
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 
-HEADER = "start,end,detector"
 _LISTED = 30  # stops
 
 
@@ -21,18 +21,12 @@ def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
     """All files; times are on the recording's clock, as in trajectory.csv."""
     folder.mkdir(parents=True, exist_ok=True)
     intervals, statistics, plot = (folder / n for n in ("detections.csv", "statistics.csv.gz", "detections.png"))
-    intervals.write_text(intervals_text(found), encoding="utf-8")
+    intervals.write_text(intervals_text(found.all), encoding="utf-8")
     # no name and no time in the header: the same recording gives the same bytes
     with statistics.open("wb") as raw, gzip.GzipFile("", "wb", 5, raw, mtime=0) as file:
         file.write(statistics_text(found).encode())
     picture(recording, found).savefig(plot, dpi=110, metadata={"Software": None})
     return [plot, intervals, statistics]
-
-
-def intervals_text(found: Detections) -> str:
-    """A row per interval and detector, the fused answer last."""
-    rows = [f"{start:.4f},{end:.4f},{d.name}" for d in found.all for start, end in d.intervals]
-    return "\n".join([HEADER, *rows]) + "\n"
 
 
 def statistics_text(found: Detections) -> str:

@@ -18,14 +18,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import graphnav
+from graphnav.detectors.base import intervals_text
 from graphnav.errors import ConfigError
 from graphnav.solution import ParameterEstimate, Solution
 from graphnav.workflow import Outcome
 
 if TYPE_CHECKING:
     from graphnav.metrics import Metrics
-
-DETECTIONS_HEADER = "start,end,detector"
 
 
 def output_folder(path: str | Path) -> Path:
@@ -89,7 +88,7 @@ def write_solver(outcome: Outcome, name: str, folder: Path, provenance: Mapping[
     trajectory = solution.trajectory(outcome.request.rate)
     write_all(replace(trajectory, name=f"{outcome.recording.name}, {name}"), folder)
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
-    (folder / "detections.csv").write_text(DETECTIONS_HEADER + "\n", encoding="utf-8")
+    (folder / "detections.csv").write_text(intervals_text(solution.detections), encoding="utf-8")
     written = time.perf_counter()
     report.write_report(
         folder / "report.html",
@@ -129,6 +128,7 @@ def solver_summary(
         "keyframes": len(solution.t),
         "counts": solution.counts,
         "rejected": rejected,
+        "stationary": {"stops": len(solution.stationary), "seconds": float(np.diff(solution.stationary).sum())},
         "iterations": solution.iterations,
         "stopped": solution.stopped,
         "final_cost": solution.cost,

@@ -73,7 +73,8 @@ def _solve(
     recording: Recording, settings: Settings, frame: LocalFrame, solvers: tuple[str, ...], progress: Progress | None
 ) -> dict[str, Solution]:
     began = time.perf_counter()
-    stationary = detect(recording, settings).stationary
+    found = detect(recording, settings)
+    stationary = found.stationary
     detected = time.perf_counter()
     aligned = align(
         recording, settings, frame, lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)
@@ -117,7 +118,8 @@ def _solve(
     return {
         name: replace(
             out[name],
-            notes=(*stated.notes, *said, *out[name].notes),
+            notes=(*stated.notes, *found.notes, *said, *out[name].notes),
+            detections=found.all,
             timings={k: timings.get(k, 0.0) + out[name].timings.get(k, 0.0) for k in (*timings, *out[name].timings)},
         )
         for name in solvers

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from graphnav import rotation
+from graphnav.detectors.base import Detection
 from graphnav.earth import LocalFrame
 from graphnav.rotation import Array
 from graphnav.state import States
@@ -83,7 +84,14 @@ class Solution:
     stopped: str = ""  # why it stopped, a sentence
     timings: dict[str, float] = field(default_factory=dict)  # s by stage
     notes: tuple[str, ...] = ()
+    detections: tuple[Detection, ...] = ()  # where the platform was found to stand, the fused answer last
     between: tuple[Between, ...] = ()  # gives states between keyframes, one for each piece of the recording
+
+    @property
+    def stationary(self) -> Array:
+        """(M, 2) s, where the platform stands."""
+        spans = [d.intervals for d in self.detections if d.name == "fused"]
+        return np.concatenate([np.empty((0, 2)), *spans])
 
     def trajectory(self, rate: float | None = None) -> Trajectory:
         """In geodetic coordinates and local axes, with 9 x 9 covariances: at the keyframes, or at `rate` (Hz)."""
@@ -160,6 +168,7 @@ def joined(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:
         cost=sum(p.cost for p in parts),
         stopped="; ".join(dict.fromkeys(p.stopped for p in parts)),
         notes=(*notes, *dict.fromkeys(note for part in parts for note in part.notes)),
+        detections=tuple(d for p in parts for d in p.detections),
         between=tuple(b for p in parts for b in p.between),
     )
 

@@ -30,8 +30,16 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     lines.append("")
     lines += _whole(outcome)
     lines += _spans(outcome)
-    lines += ["", "no stationary or stance detector has run: detections.csv holds its header only", "", "look at"]
+    lines += ["", _stops(outcome), "", "look at"]
     return "\n".join([*lines, *(f"  {file}" for file in files)])
+
+
+def _stops(outcome: Outcome) -> str:
+    spans = next(iter(outcome.solutions.values())).stationary
+    if not len(spans):
+        return "stands nowhere"
+    many = "1 stop" if len(spans) == 1 else f"{len(spans)} stops"
+    return f"{many}, {np.diff(spans).sum():.1f} s in all: detections.csv"
 
 
 def _read(outcome: Outcome) -> str:

@@ -50,6 +50,12 @@ class Detections:
         raise KeyError(name)
 
 
+def intervals_text(detections: Sequence[Detection]) -> str:
+    """What detections.csv holds: a row per interval and detector, the fused answer last."""
+    rows = [f"{start:.4f},{end:.4f},{d.name}" for d in detections for start, end in d.intervals]
+    return "\n".join(["start,end,detector", *rows]) + "\n"
+
+
 def spans_of(mask: Mask, t: Array, half: float = 0.0) -> Array:
     """(M, 2) spans covered by the runs of True, each row of t standing for `half` seconds on either side of it."""
     edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
