@@ -1,4 +1,4 @@
-"""CSV files of numbers, read at the speed of NumPy's C parser and explained line by line when they fail."""
+"""CSV files of numbers, read with whole-array arithmetic and explained line by line when they fail."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.errors import RecordingError
+from graphnav.formats.decimals import read_decimals
 from graphnav.rotation import Array
 
 _BLANK = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that has cells
@@ -109,11 +110,9 @@ def read_table(
             raise RecordingError(f"{path}: no column '{theirs}' (there are: {', '.join(header)}){hint}")
     use = [header.index(theirs) for theirs in file_names.values()]
     values = _parse(path, skip, header, use)
-    if not len(values):
+    if not values.shape[1]:
         raise RecordingError(f"{path}: holds a header and no rows")
-    # contiguous columns: what follows works on whole columns
-    columns = dict(zip(file_names, np.ascontiguousarray(values.T), strict=True))
-    return Table(path, columns, file_names, np.arange(len(values)))
+    return Table(path, dict(zip(file_names, values, strict=True)), file_names, np.arange(values.shape[1]))
 
 
 def _open(path: Path) -> IO[str]:
@@ -181,21 +180,25 @@ def _is_number(text: str) -> bool:
 
 
 def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> Array:
-    """The data, (N, len(use)): straight through, else with blanks made NaN, else cell by cell."""
+    """The wanted columns, (len(use), N): plain numbers, else as NumPy reads them, else cell by cell."""
     try:
-        return _loadtxt(str(path), skip, header, use)
+        with _open_bytes(path) as raw:
+            head = b"".join(raw.readline() for _ in range(skip))
+            if len(head.splitlines()) == skip:  # else lines end in a way of their own
+                return read_decimals(raw, len(header), use)
     except (OSError, EOFError, zlib.error) as error:
         raise _broken_gzip(path, error) from None
     except ValueError:
         pass
     try:
         with _open(path) as file:
-            return _loadtxt(io.StringIO(_BLANK.sub("nan", file.read())), skip, header, use)
+            values = _loadtxt(io.StringIO(_BLANK.sub("nan", file.read())), skip, header, use)
     except ValueError:
-        return _parse_cells(path, header, use)
+        values = _parse_cells(path, header, use)
+    return np.ascontiguousarray(values.T)
 
 
-def _loadtxt(source: str | io.StringIO, skip: int, header: list[str], use: list[int]) -> Array:
+def _loadtxt(source: io.StringIO, skip: int, header: list[str], use: list[int]) -> Array:
     # Without usecols NumPy checks that no row is longer than the others; with it, only that none is too short.
     everything = len(use) == len(header)
     with warnings.catch_warnings():
