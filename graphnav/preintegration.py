@@ -187,12 +187,12 @@ def within(samples: Samples, keyframes: Array, t: Array, ba: Array, bg: Array) -
     dR, dV, dP = np.empty((len(t), 3, 3)), np.empty((len(t), 3)), np.empty((len(t), 3))
     for rows in _chunks(pieces.count):
         dt, index = pieces.padded(rows)
-        R, V, P = _means(samples.gyro[index] - bg[rows, None], samples.accel[index] - ba[rows, None], dt)
+        R, V, P = _means(_less(samples.gyro, index, bg[rows]), _less(samples.accel, index, ba[rows]), dt)
         place = np.full(len(pieces.count), -1)
         place[rows] = np.arange(len(rows))
         here = np.flatnonzero(place[interval] >= 0)
         row, column = place[interval[here]], edge[here] - pieces.first[interval[here]]
-        dR[here], dV[here], dP[here] = R[row, column], V[row, column], P[row, column]
+        dR[here], dV[here], dP[here] = R[column, :, :, row], V[column, :, row], P[column, :, row]
     return dR, dV, dP
 
 
@@ -207,18 +207,19 @@ class _Pieces:
     count: Array
 
     def padded(self, rows: Array) -> tuple[Array, Array]:
-        """(n, L) lengths and sample indices of some intervals, padded with pieces of no length."""
-        L = int(self.count[rows].max())
-        column = np.arange(L)
-        inside = column < self.count[rows, None]
-        at = np.minimum(self.first[rows, None] + column, len(self.dt) - 1)
+        """(L, n) lengths and sample indices of some intervals, padded with pieces of no length."""
+        piece = np.arange(int(self.count[rows].max()))[:, None]
+        inside = piece < self.count[rows]
+        at = np.minimum(self.first[rows] + piece, len(self.dt) - 1)
         return np.where(inside, self.dt[at], 0.0), self.index[at]
 
 
 def _pieces(samples: Samples, t: Array, extra: Array | None = None) -> _Pieces:
     """Pieces between keyframes t, split at the `extra` times too."""
     inner = samples.t[(samples.t > t[0]) & (samples.t < t[-1])]
-    edges = np.union1d(inner, t if extra is None else np.concatenate([t, extra]))
+    # all but sorted already, which is what a stable sort makes use of
+    edges = np.sort(np.concatenate([inner, t] if extra is None else [inner, t, extra]), kind="stable")
+    edges = edges[np.append(True, np.diff(edges) > 0)]
     index = np.minimum(np.searchsorted(samples.t, edges[1:], side="left"), len(samples.t) - 1)
     starts = np.searchsorted(edges, t)
     return _Pieces(edges, np.diff(edges), index, starts[:-1], np.diff(starts))
@@ -241,116 +242,128 @@ def _chunks(count: Array) -> Iterator[Array]:
         start = lo
 
 
+def _less(x: Array, index: Array, bias: Array) -> Array:
+    """(L, 3, n) samples of (L, n) pieces less the bias (n, 3) of each interval.
+
+    Pieces first and intervals last here and below: every operation then runs along contiguous numbers.
+    """
+    return np.ascontiguousarray(np.swapaxes(x.take(index, axis=0), 1, 2)) - bias.T
+
+
 def _cross(a: Array, b: Array) -> Array:
-    """Cross product along the last axis, several times quicker than np.cross."""
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
+    """[a]x b for vectors a (L, 3, n) and vectors or matrices b (L, 3, n) or (L, 3, 3, n)."""
+    ax, ay, az = np.moveaxis(a if b.ndim == 3 else a[:, :, None], 1, 0)
+    bx, by, bz = np.moveaxis(b, 1, 0)
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
+
+
+def _turned(R: Array, x: Array) -> Array:
+    """Matrix times vector, (L, 3, 3, n) and (L, 3, n)."""
+    return R[:, :, 0] * x[:, None, 0] + R[:, :, 1] * x[:, None, 1] + R[:, :, 2] * x[:, None, 2]
 
 
 def _means(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Array]:
-    """R, V, P (start frame) at the L+1 edges of (n, L) pieces."""
-    n, L = dt.shape
-    phi = w * dt[..., None]
-    x2 = np.einsum("nli,nli->nl", phi, phi)
-    a, b, c, d = rotation.coefficients(x2)
-    S = rotation.skew(phi)
-    step = a[..., None, None] * S + b[..., None, None] * (phi[..., :, None] * phi[..., None, :])
-    cosine = 1.0 - b * x2
-    for i in range(3):
-        step[..., i, i] += cosine
-    R = np.empty((L + 1, n, 3, 3))
-    R[0] = np.eye(3)
-    step = np.ascontiguousarray(np.swapaxes(step, 0, 1))
+    """R (L+1, 3, 3, n), V, P (L+1, 3, n) (start frame) at the edges of (L, n) pieces."""
+    L, n = dt.shape
+    h = dt[:, None]
+    phi = w * h
+    x2 = phi[:, 0] * phi[:, 0] + phi[:, 1] * phi[:, 1] + phi[:, 2] * phi[:, 2]
+    a, b, c, d = (x[:, None] for x in rotation.coefficients(x2))
+    turn = np.empty((L, n, 3, 3))
+    step = np.moveaxis(turn, 1, -1)
+    np.multiply((b * phi)[:, :, None], phi[:, None], out=step)
+    cosine, sine = 1.0 - b[:, 0] * x2, a * phi
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        step[:, i, i] += cosine
+        step[:, j, i] += sine[:, k]
+        step[:, i, j] -= sine[:, k]
+    product = np.empty((L + 1, n, 3, 3))
+    product[0] = np.eye(3)
     for k in range(L):
-        np.matmul(R[k], step[k], out=R[k + 1])
-    R = np.swapaxes(R, 0, 1)
+        np.matmul(product[k], turn[k], out=product[k + 1])
+    R = np.ascontiguousarray(np.moveaxis(product, 1, -1))
     one = _cross(phi, f)
     two = _cross(phi, one)
-    body = np.stack(
-        [
-            (f + b[..., None] * one + c[..., None] * two) * dt[..., None],
-            (0.5 * f + c[..., None] * one + d[..., None] * two) * (dt * dt)[..., None],
-        ],
-        -1,
-    )
-    turned = R[:, :-1] @ body
-    V = np.zeros((n, L + 1, 3))
-    np.cumsum(turned[..., 0], axis=1, out=V[:, 1:])
-    P = np.zeros((n, L + 1, 3))
-    np.cumsum(V[:, :-1] * dt[..., None] + turned[..., 1], axis=1, out=P[:, 1:])
+    V = _summed(_turned(R[:-1], (f + b * one + c * two) * h))
+    P = _summed(V[:-1] * h + _turned(R[:-1], (0.5 * f + c * one + d * two) * (h * h)))
     return R, V, P
 
 
 def _integrate(
     samples: Samples, imu: Imu, t: Array, rows: Array, dt: Array, index: Array, ba: Array, bg: Array
 ) -> Intervals:
-    n, L = dt.shape
-    w, f = samples.gyro[index] - bg[:, None], samples.accel[index] - ba[:, None]
+    L, n = dt.shape
+    w, f = _less(samples.gyro, index, bg), _less(samples.accel, index, ba)
     R, V, P = _means(w, f, dt)
-    T = dt.sum(1)
-
-    def mean(x: Array) -> Array:
-        return np.einsum("nl,nli->ni", dt, x) / T[:, None]
-
-    A = _summed((-0.5 * dt)[..., None, None] * (R[:, :-1] + R[:, 1:]))
+    T = dt.sum(0)
+    A = _summed((-0.5 * dt)[:, None, None] * (R[:-1] + R[1:]))
     # the rest in cells of a few pieces, within which A is a straight line
     cut = np.append(np.arange(0, L, _CELL if L >= _MANY else 1), L)
-    A, R, V, P = A[:, cut], R[:, cut], V[:, cut], P[:, cut]
-    edge, qg, qa = (_summed(x)[:, cut] for x in (dt, *_white_noise(samples, imu, dt, index)))
-    h = np.diff(edge)[..., None, None]
+    A, R, V, P = A[cut], R[cut], V[cut], P[cut]
+    edge, qg, qa = (_summed(x)[cut] for x in (dt, *_white_noise(samples, imu, dt, index)))
+    h = np.diff(edge, axis=0)[:, None]
     # dV / d bg = -int [dV]x A, exactly for A linear in a cell: int (t - t_start) dV = h dV - int (V - V_start) dt
-    dv, hv = np.diff(V, axis=1), h[..., 0]
-    gain = np.diff(P, axis=1) - V[:, :-1] * hv
-    late = hv * dv - gain
-    slope = np.diff(A, axis=1) / np.maximum(h, 1e-12)
-    B = _summed(-rotation.skew(dv) @ A[:, :-1] - rotation.skew(late) @ slope)
-    PA = _summed(0.5 * h * (A[:, :-1] + A[:, 1:]))  # dP / d ba
+    dv = np.diff(V, axis=0)
+    gain = np.diff(P, axis=0) - V[:-1] * h
+    late = h * dv - gain
+    h = h[:, None]
+    slope = np.diff(A, axis=0) / np.maximum(h, 1e-12)
+    B = _summed(-_cross(dv, A[:-1]) - _cross(late, slope))
+    PA = _summed(0.5 * h * (A[:-1] + A[1:]))  # dP / d ba
     # dP / d bg = int B, in a cell B_start h - int [(t_end - t) dV]x A
-    PB = _summed(h * B[:, :-1] - rotation.skew(gain) @ (A[:, :-1] + (h / 3.0) * slope))
-    left = T[:, None] - edge  # time left at each edge
-    a_edge = V[:, -1:] - V
-    b_edge = P[:, -1:] - P - V * left[..., None]
-    Q = _white(np.diff(qg), np.diff(qa), left, a_edge, b_edge)
+    PB = _summed(h * B[:-1] - _cross(gain, A[:-1] + (h / 3.0) * slope))
+    left = T - edge  # time left at each edge
+    a_edge = V[-1] - V
+    b_edge = P[-1] - P - V * left[:, None]
+    Q = _white(np.diff(qg, axis=0), np.diff(qa, axis=0), left, a_edge, b_edge)
     Q += _walk(imu, edge, left, A, B, PA, PB, a_edge, b_edge)
 
-    dR = R[:, -1]
+    dR, v_ba, v_bg, p_ba, p_bg = (_last(x) for x in (R, A, B, PA, PB))
     turn = np.zeros((n, 15, 15))  # theta from the start frame to a right perturbation of dR
     turn[:, 3:, 3:] = np.eye(12)
     turn[:, :3, :3] = np.swapaxes(dR, -1, -2)
     Q = turn @ Q @ np.swapaxes(turn, -1, -2)
-    theta_bg = np.swapaxes(dR, -1, -2) @ A[:, -1]
+    theta_bg = np.swapaxes(dR, -1, -2) @ v_ba
+    rate, force = (np.sum(x * dt[:, None], axis=0).T / T[:, None] for x in (w, f))
     return Intervals(
-        t[rows], t[rows + 1], dR, V[:, -1], P[:, -1], theta_bg, A[:, -1], B[:, -1], PA[:, -1], PB[:, -1],
-        np.array(ba), np.array(bg), mean(w), mean(f), Q, *_past(edge, R, V, A),
+        t[rows], t[rows + 1], dR, _last(V), _last(P), theta_bg, v_ba, v_bg, p_ba, p_bg,
+        np.array(ba), np.array(bg), rate, force, Q, *_past(edge, R, V, A),
     )  # fmt: skip
 
 
 def _past(edge: Array, R: Array, V: Array, A: Array) -> tuple[Array, Array, Array, Array]:
     """What the mean velocity over an interval is made of, seen from its end; by the trapezoidal rule."""
-    T = edge[:, -1:]
-    h = np.diff(edge, axis=1)
+    T = edge[-1]
+    h = np.diff(edge, axis=0)
     weight = np.zeros_like(edge)
-    weight[:, 1:] += h
-    weight[:, :-1] += h
+    weight[1:] += h
+    weight[:-1] += h
     weight /= 2.0 * T
-    turned = np.einsum("nl,nlji->nij", weight, R)  # mean of R(t)^T
-    late = np.einsum("nl,nlji->nij", weight * (T - edge), R)
-    left = np.concatenate([V[:, -1:] - V, np.swapaxes(A[:, -1:] - A, -1, -2).reshape(*edge.shape, 9)], -1)
-    left = left.reshape(*edge.shape, 4, 3) @ R  # rows times R: columns times R^T
-    left = np.einsum("nl,nlki->nik", weight, left)
-    return turned @ R[:, -1], late @ R[:, -1], left[..., 0], left[..., 1:]
+    back = np.swapaxes(R, 1, 2)  # R(t)^T, (L, 3, 3, n)
+    left = np.concatenate([(V[-1] - V)[:, :, None], A[-1] - A], axis=2)  # (L, 3, 4, n)
+    left = sum(back[:, :, j, None] * left[:, None, j] for j in range(3))
+    turned, late, left = (
+        np.moveaxis(np.einsum("ln,lijn->ijn", w, x), -1, 0)
+        for w, x in ((weight, back), (weight * (T - edge), back), (weight, left))
+    )
+    return turned @ _last(R), late @ _last(R), left[..., 0], left[..., 1:]
+
+
+def _last(x: Array) -> Array:
+    """(n, ...) what (L, ..., n) holds at the end."""
+    return np.ascontiguousarray(np.moveaxis(x[-1], -1, 0))
 
 
 def _summed(terms: Array) -> Array:
-    """Running sums along the second axis, from zero: one more than there are terms."""
-    out = np.zeros((terms.shape[0], terms.shape[1] + 1, *terms.shape[2:]))
-    np.cumsum(terms, axis=1, out=out[:, 1:])
+    """Running sums along the first axis, from zero: one more than there are terms."""
+    out = np.zeros((len(terms) + 1, *terms.shape[1:]))
+    for k, term in enumerate(terms):
+        np.add(out[k], term, out=out[k + 1])
     return out
 
 
 def _white_noise(samples: Samples, imu: Imu, dt: Array, index: Array) -> tuple[Array, Array]:
-    """Variances (n, L) of the integrals of white rate and force noise over each piece."""
+    """Variances (L, n) of the integrals of white rate and force noise over each piece."""
     qg, qa = imu.noise.gyro_noise_density**2 * dt, imu.noise.accel_noise_density**2 * dt
     if len(samples.bridged):
         qg, qa = qg + samples.extra_gyro[index] * dt, qa + samples.extra_accel[index] * dt
@@ -358,25 +371,25 @@ def _white_noise(samples: Samples, imu: Imu, dt: Array, index: Array) -> tuple[A
 
 
 def _white(qg: Array, qa: Array, left: Array, a_edge: Array, b_edge: Array) -> Array:
-    """Covariance (n, 15, 15), start frame, of white noise with variances qg, qa (n, L) in each cell."""
-    a, b = 0.5 * (a_edge[:, :-1] + a_edge[:, 1:]), 0.5 * (b_edge[:, :-1] + b_edge[:, 1:])
-    s, dt = 0.5 * (left[:, :-1] + left[:, 1:]), left[:, :-1] - left[:, 1:]
+    """Covariance (n, 15, 15), start frame, of white noise with variances qg, qa (L, n) in each cell."""
+    a, b = 0.5 * (a_edge[:-1] + a_edge[1:]), 0.5 * (b_edge[:-1] + b_edge[1:])
+    s, dt = 0.5 * (left[:-1] + left[1:]), left[:-1] - left[1:]
     eye = np.eye(3)
-    Q = np.zeros((len(qg), 15, 15))
+    Q = np.zeros((qg.shape[1], 15, 15))
     theta, p, v = slice(0, 3), slice(3, 6), slice(6, 9)
 
     def outer(x: Array, y: Array) -> Array:
         """sum q ([x]x [y]x^T) = sum q (x.y I - y x^T)"""
-        xy = np.einsum("nl,nli,nlj->nij", qg, y, x, optimize=True)
+        xy = np.einsum("lin,ljn->nij", qg[:, None] * y, x)
         return np.trace(xy, axis1=-2, axis2=-1)[:, None, None] * eye - xy
 
-    Q[:, theta, theta] = qg.sum(1)[:, None, None] * eye
-    Q[:, theta, v] = rotation.skew(np.einsum("nl,nli->ni", qg, a))
-    Q[:, theta, p] = rotation.skew(np.einsum("nl,nli->ni", qg, b))
-    Q[:, v, v] = outer(a, a) + qa.sum(1)[:, None, None] * eye
-    Q[:, v, p] = outer(a, b) + (qa * s).sum(1)[:, None, None] * eye
+    Q[:, theta, theta] = qg.sum(0)[:, None, None] * eye
+    Q[:, theta, v] = rotation.skew(np.sum(qg[:, None] * a, axis=0).T)
+    Q[:, theta, p] = rotation.skew(np.sum(qg[:, None] * b, axis=0).T)
+    Q[:, v, v] = outer(a, a) + qa.sum(0)[:, None, None] * eye
+    Q[:, v, p] = outer(a, b) + (qa * s).sum(0)[:, None, None] * eye
     # force noise inside a cell also moves the position: dt^2/12 keeps one-cell intervals regular
-    Q[:, p, p] = outer(b, b) + (qa * (s * s + dt * dt / 12.0)).sum(1)[:, None, None] * eye
+    Q[:, p, p] = outer(b, b) + (qa * (s * s + dt * dt / 12.0)).sum(0)[:, None, None] * eye
     for x, y in ((theta, v), (theta, p), (v, p)):
         Q[:, y, x] = np.swapaxes(Q[:, x, y], -1, -2)
     return Q
@@ -384,24 +397,25 @@ def _white(qg: Array, qa: Array, left: Array, a_edge: Array, b_edge: Array) -> A
 
 def _walk(imu: Imu, edge: Array, left: Array, A: Array, B: Array, PA: Array, PB: Array, a: Array, b: Array) -> Array:
     """Covariance (n, 15, 15), start frame, of bias walk inside the interval, by midpoint quadrature."""
-    n = len(edge)
-    T = edge[:, -1]
+    n = edge.shape[1]
+    T = edge[-1]
     target = T[:, None] * (np.arange(_WALK_POINTS) + 0.5) / _WALK_POINTS
     at = np.empty((n, _WALK_POINTS), dtype=int)
     for j in range(_WALK_POINTS):  # the edge nearest to each quadrature point
-        at[:, j] = np.argmin(np.abs(edge - target[:, j, None]), axis=1)
+        at[:, j] = np.argmin(np.abs(edge - target[:, j]), axis=0)
     row = np.arange(n)[:, None]
-    s = left[row, at][..., None, None]
+    s = left[at, row][..., None, None]
     gyro = np.zeros((n, _WALK_POINTS, 15, 3))
     accel = np.zeros((n, _WALK_POINTS, 15, 3))
     eye = np.eye(3)
-    A_t = A[row, at]
-    gyro[..., 0:3, :] = A[:, -1:] - A_t
-    gyro[..., 3:6, :] = PB[:, -1:] - PB[row, at] - B[row, at] * s + rotation.skew(b[row, at]) @ A_t
-    gyro[..., 6:9, :] = B[:, -1:] - B[row, at] + rotation.skew(a[row, at]) @ A_t
+    A_t, B_t, PA_t, PB_t = (x[at, :, :, row] for x in (A, B, PA, PB))
+    A_T, B_T, PA_T, PB_T = (_last(x)[:, None] for x in (A, B, PA, PB))
+    gyro[..., 0:3, :] = A_T - A_t
+    gyro[..., 3:6, :] = PB_T - PB_t - B_t * s + rotation.skew(b[at, :, row]) @ A_t
+    gyro[..., 6:9, :] = B_T - B_t + rotation.skew(a[at, :, row]) @ A_t
     gyro[..., 12:15, :] = eye
-    accel[..., 3:6, :] = PA[:, -1:] - PA[row, at] - A_t * s
-    accel[..., 6:9, :] = A[:, -1:] - A_t
+    accel[..., 3:6, :] = PA_T - PA_t - A_t * s
+    accel[..., 6:9, :] = A_T - A_t
     accel[..., 9:12, :] = eye
     q = (T / _WALK_POINTS)[:, None, None]
     Q = np.zeros((n, 15, 15))
