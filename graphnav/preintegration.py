@@ -357,8 +357,11 @@ def _last(x: Array) -> Array:
 def _summed(terms: Array) -> Array:
     """Running sums along the first axis, from zero: one more than there are terms."""
     out = np.zeros((len(terms) + 1, *terms.shape[1:]))
-    for k, term in enumerate(terms):
-        np.add(out[k], term, out=out[k + 1])
+    if out[0].size < 100:
+        np.cumsum(terms, axis=0, out=out[1:])
+    else:  # several times quicker than NumPy's sums, which go down one column after the other
+        for k, term in enumerate(terms):
+            np.add(out[k], term, out=out[k + 1])
     return out
 
 
