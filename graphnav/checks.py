@@ -167,7 +167,8 @@ def _at_rest(recording: Recording, track: Track | None) -> Array:
         return mask
 
     def scatter(x: Array) -> Array:
-        return np.linalg.norm(x[: blocks * n].reshape(blocks, n, 3).std(axis=1), axis=-1)
+        axes = np.ascontiguousarray(x[: blocks * n].T).reshape(3, blocks, n)
+        return np.linalg.norm(axes.std(axis=-1), axis=0)
 
     force, rate = scatter(imu.accel), scatter(imu.gyro)
     quiet = (force < 4.0 * np.percentile(force, 2) + 0.02) & (rate < 4.0 * np.percentile(rate, 2) + 0.002)

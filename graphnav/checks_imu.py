@@ -37,7 +37,8 @@ def gap_limit(t: Array) -> float:
 
 
 def repeats(imu: Imu) -> Iterator[Finding]:
-    same = (np.diff(imu.gyro, axis=0) == 0).all(1) & (np.diff(imu.accel, axis=0) == 0).all(1)
+    gyro, accel = imu.gyro[1:] == imu.gyro[:-1], imu.accel[1:] == imu.accel[:-1]
+    same = np.logical_and.reduce([*gyro.T, *accel.T])
     if same.mean() > 0.002:
         yield Finding("note", f"{same.sum()} IMU rows ({100 * same.mean():.1f} %) repeat the values of the row before")
     stuck = max((b - a for a, b in runs_of(same)), default=0) * period_of(imu.t)
@@ -48,7 +49,7 @@ def repeats(imu: Imu) -> Iterator[Finding]:
 def saturation(imu: Imu) -> Iterator[Finding]:
     # in the file's axes: a tilted mount would spread a clipped axis over three
     for what, values, smallest, unit in (("gyro", imu.gyro, 0.5, "rad/s"), ("accelerometer", imu.accel, 5.0, "m/s2")):
-        x = np.ascontiguousarray((values @ imu.R_bs).T)
+        x = imu.R_bs.T @ values.T
         for axis in range(3):
             for sign in (1.0, -1.0):
                 signed = sign * x[axis]
@@ -65,7 +66,8 @@ def saturation(imu: Imu) -> Iterator[Finding]:
 
 
 def imu_units(recording: Recording) -> Iterator[Finding]:
-    f = float(np.median(np.linalg.norm(recording.imu.accel, axis=1)))
+    x, y, z = recording.imu.accel.T
+    f = float(np.median(np.sqrt(x * x + y * y + z * z)))
     guesses = (
         (0.8, 1.2, 'the accelerometer seems to be in g: say units = { accel = "g" }'),
         (85.0, 110.0, "the accelerometer seems to be in m/s2 already: leave out units.accel"),

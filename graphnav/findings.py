@@ -21,7 +21,8 @@ class Finding:
 
 def period_of(t: Array) -> float:
     """Median step of time stamps, s; NaN of fewer than two."""
-    return float(np.median(np.diff(t))) if len(t) > 1 else float("nan")
+    every = max(1, len(t) // 100_000)  # a hundred thousand steps tell it as well as all
+    return float(np.median(t[1::every] - t[:-1:every])) if len(t) > 1 else float("nan")
 
 
 def runs_of(mask: NDArray[Any]) -> list[tuple[int, int]]:
