@@ -32,6 +32,14 @@ def skew(v: Array) -> Array:
     return (v @ _GENERATORS).reshape(*v.shape, 3)
 
 
+def columns(*parts: Array) -> Array:
+    """``np.stack(parts, axis=-1)``, several times quicker for the few rows that a filter asks for at a time."""
+    out = np.empty((*np.shape(parts[0]), len(parts)))
+    for k, part in enumerate(parts):
+        out[..., k] = part
+    return out
+
+
 def mv(M: Array, v: Array) -> Array:
     """Matrix times vector along the leading axes: (..., m, k), (..., k) -> (..., m)."""
     return (M @ v[..., None])[..., 0]

@@ -37,7 +37,7 @@ from graphnav.dynamics import SCALE, scale_parameter
 from graphnav.earth import LocalFrame
 from graphnav.preintegration import Intervals
 from graphnav.recording import Recording
-from graphnav.rotation import Array, mv
+from graphnav.rotation import Array, columns, mv
 from graphnav.state import Parameter, States
 from graphnav.wheels import MeanSpeed, faults
 
@@ -52,6 +52,7 @@ _LINEAR = 3.0  # m/s^2, lateral force up to which tyres behave linearly
 _BEYOND = 0.1  # m/s of sideways speed per m/s^2 beyond that
 _AXLE_LEFT = 0.2  # m, what is not known of the axle's place in a turn: front wheels steer, tyres have width
 _HALF_WHEELBASE = 1.3  # m
+_I3 = np.eye(3)
 _E_Y = np.array([[0.0, 1.0, 0.0]])
 
 
@@ -82,12 +83,13 @@ class Past:
         """u (N, 3) at a lever arm, body axes; turn rate; acceleration; and the derivatives of u and acceleration."""
         turn, late, rate, force = self.turn[rows], self.late[rows], self.rate[rows], self.force[rows]
         omega_n = self.frame.omega_n
+        W = rotation.skew(omega_n)
         Rt = np.swapaxes(states.R_nb, -1, -2)
         da, dg = states.ba - self.ba[rows], states.bg - self.bg[rows]
         if SCALE in parameters:
             scale = parameters[SCALE]
             da, dg = da + scale[:, 3:] * force, dg + scale[:, :3] * rate
-        v, g = mv(Rt, states.v), mv(Rt, self.frame.gravity_n(states.p) - np.cross(omega_n, states.v))
+        v, g = mv(Rt, states.v), mv(Rt, self.frame.gravity_n(states.p) - states.v @ W.T)
         earth = mv(Rt, omega_n)
         omega = rate - dg - earth
         L = rotation.skew(lever)
@@ -96,28 +98,28 @@ class Past:
         by_ba, by_bg = -self.by_ba[rows], late @ rotation.skew(v) + L
         J = {
             "theta": turned @ rotation.skew(v) - late @ rotation.skew(g) + L @ rotation.skew(earth),
-            "v": turned @ Rt + late @ Rt @ rotation.skew(omega_n),
+            "v": turned @ Rt + late @ Rt @ W,
             "ba": by_ba,
             "bg": by_bg,
         }
         # without turning, as springs feel it: what the accelerometer reads less gravity
         acceleration = force - da + g
-        Ja = {"theta": rotation.skew(g), "v": -Rt @ rotation.skew(omega_n), "ba": -np.broadcast_to(np.eye(3), L.shape)}
+        Ja = {"theta": rotation.skew(g), "v": -Rt @ W, "ba": -_I3[None]}
         if SCALE in parameters:
             J[SCALE] = np.concatenate([by_bg * rate[:, None], by_ba * force[:, None]], axis=-1)
-            Ja[SCALE] = np.concatenate([np.zeros_like(by_ba), -np.eye(3) * force[:, None]], axis=-1)
+            Ja[SCALE] = np.concatenate([np.zeros_like(by_ba), -_I3 * force[:, None]], axis=-1)
         return u, omega, acceleration, J, Ja
 
 
 def _turned(u: Array, mounting: Array) -> tuple[Array, Array, Array]:
     """R_vb u (N, 3), R_vb (N, 3, 3), and the derivative of R_vb u by the mounting angles (N, 3, 2)."""
-    ca, sa, cb, sb = np.cos(mounting[:, 0]), np.sin(mounting[:, 0]), np.cos(mounting[:, 1]), np.sin(mounting[:, 1])
+    (ca, cb), (sa, sb) = np.cos(mounting).T, np.sin(mounting).T
     zero = np.zeros_like(ca)
-    R = np.stack([cb, sb * ca, -sb * sa, -sb, cb * ca, -cb * sa, zero, sa, ca], -1).reshape(-1, 3, 3)
+    R = columns(cb, sb * ca, -sb * sa, -sb, cb * ca, -cb * sa, zero, sa, ca).reshape(-1, 3, 3)
     out = mv(R, u)
-    by_pitch = mv(R, np.stack([zero, -u[:, 2], u[:, 1]], -1))
-    by_heading = np.stack([out[:, 1], -out[:, 0], zero], -1)
-    return out, R, np.stack([by_pitch, by_heading], -1)
+    by_pitch = mv(R, columns(zero, -u[:, 2], u[:, 1]))
+    by_heading = columns(out[:, 1], -out[:, 0], zero)
+    return out, R, columns(by_pitch, by_heading)
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,7 @@ class Wheels(Constraint):
         if MOUNTING in parameters:
             jacobians[MOUNTING] = by_mounting
         if AXLE in parameters:
-            jacobians[AXLE] = R @ np.stack([-omega[:, 2], np.zeros(len(omega)), omega[:, 0]], -1)[..., None]
+            jacobians[AXLE] = R @ columns(-omega[:, 2], np.zeros(len(omega)), omega[:, 0])[..., None]
         return out, jacobians, omega, acceleration, Ja
 
 
@@ -213,15 +215,15 @@ class NonHolonomic(Wheels):
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         assert self.past is not None
         u, J, omega, acceleration, Ja = self._velocity(states, parameters, rows)
-        residual = u[:, [0, 2]]
-        jacobians = {name: x[:, [0, 2]] for name, x in J.items()}
+        residual = u[:, ::2]
+        jacobians = {name: x[:, ::2] for name, x in J.items()}
         if BODY in parameters:
             slip, squat = parameters[BODY].T
             v, w, a = u[:, 1], omega[:, 2], acceleration[:, 1]
-            effect = np.stack([v * v * w, v * a], -1)
-            residual = residual - np.stack([slip, squat], -1) * effect
-            by_v = np.stack([2.0 * slip * v * w, squat * a], -1)[..., None]
-            by_a = np.stack([np.zeros_like(v), squat * v], -1)[..., None]
+            effect = columns(v * v * w, v * a)
+            residual = residual - parameters[BODY] * effect
+            by_v = columns(2.0 * slip * v * w, squat * a)[..., None]
+            by_a = columns(np.zeros_like(v), squat * v)[..., None]
             for name in J:
                 jacobians[name] = jacobians[name] - by_v * J[name][:, 1:2]
                 if name in Ja:
@@ -292,7 +294,9 @@ class OdometerSpeed(Wheels):
         u, J, *_ = self._velocity(states, parameters, rows)
         delay = parameters[ODOMETER_DELAY][:, 0] if ODOMETER_DELAY in parameters else np.zeros(len(states))
         # what is true now is read `delay` later
-        read, by_delay = self.speed(self.begin[rows], self.end[rows], np.clip(delay, -self.reach, self.reach))
+        read, by_delay = self.speed(
+            self.begin[rows], self.end[rows], np.minimum(np.maximum(delay, -self.reach), self.reach)
+        )
         scale = 1.0 + parameters[ODOMETER_SCALE][:, 0]
         sign = np.ones(len(states)) if self.signed else np.where(u[:, 1] < 0.0, -1.0, 1.0)
         residual = (sign * u[:, 1] - scale * read)[:, None]

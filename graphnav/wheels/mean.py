@@ -157,7 +157,7 @@ class MeanSpeed:
 
     def _segment(self, x: Array) -> NDArray[np.intp]:
         """The segment k between t[k] and t[k+1] in which x lies."""
-        return np.clip(np.searchsorted(self.t, x, side="right") - 1, 0, len(self.t) - 2)
+        return np.minimum(np.maximum(np.searchsorted(self.t, x, side="right") - 1, 0), len(self.t) - 2)
 
     def _at(self, k: NDArray[np.intp], x: Array) -> tuple[Array, Array]:
         """Way and speed at x in the segments k."""
