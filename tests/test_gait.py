@@ -81,8 +81,8 @@ def test_a_sole_rolls_about_the_point_that_touches() -> None:
     assert heel[0] == pytest.approx(-0.2, abs=1e-3)
 
 
-@pytest.mark.parametrize(("pace", "slides"), [("slow", 0.10), ("normal", 0.10), ("fast", 0.15)])
-def test_the_shoe_stays_on_the_floor_and_does_not_slide(pace: str, slides: float) -> None:
+@pytest.mark.parametrize("pace", PACES)
+def test_the_shoe_stays_on_the_floor_and_does_not_slide(pace: str) -> None:
     """The lowest point of the sole: on the floor through every stance, above it in the air, and without speed."""
     walk = made("gait", pace=pace, course="straight")
     assert walk.motion is not None
@@ -95,9 +95,10 @@ def test_the_shoe_stays_on_the_floor_and_does_not_slide(pace: str, slides: float
     swings = np.column_stack([contacts[:-1, 1], contacts[1:, 0]])
     middle = within(t, np.column_stack([swings @ [0.75, 0.25], swings @ [0.3, 0.7]]))
     assert low[middle].min() > 0.005
-    # once the strike has died out, until shortly before lift-off, the ball or the toes carry it
+    # Once the strike has died out, until shortly before lift-off, the ball or the toes carry it. Points of the sole
+    # are 4 cm apart: at 6 rad/s the nearest one to what touches moves at up to 12 cm/s.
     rising = within(t, np.column_stack([spans(walk, "stances")[:, 1], contacts[:, 1] - 0.06])[:-1])
-    assert speeds[:, rising].min(axis=0).max() < slides
+    assert speeds[:, rising].min(axis=0).max() < 0.15
     assert walk.motion.point(t[rising], np.zeros(3))[1].max() > 0.3  # and yet the IMU moves
 
 
@@ -115,7 +116,7 @@ def test_stance_is_slow_and_not_still(pace: str) -> None:
     assert 5.0 < np.median(turn) < 30.0
 
 
-@pytest.mark.parametrize(("pace", "low", "high"), [("slow", 2.3, 3.2), ("normal", 3.2, 4.5), ("fast", 4.2, 6.0)])
+@pytest.mark.parametrize(("pace", "low", "high"), [("slow", 2.3, 3.2), ("normal", 3.2, 4.5), ("fast", 4.4, 6.0)])
 def test_swing_is_as_fast_and_high_as_a_foot(pace: str, low: float, high: float) -> None:
     walk = made("gait", pace=pace, course="straight")
     motion, contacts = walk.motion, spans(walk, "contacts")

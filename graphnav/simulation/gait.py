@@ -83,7 +83,7 @@ class Style:
         v = float(np.clip(speed, 0.5, 2.2))
         hard = max(v - 1.2, 0.0)
         return cls(
-            strike_pitch=11.0 + 7.0 * v, off_pitch=-(28.0 + 12.0 * v), last_pitch=-(42.0 + 14.0 * v),
+            strike_pitch=11.0 + 7.0 * v, off_pitch=-(34.0 + 8.0 * v), last_pitch=-(48.0 + 10.0 * v),
             high_pitch=13.0 + 8.0 * v, clearance=0.028 + 0.004 * v,
             landing=(0.35 * v + 2.2 * hard, 0.3 * v + 1.8 * hard),
             impact=24.0 * v + 130.0 * hard, give=max(0.012 - 0.017 * hard, 0.003),
@@ -103,7 +103,7 @@ class Foot:
 
 # Shares of a stance's time and what the pitch is there, in deg: flat after the slap, heel off, rising on the ball.
 _FLAT, _HEEL_OFF = 0.17, 0.58
-_ROLLING = ((_FLAT, 1.6), (0.38, -0.3), (_HEEL_OFF, -2.6), (0.74, -8.0), (0.88, -19.0))
+_ROLLING = ((_FLAT, 1.6), (0.38, -0.3), (_HEEL_OFF, -2.6), (0.74, -6.5), (0.88, -17.0))
 
 
 def walk(steps: Steps, style: Style, sole: Sole, end: float, rng: np.random.Generator) -> Foot:
@@ -204,7 +204,7 @@ def _roll(t: Array, steps: Steps, begun: Array, style: Style, vary: Array) -> Ar
 
 
 # Bernstein coefficients of the slide's speed: it takes over from the rolling and has nearly ended before the strike
-_SPEED = np.array([0.0, 1.05, 1.1, 1.2, 1.4, 0.9, 0.0])
+_SPEED = np.array([0.0, 0.65, 1.05, 1.25, 1.45, 1.0, 0.0])
 
 
 def _slide(u: Array) -> Array:

@@ -35,7 +35,7 @@ SHOE = ImuModel(
     accelerometer(100.0, 6.0, instability_mg=0.05, scale_ppm=3000.0, misalignment_mrad=3.0, range_g=18.0),
 )  # fmt: skip
 PRESETS = {"ellipse2": ELLIPSE2, "shoe": SHOE}
-PACES = {"slow": 0.8, "normal": 1.25, "fast": 1.75}  # m/s
+PACES = {"slow": 0.8, "normal": 1.2, "fast": 1.75}  # m/s
 _ORIGIN = (32.06, 118.79, 20.0)
 
 
