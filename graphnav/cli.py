@@ -16,6 +16,9 @@ import typer
 from graphnav import __version__
 from graphnav.errors import ConfigError, GraphnavError
 
+# Before NumPy is imported: see `graphnav.pipeline`, which limits threads for those who do not come this way.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 BAD_INPUT, INTERNAL, INTERRUPTED, PIPE_CLOSED = 2, 1, 130, 141
 DEBUG = "GRAPHNAV_DEBUG"  # set, a traceback is shown
 

@@ -7,6 +7,7 @@ import time
 from dataclasses import replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from graphnav import judgement
 from graphnav.alignment import Alignment, align, with_known_heading
@@ -59,7 +60,9 @@ def run(
     found: list[dict[str, Solution]] = []
     for piece in pieces:
         try:
-            found.append(_solve(piece, settings, frame, solvers, progress))
+            # matrices here have thirty rows: threads for them cost more than the work, twenty times on a busy machine
+            with threadpool_limits(limits=1, user_api="blas"):
+                found.append(_solve(piece, settings, frame, solvers, progress))
         except EstimationError as error:
             if len(pieces) == 1:
                 raise
