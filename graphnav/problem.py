@@ -119,11 +119,14 @@ def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Arra
 
 
 def _inside(stationary: Array | None, recording: Recording) -> Array:
-    """The parts of stationary spans that a recording covers, (M, 2)."""
+    """The parts of stationary spans that a recording covers, (M, 2), from sample to sample of the IMU."""
     if stationary is None or not len(stationary):
         return np.empty((0, 2))
-    cut = np.clip(stationary, recording.start, recording.end)
-    return cut[cut[:, 1] - cut[:, 0] > SAME_TIME]
+    t = np.concatenate([[recording.start], recording.imu.t])
+    first = np.searchsorted(t, stationary[:, 0] - SAME_TIME)
+    last = np.searchsorted(t, stationary[:, 1] + SAME_TIME, side="right") - 1
+    kept = last > first
+    return np.stack([t[first[kept]], t[last[kept]]], -1)
 
 
 def _chains(parameters: tuple[Parameter, ...], t: Array) -> tuple[ParameterChain, ...]:

@@ -290,7 +290,7 @@ def _epochs(solution: Solution, truth: Array) -> Array:
         k = np.clip(np.searchsorted(truth, t), 1, len(truth) - 1)
         before, after = t - truth[k - 1], truth[k] - t
         there = (np.minimum(np.abs(before), np.abs(after)) <= _SAME) | (before + after <= _NEAR)
-        if there.sum() >= max(_ENOUGH, 0.99 * len(t)):
+        if there.sum() >= max(_ENOUGH, 0.8 * len(t)):
             return np.asarray(t[there])
     return _thinned(truth, solution, _MOST)
 

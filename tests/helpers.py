@@ -59,29 +59,31 @@ def random_imu(rng: np.random.Generator, seconds: float, rate: float = 100.0, no
 
 
 def truth_states(truth: Trajectory, t: Array, frame: LocalFrame) -> States:
-    """The truth at times that are its own, as states in a navigation frame."""
-    i = np.searchsorted(truth.t, t - 1e-6)
-    assert np.abs(truth.t[i] - t).max() < 1e-6, "the truth has no row at these times"
-    p = frame.from_llh(truth.llh[i])
+    """The truth as states in a navigation frame, straight between its rows, of which there is one a few ms away."""
+    i = np.clip(np.searchsorted(truth.t, t - 1e-6), 1, len(truth.t) - 1)
+    w = ((t - truth.t[i - 1]) / (truth.t[i] - truth.t[i - 1]))[:, None]
+    assert np.all((w > -1e-3) & (w < 1.001)) and np.all(np.diff(truth.t[[i - 1, i]], axis=0) < 0.011), "no truth there"
+
+    def at(x: Array | None) -> Array:
+        return np.zeros((len(t), 3)) if x is None else (1 - w) * x[i - 1] + w * x[i]
+
+    p = at(frame.from_llh(truth.llh))
     R_nl = np.swapaxes(frame.R_ln(p), -1, -2)
-    zero = np.zeros((len(t), 3))
-    ba = zero if truth.accel_bias is None else truth.accel_bias[i]
-    bg = zero if truth.gyro_bias is None else truth.gyro_bias[i]
-    v = np.einsum("kij,kj->ki", R_nl, truth.v[i])
-    return States(R_nl @ rotation.from_rph(truth.rph[i]), p, v, ba, bg)
+    rph = truth.rph[i - 1] + w * rotation.wrap(truth.rph[i] - truth.rph[i - 1])
+    v = np.einsum("kij,kj->ki", R_nl, at(truth.v))
+    return States(R_nl @ rotation.from_rph(rph), p, v, at(truth.accel_bias), at(truth.gyro_bias))
 
 
 def errors(solution: Solution, truth: Trajectory) -> tuple[Array, Array, Array, Array]:
     """(position error e n u, its sigma, roll-pitch-heading error, its sigma) at every keyframe; m and rad."""
     mine = solution.trajectory()
-    i = np.searchsorted(truth.t, mine.t - 1e-6)
-    assert np.abs(truth.t[i] - mine.t).max() < 1e-6, "the truth has no row at these times"
     true = truth_states(truth, mine.t, solution.frame)
     R_ln = solution.frame.R_ln(true.p)
     position = np.einsum("kij,kj->ki", R_ln, solution.states.p - true.p)
     assert mine.sd_p is not None
     assert mine.sd_rph is not None
-    return position, mine.sd_p, rotation.wrap(mine.rph - truth.rph[i]), mine.sd_rph
+    rph = rotation.to_rph(R_ln @ true.R_nb)
+    return position, mine.sd_p, rotation.wrap(mine.rph - rph), mine.sd_rph
 
 
 Factor = tuple[dict[int, Array], Array]  # {key: A (m, k)}, b (m,)

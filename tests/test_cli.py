@@ -77,7 +77,7 @@ def test_compare_succeeds_and_says_where_to_look(compared):
     assert f"  {out / 'comparison.html'}" in run.stdout.splitlines()
     for solver in SOLVERS:
         assert any(line.split()[:1] == [solver] for line in run.stdout.splitlines())
-    assert "detections.csv holds its header only" in run.stdout
+    assert "s in all: detections.csv" in run.stdout
 
 
 def test_compare_writes_what_it_promises(compared):
@@ -86,7 +86,8 @@ def test_compare_writes_what_it_promises(compared):
     for solver in SOLVERS:
         assert {p.name for p in (out / solver).iterdir()} == FILES
         assert (out / solver / "trajectory.csv").read_text().splitlines()[0] == TRAJECTORY_COLUMNS
-        assert (out / solver / "detections.csv").read_text() == "start,end,detector\n"
+        found = rows(out / solver / "detections.csv")
+        assert [list(found[0]), found[-1]["detector"]] == [["start", "end", "detector"], "fused"]
         assert "<html" in (out / solver / "report.html").read_text(encoding="utf-8")
 
 
@@ -166,7 +167,8 @@ def test_evaluate_finds_the_errors_that_subtraction_finds(compared, drive, tmp_p
         {round(float(row["t"]), 3): (float(row["lat"]), float(row["lon"])) for row in rows(path)}
         for path in (out / "batch" / "trajectory.csv", drive / "truth.csv")
     )
-    assert values["n"] == len(mine) == len(set(mine) & set(true))
+    mine = {t: place for t, place in mine.items() if t in true}  # the ends of stops fall between the truth's rows
+    assert values["n"] == len(mine) > 150
     d = np.radians([np.subtract(mine[t], true[t]) for t in mine]) * 6371e3
     north, east = d[:, 0], d[:, 1] * np.cos(np.radians(30.5))
     assert values["e_rms_m"] == pytest.approx(np.sqrt(np.mean(east**2)), rel=5e-3)
@@ -238,7 +240,6 @@ def test_info_of_a_real_drive():
 BAD = {
     "no such recording": (["info", "nothing/here"], "nothing/here: no such file or folder"),
     "unknown command": (["smoth", "kitti"], "smoth"),
-    "not there yet": (["detect", "kitti", "-o", "o"], "No such command"),
     "unknown option": (["smooth", "kitti", "-o", "o", "--solvr", "ekf"], "--solvr"),
     "no output": (["smooth", "kitti"], "-o"),
     "no number": (["smooth", "kitti", "-o", "o", "--start", "soon"], "--start"),
