@@ -19,7 +19,7 @@ ROOMS = [
     "dense", "solvers", "judgement", "pipeline",
     "interpolation", "metrics", "scoring", "evaluation", "exporters",
     "panels", "page", "plots", "report_tables", "report_pictures", "report",
-    "workflow", "outputs", "terminal", "detection_pictures", "detection_report", "cli",
+    "workflow", "outputs", "convert", "terminal", "detection_pictures", "detection_report", "cli_logs", "cli",
 ]  # fmt: skip
 
 GTSAM_ROOMS = {"solvers"}

@@ -1,0 +1,54 @@
+"""Commands about logs: `convert`, `init` and `allan`. `graphnav.cli` puts them on the program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from graphnav.errors import ConfigError
+
+
+def register(app: typer.Typer, say: Callable[[str], None]) -> None:
+    """Add the commands to the program; `say` prints."""
+
+    @app.command(
+        epilog="\b\nExamples:\n  graphnav convert dataset/kf-gins.yaml -o drive\n"
+        "  graphnav convert out/trajectory.csv -o track.gpx --point antenna"
+    )
+    def convert(
+        source: Annotated[str, typer.Argument(metavar="SOURCE", help="Another program's log, or a trajectory file.")],
+        out: Annotated[
+            Path, typer.Option("-o", "--out", metavar="OUT", help="Folder; for a trajectory, a file will do.")
+        ],
+        format: Annotated[
+            str | None,
+            typer.Option("--format", metavar="NAME", help="What the log is, or what to write a trajectory as."),
+        ] = None,
+        point: Annotated[
+            str | None, typer.Option("--point", metavar="POINT", help="Trajectory: imu, antenna or x,y,z (m; RFU).")
+        ] = None,
+        rate: Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Trajectory: interpolate to.")] = None,
+        clock: Annotated[
+            str | None,
+            typer.Option("--clock", metavar="TEXT", help="Trajectory: unix, 'gps week 2313' or a UTC date of t = 0."),
+        ] = None,
+    ) -> None:
+        """Turn another program's log into a recording folder, or a trajectory into gpx, nav, nmea, tum, kml or csv."""
+        from graphnav import convert as conversion
+        from graphnav.outputs import output_folder
+
+        if conversion.is_export(Path(source), out, format):
+            if rate is not None and not 0.0 < rate <= 10_000.0:
+                raise ConfigError(f"--rate {rate:g}: must be above 0 and at most 10000 Hz")
+            output_folder(out.parent if out.suffix else out)
+            _, files, notes = conversion.export_file(Path(source), out, format, point, rate, clock)
+            say("\n".join([*(f"note: {note}" for note in notes), *(f"wrote {file}" for file in files)]))
+            return
+        for option, value in (("--point", point), ("--rate", rate), ("--clock", clock)):
+            if value is not None:
+                raise ConfigError(f"{option}: is for trajectories; a log keeps its own")
+        log, files = conversion.convert_log(source, output_folder(out), format)
+        say(conversion.log_text(log, files))
