@@ -52,3 +52,32 @@ def register(app: typer.Typer, say: Callable[[str], None]) -> None:
                 raise ConfigError(f"{option}: is for trajectories; a log keeps its own")
         log, files = conversion.convert_log(source, output_folder(out), format)
         say(conversion.log_text(log, files))
+
+    @app.command(epilog="\b\nExample:\n  graphnav init imu.csv ride.nmea -o recording.toml")
+    def init(
+        logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="CSV files, or logs of a known kind.")],
+        out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The .toml to write.")] = Path(
+            "recording.toml"
+        ),
+        name: Annotated[str | None, typer.Option("--name", help="Of the recording; default: its folder's.")] = None,
+        force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
+    ) -> None:
+        """Draft a recording.toml from logs: columns, units, axes and clocks as they seem to be, and why."""
+        from graphnav.draft import draft
+        from graphnav.formats.writer import write_csv
+        from graphnav.outputs import output_folder
+
+        out = out / "recording.toml" if out.is_dir() else out
+        if out.suffix != ".toml":
+            raise ConfigError(f"-o {out}: name a .toml file, or a folder for recording.toml")
+        if out.exists() and not force:
+            raise ConfigError(f"-o {out}: is there already; name another file, or say --force")
+        folder = output_folder(out.parent)
+        drafted = draft(logs, folder, name)
+        folder.mkdir(parents=True, exist_ok=True)
+        for made, columns in drafted.made.items():
+            if (folder / made).exists() and not force:
+                raise ConfigError(f"{folder / made}: is there already; say --force to write over it")
+            write_csv(folder / made, list(columns), list(columns.values()))
+        out.write_text(drafted.text, encoding="utf-8")
+        say("\n".join([*(f"  {line}" for line in drafted.decisions), f"wrote {out}; look at the lines marked CHECK"]))

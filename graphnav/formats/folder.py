@@ -114,6 +114,8 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     every = np.ones(len(rows), dtype=bool)
     sd = sigmas(rows, ("sd_e", "sd_n", "sd_u"), d.sd, DEFAULT_SD, "GNSS position", every, remarks)
     v = sd_v = None
+    if "vd" in rows and "vu" not in rows:
+        rows = rows.with_column("vu", -rows["vd"])
     there = [c for c in ("ve", "vn", "vu") if c in rows]
     if len(there) == 3:
         scale = schema.SPEED[d.units.speed]

@@ -186,7 +186,7 @@ class GnssTable(_Sensor):
     """[gnss]"""
 
     required = ("t", "lat", "lon", "h")
-    optional = ("sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu", "speed", "course")
+    optional = ("sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu", "vd", "speed", "course")
 
     units: GnssUnits = GnssUnits()
     lever_arm: Vector = (0.0, 0.0, 0.0)

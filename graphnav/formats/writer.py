@@ -36,7 +36,7 @@ def write_recording(log: Log, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     files = [f for f in (_imu(log), _gnss(log), _odometer(log), _truth(log)) if f is not None]
     for file in files:
-        _write_csv(folder / file.name, file.header, file.columns)
+        write_csv(folder / file.name, file.header, file.columns)
     path = folder / "recording.toml"
     path.write_text(_toml(log), encoding="utf-8")
     return [path, *(folder / file.name for file in files)]
@@ -110,7 +110,8 @@ def _truth(log: Log) -> _File | None:
     return _File("truth.csv.gz", header, columns)
 
 
-def _write_csv(path: Path, header: list[str], columns: list[Array]) -> None:
+def write_csv(path: Path, header: list[str], columns: list[Array]) -> None:
+    """Write columns as gzipped CSV; NaN is blank."""
     table = np.column_stack(columns)
     row = ",".join(["%r"] * len(header)) + "\n"
     # no time stamp in the file: the same log gives the same bytes
