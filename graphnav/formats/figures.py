@@ -51,7 +51,7 @@ EXAMPLES = {
     "gyro_scale_sigma": "300 ppm",
     "accel_scale_sigma": "0.1 %",
 }
-_FIGURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)\s*")
+_FIGURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\s\d.].*?)\s*")
 
 
 def parse_figure(key: str, value: Any) -> Any:
@@ -94,7 +94,7 @@ def _plain(unit: str) -> str:
         ("√", "sqrt"),
     ):
         text = text.replace(old, new)
-    text = re.sub(r"\b(hours?|hrs?)\b", "h", text)
-    text = re.sub(r"\b(sec(onds?)?)\b", "s", text)
     text = re.sub(r"(?<!sq)rt(?=\(|hz)", "sqrt", re.sub(r"m/s/s(?![a-z])", "m/s2", text))
-    return re.sub(r"sqrt([a-z]+)", r"sqrt(\1)", text)
+    text = re.sub(r"sqrt([a-z]+)", r"sqrt(\1)", text)
+    text = re.sub(r"\b(hours?|hrs?)\b", "h", text)
+    return re.sub(r"\b(sec(onds?)?)\b", "s", text)
