@@ -53,6 +53,40 @@ def register(app: typer.Typer, say: Callable[[str], None]) -> None:
         log, files = conversion.convert_log(source, output_folder(out), format)
         say(conversion.log_text(log, files))
 
+    @app.command(epilog="\b\nExample:\n  graphnav allan rest.csv -o out/allan")
+    def allan(
+        log: Annotated[str, typer.Argument(metavar="LOG", help="A log at rest: CSV, a recording or a known log.")],
+        out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into.")],
+        start: Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from its start.")] = None,
+        end: Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from its start.")] = None,
+    ) -> None:
+        """Measure the noise figures of an IMU from a log at rest, and print them as lines for recording.toml."""
+        from graphnav.allan import allan_of, files
+        from graphnav.draft import imu_of
+        from graphnav.errors import RecordingError
+        from graphnav.formats import load
+        from graphnav.outputs import output_folder
+
+        folder = output_folder(out)
+        if log.endswith((".csv", ".csv.gz")):
+            t, gyro, accel = imu_of(Path(log))
+        else:
+            imu = load(log).imu
+            if imu is None:
+                raise RecordingError(f"{log}: holds no IMU")
+            t, gyro, accel = imu.t, imu.gyro, imu.accel
+        since = t - t[0]
+        part = (since >= (start or 0.0)) & (since <= (since[-1] if end is None else end))
+        if part.sum() < 2:
+            raise ConfigError(f"--start, --end: nothing of {log} lies between them; it runs to {since[-1]:.1f} s")
+        try:
+            result = allan_of(t[part], gyro[part], accel[part])
+        except RecordingError as error:
+            raise RecordingError(f"{log}: {error}") from None
+        written = files.write(result, folder)
+        lines = [f"{result.duration:.0f} s at rest, {result.rate:.4g} Hz", "", "[imu.noise]", *result.lines(), ""]
+        say("\n".join([*lines, *(f"wrote {path}" for path in written)]))
+
     @app.command(epilog="\b\nExample:\n  graphnav init imu.csv ride.nmea -o recording.toml")
     def init(
         logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="CSV files, or logs of a known kind.")],

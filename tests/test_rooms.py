@@ -14,8 +14,8 @@ PACKAGE = Path(__file__).resolve().parents[1] / "graphnav"
 # Modules and packages of graphnav, left to right. A new one needs a place here, as far left as it can stand.
 ROOMS = [
     "errors", "rotation", "earth", "state", "config", "recording", "trajectory",
-    "formats", "draft", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding", "checks",
-    "detectors",
+    "formats", "draft", "allan", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding",
+    "checks", "detectors",
     "preintegration", "dynamics", "constraints", "problem", "solution", "alignment",
     "dense", "solvers", "judgement", "pipeline",
     "interpolation", "metrics", "scoring", "evaluation", "exporters",
@@ -24,7 +24,7 @@ ROOMS = [
 ]  # fmt: skip
 
 GTSAM_ROOMS = {"solvers"}
-MATPLOTLIB_ROOMS = {"panels", "plots", "detection_pictures"}
+MATPLOTLIB_ROOMS = {"allan", "panels", "plots", "detection_pictures"}
 PRINTING_ROOMS = {"cli"}
 
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -48,6 +48,21 @@ def draft(paths: Sequence[Path], folder: Path, name: str | None = None) -> Draft
     return Draft(text, tuple(writer.decisions), writer.made)
 
 
+def imu_of(path: Path) -> tuple[Array, Array, Array]:
+    """Times (N,), rates and forces (N, 3) of a CSV file in SI, units as `draft` would guess them.
+
+    Raises
+    ------
+    RecordingError
+        As `draft`.
+    """
+    source = sources([path])["imu"]
+    gyro, accel = source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
+    force = guesses.accel_unit(path, accel, source.stated("ax", "accel"))
+    rate = guesses.gyro_unit(gyro, source.stated("gx", "gyro"), None, vehicle=False)
+    return source.t, gyro * RATE[str(rate.value)], accel * FORCE[str(force.value)]
+
+
 class _Writer:
     """Lines of the file; every decision goes into a comment and into a list."""
 
