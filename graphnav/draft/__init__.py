@@ -98,7 +98,7 @@ class _Writer:
         if source.log is not None:
             assert source.log.imu is not None
             imu = source.log.imu
-            t, gyro, accel = imu.t, imu.gyro, imu.accel
+            t, gyro, accel = imu.t, imu.gyro @ imu.R_bs, imu.accel @ imu.R_bs  # in the log's own axes
         else:
             t, gyro, accel = source.t, source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
             force = guesses.accel_unit(source.path, accel, source.stated("ax", "accel"))
@@ -110,10 +110,14 @@ class _Writer:
             gyro = gyro * RATE[str(rate.value)]
             self._units({"t": source.t_unit, "gyro": rate, "accel": force})
             front = self._axes(up, up_why, agreement)
-            self._noise(t, gyro, accel)
+        elif source.log.mount_known or agreement.clearest is None:
+            assert source.log.imu is not None
+            self.decisions.append(f"IMU: axes and units are those of {source.path.name}")
+            front = source.log.imu.R_bs[1]
         else:
-            self.decisions.append(f"IMU: axes, units and noise are those of {source.path.name}")
-            front = np.array([0.0, 1.0, 0.0])
+            front = self._axes(up, up_why, agreement)
+        if source.log is None or (source.log.imu is not None and source.log.imu.noise_assumed):
+            self._noise(t, gyro, accel)
         return agreement, (t, accel @ front)
 
     def _axes(self, up: Array, up_why: str, agreement: Agreement) -> Array:

@@ -42,6 +42,7 @@ def read_folder(source: str | Path) -> Recording:
     d = schema.read_description(path)
     remarks = Remarks()
     files = [path]
+    logs: dict[str, Log | None] = {}  # by file; one log may hold several sensors
 
     def table(name: str) -> Table:
         section = getattr(d, name)
@@ -63,10 +64,12 @@ def read_folder(source: str | Path) -> Recording:
         section = getattr(d, name)
         if section is None:
             return None
-        log = other_log(path.parent / section.file)
+        if section.file not in logs:
+            logs[section.file] = other_log(path.parent / section.file)
+        log = logs[section.file]
         if log is None:
             return of_table(section, table(name), remarks)
-        files.extend(log.files)
+        files.extend(file for file in log.files if file not in files)
         if getattr(log, name) is None:
             raise RecordingError(f"{path}: '{name}.file': {section.file} holds no {name}")
         for key in ("columns", "units", "keep"):

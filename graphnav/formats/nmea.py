@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.errors import RecordingError
+from graphnav.formats import ubx
 from graphnav.formats.clocks import of_week, utc_to_gps
 from graphnav.formats.registry import Log, extra, first_bytes, log_format
 from graphnav.formats.repair import DEFAULT_SD, DEFAULT_SD_V, Remarks, horizontal_velocity
@@ -42,7 +43,9 @@ class _Epoch:
 
 
 def recognises(path: Path) -> bool:
-    """Whether one of the first lines is a sentence: $, talker and type, a comma."""
+    """Whether one of the first lines is a sentence ($, talker and type, a comma) and UBX does not say more."""
+    if ubx.recognises(path):
+        return False
     lines = first_bytes(path).splitlines()[:20]
     return any(line[:1] == b"$" and line[6:7] == b"," and line[1:6].isalpha() and line[1:2] != b"P" for line in lines)
 

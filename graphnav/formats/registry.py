@@ -31,6 +31,7 @@ class Log:
     platform: str = "vehicle"
     clock: Clock = "own"
     gps_zero: float | None = None  # s since the GPS epoch at t = 0 of the log, where it is known
+    mount_known: bool = True  # whether the IMU's axes are by definition those of the vehicle
     files: tuple[Path, ...] = ()
     remarks: tuple[str, ...] = ()  # sentences about what was assumed
 
