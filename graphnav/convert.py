@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -34,7 +35,7 @@ def is_export(source: Path, out: Path, name: str | None) -> bool:
         return False
     if out.suffix[1:] in NAMES and not out.is_dir():
         return True
-    if name not in NAMES:
+    if name is None or not {part.strip() for part in name.split(",")} <= set(NAMES):
         return False
     known = formats()
     return name not in known or not known[name].recognises(source)
@@ -50,6 +51,11 @@ def convert_log(source: str, out: Path, name: str | None) -> tuple[Log, list[Pat
     ConfigError
         If it would be written over itself.
     """
+    if name is not None and name not in formats():
+        known = [*formats(), *NAMES]
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
+        raise ConfigError(f"--format {name}: no such format; {hint}")
     log = load(source, name)
     if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
         raise ConfigError(f"-o {out}: the recording is read from there; name another folder")
