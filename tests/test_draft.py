@@ -49,6 +49,7 @@ DRIVE, _ = oracle.drive(
          {"h": "altitude", "course": "bearing", "sd_n": "horizontalAccuracy", "sd_u": "verticalAccuracy"}),
         ("t_s,lat_deg,lon_deg,h_m,speed_mps,course_deg,epe_m,hdop", "gnss", {"h": "h_m", "course": "course_deg"}),
         ("timestamp,wheel_speed_kmh,gear", "odometer", {"speed": "wheel_speed_kmh"}),
+        ("t,wheel_fl_kmh,wheel_fr_kmh,RearLeft,rr", "odometer", {"speed_fl": "wheel_fl_kmh", "speed_rl": "RearLeft"}),
         ("time,temperature,pressure", None, {"t": "time"}),
     ],
 )  # fmt: skip

@@ -194,6 +194,7 @@ class _Writer:
             if lag is not None and lag.correlation > FAIR and abs(lag.seconds) > _SMALL:
                 sure = "" if lag.correlation > CLEAR else "CHECK: "
                 self._key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_agree(lag)}")
+                self._key("delay_sigma", "0.05", "s, what is left of it; it is estimated")
         self._key("lever_arm", "[0.0, 0.0, 0.0]", "CHECK: m, from the IMU to the middle of the rear axle")
 
     # ---- lines

@@ -11,6 +11,7 @@ _GYRO = r"(?:.*_)?(?:gyr\w*?|angular_(?:velocity|rate)|ang_vel|omega|rotation_ra
 _ACCEL = r"(?:.*_)?(?:acc\w*?|linear_acceleration|total_acceleration|specific_force|imu_a|imu_f|force|a|f)_?"
 _HORIZONTAL = r"sd_?h|(?:.*_)?(?:h_?acc\w*|horizontal_accuracy)|accuracy|eph|epe(?:_m)?"
 _VERTICAL = r"sd_?v|(?:.*_)?(?:v_?acc\w*|vertical_accuracy)|altitude_accuracy|epv"
+_WHEEL, _SPEED = r"(?:wheel_?|speed_?|wheel_?speed_?)*", r"(?:_?wheel)?(?:_?speed)?"
 _PATTERNS: dict[str, tuple[str, ...]] = {
     "t": (
         r"t", r"seconds_elapsed", r"time_elapsed|elapsed_time|elapsed|time_since_start|rel_?time",
@@ -39,6 +40,10 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
         r"speed_over_ground|sog|g_?speed",
         r"(?:.*_)?(?:speed|velocity|v_?x|twist_linear_x|linear_x|v)",
     ),
+    "speed_fl": (rf"{_WHEEL}(?:fl|front_left|left_front){_SPEED}",),
+    "speed_fr": (rf"{_WHEEL}(?:fr|front_right|right_front){_SPEED}",),
+    "speed_rl": (rf"{_WHEEL}(?:rl|rear_left|left_rear){_SPEED}",),
+    "speed_rr": (rf"{_WHEEL}(?:rr|rear_right|right_rear){_SPEED}",),
     "course": (
         r"course(?:_over_ground)?|cog", r"(?:.*_)?(?:bearing|track|course|head_mot|motion_heading|heading_of_motion)",
         r"heading",
@@ -78,7 +83,8 @@ class Columns:
             return "imu"
         if {"lat", "lon"} <= self.names.keys():
             return "gnss"
-        return "gyro" if gyro else "accel" if accel else "odometer" if "speed" in self.names else None
+        wheel = any(name == "speed" or name.startswith("speed_") for name in self.names)
+        return "gyro" if gyro else "accel" if accel else "odometer" if wheel else None
 
 
 def match(header: Sequence[str], stem: str = "") -> Columns:

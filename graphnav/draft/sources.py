@@ -14,7 +14,7 @@ from graphnav.draft.guesses import Guess
 from graphnav.errors import RecordingError
 from graphnav.formats.folder import other_log
 from graphnav.formats.registry import Log
-from graphnav.formats.schema import ANGLE, SPEED, TIME
+from graphnav.formats.schema import ANGLE, SPEED, TIME, WHEELS
 from graphnav.formats.table import read_header, read_table
 from graphnav.rotation import Array
 
@@ -23,9 +23,9 @@ _WANTED = {
     "gyro": ("t", "gx", "gy", "gz"),
     "accel": ("t", "ax", "ay", "az"),
     "gnss": ("t", "lat", "lon", "h", "sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "vd", "speed", "course"),
-    "odometer": ("t", "speed"),
+    "odometer": ("t", "speed", *WHEELS),
 }
-_NEEDED = {"gnss": 4}  # of those, how many must be there in a row
+_NEEDED = {"gnss": 4, "odometer": 2}  # of those, how many must be there in a row
 
 
 @dataclass
@@ -163,6 +163,11 @@ def _read(path: Path, columns: matching.Columns, role: str) -> Source:
     values = {ours: table[ours][whole] for ours in names}
     order = np.argsort(values["t"], kind="stable")
     order = order[np.concatenate([[True], np.diff(values["t"][order]) > 0])]
-    source = Source(path, matching.Columns(names, columns.units), {ours: v[order] for ours, v in values.items()})
+    values = {ours: v[order] for ours, v in values.items()}
+    if role == "odometer" and "speed" not in values:  # as it will be read
+        rear = [w for w in WHEELS[2:] if w in values] or [w for w in WHEELS if w in values]
+        values["speed"] = np.mean([values[w] for w in rear], axis=0)
+        columns = matching.Columns(columns.names, {**columns.units, "speed": columns.units.get(rear[0], "")})
+    source = Source(path, matching.Columns(names, columns.units), values)
     source.t_unit = guesses.time_unit(source.values["t"], source.stated("t", "t"), role in ("imu", "gyro", "accel"))
     return source

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import numpy as np
 
 from graphnav.formats.clocks import clock_words
 from graphnav.formats.registry import Log
-from graphnav.recording import ImuNoise
+from graphnav.formats.schema import WHEELS
+from graphnav.recording import ImuNoise, Odometer, Recording
 from graphnav.rotation import Array
 
 _DEG = np.pi / 180.0
@@ -40,6 +42,13 @@ def write_recording(log: Log, folder: Path) -> list[Path]:
     path = folder / "recording.toml"
     path.write_text(_toml(log), encoding="utf-8")
     return [path, *(folder / file.name for file in files)]
+
+
+def write_folder(recording: Recording, folder: str | Path, notes: Sequence[str] = ()) -> list[Path]:
+    """Write a recording; `notes` become comments of recording.toml."""
+    r = recording
+    log = Log(r.name, r.imu, r.gnss, r.odometer, r.truth, r.platform, gps_zero=r.gps_zero, remarks=tuple(notes))
+    return write_recording(log, Path(folder))
 
 
 def degrees(angle: Array) -> Array:
@@ -87,9 +96,15 @@ def _gnss(log: Log) -> _File | None:
 
 
 def _odometer(log: Log) -> _File | None:
-    return (
-        None if log.odometer is None else _File("odometer.csv.gz", ["t", "speed"], [log.odometer.t, log.odometer.speed])
-    )
+    if log.odometer is None:
+        return None
+    odometer = log.odometer
+    header, columns = ["t", "speed"], [odometer.t, odometer.speed]
+    if odometer.way is not None:
+        header, columns = [*header, "pulses"], [*columns, np.round(odometer.way / odometer.pulse)]
+    if odometer.wheels is not None:
+        header, columns = [*header, *WHEELS], [*columns, *odometer.wheels.T]
+    return _File("odometer.csv.gz", header, columns)
 
 
 def _truth(log: Log) -> _File | None:
@@ -150,7 +165,7 @@ def _toml(log: Log) -> str:
     if log.odometer is not None:
         lines += ["", "[odometer]", 'file = "odometer.csv.gz"       # t,speed; s, m/s, forward positive']
         lines += [f"lever_arm = {_vector(log.odometer.lever_arm)}    # to the point that does not slip sideways, m"]
-        lines += [f"scale_sigma = {log.odometer.scale_sigma!r}"]
+        lines += _odometer_keys(log.odometer)
     if log.truth is not None:
         lines += ["", "[truth]                        # only for evaluation"]
         if log.truth.closed_loop_sigma is not None:
@@ -162,6 +177,18 @@ def _toml(log: Log) -> str:
         )
         lines += [f'of = "{log.truth.of}"']
     return "\n".join(lines) + "\n"
+
+
+def _odometer_keys(odometer: Odometer) -> list[str]:
+    lines = []
+    if odometer.way is not None:
+        lines += [f"metres_per_pulse = {float(odometer.pulse)!r}", 'pulses = "cumulative"']
+    lines += [f"scale_sigma = {float(odometer.scale_sigma)!r}", f"signed = {str(odometer.signed).lower()}"]
+    if odometer.speed_sigma is not None:
+        lines.append(f"speed_sigma = {float(odometer.speed_sigma)!r}".ljust(31) + "# m/s, of one reading")
+    if odometer.delay_sigma:
+        lines.append(f"delay_sigma = {float(odometer.delay_sigma)!r}".ljust(31) + "# s, of the stamps")
+    return lines
 
 
 def _noise(noise: ImuNoise, assumed: bool) -> list[str]:
