@@ -226,6 +226,8 @@ def test_logs_of_other_programs_are_joined(tmp_path):
     recording, truth = logs.simulated(100.0)
     logs.write_kf_gins(tmp_path, recording, truth)
     logs.write_nmea(tmp_path / "ride.nmea", recording)
+    (whole := tmp_path / "whole").mkdir()
+    assert "lever_arm = [0.3000, 0.5000, 1.2000]" in draft([tmp_path], whole).text  # the configuration's
     found = draft([tmp_path / "imu.txt", tmp_path / "ride.nmea"], tmp_path)
     (tmp_path / "recording.toml").write_text(found.text)
     read_back = read(tmp_path)

@@ -16,6 +16,7 @@ from graphnav.draft.sources import Source, fix_speed_unit, fixes, sources
 from graphnav.errors import RecordingError
 from graphnav.formats.schema import FORCE, RATE, SPEED
 from graphnav.formats.writer import quoted
+from graphnav.recording import Gnss, Odometer
 from graphnav.rotation import Array
 
 __all__ = ["Draft", "draft"]
@@ -178,7 +179,7 @@ class _Writer:
             words = f"velocities are not used: they come {behind:.2f} s after the positions"
             self.lines.append(f"# {words}")
             self.decisions.append(words)
-        self._key("lever_arm", "[0.0, 0.0, 0.0]", "CHECK: m, from the IMU to the antenna: right, forward, up")
+        self._lever_arm(source.log.gnss if source.log else None, "from the IMU to the antenna: right, forward, up")
         lag = agreement.best
         if lag is not None and lag.correlation > FAIR and abs(lag.seconds) > _SMALL:
             sure = "" if lag.correlation > CLEAR else "CHECK: "
@@ -195,7 +196,14 @@ class _Writer:
                 sure = "" if lag.correlation > CLEAR else "CHECK: "
                 self._key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_agree(lag)}")
                 self._key("delay_sigma", "0.05", "s, what is left of it; it is estimated")
-        self._key("lever_arm", "[0.0, 0.0, 0.0]", "CHECK: m, from the IMU to the middle of the rear axle")
+        self._lever_arm(source.log.odometer if source.log else None, "from the IMU to the middle of the rear axle")
+
+    def _lever_arm(self, sensor: Gnss | Odometer | None, what: str) -> None:
+        """That of a log, if it has one."""
+        if sensor is not None and np.any(sensor.lever_arm):
+            self._key("lever_arm", _vector(sensor.lever_arm), f"m, {what}; as the log says")
+        else:
+            self._key("lever_arm", "[0.0, 0.0, 0.0]", f"CHECK: m, {what}")
 
     # ---- lines
 

@@ -77,8 +77,16 @@ def _messages(path: Path, pyubx2: Any) -> _Content:
     content = _Content()
     tag: int | None = None
     with path.open("rb") as stream:
-        for raw, _ in pyubx2.UBXReader(stream, protfilter=pyubx2.UBX_PROTOCOL, quitonerror=0, parsing=0):
-            if raw is None or len(raw) < 8:
+        reader = pyubx2.UBXReader(stream, protfilter=pyubx2.UBX_PROTOCOL, quitonerror=0, parsing=0)
+        while True:
+            try:
+                raw, _ = reader.read()
+            except Exception:  # bytes between the frames that look like another protocol and are not
+                content.broken += 1
+                continue
+            if raw is None:
+                break
+            if len(raw) < 8:
                 continue
             kind = (raw[2], raw[3])
             if kind not in (_PVT, _HP, _MEAS, _RAW):
