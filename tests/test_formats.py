@@ -335,3 +335,32 @@ def test_real_recordings_convert_unchanged(shared_data, tmp_path):
     ):
         convert.convert_log(str(shared_data / name), tmp_path / name, None)
         same_recording(read(tmp_path / name), read(shared_data / name))
+
+
+def cut_sources(folder):
+    """A log of every text form."""
+    logs.write_kf_gins(folder / "kf", RECORDING, TRUTH)
+    return [
+        folder / "kf" / "imu.txt", folder / "kf" / "gnss.txt", folder / "kf" / "kf-gins.yaml",
+        logs.write_rtklib(folder / "a.pos", RECORDING), logs.write_nmea(folder / "a.nmea", RECORDING),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("share", [0.0, 0.013, 0.31, 0.777, 0.99])
+@pytest.mark.parametrize("which", range(5), ids=["imu", "gnss", "yaml", "pos", "nmea"])
+def test_a_file_that_is_cut_off_is_read_to_there_or_refused_in_a_line(tmp_path, which, share):
+    path = cut_sources(tmp_path)[which]
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    name = ("kf-gins", "kf-gins", "kf-gins", "rtklib", "nmea")[which]
+    log, refusal = None, ""
+    try:
+        log = load(path, name)
+    except RecordingError as error:
+        refusal = str(error)
+    if log is None:
+        assert path.name in refusal
+        assert "\n" not in refusal
+    else:
+        sensor = log.imu if which == 0 else log.gnss
+        assert 0 < len(sensor.t) <= len(RECORDING.imu.t)
