@@ -71,6 +71,7 @@ def test_kf_gins_increments_become_rates_with_its_noise_lever_arm_and_truth(kf_g
     assert not found.imu.noise_assumed
     assert found.truth.rph == pytest.approx(TRUTH.rph, abs=1e-9)
     assert found.truth.v == pytest.approx(TRUTH.v, abs=1e-9)
+    assert found.gps_zero == logs.WEEK * 604800.0  # the truth's first column
     assert any("starttime" in remark for remark in found.remarks)
 
 
@@ -257,6 +258,7 @@ def test_a_recording_may_name_logs_of_other_programs(tmp_path, kf_gins):
     found = read(kf_gins)
     assert found.imu.gyro == pytest.approx(RECORDING.imu.gyro, abs=1e-9)
     assert found.gnss.t == pytest.approx(logs.TOW + 0.5 + RECORDING.gnss.t, abs=1e-6)
+    assert found.gps_zero == logs.WEEK * 604800.0 - 0.5  # the fixes' clock, as it was shifted
     assert found.gnss.lever_arm.tolist() == [0.1, 0.2, 0.3]
     assert found.gnss.sd[0].tolist() == [1.0, 2.0, 3.0]
     assert found.truth.rph == pytest.approx(TRUTH.rph, abs=1e-9)

@@ -22,6 +22,7 @@ from graphnav.rotation import Array
 __all__ = ["Draft", "draft"]
 
 JOINED = "imu.csv.gz"  # the file that is made of a gyro's and an accelerometer's
+_UNIX = 1e9  # s
 _SMALL = 0.03  # s; shifts of clocks below this are left to the smoother, which estimates them
 _SD = "[3.3, 3.3, 6.6]"  # m, what is assumed of fixes that state none (graphnav.formats.repair.DEFAULT_SD)
 
@@ -81,6 +82,8 @@ class _Writer:
         ]  # fmt: skip
         why = "there are fixes or speeds" if vehicle else "CHECK: no fixes and no speed, so it is taken for a walk"
         self._key("platform", '"vehicle"' if vehicle else '"foot"', why)
+        if found["imu"].log is None and found["imu"].t[0] > _UNIX:
+            self._key("clock", '"unix"', "the stamps are dates of this century, s since 1970")
         agreement, felt = self._imu(found["imu"], found.get("gnss"), vehicle)
         course = None
         if "gnss" in found:

@@ -43,6 +43,7 @@ def read_folder(source: str | Path) -> Recording:
     remarks = Remarks()
     files = [path]
     logs: dict[str, Log | None] = {}  # by file; one log may hold several sensors
+    zeros: list[float] = []  # of their clocks
 
     def table(name: str) -> Table:
         section = getattr(d, name)
@@ -76,6 +77,8 @@ def read_folder(source: str | Path) -> Recording:
             if key in section.model_fields_set:
                 raise RecordingError(f"{path}: '{name}.{key}' is only for CSV files, and {section.file} is none")
         remarks.extend(r for r in log.remarks if r not in remarks)
+        if log.gps_zero is not None:
+            zeros.append(log.gps_zero - section.time_offset)
         return of_log(section, getattr(log, name))
 
     imu = sensor("imu", _imu, _imu_of)
@@ -90,7 +93,7 @@ def read_folder(source: str | Path) -> Recording:
     elif d.truth:
         truth = _truth(d.truth, table("truth"), remarks)
     name = d.name or (path.resolve().parent.name if path.name == "recording.toml" else path.stem)
-    gps_zero = parse_clock(d.clock, float(imu.t[0])) if d.clock else None
+    gps_zero = parse_clock(d.clock, float(imu.t[0])) if d.clock else next(iter(zeros), None)
     return Recording(name, d.platform, imu, gnss, odometer, truth, path, tuple(files), gps_zero, tuple(remarks))
 
 

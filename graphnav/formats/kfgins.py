@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.errors import RecordingError
+from graphnav.formats.clocks import WEEK
 from graphnav.formats.registry import Log, extra, first_bytes, log_format
 from graphnav.formats.repair import Remarks
 from graphnav.formats.schema import rotation_from_letters
@@ -70,7 +71,7 @@ def load(path: Path) -> Log:
         )
     files = [f for f in (config_file, imu_file, gnss_file) if f is not None]
     where = config_file or path
-    imu = odometer = gnss = truth = None
+    imu = odometer = gnss = truth = zero = None
     if imu_file is not None:
         imu, speed = _read_imu(imu_file, remarks)
         if config:
@@ -84,6 +85,8 @@ def load(path: Path) -> Log:
     if nav := _truth_file(folder, remarks) if folder.is_dir() else None:
         track = read_trajectory(nav)
         truth = Truth(track.t, track.llh, v=track.v, rph=track.rph)
+        week = next((line.split()[0] for line in text_lines(nav) if line.strip()), "0")
+        zero = WEEK * float(week) if float(week) > 0 else None  # KF-GINS itself writes week 0
         files.append(nav)
         remarks.add(
             f"truth: {nav.name}, of the IMU, with north-east-down velocities and roll, pitch, yaw of an FRD body"
@@ -91,7 +94,7 @@ def load(path: Path) -> Log:
     _mention(config, remarks)
     remarks.add("clock: seconds of the GPS week, as in the files")
     return Log(
-        path.stem if path.is_file() else path.resolve().name, imu, gnss, odometer, truth, clock="gps week",
+        path.stem if path.is_file() else path.resolve().name, imu, gnss, odometer, truth, gps_zero=zero,
         files=tuple(files), remarks=tuple(remarks),
     )  # fmt: skip
 

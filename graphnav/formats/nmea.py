@@ -96,7 +96,7 @@ def load(path: Path) -> Log:
         remarks.add(f"{len(t) - len(order)} fixes without a height or with the time of another were left out")
     gnss = Gnss(t[order], llh[order], sd[order], None if v is None else v[order], None if sd_v is None else sd_v[order])
     remarks.add("GNSS: position of the antenna; its lever arm is not in the log and taken as zero")
-    return Log(path.stem, gnss=gnss, clock="gps week", gps_zero=zero, remarks=tuple(remarks))
+    return Log(path.stem, gnss=gnss, gps_zero=zero, remarks=tuple(remarks))
 
 
 def _epochs(path: Path, pynmea: Any) -> tuple[list[_Epoch], list[int], int]:

@@ -11,12 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Literal
 
 from graphnav.errors import RecordingError
 from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth
-
-Clock = Literal["gps week", "unix", "own"]  # seconds of a GPS week, since 1970 UTC, of anything else
 
 
 @dataclass(frozen=True)
@@ -29,7 +26,6 @@ class Log:
     odometer: Odometer | None = None
     truth: Truth | None = None
     platform: str = "vehicle"
-    clock: Clock = "own"
     gps_zero: float | None = None  # s since the GPS epoch at t = 0 of the log, where it is known
     mount_known: bool = True  # whether the IMU's axes are by definition those of the vehicle
     files: tuple[Path, ...] = ()

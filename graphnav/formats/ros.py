@@ -76,7 +76,7 @@ def load(path: Path) -> Log:
     remarks.add("clock: the stamps in the headers" + (", Unix time" if zero is not None else ", of no known epoch"))
     name = path.stem if path.is_file() else path.resolve().name
     return Log(
-        name, imu, gnss, odometer, clock="unix" if zero is not None else "own", gps_zero=zero,
+        name, imu, gnss, odometer, gps_zero=zero,
         remarks=tuple(remarks), mount_known=False,
     )  # fmt: skip
 

@@ -62,7 +62,7 @@ def load(path: Path) -> Log:
         remarks.add("velocity sigmas of 0.2, 0.2, 0.4 m/s are assumed: the file states none")
     remarks.add("GNSS: position of the antenna; its lever arm is not in the file and taken as zero")
     remarks.add("clock: seconds of the GPS week of the first row")
-    return Log(path.stem, gnss=Gnss(t, track.llh, sd, v, sd_v), clock="gps week", gps_zero=zero, remarks=tuple(remarks))
+    return Log(path.stem, gnss=Gnss(t, track.llh, sd, v, sd_v), gps_zero=zero, remarks=tuple(remarks))
 
 
 def _week_of(path: Path, fields: list[str]) -> float:

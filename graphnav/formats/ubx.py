@@ -68,7 +68,7 @@ def load(path: Path) -> Log:
     if zero is not None:
         remarks.add("clock: seconds of the GPS week (iTOW)")
     return Log(
-        path.stem, imu, gnss, odometer, clock="gps week" if fixes else "own", gps_zero=zero, remarks=tuple(remarks),
+        path.stem, imu, gnss, odometer, gps_zero=zero, remarks=tuple(remarks),
         mount_known=False,
     )  # fmt: skip
 
