@@ -85,7 +85,7 @@ def load(path: Path) -> Log:
     if nav := _truth_file(folder, remarks) if folder.is_dir() else None:
         track = read_trajectory(nav)
         truth = Truth(track.t, track.llh, v=track.v, rph=track.rph)
-        week = next((line.split()[0] for line in text_lines(nav) if line.strip()), "0")
+        week = next((line.split()[0] for line in text_lines(nav) if line.strip() and line.strip()[0] not in "#%"), "0")
         zero = WEEK * float(week) if float(week) > 0 else None  # KF-GINS itself writes week 0
         files.append(nav)
         remarks.add(
