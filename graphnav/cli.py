@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from graphnav import __version__
+from graphnav import __version__, cli_logs
 from graphnav.errors import ConfigError, GraphnavError
 
 # Before NumPy is imported: see `graphnav.pipeline`, which limits threads for those who do not come this way.
@@ -82,9 +82,15 @@ def smooth(
     start: Start = None,
     end: End = None,
     quiet: Quiet = False,
+    export: Annotated[
+        str | None, typer.Option("--export", metavar="NAMES", help="More formats: some of gpx,nav,nmea,csv,tum,kml.")
+    ] = None,
+    point: Annotated[
+        str | None, typer.Option("--point", metavar="POINT", help="Of --export: imu, antenna or x,y,z (m; RFU).")
+    ] = None,
 ) -> None:
     """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
-    _solve((solver,), "--solver", out, recording, config, without, rate, start, end, quiet)
+    _solve((solver,), "--solver", out, recording, config, without, rate, start, end, quiet, export, point)
 
 
 @app.command(epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out/kitti")
@@ -184,6 +190,9 @@ def simulate(
     say("\n".join([made.text(), *(f"  {file}" for file in files)]))
 
 
+cli_logs.register(app, lambda text: say(text))
+
+
 def _solve(
     solvers: tuple[str, ...],
     option: str,
@@ -195,8 +204,10 @@ def _solve(
     start: float | None,
     end: float | None,
     quiet: bool,
+    export: str | None = None,
+    point: str | None = None,
 ) -> None:
-    from graphnav import outputs, terminal, workflow
+    from graphnav import convert, outputs, terminal, workflow
     from graphnav.config import Settings, read_settings
 
     withheld = tuple(workflow.parse_withheld(one) for one in without or ())
@@ -211,6 +222,10 @@ def _solve(
         "without": without, "rate": rate, "start": start, "end": end,
     }  # fmt: skip
     folder = outputs.output_folder(out)
+    if point is not None and export is None:
+        raise ConfigError(f"--point {point}: is of the files of --export; name some")
+    exported = convert.parse_names(export, "--export") if export is not None else ()
+    convert.parse_point(point)
     request = workflow.Request(
         recording, chosen, settings, withheld, start, end, rate, {k: v for k, v in given.items() if v is not None}
     )
@@ -220,6 +235,7 @@ def _solve(
             progress("writing", 0.0)
         write = outputs.write_run if option == "--solver" else outputs.write_comparison
         files = write(outcome, folder)
+        files += convert.export_run(outcome, folder, exported, point) if exported else []
     if not quiet:
         say(terminal.run_text(outcome, files))
 

@@ -20,6 +20,8 @@ import numpy as np
 import graphnav
 from graphnav.detectors.base import intervals_text
 from graphnav.errors import ConfigError
+from graphnav.recording import Recording
+from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
 from graphnav.workflow import Outcome
 
@@ -144,11 +146,21 @@ def solver_summary(
         "parameters": {
             key: {"value": p.value[-1], "sigma": p.sigma[-1], "unit": p.unit} for key, p in solution.parameters.items()
         },
+        "antenna_lever_arm": antenna_lever_arm(outcome.recording, solution),
+        "gps_zero": outcome.recording.gps_zero,
         "notes": list(dict.fromkeys(notes)),
         "remarks": list(outcome.findings),
         "settings": outcome.request.settings.model_dump(),
         "provenance": provenance,
     }
+
+
+def antenna_lever_arm(recording: Recording, solution: Solution) -> Array | None:
+    """From the IMU to the antenna, m, RFU: as estimated, else as stated; None without GNSS."""
+    if recording.gnss is None:
+        return None
+    estimated = solution.parameters.get("gnss_lever_arm")
+    return recording.gnss.lever_arm if estimated is None else estimated.value[-1]
 
 
 def comparison(outcome: Outcome) -> list[dict[str, Any]]:

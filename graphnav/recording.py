@@ -98,6 +98,7 @@ class Recording:
     truth: Truth | None = None
     source: Path | None = None
     files: tuple[Path, ...] = ()  # everything that was read, for provenance
+    gps_zero: float | None = None  # s since the GPS epoch (1980-01-06) at t = 0, where it is known
     remarks: tuple[str, ...] = ()
 
     @property

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from graphnav import rotation
 from graphnav.earth import LocalFrame
 from graphnav.problem import Problem
-from graphnav.recording import Imu, ImuNoise
+from graphnav.recording import Imu, ImuNoise, Recording
 from graphnav.solution import Solution
 from graphnav.state import BLOCKS, DIM, States
 from graphnav.trajectory import Trajectory
@@ -152,3 +152,21 @@ def dense(parts: list[Factor], widths: list[int]) -> tuple[Array, Array]:
     Q, R = np.linalg.qr(A / size)
     root = np.linalg.inv(R) / size[:, None]
     return root @ (Q.T @ right), root @ root.T
+
+
+def same_recording(a: Recording, b: Recording, angle: float = 0.0) -> None:
+    """Every number of two recordings is the same; positions may differ by `angle` (rad)."""
+    assert (a.name, a.platform, a.gps_zero) == (b.name, b.platform, b.gps_zero)
+    for sensor in ("imu", "gnss", "odometer", "truth"):
+        one, other = getattr(a, sensor), getattr(b, sensor)
+        assert (one is None) == (other is None), sensor
+        if one is None:
+            continue
+        for key, value in other.__dict__.items():
+            if key == "R_bs":
+                continue  # body axes are written
+            if isinstance(value, np.ndarray):
+                tolerance = angle if key == "llh" else 0.0
+                np.testing.assert_allclose(getattr(one, key), value, 0.0, tolerance, err_msg=f"{sensor}.{key}")
+            else:
+                assert getattr(one, key) == value, f"{sensor}.{key}"

@@ -220,7 +220,10 @@ BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
     "two sd": (toml("lever_arm", "sd_v = [1.0, 1.0]\nlever_arm"), ("'gnss.sd_v'", "three numbers")),
     "lever arm of two": (toml("[0.1, 0.2, 0.3]", "[0.1, 0.2]"), ("'gnss.lever_arm'", "three numbers")),
     "lever arm of nan": (toml("[0.1, 0.2, 0.3]", "[0.1, 0.2, nan]"), ("'gnss.lever_arm'", "three numbers")),
-    "bad unit": (toml('axes = "RFU"', 'units = { gyro = "rpm" }'), ("'imu.units.gyro' = 'rpm'", "'rad/s' or 'deg/s'")),
+    "bad unit": (
+        toml('axes = "RFU"', 'units = { gyro = "rpm" }'),
+        ("'imu.units.gyro' = 'rpm'", "'rad/s', 'deg/s' or"),
+    ),
     "unknown unit key": (
         toml('axes = "RFU"', 'units = { gyros = "rad/s" }'),
         ("'imu.units.gyros'", "did you mean 'gyro'"),

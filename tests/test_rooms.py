@@ -14,16 +14,17 @@ PACKAGE = Path(__file__).resolve().parents[1] / "graphnav"
 # Modules and packages of graphnav, left to right. A new one needs a place here, as far left as it can stand.
 ROOMS = [
     "errors", "rotation", "earth", "state", "config", "recording", "trajectory",
-    "formats", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding", "checks", "detectors",
+    "formats", "draft", "allan", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding",
+    "checks", "detectors",
     "preintegration", "dynamics", "constraints", "problem", "solution", "alignment",
     "dense", "solvers", "judgement", "pipeline",
     "interpolation", "metrics", "scoring", "evaluation", "exporters",
     "panels", "page", "plots", "report_tables", "report_pictures", "report",
-    "workflow", "outputs", "terminal", "detection_pictures", "detection_report", "cli",
+    "workflow", "outputs", "convert", "terminal", "detection_pictures", "detection_report", "cli_logs", "cli",
 ]  # fmt: skip
 
 GTSAM_ROOMS = {"solvers"}
-MATPLOTLIB_ROOMS = {"panels", "plots", "detection_pictures"}
+MATPLOTLIB_ROOMS = {"allan", "panels", "plots", "detection_pictures"}
 PRINTING_ROOMS = {"cli"}
 
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -1,11 +1,17 @@
-"""One module per output format, each with ``write(trajectory, path)``; `write_all` writes them all."""
+"""One module per output format, each with ``write(trajectory, path)``, and those that need it with the UTC of the rows.
+
+`write_all` writes what every run leaves, `write_as` one format by name.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from graphnav.errors import RecordingError
+from graphnav.rotation import Array
 from graphnav.trajectory import Trajectory
+
+NAMES = ("csv", "tum", "kml", "gpx", "nav", "nmea")  # which are the suffixes of the files too
 
 
 def write_all(trajectory: Trajectory, folder: Path) -> None:
@@ -16,13 +22,28 @@ def write_all(trajectory: Trajectory, folder: Path) -> None:
     RecordingError
         If the trajectory is in a local frame, or has no attitude (which TUM cannot leave out).
     """
-    from graphnav.exporters import csv, kml, tum
-
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    csv.write(trajectory, folder / "trajectory.csv")
-    kml.write(trajectory, folder / "trajectory.kml")
-    tum.write(trajectory, folder / "trajectory.tum")
+    for name in ("csv", "kml", "tum"):
+        write_as(name, trajectory, folder / f"trajectory.{name}")
+
+
+def write_as(name: str, trajectory: Trajectory, path: Path, utc: Array | None = None) -> None:
+    """Write one of `NAMES`; `utc` (K,), datetime64, where the clock is known.
+
+    Raises
+    ------
+    RecordingError
+        If the format cannot hold this trajectory.
+    """
+    from graphnav.exporters import csv, gpx, kml, nav, nmea, tum
+
+    plain = {"csv": csv.write, "kml": kml.write, "tum": tum.write}
+    timed = {"gpx": gpx.write, "nav": nav.write, "nmea": nmea.write}
+    if name in timed:
+        timed[name](trajectory, path, utc)
+    else:
+        plain[name](trajectory, path)
 
 
 def require_geodetic(trajectory: Trajectory, path: Path) -> None:

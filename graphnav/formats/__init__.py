@@ -5,15 +5,16 @@ A new format is a new module in this package with a module-level ``FORMAT = Form
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import pkgutil
 from pathlib import Path
 
 from graphnav.errors import RecordingError
-from graphnav.formats.registry import Format
+from graphnav.formats.registry import Format, Log
 from graphnav.recording import Recording
 
-__all__ = ["Format", "formats", "read"]
+__all__ = ["Format", "Log", "formats", "load", "read"]
 
 
 def formats() -> dict[str, Format]:
@@ -40,12 +41,54 @@ def read(source: str | Path) -> Recording:
     for candidate in known.values():
         if candidate.recognises(source):
             return candidate.read(source)
+    raise _unknown(source, known)
+
+
+def load(source: str | Path, name: str | None = None) -> Log:
+    """Whatever a source holds, be it a whole recording or one sensor's log.
+
+    Parameters
+    ----------
+    name
+        The format to read it as; found from the content if None.
+
+    Raises
+    ------
+    RecordingError
+        As `read`, and for a name that no format has.
+    """
+    known = formats()
+    if name is not None and name not in known:
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
+        raise RecordingError(f"--format {name}: no such format; {hint}")
+    chosen = known[name] if name else next((f for f in known.values() if f.recognises(source)), None)
+    if chosen is None:
+        raise _unknown(source, known)
+    if chosen.load is not None:
+        return chosen.load(source)
+    r = chosen.read(source)
+    return Log(
+        r.name, r.imu, r.gnss, r.odometer, r.truth, r.platform, gps_zero=r.gps_zero, files=r.files, remarks=r.remarks
+    )
+
+
+def _unknown(source: str | Path, known: dict[str, Format]) -> RecordingError:
+    """Why nothing can read a source."""
     builtin = ", ".join(name for name, f in known.items() if f.builtin)
     path = Path(source)
     if path.is_dir():
         there = sorted(p.name for p in path.glob("*.toml"))
         hint = f"; point at one of {', '.join(there)} in it" if there else ""
-        raise RecordingError(f"{path}: the folder holds no recording.toml{hint}")
+        return RecordingError(f"{path}: the folder holds no recording.toml{hint}")
     if path.exists():
-        raise RecordingError(f"{path}: not a recording; point at its folder or its .toml file")
-    raise RecordingError(f"{path}: no such file or folder (built-in recordings: {builtin})")
+        if path.suffix == ".csv" or path.name.endswith(".csv.gz"):
+            return RecordingError(
+                f"{path}: not a recording; point at its folder or its .toml file (graphnav init drafts one)"
+            )
+        others = ", ".join(name for name, f in known.items() if f.load is not None)
+        return RecordingError(
+            f"{path}: not a recording; point at its folder or its .toml file, or at a log of a kind that is known "
+            f"({others})"
+        )
+    return RecordingError(f"{path}: no such file or folder (built-in recordings: {builtin})")

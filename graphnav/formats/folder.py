@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from graphnav.errors import RecordingError
 from graphnav.formats import schema
+from graphnav.formats.clocks import parse_clock
 from graphnav.formats.pulses import counted
-from graphnav.formats.registry import Format
-from graphnav.formats.repair import Remarks, geodetic, sigmas, usable_rows
+from graphnav.formats.registry import Format, Log
+from graphnav.formats.repair import (
+    DEFAULT_SD,
+    DEFAULT_SD_V,
+    Remarks,
+    geodetic,
+    horizontal_velocity,
+    sigmas,
+    usable_rows,
+)
 from graphnav.formats.table import Table, read_table
+from graphnav.formats.trajectories import read_trajectory
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording, Truth
 from graphnav.rotation import Array
-
-# 1-sigma where a recording states none, from the GPS Standard Positioning Service Performance Standard (5th ed.,
-# 2020, section 3.8): 8 m horizontal (2.45 sigma in two dimensions) and 13 m vertical (1.96 sigma), both 95 %.
-DEFAULT_SD = (3.3, 3.3, 6.6)  # m
-# The same section's 0.2 m/s (95 %, one axis) is for the open sky; twice its sigma for a vehicle among buildings.
-DEFAULT_SD_V = (0.2, 0.2, 0.4)  # m/s
 
 
 def read_folder(source: str | Path) -> Recording:
@@ -36,6 +42,8 @@ def read_folder(source: str | Path) -> Recording:
     d = schema.read_description(path)
     remarks = Remarks()
     files = [path]
+    logs: dict[str, Log | None] = {}  # by file; one log may hold several sensors
+    zeros: list[float] = []  # of their clocks
 
     def table(name: str) -> Table:
         section = getattr(d, name)
@@ -52,23 +60,48 @@ def read_folder(source: str | Path) -> Recording:
                 read_table(file, required, (), section.columns)  # says what is missing
         return usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
 
-    imu = _imu(d.imu, table("imu"), remarks)
-    gnss = _gnss(d.gnss, table("gnss"), remarks) if d.gnss else None
-    odometer = _odometer(d.odometer, table("odometer"), remarks) if d.odometer else None
+    def sensor(name: str, of_table: Callable[[Any, Table, Remarks], Any], of_log: Callable[[Any, Any], Any]) -> Any:
+        """The sensor of a table of the .toml: from its CSV file, or from the log of another program."""
+        section = getattr(d, name)
+        if section is None:
+            return None
+        if section.file not in logs:
+            logs[section.file] = other_log(path.parent / section.file)
+        log = logs[section.file]
+        if log is None:
+            return of_table(section, table(name), remarks)
+        files.extend(file for file in log.files if file not in files)
+        if getattr(log, name) is None:
+            raise RecordingError(f"{path}: '{name}.file': {section.file} holds no {name}")
+        for key in ("columns", "units", "keep"):
+            if key in section.model_fields_set:
+                raise RecordingError(f"{path}: '{name}.{key}' is only for CSV files, and {section.file} is none")
+        remarks.extend(r for r in log.remarks if r not in remarks)
+        if log.gps_zero is not None:
+            zeros.append(log.gps_zero - section.time_offset)
+        return of_log(section, getattr(log, name))
+
+    imu = sensor("imu", _imu, _imu_of)
+    gnss = sensor("gnss", _gnss, _gnss_of)
+    odometer = sensor("odometer", _odometer, _odometer_of)
     truth = None
     if d.truth and d.truth.closed_loop_sigma:
         truth = Truth(imu.t[[0, -1]], of=d.truth.of, closed_loop_sigma=d.truth.closed_loop_sigma)
+    elif d.truth and d.truth.file and Path(d.truth.file).suffix in (".nav", ".pos", ".tum"):
+        files.append(path.parent / d.truth.file)
+        truth = _truth_of_log(d.truth, files[-1], remarks)
     elif d.truth:
         truth = _truth(d.truth, table("truth"), remarks)
     name = d.name or (path.resolve().parent.name if path.name == "recording.toml" else path.stem)
-    return Recording(name, d.platform, imu, gnss, odometer, truth, path, tuple(files), tuple(remarks))
+    gps_zero = parse_clock(d.clock, float(imu.t[0])) if d.clock else next(iter(zeros), None)
+    return Recording(name, d.platform, imu, gnss, odometer, truth, path, tuple(files), gps_zero, tuple(remarks))
 
 
 def _imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
     R_bs = d.R_bs
     gyro = rows.stack("gx", "gy", "gz") * schema.RATE[d.units.gyro] @ R_bs.T
     accel = rows.stack("ax", "ay", "az") * schema.FORCE[d.units.accel] @ R_bs.T
-    stated: dict[str, float] = d.noise.model_dump(exclude_none=True) if d.noise else {}
+    stated = d.figures
     noise = replace(ImuNoise(), **stated)
     missing = [key for key in schema.NOISE_FIGURES if key not in stated]
     if 0 < len(missing) < len(schema.NOISE_FIGURES):
@@ -87,6 +120,8 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     every = np.ones(len(rows), dtype=bool)
     sd = sigmas(rows, ("sd_e", "sd_n", "sd_u"), d.sd, DEFAULT_SD, "GNSS position", every, remarks)
     v = sd_v = None
+    if "vd" in rows and "vu" not in rows:
+        rows = rows.with_column("vu", -rows["vd"])
     there = [c for c in ("ve", "vn", "vu") if c in rows]
     if len(there) == 3:
         scale = schema.SPEED[d.units.speed]
@@ -100,6 +135,12 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
         if absent.all():
             v = sd_v = None
             remarks.add("the GNSS velocity columns are blank throughout: no velocities")
+    elif "speed" in rows and "course" in rows:
+        course = rows["course"] * schema.ANGLE[d.units.angle or "deg"]
+        v, sd_v, sentence = horizontal_velocity(
+            rows["speed"] * schema.SPEED[d.units.speed], course, d.sd_v or DEFAULT_SD_V
+        )
+        remarks.add(sentence)
     elif there:
         remarks.add(f"GNSS velocities need ve, vn and vu; only {', '.join(there)} is there, so none are used")
     return Gnss(rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm))
@@ -135,6 +176,18 @@ def _odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odomete
     )
 
 
+def _truth_of_log(d: schema.TruthTable, file: Path, remarks: Remarks) -> Truth:
+    """The truth from a trajectory file of another program."""
+    for key in ("columns", "units", "keep"):
+        if key in d.model_fields_set:
+            raise RecordingError(f"{file}: 'truth.{key}' is only for CSV files")
+    track = read_trajectory(file)
+    remarks.extend(track.notes)
+    local = track.frame == "local"
+    llh, xyz = (None, track.llh) if local else (track.llh, None)
+    return Truth(track.t + d.time_offset, llh, xyz, track.v, track.rph, d.of)
+
+
 def _truth(d: schema.TruthTable, rows: Table, remarks: Remarks) -> Truth:
     llh = xyz = None
     if d.frame == "local":
@@ -152,6 +205,43 @@ def _partial(rows: Table, names: tuple[str, ...], scale: float) -> Array | None:
         return None
     absent = np.full(len(rows), np.nan)
     return np.stack([rows.get(name, absent) for name in names], -1) * scale
+
+
+def other_log(file: Path) -> Log | None:
+    """The log of another program, or None for a CSV file or one that is not there."""
+    from graphnav.formats import formats  # which imports this module
+
+    if file.name.endswith((".csv", ".csv.gz")) or not file.exists():
+        return None
+    for known in formats().values():
+        if known.load is not None and known.recognises(file):
+            return known.load(file)
+    return None
+
+
+def _imu_of(d: schema.ImuTable, imu: Imu) -> Imu:
+    """The IMU of another program's log, with what the .toml adds to it."""
+    if {"axes", "forward", "up"} & d.model_fields_set:
+        turn = d.R_bs @ imu.R_bs.T  # the .toml speaks of the file's own axes
+        imu = replace(imu, gyro=imu.gyro @ turn.T, accel=imu.accel @ turn.T, R_bs=d.R_bs)
+    stated = d.figures if d.noise or d.model else {}
+    return replace(
+        imu, t=imu.t + d.time_offset, noise=replace(imu.noise, **stated), noise_assumed=imu.noise_assumed and not stated
+    )
+
+
+def _gnss_of(d: schema.GnssTable, gnss: Gnss) -> Gnss:
+    lever_arm = np.array(d.lever_arm) if "lever_arm" in d.model_fields_set else gnss.lever_arm
+    sd = gnss.sd if d.sd is None else np.tile(d.sd, (len(gnss.t), 1))
+    sd_v = gnss.sd_v
+    if gnss.v is not None and d.sd_v is not None:
+        sd_v = np.where(np.isnan(gnss.v), np.nan, np.array(d.sd_v))
+    return replace(gnss, t=gnss.t + d.time_offset, lever_arm=lever_arm, sd=sd, sd_v=sd_v)
+
+
+def _odometer_of(d: schema.OdometerTable, odometer: Odometer) -> Odometer:
+    lever_arm = np.array(d.lever_arm) if "lever_arm" in d.model_fields_set else odometer.lever_arm
+    return replace(odometer, t=odometer.t + d.time_offset, lever_arm=lever_arm, scale_sigma=d.scale_sigma)
 
 
 FORMAT = Format(

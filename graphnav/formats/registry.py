@@ -1,19 +1,61 @@
-"""How a log format makes itself known: its module in this package holds one `FORMAT`."""
+"""How a log format makes itself known: its module in this package holds one `FORMAT`.
+
+A log need not hold every sensor: it is read into a `Log`, and becomes a recording alone, or with others through the
+``file`` keys of a recording.toml.
+"""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 
-from graphnav.recording import Recording
+from graphnav.errors import RecordingError
+from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth
+
+
+@dataclass(frozen=True)
+class Log:
+    """What one log holds, as a `Recording` would have it, with whatever it lacks left None."""
+
+    name: str
+    imu: Imu | None = None
+    gnss: Gnss | None = None
+    odometer: Odometer | None = None
+    truth: Truth | None = None
+    platform: str = "vehicle"
+    gps_zero: float | None = None  # s since the GPS epoch at t = 0 of the log, where it is known
+    mount_known: bool = True  # whether the IMU's axes are by definition those of the vehicle
+    files: tuple[Path, ...] = ()
+    remarks: tuple[str, ...] = ()  # sentences about what was assumed
+
+    def recording(self, source: str | Path) -> Recording:
+        """The log as a recording.
+
+        Raises
+        ------
+        RecordingError
+            If it holds no IMU.
+        """
+        if self.imu is None:
+            held = [name for name in ("gnss", "odometer", "truth") if getattr(self, name) is not None]
+            raise RecordingError(
+                f"{source}: holds no IMU, only {' and '.join(held)}; 'graphnav init IMU-LOG {Path(source).name}' "
+                "drafts a recording.toml that joins both"
+            )
+        return Recording(
+            self.name, self.platform, self.imu, self.gnss, self.odometer, self.truth,
+            Path(source), self.files, self.gps_zero, self.remarks,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Format:
-    """One way a recording can be stored.
+    """One way a recording, or a part of one, can be stored.
 
-    `recognises` must be cheap and must not raise; `read` raises RecordingError for anything it cannot use.
+    `recognises` must be cheap and must not raise; `read` and `load` raise RecordingError for anything they cannot use.
     """
 
     name: str
@@ -21,3 +63,45 @@ class Format:
     recognises: Callable[[str | Path], bool]
     read: Callable[[str | Path], Recording]
     builtin: bool = False  # a name that is always there, such as "kitti", rather than a path
+    load: Callable[[str | Path], Log] | None = None  # for logs of other programs
+
+
+def log_format(name: str, about: str, recognises: Callable[[Path], bool], load: Callable[[Path], Log]) -> Format:
+    """The `Format` of another program's log."""
+
+    def known(source: str | Path) -> bool:
+        try:
+            return recognises(Path(source))
+        except OSError:
+            return False
+
+    def loaded(source: str | Path) -> Log:
+        path = Path(source)
+        if not path.exists():
+            raise RecordingError(f"{path}: no such file or folder")
+        log = load(path)
+        return replace(log, files=log.files or (path,))
+
+    return Format(name, about, known, lambda source: loaded(source).recording(source), load=loaded)
+
+
+def first_bytes(path: Path, count: int = 4096) -> bytes:
+    """The beginning of a file; nothing of a folder or of what cannot be read."""
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        return file.read(count)
+
+
+def extra(module: str, name: str, what: str) -> ModuleType:
+    """An optional library, imported when first needed.
+
+    Raises
+    ------
+    RecordingError
+        Saying what to install, if it is not there.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise RecordingError(f"{what} needs the package {module}: pip install 'graphnav[{name}]'") from None

@@ -13,6 +13,13 @@ _LABEL = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"
 _RADIANS = (1.58, 3.15)  # |lat|, |lon| that angles in radians cannot exceed
 
 
+# 1-sigma where a recording states none, from the GPS Standard Positioning Service Performance Standard (5th ed.,
+# 2020, section 3.8): 8 m horizontal (2.45 sigma in two dimensions) and 13 m vertical (1.96 sigma), both 95 %.
+DEFAULT_SD = (3.3, 3.3, 6.6)  # m
+# The same section's 0.2 m/s (95 %, one axis) is for the open sky; twice its sigma for a vehicle among buildings.
+DEFAULT_SD_V = (0.2, 0.2, 0.4)  # m/s
+
+
 class Remarks(list[str]):
     """Sentences about what loading changed or assumed."""
 
@@ -162,3 +169,28 @@ def sigmas(
     if stated is None and (n := (blank.any(-1) & used).sum()):
         remarks.add(f"{assumed} where the file's own are blank ({n} of {len(rows)} rows)")
     return np.where(blank, fallback, sd)
+
+
+# 1-sigma of a vertical velocity that is taken as zero because a receiver gives only speed and course: a slope of 10 %
+_SLOPE = 0.1
+
+
+def horizontal_velocity(speed: Array, course: Array, sd: tuple[float, float, float]) -> tuple[Array, Array, str]:
+    """East-north-up velocities of speed (N,) m/s over ground and course (N,) rad, their sigmas, and what was assumed.
+
+    A standing receiver may leave the course blank; a blank speed gives no velocity.
+    """
+    course = np.where(np.isnan(course) & (speed < sd[0]), 0.0, course)
+    v = np.stack([speed * np.sin(course), speed * np.cos(course), np.zeros_like(speed)], -1)
+    v[np.isnan(v).any(-1)] = np.nan
+    sd_v = np.tile(np.array(sd), (len(speed), 1))
+    sd_v[:, 2] = np.maximum(sd[2], _SLOPE * np.abs(np.nan_to_num(speed)))
+    sd_v[np.isnan(v).any(-1)] = np.nan
+    return (
+        v,
+        sd_v,
+        (
+            f"velocity: from speed and course over ground, 1-sigma {sd[0]:g} m/s a horizontal axis; the vertical one "
+            f"is taken as 0 with {sd[2]:g} m/s or a tenth of the speed"
+        ),
+    )

@@ -6,6 +6,7 @@ import difflib
 import tomllib
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -24,6 +25,9 @@ from pydantic.types import Strict
 
 from graphnav.config import explain, suggestion
 from graphnav.errors import RecordingError
+from graphnav.formats.clocks import parse_clock
+from graphnav.formats.figures import parse_figure
+from graphnav.formats.imu_models import MODELS, find_model
 from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 
@@ -53,8 +57,8 @@ Sigmas = Annotated[tuple[float, float, float], BeforeValidator(_three_positive)]
 
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 ANGLE = {"deg": np.pi / 180.0, "rad": 1.0}
-RATE = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
-FORCE = {"m/s2": 1.0, "g": 9.80665}  # standard gravity, by definition
+RATE = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180e3}
+FORCE = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3}  # standard gravity, by definition
 SPEED = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600}
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -102,8 +106,8 @@ class ImuUnits(_Section):
     """Units of imu.csv."""
 
     t: TimeUnit = "s"
-    gyro: Literal["rad/s", "deg/s"] = "rad/s"
-    accel: Literal["m/s2", "g"] = "m/s2"
+    gyro: Literal["rad/s", "deg/s", "mdeg/s"] = "rad/s"
+    accel: Literal["m/s2", "g", "mg"] = "m/s2"
 
 
 class GnssUnits(_Section):
@@ -121,12 +125,18 @@ class OdometerUnits(_Section):
     speed: SpeedUnit = "m/s"
 
 
-# [imu.noise]: the fields of ImuNoise, None where the file says nothing; only a scale error may be stated as none
+# [imu.noise]: the fields of ImuNoise, None where the file says nothing; only a scale error may be stated as none.
+# A figure is a number in SI, or text with a unit.
 NOISE_FIGURES = tuple(f.name for f in fields(ImuNoise) if not f.name.endswith("_scale_sigma"))
+
+
+def _figure(key: str) -> Any:
+    number = Positive if key in NOISE_FIGURES else NotNegative
+    return Annotated[number | None, BeforeValidator(partial(parse_figure, key))]
+
+
 Noise = create_model(  # type: ignore[call-overload]
-    "Noise",
-    __base__=_Section,
-    **{f.name: ((Positive if f.name in NOISE_FIGURES else NotNegative) | None, None) for f in fields(ImuNoise)},
+    "Noise", __base__=_Section, **{f.name: (_figure(f.name), None) for f in fields(ImuNoise)}
 )
 
 
@@ -140,6 +150,14 @@ class ImuTable(_Sensor):
     up: Vector | None = None
     units: ImuUnits = ImuUnits()
     noise: Noise | None = None  # type: ignore[valid-type]
+    model: str | None = None  # of graphnav.formats.imu_models; [imu.noise] goes before it
+
+    @field_validator("model")
+    @classmethod
+    def _known_model(cls, model: str | None) -> str | None:
+        if model is not None and find_model(model) is None:
+            raise ValueError(f"no figures of an IMU called '{model}' are known; {_nearest(model, tuple(MODELS))}")
+        return model
 
     @model_validator(mode="after")
     def _one_mount(self) -> ImuTable:
@@ -148,6 +166,13 @@ class ImuTable(_Sensor):
         if (self.forward is None) != (self.up is None):
             raise ValueError("forward and up belong together: give both")
         return self
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """The noise figures that are stated: those of the model, with those of [imu.noise] over them."""
+        model = find_model(self.model) if self.model else None
+        stated: dict[str, float] = self.noise.model_dump(exclude_none=True) if self.noise else {}
+        return {**(model.noise if model else {}), **stated}
 
     @property
     def R_bs(self) -> Array:
@@ -161,7 +186,7 @@ class GnssTable(_Sensor):
     """[gnss]"""
 
     required = ("t", "lat", "lon", "h")
-    optional = ("sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu")
+    optional = ("sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu", "vd", "speed", "course")
 
     units: GnssUnits = GnssUnits()
     lever_arm: Vector = (0.0, 0.0, 0.0)
@@ -232,10 +257,18 @@ class RecordingFile(_Section):
     format: Literal["graphnav-recording/1"]
     name: str | None = None
     platform: Literal["vehicle", "foot"]
+    clock: str | None = None  # what t = 0 is, see graphnav.formats.clocks.parse_clock; only for output
     imu: ImuTable
     gnss: GnssTable | None = None
     odometer: OdometerTable | None = None
     truth: TruthTable | None = None
+
+    @field_validator("clock")
+    @classmethod
+    def _known_clock(cls, clock: str | None) -> str | None:
+        if clock is not None:
+            parse_clock(clock, 0.0)
+        return clock
 
     @model_validator(mode="after")
     def _truth_of_a_sensor(self) -> RecordingFile:

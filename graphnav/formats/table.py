@@ -115,6 +115,17 @@ def read_table(
     return Table(path, dict(zip(file_names, values, strict=True)), file_names, np.arange(values.shape[1]))
 
 
+def read_header(path: Path) -> list[str]:
+    """The column names of a .csv or .csv.gz.
+
+    Raises
+    ------
+    RecordingError
+        If the file is none.
+    """
+    return _header(path)[1]
+
+
 def _open(path: Path) -> IO[str]:
     """Text of a plain or gzip file."""
     return io.TextIOWrapper(_open_bytes(path), encoding="utf-8-sig")

@@ -17,7 +17,6 @@ Files with a GNSS week give t in seconds of the week of their first row, running
 
 from __future__ import annotations
 
-import gzip
 import re
 from pathlib import Path
 
@@ -25,6 +24,7 @@ import numpy as np
 
 from graphnav import rotation
 from graphnav.errors import RecordingError
+from graphnav.formats.text import number_table, text_lines
 from graphnav.rotation import Array
 from graphnav.trajectory import Trajectory
 
@@ -48,7 +48,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
         Naming the file, and the line and field where there is one, if it cannot be read as it is.
     """
     path = Path(path)
-    lines = _lines(path)
+    lines = text_lines(path)
     numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
     rows = [(number, line) for number, line in numbered if line.lstrip()[0] not in "#%"]
     if not rows:
@@ -69,62 +69,6 @@ def read_trajectory(path: str | Path) -> Trajectory:
         f"{path}, line {rows[0][0]}: {width} columns without a header; expected a CSV header with t, lat, lon, h, "
         "11 columns (KF-GINS .nav), 8 columns (TUM) or an RTKLIB .pos"
     )
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        data = path.read_bytes()
-        if data[:2] == b"\x1f\x8b":
-            data = gzip.decompress(data)
-    except (OSError, EOFError) as error:
-        raise RecordingError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
-    if b"\0" in data[:4096]:
-        raise RecordingError(f"{path}: a binary file; expected text")
-    try:
-        return data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise RecordingError(f"{path}: not a text file (it is not UTF-8)") from None
-
-
-def _table(
-    path: Path, rows: list[tuple[int, str]], names: list[str], delimiter: str | None, wanted: set[str] | None = None
-) -> Array:
-    """Numbers (K, n) of text rows, NaN for a blank and in columns not `wanted`, which may hold words.
-
-    Errors name the line and the column.
-    """
-    lines = [line for _, line in rows]
-    use = [k for k, name in enumerate(names) if wanted is None or name in wanted]
-    whole = delimiter is None or all(line.count(delimiter) == len(names) - 1 for line in lines)
-    if delimiter == "," and whole:
-        lines = [
-            _fill(line) if ",," in line or line.rstrip()[-1:] == "," or line[:1] == "," else line for line in lines
-        ]
-    try:
-        if whole:
-            loaded = np.loadtxt(lines, delimiter=delimiter, ndmin=2, comments=None, usecols=use if wanted else None)
-            if loaded.shape[1] == len(use):
-                table = np.full((len(rows), len(names)), np.nan)
-                table[:, use] = loaded
-                return table
-    except ValueError:
-        pass
-    for number, line in rows:  # only to say where; the fast reader does not
-        fields = line.split(delimiter)
-        if len(fields) != len(names):
-            raise RecordingError(f"{path}, line {number}: {len(fields)} fields where {len(names)} were expected")
-        for k in use:
-            try:
-                float(fields[k].strip() or "nan")
-            except ValueError:
-                raise RecordingError(
-                    f"{path}, line {number}, {names[k]}: '{fields[k].strip()}' is not a number"
-                ) from None
-    raise RecordingError(f"{path}: cannot be read as a table of numbers")
-
-
-def _fill(line: str) -> str:
-    return ",".join(field.strip() or "nan" for field in line.split(","))
 
 
 def _build(
@@ -187,7 +131,7 @@ def _csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     if missing := [name for name in needed if name not in columns]:
         raise RecordingError(f"{path}, line 1: no column '{missing[0]}'; found {', '.join(names)}")
     wanted = {names[k] for name, k in columns.items() if name in _KNOWN}
-    table = _table(path, rows, names, ",", wanted)
+    table = number_table(path, rows, names, ",", wanted)
 
     def take(*wanted: str, scale: float = 1.0) -> Array | None:
         if not any(name in columns for name in wanted):
@@ -213,7 +157,7 @@ def _csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
 
 def _kf_gins(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     names = ["week", "sow", "lat", "lon", "h", "vn", "ve", "vd", "roll", "pitch", "yaw"]
-    table = _table(path, rows, names, None)
+    table = number_table(path, rows, names, None)
     t = table[:, 1] + WEEK * (table[:, 0] - table[0, 0])  # KF-GINS itself writes week 0
     position = np.column_stack([table[:, 2:4] * _DEG, table[:, 4]])
     v = np.column_stack([table[:, 6], table[:, 5], -table[:, 7]])
@@ -222,7 +166,7 @@ def _kf_gins(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
 
 def _tum(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     names = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
-    table = _table(path, rows, names, None)
+    table = number_table(path, rows, names, None)
     norm = np.linalg.norm(table[:, 4:8], axis=1)
     if (bad := np.abs(norm - 1.0) > 1e-2).any():
         k = int(np.flatnonzero(bad)[0])
@@ -261,7 +205,7 @@ def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Traject
         notes.append(f"{path.name}: heights are above mean sea level, not above the ellipsoid")
     dated = "/" in rows[0][1].split(separator)[0]
     t, numeric = _rtklib_times(path, rows, separator) if dated else (None, rows)
-    table = _table(path, numeric, names, separator)
+    table = number_table(path, numeric, names, separator)
     if t is None:
         t = table[:, 1] + WEEK * (table[:, 0] - table[0, 0])
     at = {name: k for k, name in enumerate(names)}

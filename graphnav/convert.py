@@ -1,0 +1,229 @@
+"""Logs of other programs into a recording folder, and trajectories into other programs' files."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphnav.errors import ConfigError, RecordingError
+from graphnav.exporters import NAMES, write_as
+from graphnav.formats import formats, load
+from graphnav.formats.clocks import gps_to_utc, parse_clock
+from graphnav.formats.registry import Log
+from graphnav.formats.trajectories import read_trajectory
+from graphnav.formats.writer import write_recording
+from graphnav.interpolation import interpolate
+from graphnav.outputs import antenna_lever_arm
+from graphnav.rotation import Array
+from graphnav.trajectory import Trajectory
+from graphnav.workflow import Outcome
+
+SUMMARY = "summary.json"  # of the run that wrote a trajectory: its clock and its points
+_DENSE = 20.0  # Hz
+_MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
+
+
+def is_export(source: Path, out: Path, name: str | None) -> bool:
+    """Whether a trajectory is to be written for another program, rather than a log to be read."""
+    if source.is_dir():
+        return False
+    if out.suffix[1:] in NAMES and not out.is_dir():
+        return True
+    if name is None or not {part.strip() for part in name.split(",")} <= set(NAMES):
+        return False
+    known = formats()
+    return name not in known or not known[name].recognises(source)
+
+
+def convert_log(source: str, out: Path, name: str | None) -> tuple[Log, list[Path]]:
+    """Read a log of any kind that is known and write it as a recording folder.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read.
+    ConfigError
+        If it would be written over itself.
+    """
+    if name is not None and name not in formats():
+        known = [*formats(), *NAMES]
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
+        raise ConfigError(f"--format {name}: no such format; {hint}")
+    log = load(source, name)
+    if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
+        raise ConfigError(f"-o {out}: the recording is read from there; name another folder")
+    return log, write_recording(log, out)
+
+
+def parse_names(text: str, option: str) -> tuple[str, ...]:
+    """Formats to write, such as ``gpx,nav``.
+
+    Raises
+    ------
+    ConfigError
+        If one is not known.
+    """
+    names = tuple(name.strip().lstrip(".") for name in text.split(",") if name.strip())
+    for name in names:
+        if name not in NAMES:
+            raise ConfigError(f"{option} {text}: no format '{name}' can be written; known: {', '.join(NAMES)}")
+    if not names:
+        raise ConfigError(f"{option}: names no format; known: {', '.join(NAMES)}")
+    return tuple(dict.fromkeys(names))
+
+
+def parse_point(text: str | None) -> str | Array:
+    """``imu``, ``antenna``, or a lever arm ``x,y,z`` (m; right, forward, up of the IMU).
+
+    Raises
+    ------
+    ConfigError
+        If it is none of these.
+    """
+    if text in (None, "imu", "antenna"):
+        return text or "imu"
+    assert text is not None
+    try:
+        arm = np.array([float(x) for x in text.split(",")])
+    except ValueError:
+        arm = np.empty(0)
+    if arm.shape != (3,) or not np.isfinite(arm).all():
+        raise ConfigError(f"--point {text}: write imu, antenna, or x,y,z in m: right, forward, up of the IMU")
+    return arm
+
+
+def export_file(
+    source: Path, out: Path, name: str | None, point: str | None, rate: float | None, clock: str | None
+) -> tuple[Trajectory, list[Path], list[str]]:
+    """Write a trajectory file for other programs: into the file `out`, or into the folder `out` under its own name.
+
+    Returns
+    -------
+    trajectory, files, notes
+        As written, and sentences about what was not known.
+
+    Raises
+    ------
+    RecordingError
+        If the trajectory cannot be read, moved to the point or held by the format.
+    ConfigError
+        For options that cannot be used.
+    """
+    trajectory = read_trajectory(source)
+    if out.suffix[1:] in NAMES and not out.is_dir():
+        if name is not None and name != out.suffix[1:]:
+            raise ConfigError(f"--format {name}: but {out.name} is to be written")
+        targets = {out.suffix[1:]: out}
+    else:
+        assert name is not None
+        targets = {one: out / f"{source.stem}.{one}" for one in parse_names(name, "--format")}
+    run = _run(source)
+    arm = parse_point(point)
+    if isinstance(arm, str) and arm == "antenna":
+        stated = run.get("antenna_lever_arm")
+        if stated is None:
+            raise ConfigError(f"--point antenna: no {SUMMARY} beside {source.name} says where it is; say x,y,z")
+        arm = np.array(stated, dtype=float)
+    gps_zero = run.get("gps_zero")
+    if clock is not None:
+        try:
+            gps_zero = parse_clock(clock, float(trajectory.t[0]))
+        except ValueError as error:
+            raise ConfigError(f"--clock {clock}: {error}") from None
+    notes = list(trajectory.notes)
+    if gps_zero is None and trajectory.t[0] > 1e9:
+        gps_zero = parse_clock("unix", float(trajectory.t[0]))
+        notes.append("t is taken as Unix time: it is above 1e9")
+    if gps_zero is None and {"gpx", "nav"} & set(targets):
+        notes.append("what t counts from is not known: GPX is written without times, .nav with week 0; --clock says it")
+    moved = at_point(trajectory, None if isinstance(arm, str) else arm, rate)
+    files = write_formats(moved, targets, gps_zero)
+    return moved, files, notes
+
+
+def at_point(trajectory: Trajectory, arm: Array | None, rate: float | None = None) -> Trajectory:
+    """The trajectory of the point at the end of a lever arm, at its own times or at `rate` (Hz).
+
+    Raises
+    ------
+    RecordingError
+        If there is a lever arm and no attitude to turn it.
+    """
+    if arm is not None and not np.any(arm):
+        arm = None
+    if arm is None and rate is None:
+        return trajectory
+    if arm is not None and trajectory.rph is None:
+        raise RecordingError("--point: the trajectory has no attitude, so no other point of the body can be placed")
+    t = trajectory.t
+    if rate is not None:
+        t = np.arange(np.ceil(t[0] * rate - 1e-6), np.floor(t[-1] * rate + 1e-6) + 1) / rate
+    moved, _ = interpolate(trajectory, t, max_gap=_MAX_GAP, lever_arm=arm)
+    return moved
+
+
+def write_formats(trajectory: Trajectory, targets: dict[str, Path], gps_zero: float | None) -> list[Path]:
+    """Write the formats, each to its path; `gps_zero` (s) is when t = 0 was, where it is known."""
+    utc = None if gps_zero is None else gps_to_utc(trajectory.t + gps_zero)
+    for name, path in targets.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_as(name, trajectory, path, utc)
+    return list(targets.values())
+
+
+def export_run(outcome: Outcome, folder: Path, names: Sequence[str], point: str | None) -> list[Path]:
+    """Write the only solution of a run in some formats, in files named after the point: trajectory.gpx, antenna.gpx.
+
+    Raises
+    ------
+    ConfigError
+        If the antenna is asked for and there is none.
+    """
+    ((solver, solution),) = outcome.solutions.items()
+    rate = outcome.request.rate
+    trajectory = solution.trajectory(rate)
+    arm = parse_point(point)
+    name = "trajectory" if point in (None, "imu") else "antenna" if point == "antenna" else "point"
+    if isinstance(arm, str) and arm == "antenna":
+        found = antenna_lever_arm(outcome.recording, solution)
+        if found is None:
+            raise ConfigError("--point antenna: the recording has no GNSS")
+        arm = found
+    if not isinstance(arm, str) and np.any(arm):
+        # between keyframes a second apart the turn rate, and with it the point's velocity, would be guessed
+        dense = solution.trajectory(max(rate or 0.0, _DENSE))
+        trajectory, _ = interpolate(dense, trajectory.t, max_gap=_MAX_GAP, lever_arm=arm)
+    title = f"{outcome.recording.name}, {solver}" + (f", {name}" if name != "trajectory" else "")
+    targets = {one: folder / f"{name}.{one}" for one in names}
+    return write_formats(replace(trajectory, name=title), targets, outcome.recording.gps_zero)
+
+
+def _run(source: Path) -> dict[str, Any]:
+    """What the summary beside a trajectory says of its points and its clock."""
+    path = source.parent / SUMMARY
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return values if isinstance(values, dict) else {}
+
+
+def log_text(log: Log, files: Sequence[Path]) -> str:
+    """What was read, what was assumed, and what was written."""
+    held = []
+    for name, label in (("imu", "IMU"), ("gnss", "GNSS"), ("odometer", "odometer"), ("truth", "truth")):
+        sensor = getattr(log, name)
+        if sensor is not None and len(sensor.t):
+            span = f"{sensor.t[0]:.3f} to {sensor.t[-1]:.3f} s"
+            held.append(f"  {label:<9} {len(sensor.t)} rows, {span}")
+    lines = [f"{log.name} ({log.platform})", *held, *(f"  assumed: {remark}" for remark in log.remarks)]
+    if log.imu is None:
+        lines.append("  warning: no IMU in it: put its rows into imu.csv beside recording.toml, or use 'graphnav init'")
+    return "\n".join([*lines, *(f"wrote {file}" for file in files)])

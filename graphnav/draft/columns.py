@@ -1,0 +1,137 @@
+"""Which column is what: names of phones, receivers, ROS and data loggers, matched by meaning, and the units in them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+# A name is brought to one spelling first: lower case, words apart by _, the unit taken off. Earlier patterns win.
+_GYRO = r"(?:.*_)?(?:gyr\w*?|angular_(?:velocity|rate)|ang_vel|omega|rotation_rate|rot_rate|imu_w|w|turn_rate|g)_?"
+_ACCEL = r"(?:.*_)?(?:acc\w*?|linear_acceleration|total_acceleration|specific_force|imu_a|imu_f|force|a|f)_?"
+_HORIZONTAL = r"sd_?h|(?:.*_)?(?:h_?acc\w*|horizontal_accuracy)|accuracy|eph|epe(?:_m)?"
+_VERTICAL = r"sd_?v|(?:.*_)?(?:v_?acc\w*|vertical_accuracy)|altitude_accuracy|epv"
+_WHEEL, _SPEED = r"(?:wheel_?|speed_?|wheel_?speed_?)*", r"(?:_?wheel)?(?:_?speed)?"
+_PATTERNS: dict[str, tuple[str, ...]] = {
+    "t": (
+        r"t", r"seconds_elapsed", r"time_elapsed|elapsed_time|elapsed|time_since_start|rel_?time",
+        r"(?:.*_)?header_stamp", r"time(?:stamp)?", r"gps_?time|gps_?sow|sow|i_?tow|gnss_time",
+        r"(?:unix|epoch|utc|sensor|logging|local)_?time\w*",
+        r"sec(?:onds?)?|stamp|(?:.*_)time(?:stamp)?",
+    ),
+    **{f"g{x}": (rf"{_GYRO}{x}",) for x in "xyz"},
+    **{f"a{x}": (rf"{_ACCEL}{x}",) for x in "xyz"},
+    "lat": (r"(?:.*_)?lat(?:itude)?",),
+    "lon": (r"(?:.*_)?(?:lon|lng|long|longitude)",),
+    "h": (
+        r"h|h_?ell|height_?(?:ell\w*)?|ell\w*_height|alt_?ell\w*",
+        r"(?:.*_)?(?:alt(?:itude)?|height|h_?msl|elevation|ele)",
+        r"(?:.*_)?(?:alt(?:itude)?|height|h)_?(?:msl|wgs84)?",
+    ),
+    "ve": (r"ve|v_?east|vel_?e(?:ast)?|east_vel\w*|velocity_e(?:ast)?|e_vel",),
+    "vn": (r"vn|v_?north|vel_?n(?:orth)?|north_vel\w*|velocity_n(?:orth)?|n_vel",),
+    "vu": (r"vu|v_?up|vel_?u(?:p)?|up_vel\w*|velocity_u(?:p)?|u_vel",),
+    "vd": (r"vd|v_?down|vel_?d(?:own)?|down_vel\w*|velocity_d(?:own)?|d_vel",),
+    "sd_e": (r"sd_?e|std_?e|sigma_?e|e(?:ast)?_(?:sd|std|sigma)", _HORIZONTAL),
+    "sd_n": (r"sd_?n|std_?n|sigma_?n|n(?:orth)?_(?:sd|std|sigma)", _HORIZONTAL),
+    "sd_u": (r"sd_?u|std_?u|sigma_?u|u(?:p)?_(?:sd|std|sigma)", _VERTICAL),
+    "speed": (
+        r"speed", r"(?:wheel|vehicle|odo(?:meter)?|ground|gps|gnss|can|car)_?(?:speed|velocity)",
+        r"speed_over_ground|sog|g_?speed",
+        r"(?:.*_)?(?:speed|velocity|v_?x|twist_linear_x|linear_x|v)",
+    ),
+    "speed_fl": (rf"{_WHEEL}(?:fl|front_left|left_front){_SPEED}",),
+    "speed_fr": (rf"{_WHEEL}(?:fr|front_right|right_front){_SPEED}",),
+    "speed_rl": (rf"{_WHEEL}(?:rl|rear_left|left_rear){_SPEED}",),
+    "speed_rr": (rf"{_WHEEL}(?:rr|rear_right|right_rear){_SPEED}",),
+    "course": (
+        r"course(?:_over_ground)?|cog", r"(?:.*_)?(?:bearing|track|course|head_mot|motion_heading|heading_of_motion)",
+        r"heading",
+    ),
+}  # fmt: skip
+
+UNITS = {
+    "s": ("t", "s"), "sec": ("t", "s"), "seconds": ("t", "s"), "ms": ("t", "ms"), "us": ("t", "us"), "ns": ("t", "ns"),
+    "dps": ("gyro", "deg/s"), "deg_s": ("gyro", "deg/s"), "degps": ("gyro", "deg/s"), "deg_sec": ("gyro", "deg/s"),
+    "rad_s": ("gyro", "rad/s"), "rps": ("gyro", "rad/s"), "rads": ("gyro", "rad/s"), "mdps": ("gyro", "mdeg/s"),
+    "rad_sec": ("gyro", "rad/s"), "radps": ("gyro", "rad/s"),
+    "m_s2": ("accel", "m/s2"), "ms2": ("accel", "m/s2"), "mps2": ("accel", "m/s2"), "m_s_2": ("accel", "m/s2"),
+    "m_ss": ("accel", "m/s2"), "m_s_s": ("accel", "m/s2"),
+    "g": ("accel", "g"), "mg": ("accel", "mg"),
+    "mps": ("speed", "m/s"), "m_s": ("speed", "m/s"), "kmh": ("speed", "km/h"), "km_h": ("speed", "km/h"),
+    "kph": ("speed", "km/h"), "kmph": ("speed", "km/h"), "mph": ("speed", "mph"), "kn": ("speed", "knots"),
+    "knots": ("speed", "knots"), "kt": ("speed", "knots"), "kts": ("speed", "knots"),
+    "deg": ("angle", "deg"), "degrees": ("angle", "deg"), "rad": ("angle", "rad"), "m": ("length", "m"),
+}  # fmt: skip
+_AXES = ("gx", "gy", "gz", "ax", "ay", "az")
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns of one file: our name -> the file's, and our name -> the unit that its name states."""
+
+    names: dict[str, str]
+    units: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def sensor(self) -> str | None:
+        """What the file is of: imu, gyro, accel, gnss, odometer, or None."""
+        gyro, accel = ({f"{s}{x}" for x in "xyz"} <= self.names.keys() for s in "ga")
+        if "t" not in self.names:
+            return None
+        if gyro and accel:
+            return "imu"
+        if {"lat", "lon"} <= self.names.keys():
+            return "gnss"
+        wheel = any(name == "speed" or name.startswith("speed_") for name in self.names)
+        return "gyro" if gyro else "accel" if accel else "odometer" if wheel else None
+
+
+def match(header: Sequence[str], stem: str = "") -> Columns:
+    """Find our columns among a file's; `stem`, the file's name, tells what bare x, y, z are of."""
+    spelt = [(name, *split_unit(name)) for name in header]
+    names: dict[str, str] = {}
+    units: dict[str, str] = {}
+    for ours, patterns in _PATTERNS.items():
+        found = next(((name, unit) for p in patterns for name, plain, unit in spelt if re.fullmatch(p, plain)), None)
+        if found is not None:
+            names[ours], unit = found
+            if unit:
+                units[ours] = unit
+    bare = {plain: (name, unit) for name, plain, unit in spelt if plain in ("x", "y", "z")}
+    kind = "g" if "gyr" in stem.lower() else "a" if "acc" in stem.lower() else None
+    if kind and len(bare) == 3 and not any(f"{kind}{x}" in names for x in "xyz"):
+        for x in "xyz":
+            names[f"{kind}{x}"] = bare[x][0]
+            if bare[x][1]:
+                units[f"{kind}{x}"] = bare[x][1]
+    # one letter is not enough when the triple is not whole
+    for kind in "ga":
+        if not all(f"{kind}{x}" in names for x in "xyz"):
+            for x in "xyz":
+                names.pop(f"{kind}{x}", None)
+    return Columns(names, units)
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """A name in one spelling, and the unit it states ('' if none)."""
+    bracket = re.search(r"[(\[]([^)\]]*)[)\]]\s*$", name)
+    base = name[: bracket.start()] if bracket else name
+    base = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", base)
+    plain = re.sub(r"[^a-z0-9]+", "_", base.lower()).strip("_")
+    if bracket:
+        unit = bracket[1].lower().replace("²", "2").replace("°", "deg").replace("µ", "u").replace("^", "")
+        return plain, re.sub(r"[^a-z0-9]+", "_", unit).strip("_")
+    words = plain.split("_")
+    for count in (3, 2, 1):
+        unit = "_".join(words[-count:])
+        # "a_g" may be anything, "g" alone and "s" alone are names
+        if len(words) > count and unit in UNITS:
+            return "_".join(words[:-count]), unit
+    return plain, ""
+
+
+def unit_of(columns: Columns, ours: str, kind: str) -> str | None:
+    """The unit of recording.toml that a column's name states, if it is one of that kind."""
+    found = UNITS.get(columns.units.get(ours, ""))
+    return found[1] if found and found[0] == kind else None

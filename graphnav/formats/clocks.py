@@ -1,0 +1,86 @@
+"""GPS time, UTC and the leap seconds between them.
+
+GPS time runs on since 6 January 1980 UTC; each leap second since then puts it one further ahead (IERS Bulletin C; the
+table of IS-GPS-200 applications). No leap second has been added since 2017, and none will be before 2027.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from graphnav.rotation import Array
+
+WEEK = 604800.0  # s
+GPS_TO_UNIX = 315964800.0  # s from the Unix to the GPS epoch, leap seconds aside
+_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
+# days on which GPS - UTC grew by one, to 1 s at the first
+_LEAPS = np.array(
+    [
+        "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01", "1992-07-01",
+        "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01", "1999-01-01", "2006-01-01", "2009-01-01", "2012-07-01",
+        "2015-07-01", "2017-01-01",
+    ],
+    dtype="datetime64[us]",
+)  # fmt: skip
+
+
+def leap_seconds(utc: Array) -> Array:
+    """GPS minus UTC (s) at dates of type datetime64."""
+    return np.searchsorted(_LEAPS, utc, side="right").astype(float)
+
+
+def utc_to_gps(utc: Array) -> Array:
+    """Seconds since the GPS epoch of UTC dates (datetime64[us])."""
+    return (utc - _EPOCH) / np.timedelta64(1, "us") * 1e-6 + leap_seconds(utc)
+
+
+def unix_to_gps(t: Array) -> Array:
+    """Seconds since the GPS epoch of Unix time."""
+    utc = (np.asarray(t) * 1e6).astype("int64").astype("datetime64[us]")
+    return np.asarray(t) - GPS_TO_UNIX + leap_seconds(utc)
+
+
+def gps_to_utc(t: Array) -> Array:
+    """UTC (datetime64[us]) of seconds since the GPS epoch; right but for the second before a leap."""
+    gps = _EPOCH + np.round(np.asarray(t, dtype=float) * 1e6).astype("timedelta64[us]")
+    leap = leap_seconds(gps)
+    leap = leap_seconds(gps - (leap * 1e6).astype("timedelta64[us]"))
+    return np.asarray(gps - (leap * 1e6).astype("timedelta64[us]"))
+
+
+def of_week(gps: Array) -> tuple[Array, float]:
+    """Seconds of the GPS week of the first of some GPS times, and where that week begins (s since the GPS epoch)."""
+    zero = WEEK * np.floor(gps[0] / WEEK)
+    return gps - zero, float(zero)
+
+
+def parse_clock(text: str, t: float) -> float:
+    """Seconds since the GPS epoch at t = 0 of a clock in words; `t` (s) is a time of the log, for the leap seconds.
+
+    ``unix``: seconds since 1970 UTC. ``gps week 2313``: seconds of that week. ``2024-05-01T12:00:00Z``: seconds since
+    then, UTC.
+
+    Raises
+    ------
+    ValueError
+        If it is none of these.
+    """
+    if text == "unix":
+        return float(unix_to_gps(np.array([t]))[0]) - t
+    if found := re.fullmatch(r"gps week (\d{1,4})", text):
+        return WEEK * int(found[1])
+    try:
+        return float(utc_to_gps(np.array([text.removesuffix("Z")], dtype="datetime64[us]"))[0])
+    except ValueError:
+        raise ValueError('must be "unix", "gps week 2313" or a UTC date such as "2024-05-01T12:00:00Z"') from None
+
+
+def clock_words(gps_zero: float) -> str:
+    """The words of `parse_clock` for a clock: a GPS week, Unix time, or the UTC date of its zero."""
+    if -GPS_TO_UNIX <= gps_zero < -GPS_TO_UNIX + 60.0:
+        return "unix"
+    if gps_zero % WEEK == 0.0:
+        return f"gps week {round(gps_zero / WEEK)}"
+    return f"{gps_to_utc(np.array([gps_zero]))[0]}Z"

@@ -1,0 +1,131 @@
+"""Small logs in other programs' forms, made of a simulated drive; each maker follows the form's own description.
+
+The drive is `oracle.vehicle_path`, with exact samples and fixes, so that what is read can be compared with it.
+"""
+
+from __future__ import annotations
+
+import datetime
+from functools import reduce
+from operator import xor
+from pathlib import Path
+
+import numpy as np
+import oracle
+
+from graphnav.recording import Recording
+from graphnav.trajectory import Trajectory
+
+WEEK, TOW = 2200, 345600.0  # Thursday, 10 March 2022, 0:00 GPS time
+UTC_MIDNIGHT = datetime.datetime(2022, 3, 9, 23, 59, 42)  # the same, 18 leap seconds behind
+FLU, FRD = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # of RFU
+LEVER_ARM = (0.3, 0.5, 1.2)  # RFU
+
+
+def simulated(seconds: float = 40.0) -> tuple[Recording, Trajectory]:
+    """10 s into a drive at 50 Hz with exact IMU rows, fixes with velocities, and a wheel, and its whole truth."""
+    recording, truth = oracle.drive(
+        oracle.vehicle_path(120.0, 50.0), imu_noise=None, gnss_exact=True, gnss_velocity_sd=(0.05, 0.05, 0.1),
+        lever_arm=LEVER_ARM, odometer_rate=50.0, odometer_sd=0.0, odometer_scale=0.0,
+    )  # fmt: skip
+    return recording.crop(10.0, 10.0 + seconds), truth
+
+
+def write_kf_gins(folder: Path, recording: Recording, truth: Trajectory, odometer: bool = False) -> Path:
+    """IMU increments and fixes in the columns of KF-GINS' README, the truth as .nav, and a configuration."""
+    imu, gnss = recording.imu, recording.gnss
+    assert gnss is not None
+    folder.mkdir(parents=True, exist_ok=True)
+    dt = np.diff(imu.t, prepend=imu.t[0] - np.median(np.diff(imu.t)))[:, None]
+    columns = [TOW + imu.t[:, None], imu.gyro @ FRD.T * dt, imu.accel @ FRD.T * dt]
+    if odometer:
+        assert recording.odometer is not None
+        columns.append(np.interp(imu.t, recording.odometer.t, recording.odometer.speed)[:, None])
+    np.savetxt(folder / "imu.txt", np.hstack(columns), fmt="%.15g")
+    fixes = [TOW + gnss.t, np.degrees(gnss.llh[:, 0]), np.degrees(gnss.llh[:, 1]), gnss.llh[:, 2]]
+    np.savetxt(folder / "gnss.txt", np.column_stack([*fixes, gnss.sd[:, [1, 0, 2]]]), fmt="%.13f")
+    v, rph = truth.v, np.degrees(truth.rph)
+    rows = [np.full(len(truth), WEEK), TOW + truth.t, np.degrees(truth.llh[:, :2]), truth.llh[:, 2]]
+    table = np.column_stack([*rows, v[:, 1], v[:, 0], -v[:, 2], rph])
+    np.savetxt(folder / "truth.nav", table, fmt="%.12f")
+    right, forward, up = gnss.lever_arm
+    (folder / "kf-gins.yaml").write_text(
+        f'imupath: "./dataset/imu.txt"\ngnsspath: "./dataset/gnss.txt"\noutputpath: "./dataset"\nimudatalen: 7\n'
+        "starttime: 345600\nendtime: -1\ninitpos: [ 30.0, 114.0, 20.0 ]\ninitgyrbias: [ 0, 0, 0 ]\n"
+        "imunoise:\n  arw: [0.1, 0.1, 0.1]\n  vrw: [0.2, 0.2, 0.2]\n  gbstd: [25.0, 25.0, 25.0]\n"
+        "  abstd: [200.0, 200.0, 200.0]\n  gsstd: [300.0, 300.0, 300.0]\n  asstd: [300.0, 300.0, 300.0]\n"
+        f"  corrtime: 4.0\nantlever: [ {forward}, {right}, {-up} ]\n"
+    )
+    return folder
+
+
+def write_rtklib(path: Path, recording: Recording, scale: str = "GPST") -> Path:
+    """A .pos file as RTKLIB 2.4.3 writes it with velocities, in GPST or UTC."""
+    gnss = recording.gnss
+    assert gnss is not None
+    start = UTC_MIDNIGHT if scale == "UTC" else datetime.datetime(2022, 3, 10)
+    lines = [
+        "% program   : RTKPOST ver.2.4.3",
+        "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)",
+        f"%  {scale}                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)"
+        "  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio    vn(m/s)    ve(m/s)    vu(m/s)      sdvn     sdve     sdvu"
+        "    sdvne    sdveu    sdvun",
+    ]
+    for k, t in enumerate(gnss.t):
+        stamp = (start + datetime.timedelta(seconds=float(t))).strftime("%Y/%m/%d %H:%M:%S.%f")[:-3]
+        lat, lon = np.degrees(gnss.llh[k, :2])
+        (e, n, u), (ve, vn, vu), (se, sn, su) = gnss.sd[k], gnss.v[k], gnss.sd_v[k]
+        lines.append(
+            f"{stamp}   {lat:.11f} {lon:.11f} {gnss.llh[k, 2]:.12f}   1  20 {n} {e} {u} 0 0 0 0.00 99.9 "
+            f"{vn:.7f} {ve:.7f} {vu:.7f} {sn} {se} {su} 0 0 0"
+        )
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_kitti(folder: Path, recording: Recording, truth: Trajectory) -> Path:
+    """A drive in the form of the KITTI raw data: 30 numbers a file, stamps in a file of their own."""
+    data = folder / "2011_09_30_drive_0099_extract" / "oxts" / "data"
+    data.mkdir(parents=True)
+    start = datetime.datetime(2011, 9, 30, 12, 40, 59)
+    stamps = []
+    gyro, accel = recording.imu.gyro @ FLU.T, recording.imu.accel @ FLU.T
+    at = np.searchsorted(truth.t, recording.imu.t - 1e-9)
+    for k, i in enumerate(at):
+        roll, pitch, heading = truth.rph[i]
+        ve, vn, vu = truth.v[i]
+        lat, lon = np.degrees(truth.llh[i, :2])
+        numbers = [lat, lon, truth.llh[i, 2], roll, -pitch, np.pi / 2 - heading, vn, ve, 0.0, 0.0, vu, *accel[k]]
+        numbers += [0.0] * 3 + [*gyro[k]] + [0.0] * 3 + [0.05, 0.02, 4, 8, 4, 4, 0]
+        (data / f"{k:010d}.txt").write_text(" ".join(repr(float(x)) for x in numbers))
+        stamp = start + datetime.timedelta(seconds=float(recording.imu.t[k]))
+        stamps.append(stamp.strftime("%Y-%m-%d %H:%M:%S.%f") + "000")
+    (data.parent / "timestamps.txt").write_text("\n".join(stamps) + "\n")
+    return data.parent.parent
+
+
+def sentence(body: str) -> str:
+    """An NMEA sentence with its checksum."""
+    return f"${body}*{reduce(xor, body.encode()):02X}\r\n"
+
+
+def write_nmea(path: Path, recording: Recording, gst: bool = True) -> Path:
+    """GGA, GST and RMC of every fix; the geoid 40 m above the ellipsoid."""
+    gnss = recording.gnss
+    text = ""
+    for k, t in enumerate(gnss.t):
+        stamp = UTC_MIDNIGHT + datetime.timedelta(seconds=float(t))
+        clock = stamp.strftime("%H%M%S.%f")[:-4]
+        place = ""
+        for value, width, signs in ((gnss.llh[k, 0], 2, "NS"), (gnss.llh[k, 1], 3, "EW")):
+            minutes = abs(np.degrees(value)) * 60
+            place += f"{int(minutes // 60):0{width}d}{minutes % 60:010.7f},{signs[0 if value >= 0 else 1]},"
+        text += sentence(f"GNGGA,{clock},{place}4,12,0.80,{gnss.llh[k, 2] - 40.0:.3f},M,40.0,M,1.0,0000")
+        if gst:
+            e, n, u = gnss.sd[k]
+            text += sentence(f"GNGST,{clock},0.1,,,,{n},{e},{u}")
+        speed, course = np.hypot(*gnss.v[k, :2]), np.degrees(np.arctan2(gnss.v[k, 0], gnss.v[k, 1])) % 360
+        where = place.rstrip(",")
+        text += sentence(f"GNRMC,{clock},A,{where},{speed * 3600 / 1852:.4f},{course:.4f},{stamp:%d%m%y},,,D")
+    path.write_text(text)
+    return path

@@ -1,0 +1,273 @@
+"""`graphnav init`: what it makes of logs whose truth is known, in any mount, unit, clock and spelling."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import logs
+import numpy as np
+import oracle
+import pytest
+
+from graphnav import cli
+from graphnav.draft import columns, draft, guesses, motion
+from graphnav.draft.agreement import level_axes
+from graphnav.errors import RecordingError
+from graphnav.formats import read
+from graphnav.formats.schema import rotation_from_letters
+from graphnav.rotation import exp
+
+DRIVE, _ = oracle.drive(
+    oracle.vehicle_path(240.0, 50.0), seed=3, gnss_rate=5.0, gnss_velocity_sd=(0.05, 0.05, 0.1), odometer_rate=20.0
+)
+
+
+# ---- names
+
+
+@pytest.mark.parametrize(
+    ("header", "sensor", "found"),
+    [
+        ("t,gx,gy,gz,ax,ay,az", "imu", {"gx": "gx", "az": "az"}),
+        ("Timestamp,GyroX,GyroY,GyroZ,AccX,AccY,AccZ", "imu", {"t": "Timestamp", "gy": "GyroY", "ax": "AccX"}),
+        ("time_s,gyro_x_dps,gyro_y_dps,gyro_z_dps,acc_x_g,acc_y_g,acc_z_g", "imu", {"gz": "gyro_z_dps"}),
+        (
+            "%time,field.header.stamp,field.angular_velocity.x,field.angular_velocity.y,field.angular_velocity.z,"
+            "field.linear_acceleration.x,field.linear_acceleration.y,field.linear_acceleration.z",
+            "imu", {"t": "field.header.stamp", "gx": "field.angular_velocity.x", "az": "field.linear_acceleration.z"},
+        ),
+        (
+            "Time (s),Gyroscope x (rad/s),Gyroscope y (rad/s),Gyroscope z (rad/s),Acceleration x (m/s^2),"
+            "Acceleration y (m/s^2),Acceleration z (m/s^2)",
+            "imu", {"t": "Time (s)", "gx": "Gyroscope x (rad/s)", "ay": "Acceleration y (m/s^2)"},
+        ),
+        ("timestamp,omega_x,omega_y,omega_z,alpha_x,alpha_y,alpha_z,f_x,f_y,f_z", "imu", {"ax": "f_x"}),
+        ("time,seconds_elapsed,z,y,x", None, {"t": "seconds_elapsed"}),
+        ("iTOW,lon,lat,height,hMSL,hAcc,vAcc,velN,velE,velD,gSpeed,headMot", "gnss",
+         {"t": "iTOW", "h": "height", "ve": "velE", "vd": "velD", "sd_e": "hAcc", "sd_u": "vAcc", "course": "headMot"}),
+        ("time,seconds_elapsed,latitude,longitude,altitude,speed,bearing,horizontalAccuracy,verticalAccuracy", "gnss",
+         {"h": "altitude", "course": "bearing", "sd_n": "horizontalAccuracy", "sd_u": "verticalAccuracy"}),
+        ("t_s,lat_deg,lon_deg,h_m,speed_mps,course_deg,epe_m,hdop", "gnss", {"h": "h_m", "course": "course_deg"}),
+        ("timestamp,wheel_speed_kmh,gear", "odometer", {"speed": "wheel_speed_kmh"}),
+        ("t,wheel_fl_kmh,wheel_fr_kmh,RearLeft,rr", "odometer", {"speed_fl": "wheel_fl_kmh", "speed_rl": "RearLeft"}),
+        ("time,temperature,pressure", None, {"t": "time"}),
+    ],
+)  # fmt: skip
+def test_columns_are_found_by_meaning(header, sensor, found):
+    match = columns.match(header.split(","))
+    assert match.sensor == sensor
+    for ours, theirs in found.items():
+        assert match.names[ours] == theirs
+
+
+def test_bare_axes_are_told_apart_by_the_file_name():
+    header = ["time", "seconds_elapsed", "z", "y", "x"]
+    assert columns.match(header, "Gyroscope").names["gx"] == "x"
+    assert columns.match(header, "TotalAcceleration").sensor == "accel"
+
+
+@pytest.mark.parametrize(
+    ("name", "plain", "unit"),
+    [
+        ("gyro_x_dps", "gyro_x", "dps"), ("Acceleration y (m/s²)", "acceleration_y", "m_s2"),
+        ("rotationRateX(rad/s)", "rotation_rate_x", "rad_s"), ("lat", "lat", ""), ("s", "s", ""),
+        ("acc_x[mg]", "acc_x", "mg"), ("speed_km_h", "speed", "km_h"),
+    ],
+)  # fmt: skip
+def test_units_in_names(name, plain, unit):
+    assert columns.split_unit(name) == (plain, unit)
+
+
+# ---- sizes
+
+
+@pytest.mark.parametrize(
+    ("first", "step", "unit"),
+    [(0.0, 0.01, "s"), (0.0, 10.0, "ms"), (5e5, 1e4, "us"), (0.0, 1e7, "ns"), (1.7e9, 0.01, "s"), (1.7e12, 10, "ms"),
+     (1.7e18, 1e7, "ns"), (345600.0, 0.005, "s"), (345600000.0, 5.0, "ms")],
+)  # fmt: skip
+def test_time_units(first, step, unit):
+    assert guesses.time_unit(first + step * np.arange(100), None, imu=True).value == unit
+
+
+def test_forces_without_gravity_and_raw_counts_are_refused():
+    rng = np.random.default_rng(1)
+    still = rng.normal(0, 0.3, (500, 3))
+    with pytest.raises(RecordingError, match=r"a\.csv: .*without gravity"):
+        guesses.accel_unit(Path("a.csv"), still, "m/s2")
+    with pytest.raises(RecordingError, match=r"raw counts"):
+        guesses.accel_unit(Path("a.csv"), still + np.array([0, 0, 16384.0]), None)
+    assert guesses.accel_unit(Path("a.csv"), still / 9.8 + [0, 0, 1.0], None).value == "g"
+
+
+def test_white_noise_is_measured():
+    rng = np.random.default_rng(2)
+    t = np.arange(60000) / 100
+    assert guesses.noise_density(t, rng.normal(0, 0.02, (60000, 3))) == pytest.approx(0.002, rel=0.25)
+
+
+# ---- motion
+
+
+def test_lag_slope_and_angle_of_planar_vectors():
+    rng = np.random.default_rng(4)
+    t = np.arange(0, 300, motion.STEP)
+    z = motion.mean(rng.normal(size=len(t))) + 1j * motion.mean(rng.normal(size=len(t)))
+    late = 0.37
+    y = np.interp(t - late, t, z)
+    found = motion.lag(t, 2.0 * z * np.exp(1j * 0.6), t, y)
+    assert found.seconds == pytest.approx(late, abs=0.01)
+    assert found.correlation > 0.99
+    assert found.slope == pytest.approx(2.0 * np.exp(1j * 0.6), rel=0.02)
+
+
+def test_lag_of_clocks_that_have_nothing_in_common():
+    rng = np.random.default_rng(5)
+    t = np.arange(0, 600, motion.STEP)
+    x = motion.mean(rng.normal(size=len(t)), 3.0)
+    found = motion.lag(t, 57.3 * x, t[1000:5000] + 1.7e6, x[1000:5000], anywhere=True)
+    assert found.seconds == pytest.approx(1.7e6, abs=0.02)
+    assert found.slope == pytest.approx(57.3, rel=1e-3)
+
+
+def test_level_axes_are_right_handed():
+    for up in ([0, 0, 1.0], [0, -1.0, 0], [0.6, 0, 0.8]):
+        first, second = level_axes(np.array(up))
+        assert np.cross(first, second) == pytest.approx(up)
+
+
+# ---- whole drafts
+
+
+def write_logs(folder, letters="FLU", gyro=1.0, accel=1.0, time=1.0, gnss_late=0.0, speed=1.0, turn=None):
+    """The drive as CSV files of a logger, in other axes and units."""
+    folder.mkdir(exist_ok=True)
+    R = rotation_from_letters(letters).T if turn is None else turn
+    imu, gnss, odometer = DRIVE.imu, DRIVE.gnss, DRIVE.odometer
+    table = np.column_stack([imu.t * time, imu.gyro @ R.T * gyro, imu.accel @ R.T * accel])
+    head = "Timestamp,GyroX,GyroY,GyroZ,AccX,AccY,AccZ"
+    np.savetxt(folder / "imu.csv", table, "%.9g", ",", header=head, comments="")
+    table = np.column_stack(
+        [gnss.t + gnss_late, np.degrees(gnss.llh[:, :2]), gnss.llh[:, 2], gnss.v * [1, 1, -1], gnss.sd[:, :1]]
+    )
+    head = "time,latitude,longitude,height,velE,velN,velD,hAcc"
+    np.savetxt(folder / "gnss.csv", table, "%.10f", ",", header=head, comments="")
+    table = np.column_stack([odometer.t, odometer.speed * speed])
+    np.savetxt(folder / "wheel.csv", table, "%.6f", ",", header="time,wheel_speed", comments="")
+    return [folder / name for name in ("imu.csv", "gnss.csv", "wheel.csv")]
+
+
+def drafted(folder, paths):
+    found = draft(paths, folder)
+    (folder / "recording.toml").write_text(found.text)
+    return found, read(folder)
+
+
+@pytest.mark.parametrize("letters", ["RFU", "FLU", "FRD", "BRU", "DFR"])
+def test_axes_are_found_in_any_mount(tmp_path, letters):
+    found, recording = drafted(tmp_path, write_logs(tmp_path, letters))
+    assert f'axes = "{letters}"' in found.text
+    assert recording.imu.accel == pytest.approx(DRIVE.imu.accel, abs=1e-6)
+    assert recording.imu.gyro == pytest.approx(DRIVE.imu.gyro, abs=1e-7)
+    assert recording.gnss.v == pytest.approx(DRIVE.gnss.v, abs=1e-9)  # the file's is down
+    assert "time_offset" not in found.text
+
+
+def test_a_tilted_mount_gets_two_vectors(tmp_path):
+    turn = exp(np.array([0.3, 0.2, 0.5]))
+    found, recording = drafted(tmp_path, write_logs(tmp_path, turn=turn))
+    assert "forward = [" in found.text
+    error = recording.imu.R_bs @ turn  # body from body: nearly nothing
+    # the mean force leans with the road and the driver's braking; the forward axis with the side slip
+    assert np.degrees(np.arccos((np.trace(error) - 1) / 2)) < 3.0
+
+
+def test_units_are_found_by_their_size_and_checked_by_the_fixes(tmp_path):
+    paths = write_logs(tmp_path, gyro=180 / np.pi, accel=1 / 9.80665, time=1e6, speed=3.6)
+    found, recording = drafted(tmp_path, paths)
+    assert 'units = { t = "us", gyro = "deg/s", accel = "g" }' in found.text
+    assert 'units = { speed = "km/h" }' in found.text
+    assert recording.imu.gyro == pytest.approx(DRIVE.imu.gyro, abs=1e-7)
+    assert recording.odometer.speed == pytest.approx(DRIVE.odometer.speed, abs=1e-5)
+
+
+def test_late_fixes_are_seen(tmp_path):
+    _, recording = drafted(tmp_path, write_logs(tmp_path, gnss_late=0.4))
+    assert recording.gnss.t == pytest.approx(DRIVE.gnss.t, abs=0.03)
+
+
+def test_clocks_that_have_nothing_in_common_are_brought_together(tmp_path):
+    _, recording = drafted(tmp_path, write_logs(tmp_path, gnss_late=1.6e9))
+    assert recording.gnss.t == pytest.approx(DRIVE.gnss.t, abs=0.03)
+
+
+def test_a_phone_with_a_file_per_sensor(tmp_path, capsys):
+    imu, gnss = DRIVE.imu, DRIVE.gnss
+    ns = 1.6e18 + np.round(imu.t * 1e9)
+    for name, values, shift in (("Gyroscope", imu.gyro, 0.0), ("TotalAcceleration", imu.accel, 0.004)):
+        at = np.column_stack([np.interp(imu.t + shift, imu.t, x) for x in values.T])
+        table = np.column_stack([ns, imu.t + shift, at[:, ::-1]])
+        np.savetxt(tmp_path / f"{name}.csv", table, "%.9g", ",", header="time,seconds_elapsed,z,y,x", comments="")
+    speed, course = np.hypot(*gnss.v[:, :2].T), np.degrees(np.arctan2(gnss.v[:, 0], gnss.v[:, 1])) % 360
+    table = np.column_stack([gnss.t, np.degrees(gnss.llh[:, :2]), gnss.llh[:, 2], speed, course, gnss.sd[:, [0, 2]]])
+    head = "seconds_elapsed,latitude,longitude,altitude,speed,bearing,horizontalAccuracy,verticalAccuracy"
+    np.savetxt(tmp_path / "Location.csv", table, "%.10f", ",", header=head, comments="")
+    files = [str(tmp_path / f"{n}.csv") for n in ("Gyroscope", "TotalAcceleration", "Location")]
+    assert cli.run(["init", *files, "-o", str(tmp_path / "recording.toml")]) == 0
+    assert "imu.csv.gz: made of Gyroscope.csv and TotalAcceleration.csv" in capsys.readouterr().out
+    recording = read(tmp_path)
+    assert recording.imu.gyro == pytest.approx(DRIVE.imu.gyro[1 : len(recording.imu.t) + 1], abs=1e-6)
+    assert recording.gnss.v[:, :2] == pytest.approx(gnss.v[:, :2], abs=1e-6)
+    assert cli.run(["init", *files, "-o", str(tmp_path / "recording.toml")]) == 2
+    assert "is there already" in capsys.readouterr().err
+
+
+def test_logs_of_other_programs_are_joined(tmp_path):
+    recording, truth = logs.simulated(100.0)
+    logs.write_kf_gins(tmp_path, recording, truth)
+    logs.write_nmea(tmp_path / "ride.nmea", recording)
+    (whole := tmp_path / "whole").mkdir()
+    assert "lever_arm = [0.3000, 0.5000, 1.2000]" in draft([tmp_path], whole).text  # the configuration's
+    found = draft([tmp_path / "imu.txt", tmp_path / "ride.nmea"], tmp_path)
+    (tmp_path / "recording.toml").write_text(found.text)
+    read_back = read(tmp_path)
+    assert read_back.imu.gyro == pytest.approx(recording.imu.gyro, abs=1e-9)
+    assert read_back.gnss.t == pytest.approx(logs.TOW + recording.gnss.t, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("time,temperature\n0,1\n1,2\n", r"a\.csv, line 1: no sensor is recognised in the columns time, temperature"),
+        ("t,lat,lon,h\n0,1,2,3\n1,1,2,3\n", r"no IMU in these logs \(found: gnss\)"),
+        ("t,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0,x\n", r"a\.csv, line 2, column 'az': 'x' is not a number"),
+        ("t,gx,gy,gz,ax,ay,az\n0,,0,0,0,0,1\n", r"a\.csv: fewer than two rows"),
+        ("1,2,3\n4,5,6\n", r"a\.csv, line 1: the first line must name the columns"),
+    ],
+)
+def test_logs_that_cannot_be_drafted_say_why(tmp_path, text, sentence):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(RecordingError, match=sentence):
+        draft([tmp_path / "a.csv"], tmp_path)
+
+
+# ---- real logs, as they came
+
+
+@pytest.mark.parametrize(
+    ("name", "axes", "gnss_offset"),
+    [("tokyo_20201105", "RFU", 0.0), ("boulder_drive_20250708", "BRU", 0.2), ("dresden_car_20140326", "FLU", -0.55),
+     ("comma_highway_20180802", "FRD", -0.13)],
+)  # fmt: skip
+def test_real_logs_get_the_axes_and_clocks_that_are_known(shared_data, tmp_path, name, axes, gnss_offset):
+    folder = shared_data / name
+    paths = [folder / file for file in ("imu.csv.gz", "gnss.csv.gz", "odo.csv.gz") if (folder / file).exists()]
+    text = draft(paths, tmp_path).text
+    (tmp_path / "recording.toml").write_text(text)
+    found, known = read(tmp_path), read(folder)
+    assert f'axes = "{axes}"' in text
+    assert np.array_equal(found.imu.R_bs, known.imu.R_bs)
+    raw = float(np.loadtxt(folder / "gnss.csv.gz", delimiter=",", skiprows=1, max_rows=1, usecols=0))
+    assert found.gnss.t[0] - raw == pytest.approx(gnss_offset, abs=0.25)
+    if known.odometer is not None:
+        assert found.odometer.t[0] == pytest.approx(known.odometer.t[0], abs=0.06)
