@@ -167,15 +167,18 @@ def test_evaluate_finds_the_errors_that_subtraction_finds(compared, drive, tmp_p
         {round(float(row["t"]), 3): (float(row["lat"]), float(row["lon"])) for row in rows(path)}
         for path in (out / "batch" / "trajectory.csv", drive / "truth.csv")
     )
-    mine = {t: place for t, place in mine.items() if t in true}  # the ends of stops fall between the truth's rows
-    assert values["n"] == len(mine) > 150
-    d = np.radians([np.subtract(mine[t], true[t]) for t in mine]) * 6371e3
-    north, east = d[:, 0], d[:, 1] * np.cos(np.radians(30.5))
-    assert values["e_rms_m"] == pytest.approx(np.sqrt(np.mean(east**2)), rel=5e-3)
-    assert values["n_rms_m"] == pytest.approx(np.sqrt(np.mean(north**2)), rel=5e-3)
+    assert values["n"] == len(mine)
+    written = {round(float(row["t"]), 3): (float(row["east"]), float(row["north"])) for row in
+               rows(tmp_path / "e" / "errors.csv")}  # fmt: skip
+    both = sorted(set(mine) & set(true) & set(written))  # the ends of stops fall between the truth's rows
+    assert len(both) > 150
+    d = np.radians([np.subtract(mine[t], true[t]) for t in both]) * 6371e3
+    off = np.array([written[t] for t in both])
+    assert off[:, 1] == pytest.approx(d[:, 0], rel=5e-3, abs=1e-5)
+    assert off[:, 0] == pytest.approx(d[:, 1] * np.cos(np.radians(30.5)), rel=5e-3, abs=1e-5)
     assert json.loads((tmp_path / "e" / "evaluation.json").read_text()) == values
-    written = np.array([float(row["east"]) for row in rows(tmp_path / "e" / "errors.csv")])
-    assert np.sqrt(np.mean(written**2)) == pytest.approx(values["e_rms_m"], rel=1e-4)
+    all_east = [east for east, _ in written.values()]
+    assert np.sqrt(np.mean(np.square(all_east))) == pytest.approx(values["e_rms_m"], rel=1e-4)
 
 
 def test_evaluate_prints_a_table_and_writes_nothing_unasked(compared, tmp_path):
