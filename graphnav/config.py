@@ -119,7 +119,7 @@ class FootSettings(_Section):
     correlation: float = Field(0.2, ge=0, description="s, over which the errors of a stance are one")
     pivot_sigma: float = Field(0.1, gt=0, description="m, 1-sigma of the pivot's place about the IMU, estimated")
     travel_sigma: float = Field(0.1, gt=0, description="m, 1-sigma of how far it travels either way, estimated")
-    half_stance: float = Field(0.35, gt=0, description="s after landing and before leaving in which the pivot travels")
+    half_stance: float = Field(0.2, gt=0, description="s after landing and before leaving in which the pivot travels")
     lateral: bool = Field(False, description="no sideways speed in swing")
     sideways: float = Field(0.1, gt=0, description="m/s, 1-sigma of the mean sideways speed of a swing")
     turn: float = Field(10.0, gt=0, description="deg by which a foot turns in a swing that double that")

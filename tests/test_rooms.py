@@ -15,7 +15,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "graphnav"
 ROOMS = [
     "errors", "rotation", "earth", "state", "config", "recording", "trajectory",
     "formats", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding", "checks", "detectors",
-    "preintegration", "dynamics", "constraints", "problem", "solution", "alignment",
+    "preintegration", "unresolved", "dynamics", "constraints", "problem", "solution", "alignment",
     "dense", "solvers", "judgement", "pipeline",
     "interpolation", "metrics", "scoring", "evaluation", "exporters",
     "panels", "page", "plots", "report_tables", "report_pictures", "report",

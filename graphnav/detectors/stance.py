@@ -63,8 +63,9 @@ def detect_stances(imu: Imu, period: float, settings: StanceSettings) -> Detecti
         () if len(kept) == len(spans)
         else (f"{len(spans) - len(kept)} short lulls that do not reach as deep as the stances were left out",)
     )  # fmt: skip
-    found = Detection("stance", t, e, settings.threshold, inside(t, kept), kept, notes)
-    return Detections(kept, (found,), notes)
+    found = Detection("stance", t, e, settings.threshold, below, spans)
+    answer = Detection("fused", t, e, settings.threshold, inside(t, kept), kept, notes)
+    return Detections(kept, (found, answer), notes)
 
 
 def _quietest(imu: Imu, period: float) -> tuple[Array, float]:
