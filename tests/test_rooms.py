@@ -17,7 +17,7 @@ ROOMS = [
     "formats", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding", "checks", "detectors",
     "preintegration", "unresolved", "dynamics", "constraints", "problem", "solution", "alignment",
     "dense", "solvers", "judgement", "pipeline",
-    "interpolation", "metrics", "scoring", "evaluation", "exporters",
+    "interpolation", "metrics", "scoring", "strides", "evaluation", "exporters",
     "panels", "page", "plots", "report_tables", "report_pictures", "report",
     "workflow", "outputs", "terminal", "detection_pictures", "detection_report", "cli",
 ]  # fmt: skip
