@@ -35,6 +35,7 @@ _SWAY = 2.0 * np.pi  # rad/s, the slowest swaying of a body on springs
 _STILL_V, _STILL_P = 1e-3, 1e-3  # m/s, m: no body stands stiller than this
 _FAR = 60.0  # m/s; times the seconds without a fix: how far from the last one a stop may be
 _ROLLING = 0.1  # rad/s; a foot that rolls over its stance turns quicker
+_SLOW = 0.3  # s, about a quarter of a period of a standing body's sway
 _STANDING = 0.6  # s; in a walk no stance is that quiet for so long
 _I3 = np.eye(3)
 
@@ -135,6 +136,9 @@ class ZeroRate(_Standing):
         if not len(rows) or not scene.settings.standstill.zero_rate:
             return None
         _, rate = unrest(scene, rows, stop)
+        if scene.recording.platform == "foot":
+            # a body sways slowly: what it does in one interval it does in the next
+            rate *= np.sqrt(np.maximum(1.0, _SLOW / scene.intervals.T[rows]))[:, None]
         own = scene.recording.imu.noise.gyro_noise_density / np.sqrt(scene.intervals.T[rows])
         return cls(
             keyframe=rows + 1,
