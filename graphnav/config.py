@@ -76,7 +76,7 @@ class StandstillSettings(_Section):
     """What is used where the platform stands still."""
 
     zero_velocity: bool = Field(True, description="no velocity")
-    zero_rate: bool = Field(True, description="no turn rate (of a foot: where it stands for a while, not in its stances)")
+    zero_rate: bool = Field(True, description="no turn rate (of a foot: not in its stances, but where it stands)")
     held_position: bool = Field(True, description="one place for a whole stop")
 
 

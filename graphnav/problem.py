@@ -106,7 +106,7 @@ def pose(
         prior=prior,
         constraints=built,
         chains=_chains((*scale_parameter(recording.imu.noise), *(p for rows in built for p in rows.parameters)), t),
-        notes=_notes(samples, recording),
+        notes=(*_notes(samples, recording), *(note for rows in built for note in rows.notes)),
     )
 
 

@@ -86,7 +86,11 @@ def build(name: str, recording: Recording, settings: Settings) -> Case:
 NAMES = tuple(cls.name for cls in registered())
 
 
-@pytest.fixture(scope="module", params=[(n, p) for n in NAMES for p in (False, True) if p or n not in ON_FOOT - {"stance"}], ids=lambda x: f"{x[0]}-{x[1]}")
+# those that are off by default have no plain case
+CASES = [(n, p) for n in NAMES for p in (False, True) if p or n not in {"foot_lateral", "closed_loop"}]
+
+
+@pytest.fixture(scope="module", params=CASES, ids=lambda x: f"{x[0]}-{x[1]}")
 def case(request: pytest.FixtureRequest, recording: Recording) -> Case:
     name, estimated = request.param
     return build(name, recording, with_parameters() if estimated else Settings())

@@ -37,7 +37,8 @@ class ClosedLoop(Constraint):
         sigma, gnss = scene.settings.foot.closed_loop, scene.recording.gnss
         if sigma is None or scene.recording.platform != "foot" or (gnss is not None and len(gnss.t)):
             return None
-        return cls(keyframe=np.array([len(scene.t) - 1]), sigma=np.full((1, 3), sigma))
+        note = f"the end is set to be the start, to {sigma:g} m (closed_loop): the closure is no measure"
+        return cls(keyframe=np.array([len(scene.t) - 1]), sigma=np.full((1, 3), sigma), notes=(note,))
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         return Linearized(states.p, {"p": np.broadcast_to(np.eye(3), (len(states), 3, 3))}, self.sigma[rows])
