@@ -21,6 +21,7 @@ import numpy as np
 
 from graphnav import rotation
 from graphnav.config import Settings
+from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.preintegration import bridge_gaps, prefix
@@ -33,6 +34,8 @@ from graphnav.state import States
 COURSE_SIGMA = np.radians(10.0)  # rad, a stated forward axis against the course: mounting, side slip
 _DISTANCE = 50.0  # m of travel the short problem wants to see
 _FIXES = 10  # and fixes
+_AT_ONCE = 0.05  # s from the start within which a foot that stands is found
+_WALKING = 3.0  # m/s, 1-sigma of the start velocity of a foot in the air
 _GOOD_FIT = 2.0  # squared sigmas per row below which no other start heading is tried
 
 Smoother = Callable[[Problem, States], Solution]
@@ -136,19 +139,25 @@ def _usual_rate(imu: Imu) -> Array:
 def _at_rest(recording: Recording, settings: Settings, frame: LocalFrame) -> Alignment:
     """Level only; the heading stays unknown."""
     noise, gnss = recording.imu.noise, recording.gnss
-    roll, pitch = _level(recording, recording.start)
-    tilt = noise.accel_bias_sigma / 9.8 + np.radians(1.0)
+    begin, seconds = _standing(recording, settings)
+    R = rotation.from_rph(np.array([*_level(recording, begin, seconds), 0.0]))
+    tilt, sd_v = noise.accel_bias_sigma / 9.8 + np.radians(1.0), 0.5
+    if begin > recording.start:
+        dR, _, _ = prefix(bridge_gaps(recording.imu), recording.start, np.array([begin]), np.zeros(3), np.zeros(3))
+        R = R @ dR[0].T
+        R = rotation.from_rph(rotation.to_rph(R) * [1.0, 1.0, 0.0])
+        tilt, sd_v = np.hypot(tilt, noise.gyro_bias_sigma * (begin - recording.start)), _WALKING
     own = np.array([tilt, tilt, np.pi])
     if gnss is None or not len(gnss.t):
         # without fixes the first pose defines the frame: position and heading are exact by definition
         p, sd_p, sd_heading = np.zeros(3), np.full(3, 1e-3), 1e-4
         note = "no GNSS: levelled at the start, position and heading count from zero there"
     else:
-        p = frame.from_llh(gnss.llh[0]) - rotation.from_rph(np.array([roll, pitch, 0.0])) @ gnss.lever_arm
+        p = frame.from_llh(gnss.llh[0]) - R @ gnss.lever_arm
         sd_p, sd_heading = 10.0 * gnss.sd[0] + 1.0, np.pi
         note = "no motion in the GNSS fixes: levelled at the start, heading unknown"
     state = States(
-        rotation.from_rph(np.array([roll, pitch, 0.0]))[None],
+        R[None],
         p[None],
         np.zeros((1, 3)),
         np.zeros((1, 3)),
@@ -159,12 +168,25 @@ def _at_rest(recording: Recording, settings: Settings, frame: LocalFrame) -> Ali
             [settings.alignment.prior_inflation * tilt] * 2,
             [sd_heading],
             sd_p,
-            [0.5] * 3,
+            [sd_v] * 3,
             [noise.accel_bias_sigma] * 3,
             [noise.gyro_bias_sigma] * 3,
         ]
     )
     return Alignment(state, sigma, own, (note,))
+
+
+def _standing(recording: Recording, settings: Settings) -> tuple[float, float]:
+    """From when (s), and for how long, to level: from the start, or for a foot that starts in the air its first stance.
+
+    Of a stance the middle half is used.
+    """
+    if recording.platform == "foot":
+        spans = detect(recording, settings).stationary
+        if len(spans) and spans[0, 0] > recording.start + _AT_ONCE:
+            length = float(spans[0, 1] - spans[0, 0])
+            return float(spans[0, 0]) + 0.25 * length, min(1.0, 0.5 * length)
+    return recording.start, 1.0
 
 
 def _in_motion(

@@ -76,7 +76,7 @@ class StandstillSettings(_Section):
     """What is used where the platform stands still."""
 
     zero_velocity: bool = Field(True, description="no velocity")
-    zero_rate: bool = Field(True, description="no turn rate (vehicles only: a foot rolls over its stance)")
+    zero_rate: bool = Field(True, description="no turn rate (of a foot: not in its stances, but where it stands)")
     held_position: bool = Field(True, description="one place for a whole stop")
 
 
@@ -107,6 +107,39 @@ class VehicleSettings(_Section):
     robust: Kernel = Field("none", description="robust kernel of the smoother")
     robust_scale: float = Field(3.0, gt=0, description="whitened norm of a row at which the kernel bends")
     gate: float | None = Field(None, gt=0, description="whitened norm above which the filter rejects a row")
+
+
+class FootSettings(_Section):
+    """What is used of a foot's way over the floor and through the air."""
+
+    rate: float = Field(20.0, gt=0, le=200, description="Hz, keyframes within a stance and within a swing")
+    stance: bool = Field(True, description="where the shoe touches the floor it does not move")
+    still: float = Field(0.01, gt=0, description="m/s, 1-sigma of a stance in which nothing turns")
+    rolling: float = Field(0.02, ge=0, description="m, 1-sigma of where the pivot is; times the turn rate")
+    correlation: float = Field(0.2, ge=0, description="s, over which the errors of a stance are one")
+    pivot_sigma: float = Field(0.1, gt=0, description="m, 1-sigma of the pivot's place about the IMU, estimated")
+    travel_sigma: float = Field(0.1, gt=0, description="m, 1-sigma of how far it travels either way, estimated")
+    half_stance: float = Field(0.2, gt=0, description="s after landing and before leaving in which the pivot travels")
+    lateral: bool = Field(False, description="no sideways speed in swing")
+    sideways: float = Field(0.1, gt=0, description="m/s, 1-sigma of the mean sideways speed of a swing")
+    turn: float = Field(10.0, gt=0, description="deg by which a foot turns in a swing that double that")
+    axis_sigma: float = Field(20.0, gt=0, description="deg, 1-sigma of the foot's sideways axis in the body's")
+    closed_loop: float | None = Field(
+        None, gt=0, description="m, 1-sigma; given, the end is the start (only without GNSS)"
+    )
+    robust: Kernel = Field("none", description="robust kernel of the smoother")
+    robust_scale: float = Field(3.0, gt=0, description="whitened norm of a row at which the kernel bends")
+    gate: float | None = Field(None, gt=0, description="whitened norm above which the filter rejects a row")
+
+
+class StanceSettings(_Section):
+    """Where a foot is on the floor."""
+
+    window: float = Field(0.05, gt=0, le=1, description="s, length of a window")
+    threshold: float = Field(1.5, gt=0, description="rad/s, of the statistic, between stance and swing")
+    force_per_rate: float = Field(5.7, gt=0, description="m/s^2 of force that weigh as much as 1 rad/s")
+    shortest: float = Field(0.06, ge=0, description="s, the shortest stance")
+    bridge: float = Field(0.03, ge=0, description="s, the longest disturbance within a stance")
 
 
 class SwaySettings(_Section):
@@ -162,6 +195,7 @@ class DetectorSettings(_Section):
     glrt: GlrtSettings = GlrtSettings()
     fft: FftSettings = FftSettings()
     fusion: FusionSettings = FusionSettings()
+    stance: StanceSettings = StanceSettings()
 
 
 class SolverSettings(_Section):
@@ -183,6 +217,7 @@ class Settings(_Section):
     detectors: DetectorSettings = DetectorSettings()
     standstill: StandstillSettings = StandstillSettings()
     vehicle: VehicleSettings = VehicleSettings()
+    foot: FootSettings = FootSettings()
     solver: SolverSettings = SolverSettings()
 
     def without_wheels(self) -> Settings:

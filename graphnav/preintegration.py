@@ -96,7 +96,7 @@ class Samples:
     """IMU samples as pieces of constant rate and force, with gaps made explicit.
 
     `extra_gyro`, `extra_accel` are white densities squared ((rad/s)^2/Hz, (m/s^2)^2/Hz) on top of the
-    sensor's own, non-zero only where a gap is bridged.
+    sensor's own: where a gap is bridged, and what `graphnav.unresolved` adds for a foot.
     """
 
     t: Array  # (N,) end of each sample's period
@@ -368,7 +368,7 @@ def _summed(terms: Array) -> Array:
 def _white_noise(samples: Samples, imu: Imu, dt: Array, index: Array) -> tuple[Array, Array]:
     """Variances (L, n) of the integrals of white rate and force noise over each piece."""
     qg, qa = imu.noise.gyro_noise_density**2 * dt, imu.noise.accel_noise_density**2 * dt
-    if len(samples.bridged):
+    if samples.extra_gyro.any() or samples.extra_accel.any():
         qg, qa = qg + samples.extra_gyro[index] * dt, qa + samples.extra_accel[index] * dt
     return qg, qa
 

@@ -16,6 +16,7 @@ from graphnav.preintegration import Intervals, Samples, bridge_gaps, preintegrat
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.state import DIM, Parameter, States
+from graphnav.unresolved import with_unresolved_motion
 
 NODE_SPACING = 5.0  # s between the nodes of a slowly moving parameter: a twentieth of the shortest correlation time
 
@@ -88,6 +89,8 @@ def pose(
     wanted = [cls.epochs(recording, settings, stops) for cls in classes]
     t = keyframe_times(recording.start, recording.end, np.concatenate([*wanted, np.empty(0)]), settings.keyframes.rate)
     samples = bridge_gaps(recording.imu)
+    if recording.platform == "foot":
+        samples = with_unresolved_motion(samples, recording.imu.noise)
     intervals = preintegrate(samples, recording.imu, t, start.ba[0], start.bg[0])
     scene = Scene(recording, settings, frame, t, stops, intervals)
     built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
@@ -103,7 +106,7 @@ def pose(
         prior=prior,
         constraints=built,
         chains=_chains((*scale_parameter(recording.imu.noise), *(p for rows in built for p in rows.parameters)), t),
-        notes=_notes(samples, recording),
+        notes=(*_notes(samples, recording), *(note for rows in built for note in rows.notes)),
     )
 
 

@@ -16,9 +16,9 @@ ROOMS = [
     "errors", "rotation", "earth", "state", "config", "recording", "trajectory",
     "formats", "draft", "allan", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding",
     "checks", "detectors",
-    "preintegration", "dynamics", "constraints", "problem", "solution", "alignment",
+    "preintegration", "unresolved", "dynamics", "constraints", "problem", "solution", "alignment",
     "dense", "solvers", "judgement", "pipeline",
-    "interpolation", "metrics", "scoring", "evaluation", "exporters",
+    "interpolation", "metrics", "scoring", "strides", "evaluation", "exporters",
     "panels", "page", "plots", "report_tables", "report_pictures", "report",
     "workflow", "outputs", "convert", "terminal", "detection_pictures", "detection_report", "cli_logs", "cli",
 ]  # fmt: skip

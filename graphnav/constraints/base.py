@@ -67,6 +67,7 @@ class Constraint(ABC):
     robust: str = "none"
     robust_scale: float = 3.0
     gate: float | None = None
+    notes: tuple[str, ...] = ()  # sentences that whoever reads the result must know
 
     def __len__(self) -> int:
         return len(self.keyframe)

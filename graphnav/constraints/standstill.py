@@ -6,6 +6,8 @@ Skog et al. 2010 (zero velocity), Li 2024 (the same, found by the engine's idlin
     zero rate:       omega_b - b_g - R_nb^T omega_n        mean over the interval that ends at the keyframe
     held position:   p - a                                 a: one unknown place for each stop
 
+For a foot the first and the last give way to `graphnav.constraints.foot`; the second holds where it really stands.
+
 A body on springs is not perfectly still: passengers move it, the engine shakes it. How much, the recording says
 itself: the scatter of the one-interval means of force and rate around their median, over a few intervals, is what
 the sigmas are made of, on top of the sensors' own noise. A force that scatters by s moves a body that sways at 1 Hz
@@ -32,6 +34,9 @@ _NEIGHBOURS = 5  # intervals over which unrest is looked for
 _SWAY = 2.0 * np.pi  # rad/s, the slowest swaying of a body on springs
 _STILL_V, _STILL_P = 1e-3, 1e-3  # m/s, m: no body stands stiller than this
 _FAR = 60.0  # m/s; times the seconds without a fix: how far from the last one a stop may be
+_ROLLING = 0.1  # rad/s; a foot that rolls over its stance turns quicker
+_SLOW = 0.3  # s, about a quarter of a period of a standing body's sway
+_STANDING = 0.6  # s; in a walk no stance is that quiet for so long
 _I3 = np.eye(3)
 
 
@@ -44,6 +49,23 @@ def standing_intervals(scene: Scene) -> tuple[Array, Array]:
     inside = (stop >= 0) & (iv.t1 <= spans[np.maximum(stop, 0), 1] + SAME_TIME)
     rows = np.flatnonzero(inside)
     return rows, stop[rows]
+
+
+def _unmoved(scene: Scene, rows: Array, stop: Array) -> tuple[Array, Array]:
+    """Those of the intervals in which a foot does not roll over its stance but stands, and in which standing.
+
+    They last together for longer than any stance of a walk is that quiet, at less than the rate of the slowest rolling.
+    """
+    iv = scene.intervals
+    rate = iv.rate[rows]
+    usual = np.empty((len(rows), 3))
+    for one in np.unique(stop):
+        usual[stop == one] = np.median(rate[stop == one], axis=0)
+    still = np.linalg.norm(rate - usual, axis=1) < _ROLLING
+    run = np.cumsum(np.r_[True, (np.diff(stop) != 0) | (np.diff(still) != 0)][: len(rows)]) - 1
+    lasts = np.bincount(run, weights=iv.T[rows])
+    keep = still & (lasts[run] >= _STANDING)
+    return rows[keep], run[keep]
 
 
 def unrest(scene: Scene, rows: Array, stop: Array) -> tuple[Array, Array]:
@@ -83,7 +105,7 @@ class ZeroVelocity(_Standing):
     @classmethod
     def build(cls, scene: Scene) -> ZeroVelocity | None:
         rows, stop = standing_intervals(scene)
-        if not len(rows) or not scene.settings.standstill.zero_velocity:
+        if not len(rows) or not scene.settings.standstill.zero_velocity or scene.recording.platform == "foot":
             return None
         force, _ = unrest(scene, rows, stop)
         # the sway of a body is not known by axis in n: its largest for all
@@ -109,9 +131,14 @@ class ZeroRate(_Standing):
     @classmethod
     def build(cls, scene: Scene) -> ZeroRate | None:
         rows, stop = standing_intervals(scene)
-        if not len(rows) or not scene.settings.standstill.zero_rate or scene.recording.platform != "vehicle":
+        if scene.recording.platform == "foot":
+            rows, stop = _unmoved(scene, rows, stop)
+        if not len(rows) or not scene.settings.standstill.zero_rate:
             return None
         _, rate = unrest(scene, rows, stop)
+        if scene.recording.platform == "foot":
+            # a body sways slowly: what it does in one interval it does in the next
+            rate *= np.sqrt(np.maximum(1.0, _SLOW / scene.intervals.T[rows]))[:, None]
         own = scene.recording.imu.noise.gyro_noise_density / np.sqrt(scene.intervals.T[rows])
         return cls(
             keyframe=rows + 1,
@@ -140,7 +167,7 @@ class HeldPosition(_Standing):
     @classmethod
     def build(cls, scene: Scene) -> HeldPosition | None:
         rows, stop = standing_intervals(scene)
-        if not len(rows) or not scene.settings.standstill.held_position:
+        if not len(rows) or not scene.settings.standstill.held_position or scene.recording.platform == "foot":
             return None
         force, _ = unrest(scene, rows, stop)
         sigma = np.hypot(_STILL_P, force.max(axis=1, keepdims=True) / _SWAY**2)

@@ -10,6 +10,7 @@ from graphnav.detectors.fft import detect_fft
 from graphnav.detectors.fusion import candidates, fuse
 from graphnav.detectors.glrt import detect_windows, glrt_statistic
 from graphnav.detectors.motion import moving, speeds
+from graphnav.detectors.stance import detect_stances
 from graphnav.detectors.sway import detect_sway
 from graphnav.detectors.windows import blocks, low_pass
 from graphnav.earth import gravity
@@ -29,6 +30,8 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
     imu, period = recording.imu, period_of(recording.imu.t)
     if not recording.duration >= _SHORTEST or not period > 0.0:
         return Detections(NONE, (), (f"no detection: the recording is shorter than {_SHORTEST:g} s",))
+    if recording.platform == "foot":
+        return detect_stances(imu, period, d.stance)
     b = blocks(imu, period)
     low = low_pass(b)
     if not len(low.t):

@@ -124,6 +124,15 @@ def _minimise(problem: Problem, point: Point, progress: Progress | None, reinteg
             ahead = cost(problem, candidate, layout)
             if ahead < now or gain < settings.tolerance:
                 break
+            if damping == 0.0:
+                # an early heading swings all that comes after it along tangents, off the track by the square of
+                # the angle; the step after this one takes that back, and only then is it seen what both bring
+                second = layout.unpack(_eliminate(whitened(problem, candidate, layout), layout, 0.0).solve(layout.keys))
+                beyond = candidate.moved(second)
+                behind = cost(problem, beyond, layout)
+                if behind < now:
+                    candidate, ahead = beyond, behind
+                    break
             refused += 1
             damping = max(gentlest, 10.0 * damping)
             if damping > _MAX_DAMPING:

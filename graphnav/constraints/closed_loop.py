@@ -1,0 +1,44 @@
+"""The end is the start, where somebody says so: p_K - p_0, with p_0 where the frame begins.
+
+Only for recordings whose positions count from their start (no GNSS), and never where the closure itself is what is
+to be judged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.base import Constraint, Linearized, Scene
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+from graphnav.state import States
+
+
+@dataclass(frozen=True)
+class ClosedLoop(Constraint):
+    """One row at the last keyframe."""
+
+    name: ClassVar[str] = "closed_loop"
+    axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
+    unit: ClassVar[str] = "m"
+
+    sigma: Array = field(default_factory=lambda: np.empty((0, 3)))
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        return np.empty(0)  # the last keyframe is always there
+
+    @classmethod
+    def build(cls, scene: Scene) -> ClosedLoop | None:
+        sigma, gnss = scene.settings.foot.closed_loop, scene.recording.gnss
+        if sigma is None or scene.recording.platform != "foot" or (gnss is not None and len(gnss.t)):
+            return None
+        note = f"the end is set to be the start, to {sigma:g} m (closed_loop): the closure is no measure"
+        return cls(keyframe=np.array([len(scene.t) - 1]), sigma=np.full((1, 3), sigma), notes=(note,))
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        return Linearized(states.p, {"p": np.broadcast_to(np.eye(3), (len(states), 3, 3))}, self.sigma[rows])

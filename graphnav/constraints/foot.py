@@ -1,0 +1,169 @@
+"""What a foot allows: where the shoe is on the floor it does not slide, and in the air it goes where it points.
+
+Ren 2021 takes the IMU's velocity as zero in stance and its sideways velocity as zero in swing (eq. 6-9, 16-19). Both
+are nearly true only, and what is missing is not noise. Over the floor a shoe rolls, from the heel at its landing to
+the toes where it takes off, and the IMU on top of it, 5 to 15 cm above the sole, goes forward meanwhile: at
+0.2 rad/s in the middle of a stance 2 cm/s, 1.5 % of the way of a walk. What does not move is where shoe and floor
+touch. So the rows of `Stance` say, of the mean over each interval within a stance (see `constraints.vehicle.Past`),
+
+    mean of  v_b + omega_nb x (l + c d)  =  0          l: pivot,  d = (d_x, d_y, 0): its travel,  c: -1 ... 1
+
+with the lever arm l from the IMU to the middle of the rolling and its travel d along the sole both estimated. c goes
+from -1 at the landing to 0 in `half_stance` and from 0 to 1 in as much before the foot leaves the floor; in a long
+stance, and in standing, nothing turns in between.
+
+What is left is a share of the turn rate (the pivot is not a point, the sole gives way) and a little more:
+
+    sigma^2 = (still^2 + (rolling |omega|)^2) max(1, tau / T)
+
+The second factor is for errors that last: over a time tau they are one error, not one per interval of length T.
+
+In swing the foot hardly goes sideways. `FootLateral` says of the mean over each interval
+
+    u_x + a u_y + b u_z  =  0                          a, b: the foot's own sideways axis in the body's, estimated
+
+with a density made so that a whole swing counts as one row of `sideways`, wider by what the foot turns in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from graphnav import rotation
+from graphnav.config import Settings
+from graphnav.constraints.base import Constraint, Linearized, Scene
+from graphnav.constraints.standstill import standing_intervals
+from graphnav.constraints.vehicle import Past
+from graphnav.dynamics import scale_parameter
+from graphnav.recording import Recording
+from graphnav.rotation import Array, mv
+from graphnav.state import Parameter, States
+
+PIVOT = "pivot"
+TRAVEL = "pivot_travel"
+FOOT_AXIS = "foot_axis"
+_SHORTEST = 0.01  # s; a mean over less says nothing
+
+
+@dataclass(frozen=True)
+class Stance(Constraint):
+    """Where the shoe touches the floor it does not move."""
+
+    name: ClassVar[str] = "stance"
+    axes: ClassVar[tuple[str, ...]] = ("right", "forward", "up")
+    unit: ClassVar[str] = "m/s"
+
+    past: Past | None = None
+    phase: Array = field(default_factory=lambda: np.empty(0))  # (N,) c
+    sigma: Array = field(default_factory=lambda: np.empty((0, 3)))
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        """Both ends of every stance, and in stance and swing as many between them as `foot.rate` asks for."""
+        if recording.platform != "foot" or not len(stationary):
+            return np.empty(0)
+        edges = np.unique(np.concatenate([[recording.start], stationary.ravel(), [recording.end]]))
+        parts = np.maximum(1, np.rint(np.diff(edges) * settings.foot.rate).astype(int))
+        step = np.repeat(np.diff(edges) / parts, parts)
+        within = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
+        return np.asarray((np.repeat(edges[:-1], parts) + within * step)[1:])
+
+    @classmethod
+    def build(cls, scene: Scene) -> Stance | None:
+        s, iv = scene.settings.foot, scene.intervals
+        rows, stop = standing_intervals(scene)
+        if scene.recording.platform != "foot" or not len(rows) or not s.stance:
+            return None
+        span, t = scene.stationary[stop], 0.5 * (iv.t0 + iv.t1)[rows]
+        half = np.minimum(0.5 * (span[:, 1] - span[:, 0]), s.half_stance)
+        landed, leaves = np.minimum(t - span[:, 0], half) / half, np.minimum(span[:, 1] - t, half) / half
+        past = Past.of(iv, rows, scene.frame)
+        turning = np.linalg.norm(past.rate - np.median(past.rate, axis=0), axis=1)
+        sigma = np.hypot(s.still, s.rolling * turning) * np.sqrt(np.maximum(1.0, s.correlation / iv.T[rows]))
+        return cls(
+            keyframe=rows + 1,
+            past=past,
+            phase=landed - leaves,
+            sigma=np.repeat(sigma[:, None], 3, axis=1),
+            parameters=(
+                *scale_parameter(scene.recording.imu.noise),
+                Parameter(PIVOT, np.zeros(3), np.full(3, s.pivot_sigma), "m"),
+                Parameter(TRAVEL, np.zeros(2), np.full(2, s.travel_sigma), "m"),
+            ),
+            robust=s.robust,
+            robust_scale=s.robust_scale,
+            gate=s.gate,
+        )
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        assert self.past is not None
+        phase = self.phase[rows][:, None]
+        lever = parameters[PIVOT].copy()
+        lever[:, :2] += phase * parameters[TRAVEL]
+        u, omega, _, J, _ = self.past.velocity(states, parameters, rows, lever)
+        by_lever = rotation.skew(omega)
+        J |= {PIVOT: by_lever, TRAVEL: phase[..., None] * by_lever[..., :2]}
+        return Linearized(u, J, self.sigma[rows])
+
+
+@dataclass(frozen=True)
+class FootLateral(Constraint):
+    """In the air a foot goes where it points."""
+
+    name: ClassVar[str] = "foot_lateral"
+    axes: ClassVar[tuple[str, ...]] = ("sideways",)
+    unit: ClassVar[str] = "m/s"
+
+    past: Past | None = None
+    sigma: Array = field(default_factory=lambda: np.empty((0, 1)))
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        return np.empty(0)  # those of the stances will do
+
+    @classmethod
+    def build(cls, scene: Scene) -> FootLateral | None:
+        s, iv = scene.settings.foot, scene.intervals
+        if scene.recording.platform != "foot" or not len(scene.stationary) or not s.lateral:
+            return None
+        moving = iv.T > _SHORTEST
+        moving[standing_intervals(scene)[0]] = False
+        rows = np.flatnonzero(moving)
+        past = Past.of(iv, rows, scene.frame)
+        # a swing lies between two stances; the heading changes in it by the integral of the turn rate about the
+        # vertical, which the force points to in the mean of a swing
+        swing = np.searchsorted(scene.stationary[:, 0], iv.t0[rows])
+        lasts = np.bincount(swing, weights=iv.T[rows])[swing]
+        turned = np.abs(_turn(past, iv.T[rows], swing))[swing]
+        sigma = s.sideways * (1.0 + turned / np.radians(s.turn)) * np.sqrt(np.maximum(1.0, lasts / iv.T[rows]))
+        return cls(
+            keyframe=rows + 1,
+            past=past,
+            sigma=sigma[:, None],
+            parameters=(
+                *scale_parameter(scene.recording.imu.noise),
+                Parameter(FOOT_AXIS, np.zeros(2), np.full(2, np.radians(s.axis_sigma)), "rad"),
+            ),
+            robust=s.robust,
+            robust_scale=s.robust_scale,
+            gate=s.gate,
+        )
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        assert self.past is not None
+        u, _, _, J, _ = self.past.velocity(states, parameters, rows, np.zeros((len(states), 3)))
+        axis = np.concatenate([np.ones((len(states), 1)), parameters[FOOT_AXIS]], axis=1)[:, None]
+        J = {name: axis @ x for name, x in J.items()} | {FOOT_AXIS: u[:, None, 1:]}
+        return Linearized(mv(axis, u), J, self.sigma[rows])
+
+
+def _turn(past: Past, T: Array, swing: Array) -> Array:
+    """Angle (M,) by which the foot's heading changes in each swing, rad, from the rates of its intervals (N,)."""
+    count = int(swing.max()) + 1 if len(swing) else 0
+    total = np.zeros((count, 2, 3))
+    np.add.at(total, swing, np.stack([past.rate, past.force], 1) * T[:, None, None])
+    up = total[:, 1] / np.maximum(np.linalg.norm(total[:, 1], axis=1, keepdims=True), 1e-12)
+    return np.asarray(np.einsum("mi,mi->m", total[:, 0], up))

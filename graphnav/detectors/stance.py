@@ -1,0 +1,90 @@
+"""Where a foot is on the floor: the GLRT (Skog et al. 2010, eq. 9; Ren 2021, eq. 3-5) in units of turn rate.
+
+What keeps a foot in stance from reading like one at rest is not the noise of its sensors, but that the shoe rolls
+over the floor. So the sigmas of the test are not the sensors' but those of rolling, and it reads
+
+    e^2 = mean |omega_k - b|^2 + mean |f_k - g f_bar/|f_bar||^2 / c^2            over `window`
+
+with b, g the mean rate and the size of the mean force of the quietest second of the recording, which hold the biases.
+e is the turn rate of a foot that moves that much. c, m/s^2 per rad/s, is what a force must differ by to weigh as much
+as a turn rate; it is that of Skog's sigmas, 0.01 m/s^2 to 0.1 deg/s.
+
+In the swing of any walk e is several rad/s, in the middle of a stance some tenths. The threshold lies between them,
+at 1.5 rad/s, where an IMU 10 cm above the floor moves at 0.15 m/s, a twentieth of what it does in swing. It need not
+be sharp, because the rows of `graphnav.constraints.foot` account for the rolling and weigh less the more of it there
+is. What must not happen is to take part of a swing for a stance: the slow first step of a walk has a moment in which
+force and rate are low. But such a moment is not as deep as stances are. So spans whose lowest e stands out from
+that of all spans, by three of their spreads (median absolute deviation, in log e), are left out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.config import StanceSettings
+from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, merged, spans_of
+from graphnav.detectors.glrt import glrt_statistic
+from graphnav.detectors.windows import running, unbroken
+from graphnav.recording import Imu
+from graphnav.rotation import Array
+
+_QUIET = 1.0  # s; the quietest of the recording says what bias and gravity are
+_GAP = 3.0  # sample periods; a longer silence is no stance
+_ENOUGH = 5  # spans, to say what is usual
+_LEAST_SPREAD = 0.3  # of log e, between the stances of the most even walk
+_SPREADS = 3.0
+
+
+def detect_stances(imu: Imu, period: float, settings: StanceSettings) -> Detections:
+    """Stances of a foot, and e with the threshold they come from.
+
+    Parameters
+    ----------
+    period : s between rows.
+    """
+    window = max(3, round(settings.window / period))
+    if len(imu.t) < window:
+        return Detections(NONE, (), ("no detection: the recording is shorter than a window",))
+    bias, g = _quietest(imu, period)
+    e = np.sqrt(glrt_statistic(imu.accel, imu.gyro - bias, window, settings.force_per_rate, 1.0, g))
+    t = 0.5 * (imu.t[: len(e)] + imu.t[window - 1 :]) - 0.5 * period  # a row speaks for the period before it
+    whole = unbroken(np.r_[True, np.diff(imu.t) < _GAP * period], window)
+    e = np.where(whole, e, np.nan)
+    below = e < settings.threshold
+    spans = longer_than(merged(spans_of(below, t, 0.5 * period), settings.bridge), settings.shortest)
+    # windows begin and end inside the recording: its first and last stance reach to its ends
+    half = 0.5 * window * period
+    if len(spans) and spans[0, 0] < imu.t[0] + half:
+        spans[0, 0] = imu.t[0] - period
+    if len(spans) and spans[-1, 1] > imu.t[-1] - half - period:
+        spans[-1, 1] = imu.t[-1]
+    kept = spans[_as_deep_as_others(spans, t, e)]
+    notes = (
+        () if len(kept) == len(spans)
+        else (f"{len(spans) - len(kept)} short lulls that do not reach as deep as the stances were left out",)
+    )  # fmt: skip
+    found = Detection("stance", t, e, settings.threshold, below, spans)
+    answer = Detection("fused", t, e, settings.threshold, inside(t, kept), kept, notes)
+    return Detections(kept, (found, answer), notes)
+
+
+def _quietest(imu: Imu, period: float) -> tuple[Array, float]:
+    """Mean rate (3,) and size of the mean force of the second in which both scatter least."""
+    n = min(len(imu.t), max(2, round(_QUIET / period)))
+    rows = np.column_stack([imu.gyro, imu.accel])
+    means, squares = running(rows).means(n), running(rows**2).means(n)
+    scatter = squares - means**2
+    # each against its own typical scatter, so that neither unit decides
+    total = np.sum(scatter / np.maximum(np.median(scatter, axis=0), 1e-12), axis=1)
+    k = int(np.argmin(total))
+    return means[k, :3], float(np.linalg.norm(means[k, 3:]))
+
+
+def _as_deep_as_others(spans: Array, t: Array, e: Array) -> Array:
+    """(M,) bool, which spans reach about as low as the others do."""
+    if len(spans) < _ENOUGH:
+        return np.ones(len(spans), dtype=bool)
+    depth = np.array([np.log(np.nanmin(e[slice(*np.searchsorted(t, span))])) for span in spans])
+    middle = float(np.median(depth))
+    spread = max(1.4826 * float(np.median(np.abs(depth - middle))), _LEAST_SPREAD)
+    return np.asarray(depth < middle + _SPREADS * spread)

@@ -1,0 +1,96 @@
+"""How a walk without a place on the Earth is judged: by shape, strides, height and closure.
+
+A solution's position and heading count from zero at its start, a truth in a local frame from anywhere. For the shape,
+yaw and offset are fitted over all epochs, as in `graphnav.scoring`. For consistency that would be wrong: the solution
+is certain of its start and says of all else how far from there it may be. So the truth is moved to the solution where
+it begins, and only the yaw is fitted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.interpolation import fit_yaw
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+from graphnav.scoring import closure
+from graphnav.solution import Solution
+from graphnav.trajectory import Trajectory
+
+_SPACING = 0.1  # s between the epochs compared with a dense truth
+_STANDS = 1.0  # s at the start of which a dense truth is averaged to place it
+_A_STRIDE = 0.3  # m; points closer together are no stride
+
+
+@dataclass(frozen=True)
+class WalkErrors:
+    """Of one solution; NaN where the truth does not tell. Sizes in m, NEES per degree of freedom (1 where true)."""
+
+    horizontal: float  # rms after the fit; of a loop, start to end
+    up: float  # rms with the start's height taken off; of a loop, end less start
+    stride: float  # median of stride length over its truth; 1 where there is no bias
+    nees_h: float
+    nees_up: float
+
+
+def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0.0) -> WalkErrors:
+    """Errors of a walk against the recording's truth.
+
+    Parameters
+    ----------
+    truth_sigma : m, of a coordinate of the truth, added to the solution's own in the NEES: its noise, and how far its
+        point lies from the IMU where that is not known.
+
+    Raises
+    ------
+    ValueError
+        If the recording has no truth in a local frame and is no loop.
+    """
+    truth = recording.truth
+    if truth is not None and truth.closed_loop_sigma is not None:
+        return _of_loop(solution, truth.closed_loop_sigma)
+    if truth is None or truth.xyz is None:
+        raise ValueError(f"'{recording.name}' has no truth in a local frame and is no loop")
+    t, X = truth.t, truth.xyz
+    inside = (t >= solution.t[0]) & (t <= solution.t[-1]) & np.isfinite(X).all(axis=1)
+    t, X = t[inside], X[inside]
+    first = X[t <= t[0] + _STANDS].mean(axis=0) if X.shape[1] == 3 else X[0]
+    if X.shape[1] == 3:
+        _, rows = np.unique(np.floor((t - t[0]) / _SPACING), return_index=True)
+        t, X = t[rows], X[rows]
+    _, states, covariance = solution.at(t)
+    p, P = states.p, covariance[:, 3:6, 3:6]
+    flat = np.column_stack([X[:, :2], np.zeros(len(X))])
+    yaw, offset = fit_yaw(flat, p * [1.0, 1.0, 0.0])
+    fitted = _turned(X[:, :2], yaw) + offset[:2]
+    # about the start
+    at_start = p[0, :2] if X.shape[1] == 2 else p[t <= t[0] + _STANDS, :2].mean(axis=0)
+    a, b = X[:, :2] - first[:2], p[:, :2] - at_start
+    anchored = _turned(a, float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))))
+    e = b - anchored
+    R = truth_sigma**2
+    nees_h = 0.5 * np.einsum("ni,nij,nj->n", e, np.linalg.inv(P[:, :2, :2] + R * np.eye(2)), e)
+    up = nees_up = stride = np.nan
+    if X.shape[1] == 3:
+        height = p[:, 2] - X[:, 2] - np.mean((p[:, 2] - X[:, 2])[t <= t[0] + _STANDS])
+        up, nees_up = float(np.sqrt(np.mean(height**2))), float(np.mean(height**2 / (P[:, 2, 2] + R)))
+    else:
+        true, mine = (np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1) for x in (X, p))
+        stride = float(np.median((mine / true)[true > _A_STRIDE]))
+    horizontal = float(np.sqrt(np.mean(np.sum((p[:, :2] - fitted) ** 2, axis=1))))
+    return WalkErrors(horizontal, up, stride, float(np.mean(nees_h)), nees_up)
+
+
+def _of_loop(solution: Solution, sigma: float) -> WalkErrors:
+    p, P = solution.states.p, solution.covariance[-1][3:6, 3:6] + sigma**2 * np.eye(3)
+    found = closure(Trajectory(solution.t, p, frame="local"))
+    off = p[-1] - p[0]
+    nees_h = 0.5 * float(off[:2] @ np.linalg.solve(P[:2, :2], off[:2]))
+    return WalkErrors(found.horizontal, found.vertical, np.nan, nees_h, float(off[2] ** 2 / P[2, 2]))
+
+
+def _turned(x: Array, yaw: float) -> Array:
+    c, s = np.cos(yaw), np.sin(yaw)
+    return x @ np.array([[c, s], [-s, c]])
