@@ -1,0 +1,240 @@
+"""A window over the newest keyframes: exact smoothing with bounded time and memory.
+
+Keyframes enter one by one (`graphnav.solvers.stages`); the newest message is what a filter would hold. Back through
+the stages go means and covariances (Rauch, Tung, Striebel in information form). A keyframe that is older than the
+lag leaves the window: its state is settled, and the message behind it is the marginal of all the past, a Gaussian on
+what the future still touches. Where a state has moved so far that its rows should be linearised anew, the stages
+from there on are made again about the smoothed states: Gauss-Newton on the window. A measurement that comes late
+does the same from its own time on. With a lag longer than the drive this is the batch solution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav import rotation
+from graphnav.rotation import Array
+from graphnav.solvers.stages import (
+    Columns,
+    Message,
+    Place,
+    Stage,
+    at_points,
+    eliminate,
+    extended,
+    measured,
+    predicted,
+    width,
+)
+from graphnav.state import DIM, States
+
+TURN = 1e-3  # rad; what is neglected of a turn a is a^2/2 of what it turns: 8 um/s of 15 m/s
+_DELAY = 5e-3  # s, of a delay: with 2 m/s^2 of acceleration 1 cm/s
+_ROUNDS = 5
+_LIMITS = {"rad": TURN, "s": _DELAY}
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """Some keyframes with all that the window knows: states, covariances, and the parameters there."""
+
+    t: Array  # (n,)
+    states: States
+    covariance: Array  # (n, 15, 15)
+    columns: tuple[Columns, ...]
+    values: tuple[Array, ...]  # (D-15,) each
+    sigma: tuple[Array, ...]  # (D-15,) each
+    places: tuple[Place, ...]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+class Window:
+    """The newest keyframes of a drive.
+
+    Parameters
+    ----------
+    prior : message on the first keyframe before any measurement, from `first_message`.
+    """
+
+    def __init__(self, prior: Message) -> None:
+        self.head = prior  # all that is known before the first stage
+        self.stages: list[Stage] = []
+        self.relinearized = 0  # stages made anew
+        self._limit = _limits(prior.columns, {})
+
+    def __len__(self) -> int:
+        return len(self.stages)
+
+    @property
+    def newest(self) -> Message:
+        """What is known of the newest keyframe: the live estimate is its point."""
+        return self.stages[-1].message if self.stages else self.head
+
+    @property
+    def t(self) -> Array:
+        """Times of the keyframes in the window, s."""
+        return np.array([stage.place.t for stage in self.stages])
+
+    def push(self, place: Place) -> float:
+        """Add a keyframe, linearised at its prediction; returns by how much its measurements turned it, rad."""
+        before = self.newest
+        state, values, columns, link = predicted(before, place)
+        linear = measured(place, state, values, columns)
+        if link is not None:
+            linear = type(linear)(link, linear.measured)
+        stage = eliminate(before, place, linear, state, values, columns)
+        e = stage.message.estimate
+        self.stages.append(stage.moved(e))
+        if len(columns) > len(self._limit[0]):
+            self._limit = _limits(columns, {p.name: p.unit for c in place.problem.constraints for p in c.parameters})
+        return float(np.linalg.norm(e[:3]))
+
+    def truncate(self, keep: int) -> None:
+        """Forget all but the first `keep` stages: something before what follows has changed."""
+        del self.stages[keep:]
+        if self.stages:
+            self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
+        else:
+            self.head = self.head.moved(self.head.estimate)
+
+    def means(self) -> list[Array]:
+        """Smoothed error states, one of the message before the window and one of each stage."""
+        e = self.newest.estimate
+        out = [e]
+        for stage in reversed(self.stages):
+            e = stage.g + stage.G @ e
+            out.append(e)
+        return out[::-1]
+
+    def settle(self, count: int) -> Smoothed:
+        """Smooth the window and let its first `count` stages go."""
+        means = self.means()
+        P = self.newest.covariance
+        covariances = []
+        for k in range(len(self.stages) - 1, -1, -1):
+            stage = self.stages[k]
+            if k < count:
+                covariances.append(P)
+            if k:
+                P = stage.G @ P @ stage.G.T
+                P[np.ix_(stage.lost, stage.lost)] += stage.C
+        gone, rows = self.stages[:count], []
+        sigma = []
+        for stage, e, P in zip(gone, means[1 : count + 1], reversed(covariances), strict=True):
+            J = np.eye(DIM)
+            J[:3, :3] = rotation.right_jacobian(e[None, :3])[0]
+            rows.append((stage.message.state.plus(e[None, :DIM]), J @ P[:DIM, :DIM] @ J.T))
+            sigma.append(np.sqrt(np.maximum(np.diagonal(P)[DIM:], 0.0)))
+        if gone:
+            self.head = gone[-1].message
+            del self.stages[:count]
+            if not self.stages:
+                self.head = self.head.moved(self.head.estimate)
+        return Smoothed(
+            t=np.array([stage.place.t for stage in gone]),
+            states=States.stack([state for state, _ in rows]) if rows else self.head.state[:0],
+            covariance=np.array([P for _, P in rows]).reshape(-1, DIM, DIM),
+            columns=tuple(stage.message.columns for stage in gone),
+            values=tuple(s.message.values + e[DIM:] for s, e in zip(gone, means[1 : count + 1], strict=True)),
+            sigma=tuple(sigma),
+            places=tuple(stage.place for stage in gone),
+        )
+
+    # ------------------------------------------------------------------------------------------ linearising again
+    def first_moved(self, share: float = 1.0) -> int | None:
+        """The first stage whose point is further than its limit from the smoothed state; None if there is none."""
+        columns, limit = self._limit
+        for k, e in enumerate(self.means()[1:]):
+            if np.dot(e[:3], e[:3]) > (share * TURN) ** 2 or np.any(np.abs(e[DIM:]) > share * limit[: len(e) - DIM]):
+                return k
+        return None
+
+    def relinearize(self, first: int, places: Sequence[Place] | None = None) -> None:
+        """Make the stages from `first` on anew about the smoothed states.
+
+        `places` are where their rows come from, if not where they came from before; all of one problem.
+        """
+        means = self.means()
+        old = self.stages[first:]
+        places = places or [stage.place for stage in old]
+        before = self.stages[first - 1].message if first else self.head
+        self.stages[first:] = []
+        if first:
+            self.stages[-1] = self.stages[-1].moved(means[first])
+        else:
+            self.head = self.head.moved(means[0])
+        points = [before.moved(means[first])]
+        points += [stage.message.moved(e) for stage, e in zip(old, means[first + 1 :], strict=True)]
+        self.stages += remade(points, places)
+        self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
+        self.relinearized += len(places)
+
+    def converge(self, share: float = 1.0, always: bool = False) -> int:
+        """Relinearise until nothing has moved; returns how often. `always`: once at least."""
+        for count in range(_ROUNDS):
+            first = 0 if always and not count else self.first_moved(share)
+            if first is None:
+                return count
+            self.relinearize(first)
+        return _ROUNDS
+
+
+def first_message(state: States, sigma: Array) -> Message:
+    """A prior: one state and its fifteen sigmas."""
+    return Message(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM))
+
+
+def remade(points: Sequence[Message], places: Sequence[Place]) -> list[Stage]:
+    """Stages about given points, `points[0]` being the message before them."""
+    before, out = points[0], []
+    for run in _runs(points, places):
+        part = [points[k + 1] for k in run]
+        own = [places[k] for k in run]
+        linked = own[0].linked
+        around = [points[run[0]], *part] if linked else part
+        columns = part[-1].columns
+        D = width(columns)
+        values = np.zeros((len(around), D - DIM))
+        for row, point in zip(values, around, strict=True):
+            row[: len(point.values)] = point.values
+        states = States.stack([point.state for point in around])
+        for place, point, linear in zip(own, part, at_points(own, states, values, columns, linked), strict=True):
+            stage = eliminate(before, place, linear, point.state, point.values, point.columns, weighted=True)
+            before = stage.message
+            out.append(stage)
+    return out
+
+
+def _runs(points: Sequence[Message], places: Sequence[Place]) -> list[list[int]]:
+    """Indices of places that can be linearised together: one problem, keyframe after keyframe, the same columns."""
+    runs: list[list[int]] = []
+    for k, place in enumerate(places):
+        last = places[k - 1] if runs else None
+        alike = (
+            last is not None
+            and place.linked == last.linked
+            and place.problem is last.problem
+            and place.k == last.k + 1
+            and points[k + 1].columns == points[k].columns
+        )
+        if alike:
+            runs[-1].append(k)
+        else:
+            runs.append([k])
+    return runs
+
+
+def _limits(columns: Columns, units: dict[str, str]) -> tuple[Columns, Array]:
+    """How far each parameter may move before rows are linearised anew."""
+    limit = np.full(width(columns) - DIM, np.inf)
+    for name, at in columns.items():
+        limit[at.start - DIM : at.stop - DIM] = _LIMITS.get(units.get(name, ""), np.inf)
+    return columns, limit
+
+
+__all__ = ["Message", "Place", "Smoothed", "Window", "extended", "first_message"]
