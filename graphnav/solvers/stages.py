@@ -245,11 +245,12 @@ def eliminate(
     """
     D0, D = len(before.z), width(columns)
     gone = [before.columns[s.name] for s in place.steps if s.name in before.columns]
-    parts = [np.arange(DIM if place.linked else 0), *(np.arange(at.start, at.stop) for at in gone)]
-    lost = np.concatenate(parts)
+    lost = np.arange(DIM if place.linked else 0)
+    if gone:
+        lost = np.concatenate([lost, *(np.arange(at.start, at.stop) for at in gone)])
     E = len(lost)
     # where each column of the message goes: to the eliminated ones in front, or to its own place behind them
-    to = E + np.arange(D0)
+    to = np.arange(E, E + D0)
     to[lost] = np.arange(E)
     steps = sum(len(s.mean) for s in place.steps)
     head = np.zeros((D0 + steps + (0 if linear.link is None else DIM), E + D + 1))
@@ -259,7 +260,11 @@ def eliminate(
         if np.any(shift):
             head[:D0, -1] -= before.R[:, :DIM] @ shift
             head[:D0, E : E + 3] = head[:D0, E : E + 3] @ rotation.right_jacobian_inverse(shift[None, :3])[0]
-    _same(before, place, values, head, D0)
+    moved = values[: D0 - DIM] - before.values
+    for at in gone:
+        moved[_shift(at)] = 0.0
+    if np.any(moved):  # parameters that stay are about the new point's values
+        head[:D0, -1] -= before.R[:, DIM:] @ moved
     row = D0
     for step in place.steps:
         at = columns[step.name]
@@ -288,25 +293,15 @@ def eliminate(
     if info:
         raise EstimationError(f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units")
     G, g = np.zeros((D0, D)), np.zeros(D0)
-    kept = np.setdiff1d(np.arange(D0), lost)
+    kept = np.arange(D0)
     G[kept, kept] = 1.0
-    g[kept[kept >= DIM]] = (values[: D0 - DIM] - before.values)[kept[kept >= DIM] - DIM]
+    g[DIM:] = values[: D0 - DIM] - before.values
     G[lost], g[lost] = -root @ R[:E, E : E + D], root @ R[:E, -1]
     if not place.linked and np.any(state.minus(before.state)):
         shift = state.minus(before.state)[0]
         G[:DIM] = turned(G[:DIM], shift)
         g[:DIM] += shift
     return Stage(place, message, G, g, lost, root @ root.T)
-
-
-def _same(before: Message, place: Place, values: Array, head: Array, D0: int) -> None:
-    """Parameters that stay are about the point's own values: the message is moved there."""
-    moved = values[: D0 - DIM] - before.values
-    for step in place.steps:
-        if step.name in before.columns:
-            moved[_shift(before.columns[step.name])] = 0.0
-    if np.any(moved):
-        head[:D0, -1] -= before.R[:, DIM:] @ moved
 
 
 def _shift(columns: slice) -> slice:

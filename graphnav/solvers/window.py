@@ -31,10 +31,11 @@ from graphnav.solvers.stages import (
 )
 from graphnav.state import DIM, States
 
-TURN = 1e-3  # rad; what is neglected of a turn a is a^2/2 of what it turns: 8 um/s of 15 m/s
-_DELAY = 5e-3  # s, of a delay: with 2 m/s^2 of acceleration 1 cm/s
+TURN = 3e-3  # rad; what is neglected of a turn a is a^2/2 of what it turns: 0.05 mm/s of 10 m/s
+_DELAY = 0.02  # s, of a delay: 1 mm where speed is known to 5 cm/s
 _ROUNDS = 5
-_LIMITS = {"rad": TURN, "s": _DELAY}
+_ALMOST = 0.3
+_LIMITS = {"rad": 1e-2, "s": _DELAY}
 
 
 @dataclass(frozen=True)
@@ -161,18 +162,21 @@ class Window:
         """
         means = self.means()
         old = self.stages[first:]
-        places = places or [stage.place for stage in old]
-        before = self.stages[first - 1].message if first else self.head
-        self.stages[first:] = []
         if first:
-            self.stages[-1] = self.stages[-1].moved(means[first])
+            self.stages[first - 1] = self.stages[first - 1].moved(means[first])
+            before = self.stages[first - 1].message
         else:
-            self.head = self.head.moved(means[0])
-        points = [before.moved(means[first])]
-        points += [stage.message.moved(e) for stage, e in zip(old, means[first + 1 :], strict=True)]
-        self.stages += remade(points, places)
+            before = self.head = self.head.moved(means[0])
+        around = [before, *(stage.message for stage in old)]
+        moves = [np.zeros(len(before.z)), *means[first + 1 :]]
+        states = States.stack([m.state for m in around]).plus(np.array([e[:DIM] for e in moves]))
+        points = [
+            Point(states[k : k + 1], m.values + e[DIM:], m.columns)
+            for k, (m, e) in enumerate(zip(around, moves, strict=True))
+        ]
+        self.stages[first:] = remade(before, points, places or [stage.place for stage in old])
         self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
-        self.relinearized += len(places)
+        self.relinearized += len(old)
 
     def converge(self, share: float = 1.0, always: bool = False) -> int:
         """Relinearise until nothing has moved; returns how often. `always`: once at least."""
@@ -180,7 +184,8 @@ class Window:
             first = 0 if always and not count else self.first_moved(share)
             if first is None:
                 return count
-            self.relinearize(first)
+            # what has moved almost as far goes with it: it would be next
+            self.relinearize(min(first, self.first_moved(_ALMOST * share) or 0) if first else 0)
         return _ROUNDS
 
 
@@ -189,17 +194,24 @@ def first_message(state: States, sigma: Array) -> Message:
     return Message(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM))
 
 
-def remade(points: Sequence[Message], places: Sequence[Place]) -> list[Stage]:
-    """Stages about given points, `points[0]` being the message before them."""
-    before, out = points[0], []
+@dataclass(frozen=True)
+class Point:
+    """Where rows are linearised: one state, parameter values and where they stand."""
+
+    state: States
+    values: Array
+    columns: Columns
+
+
+def remade(before: Message, points: Sequence[Point], places: Sequence[Place]) -> list[Stage]:
+    """Stages about given points; `points[0]` is that of the message before them."""
+    out: list[Stage] = []
     for run in _runs(points, places):
+        linked, own = places[run[0]].linked, [places[k] for k in run]
         part = [points[k + 1] for k in run]
-        own = [places[k] for k in run]
-        linked = own[0].linked
         around = [points[run[0]], *part] if linked else part
         columns = part[-1].columns
-        D = width(columns)
-        values = np.zeros((len(around), D - DIM))
+        values = np.zeros((len(around), width(columns) - DIM))
         for row, point in zip(values, around, strict=True):
             row[: len(point.values)] = point.values
         states = States.stack([point.state for point in around])
@@ -210,7 +222,7 @@ def remade(points: Sequence[Message], places: Sequence[Place]) -> list[Stage]:
     return out
 
 
-def _runs(points: Sequence[Message], places: Sequence[Place]) -> list[list[int]]:
+def _runs(points: Sequence[Point], places: Sequence[Place]) -> list[list[int]]:
     """Indices of places that can be linearised together: one problem, keyframe after keyframe, the same columns."""
     runs: list[list[int]] = []
     for k, place in enumerate(places):
