@@ -21,8 +21,7 @@ from graphnav.solution import Solution, joined
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import Filtered, Progress, Smoothed, backward, ekf, rts
 
-SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
-KNOWN = ("ekf", "rts", "incremental", "batch")
+SOLVERS = ("ekf", "rts", "batch")
 _FAR = 0.5  # rad between the stated and the found start attitude
 _SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
 
@@ -39,7 +38,7 @@ def run(
     ----------
     recording : from `graphnav.load`.
     settings : default settings when None.
-    solvers : out of "ekf", "rts", "incremental", "batch".
+    solvers : out of "ekf", "rts", "batch".
     progress : called now and then with a stage and its share done, 0 to 1.
 
     Returns
@@ -53,9 +52,9 @@ def run(
         If the recording does not determine a trajectory.
     """
     settings = settings or Settings()
-    unknown = [name for name in solvers if name not in KNOWN]
+    unknown = [name for name in solvers if name not in SOLVERS]
     if unknown:
-        raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}")
+        raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(SOLVERS)}")
     frame = LocalFrame(_origin(recording))
     pieces, notes = _pieces(recording, settings)
     found: list[dict[str, Solution]] = []
@@ -119,114 +118,6 @@ def _solve(
         out["batch"] = batch(problem, start.states, start.nodes(problem), progress=progress)
         # what it took to get there is part of it
         out["batch"] = replace(out["batch"], timings={**forward.solution.timings, **out["batch"].timings})
-    if "incremental" in solvers:
-        begin = aligned.state if astray else None
-        out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
-
-SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
-KNOWN = ("ekf", "rts", "incremental", "batch")
-_FAR = 0.5  # rad between the stated and the found start attitude
-_SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
-
-
-def run(
-    recording: Recording,
-    settings: Settings | None = None,
-    solvers: tuple[str, ...] = SOLVERS,
-    progress: Progress | None = None,
-) -> dict[str, Solution]:
-    """Solve a recording with several solvers on exactly the same information.
-
-    Parameters
-    ----------
-    recording : from `graphnav.load`.
-    settings : default settings when None.
-    solvers : out of "ekf", "rts", "incremental", "batch".
-    progress : called now and then with a stage and its share done, 0 to 1.
-
-    Returns
-    -------
-    dict
-        Solver name to `Solution`, in the order asked for.
-
-    Raises
-    ------
-    EstimationError
-        If the recording does not determine a trajectory.
-    """
-    settings = settings or Settings()
-    unknown = [name for name in solvers if name not in KNOWN]
-    if unknown:
-        raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}")
-    frame = LocalFrame(_origin(recording))
-    pieces, notes = _pieces(recording, settings)
-    found: list[dict[str, Solution]] = []
-    for piece in pieces:
-        try:
-            found.append(_solve(piece, settings, frame, solvers, progress))
-        except EstimationError as error:
-            if len(pieces) == 1:
-                raise
-            notes.append(f"{_span(recording, piece)} left out: {error}")
-    if not found:
-        raise EstimationError(f"'{recording.name}': no piece between its IMU gaps can be solved")
-    return {name: joined([one[name] for one in found], tuple(notes)) for name in solvers}
-
-
-def _solve(
-    recording: Recording, settings: Settings, frame: LocalFrame, solvers: tuple[str, ...], progress: Progress | None
-) -> dict[str, Solution]:
-    began = time.perf_counter()
-    found = detect(recording, settings)
-    stationary = found.stationary
-    detected = time.perf_counter()
-    aligned = align(
-        recording, settings, frame, lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)
-    )
-    after = time.perf_counter()
-    recording, settings, said = _judged(recording, settings, frame, aligned, stationary)
-    judged = time.perf_counter()
-    stated = with_known_heading(aligned, settings)
-    problem = pose(recording, settings, frame, stated.state, stated.sigma, stationary)
-    timings = {
-        "detection": detected - began,
-        "alignment": after - detected,
-        "judgement": judged - after,
-        "preintegration": time.perf_counter() - judged,
-    }
-    # A stated heading far from the one found sends the filter, and its linearisation with it, astray for a while. It
-    # stays in the problem as its prior, but wheels are judged, and the smoother sets out, from what was found.
-    astray = bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
-    prior = problem.prior
-    if astray:
-        problem = replace(problem, prior=replace(prior, mean=aligned.state, sigma=aligned.sigma[None]))
-    forward = ekf(problem, progress, aligned.until)
-    began, smoothed = time.perf_counter(), backward(problem, forward, progress)
-    problem, raised = judgement.judge_wheels(problem, smoothed)
-    if raised:
-        forward = ekf(problem, progress, aligned.until)
-        smoothed, said = backward(problem, forward, progress), (*said, *raised)
-    timings["smoother"] = time.perf_counter() - began
-    start = smoothed
-    if astray:
-        problem = replace(problem, prior=prior)
-        forward = ekf(problem, progress, aligned.until)
-        smoothed = backward(problem, forward, progress)
-    out = {"ekf": forward.solution}
-    if "rts" in solvers:
-        out["rts"] = rts(problem, forward, smoothed)
-    if "batch" in solvers:
-        out["batch"] = batch(problem, start.states, start.nodes(problem), progress=progress)
-        # what it took to get there is part of it
-<<<<<<< HEAD
-        out["batch"] = replace(out["batch"], timings={**forward.solution.timings, **out["batch"].timings})
-=======
-        spent = {**out["rts"].timings, **out["batch"].timings}
-        out["batch"] = replace(out["batch"], timings=spent)
-    if "incremental" in solvers:
-        begin = aligned.state if _misled(aligned, stated) else None
-        out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
->>>>>>> 77d5269 (smooth and compare with the incremental solver: every state with a lag of the future, linearised again where it moved)
     return {
         name: replace(
             out[name],
@@ -280,28 +171,6 @@ def _judged(
     return recording, fixes.applied(settings), (*notes, *fixes.notes)
 
 
-<<<<<<< HEAD
-=======
-def _start(
-    problem: Problem, smoothed: Solution, aligned: Alignment, stated: Alignment
-) -> tuple[States, dict[str, np.ndarray]]:
-    """Where the batch solver begins: the smoothed filter.
-
-    A stated heading far from the one found would send the filter, and the linearisation with it, astray for a
-    while. The statement stays in the problem as its prior, but the solver sets out from what was found.
-    """
-    if _misled(aligned, stated):
-        other = replace(problem, prior=replace(problem.prior, mean=aligned.state, sigma=aligned.sigma[None]))
-        smoothed = rts(other, ekf(other, opening=aligned.until))
-    return smoothed.states, {name: p.value for name, p in smoothed.parameters.items()}
-
-
-def _misled(aligned: Alignment, stated: Alignment) -> bool:
-    """Whether the stated start attitude is far from the one found."""
-    return bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
-
-
->>>>>>> 77d5269 (smooth and compare with the incremental solver: every state with a lag of the future, linearised again where it moved)
 def _origin(recording: Recording) -> np.ndarray:
     """Origin of the navigation frame: the first fix, or 45 deg north at sea level without any."""
     gnss = recording.gnss

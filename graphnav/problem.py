@@ -74,6 +74,7 @@ def pose(
     start: States,
     sigma: Array,
     stationary: Array | None = None,
+    times: Array | None = None,
 ) -> Problem:
     """Pose the estimation problem for a recording.
 
@@ -82,11 +83,15 @@ def pose(
     start : one state at the start of the recording: mean of the prior and where biases are expected.
     sigma : (15,) 1-sigma of the prior.
     stationary : (M, 2) spans in which the platform stands still, s; none when None.
+    times : (K,) keyframes, s, where they are given: measurements at other times are left out.
     """
     classes = registered()
     stops = _inside(stationary, recording)
-    wanted = [cls.epochs(recording, settings, stops) for cls in classes]
-    t = keyframe_times(recording.start, recording.end, np.concatenate([*wanted, np.empty(0)]), settings.keyframes.rate)
+    if times is None:
+        wanted = [cls.epochs(recording, settings, stops) for cls in classes]
+        epochs = np.concatenate([*wanted, np.empty(0)])
+        times = keyframe_times(recording.start, recording.end, epochs, settings.keyframes.rate)
+    t = times
     samples = bridge_gaps(recording.imu)
     intervals = preintegrate(samples, recording.imu, t, start.ba[0], start.bg[0])
     scene = Scene(recording, settings, frame, t, stops, intervals)

@@ -98,7 +98,7 @@ def incremental(
     seconds = np.empty(K)
     for k in range(K):
         before = time.process_time()
-        solver.add(Place(problem, k, steps.get(k, ()), linked=k > 0))
+        solver.add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
         newest = solver.window.newest
         live.append(newest.state)
         live_P[k] = newest.covariance[:DIM, :DIM]
@@ -163,7 +163,8 @@ def _steps(problem: Problem) -> dict[int, tuple[Step, ...]]:
 
 
 def _robust(window: Window) -> bool:
-    return any(c.robust != "none" for c in window.stages[-1].place.problem.constraints)
+    problem = window.stages[-1].place.problem
+    return problem is not None and any(c.robust != "none" for c in problem.constraints)
 
 
 def _scale(at: dict[str, slice], values: Array) -> Array | None:

@@ -46,17 +46,16 @@ class Step:
 
 @dataclass(frozen=True)
 class Place:
-    """Where the rows of a keyframe come from: keyframe `k` of a problem, and the parameters that step there."""
+    """A keyframe: its time, the parameters that step there, and where its rows come from.
 
-    problem: Problem
-    k: int
+    These are keyframe `k` of a problem, and the interval that ends there; None once nobody will ask again.
+    """
+
+    t: float  # s
+    problem: Problem | None
+    k: int = 0
     steps: tuple[Step, ...] = ()
     linked: bool = True  # to the keyframe before; the first of all is not
-
-    @property
-    def t(self) -> float:
-        """Time of the keyframe, s."""
-        return float(self.problem.t[self.k])
 
 
 @dataclass(frozen=True)
@@ -166,6 +165,7 @@ def predicted(before: Message, place: Place) -> tuple[States, Array, Columns, Ar
         values[at] = step.mean + step.decay * (old - step.mean_before)
     if not place.linked:
         return before.state, values, columns, None
+    assert place.problem is not None
     motion, row = place.problem.motion, slice(place.k - 1, place.k)
     scale = before.value(SCALE) if SCALE in before.columns else None
     ahead, F = motion.propagate(row, before.state, scale)
@@ -194,6 +194,7 @@ def at_points(
     keyframe before.
     """
     problem, first, n = places[0].problem, places[0].k, len(places)
+    assert problem is not None
     D, skip = width(columns), int(linked)
     links: list[Array | None] = [None] * n
     if linked:

@@ -10,7 +10,7 @@ does the same from its own time on. With a lag longer than the drive this is the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +36,9 @@ _DELAY = 0.02  # s, of a delay: 1 mm where speed is known to 5 cm/s
 _ROUNDS = 5
 _ALMOST = 0.3
 _LIMITS = {"rad": 1e-2, "s": _DELAY}
+
+
+Renewed = Callable[[int], list[Place]]
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,8 @@ class Window:
         e = stage.message.estimate
         self.stages.append(stage.moved(e))
         if len(columns) > len(self._limit[0]):
-            self._limit = _limits(columns, {p.name: p.unit for c in place.problem.constraints for p in c.parameters})
+            assert place.problem is not None
+            self._limit = _limits(columns, {c.parameter.name: c.parameter.unit for c in place.problem.chains})
         return float(np.linalg.norm(e[:3]))
 
     def truncate(self, keep: int) -> None:
@@ -178,14 +182,22 @@ class Window:
         self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
         self.relinearized += len(old)
 
-    def converge(self, share: float = 1.0, always: bool = False) -> int:
-        """Relinearise until nothing has moved; returns how often. `always`: once at least."""
+    def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> int:
+        """Relinearise until nothing has moved; returns how often.
+
+        Parameters
+        ----------
+        share : of the usual limits.
+        always : once at least.
+        renewed : gives the places of the stages from an index on, where they no longer know their rows.
+        """
         for count in range(_ROUNDS):
             first = 0 if always and not count else self.first_moved(share)
             if first is None:
                 return count
             # what has moved almost as far goes with it: it would be next
-            self.relinearize(min(first, self.first_moved(_ALMOST * share) or 0) if first else 0)
+            first = min(first, self.first_moved(_ALMOST * share) or 0) if first else 0
+            self.relinearize(first, renewed(first) if renewed is not None else None)
         return _ROUNDS
 
 
