@@ -211,8 +211,8 @@ def at_points(
     parts: list[list[tuple[Array, Array, str, float]]] = [[] for _ in places]
     for constraint in problem.constraints:
         lo, hi = np.searchsorted(constraint.keyframe, [first, first + n])
-        if lo == hi:
-            continue
+        if lo == hi or any(p.name not in columns for p in constraint.parameters):
+            continue  # none here, or of parameters that have not begun
         at = constraint.keyframe[lo:hi] - first + skip
         given = {p.name: values[at, _shift(columns[p.name])] for p in constraint.parameters}
         linear = constraint.linearize(states[at], given, slice(lo, hi))

@@ -94,7 +94,7 @@ class Window:
         stage = eliminate(before, place, linear, state, values, columns)
         e = stage.message.estimate
         self.stages.append(stage.moved(e))
-        if len(columns) > len(self._limit[0]):
+        if columns != self._limit[0]:
             assert place.problem is not None
             self._limit = _limits(columns, {c.parameter.name: c.parameter.unit for c in place.problem.chains})
         return float(np.linalg.norm(e[:3]))
