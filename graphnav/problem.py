@@ -16,6 +16,7 @@ from graphnav.preintegration import Intervals, Samples, bridge_gaps, preintegrat
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.state import DIM, Parameter, States
+from graphnav.wheels import MeanSpeed
 
 NODE_SPACING = 5.0  # s between the nodes of a slowly moving parameter: a twentieth of the shortest correlation time
 
@@ -75,6 +76,7 @@ def pose(
     sigma: Array,
     stationary: Array | None = None,
     times: Array | None = None,
+    speed: MeanSpeed | None = None,
 ) -> Problem:
     """Pose the estimation problem for a recording.
 
@@ -84,6 +86,7 @@ def pose(
     sigma : (15,) 1-sigma of the prior.
     stationary : (M, 2) spans in which the platform stands still, s; none when None.
     times : (K,) keyframes, s, where they are given: measurements at other times are left out.
+    speed : of the odometer, where it is known already.
     """
     classes = registered()
     stops = _inside(stationary, recording)
@@ -94,7 +97,7 @@ def pose(
     t = times
     samples = bridge_gaps(recording.imu)
     intervals = preintegrate(samples, recording.imu, t, start.ba[0], start.bg[0])
-    scene = Scene(recording, settings, frame, t, stops, intervals)
+    scene = Scene(recording, settings, frame, t, stops, intervals, speed)
     built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
     prior = InitialPrior(keyframe=np.zeros(1, dtype=int), mean=start, sigma=np.asarray(sigma)[None])
     return Problem(

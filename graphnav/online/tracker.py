@@ -26,9 +26,13 @@ from graphnav.rotation import Array
 from graphnav.solvers.stages import Place, Step
 from graphnav.solvers.window import TURN, Message, Smoothed, Window
 from graphnav.state import DIM, Parameter, States
+from graphnav.wheels import MeanSpeed
+from graphnav.wheels.faults import faults
 
 CONTEXT = 30.0  # s of rows before a keyframe that its constraints may look at
-_BEFORE = 6  # keyframes posed again with a new one, so that a stop is seen for what it is
+_BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
+_EVERY = 2.0  # s between looks of the detectors
+_WHEELS = 10.0  # s between looks at the odometer
 _LOOK = 30.0  # s that the detectors see
 _SEEN = 25.0  # s of these that they answer for; the first few lack what was before
 SURE = 1.0  # s before now that they answer for: the end of a stop shows only when it is over
@@ -65,7 +69,9 @@ class Tracker:
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
         self._parameters: dict[str, Parameter] = {}
-        self._detected = -np.inf
+        self._detected = self._judged = -np.inf
+        self._speed: MeanSpeed | None = None  # of the odometer, when it was looked at last
+        self._wrong: Array = np.empty((0, 2))  # s, where its readings are wrong
 
     @property
     def newest(self) -> float:
@@ -82,15 +88,18 @@ class Tracker:
         """Add keyframes at the times `new`, after the newest, and redo those from `dirty` on."""
         edges = np.unique(np.concatenate([self.times, new]))
         now = float(edges[-1])
-        if now - self._detected >= 1.0 - SAME_TIME:
+        if now - self._detected >= _EVERY - SAME_TIME:
             dirty = min(dirty, self._classify(sensors, edges, now))
+        if now - self._judged >= _WHEELS - SAME_TIME:
+            dirty = min(dirty, self._judge_odometer(sensors, now))
         t = self.window.t
         keep = int(np.searchsorted(t, dirty - SAME_TIME))
         times = np.unique(np.concatenate([t[keep:], new]))
         times = times[np.concatenate([[True], np.diff(times) > SAME_TIME])]
         if not len(times):
             return
-        before = self.times[: len(self.times) - len(t) + keep][-_BEFORE:]
+        before = self.times[: len(self.times) - len(t) + keep]
+        before = before[-_BEFORE:] if len(self.stops) and self.stops[-1, 1] > times[0] - _BEFORE else before[-1:]
         self.window.truncate(keep)
         del self._nodes[keep:]
         problem = self._pose(sensors, np.concatenate([before, times]))
@@ -145,8 +154,10 @@ class Tracker:
             here = self.stops[(self.stops[:, 0] < begin) & (self.stops[:, 1] > begin)]
             begin = min([begin, *here[:, 0].tolist()])
         recording = sensors.recording(begin - CONTEXT, float(times[-1]) + 0.1)
-        start = self.window.newest.state
-        problem = pose(recording, self.settings, self.frame, start, np.ones(DIM), self.stops, times)
+        start, speed = self.window.newest.state, None
+        if self._speed is not None and recording.odometer is not None:
+            speed = MeanSpeed.of(recording.odometer, self._wrong, self._speed)
+        problem = pose(recording, self.settings, self.frame, start, np.ones(DIM), self.stops, times, speed)
         factor = self.settings.gnss.sd_factor or 1.0
         rows = tuple(
             replace(c, usual=factor * sensors.usual(times[c.keyframe])) if isinstance(c, GnssPosition) else c
@@ -204,7 +215,18 @@ class Tracker:
             if stage.place.problem is not None:
                 stages[k] = replace(stage, place=replace(stage.place, problem=None))
 
-    # ----------------------------------------------------------------------------------------------------- stops
+    # ----------------------------------------------------------------------------------------- stops, bad readings
+    def _judge_odometer(self, sensors: Sensors, now: float) -> float:
+        """Look for wrong readings of the odometer; returns the start of the first that was not known."""
+        self._judged = now
+        recording = sensors.recording()
+        if recording.odometer is None:
+            return np.inf
+        known, self._wrong = self._wrong, faults(recording.odometer, recording.imu).spans
+        self._speed = MeanSpeed.of(recording.odometer, self._wrong)
+        new = self._wrong[~np.isin(self._wrong[:, 0], known[:, 0])]
+        return float(new[0, 0]) if len(new) and len(self.window) else np.inf
+
     def _classify(self, sensors: Sensors, edges: Array, now: float) -> float:
         """Ask the detectors; returns the start of the first interval between keyframes that they see otherwise."""
         whole = not np.isfinite(self._detected)
