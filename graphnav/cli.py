@@ -98,7 +98,8 @@ def compare(
     recording: Source,
     out: Out,
     solvers: Annotated[
-        str, typer.Option("--solvers", metavar="NAMES", help="Some of ekf, rts, incremental, batch, with commas between.")
+        str,
+        typer.Option("--solvers", metavar="NAMES", help="Some of ekf, rts, incremental, batch, with commas between."),
     ] = "ekf,rts,batch",
     config: Config = None,
     without: Without = None,

@@ -164,5 +164,9 @@ def rows_of(recording: Recording) -> tuple[Array, list[Row]]:
     parts.append((recording.imu.t, "imu", np.concatenate([recording.imu.gyro, recording.imu.accel], axis=1)))
     t = np.concatenate([part[0] for part in parts])
     order = np.argsort(t, kind="stable")
-    every = [(name, x, tuple(row)) for times, name, rows in parts for x, row in zip(times.tolist(), rows.tolist(), strict=True)]
+    every = [
+        (name, x, tuple(row))
+        for times, name, rows in parts
+        for x, row in zip(times.tolist(), rows.tolist(), strict=True)
+    ]
     return t[order], [every[i] for i in order]

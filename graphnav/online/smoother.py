@@ -58,7 +58,7 @@ class Online:
 
     @property
     def status(self) -> str:
-        """"aligning" or "running"."""
+        """ "aligning" or "running"."""
         return "aligning" if self.tracker is None else "running"
 
     def add(self, row: Row) -> None:

@@ -7,6 +7,7 @@ recognised a second or two after it began) takes back the keyframes from there o
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import GnssPosition
 from graphnav.constraints.standstill import PLACE
+from graphnav.dense import Dense
 from graphnav.detectors import detect
 from graphnav.detectors.base import merged
 from graphnav.dynamics import SCALE, Motion
@@ -32,7 +34,7 @@ from graphnav.wheels.faults import faults
 CONTEXT = 30.0  # s of rows before a keyframe that its constraints may look at
 _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
 _EVERY = 2.0  # s between looks of the detectors
-_WHEELS = 10.0  # s between looks at the odometer
+_WHEELS, _WHEELS_LOOK = 10.0, 40.0  # s between looks at the odometer, and what they see
 _LOOK = 30.0  # s that the detectors see
 _SEEN = 25.0  # s of these that they answer for; the first few lack what was before
 SURE = 1.0  # s before now that they answer for: the end of a stop shows only when it is over
@@ -66,6 +68,7 @@ class Tracker:
         self.stops: Array = np.empty((0, 2))  # s, between keyframes
         self.settled: list[Smoothed] = []
         self.in_force: dict[str, int] = {}  # rows of each constraint at the newest keyframe
+        self.seconds: dict[str, float] = {}  # of process time, by what the newest update did
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
         self._parameters: dict[str, Parameter] = {}
@@ -86,12 +89,14 @@ class Tracker:
 
     def update(self, sensors: Sensors, new: Array, dirty: float = np.inf) -> None:
         """Add keyframes at the times `new`, after the newest, and redo those from `dirty` on."""
+        clock = [time.process_time()]
         edges = np.unique(np.concatenate([self.times, new]))
         now = float(edges[-1])
         if now - self._detected >= _EVERY - SAME_TIME:
             dirty = min(dirty, self._classify(sensors, edges, now))
         if now - self._judged >= _WHEELS - SAME_TIME:
             dirty = min(dirty, self._judge_odometer(sensors, now))
+        clock.append(time.process_time())
         t = self.window.t
         keep = int(np.searchsorted(t, dirty - SAME_TIME))
         times = np.unique(np.concatenate([t[keep:], new]))
@@ -103,6 +108,7 @@ class Tracker:
         self.window.truncate(keep)
         del self._nodes[keep:]
         problem = self._pose(sensors, np.concatenate([before, times]))
+        clock.append(time.process_time())
         turn = 0.0
         for k in range(len(before), len(problem.t)):
             turn = max(turn, self._push(problem, k))
@@ -114,6 +120,8 @@ class Tracker:
         if self.newest - self.window.stages[0].place.t > self.settings.solver.lag * (1.0 + 1.0 / _PORTIONS):
             self.settle(sensors, self.newest - self.settings.solver.lag)
         self._forget()
+        clock.append(time.process_time())
+        self.seconds = dict(zip(("detectors", "posing", "solving"), np.diff(clock).tolist(), strict=True))
 
     def settle(self, sensors: Sensors, until: float = np.inf) -> None:
         """Settle the keyframes before a time."""
@@ -146,6 +154,28 @@ class Tracker:
             P = F @ P @ F.T + motion.noise(one, state.R_nb)[0]
             state = ahead
         return Live(float(max(now, T)), state, P[:DIM, :DIM], T)
+
+    def since(self, sensors: Sensors) -> tuple[Array, States, Array]:
+        """Times (M,), states and covariances (M, 15, 15) at every IMU row since the newest keyframe.
+
+        Predicted through each row; covariances lie on the straight line between those at both ends.
+        """
+        message, T = self.window.newest, self.newest
+        t = sensors.imu.t[sensors.imu.t > T + SAME_TIME].copy()
+        if not len(t):
+            return t, message.state[:0], np.empty((0, DIM, DIM))
+        now = self.live(sensors)
+        imu, start = sensors.recording(T - 1.0, now.t).imu, message.state
+        ba, bg = start.ba, start.bg
+        if SCALE in message.columns:
+            scale, rows = message.value(SCALE), imu.t > T
+            bg = bg + scale[:3] * (imu.gyro[rows].mean(axis=0) - bg)
+            ba = ba + scale[3:] * (imu.accel[rows].mean(axis=0) - ba)
+        ends, both = np.array([T, now.t]), np.stack([message.covariance[:DIM, :DIM], now.covariance])
+        between = Dense(
+            bridge_gaps(imu), self.frame, ends, States.stack([start, now.state]), both, ba, bg, smooth=False
+        )  # fmt: skip
+        return t, *between(t)
 
     # ------------------------------------------------------------------------------------------------- keyframes
     def _pose(self, sensors: Sensors, times: Array) -> Problem:
@@ -218,11 +248,14 @@ class Tracker:
     # ----------------------------------------------------------------------------------------- stops, bad readings
     def _judge_odometer(self, sensors: Sensors, now: float) -> float:
         """Look for wrong readings of the odometer; returns the start of the first that was not known."""
-        self._judged = now
-        recording = sensors.recording()
+        whole, self._judged = not np.isfinite(self._judged), now
+        recording = sensors.recording(-np.inf if whole else now - _WHEELS_LOOK, now)
         if recording.odometer is None:
             return np.inf
-        known, self._wrong = self._wrong, faults(recording.odometer, recording.imu).spans
+        found, known = faults(recording.odometer, recording.imu).spans, self._wrong
+        since = float(recording.odometer.t[0]) + (0.0 if whole else 5.0)
+        old = known[(known[:, 0] < since) & (known[:, 1] > since - CONTEXT - _WHEELS_LOOK)]
+        self._wrong = np.concatenate([old, found[found[:, 0] >= since]])
         self._speed = MeanSpeed.of(recording.odometer, self._wrong)
         new = self._wrong[~np.isin(self._wrong[:, 0], known[:, 0])]
         return float(new[0, 0]) if len(new) and len(self.window) else np.inf

@@ -179,7 +179,9 @@ def _parameters(problem: Problem, at: dict[str, slice], values: Array, sigma: Ar
         if p.begins is not None:
             continue
         last = np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
-        out[p.name] = ParameterEstimate(chain.t, values[last][:, at[p.name]], sigma[last][:, at[p.name]], p.sigma, p.unit)
+        out[p.name] = ParameterEstimate(
+            chain.t, values[last][:, at[p.name]], sigma[last][:, at[p.name]], p.sigma, p.unit
+        )
     return out
 
 

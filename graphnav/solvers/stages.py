@@ -307,4 +307,3 @@ def eliminate(
 
 def _shift(columns: slice) -> slice:
     return slice(columns.start - DIM, columns.stop - DIM)
-
