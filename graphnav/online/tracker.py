@@ -24,9 +24,10 @@ from graphnav.earth import LocalFrame
 from graphnav.online.sensors import Sensors
 from graphnav.preintegration import bridge_gaps, preintegrate
 from graphnav.problem import NODE_SPACING, Problem, pose
+from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 from graphnav.solvers.stages import Place, Step
-from graphnav.solvers.window import TURN, Message, Smoothed, Window
+from graphnav.solvers.window import Message, Smoothed, Window, turn_limit
 from graphnav.state import DIM, Parameter, States
 from graphnav.wheels import MeanSpeed
 from graphnav.wheels.faults import faults
@@ -58,11 +59,12 @@ class Tracker:
     Parameters
     ----------
     message, t0 : the prior and the time it is for.
+    noise : of the IMU.
     """
 
-    def __init__(self, settings: Settings, frame: LocalFrame, message: Message, t0: float) -> None:
+    def __init__(self, settings: Settings, frame: LocalFrame, message: Message, t0: float, noise: ImuNoise) -> None:
         self.settings, self.frame = settings, frame
-        self.window = Window(message)
+        self.window = Window(message, turn_limit(noise))
         self.head = t0  # time of the message before the window, or of the first keyframe as long as it is in it
         self.opened = False  # whether the first keyframe has left the window
         self.stops: Array = np.empty((0, 2))  # s, between keyframes
@@ -112,7 +114,7 @@ class Tracker:
         turn = 0.0
         for k in range(len(before), len(problem.t)):
             turn = max(turn, self._push(problem, k))
-        if turn > TURN:
+        if turn > self.window.turn:
             self.window.converge(renewed=lambda first: self._renewed(sensors, first))
         self.in_force = {
             c.name: n for c in problem.constraints if (n := int(np.sum(c.keyframe == len(problem.t) - 1)))

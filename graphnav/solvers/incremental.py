@@ -20,7 +20,7 @@ from graphnav.solution import ParameterEstimate, Solution
 from graphnav.solvers.ekf import Progress, residual_record
 from graphnav.solvers.robust import weight_and_cost
 from graphnav.solvers.stages import Place, Step
-from graphnav.solvers.window import TURN, Smoothed, Window, first_message
+from graphnav.solvers.window import Smoothed, Window, first_message, turn_limit
 from graphnav.state import DIM, States
 
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
@@ -44,7 +44,7 @@ class Incremental:
     def add(self, place: Place) -> None:
         """Take in one more keyframe."""
         turn = self.window.push(place)
-        if turn > TURN:
+        if turn > self.window.turn:
             self.window.converge()
         t = self.window.stages[-1].place.t
         if t - self.window.stages[0].place.t > self.lag * (1.0 + 1.0 / _PORTIONS):
@@ -92,8 +92,8 @@ def incremental(
     message = first_message(mean, problem.prior.sigma[0])
     if start is not None:
         message = message.moved(start.minus(mean)[0])
-    solver = Incremental(Window(message), lag)
-    steps = _steps(problem)
+    solver = Incremental(Window(message, turn_limit(problem.recording.imu.noise)), lag)
+    steps = node_steps(problem)
     live, live_P, live_values = [], np.empty((K, DIM, DIM)), []
     seconds = np.empty(K)
     for k in range(K):
@@ -148,7 +148,7 @@ def incremental(
     return Replayed(settled, now, seconds)
 
 
-def _steps(problem: Problem) -> dict[int, tuple[Step, ...]]:
+def node_steps(problem: Problem) -> dict[int, tuple[Step, ...]]:
     """The parameters that begin or move on to their next node, by keyframe."""
     out: dict[int, list[Step]] = {}
     for chain in problem.chains:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav import rotation
+from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 from graphnav.solvers.stages import (
     Columns,
@@ -31,7 +32,8 @@ from graphnav.solvers.stages import (
 )
 from graphnav.state import DIM, States
 
-TURN = 3e-3  # rad; what is neglected of a turn a is a^2/2 of what it turns: 0.05 mm/s of 10 m/s
+_SHARE = 0.01  # of the noise of a second's force that a turn may be neglected for: the same way every second, it adds up
+_G = 9.8  # m/s^2
 _DELAY = 0.02  # s, of a delay: 1 mm where speed is known to 5 cm/s
 _ROUNDS = 5
 _ALMOST = 0.3
@@ -63,9 +65,11 @@ class Window:
     Parameters
     ----------
     prior : message on the first keyframe before any measurement, from `first_message`.
+    turn : rad that an attitude may move before rows are linearised anew, from `turn_limit`.
     """
 
-    def __init__(self, prior: Message) -> None:
+    def __init__(self, prior: Message, turn: float) -> None:
+        self.turn = turn
         self.head = prior  # all that is known before the first stage
         self.stages: list[Stage] = []
         self.relinearized = 0  # stages made anew
@@ -153,9 +157,9 @@ class Window:
     # ------------------------------------------------------------------------------------------ linearising again
     def first_moved(self, share: float = 1.0) -> int | None:
         """The first stage whose point is further than its limit from the smoothed state; None if there is none."""
-        columns, limit = self._limit
+        _, limit = self._limit
         for k, e in enumerate(self.means()[1:]):
-            if np.dot(e[:3], e[:3]) > (share * TURN) ** 2 or np.any(np.abs(e[DIM:]) > share * limit[: len(e) - DIM]):
+            if np.dot(e[:3], e[:3]) > (share * self.turn) ** 2 or np.any(np.abs(e[DIM:]) > share * limit[: len(e) - DIM]):
                 return k
         return None
 
@@ -199,6 +203,14 @@ class Window:
             first = min(first, self.first_moved(_ALMOST * share) or 0) if first else 0
             self.relinearize(first, renewed(first) if renewed is not None else None)
         return _ROUNDS
+
+
+def turn_limit(noise: ImuNoise) -> float:
+    """How far an attitude may move (rad) before rows are linearised anew.
+
+    What is neglected of a turn a is a^2/2 of the force it turns: in a second, a^2/2 g against the noise of its integral.
+    """
+    return float(np.clip(np.sqrt(2.0 * _SHARE * noise.accel_noise_density / _G), 3e-4, 1e-2))
 
 
 def first_message(state: States, sigma: Array) -> Message:
