@@ -43,7 +43,6 @@ def main() -> int:
     parser.add_argument("--lag", type=float, help="s of future that a settled state has seen")
     parser.add_argument("--quiet", action="store_true", help="no view")
     options = parser.parse_args()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         return send(options) if options.send else smooth(options)
     except GraphnavError as error:
@@ -53,7 +52,6 @@ def main() -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:
-        print("online: interrupted", file=sys.stderr)
         return INTERRUPTED
 
 
@@ -79,37 +77,58 @@ def smooth(options: argparse.Namespace) -> int:
     live = options.source == "-" or options.source.startswith("tcp:")
     recording = None if live else read(options.source)
     session = Session(settings, options.source, folder, options.resume, recording)
-    shown = Shown(session, options.quiet)
+    shown, asked = Shown(session, options.quiet), Asked()
     try:
         if live:
-            chunks = standard_input() if options.source == "-" else connections(options.source)
-            follow(session, chunks, shown)
+            follow(session, standard_input() if options.source == "-" else connections(options.source), shown, asked)
         else:
             pace = Pace(options.speed)
             for row in session.rows[session.taken :]:
-                pace.wait(row[1], shown.update)
+                pace.wait(row[1], shown.update, asked)
+                if asked:
+                    break
                 session.add(row)
                 shown.now_and_then()
-        session.finish()
-    except KeyboardInterrupt:
-        session.stop()
-        raise
+        if not asked:
+            session.finish()
+        elif not session.done:
+            session.stop()
     finally:
         session.close()
         shown.last()
+    if asked and not session.done:
+        print("online: interrupted" + (f"; go on with --resume -o {folder}" if folder else ""), file=sys.stderr)
+        return INTERRUPTED
     return 0
 
 
-def follow(session: Session, chunks: Iterator[bytes], shown: Shown) -> None:
+class Asked:
+    """Whether Ctrl-C or a SIGTERM asked to end: between two rows, where the smoother is whole."""
+
+    def __init__(self) -> None:
+        self.so = False
+        for what in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(what, self._ask)
+
+    def __bool__(self) -> bool:
+        return self.so
+
+    def _ask(self, *_: object) -> None:
+        if self.so:
+            raise KeyboardInterrupt  # asked twice: at once, from the checkpoint on disk
+        self.so = True
+
+
+def follow(session: Session, chunks: Iterator[bytes], shown: Shown, asked: Asked) -> None:
     """Take in lines until the source ends or says so; b"" means that nothing came for a while."""
     rest, heard = b"", time.monotonic()
     for chunk in chunks:
         if chunk:
             *whole, rest = (rest + chunk).split(b"\n")
-            session.add_lines([line.decode("utf-8", "replace") for line in whole])
+            session.add_lines([line.decode("utf-8", "replace") for line in whole], asked.__bool__)
             heard = time.monotonic()
         shown.now_and_then(time.monotonic() - heard)
-        if session.done:
+        if session.done or asked:
             return
 
 
@@ -157,13 +176,15 @@ class Pace:
     def __init__(self, speed: float) -> None:
         self.speed, self.began, self.first = speed, time.monotonic(), float("nan")
 
-    def wait(self, t: float, meanwhile: Callable[[], None] | None = None) -> None:
+    def wait(self, t: float, meanwhile: Callable[[], None] | None = None, asked: Asked | None = None) -> None:
         if self.speed <= 0.0:
             return
         if self.first != self.first:
             self.first, self.began = t, time.monotonic()
         while (ahead := (t - self.first) / self.speed - (time.monotonic() - self.began)) > 0.0:
             time.sleep(min(ahead, TICK))
+            if asked:
+                return
             if meanwhile is not None and ahead > TICK:
                 meanwhile()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 from graphnav.config import Settings
@@ -60,14 +61,17 @@ class Session:
         self.taken += 1
         self._save()
 
-    def add_lines(self, lines: list[str]) -> None:
-        """Take in lines of a live source; they are in the journal before they count."""
+    def add_lines(self, lines: list[str], asked: Callable[[], bool] = bool) -> None:
+        """Take in lines of a live source; they are in the journal before they count.
+
+        Once `asked` to end, the rest stays there.
+        """
         if self.store is None:
             for line in lines:
                 self._take_line(line)
         elif lines:
             self.store.note([line.encode() for line in lines])
-            self._take_pending(self.store)
+            self._take_pending(self.store, asked)
 
     def finish(self) -> None:
         """Nothing more will come: settle all and say what it was."""
@@ -104,8 +108,8 @@ class Session:
             "lag_s": self.settings.solver.lag,
         }
 
-    def _take_pending(self, store: Store) -> None:
-        while store.pending:
+    def _take_pending(self, store: Store, asked: Callable[[], bool] = bool) -> None:
+        while store.pending and not asked():
             self._take_line(store.pending.popleft().decode("utf-8", "replace"))
 
     def _counts(self) -> dict[str, int]:

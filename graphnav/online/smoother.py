@@ -146,7 +146,9 @@ class Online:
         sensors.setup = _with_noise(sensors.setup, recording)
         stated = with_known_heading(found, self.settings)
         self.notes += [*stated.notes, *said]
-        self.tracker = Tracker(settings, frame, first_message(stated.state, stated.sigma), recording.start, recording.imu.noise)
+        self.tracker = Tracker(
+            settings, frame, first_message(stated.state, stated.sigma), recording.start, recording.imu.noise
+        )
         if found is not stated:
             self.tracker.window.head = self.tracker.window.head.moved(found.state.minus(stated.state)[0])
         self._fixes = [t for t in sensors.gnss.t.tolist() if t >= recording.start - SAME_TIME]

@@ -32,7 +32,9 @@ from graphnav.solvers.stages import (
 )
 from graphnav.state import DIM, States
 
-_SHARE = 0.01  # of the noise of a second's force that a turn may be neglected for: the same way every second, it adds up
+_SHARE = (
+    0.01  # of the noise of a second's force that a turn may be neglected for: the same way every second, it adds up
+)
 _G = 9.8  # m/s^2
 _DELAY = 0.02  # s, of a delay: 1 mm where speed is known to 5 cm/s
 _ROUNDS = 5
@@ -159,7 +161,9 @@ class Window:
         """The first stage whose point is further than its limit from the smoothed state; None if there is none."""
         _, limit = self._limit
         for k, e in enumerate(self.means()[1:]):
-            if np.dot(e[:3], e[:3]) > (share * self.turn) ** 2 or np.any(np.abs(e[DIM:]) > share * limit[: len(e) - DIM]):
+            if np.dot(e[:3], e[:3]) > (share * self.turn) ** 2 or np.any(
+                np.abs(e[DIM:]) > share * limit[: len(e) - DIM]
+            ):
                 return k
         return None
 
