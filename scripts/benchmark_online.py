@@ -71,7 +71,8 @@ def main() -> None:
                 i = np.clip(np.rint((track.t - truth.t[0]) * RATE).astype(int), 0, len(truth.t) - 1)
                 assert track.sd_p is not None
                 off = (track.llh - truth.llh[i]) * scale
-                errors += np.stack([(off**2).sum(axis=1), ((off[:, [1, 0, 2]] / track.sd_p) ** 2).mean(axis=1)], -1).tolist()
+                ratio = off[:, [1, 0, 2]] / track.sd_p
+                errors += np.stack([(off**2).sum(axis=1), (ratio**2).mean(axis=1)], -1).tolist()
         if row[1] >= 3600.0 * hour - 1e-6 or row[1] >= recording.end - 1e-6:
             report(hour, np.array(found), np.array(errors), time.process_time() - began, len(online.sensors.imu))
             hour, found, errors, began = hour + 1, [], [], time.process_time()
@@ -82,6 +83,7 @@ def main() -> None:
 def lazily(recording: Recording) -> Iterator[Row]:
     """The rows in order, a portion at a time."""
     for begin in np.arange(recording.start, recording.end, PORTION):
+
         def part(sensor, begin=begin):
             keep = (sensor.t > begin + 1e-9) & (sensor.t <= begin + PORTION + 1e-9)
             names = ("t", "gyro", "accel", "llh", "sd", "speed")
@@ -106,10 +108,8 @@ def report(hour: int, found: np.ndarray, errors: np.ndarray, cpu: float, rows: i
     every = np.column_stack([found, found.sum(axis=1)]) * 1e3
     cells = [" / ".join(f"{x:.1f}" for x in np.quantile(column, [0.5, 0.99, 1.0])) for column in every.T]
     rms, nees = (np.sqrt(errors[:, 0].mean()), errors[:, 1].mean()) if len(errors) else (np.nan, np.nan)
-    print(
-        f"| {hour} | {len(found)} | {' | '.join(cells)} | {cpu:.1f} | {memory_mb():.0f} | {rms:.4f} | {nees:.2f} | {rows} |",
-        flush=True,
-    )
+    more = f"{cpu:.1f} | {memory_mb():.0f} | {rms:.4f} | {nees:.2f} | {rows}"
+    print(f"| {hour} | {len(found)} | {' | '.join(cells)} | {more} |", flush=True)
 
 
 def memory_mb() -> float:

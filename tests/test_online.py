@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,9 @@ from graphnav.solution import to_trajectory
 from graphnav.trajectory import Trajectory
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "online.py"
-QUICK = settings_from({"gnss": {"slow_share": 0.0, "sd_factor": 1.0}, "imu": {"as_stated": True}, "solver": {"lag": 20.0}})
+QUICK = settings_from(
+    {"gnss": {"slow_share": 0.0, "sd_factor": 1.0}, "imu": {"as_stated": True}, "solver": {"lag": 20.0}}
+)
 
 
 @pytest.fixture(scope="module")
@@ -330,7 +333,7 @@ def test_killed_and_resumed_it_ends_with_the_same(
     data = folder.read_bytes()
     out = tmp_path / "out"
     cuts = [0, int(0.75 * len(data)), int(0.9 * len(data)), len(data)]
-    for k, (begin, end) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
+    for k, (begin, end) in enumerate(pairwise(cuts)):
         last = end == len(data)
         process = program("-", "-o", out, "--config", config, "--quiet", *["--resume"] * (k > 0), stdin=subprocess.PIPE)
         # a sender that begins a little before where it was cut off
@@ -340,8 +343,9 @@ def test_killed_and_resumed_it_ends_with_the_same(
         if last:
             assert process.wait(60) == 0, process.stderr.read()
             break
-        wait_for(lambda want=data.rfind(b"\n", 0, end), have=out: consumed(have) >= data[:want].count(b"\nI"))
-        wait_for(lambda have=out: (have / "trajectory.csv").read_bytes().count(b"\n") > 5)
+        want = data[: data.rfind(b"\n", 0, end)].count(b"\nI")
+        wait_for(lambda want=want: consumed(out) >= want)
+        wait_for(lambda: (out / "trajectory.csv").read_bytes().count(b"\n") > 5)
         process.send_signal(how)
         code = process.wait(60)
         assert code == (-9 if how == signal.SIGKILL else 130)
@@ -385,9 +389,13 @@ def test_a_full_disk_leaves_what_had_settled(
         real(handle)
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(GraphnavError, match=r"No space left.*--resume"):
+
+    def add_all() -> None:
         for row in session.rows:
             session.add(row)
+
+    with pytest.raises(GraphnavError, match=r"No space left.*--resume"):
+        add_all()
     session.close()
     monkeypatch.undo()
     so_far = (tmp_path / "out" / "trajectory.csv").read_bytes()

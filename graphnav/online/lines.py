@@ -79,18 +79,16 @@ def setup_of(line: str) -> Recording:
         raise RecordingError(
             f"line 1: setup: unknown key 'imu.noise.{unknown[0]}'; known keys: {', '.join(sorted(known))}"
         )
-    odometer = found.odometer
-    return Recording(
-        found.name,
-        found.platform,
-        Imu(_NONE, _ROWS, _ROWS, ImuNoise(**found.imu.noise), noise_assumed=not found.imu.noise),
-        found.gnss and Gnss(_NONE, _ROWS, _ROWS, lever_arm=np.array(found.gnss.lever_arm)),
-        odometer
-        and Odometer(
-            _NONE, _NONE, np.array(odometer.lever_arm), odometer.scale_sigma, signed=odometer.signed,
-            speed_sigma=odometer.speed_sigma, delay_sigma=odometer.delay_sigma,
-        ),
-    )  # fmt: skip
+    gnss = odometer = None
+    if found.gnss is not None:
+        gnss = Gnss(_NONE, _ROWS, _ROWS, lever_arm=np.array(found.gnss.lever_arm))
+    if (o := found.odometer) is not None:
+        odometer = Odometer(
+            _NONE, _NONE, np.array(o.lever_arm), o.scale_sigma,
+            signed=o.signed, speed_sigma=o.speed_sigma, delay_sigma=o.delay_sigma,
+        )  # fmt: skip
+    imu = Imu(_NONE, _ROWS, _ROWS, ImuNoise(**found.imu.noise), noise_assumed=not found.imu.noise)
+    return Recording(found.name, found.platform, imu, gnss, odometer)
 
 
 def row_of(line: str) -> Row | None:

@@ -10,13 +10,15 @@ the same order make the same trajectory.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import pickle
 from collections import deque
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from graphnav.errors import ConfigError, GraphnavError
 from graphnav.exporters import csv
@@ -51,7 +53,7 @@ class Store:
     def __init__(self, folder: Path, source: str, resume: bool, live: bool) -> None:
         self.folder, self.source, self.live = folder, source, live
         self.pending: deque[bytes] = deque()  # lines in the journal that were not taken in yet
-        self._journal: BinaryIO | None = None
+        self._journal: FileIO | None = None
         self._number = 0
         path = folder / CHECKPOINT
         self.resumed: Checkpoint | None = None
@@ -148,10 +150,8 @@ class Store:
             write()
         except OSError as error:
             for mend in (lambda: self._file.truncate(self._length), lambda: self._file.seek(self._length)):
-                try:
+                with contextlib.suppress(OSError):
                     mend()
-                except (OSError, AttributeError):
-                    pass
             raise GraphnavError(
                 f"{self.folder}: cannot be written ({error.strerror}); what had settled is safe, "
                 "mend that and go on with --resume"

@@ -291,4 +291,4 @@ def _clipped(spans: Array, begin: float, end: float) -> Array:
 
 def _within(t: Array, spans: Array) -> Array:
     """Which times lie in the spans (M, 2)."""
-    return ((t[:, None] >= spans[:, 0]) & (t[:, None] <= spans[:, 1])).any(axis=1)
+    return np.asarray(((t[:, None] >= spans[:, 0]) & (t[:, None] <= spans[:, 1])).any(axis=1))

@@ -205,8 +205,8 @@ def at_points(
         rows = np.zeros((n, DIM, DIM + D + 1))
         rows[:, :, :DIM], rows[:, :, DIM : 2 * DIM], rows[:, :, -1] = W @ Ji, W @ Jj, -mv(W, r)
         if scale is not None:
-            at = columns[SCALE]
-            rows[:, :, DIM + at.start : DIM + at.stop] = W @ Js
+            here = columns[SCALE]
+            rows[:, :, DIM + here.start : DIM + here.stop] = W @ Js
         links = list(rows)
     parts: list[list[tuple[Array, Array, str, float]]] = [[] for _ in places]
     for constraint in problem.constraints:
@@ -219,7 +219,7 @@ def at_points(
         H = assemble(linear, columns, D) / linear.sigma[..., None]
         b = -linear.residual / linear.sigma
         edge = np.searchsorted(at, np.arange(n + 1) + skip)
-        for i in np.unique(at) - skip:
+        for i in np.flatnonzero(np.diff(edge)):
             own = slice(edge[i], edge[i + 1])
             parts[i].append((H[own], b[own], constraint.robust, constraint.robust_scale))
     return [Linear(link, tuple(part)) for link, part in zip(links, parts, strict=True)]

@@ -212,7 +212,7 @@ class Window:
 def turn_limit(noise: ImuNoise) -> float:
     """How far an attitude may move (rad) before rows are linearised anew.
 
-    What is neglected of a turn a is a^2/2 of the force it turns: in a second, a^2/2 g against the noise of its integral.
+    What is neglected of a turn a is a^2/2 of the force it turns: in a second a^2/2 g, against the noise.
     """
     return float(np.clip(np.sqrt(2.0 * _SHARE * noise.accel_noise_density / _G), 3e-4, 1e-2))
 
