@@ -76,6 +76,12 @@ def align(recording: Recording, settings: Settings, frame: LocalFrame, smooth: S
     return replace(_in_motion(recording, settings, frame, smooth, span), motion=span[0], until=span[1])
 
 
+def ready(recording: Recording, settings: Settings) -> bool:
+    """Whether the fixes so far show all the motion that an alignment wants to see."""
+    span = _motion(recording, settings)
+    return span is not None and recording.gnss is not None and span[1] < recording.gnss.t[-1]
+
+
 def with_known_heading(found: Alignment, settings: Settings) -> Alignment:
     """The alignment with the start heading the user states, where there is one."""
     known = settings.alignment.heading

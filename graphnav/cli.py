@@ -75,7 +75,7 @@ def info(recording: Source) -> None:
 def smooth(
     recording: Source,
     out: Out,
-    solver: Annotated[str, typer.Option("--solver", metavar="NAME", help="batch, rts or ekf.")] = "batch",
+    solver: Annotated[str, typer.Option("--solver", metavar="NAME", help="batch, incremental, rts or ekf.")] = "batch",
     config: Config = None,
     without: Without = None,
     rate: Rate = None,
@@ -98,7 +98,8 @@ def compare(
     recording: Source,
     out: Out,
     solvers: Annotated[
-        str, typer.Option("--solvers", metavar="NAMES", help="Some of ekf, rts, batch, with commas between.")
+        str,
+        typer.Option("--solvers", metavar="NAMES", help="Some of ekf, rts, incremental, batch, with commas between."),
     ] = "ekf,rts,batch",
     config: Config = None,
     without: Without = None,

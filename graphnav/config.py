@@ -199,8 +199,11 @@ class DetectorSettings(_Section):
 
 
 class SolverSettings(_Section):
-    """The batch solver's outer loop."""
+    """The outer loop of the batch solver, and how long the incremental one waits."""
 
+    lag: float = Field(
+        120.0, ge=1, description="s of future that a state has seen when the incremental solver lets it settle"
+    )
     max_iterations: int = Field(30, ge=1, description="Levenberg-Marquardt iterations")
     tolerance: float = Field(
         1e-3, gt=0, description="stop when the next step could lower the cost by less than this (cost is in sigma^2/2)"

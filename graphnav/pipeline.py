@@ -20,8 +20,10 @@ from graphnav.recording import Recording
 from graphnav.solution import Solution, joined
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import Filtered, Progress, Smoothed, backward, ekf, rts
+from graphnav.solvers.incremental import incremental
 
-SOLVERS = ("ekf", "rts", "batch")
+SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
+KNOWN = ("ekf", "rts", "incremental", "batch")
 _FAR = 0.5  # rad between the stated and the found start attitude
 _SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
 
@@ -38,7 +40,7 @@ def run(
     ----------
     recording : from `graphnav.load`.
     settings : default settings when None.
-    solvers : out of "ekf", "rts", "batch".
+    solvers : out of "ekf", "rts", "incremental", "batch".
     progress : called now and then with a stage and its share done, 0 to 1.
 
     Returns
@@ -52,10 +54,10 @@ def run(
         If the recording does not determine a trajectory.
     """
     settings = settings or Settings()
-    unknown = [name for name in solvers if name not in SOLVERS]
+    unknown = [name for name in solvers if name not in KNOWN]
     if unknown:
-        raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(SOLVERS)}")
-    frame = LocalFrame(_origin(recording))
+        raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}")
+    frame = LocalFrame(origin(recording))
     pieces, notes = _pieces(recording, settings)
     found: list[dict[str, Solution]] = []
     for piece in pieces:
@@ -83,15 +85,15 @@ def _solve(
         recording, settings, frame, lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)
     )
     after = time.perf_counter()
-    recording, settings, said = _judged(recording, settings, frame, aligned, stationary)
-    judged = time.perf_counter()
+    recording, settings, said = judged(recording, settings, frame, aligned, stationary)
+    done = time.perf_counter()
     stated = with_known_heading(aligned, settings)
     problem = pose(recording, settings, frame, stated.state, stated.sigma, stationary)
     timings = {
         "detection": detected - began,
         "alignment": after - detected,
-        "judgement": judged - after,
-        "preintegration": time.perf_counter() - judged,
+        "judgement": done - after,
+        "preintegration": time.perf_counter() - done,
     }
     # A stated heading far from the one found sends the filter, and its linearisation with it, astray for a while. It
     # stays in the problem as its prior, but wheels are judged, and the smoother sets out, from what was found.
@@ -118,6 +120,9 @@ def _solve(
         out["batch"] = batch(problem, start.states, start.nodes(problem), progress=progress)
         # what it took to get there is part of it
         out["batch"] = replace(out["batch"], timings={**forward.solution.timings, **out["batch"].timings})
+    if "incremental" in solvers:
+        begin = aligned.state if astray else None
+        out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
     return {
         name: replace(
             out[name],
@@ -129,7 +134,7 @@ def _solve(
     }
 
 
-def _judged(
+def judged(
     recording: Recording, settings: Settings, frame: LocalFrame, aligned: Alignment, stationary: np.ndarray
 ) -> tuple[Recording, Settings, tuple[str, ...]]:
     """Recording and settings with the figures of IMU and fixes judged by the first part of the drive."""
@@ -154,9 +159,9 @@ def _judged(
     fixes = judgement.judge_fixes(problem, back)
     if not settings.imu.as_stated and judgement.judge_imu(problem, forward, back).clear:
         # fixes that wander would pass for noise of the IMU: it is judged with their wandering in the problem
-        judged = plain if fixes is None else fixes.applied(free)
+        basis = plain if fixes is None else fixes.applied(free)
         for _ in range(judgement.ROUNDS):
-            imu = judgement.judge_imu(*smoothed(judged))
+            imu = judgement.judge_imu(*smoothed(basis))
             better = imu.applied(noise, stated)
             if (noise == stated and not imu.clear) or imu.settled or better == noise:
                 break
@@ -171,7 +176,7 @@ def _judged(
     return recording, fixes.applied(settings), (*notes, *fixes.notes)
 
 
-def _origin(recording: Recording) -> np.ndarray:
+def origin(recording: Recording) -> np.ndarray:
     """Origin of the navigation frame: the first fix, or 45 deg north at sea level without any."""
     gnss = recording.gnss
     if gnss is not None and len(gnss.t):

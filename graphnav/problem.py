@@ -17,6 +17,7 @@ from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.state import DIM, Parameter, States
 from graphnav.unresolved import with_unresolved_motion
+from graphnav.wheels import MeanSpeed
 
 NODE_SPACING = 5.0  # s between the nodes of a slowly moving parameter: a twentieth of the shortest correlation time
 
@@ -75,6 +76,8 @@ def pose(
     start: States,
     sigma: Array,
     stationary: Array | None = None,
+    times: Array | None = None,
+    speed: MeanSpeed | None = None,
 ) -> Problem:
     """Pose the estimation problem for a recording.
 
@@ -83,16 +86,21 @@ def pose(
     start : one state at the start of the recording: mean of the prior and where biases are expected.
     sigma : (15,) 1-sigma of the prior.
     stationary : (M, 2) spans in which the platform stands still, s; none when None.
+    times : (K,) keyframes, s, where they are given: measurements at other times are left out.
+    speed : of the odometer, where it is known already.
     """
     classes = registered()
     stops = _inside(stationary, recording)
-    wanted = [cls.epochs(recording, settings, stops) for cls in classes]
-    t = keyframe_times(recording.start, recording.end, np.concatenate([*wanted, np.empty(0)]), settings.keyframes.rate)
+    if times is None:
+        wanted = [cls.epochs(recording, settings, stops) for cls in classes]
+        epochs = np.concatenate([*wanted, np.empty(0)])
+        times = keyframe_times(recording.start, recording.end, epochs, settings.keyframes.rate)
+    t = times
     samples = bridge_gaps(recording.imu)
     if recording.platform == "foot":
         samples = with_unresolved_motion(samples, recording.imu.noise)
     intervals = preintegrate(samples, recording.imu, t, start.ba[0], start.bg[0])
-    scene = Scene(recording, settings, frame, t, stops, intervals)
+    scene = Scene(recording, settings, frame, t, stops, intervals, speed)
     built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
     prior = InitialPrior(keyframe=np.zeros(1, dtype=int), mean=start, sigma=np.asarray(sigma)[None])
     return Problem(

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,7 @@ class Recording:
     gps_zero: float | None = None  # s since the GPS epoch (1980-01-06) at t = 0, where it is known
     remarks: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def start(self) -> float:
         """Start of the first IMU period: where the recording's own clock reads 0, s."""
         t = self.imu.t

@@ -113,13 +113,13 @@ def known_solvers(names: tuple[str, ...], option: str) -> tuple[str, ...]:
     ConfigError
         If one is not a solver, listing those that are.
     """
-    from graphnav.pipeline import SOLVERS
+    from graphnav.pipeline import KNOWN
 
     for name in names:
-        if name not in SOLVERS:
-            raise ConfigError(f"{option} {name}: no solver '{name}'; known: {', '.join(SOLVERS)}")
+        if name not in KNOWN:
+            raise ConfigError(f"{option} {name}: no solver '{name}'; known: {', '.join(KNOWN)}")
     if not names:
-        raise ConfigError(f"{option}: names no solver; known: {', '.join(SOLVERS)}")
+        raise ConfigError(f"{option}: names no solver; known: {', '.join(KNOWN)}")
     return tuple(dict.fromkeys(names))
 
 

@@ -18,7 +18,7 @@ ROOMS = [
     "checks", "detectors",
     "preintegration", "unresolved", "dynamics", "constraints", "problem", "solution", "alignment",
     "dense", "solvers", "judgement", "pipeline",
-    "interpolation", "metrics", "scoring", "strides", "evaluation", "exporters",
+    "interpolation", "metrics", "scoring", "strides", "evaluation", "exporters", "online",
     "panels", "page", "plots", "report_tables", "report_pictures", "report",
     "workflow", "outputs", "convert", "terminal", "detection_pictures", "detection_report", "cli_logs", "cli",
 ]  # fmt: skip

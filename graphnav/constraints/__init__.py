@@ -5,10 +5,12 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+from functools import cache
 
 from graphnav.constraints.base import Constraint
 
 
+@cache
 def registered() -> tuple[type[Constraint], ...]:
     """All constraint classes, in the order of their names."""
     found = {}

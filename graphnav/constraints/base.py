@@ -21,6 +21,7 @@ from graphnav.preintegration import Intervals
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.state import BLOCKS, DIM, Parameter, States
+from graphnav.wheels import MeanSpeed
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class Scene:
     t: Array  # (K,) keyframe times, s
     stationary: Array  # (M, 2) spans in which the platform stands still, s
     intervals: Intervals  # (K-1) between the keyframes
+    speed: MeanSpeed | None = None  # of the odometer, where it is known already
 
     def keyframe_at(self, t: Array) -> Array:
         """Index of the keyframe at each time, -1 where there is none."""

@@ -99,9 +99,12 @@ class GnssPosition(Constraint):
             return None
         keyframe = scene.keyframe_at(gnss.t)
         used = keyframe >= 0
+        if not used.any():
+            return None
         llh = gnss.llh[used]
         s = scene.settings.gnss
-        stated = (s.sd_factor or 1.0) * gnss.sd[used]
+        every = (s.sd_factor or 1.0) * gnss.sd
+        stated = every[used]
         common = _common(scene, TIME_OFFSET)
         share = s.slow_share or 0.0
         if share > 0:
@@ -115,7 +118,7 @@ class GnssPosition(Constraint):
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
             sigma=np.sqrt(1.0 - share) * stated,
             stated=stated,
-            usual=_usual(gnss.t[used], stated),
+            usual=_usual(gnss.t, every)[used],
             lever_arm=gnss.lever_arm,
             gyro=around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
             omega_n=scene.frame.omega_n,

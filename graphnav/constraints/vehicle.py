@@ -259,7 +259,7 @@ class OdometerSpeed(Wheels):
         s, odometer = scene.settings.vehicle, scene.recording.odometer
         if scene.recording.platform != "vehicle" or odometer is None or not s.odometer:
             return None
-        speed = MeanSpeed.of(odometer, faults(odometer, scene.recording.imu).spans)
+        speed = scene.speed or MeanSpeed.of(odometer, faults(odometer, scene.recording.imu).spans)
         rows = moving_rows(scene)
         begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
         reach = _REACH * odometer.delay_sigma

@@ -18,12 +18,17 @@ _CHUNK = 2000  # rows formatted by one %: long enough to be fast, short enough t
 
 
 def write(trajectory: Trajectory, path: Path) -> None:
-    """Write `trajectory` to `path`.
+    """Write `trajectory` to `path`; digits as in `rows`."""
+    require_geodetic(trajectory, path)
+    Path(path).write_text(HEADER + "\n" + rows(trajectory), "utf-8")
+
+
+def rows(trajectory: Trajectory) -> str:
+    """The rows of `trajectory`, a line each.
 
     Digits: a microsecond, a micrometre on the ground (1e-11 deg), 0.01 mm in height, 0.01 mm/s, 1e-7 deg;
     sigmas and biases six significant.
     """
-    require_geodetic(trajectory, path)
     deg = np.rad2deg(1.0)
     columns: list[Array] = [trajectory.t[:, None]]
     formats = ["%.6f"]
@@ -45,7 +50,7 @@ def write(trajectory: Trajectory, path: Path) -> None:
     add(trajectory.sd_rph, deg, "%.6g")
     add(trajectory.gyro_bias, 1.0, "%.6g")
     add(trajectory.accel_bias, 1.0, "%.6g")
-    Path(path).write_text(HEADER + "\n" + rows_text(np.concatenate(columns, axis=1), ",".join(formats)), "utf-8")
+    return rows_text(np.concatenate(columns, axis=1), ",".join(formats))
 
 
 def rows_text(table: Array, row_format: str) -> str:

@@ -107,6 +107,17 @@ def gaps(t: Array) -> Spans:
     return np.stack([t[k] + period_of(t), t[k + 1]], -1).reshape(-1, 2)
 
 
+def _sigmas(odometer: Odometer) -> tuple[float, float, float]:
+    """`white`, `rounding` and `ends` of a `MeanSpeed`."""
+    pulse = counts(odometer)
+    if odometer.speed_sigma is not None:
+        return float(odometer.speed_sigma), 0.0, 0.0
+    if pulse:  # each end of a count is wrong by up to one pulse, evenly: a difference of two
+        return 0.0, 0.0, float(np.sqrt(2.0) * _STEP * pulse)
+    sigma, rounding = reading_sigma(odometer), _STEP * quantum(odometer.speed)
+    return float(np.sqrt(max(sigma**2 - rounding**2, 0.0))), rounding, 0.0
+
+
 @dataclass(frozen=True)
 class MeanSpeed:
     """Mean speed over windows, from sums made once: a call costs two searches per window.
@@ -125,8 +136,8 @@ class MeanSpeed:
     ends: float  # m, the error of a way that is counted
 
     @classmethod
-    def of(cls, odometer: Odometer, spans: Spans | None = None) -> MeanSpeed:
-        """Without the readings in `spans` (see `faults`) and not across gaps."""
+    def of(cls, odometer: Odometer, spans: Spans | None = None, like: MeanSpeed | None = None) -> MeanSpeed:
+        """Without the readings in `spans` (see `faults`) and not across gaps; with the sigmas of `like`, if given."""
         t, speed = odometer.t, odometer.speed
         step = np.diff(t)
         good = np.ones(len(t), dtype=bool)
@@ -135,14 +146,9 @@ class MeanSpeed:
             good &= (t < begin) | (t >= end)
             across |= (t[:-1] < end) & (t[1:] > begin)
         bad = across | ~good[1:] | ~good[:-1]
-        counted, pulse = odometer.way is not None, counts(odometer)
+        counted = odometer.way is not None
         way = odometer.way if odometer.way is not None else np.r_[0.0, np.cumsum(0.5 * (speed[1:] + speed[:-1]) * step)]
-        sigma, rounding = reading_sigma(odometer), _STEP * quantum(speed)
-        white, ends = np.sqrt(max(sigma**2 - rounding**2, 0.0)), 0.0
-        if odometer.speed_sigma is not None:
-            white, rounding = sigma, 0.0
-        elif pulse:  # each end of a count is wrong by up to one pulse, evenly: a difference of two
-            white, rounding, ends = 0.0, 0.0, np.sqrt(2.0) * _STEP * pulse
+        white, rounding, ends = _sigmas(odometer) if like is None else (like.white, like.rounding, like.ends)
         return cls(
             t,
             speed,
@@ -150,9 +156,9 @@ class MeanSpeed:
             counted,
             np.r_[0, np.cumsum(bad)],
             np.r_[0, np.cumsum(speed[1:] != speed[:-1])],
-            white=float(white),
+            white=white,
             rounding=rounding,
-            ends=float(ends),
+            ends=ends,
         )
 
     def _segment(self, x: Array) -> NDArray[np.intp]:

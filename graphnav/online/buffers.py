@@ -1,0 +1,81 @@
+"""Rows of one sensor, in order of time, bounded at their old end."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.rotation import Array
+
+SAME = 1e-9  # s; rows closer than this are one
+
+
+class Buffer:
+    """Rows (t, values) kept in order whatever order they come in; a row at the end costs no copy."""
+
+    def __init__(self, columns: int) -> None:
+        self._data = np.empty((256, 1 + columns))
+        self._begin = self._end = 0
+
+    def __len__(self) -> int:
+        return self._end - self._begin
+
+    @property
+    def rows(self) -> Array:
+        """(N, 1 + columns), the time first; a view."""
+        return self._data[self._begin : self._end]
+
+    @property
+    def t(self) -> Array:
+        """(N,) s"""
+        return self._data[self._begin : self._end, 0]
+
+    @property
+    def newest(self) -> float:
+        """Newest time, minus infinity without any."""
+        return float(self._data[self._end - 1, 0]) if self._end > self._begin else -np.inf
+
+    def add(self, t: float, values: tuple[float, ...]) -> bool:
+        """Put a row in its place; False if there is one at that time already, which stays."""
+        if self._end == len(self._data):
+            self._make_room()
+        at = self._end
+        if t <= self.newest + SAME:
+            at = self._begin + int(np.searchsorted(self.t, t))
+            near = self._data[max(at - 1, self._begin) : min(at + 1, self._end), 0]
+            if np.abs(near - t).min() <= SAME:
+                return False
+        self._data[at + 1 : self._end + 1] = self._data[at : self._end]
+        self._data[at, 0], self._data[at, 1:] = t, values
+        self._end += 1
+        return True
+
+    def drop_before(self, t: float) -> None:
+        """Forget the rows before a time."""
+        self._begin += int(np.searchsorted(self.t, t))
+
+    def drop_after(self, t: float) -> None:
+        """Forget the rows after a time."""
+        self._end = self._begin + int(np.searchsorted(self.t, t, side="right"))
+
+    def between(self, begin: float, end: float) -> Array:
+        """The rows from `begin` to `end`, both included, as a copy."""
+        lo, hi = np.searchsorted(self.t, begin, side="left"), np.searchsorted(self.t, end, side="right")
+        return self.rows[lo:hi].copy()
+
+    def _make_room(self) -> None:
+        rows = self.rows
+        if len(rows) > len(self._data) // 2:
+            grown = np.empty((2 * len(self._data), self._data.shape[1]))
+            grown[: len(rows)] = rows
+            self._data = grown
+        else:
+            self._data[: len(rows)] = rows.copy()
+        self._begin, self._end = 0, len(rows)
+
+    def __getstate__(self) -> Array:
+        return self.rows.copy()
+
+    def __setstate__(self, rows: Array) -> None:
+        self._data = np.empty((max(256, len(rows)), rows.shape[1]))
+        self._data[: len(rows)] = rows
+        self._begin, self._end = 0, len(rows)

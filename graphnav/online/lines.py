@@ -1,0 +1,164 @@
+"""The line protocol of a live source: text, a row a line, described in docs/online.md.
+
+graphnav-online/1 {"platform": "vehicle", "imu": {"noise": {...}}, "gnss": {"lever_arm": [0, 0, 1.2]}}
+I,t,gx,gy,gz,ax,ay,az
+G,t,lat,lon,h,sd_e,sd_n,sd_u[,ve,vn,vu,sd_ve,sd_vn,sd_vu]
+O,t,speed
+E
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, fields
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from graphnav.config import explain
+from graphnav.errors import RecordingError
+from graphnav.online.sensors import Row, rows_of
+from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
+
+HEAD = "graphnav-online/1"
+END = "E"
+_NONE, _ROWS = np.empty(0), np.empty((0, 3))
+_BLANK = (float("nan"),) * 6
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class _Imu(_Part):
+    noise: dict[str, float] = Field(default_factory=dict)
+
+
+class _Gnss(_Part):
+    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class _Odometer(_Part):
+    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scale_sigma: float = Field(0.02, gt=0)
+    signed: bool = True
+    speed_sigma: float | None = Field(None, gt=0)
+    delay_sigma: float = Field(0.0, ge=0)
+
+
+class _Setup(_Part):
+    name: str = "online"
+    platform: Literal["vehicle", "foot"] = "vehicle"
+    imu: _Imu = _Imu()
+    gnss: _Gnss | None = None
+    odometer: _Odometer | None = None
+
+
+def setup_of(line: str) -> Recording:
+    """The sensors that the first line of a source describes.
+
+    Raises
+    ------
+    RecordingError
+        In one plain sentence, if it is not such a line.
+    """
+    word, _, text = line.strip().partition(" ")
+    if word != HEAD:
+        raise RecordingError(f"line 1: a live source begins with '{HEAD}' and a setup as JSON, not with '{line[:40]}'")
+    try:
+        found = _Setup.model_validate(json.loads(text or "{}"))
+    except json.JSONDecodeError as error:
+        raise RecordingError(f"line 1: the setup is not JSON ({error.msg} at character {error.pos})") from None
+    except ValidationError as error:
+        raise RecordingError(f"line 1: setup: {explain(error, _Setup)}") from None
+    known = {f.name for f in fields(ImuNoise)}
+    unknown = sorted(set(found.imu.noise) - known)
+    if unknown:
+        raise RecordingError(
+            f"line 1: setup: unknown key 'imu.noise.{unknown[0]}'; known keys: {', '.join(sorted(known))}"
+        )
+    gnss = odometer = None
+    if found.gnss is not None:
+        gnss = Gnss(_NONE, _ROWS, _ROWS, lever_arm=np.array(found.gnss.lever_arm))
+    if (o := found.odometer) is not None:
+        odometer = Odometer(
+            _NONE, _NONE, np.array(o.lever_arm), o.scale_sigma,
+            signed=o.signed, speed_sigma=o.speed_sigma, delay_sigma=o.delay_sigma,
+        )  # fmt: skip
+    imu = Imu(_NONE, _ROWS, _ROWS, ImuNoise(**found.imu.noise), noise_assumed=not found.imu.noise)
+    return Recording(found.name, found.platform, imu, gnss, odometer)
+
+
+def row_of(line: str) -> Row | None:
+    """A row; None for an empty line or a comment.
+
+    Raises
+    ------
+    ValueError
+        In a few words, if it is neither.
+    """
+    line = line.strip()
+    if not line or line.startswith("#"):
+        return None
+    kind, *cells = line.split(",")
+    try:
+        numbers = [float(cell) if cell.strip() else float("nan") for cell in cells]
+    except ValueError:
+        raise ValueError(f"'{line[:40]}' holds something that is no number") from None
+    if kind == "I" and len(numbers) == 7:
+        return "imu", numbers[0], tuple(numbers[1:])
+    if kind == "G" and len(numbers) in (7, 13):
+        place = (np.radians(numbers[1]), np.radians(numbers[2]), *numbers[3:7])
+        return "gnss", numbers[0], (*map(float, place), *(numbers[7:] or _BLANK))
+    if kind == "O" and len(numbers) == 2:
+        return "odometer", numbers[0], (numbers[1], *_BLANK[:5])
+    wanted = {"I": "7", "G": "7 or 13", "O": "2"}.get(kind)
+    raise ValueError(
+        f"'{kind}' needs {wanted} numbers, not {len(numbers)}" if wanted else f"no rows of kind '{kind[:10]}'"
+    )
+
+
+def head_of(recording: Recording) -> str:
+    """The first line that describes the sensors of a recording."""
+    setup: dict[str, object] = {"name": recording.name, "platform": recording.platform}
+    setup["imu"] = {"noise": asdict(recording.imu.noise)}
+    if recording.gnss is not None:
+        setup["gnss"] = {"lever_arm": recording.gnss.lever_arm.tolist()}
+    o = recording.odometer
+    if o is not None:
+        setup["odometer"] = {
+            "lever_arm": o.lever_arm.tolist(), "scale_sigma": o.scale_sigma, "signed": o.signed,
+            "speed_sigma": o.speed_sigma, "delay_sigma": o.delay_sigma,
+        }  # fmt: skip
+    return f"{HEAD} {json.dumps(setup)}"
+
+
+def line_of(row: Row) -> str:
+    """A row as a line; every number reads back as it was."""
+    sensor, t, values = row
+    if sensor == "imu":
+        return f"I,{t!r}," + ",".join(map(repr, values))
+    if sensor == "odometer":
+        return f"O,{t!r},{values[0]!r}"
+    lat, lon = float(np.degrees(values[0])), float(np.degrees(values[1]))
+    rest = values[2:6] if np.isnan(values[6]) else values[2:]
+    return f"G,{t!r},{lat!r},{lon!r}," + ",".join("" if np.isnan(x) else repr(x) for x in rest)
+
+
+def lines_of(recording: Recording) -> Iterator[tuple[float, str]]:
+    """A recording as a live source would send it: time and line, the first line and the end included."""
+    yield recording.start, head_of(recording)
+    for row in rows_of(recording)[1]:
+        yield row[1], line_of(row)
+    yield recording.end, END
+
+
+def split(chunks: Iterable[bytes]) -> Iterator[str]:
+    """Whole lines of a stream that comes in pieces; what follows the last line end is dropped."""
+    rest = b""
+    for chunk in chunks:
+        *whole, rest = (rest + chunk).split(b"\n")
+        for line in whole:
+            yield line.decode("utf-8", "replace")

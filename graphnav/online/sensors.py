@@ -1,0 +1,172 @@
+"""What has come from the sensors so far: checked, in order of time, and bounded."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from graphnav.online.buffers import Buffer
+from graphnav.recording import Gnss, Odometer, Recording
+from graphnav.rotation import Array
+
+AHEAD = 60.0  # s; stamps of other sensors further than this before the IMU's are wrong
+_WIDTH = {"imu": 6, "gnss": 15, "odometer": 6}  # the last three of a fix: its usual sigma
+_USUAL = 60.0  # s over which the usual sigma of fixes is averaged
+_NAN = float("nan")
+
+Row = tuple[str, float, tuple[float, ...]]  # sensor, time (s), values
+
+
+@dataclass
+class Sensors:
+    """Buffers of all sensors.
+
+    Parameters
+    ----------
+    setup : a recording without rows: platform, noise figures, lever arms.
+    longest_gap : s between IMU rows beyond which a stamp is wrong, or the IMU was away.
+    """
+
+    setup: Recording
+    longest_gap: float = 2.0
+    counts: Counter[str] = field(default_factory=Counter)
+    imu: Buffer = field(default_factory=lambda: Buffer(_WIDTH["imu"]))
+    gnss: Buffer = field(default_factory=lambda: Buffer(_WIDTH["gnss"]))
+    odometer: Buffer = field(default_factory=lambda: Buffer(_WIDTH["odometer"]))
+    oldest: float = -np.inf  # s; rows up to here come too late
+    _mean: tuple[float, tuple[float, ...]] = (-np.inf, (0.0, 0.0, 0.0))
+    _suspect: tuple[float, tuple[float, ...]] | None = None  # an IMU row far ahead of the one before
+
+    def add(self, sensor: str, t: float, values: tuple[float, ...]) -> bool:
+        """Take in a row; False if it is of no use (`counts` says why).
+
+        The values are gyro and force of an IMU (rad/s, m/s^2); latitude, longitude (rad), height, three sigmas,
+        velocity and its sigmas (NaN where there is none) of a fix; speed, way counted and four wheels of an odometer.
+        """
+        known = values[: 6 if sensor != "odometer" else 1]
+        if not (np.isfinite(t) and np.isfinite(known).all()) or (sensor == "gnss" and min(values[3:6]) <= 0.0):
+            self.counts[f"{sensor}: not a number"] += 1
+            return False
+        if t <= self.oldest:
+            self.counts[f"{sensor}: too late"] += 1
+            return False
+        buffer: Buffer = getattr(self, sensor)
+        if sensor == "imu":
+            return self._add_imu(t, values)
+        if len(self.imu) and t > self.imu.newest + AHEAD:
+            self.counts[f"{sensor}: stamp in the future"] += 1
+            return False
+        if sensor == "gnss":
+            values = (*values, *self._usually(t, values[3:6]))
+        if not buffer.add(t, values):
+            self.counts[f"{sensor}: repeated"] += 1
+            return False
+        self.counts[sensor] += 1
+        return True
+
+    def usual(self, t: Array) -> Array:
+        """(N, 3) what the fixes at some times usually state, m: the unit of their slow errors."""
+        return self.gnss.rows[np.searchsorted(self.gnss.t, t - 1e-6), 13:16]
+
+    def _usually(self, t: float, sd: tuple[float, ...]) -> tuple[float, ...]:
+        """A mean that looks back only, and so is the same whenever a fix is posed.
+
+        The median of a minute that `graphnav.constraints.gnss` takes would change with every row that follows, and
+        a slow error in such a unit would give itself away.
+        """
+        last, mean = self._mean
+        gain = -np.expm1(-max(t - last, 0.0) / _USUAL) if np.isfinite(last) else 1.0
+        mean = tuple(float(m + gain * (s - m)) for m, s in zip(mean, sd, strict=True))
+        self._mean = max(t, last), mean
+        return mean
+
+    def _add_imu(self, t: float, values: tuple[float, ...]) -> bool:
+        if len(self.imu) and t > self.imu.newest + self.longest_gap:
+            # the next row tells whether this stamp was wrong or the IMU away
+            before, self._suspect = self._suspect, (t, values)
+            if before is None or not 0.0 < t - before[0] < self.longest_gap:
+                self.counts["imu: stamp in the future"] += before is not None
+                return False
+            self.imu.add(*before)
+            self.counts["imu"] += 1
+        elif self._suspect is not None:
+            self.counts["imu: stamp in the future"] += 1
+        self._suspect = None
+        if not self.imu.add(t, values):
+            self.counts["imu: repeated"] += 1
+            return False
+        self.counts["imu"] += 1
+        return True
+
+    def drop_before(self, t: float) -> None:
+        """Forget rows before a time."""
+        for buffer in (self.imu, self.gnss, self.odometer):
+            buffer.drop_before(t)
+
+    def recording(self, begin: float = -np.inf, end: float = np.inf) -> Recording:
+        """The rows between two times as a recording."""
+        rows = self.imu.between(begin, end)
+        imu = replace(self.setup.imu, t=rows[:, 0], gyro=rows[:, 1:4], accel=rows[:, 4:7])
+        return replace(self.setup, imu=imu, gnss=self._gnss(begin, end), odometer=self._odometer(begin, end))
+
+    def _gnss(self, begin: float, end: float) -> Gnss | None:
+        rows = self.gnss.between(begin, end)
+        if self.setup.gnss is None or not len(rows):
+            return None
+        v = sd_v = None
+        if np.isfinite(rows[:, 7:13]).all(axis=1).any():
+            v, sd_v = rows[:, 7:10], rows[:, 10:13]
+        return replace(self.setup.gnss, t=rows[:, 0], llh=rows[:, 1:4], sd=rows[:, 4:7], v=v, sd_v=sd_v)
+
+    def _odometer(self, begin: float, end: float) -> Odometer | None:
+        rows = self.odometer.between(begin, end)
+        if self.setup.odometer is None or len(rows) < 2:
+            return None
+        way = rows[:, 2] if np.isfinite(rows[:, 2]).all() else None
+        wheels = rows[:, 3:7] if np.isfinite(rows[:, 3:7]).any() else None
+        return replace(self.setup.odometer, t=rows[:, 0], speed=rows[:, 1], way=way, wheels=wheels)
+
+
+def without_rows(recording: Recording) -> Recording:
+    """The setup of a recording's sensors."""
+    none, rows = np.empty(0), np.empty((0, 3))
+    gnss, odometer = recording.gnss, recording.odometer
+    return replace(
+        recording,
+        imu=replace(recording.imu, t=none, gyro=rows, accel=rows),
+        gnss=gnss and replace(gnss, t=none, llh=rows, sd=rows, v=None, sd_v=None),
+        odometer=odometer and replace(odometer, t=none, speed=none, way=None, wheels=None),
+        truth=None,
+    )
+
+
+def rows_of(recording: Recording) -> tuple[Array, list[Row]]:
+    """Every row of a recording in the order in which sensors without delay would have sent them, and their times."""
+    parts: list[tuple[Array, str, Array]] = []
+    if recording.odometer is not None:
+        o = recording.odometer
+        blank = np.full((len(o.t), 6), np.nan)
+        blank[:, 0] = o.speed
+        if o.way is not None:
+            blank[:, 1] = o.way
+        if o.wheels is not None:
+            blank[:, 2:] = o.wheels
+        parts.append((o.t, "odometer", blank))
+    if recording.gnss is not None:
+        g = recording.gnss
+        blank = np.full((len(g.t), 12), np.nan)
+        blank[:, :3], blank[:, 3:6] = g.llh, g.sd
+        if g.v is not None and g.sd_v is not None:
+            blank[:, 6:9], blank[:, 9:] = g.v, g.sd_v
+        parts.append((g.t, "gnss", blank))
+    parts.append((recording.imu.t, "imu", np.concatenate([recording.imu.gyro, recording.imu.accel], axis=1)))
+    t = np.concatenate([part[0] for part in parts])
+    order = np.argsort(t, kind="stable")
+    every = [
+        (name, x, tuple(row))
+        for times, name, rows in parts
+        for x, row in zip(times.tolist(), rows.tolist(), strict=True)
+    ]
+    return t[order], [every[i] for i in order]

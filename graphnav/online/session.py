@@ -1,0 +1,154 @@
+"""An online run from a source to a folder: rows in, settled rows and checkpoints out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from graphnav.config import Settings
+from graphnav.online.lines import END, row_of, setup_of
+from graphnav.online.sensors import Row, rows_of, without_rows
+from graphnav.online.smoother import Online
+from graphnav.online.store import Store
+from graphnav.recording import Recording
+
+CHECKPOINTS = 60.0  # s of IMU time between checkpoints while nothing settles
+_FEW = 5  # bad lines that are told
+
+
+class Session:
+    """A run that can be ended at any time and resumed.
+
+    Parameters
+    ----------
+    folder : where it writes; None to keep nothing.
+    source : what the rows come from, remembered to tell a wrong --resume.
+    recording : replayed, or None where lines come from a live source.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        source: str,
+        folder: Path | None = None,
+        resume: bool = False,
+        recording: Recording | None = None,
+    ) -> None:
+        self.settings, self.folder = settings, folder
+        self.store = None if folder is None else Store(folder, source, resume, live=recording is None)
+        self.online: Online | None = None
+        self.taken = self.bad = self.rows_settled = 0
+        self.done = False
+        self.complaints: list[str] = []
+        self._kept = float("-inf")
+        self.rows: list[Row] = rows_of(recording)[1] if recording is not None else []
+        resumed = self.store.resumed if self.store is not None else None
+        if resumed is not None:
+            self.online, self.done = resumed.online, resumed.done
+            self.taken, self.rows_settled, self.bad = (resumed.counts[k] for k in ("taken", "settled", "bad"))
+            self._kept = self.online.sensors.imu.newest
+        elif recording is not None:
+            self._begin(Online(without_rows(recording), settings))
+        if self.store is not None and resumed is not None and recording is None:
+            self.store.recall()
+            self._take_pending(self.store)
+
+    def add(self, row: Row) -> None:
+        """Take in one row."""
+        assert self.online is not None
+        self.online.add(row)
+        self.taken += 1
+        self._save()
+
+    def add_lines(self, lines: list[str], asked: Callable[[], bool] = bool) -> None:
+        """Take in lines of a live source; they are in the journal before they count.
+
+        Once `asked` to end, the rest stays there.
+        """
+        if self.store is None:
+            for line in lines:
+                self._take_line(line)
+        elif lines:
+            self.store.note([line.encode() for line in lines])
+            self._take_pending(self.store, asked)
+
+    def finish(self) -> None:
+        """Nothing more will come: settle all and say what it was."""
+        if self.done or self.online is None:
+            return
+        self.online.finish()
+        self.done = True
+        self._save(last=True)
+        if self.folder is not None:
+            (self.folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n", encoding="utf-8")
+
+    def stop(self) -> None:
+        """Asked to end before the source does: remember where it was."""
+        if self.store is not None and self.online is not None and not self.done:
+            self.store.checkpoint(self.online, self._counts())
+
+    def close(self) -> None:
+        """Let go of the files."""
+        if self.store is not None:
+            self.store.close()
+
+    def summary(self) -> dict[str, object]:
+        """Counts of rows, and what was noted."""
+        assert self.online is not None
+        online = self.online
+        return {
+            "source": "online",
+            "settled": self.rows_settled,
+            "rows": dict(online.sensors.counts),
+            "late_and_used": dict(online.late),
+            "bad_lines": self.bad,
+            "first_bad_lines": self.complaints,
+            "notes": online.notes,
+            "lag_s": self.settings.solver.lag,
+        }
+
+    def _take_pending(self, store: Store, asked: Callable[[], bool] = bool) -> None:
+        while store.pending and not asked():
+            self._take_line(store.pending.popleft().decode("utf-8", "replace"))
+
+    def _counts(self) -> dict[str, int]:
+        return {"taken": self.taken, "settled": self.rows_settled, "bad": self.bad}
+
+    def _begin(self, online: Online) -> None:
+        self.online = online
+        if self.store is not None:
+            self.store.checkpoint(online, self._counts())
+
+    def _take_line(self, line: str) -> None:
+        if self.online is None:
+            if line.strip() and not line.startswith("#"):
+                self._begin(Online(setup_of(line), self.settings))
+            return
+        if line.strip() == END:
+            self.finish()
+            return
+        if self.done or line.startswith("graphnav-online/"):
+            return  # a sender that begins anew
+        try:
+            row = row_of(line)
+        except ValueError as error:
+            self.bad += 1
+            if len(self.complaints) < _FEW:
+                self.complaints.append(str(error))
+            return
+        if row is not None:
+            self.add(row)
+
+    def _save(self, last: bool = False) -> None:
+        assert self.online is not None
+        tracks = self.online.settled()
+        self.rows_settled += sum(len(track) for track in tracks)
+        if self.store is None:
+            return
+        newest = self.online.sensors.imu.newest
+        if tracks:
+            self.store.append(tracks)
+        if tracks or last or newest - self._kept > CHECKPOINTS:
+            self.store.checkpoint(self.online, self._counts(), self.done)
+            self._kept = newest

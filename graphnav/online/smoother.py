@@ -1,0 +1,238 @@
+"""From sensors' rows, as they come, to a live state and a settled trajectory.
+
+Rows may come in any order and with gaps: each is used at its own time as long as that lies in the window. What
+comes out depends on the rows and their order alone, never on when or in what portions they were handed over.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.alignment import align, ready, with_known_heading
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME
+from graphnav.detectors import detect
+from graphnav.earth import LocalFrame
+from graphnav.errors import EstimationError
+from graphnav.online.sensors import Row, Sensors
+from graphnav.online.tracker import CONTEXT, Live, Tracker
+from graphnav.pipeline import judged, origin
+from graphnav.recording import Recording
+from graphnav.solution import to_trajectory
+from graphnav.solvers.batch import batch
+from graphnav.solvers.window import first_message
+from graphnav.trajectory import Trajectory
+
+AFTER = 0.05  # s of IMU after a keyframe that a fix may look at
+_ODOMETER = 0.3  # s that a keyframe waits for the odometer
+_SILENT = 2.0  # s after which an odometer is not waited for
+_TRY = 2.0  # s between attempts at an alignment
+_LEVEL = 5.0  # s of rest that level a vehicle without GNSS
+_PATIENCE = 300.0  # s of rows kept while there is no motion to align with
+
+
+class Online:
+    """Smooths while the drive happens.
+
+    Parameters
+    ----------
+    setup : a recording without rows (`graphnav.online.without_rows`): platform, noise figures, lever arms.
+    settings : as for a recording; `solver.lag` says how much future a settled state has seen.
+    """
+
+    def __init__(self, setup: Recording, settings: Settings | None = None) -> None:
+        self.settings = settings or Settings()
+        self.sensors = Sensors(setup, self.settings.keyframes.bridge)
+        self.frame: LocalFrame | None = None
+        self.tracker: Tracker | None = None
+        self.notes: list[str] = []
+        self.late: Counter[str] = Counter()  # rows that came after the keyframe they belong before, and were used
+        self._fixes: list[float] = []  # s, not yet in the graph
+        self._due = -np.inf
+        self._dirty = np.inf
+        self._settled: list[Trajectory] = []
+        self._last_settled = -np.inf
+
+    @property
+    def status(self) -> str:
+        """ "aligning" or "running"."""
+        return "aligning" if self.tracker is None else "running"
+
+    def add(self, row: Row) -> None:
+        """Take in one row: sensor, time and values as in `graphnav.online.sensors.Sensors.add`."""
+        sensor, t, values = row
+        sensors = self.sensors
+        before = sensors.imu.newest
+        previous = sensors.odometer.newest
+        if not sensors.add(sensor, t, values):
+            return
+        if sensor == "imu":
+            newest = sensors.imu.newest
+            if newest - before > self.settings.keyframes.bridge and len(sensors.imu) > 1 and np.isfinite(before):
+                self._restart(before)
+        tracker = self.tracker
+        if tracker is not None:
+            if sensor == "gnss" and t > tracker.newest + SAME_TIME:
+                self._fixes = sorted([*self._fixes, t])
+                self._due = min(self._due, t + AFTER)
+            elif t <= tracker.newest + SAME_TIME:
+                self.late[sensor] += 1
+                if sensor == "gnss":
+                    self._fixes = sorted([*self._fixes, t])
+                self._dirty = min(self._dirty, t)
+            elif sensor == "odometer" and previous < tracker.newest - SAME_TIME:
+                self._dirty = min(self._dirty, previous + 2.0 * SAME_TIME)
+        if sensors.imu.newest >= self._due:
+            if self.tracker is None:
+                self._align()
+            else:
+                self._advance(self.tracker)
+
+    def live(self) -> Live | None:
+        """The state at the newest IMU row; None while aligning."""
+        return None if self.tracker is None else self.tracker.live(self.sensors)
+
+    def settled(self) -> list[Trajectory]:
+        """What has settled since it was last asked for."""
+        out, self._settled = self._settled, []
+        return out
+
+    def finish(self) -> None:
+        """Nothing more will come: settle all."""
+        if self.tracker is None:
+            try:
+                self._align(last=True)
+            except EstimationError as error:
+                self.notes.append(str(error))
+        if self.tracker is not None:
+            self._advance(self.tracker, last=True)
+            self.tracker.settle(self.sensors)
+            self._collect(self.tracker)
+
+    # ------------------------------------------------------------------------------------------------- alignment
+    def _align(self, last: bool = False) -> None:
+        sensors = self.sensors
+        if len(sensors.imu) < 2:
+            return
+        first, now = float(sensors.imu.t[0]), sensors.imu.newest
+        self._due = now + _TRY
+        if now - first < _LEVEL:
+            return
+        recording = sensors.recording()
+        if recording.gnss is None and sensors.setup.gnss is not None and not last:
+            self._wait(now)
+            return
+        if recording.gnss is not None and not last and not ready(recording, self.settings):
+            self._wait(now)
+            return
+        if self.frame is None:
+            self.frame = LocalFrame(origin(recording))
+        frame = self.frame
+        try:
+            found = align(recording, self.settings, frame, lambda problem, start: batch(
+                problem, start, wanted=(0,), reintegrate=False))  # fmt: skip
+            stationary = detect(recording, self.settings).stationary
+            recording, settings, said = judged(recording, self.settings, frame, found, stationary)
+        except EstimationError as error:
+            if last:
+                raise
+            self.notes.append(f"not aligned at {now:.1f} s: {error}")
+            self._wait(now)
+            return
+        # what the IMU was judged to be holds from here on
+        sensors.setup = _with_noise(sensors.setup, recording)
+        stated = with_known_heading(found, self.settings)
+        self.notes += [*stated.notes, *said]
+        self.tracker = Tracker(
+            settings, frame, first_message(stated.state, stated.sigma), recording.start, recording.imu.noise
+        )
+        if found is not stated:
+            self.tracker.window.head = self.tracker.window.head.moved(found.state.minus(stated.state)[0])
+        self._fixes = [t for t in sensors.gnss.t.tolist() if t >= recording.start - SAME_TIME]
+        sensors.oldest = recording.start
+        self._advance(self.tracker)
+
+    def _wait(self, now: float) -> None:
+        """Keep what the next attempt may need."""
+        if now - float(self.sensors.imu.t[0]) > _PATIENCE:
+            self.sensors.drop_before(now - 0.5 * _PATIENCE)
+
+    def _restart(self, before: float) -> None:
+        """The IMU was away for too long: what was before settles as it is, and an alignment begins anew."""
+        sensors = self.sensors
+        self.notes.append(f"the IMU was silent from {before:.3f} to {sensors.imu.newest:.3f} s: aligning anew")
+        after = sensors.imu.rows[sensors.imu.t > before].copy()
+        later = {name: getattr(sensors, name).rows.copy() for name in ("gnss", "odometer")}
+        if self.tracker is not None:
+            sensors.imu.drop_after(before)
+            self._advance(self.tracker, last=True)
+            self.tracker.settle(sensors)
+            self._collect(self.tracker)
+        self.tracker = None
+        sensors.drop_before(np.inf)
+        for row in after:
+            sensors.imu.add(float(row[0]), tuple(row[1:]))
+        for name, rows in later.items():
+            for row in rows[rows[:, 0] > before]:
+                getattr(sensors, name).add(float(row[0]), tuple(row[1:]))
+        sensors.oldest = before
+        self._fixes, self._dirty, self._due = [], np.inf, sensors.imu.newest + _TRY
+
+    # --------------------------------------------------------------------------------------------------- running
+    def _advance(self, tracker: Tracker, last: bool = False) -> None:
+        """Make the keyframes that are due."""
+        sensors, period = self.sensors, 1.0 / self.settings.keyframes.rate
+        now = sensors.imu.newest
+        limit = now if last else now - AFTER
+        odometer = sensors.odometer.newest
+        if not last and now - odometer < _SILENT:
+            limit = min(limit, max(odometer, now - _ODOMETER))
+        T = tracker.newest
+        begun = bool(len(tracker.window)) or tracker.opened
+        anchors = [t for t in self._fixes if T + SAME_TIME < t <= limit]
+        if last and limit > T + SAME_TIME and (not anchors or limit > anchors[-1] + SAME_TIME):
+            anchors.append(limit)
+        times = [] if begun else [T]
+        at = T
+        for anchor in [*anchors, np.inf]:
+            while anchor - at > period * (1.0 + 1e-6) and at + period <= limit:
+                at += period
+                times.append(at)
+            if np.isfinite(anchor):
+                at = anchor
+                times.append(at)
+        late = [t for t in self._fixes if t <= T + SAME_TIME]
+        if late and begun:
+            # a keyframe of its own, and those after it again
+            self._dirty = min(self._dirty, *late)
+            times = sorted({*times, *late})
+        enough = len(times) > 1 or begun
+        if (times and enough) or (last and self._dirty < np.inf):
+            dirty, self._dirty = self._dirty, np.inf
+            self._fixes = [t for t in self._fixes if t > limit and t > T + SAME_TIME]
+            tracker.update(sensors, np.array(times), dirty)
+            self._collect(tracker)
+        T = tracker.newest
+        self._due = min([T + period, *(t for t in self._fixes if t > T)]) + AFTER
+
+    def _collect(self, tracker: Tracker) -> None:
+        for part in tracker.settled:
+            rows = part.t > self._last_settled
+            if rows.any():
+                assert self.frame is not None
+                track = to_trajectory("online", self.frame, part.t[rows], part.states[rows], part.covariance[rows])
+                self._settled.append(track)
+                self._last_settled = float(part.t[-1])
+        tracker.settled.clear()
+        self.sensors.oldest = max(self.sensors.oldest, tracker.head)
+        begin = tracker.head
+        if len(tracker.stops):
+            begin = min(begin, max(float(tracker.stops[0, 0]), begin - 10.0 * CONTEXT))
+        self.sensors.drop_before(begin - CONTEXT - 5.0)
+
+
+def _with_noise(setup: Recording, judged_as: Recording) -> Recording:
+    return replace(setup, imu=replace(setup.imu, noise=judged_as.imu.noise))

@@ -1,0 +1,177 @@
+"""What an online run leaves on disk, so that nothing that has settled is lost whatever ends it.
+
+    trajectory.csv    grows as keyframes settle, by whole rows, each time made sure of (fsync)
+    checkpoint        the smoother as it was when it grew last, and how far the source was read; replaced in one step
+    journal-N         of a live source: the lines taken in since that checkpoint
+
+To resume is to cut trajectory.csv to the length that the checkpoint knows and to go on from there: the same rows in
+the same order make the same trajectory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import pickle
+from collections import deque
+from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
+from typing import Any
+
+from graphnav.errors import ConfigError, GraphnavError
+from graphnav.exporters import csv
+from graphnav.online.smoother import Online
+from graphnav.trajectory import Trajectory
+
+TRAJECTORY, CHECKPOINT = "trajectory.csv", "checkpoint"
+_MAGIC = b"graphnav checkpoint 1\n"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A smoother, and where it was."""
+
+    online: Online
+    source: str  # what the rows come from
+    counts: dict[str, int]  # rows taken in, settled, and lines that were bad
+    length: int  # bytes of trajectory.csv
+    journal: int  # number of the journal with what came since
+    done: bool  # nothing more will come
+
+
+class Store:
+    """The folder of a run.
+
+    Raises
+    ------
+    ConfigError
+        If the folder holds a run and is not to be resumed, or the other way round.
+    """
+
+    def __init__(self, folder: Path, source: str, resume: bool, live: bool) -> None:
+        self.folder, self.source, self.live = folder, source, live
+        self.pending: deque[bytes] = deque()  # lines in the journal that were not taken in yet
+        self._journal: FileIO | None = None
+        self._number = 0
+        path = folder / CHECKPOINT
+        self.resumed: Checkpoint | None = None
+        if resume:
+            if not path.exists():
+                raise ConfigError(f"--resume: {folder} holds no checkpoint to go on from")
+            self.resumed = _read(path)
+            if self.resumed.source != source:
+                raise ConfigError(f"--resume: {folder} was made from '{self.resumed.source}', not from '{source}'")
+            self._length = self.resumed.length
+            self._number = self.resumed.journal
+        elif path.exists():
+            raise ConfigError(f"-o {folder}: holds a run already; go on with --resume or name another folder")
+        folder.mkdir(parents=True, exist_ok=True)
+        self._file = (folder / TRAJECTORY).open("r+b" if (folder / TRAJECTORY).exists() else "w+b", buffering=0)
+        if self.resumed is None:
+            head = (csv.HEADER + "\n").encode()
+            self._file.truncate(0)
+            self._guarded(lambda: self._file.write(head))
+            self._length = len(head)
+        else:
+            if self._file.seek(0, os.SEEK_END) < self._length:
+                raise ConfigError(f"--resume: {folder / TRAJECTORY} is shorter than its checkpoint knows it")
+            self._file.truncate(self._length)
+            self._file.seek(self._length)
+
+    def recall(self) -> None:
+        """Make the whole lines that came after the checkpoint resumed from pending again."""
+        path = self._path(self._number)
+        if not path.exists():
+            return
+        whole, _, torn = path.read_bytes().rpartition(b"\n")
+        if torn:
+            with path.open("r+b") as file:
+                file.truncate(path.stat().st_size - len(torn))
+        self.pending.extend(whole.split(b"\n") if whole else [])
+
+    def note(self, lines: list[bytes]) -> None:
+        """Keep lines of a live source before they are taken in."""
+        if self._journal is None:
+            self._journal = self._path(self._number).open("ab", buffering=0)
+        journal = self._journal
+        self._guarded(lambda: journal.write(b"".join(line + b"\n" for line in lines)))
+        self.pending.extend(lines)
+
+    def append(self, tracks: list[Trajectory]) -> None:
+        """Add rows that have settled."""
+        rows = "".join(csv.rows(track) for track in tracks).encode()
+
+        def write() -> None:
+            done = 0
+            while done < len(rows):
+                done += self._file.write(rows[done:]) or 0
+            os.fsync(self._file.fileno())
+
+        self._guarded(write)
+        self._length += len(rows)
+
+    def checkpoint(self, online: Online, counts: dict[str, int], done: bool = False) -> None:
+        """Remember the smoother as it is now; what the journal held before is done with."""
+        number = self._number + 1
+        body = pickle.dumps(Checkpoint(online, self.source, counts, self._length, number, done), protocol=5)
+        path, fresh = self.folder / CHECKPOINT, self.folder / (CHECKPOINT + ".new")
+
+        def write() -> None:
+            if self.pending:
+                self._path(number).write_bytes(b"".join(line + b"\n" for line in self.pending))
+            with fresh.open("wb") as file:
+                file.write(_MAGIC + hashlib.sha256(body).digest() + body)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(fresh, path)
+            _sync(self.folder)
+
+        self._guarded(write)
+        if self._journal is not None:
+            self._journal.close()
+            self._journal = None
+        self._path(self._number).unlink(missing_ok=True)
+        self._number = number
+
+    def close(self) -> None:
+        """Nothing more will be written."""
+        self._file.close()
+        if self._journal is not None:
+            self._journal.close()
+
+    def _path(self, number: int) -> Path:
+        return self.folder / f"journal-{number:06d}"
+
+    def _guarded(self, write: Any) -> None:
+        """Write; if that fails, what is on disk stays whole and the reason is one sentence."""
+        try:
+            write()
+        except OSError as error:
+            for mend in (lambda: self._file.truncate(self._length), lambda: self._file.seek(self._length)):
+                with contextlib.suppress(OSError):
+                    mend()
+            raise GraphnavError(
+                f"{self.folder}: cannot be written ({error.strerror}); what had settled is safe, "
+                "mend that and go on with --resume"
+            ) from None
+
+
+def _read(path: Path) -> Checkpoint:
+    data = path.read_bytes()
+    start = len(_MAGIC) + 32
+    body = data[start:]
+    if not data.startswith(_MAGIC) or hashlib.sha256(body).digest() != data[len(_MAGIC) : start]:
+        raise ConfigError(f"--resume: {path} is no checkpoint of this version, or damaged")
+    found = pickle.loads(body)  # our own, by its digest; like any program, do not run what others hand you
+    assert isinstance(found, Checkpoint)
+    return found
+
+
+def _sync(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,294 @@
+"""The graph of a running drive: keyframes posed as they come, stops classified, the window kept and settled.
+
+New keyframes are posed like a recording (`graphnav.problem.pose`), from the rows around them: the same code builds
+the same rows as offline. Whatever changes the past inside the window (a fix that comes late, a stop that is
+recognised a second or two after it began) takes back the keyframes from there on and poses them again.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME
+from graphnav.constraints.gnss import GnssPosition
+from graphnav.constraints.standstill import PLACE
+from graphnav.dense import Dense
+from graphnav.detectors import detect
+from graphnav.detectors.base import merged
+from graphnav.dynamics import SCALE, Motion
+from graphnav.earth import LocalFrame
+from graphnav.online.sensors import Sensors
+from graphnav.preintegration import bridge_gaps, preintegrate
+from graphnav.problem import NODE_SPACING, Problem, pose
+from graphnav.recording import ImuNoise
+from graphnav.rotation import Array
+from graphnav.solvers.stages import Place, Step
+from graphnav.solvers.window import Message, Smoothed, Window, turn_limit
+from graphnav.state import DIM, Parameter, States
+from graphnav.wheels import MeanSpeed
+from graphnav.wheels.faults import faults
+
+CONTEXT = 30.0  # s of rows before a keyframe that its constraints may look at
+_BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
+_EVERY = 2.0  # s between looks of the detectors
+_WHEELS, _WHEELS_LOOK = 10.0, 40.0  # s between looks at the odometer, and what they see
+_LOOK = 30.0  # s that the detectors see
+_SEEN = 25.0  # s of these that they answer for; the first few lack what was before
+SURE = 1.0  # s before now that they answer for: the end of a stop shows only when it is over
+_PLACE_SIGMA = 1000.0  # m, of where a stop may be
+_PORTIONS = 8  # of the lag: keyframes settle in groups this long
+
+
+@dataclass(frozen=True)
+class Live:
+    """The state now: one state, the covariance of its error state, and the newest keyframe it is predicted from."""
+
+    t: float
+    state: States
+    covariance: Array  # (15, 15)
+    keyframe: float  # s
+
+
+class Tracker:
+    """Keyframes of a running drive.
+
+    Parameters
+    ----------
+    message, t0 : the prior and the time it is for.
+    noise : of the IMU.
+    """
+
+    def __init__(self, settings: Settings, frame: LocalFrame, message: Message, t0: float, noise: ImuNoise) -> None:
+        self.settings, self.frame = settings, frame
+        self.window = Window(message, turn_limit(noise))
+        self.head = t0  # time of the message before the window, or of the first keyframe as long as it is in it
+        self.opened = False  # whether the first keyframe has left the window
+        self.stops: Array = np.empty((0, 2))  # s, between keyframes
+        self.settled: list[Smoothed] = []
+        self.in_force: dict[str, int] = {}  # rows of each constraint at the newest keyframe
+        self.seconds: dict[str, float] = {}  # of process time, by what the newest update did
+        self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
+        self._head_nodes: dict[str, float] = {}
+        self._parameters: dict[str, Parameter] = {}
+        self._detected = self._judged = -np.inf
+        self._speed: MeanSpeed | None = None  # of the odometer, when it was looked at last
+        self._wrong: Array = np.empty((0, 2))  # s, where its readings are wrong
+
+    @property
+    def newest(self) -> float:
+        """Time of the newest keyframe, s."""
+        return self.window.stages[-1].place.t if self.window.stages else self.head
+
+    @property
+    def times(self) -> Array:
+        """Times of all keyframes that an interval in the window touches, s."""
+        t = self.window.t
+        return np.concatenate([[self.head], t]) if self.opened else t
+
+    def update(self, sensors: Sensors, new: Array, dirty: float = np.inf) -> None:
+        """Add keyframes at the times `new`, after the newest, and redo those from `dirty` on."""
+        clock = [time.process_time()]
+        edges = np.unique(np.concatenate([self.times, new]))
+        now = float(edges[-1])
+        if now - self._detected >= _EVERY - SAME_TIME:
+            dirty = min(dirty, self._classify(sensors, edges, now))
+        if now - self._judged >= _WHEELS - SAME_TIME:
+            dirty = min(dirty, self._judge_odometer(sensors, now))
+        clock.append(time.process_time())
+        t = self.window.t
+        keep = int(np.searchsorted(t, dirty - SAME_TIME))
+        times = np.unique(np.concatenate([t[keep:], new]))
+        times = times[np.concatenate([[True], np.diff(times) > SAME_TIME])]
+        if not len(times):
+            return
+        before = self.times[: len(self.times) - len(t) + keep]
+        before = before[-_BEFORE:] if len(self.stops) and self.stops[-1, 1] > times[0] - _BEFORE else before[-1:]
+        self.window.truncate(keep)
+        del self._nodes[keep:]
+        problem = self._pose(sensors, np.concatenate([before, times]))
+        clock.append(time.process_time())
+        turn = 0.0
+        for k in range(len(before), len(problem.t)):
+            turn = max(turn, self._push(problem, k))
+        if turn > self.window.turn:
+            self.window.converge(renewed=lambda first: self._renewed(sensors, first))
+        self.in_force = {
+            c.name: n for c in problem.constraints if (n := int(np.sum(c.keyframe == len(problem.t) - 1)))
+        }  # fmt: skip
+        if self.newest - self.window.stages[0].place.t > self.settings.solver.lag * (1.0 + 1.0 / _PORTIONS):
+            self.settle(sensors, self.newest - self.settings.solver.lag)
+        self._forget()
+        clock.append(time.process_time())
+        self.seconds = dict(zip(("detectors", "posing", "solving"), np.diff(clock).tolist(), strict=True))
+
+    def settle(self, sensors: Sensors, until: float = np.inf) -> None:
+        """Settle the keyframes before a time."""
+        count = int(np.searchsorted(self.window.t, until))
+        if not count:
+            return
+        last = count == len(self.window)
+        robust = {self.settings.gnss.robust, self.settings.vehicle.robust} != {"none"}
+        self.window.converge(always=last or robust, renewed=lambda first: self._renewed(sensors, first))
+        self._head_nodes = self._nodes[count - 1]
+        self.head, self.opened = float(self.window.t[count - 1]), True
+        self.settled.append(self.window.settle(count))
+        del self._nodes[:count]
+        self._forget()
+
+    def live(self, sensors: Sensors) -> Live:
+        """The state at the newest IMU row, by prediction from the newest keyframe."""
+        newest, T, now = self.window.newest, self.newest, sensors.imu.newest
+        state, P = newest.state, newest.covariance
+        if now > T + SAME_TIME:
+            imu = sensors.recording(T - 1.0, now).imu
+            intervals = preintegrate(bridge_gaps(imu), imu, np.array([T, now]), state.ba[0], state.bg[0])
+            motion, one = Motion(intervals, self.frame), slice(0, 1)
+            scale = newest.value(SCALE) if SCALE in newest.columns else None
+            ahead, F15 = motion.propagate(one, state, scale)
+            F = np.zeros((DIM, len(P)))
+            F[:, :DIM] = F15[0]
+            if scale is not None:
+                F[:, newest.columns[SCALE]] = motion.scale_columns(one, F15)[0]
+            P = F @ P @ F.T + motion.noise(one, state.R_nb)[0]
+            state = ahead
+        return Live(float(max(now, T)), state, P[:DIM, :DIM], T)
+
+    def since(self, sensors: Sensors) -> tuple[Array, States, Array]:
+        """Times (M,), states and covariances (M, 15, 15) at every IMU row since the newest keyframe.
+
+        Predicted through each row; covariances lie on the straight line between those at both ends.
+        """
+        message, T = self.window.newest, self.newest
+        t = sensors.imu.t[sensors.imu.t > T + SAME_TIME].copy()
+        if not len(t):
+            return t, message.state[:0], np.empty((0, DIM, DIM))
+        now = self.live(sensors)
+        imu, start = sensors.recording(T - 1.0, now.t).imu, message.state
+        ba, bg = start.ba, start.bg
+        if SCALE in message.columns:
+            scale, rows = message.value(SCALE), imu.t > T
+            bg = bg + scale[:3] * (imu.gyro[rows].mean(axis=0) - bg)
+            ba = ba + scale[3:] * (imu.accel[rows].mean(axis=0) - ba)
+        ends, both = np.array([T, now.t]), np.stack([message.covariance[:DIM, :DIM], now.covariance])
+        between = Dense(
+            bridge_gaps(imu), self.frame, ends, States.stack([start, now.state]), both, ba, bg, smooth=False
+        )  # fmt: skip
+        return t, *between(t)
+
+    # ------------------------------------------------------------------------------------------------- keyframes
+    def _pose(self, sensors: Sensors, times: Array) -> Problem:
+        begin = float(times[0])
+        if len(self.stops):  # a stop is posed whole, so that its place begins where it began
+            here = self.stops[(self.stops[:, 0] < begin) & (self.stops[:, 1] > begin)]
+            begin = min([begin, *here[:, 0].tolist()])
+        recording = sensors.recording(begin - CONTEXT, float(times[-1]) + 0.1)
+        start, speed = self.window.newest.state, None
+        if self._speed is not None and recording.odometer is not None:
+            speed = MeanSpeed.of(recording.odometer, self._wrong, self._speed)
+        problem = pose(recording, self.settings, self.frame, start, np.ones(DIM), self.stops, times, speed)
+        factor = self.settings.gnss.sd_factor or 1.0
+        rows = tuple(
+            replace(c, usual=factor * sensors.usual(times[c.keyframe])) if isinstance(c, GnssPosition) else c
+            for c in problem.constraints
+        )
+        return replace(problem, constraints=rows)
+
+    def _push(self, problem: Problem, k: int) -> float:
+        t = float(problem.t[k])
+        first = not self.window.stages and not self.opened
+        nodes = dict(self._nodes[-1] if self._nodes else self._head_nodes)
+        turn = self.window.push(Place(t, problem, k, self._steps(problem, t, nodes), linked=not first))
+        self._nodes.append(nodes)
+        return turn
+
+    def _steps(self, problem: Problem, t: float, nodes: dict[str, float]) -> tuple[Step, ...]:
+        """Parameters that begin or move on at a keyframe; `nodes` is brought up to date."""
+        self._parameters |= {chain.parameter.name: chain.parameter for chain in problem.chains}
+        steps = []
+        stop = self._stop_at(t)
+        for name, p in self._parameters.items():
+            if name == PLACE:
+                if stop is not None and nodes.get(name) != stop:
+                    place = self.window.newest.state.p[0]
+                    steps.append(Step(name, place, np.full(3, _PLACE_SIGMA)))
+                    nodes[name] = stop
+            elif name not in nodes:
+                steps.append(Step(name, np.atleast_2d(p.initial)[0], np.atleast_2d(p.sigma)[0]))
+                nodes[name] = t
+            elif not p.constant and t - nodes[name] >= NODE_SPACING - SAME_TIME:
+                ahead, added = p.step(np.array([t - nodes[name]]))
+                steps.append(Step(name, p.initial, added[0], float(ahead[0]), p.initial))
+                nodes[name] = t
+        return tuple(steps)
+
+    def _stop_at(self, t: float) -> float | None:
+        """When the stop began that lasts at a time."""
+        inside = (self.stops[:, 0] <= t + SAME_TIME) & (self.stops[:, 1] >= t - SAME_TIME)
+        return float(self.stops[inside][0, 0]) if inside.any() else None
+
+    def _renewed(self, sensors: Sensors, first: int) -> list[Place]:
+        """The places of the stages from `first` on, posed again."""
+        skip = len(self.times) - len(self.window)  # 1 once there is a keyframe before the first stage
+        begin = max(0, first + skip - _BEFORE)
+        problem = self._pose(sensors, self.times[begin:])
+        return [
+            replace(stage.place, problem=problem, k=first + skip - begin + i)
+            for i, stage in enumerate(self.window.stages[first:])
+        ]
+
+    def _forget(self) -> None:
+        """Stages need not know where their rows came from: that is posed again when it is asked for."""
+        stages = self.window.stages
+        for k, stage in enumerate(stages):
+            if stage.place.problem is not None:
+                stages[k] = replace(stage, place=replace(stage.place, problem=None))
+
+    # ----------------------------------------------------------------------------------------- stops, bad readings
+    def _judge_odometer(self, sensors: Sensors, now: float) -> float:
+        """Look for wrong readings of the odometer; returns the start of the first that was not known."""
+        whole, self._judged = not np.isfinite(self._judged), now
+        recording = sensors.recording(-np.inf if whole else now - _WHEELS_LOOK, now)
+        if recording.odometer is None:
+            return np.inf
+        found, known = faults(recording.odometer, recording.imu).spans, self._wrong
+        since = float(recording.odometer.t[0]) + (0.0 if whole else 5.0)
+        old = known[(known[:, 0] < since) & (known[:, 1] > since - CONTEXT - _WHEELS_LOOK)]
+        self._wrong = np.concatenate([old, found[found[:, 0] >= since]])
+        self._speed = MeanSpeed.of(recording.odometer, self._wrong)
+        new = self._wrong[~np.isin(self._wrong[:, 0], known[:, 0])]
+        return float(new[0, 0]) if len(new) and len(self.window) else np.inf
+
+    def _classify(self, sensors: Sensors, edges: Array, now: float) -> float:
+        """Ask the detectors; returns the start of the first interval between keyframes that they see otherwise."""
+        whole = not np.isfinite(self._detected)
+        since = float(edges[0]) if whole else now - _SEEN
+        self._detected = now
+        found = detect(sensors.recording(-np.inf if whole else now - _LOOK, now), self.settings).stationary
+        parts = [_clipped(self.stops, -np.inf, since), _clipped(found, since, now - SURE)]
+        spans = merged(np.concatenate(parts), gap=SAME_TIME)
+        spans = spans[spans[:, 1] >= edges[0] - SAME_TIME] if len(spans) else spans
+        aligned = []
+        for begin, end in spans:
+            inside = edges[(edges >= begin - SAME_TIME) & (edges <= end + SAME_TIME)]
+            if len(inside):
+                first = begin if begin < edges[0] else float(inside[0])
+                if inside[-1] > first:
+                    aligned.append((first, float(inside[-1])))
+        before, self.stops = self.stops, np.array(aligned).reshape(-1, 2)
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        changed = np.flatnonzero(_within(middle, before) != _within(middle, self.stops))
+        return float(edges[changed[0]]) if len(changed) else np.inf
+
+
+def _clipped(spans: Array, begin: float, end: float) -> Array:
+    cut = np.clip(spans, begin, end)
+    return cut[cut[:, 1] > cut[:, 0]]
+
+
+def _within(t: Array, spans: Array) -> Array:
+    """Which times lie in the spans (M, 2)."""
+    return np.asarray(((t[:, None] >= spans[:, 0]) & (t[:, None] <= spans[:, 1])).any(axis=1))

@@ -1,0 +1,280 @@
+"""A window over the newest keyframes: exact smoothing with bounded time and memory.
+
+Keyframes enter one by one (`graphnav.solvers.stages`); the newest message is what a filter would hold. Back through
+the stages go means and covariances (Rauch, Tung, Striebel in information form). A keyframe that is older than the
+lag leaves the window: its state is settled, and the message behind it is the marginal of all the past, a Gaussian on
+what the future still touches. Where a state has moved so far that its rows should be linearised anew, the stages
+from there on are made again about the smoothed states: Gauss-Newton on the window. A measurement that comes late
+does the same from its own time on. With a lag longer than the drive this is the batch solution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav import rotation
+from graphnav.recording import ImuNoise
+from graphnav.rotation import Array
+from graphnav.solvers.stages import (
+    Columns,
+    Message,
+    Place,
+    Stage,
+    at_points,
+    eliminate,
+    extended,
+    measured,
+    predicted,
+    width,
+)
+from graphnav.state import DIM, States
+
+_SHARE = (
+    0.01  # of the noise of a second's force that a turn may be neglected for: the same way every second, it adds up
+)
+_G = 9.8  # m/s^2
+_DELAY = 0.02  # s, of a delay: 1 mm where speed is known to 5 cm/s
+_ROUNDS = 5
+_ALMOST = 0.3
+_LIMITS = {"rad": 1e-2, "s": _DELAY}
+
+
+Renewed = Callable[[int], list[Place]]
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """Some keyframes with all that the window knows: states, covariances, and the parameters there."""
+
+    t: Array  # (n,)
+    states: States
+    covariance: Array  # (n, 15, 15)
+    columns: tuple[Columns, ...]
+    values: tuple[Array, ...]  # (D-15,) each
+    sigma: tuple[Array, ...]  # (D-15,) each
+    places: tuple[Place, ...]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+class Window:
+    """The newest keyframes of a drive.
+
+    Parameters
+    ----------
+    prior : message on the first keyframe before any measurement, from `first_message`.
+    turn : rad that an attitude may move before rows are linearised anew, from `turn_limit`.
+    """
+
+    def __init__(self, prior: Message, turn: float) -> None:
+        self.turn = turn
+        self.head = prior  # all that is known before the first stage
+        self.stages: list[Stage] = []
+        self.relinearized = 0  # stages made anew
+        self._limit = _limits(prior.columns, {})
+
+    def __len__(self) -> int:
+        return len(self.stages)
+
+    @property
+    def newest(self) -> Message:
+        """What is known of the newest keyframe: the live estimate is its point."""
+        return self.stages[-1].message if self.stages else self.head
+
+    @property
+    def t(self) -> Array:
+        """Times of the keyframes in the window, s."""
+        return np.array([stage.place.t for stage in self.stages])
+
+    def push(self, place: Place) -> float:
+        """Add a keyframe, linearised at its prediction; returns by how much its measurements turned it, rad."""
+        before = self.newest
+        state, values, columns, link = predicted(before, place)
+        linear = measured(place, state, values, columns)
+        if link is not None:
+            linear = type(linear)(link, linear.measured)
+        stage = eliminate(before, place, linear, state, values, columns)
+        e = stage.message.estimate
+        self.stages.append(stage.moved(e))
+        if columns != self._limit[0]:
+            assert place.problem is not None
+            self._limit = _limits(columns, {c.parameter.name: c.parameter.unit for c in place.problem.chains})
+        return float(np.linalg.norm(e[:3]))
+
+    def truncate(self, keep: int) -> None:
+        """Forget all but the first `keep` stages: something before what follows has changed."""
+        del self.stages[keep:]
+        if self.stages:
+            self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
+        else:
+            self.head = self.head.moved(self.head.estimate)
+
+    def means(self) -> list[Array]:
+        """Smoothed error states, one of the message before the window and one of each stage."""
+        e = self.newest.estimate
+        out = [e]
+        for stage in reversed(self.stages):
+            e = stage.g + stage.G @ e
+            out.append(e)
+        return out[::-1]
+
+    def settle(self, count: int) -> Smoothed:
+        """Smooth the window and let its first `count` stages go."""
+        means = self.means()
+        P = self.newest.covariance
+        covariances = []
+        for k in range(len(self.stages) - 1, -1, -1):
+            stage = self.stages[k]
+            if k < count:
+                covariances.append(P)
+            if k:
+                P = stage.G @ P @ stage.G.T
+                P[np.ix_(stage.lost, stage.lost)] += stage.C
+        gone, rows = self.stages[:count], []
+        sigma = []
+        for stage, e, P in zip(gone, means[1 : count + 1], reversed(covariances), strict=True):
+            J = np.eye(DIM)
+            J[:3, :3] = rotation.right_jacobian(e[None, :3])[0]
+            rows.append((stage.message.state.plus(e[None, :DIM]), J @ P[:DIM, :DIM] @ J.T))
+            sigma.append(np.sqrt(np.maximum(np.diagonal(P)[DIM:], 0.0)))
+        if gone:
+            self.head = gone[-1].message
+            del self.stages[:count]
+            if not self.stages:
+                self.head = self.head.moved(self.head.estimate)
+        return Smoothed(
+            t=np.array([stage.place.t for stage in gone]),
+            states=States.stack([state for state, _ in rows]) if rows else self.head.state[:0],
+            covariance=np.array([P for _, P in rows]).reshape(-1, DIM, DIM),
+            columns=tuple(stage.message.columns for stage in gone),
+            values=tuple(s.message.values + e[DIM:] for s, e in zip(gone, means[1 : count + 1], strict=True)),
+            sigma=tuple(sigma),
+            places=tuple(stage.place for stage in gone),
+        )
+
+    # ------------------------------------------------------------------------------------------ linearising again
+    def first_moved(self, share: float = 1.0) -> int | None:
+        """The first stage whose point is further than its limit from the smoothed state; None if there is none."""
+        _, limit = self._limit
+        for k, e in enumerate(self.means()[1:]):
+            if np.dot(e[:3], e[:3]) > (share * self.turn) ** 2 or np.any(
+                np.abs(e[DIM:]) > share * limit[: len(e) - DIM]
+            ):
+                return k
+        return None
+
+    def relinearize(self, first: int, places: Sequence[Place] | None = None) -> None:
+        """Make the stages from `first` on anew about the smoothed states.
+
+        `places` are where their rows come from, if not where they came from before; all of one problem.
+        """
+        means = self.means()
+        old = self.stages[first:]
+        if first:
+            self.stages[first - 1] = self.stages[first - 1].moved(means[first])
+            before = self.stages[first - 1].message
+        else:
+            before = self.head = self.head.moved(means[0])
+        around = [before, *(stage.message for stage in old)]
+        moves = [np.zeros(len(before.z)), *means[first + 1 :]]
+        states = States.stack([m.state for m in around]).plus(np.array([e[:DIM] for e in moves]))
+        points = [
+            Point(states[k : k + 1], m.values + e[DIM:], m.columns)
+            for k, (m, e) in enumerate(zip(around, moves, strict=True))
+        ]
+        self.stages[first:] = remade(before, points, places or [stage.place for stage in old])
+        self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
+        self.relinearized += len(old)
+
+    def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> int:
+        """Relinearise until nothing has moved; returns how often.
+
+        Parameters
+        ----------
+        share : of the usual limits.
+        always : once at least.
+        renewed : gives the places of the stages from an index on, where they no longer know their rows.
+        """
+        for count in range(_ROUNDS):
+            first = 0 if always and not count else self.first_moved(share)
+            if first is None:
+                return count
+            # what has moved almost as far goes with it: it would be next
+            first = min(first, self.first_moved(_ALMOST * share) or 0) if first else 0
+            self.relinearize(first, renewed(first) if renewed is not None else None)
+        return _ROUNDS
+
+
+def turn_limit(noise: ImuNoise) -> float:
+    """How far an attitude may move (rad) before rows are linearised anew.
+
+    What is neglected of a turn a is a^2/2 of the force it turns: in a second a^2/2 g, against the noise.
+    """
+    return float(np.clip(np.sqrt(2.0 * _SHARE * noise.accel_noise_density / _G), 3e-4, 1e-2))
+
+
+def first_message(state: States, sigma: Array) -> Message:
+    """A prior: one state and its fifteen sigmas."""
+    return Message(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM))
+
+
+@dataclass(frozen=True)
+class Point:
+    """Where rows are linearised: one state, parameter values and where they stand."""
+
+    state: States
+    values: Array
+    columns: Columns
+
+
+def remade(before: Message, points: Sequence[Point], places: Sequence[Place]) -> list[Stage]:
+    """Stages about given points; `points[0]` is that of the message before them."""
+    out: list[Stage] = []
+    for run in _runs(points, places):
+        linked, own = places[run[0]].linked, [places[k] for k in run]
+        part = [points[k + 1] for k in run]
+        around = [points[run[0]], *part] if linked else part
+        columns = part[-1].columns
+        values = np.zeros((len(around), width(columns) - DIM))
+        for row, point in zip(values, around, strict=True):
+            row[: len(point.values)] = point.values
+        states = States.stack([point.state for point in around])
+        for place, point, linear in zip(own, part, at_points(own, states, values, columns, linked), strict=True):
+            stage = eliminate(before, place, linear, point.state, point.values, point.columns, weighted=True)
+            before = stage.message
+            out.append(stage)
+    return out
+
+
+def _runs(points: Sequence[Point], places: Sequence[Place]) -> list[list[int]]:
+    """Indices of places that can be linearised together: one problem, keyframe after keyframe, the same columns."""
+    runs: list[list[int]] = []
+    for k, place in enumerate(places):
+        last = places[k - 1] if runs else None
+        alike = (
+            last is not None
+            and place.linked == last.linked
+            and place.problem is last.problem
+            and place.k == last.k + 1
+            and points[k + 1].columns == points[k].columns
+        )
+        if alike:
+            runs[-1].append(k)
+        else:
+            runs.append([k])
+    return runs
+
+
+def _limits(columns: Columns, units: dict[str, str]) -> tuple[Columns, Array]:
+    """How far each parameter may move before rows are linearised anew."""
+    limit = np.full(width(columns) - DIM, np.inf)
+    for name, at in columns.items():
+        limit[at.start - DIM : at.stop - DIM] = _LIMITS.get(units.get(name, ""), np.inf)
+    return columns, limit
+
+
+__all__ = ["Message", "Place", "Smoothed", "Window", "extended", "first_message"]

@@ -1,0 +1,122 @@
+"""Time and memory of the online smoother over a long drive, hour by hour, beside the Kalman filter on the same drive.
+
+The drive is that of scripts/benchmark.py: exact laps of python-ins (the package's `dev` extra has it), a MEMS unit at
+200 Hz, fixes at 1 Hz with three 60-s outages an hour, wheel speed at 20 Hz; every constraint of vehicles is on. Times
+are of the process, not of the clock on the wall, so a busy machine hardly shows in them.
+
+    python scripts/benchmark_online.py --hours 10
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+import oracle
+
+from graphnav.alignment import align
+from graphnav.config import Settings
+from graphnav.detectors import detect
+from graphnav.earth import LocalFrame
+from graphnav.online import Online, Row, rows_of, without_rows
+from graphnav.pipeline import judged, origin
+from graphnav.problem import pose
+from graphnav.recording import Recording
+from graphnav.solvers.batch import batch
+from graphnav.solvers.ekf import ekf
+
+RATE, LAP = 200.0, 3600.0
+PARTS = ("detectors", "posing", "solving")
+PORTION = 600.0  # s of rows that are in memory as rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--hours", type=float, default=10.0)
+    parser.add_argument("--lag", type=float, default=Settings().solver.lag, help="s (%(default)s)")
+    options = parser.parse_args()
+    settings = Settings()
+    settings = settings.model_copy(update={"solver": settings.solver.model_copy(update={"lag": options.lag})})
+    seconds = 3600.0 * options.hours
+    laps = max(1, round(seconds / LAP))
+    path = oracle.vehicle_path(seconds / laps, RATE).tiled(laps)
+    spans = oracle.moving_spans(path, 60.0, max(1, round(3 * options.hours)))
+    recording, truth = oracle.drive(path, seed=1, outages=spans, odometer_rate=20.0)
+    del path
+    filtered = filter_seconds(recording.crop(0.0, min(seconds, 1800.0)), settings)
+    print(f"the filter takes {1e3 * filtered:.2f} ms a keyframe with everything posed beforehand", flush=True)
+    online = Online(without_rows(recording), settings)
+    scale = np.array([6.378e6, 6.378e6 * np.cos(truth.llh[0, 0]), 1.0])
+    found: list[list[float]] = []  # s of each update by part, of its hour
+    errors: list[list[float]] = []  # squared ones of an hour
+    hour, newest = 1, -np.inf
+    began = time.process_time()
+    head = "| hour | keyframes | " + " | ".join(f"{p}, ms: median, 99 %, most" for p in PARTS)
+    print(head + " | all | CPU, s | memory, MB | rms, m | NEES | rows in buffers |\n" + "| --- " * 11 + "|", flush=True)
+    for row in lazily(recording):
+        online.add(row)
+        tracker = online.tracker
+        if tracker is not None and tracker.newest > newest:
+            if np.isfinite(newest):  # the first update catches up with all that was aligned over
+                found.append([tracker.seconds[p] for p in PARTS])
+            newest = tracker.newest
+            for track in online.settled():
+                i = np.clip(np.rint((track.t - truth.t[0]) * RATE).astype(int), 0, len(truth.t) - 1)
+                assert track.sd_p is not None
+                off = (track.llh - truth.llh[i]) * scale
+                ratio = off[:, [1, 0, 2]] / track.sd_p
+                errors += np.stack([(off**2).sum(axis=1), (ratio**2).mean(axis=1)], -1).tolist()
+        if row[1] >= 3600.0 * hour - 1e-6 or row[1] >= recording.end - 1e-6:
+            report(hour, np.array(found), np.array(errors), time.process_time() - began, len(online.sensors.imu))
+            hour, found, errors, began = hour + 1, [], [], time.process_time()
+        if row[1] >= recording.end - 1e-6:
+            break
+
+
+def lazily(recording: Recording) -> Iterator[Row]:
+    """The rows in order, a portion at a time."""
+    for begin in np.arange(recording.start, recording.end, PORTION):
+
+        def part(sensor, begin=begin):
+            keep = (sensor.t > begin + 1e-9) & (sensor.t <= begin + PORTION + 1e-9)
+            names = ("t", "gyro", "accel", "llh", "sd", "speed")
+            return replace(sensor, **{n: getattr(sensor, n)[keep] for n in names if hasattr(sensor, n)})
+
+        parts = {name: part(getattr(recording, name)) for name in ("imu", "gnss", "odometer")}
+        yield from rows_of(replace(recording, **parts))[1]
+
+
+def filter_seconds(recording: Recording, settings: Settings) -> float:
+    """Process time of the filter per keyframe."""
+    frame, stationary = LocalFrame(origin(recording)), detect(recording, settings).stationary
+    found = align(recording, settings, frame, lambda p, x: batch(p, x, wanted=(0,), reintegrate=False))
+    recording, settings, _ = judged(recording, settings, frame, found, stationary)
+    problem = pose(recording, settings, frame, found.state, found.sigma, stationary)
+    began = time.process_time()
+    ekf(problem)
+    return (time.process_time() - began) / len(problem.t)
+
+
+def report(hour: int, found: np.ndarray, errors: np.ndarray, cpu: float, rows: int) -> None:
+    every = np.column_stack([found, found.sum(axis=1)]) * 1e3
+    cells = [" / ".join(f"{x:.1f}" for x in np.quantile(column, [0.5, 0.99, 1.0])) for column in every.T]
+    rms, nees = (np.sqrt(errors[:, 0].mean()), errors[:, 1].mean()) if len(errors) else (np.nan, np.nan)
+    more = f"{cpu:.1f} | {memory_mb():.0f} | {rms:.4f} | {nees:.2f} | {rows}"
+    print(f"| {hour} | {len(found)} | {' | '.join(cells)} | {more} |", flush=True)
+
+
+def memory_mb() -> float:
+    """Memory held now (Linux), MB of 2^20 bytes."""
+    with open("/proc/self/statm", encoding="ascii") as file:
+        return int(file.read().split()[1]) * 4096 / 2**20
+
+
+if __name__ == "__main__":
+    main()

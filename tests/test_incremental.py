@@ -1,0 +1,222 @@
+"""The incremental solver: equal to batch where both see the same, honest where it sees less, bounded in size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import oracle
+import pytest
+from helpers import Array, dense, errors, factors, random_states, truth_states
+
+from graphnav.config import settings_from
+from graphnav.earth import LocalFrame
+from graphnav.formats import read
+from graphnav.pipeline import run
+from graphnav.problem import Problem, pose
+from graphnav.recording import Recording
+from graphnav.rotation import exp
+from graphnav.solution import Solution
+from graphnav.solvers.batch import batch
+from graphnav.solvers.ekf import backward, ekf
+from graphnav.solvers.incremental import Incremental, incremental, node_steps
+from graphnav.solvers.stages import Message, Place, Step, turned
+from graphnav.solvers.window import Window, first_message
+from graphnav.state import DIM
+from graphnav.trajectory import Trajectory
+
+EVERYTHING = 1e9  # s, a lag longer than any drive
+
+
+def sigmas(solution: Solution) -> Array:
+    return np.sqrt(np.diagonal(solution.covariance, axis1=1, axis2=2))
+
+
+def apart(a: Solution, b: Solution) -> Array:
+    """(K, 15) in sigmas of b."""
+    return a.states.minus(b.states) / sigmas(b)
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[Recording, Trajectory]:
+    path = oracle.vehicle_path(240.0)
+    return oracle.drive(path, seed=7, outages=[(110.0, 150.0)], odometer_rate=20.0)
+
+
+@pytest.fixture(scope="module")
+def posed(drive: tuple[Recording, Trajectory]) -> Problem:
+    """All constraints, slow errors of the fixes, a stop; from a start a few degrees wrong."""
+    recording, truth = drive
+    frame = LocalFrame(recording.gnss.llh[0])
+    start = truth_states(truth, np.zeros(1), frame)
+    start = replace(start, R_nb=start.R_nb @ exp(np.array([[0.01, -0.01, 0.06]])), ba=0 * start.ba, bg=0 * start.bg)
+    settings = settings_from({"gnss": {"slow_share": 0.4, "sd_factor": 1.0, "lever_arm_sigma": 0.2}})
+    still = np.array([[0.0, 8.0]]) if np.linalg.norm(truth.v[truth.t <= 8.0], axis=1).max() < 1e-3 else None
+    return pose(recording, settings, frame, start, np.repeat([0.1, 1.0, 0.5, 0.05, 5e-3], 3), still)
+
+
+@pytest.fixture(scope="module")
+def solved(posed: Problem) -> Solution:
+    smoothed = backward(posed, ekf(posed))
+    return batch(posed, smoothed.states, smoothed.nodes(posed), reintegrate=False)
+
+
+# ------------------------------------------------------------------------------------------------------- exactness
+def test_with_all_the_future_it_is_the_batch_solution(posed: Problem, solved: Solution) -> None:
+    found = incremental(posed, lag=EVERYTHING).settled
+    assert np.abs(apart(found, solved)).max() < 2e-3
+    np.testing.assert_allclose(sigmas(found), sigmas(solved), rtol=1e-3)
+    for name, p in solved.parameters.items():
+        own = found.parameters[name]
+        np.testing.assert_allclose((own.value - p.value) / p.sigma, 0.0, atol=2e-3, err_msg=name)
+        np.testing.assert_allclose(own.sigma, p.sigma, rtol=1e-3, err_msg=name)
+
+
+def test_a_window_is_the_dense_least_squares_solution(drive: tuple[Recording, Trajectory], posed: Problem) -> None:
+    """Ten seconds against one QR of all rows as `helpers.factors` makes them, with none of the solver's code."""
+    part = posed.recording.crop(40.0, 50.0)
+    start = truth_states(drive[1], np.round(np.array([part.start]), 6), posed.frame)
+    problem = pose(part, posed.settings, posed.frame, start, posed.prior.sigma[0])
+    found = incremental(problem, lag=EVERYTHING).settled
+    parts, widths = factors(problem, found.states, {n: p.value for n, p in found.parameters.items()})
+    step, covariance = dense(parts, widths)
+    K = len(problem.t)
+    sd = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(step / sd, 0.0, atol=0.01)
+    np.testing.assert_allclose(sigmas(found).ravel(), sd[: DIM * K], rtol=2e-3)
+
+
+def test_the_live_estimate_is_the_end_of_a_batch_solution_so_far(posed: Problem) -> None:
+    live = incremental(posed, lag=EVERYTHING).live
+    for end in (60.0, 130.0, 200.0):  # the second in the outage
+        part = pose(posed.recording.crop(0.0, end), posed.settings, posed.frame, posed.prior.mean,
+                    posed.prior.sigma[0], np.array([[0.0, 8.0]]))  # fmt: skip
+        smoothed = backward(part, ekf(part))
+        so_far = batch(part, smoothed.states, smoothed.nodes(part), reintegrate=False)
+        k = int(np.searchsorted(posed.t, part.t[-1] - 1e-6))
+        assert posed.t[k] == pytest.approx(part.t[-1], abs=1e-6)
+        assert np.abs((live.states[k : k + 1].minus(so_far.states[-1:])) / sigmas(so_far)[-1]).max() < 0.1
+        # what the odometer is worth is told from its readings, here fewer
+        np.testing.assert_allclose(sigmas(live)[k], sigmas(so_far)[-1], rtol=0.06)
+
+
+def test_a_lag_over_the_outage_gives_the_batch_solution_to_a_centimetre(drive: tuple[Recording, Trajectory]) -> None:
+    settings = {"gnss": {"slow_share": 0.4, "sd_factor": 1.0}}
+    best = run(drive[0], settings_from(settings), solvers=("batch",))["batch"]
+
+    def far(lag: float) -> float:
+        """m"""
+        more = settings_from({**settings, "solver": {"lag": lag}})
+        found = run(drive[0], more, solvers=("incremental",))["incremental"]
+        return float(np.abs(found.states.p - best.states.p).max())
+
+    assert far(60.0) < 0.01
+    assert far(5.0) > 0.03  # a lag shorter than the outage does not know where it ends
+
+
+# -------------------------------------------------------------------------------------------------------- messages
+def some_message(rng: np.random.Generator) -> Message:
+    return Message(random_states(rng, 1), rng.standard_normal(4), {"a": slice(15, 19)}, np.triu(
+        rng.standard_normal((19, 19)) + 5 * np.eye(19)), rng.standard_normal(19))  # fmt: skip
+
+
+def test_a_moved_message_says_the_same() -> None:
+    """Its residual at any state is what it was, to first order in the distance from the new point."""
+    rng = np.random.default_rng(1)
+    message = some_message(rng)
+    e = 0.2 * rng.standard_normal(19)
+    moved = message.moved(e)
+    for _ in range(5):
+        d = 1e-5 * rng.standard_normal(19)
+        there = moved.state.plus(d[None, :DIM])
+        before = np.concatenate([there.minus(message.state)[0], moved.values + d[DIM:] - message.values])
+        np.testing.assert_allclose(moved.R @ d - moved.z, message.R @ before - message.z, atol=1e-7)
+    back = moved.moved(-e)
+    np.testing.assert_allclose(back.state.p, message.state.p, atol=1e-12)
+
+
+def test_turned_columns_are_the_derivative_of_the_chart() -> None:
+    rng = np.random.default_rng(2)
+    e = np.concatenate([rng.standard_normal(3), np.zeros(12)])
+    A = turned(np.eye(15), e)
+    h = 1e-6
+    start = random_states(rng, 1)
+    for k in range(3):
+        d = np.zeros((1, 15))
+        d[0, k] = h
+        there = start.plus(e[None]).plus(d)
+        np.testing.assert_allclose((there.minus(start)[0, :3] - e[:3]) / h, A[:3, k], atol=1e-5)
+
+
+# ---------------------------------------------------------------------------------------------------------- window
+def fill(window: Window, problem: Problem, first: int, last: int, steps: dict[int, tuple[Step, ...]]) -> None:
+    for k in range(first, last):
+        window.push(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
+
+
+def test_taking_keyframes_back_and_adding_them_again_changes_nothing(posed: Problem) -> None:
+    steps = node_steps(posed)
+    one, two = (Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3) for _ in range(2))
+    fill(one, posed, 0, 60, steps)
+    fill(two, posed, 0, 60, steps)
+    two.truncate(35)
+    assert len(two) == 35
+    fill(two, posed, 35, 60, steps)
+    np.testing.assert_allclose(two.newest.state.minus(one.newest.state), 0.0, atol=1e-12)
+    np.testing.assert_allclose(two.newest.covariance, one.newest.covariance, rtol=1e-6, atol=1e-15)
+
+
+def test_size_does_not_grow_with_the_drive(posed: Problem) -> None:
+    """Keyframes in the window and numbers in a stage, over the drive run through three times."""
+    solver = Incremental(Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3), lag=20.0)
+    steps, sizes = node_steps(posed), []
+    for k in range(len(posed.t)):
+        solver.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=k > 0))
+        sizes.append((len(solver.window), solver.window.newest.R.size))
+    most = 20 * 1.2 + 3
+    assert max(size for size, _ in sizes[40:]) <= most + 3
+    assert len({cells for _, cells in sizes}) == 1
+    assert sum(len(part) for part in solver.settled) + len(solver.window) == len(posed.t)
+    t = np.concatenate([part.t for part in solver.settled])
+    assert np.all(np.diff(t) > 0)
+
+
+# ---------------------------------------------------------------------------------------------- robust, honest, real
+def test_outliers_are_given_up_as_by_the_batch_solver(drive: tuple[Recording, Trajectory]) -> None:
+    recording, _ = drive
+    gnss = recording.gnss
+    frame = LocalFrame(gnss.llh[0])
+    p = frame.from_llh(gnss.llh)
+    rows = np.arange(10, len(p), 12)
+    p[rows] += [15.0, -10.0, 5.0]
+    bad = replace(recording, gnss=replace(gnss, llh=frame.to_llh(p)))
+    settings = settings_from({"gnss": {"robust": "cauchy", "slow_share": 0.0, "sd_factor": 1.0}})
+    found = run(bad, settings, solvers=("incremental", "batch"))
+    a, b = found["incremental"], found["batch"]
+    far = np.abs(a.states.p - b.states.p)[a.t > a.t[0] + 20.0]
+    assert far.max() < 0.05
+    assert a.records["gnss_position"].weight[rows].max() < 0.05
+
+
+def test_sigmas_are_true(drive: tuple[Recording, Trajectory]) -> None:
+    """NEES of settled positions over drives with other noise: as in test_consistency, of far fewer drives."""
+    ratio = []
+    for seed in range(4):
+        recording, truth = oracle.drive(oracle.vehicle_path(240.0), seed=20 + seed, outages=[(110.0, 150.0)])
+        settings = settings_from({"gnss": {"slow_share": 0.0, "sd_factor": 1.0}, "solver": {"lag": 30.0}})
+        solution = run(recording, settings, solvers=("incremental",))["incremental"]
+        i = np.clip(np.searchsorted(truth.t, solution.t - 1e-6), 0, len(truth.t) - 1)
+        met = np.abs(truth.t[i] - solution.t) < 1e-6  # not where a stop begins or ends
+        at_rows = replace(solution, t=solution.t[met], states=solution.states[met], covariance=solution.covariance[met])
+        position, sd, *_ = errors(at_rows, truth)
+        ratio.append(np.mean((position / sd) ** 2))
+    assert 0.5 < np.mean(ratio) < 1.6
+
+
+@pytest.mark.parametrize("name", ["oracle_drive"])
+def test_real_program_run(shared_data: Path, name: str) -> None:
+    found = run(read(shared_data / name), solvers=("incremental", "batch"))
+    a, b = found["incremental"], found["batch"]
+    assert np.abs(a.states.p - b.states.p).max() < 0.01
+    assert any("ms (median)" in note for note in a.notes)

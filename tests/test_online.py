@@ -1,0 +1,501 @@
+"""Smoothing while the drive happens: order, delay and loss of rows, ends of every kind, and the line protocol."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import oracle
+import pytest
+from helpers import Array, truth_states
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from graphnav.config import Settings, settings_from
+from graphnav.errors import ConfigError, GraphnavError, RecordingError
+from graphnav.formats import read
+from graphnav.online import Online, Row, Session, rows_of, without_rows
+from graphnav.online.buffers import Buffer
+from graphnav.online.lines import END, head_of, line_of, lines_of, row_of, setup_of
+from graphnav.online.view import view
+from graphnav.pipeline import run
+from graphnav.recording import Recording
+from graphnav.solution import to_trajectory
+from graphnav.trajectory import Trajectory
+
+SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "online.py"
+QUICK = settings_from(
+    {"gnss": {"slow_share": 0.0, "sd_factor": 1.0}, "imu": {"as_stated": True}, "solver": {"lag": 20.0}}
+)
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[Recording, Trajectory]:
+    """A hundred seconds at 50 Hz, so that the tests are quick."""
+    path = oracle.vehicle_path(130.0, 50.0)
+    recording, truth = oracle.drive(path, seed=3, outages=[(70.0, 80.0)], odometer_rate=10.0)
+    return recording.crop(0.0, 100.0), truth
+
+
+@pytest.fixture(scope="module")
+def rows(drive: tuple[Recording, Trajectory]) -> list[Row]:
+    return rows_of(drive[0])[1]
+
+
+def played(recording: Recording, rows: Iterable[Row], how: Settings = QUICK) -> tuple[Online, Trajectory]:
+    """All rows in, all that settled out."""
+    online, parts = Online(without_rows(recording), how), []
+    for row in rows:
+        online.add(row)
+        parts += online.settled()
+    online.finish()
+    return online, joined([*parts, *online.settled()])
+
+
+def joined(parts: list[Trajectory]) -> Trajectory:
+    def column(name: str) -> Array:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    return Trajectory(**{n: column(n) for n in ("t", "llh", "v", "rph", "sd_p", "sd_v", "sd_rph")}, name="settled")
+
+
+def off(track: Trajectory, truth: Trajectory, recording: Recording) -> tuple[Array, Array]:
+    """Position errors (K, 3) m, e n u, and the sigmas stated, at the rows that the truth has too."""
+    i = np.clip(np.searchsorted(truth.t, track.t - 1e-6), 0, len(truth.t) - 1)
+    met = np.abs(truth.t[i] - track.t) < 1e-6
+    scale = np.array([6.378e6, 6.378e6 * np.cos(truth.llh[0, 0]), 1.0])
+    error = (track.llh[met] - truth.llh[i[met]]) * scale
+    return error[:, [1, 0, 2]], track.sd_p[met]
+
+
+@pytest.fixture(scope="module")
+def plain(drive: tuple[Recording, Trajectory], rows: list[Row]) -> tuple[Online, Trajectory]:
+    return played(drive[0], rows)
+
+
+# ----------------------------------------------------------------------------------------------------- trajectories
+def test_it_aligns_then_runs_and_is_as_good_as_batch(
+    drive: tuple[Recording, Trajectory], plain: tuple[Online, Trajectory]
+) -> None:
+    recording, truth = drive
+    online, track = plain
+    assert any("aligned over" in note for note in online.notes)
+    assert np.all(np.diff(track.t) > 0)
+    assert track.t[0] == pytest.approx(recording.start, abs=1e-9)
+    assert track.t[-1] == pytest.approx(recording.end, abs=1e-9)
+    error, sd = off(track, truth, recording)
+    best = run(recording, QUICK, solvers=("batch",))["batch"].trajectory()
+    reference, reference_sd = off(best, truth, recording)
+    assert np.sqrt(np.mean(error**2)) < 1.2 * np.sqrt(np.mean(reference**2)) + 0.002
+    # one drive is one sample of errors that hardly change within it: as true as batch's on the same one
+    assert 0.5 < np.mean((error / sd) ** 2) / np.mean((reference / reference_sd) ** 2) < 1.5
+
+
+def test_live_states_at_imu_rate_hold_to_their_sigmas(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    recording, truth = drive
+    online, ratio = Online(without_rows(recording), QUICK), []
+    for k, row in enumerate(rows):
+        online.add(row)
+        if online.tracker is not None and k % 601 == 0:
+            t, states, P = online.tracker.since(online.sensors)
+            now = online.live()
+            assert now is not None
+            if not len(t):
+                continue
+            assert t[-1] == now.t == online.sensors.imu.newest
+            np.testing.assert_allclose(states.p[-1], now.state.p[0], atol=1e-6)
+            true = truth_states(truth, np.round(t, 6), online.frame)
+            sd = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+            ratio.append(np.mean((states.minus(true)[-1, :9] / sd[-1, :9]) ** 2))
+    assert len(ratio) >= 5
+    assert np.mean(ratio) < 3.0
+
+
+def test_portions_do_not_matter(drive: tuple[Recording, Trajectory], rows: list[Row], tmp_path: Path) -> None:
+    """The same lines in pieces of any size, and all at once."""
+    lines = [line for _, line in lines_of(drive[0].crop(0.0, 60.0))]
+    files = []
+    for name, size in (("one", 1), ("many", 977), ("all", len(lines))):
+        session = Session(QUICK, "-", tmp_path / name)
+        for k in range(0, len(lines), size):
+            session.add_lines(lines[k : k + size])
+        session.close()
+        assert session.done
+        files.append((tmp_path / name / "trajectory.csv").read_bytes())
+    assert files[0] == files[1] == files[2]
+    assert files[0].count(b"\n") > 55
+
+
+def test_late_rows_are_used_at_their_own_time(
+    drive: tuple[Recording, Trajectory], rows: list[Row], plain: tuple[Online, Trajectory]
+) -> None:
+    """Every fix 2.3 s late, the odometer 0.7 s: after the lag the trajectory is that of rows in time."""
+    delay = {"imu": 0.0, "gnss": 2.3, "odometer": 0.7}
+    late = sorted(rows, key=lambda row: row[1] + delay[row[0]])
+    online, track = played(drive[0], late)
+    assert online.late["gnss"] > 40
+    assert not [key for key in online.sensors.counts if "too late" in key]
+    common = np.isin(np.round(track.t, 6), np.round(plain[1].t, 6))
+    other = np.isin(np.round(plain[1].t, 6), np.round(track.t, 6))
+    assert common.sum() > 80
+    away = (track.llh[common] - plain[1].llh[other]) * [6.378e6, 5.5e6, 1.0]
+    assert np.abs(away).max() < 0.02
+    np.testing.assert_allclose(track.sd_p[common], plain[1].sd_p[other], rtol=0.15)
+
+
+def test_rows_older_than_the_window_are_counted(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    fix = next(row for row in rows if row[0] == "gnss" and row[1] > 40.0)
+    moved = [row for row in rows if row is not fix]
+    at = next(k for k, row in enumerate(moved) if row[1] > 90.0)
+    online, _ = played(drive[0], [*moved[:at], fix, *moved[at:]])
+    assert online.sensors.counts["gnss: too late"] == 1
+
+
+def test_a_silent_imu_ends_one_piece_and_begins_another(drive: tuple[Recording, Trajectory]) -> None:
+    whole, truth = oracle.drive(oracle.vehicle_path(200.0, 50.0), seed=5, odometer_rate=None)
+    rows = [row for row in rows_of(whole)[1] if row[0] != "imu" or not 90.0 < row[1] < 96.0]
+    online, track = played(whole, rows)
+    assert any("silent from 90.0" in note for note in online.notes)
+    assert not np.any((track.t > 90.5) & (track.t < 95.5))
+    assert track.t[-1] == pytest.approx(200.0)
+    error, sd = off(track, truth, whole)
+    assert np.mean((error / sd) ** 2) < 2.5
+
+
+def test_a_stamp_far_ahead_is_dropped(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    """One of the IMU, one of the receiver; the rest is as if they had not come."""
+    k = next(k for k, row in enumerate(rows) if row[1] > 50.0)
+    wild: list[Row] = [("imu", 9e5, rows[k][2][:6]), ("gnss", 9e5, (0.5, 2.0, 30.0, 1.0, 1.0, 1.0, *([np.nan] * 6)))]
+    part = [row for row in rows if row[1] < 60.0]
+    online, track = played(drive[0], [*part[:k], *wild, *part[k:]])
+    assert online.sensors.counts["imu: stamp in the future"] == 1
+    assert online.sensors.counts["gnss: stamp in the future"] == 1
+    same = played(drive[0], part)[1]
+    np.testing.assert_array_equal(track.llh, same.llh)
+
+
+@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    seed=st.integers(0, 10**6),
+    jitter=st.floats(0.0, 4.0),
+    lost=st.floats(0.0, 0.3),
+    hole=st.floats(20.0, 80.0),
+    length=st.floats(0.0, 6.0),
+)
+def test_any_order_and_any_loss(
+    drive: tuple[Recording, Trajectory],
+    rows: list[Row],
+    seed: int,
+    jitter: float,
+    lost: float,
+    hole: float,
+    length: float,
+) -> None:
+    """Rows shuffled by seconds, lost, repeated, spoilt, and the IMU away: no exception, time goes on, sigma holds."""
+    rng = np.random.default_rng(seed)
+    delay = {"imu": 0.05 * jitter, "gnss": jitter, "odometer": jitter}
+    come: list[tuple[float, Row]] = []
+    for row in rows:
+        sensor, t, values = row
+        away = sensor == "imu" and hole < t < hole + length
+        if away or rng.random() < (lost if sensor != "imu" else 0.05 * lost):
+            continue
+        if rng.random() < 0.002:
+            values = tuple(float("nan") for _ in values)
+        for _ in range(1 + (rng.random() < 0.01)):
+            come.append((t + delay[sensor] * rng.random(), (sensor, t, values)))
+    come.sort(key=lambda one: one[0])
+    recording, truth = drive
+    online, parts = Online(without_rows(recording), QUICK), []
+    for _, row in come:
+        online.add(row)
+        parts += online.settled()
+    online.finish()
+    parts += online.settled()
+    if not parts:
+        assert online.status == "aligning"  # too little of it in one piece
+        return
+    track = joined(parts)
+    assert np.all(np.diff(track.t) > 0)
+    assert np.isfinite(track.llh).all()
+    assert np.all(track.sd_p > 0)
+    error, sd = off(track, truth, recording)
+    if len(error) > 30:
+        assert np.median((error / sd) ** 2) < 3.0
+        assert np.abs(error / sd).max() < 12.0
+
+
+# ------------------------------------------------------------------------------------------------------- buffers
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(0, 2000), max_size=600), st.integers(0, 500))
+def test_a_buffer_is_a_sorted_set(numbers: list[int], begin: int) -> None:
+    buffer = Buffer(1)
+    for n in numbers:
+        new = n not in buffer.t
+        assert buffer.add(float(n), (2.0 * n,)) == new
+    kept = sorted(set(numbers))
+    np.testing.assert_array_equal(buffer.t, kept)
+    np.testing.assert_array_equal(buffer.rows[:, 1], [2.0 * n for n in kept])
+    buffer.drop_before(begin)
+    np.testing.assert_array_equal(buffer.t, [n for n in kept if n >= begin])
+
+
+# ----------------------------------------------------------------------------------------------------------- lines
+def test_lines_read_back_as_they_were(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    recording = drive[0]
+    found = setup_of(head_of(recording))
+    assert found.imu.noise == recording.imu.noise
+    np.testing.assert_array_equal(found.gnss.lever_arm, recording.gnss.lever_arm)
+    np.testing.assert_array_equal(found.odometer.lever_arm, recording.odometer.lever_arm)
+    for row in rows[::500]:
+        sensor, t, values = row_of(line_of(row))
+        assert (sensor, t) == row[:2]
+        np.testing.assert_allclose(values, row[2], rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("I,1,2,3", "'I' needs 7 numbers, not 3"),
+        ("G,1,2,3,4", "'G' needs 7 or 13 numbers"),
+        ("X,1", "no rows of kind 'X'"),
+        ("O,1,fast", "holds something that is no number"),
+        ("\x00\xff", "no rows of kind"),
+    ],
+)
+def test_bad_lines_say_why(line: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        row_of(line)
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("I,1,2,3,4,5,6,7", "begins with 'graphnav-online/1'"),
+        ("graphnav-online/1 {", "not JSON"),
+        ('graphnav-online/1 {"platfrom": "vehicle"}', "did you mean 'platform'"),
+        ('graphnav-online/1 {"imu": {"noise": {"gyro": 1}}}', "unknown key 'imu.noise.gyro'"),
+    ],
+)
+def test_bad_setups_say_why(line: str, reason: str) -> None:
+    with pytest.raises(RecordingError, match=reason):
+        setup_of(line)
+
+
+# ------------------------------------------------------------------------------------------------------ nothing lost
+def program(*arguments: str | Path, **more: object) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, str(SCRIPT), *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(SCRIPT.parents[1])}, **more,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(drive: tuple[Recording, Trajectory], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drive as lines in a file."""
+    path = tmp_path_factory.mktemp("lines") / "drive.txt"
+    path.write_text("".join(line + "\n" for _, line in lines_of(drive[0])), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("config") / "quick.toml"
+    path.write_text(
+        "[gnss]\nslow_share = 0.0\nsd_factor = 1.0\n[imu]\nas_stated = true\n[solver]\nlag = 20.0\n", encoding="utf-8"
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(folder: Path, config: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    out = tmp_path_factory.mktemp("whole") / "out"
+    with folder.open("rb") as lines:
+        process = program("-", "-o", out, "--config", config, "--quiet", stdin=lines)
+        assert process.wait() == 0, process.stderr.read()
+    return (out / "trajectory.csv").read_bytes()
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_killed_and_resumed_it_ends_with_the_same(
+    folder: Path, config: Path, uninterrupted: bytes, tmp_path: Path, how: signal.Signals
+) -> None:
+    """The source is a second process, cut off in the middle of a line; the rest comes after --resume."""
+    data = folder.read_bytes()
+    out = tmp_path / "out"
+    cuts = [0, int(0.75 * len(data)), int(0.9 * len(data)), len(data)]
+    for k, (begin, end) in enumerate(pairwise(cuts)):
+        last = end == len(data)
+        process = program("-", "-o", out, "--config", config, "--quiet", *["--resume"] * (k > 0), stdin=subprocess.PIPE)
+        # a sender that begins a little before where it was cut off
+        start = data.rfind(b"\n", 0, max(begin - 3000, 0)) + 1
+        process.stdin.write(data[start:end])
+        process.stdin.flush()
+        if last:
+            assert process.wait(60) == 0, process.stderr.read()
+            break
+        want = data[: data.rfind(b"\n", 0, end)].count(b"\nI")
+        wait_for(lambda want=want: consumed(out) >= want)
+        wait_for(lambda: (out / "trajectory.csv").read_bytes().count(b"\n") > 5)
+        process.send_signal(how)
+        code = process.wait(60)
+        assert code == (-9 if how == signal.SIGKILL else 130)
+        so_far = (out / "trajectory.csv").read_bytes()
+        assert so_far.endswith(b"\n")
+        assert uninterrupted.startswith(so_far)
+    assert (out / "trajectory.csv").read_bytes() == uninterrupted
+
+
+def consumed(out: Path) -> int:
+    """IMU rows in the checkpoint and the journal after it, roughly: enough to know that all came."""
+    from graphnav.online.store import CHECKPOINT, _read
+
+    try:
+        found = _read(out / CHECKPOINT)
+        journal = out / f"journal-{found.journal:06d}"
+        more = journal.read_bytes().count(b"I,") if journal.exists() else 0
+    except (OSError, ConfigError):
+        return 0
+    return found.online.sensors.counts["imu"] + more
+
+
+def wait_for(condition: object, seconds: float = 60.0) -> None:
+    until = time.monotonic() + seconds
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < until, "it took too long"
+        time.sleep(0.05)
+
+
+def test_a_full_disk_leaves_what_had_settled(
+    drive: tuple[Recording, Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = drive[0]
+    session = Session(QUICK, "drive", tmp_path / "out", recording=recording)
+    real, written = os.fsync, [0]
+
+    def full(handle: int) -> None:
+        written[0] += 1
+        if written[0] > 12:
+            raise OSError(28, "No space left on device")
+        real(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+
+    def add_all() -> None:
+        for row in session.rows:
+            session.add(row)
+
+    with pytest.raises(GraphnavError, match=r"No space left.*--resume"):
+        add_all()
+    session.close()
+    monkeypatch.undo()
+    so_far = (tmp_path / "out" / "trajectory.csv").read_bytes()
+    assert so_far.endswith(b"\n")
+    again = Session(QUICK, "drive", tmp_path / "out", resume=True, recording=recording)
+    for row in again.rows[again.taken :]:
+        again.add(row)
+    again.finish()
+    again.close()
+    whole = Session(QUICK, "drive", tmp_path / "whole", recording=recording)
+    for row in whole.rows:
+        whole.add(row)
+    whole.finish()
+    whole.close()
+    assert (tmp_path / "out" / "trajectory.csv").read_bytes() == (tmp_path / "whole" / "trajectory.csv").read_bytes()
+    assert again.summary()["settled"] == whole.summary()["settled"]
+
+
+def test_folders_and_checkpoints_are_not_mixed_up(drive: tuple[Recording, Trajectory], tmp_path: Path) -> None:
+    recording, out = drive[0], tmp_path / "out"
+    with pytest.raises(ConfigError, match="no checkpoint"):
+        Session(QUICK, "drive", out, resume=True, recording=recording)
+    Session(QUICK, "drive", out, recording=recording).close()
+    with pytest.raises(ConfigError, match="holds a run already"):
+        Session(QUICK, "drive", out, recording=recording)
+    with pytest.raises(ConfigError, match="was made from 'drive', not from 'other'"):
+        Session(QUICK, "other", out, resume=True, recording=recording)
+    body = bytearray((out / "checkpoint").read_bytes())
+    body[-5] ^= 1
+    (out / "checkpoint").write_bytes(body)
+    with pytest.raises(ConfigError, match="damaged"):
+        Session(QUICK, "drive", out, resume=True, recording=recording)
+
+
+def test_a_socket_whose_sender_comes_back(folder: Path, config: Path, uninterrupted: bytes, tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    out = tmp_path / "out"
+    process = program(f"tcp:{port}", "-o", out, "--config", config)
+    data = folder.read_bytes()
+    for part in (data[: len(data) // 2], data[data.rfind(b"\n", 0, len(data) // 2 - 5000) + 1 :]):
+        wait_for(lambda: listening(port))
+        with socket.create_connection(("127.0.0.1", port)) as sender:
+            sender.sendall(part)
+    assert process.wait(60) == 0, process.stderr.read()
+    assert (out / "trajectory.csv").read_bytes() == uninterrupted
+    assert b"status: " in process.stdout.read()
+
+
+def listening(port: int) -> bool:
+    """Whether a server is there, without troubling it."""
+    state = Path("/proc/net/tcp")
+    if not state.exists():
+        time.sleep(2.0)
+        return True
+    return any(f":{port:04X} " in line and " 0A " in line for line in state.read_text().splitlines())
+
+
+def test_the_view_says_what_is_going_on(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    session = Session(QUICK, "drive", recording=drive[0])
+    assert dict(view(session))["status"] == "aligning"
+    for row in rows[: len(rows) * 6 // 10]:
+        session.add(row)
+    said = dict(view(session, silent=7.0))
+    assert said["status"] == "running, the source is silent for 7 s"
+    assert {"position", "speed", "attitude", "in force", "update", "settled", "window"} <= set(said)
+    assert "nhc" in said["in force"]
+
+
+def test_bad_usage_is_one_line_and_code_two(tmp_path: Path) -> None:
+    for arguments, reason in (
+        (["no-such-thing"], b"no-such-thing"),
+        (["-", "--resume"], b"say which folder"),
+        (["-", "--lag", "0"], b"at least 1 s"),
+        (["tcp:x"], b"cannot listen"),
+    ):
+        process = program(*arguments, stdin=subprocess.DEVNULL)
+        _, error = process.communicate(timeout=60)
+        assert process.returncode == 2
+        assert reason in error
+        assert error.count(b"\n") == 1
+
+
+def test_a_source_without_its_first_line_is_refused() -> None:
+    process = program("-", stdin=subprocess.PIPE)
+    _, error = process.communicate(b"I,1,2,3,4,5,6,7\n", timeout=60)
+    assert process.returncode == 2
+    assert b"line 1: a live source begins with" in error
+
+
+def test_real_recording_settles_on_the_batch_solution(shared_data: Path) -> None:
+    recording = read(shared_data / "oracle_drive").crop(80.0, 330.0)
+    online, track = played(recording, rows_of(recording)[1], Settings())
+    best = run(recording, solvers=("batch",))["batch"]
+    t, states, P = best.at(track.t[(track.t >= best.t[0]) & (track.t <= best.t[-1])])
+    mine = track.llh[np.isin(track.t, t)]
+    other = to_trajectory("batch", best.frame, t, states, P)
+    away = (mine - other.llh) * [6.378e6, 5.5e6, 1.0]
+    assert np.abs(away).max() < 0.03
+    assert replace(recording).start == pytest.approx(track.t[0])
+    assert online.status == "running"
+    assert END == "E"
