@@ -97,7 +97,8 @@ def _solve(
     }
     # A stated heading far from the one found sends the filter, and its linearisation with it, astray for a while. It
     # stays in the problem as its prior, but wheels are judged, and the smoother sets out, from what was found.
-    astray = bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
+    found_heading = aligned.motion is not None  # without motion heading zero is only a convention
+    astray = found_heading and bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
     prior = problem.prior
     if astray:
         problem = replace(problem, prior=replace(prior, mean=aligned.state, sigma=aligned.sigma[None]))
