@@ -17,8 +17,12 @@ from graphnav.solution import Solution
 from graphnav.trajectory import Trajectory
 
 SEEDS = 10
-# Wheels hold exactly on these drives, which no sigma is made for; `tests/test_vehicle.py` has wheels that slip.
-NO_WHEELS = {"vehicle": {"nhc": False, "odometer": False}}
+# Wheels and stops hold exactly on these drives, which no sigma is made for; simulated ones that slip and sway are in
+# `tests/test_vehicle.py`.
+INERTIAL = {
+    "vehicle": {"nhc": False, "odometer": False},
+    "standstill": {"zero_velocity": False, "zero_rate": False, "held_position": False},
+}
 AXES = ("east", "north", "up", "ve", "vn", "vu", "roll", "pitch", "heading")
 # Errors of smoothers stay alike for a minute, of attitude and biases for the whole drive, so ten drives of ten minutes
 # are some tens of independent samples: chi-square with 40 degrees of freedom over 40 has its 3 % tails at 0.63 and 1.45
@@ -71,7 +75,7 @@ def velocity_errors(solution: Solution, truth: Trajectory) -> tuple[Array, Array
 @pytest.fixture(scope="module")
 def positions(shared_data: Path) -> dict[str, Score]:
     drives = [oracle.oracle_drive(shared_data, seed, odometer=False) for seed in range(SEEDS)]
-    return scored(drives, NO_WHEELS)
+    return scored(drives, INERTIAL)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +85,7 @@ def velocities(shared_data: Path) -> dict[str, Score]:
         oracle.drive(path, seed=50 + seed, gnss_velocity_sd=(0.05, 0.05, 0.08), outages=((415.0, 475.0),))
         for seed in range(SEEDS)
     ]
-    return scored(drives, NO_WHEELS)
+    return scored(drives, INERTIAL)
 
 
 def assert_consistent(score: Score) -> None:
