@@ -39,7 +39,7 @@ def main() -> None:
     options = parser.parse_args()
     folder = Path(os.environ["GRAPHNAV_DATA"])
     print("| walk | s | plain filter | " + " | ".join(f"{s}, {c} lateral" for c in CASES for s in SOLVERS), end="")
-    print(" | batch, point fitted | up, m: ekf, rts, batch | stride | NEES hor. | NEES up | s per min |")
+    print(f" | batch, point fitted | up, m: {', '.join(SOLVERS)} | stride | NEES hor. | NEES up | s per min |")
     print("|" + " --- |" * (3 + len(CASES) * len(SOLVERS) + 6))
     for name in options.sets.split(","):
         rows = []
