@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from graphnav import page, plots
+from graphnav.interpolation import fit_yaw, yaw_matrix
 from graphnav.page import Raw
 from graphnav.panels import svg
 from graphnav.plots import Series
 from graphnav.recording import Recording
+from graphnav.rotation import Array
 from graphnav.solution import Solution
 from graphnav.trajectory import Trajectory
 
@@ -50,13 +52,24 @@ def trajectory_picture(
         fixes = frame.from_llh(recording.gnss.llh)[:, :2]
     if recording.truth is not None and recording.truth.llh is not None:
         truth = frame.from_llh(recording.truth.llh)[:, :2]
+    elif recording.truth is not None and recording.truth.xyz is not None:
+        truth = _laid_on(recording.truth.t, recording.truth.xyz, next(reversed(solutions.values())))
     tracks = {name: (s.t - start, s.states.p[:, :2]) for name, s in solutions.items()}
     figure = plots.trajectory(tracks, fixes=fixes, truth=truth, spans=spans)
     lat, lon = np.degrees(frame.origin[:2])
-    return page.picture(
-        svg(figure, "trajectory from above", "way"),
-        f"From above; origin at latitude {lat:.6f}, longitude {lon:.6f} deg.",
-    )
+    where = f"origin at latitude {lat:.6f}, longitude {lon:.6f} deg."
+    if recording.gnss is None:
+        where = "place and heading count from the start, because nothing says where on the Earth that is."
+    return page.picture(svg(figure, "trajectory from above", "way"), f"From above; {where}")
+
+
+def _laid_on(t: Array, xyz: Array, solution: Solution) -> Array:
+    """A truth (M, 2 or 3) in a frame of its own, turned and moved onto a solution, (N, 2)."""
+    shared = (t >= solution.t[0]) & (t <= solution.t[-1]) & np.isfinite(xyz).all(axis=1)
+    p = solution.at(t[shared])[1].p
+    flat = np.column_stack([xyz[shared, :2], np.zeros(len(p))])
+    yaw, offset = fit_yaw(flat, p)
+    return np.asarray((flat @ yaw_matrix(yaw).T + offset)[:, :2])
 
 
 def error_pictures(errors: Mapping[str, Errors], start: float, spans: list[tuple[float, float]]) -> list[Raw]:

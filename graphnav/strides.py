@@ -17,10 +17,12 @@ from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.scoring import closure
 from graphnav.solution import Solution
+from graphnav.state import States
 from graphnav.trajectory import Trajectory
 
 _SPACING = 0.1  # s between the epochs compared with a dense truth
 _STANDS = 1.0  # s at the start of which a dense truth is averaged to place it
+_TURNS = 10
 _A_STRIDE = 0.3  # m; points closer together are no stride
 
 
@@ -29,6 +31,7 @@ class WalkErrors:
     """Of one solution; NaN where the truth does not tell. Sizes in m, NEES per degree of freedom (1 where true)."""
 
     horizontal: float  # rms after the fit; of a loop, start to end
+    of_point: float  # the same with the place on the foot fitted that the truth is of
     up: float  # rms with the start's height taken off; of a loop, end less start
     stride: float  # median of stride length over its truth; 1 where there is no bias
     nees_h: float
@@ -80,7 +83,7 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
         true, mine = (np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1) for x in (X, p))
         stride = float(np.median((mine / true)[true > _A_STRIDE]))
     horizontal = float(np.sqrt(np.mean(np.sum((p[:, :2] - fitted) ** 2, axis=1))))
-    return WalkErrors(horizontal, up, stride, float(np.mean(nees_h)), nees_up)
+    return WalkErrors(horizontal, _of_point(states, flat), up, stride, float(np.mean(nees_h)), nees_up)
 
 
 def _of_loop(solution: Solution, sigma: float) -> WalkErrors:
@@ -88,7 +91,19 @@ def _of_loop(solution: Solution, sigma: float) -> WalkErrors:
     found = closure(Trajectory(solution.t, p, frame="local"))
     off = p[-1] - p[0]
     nees_h = 0.5 * float(off[:2] @ np.linalg.solve(P[:2, :2], off[:2]))
-    return WalkErrors(found.horizontal, found.vertical, np.nan, nees_h, float(off[2] ** 2 / P[2, 2]))
+    return WalkErrors(found.horizontal, found.horizontal, found.vertical, np.nan, nees_h, float(off[2] ** 2 / P[2, 2]))
+
+
+def _of_point(states: States, flat: Array) -> float:
+    """Horizontal rms after fitting yaw, offset and a lever arm in the body, by turns, m."""
+    arm = np.zeros(3)
+    level = states.R_nb[:, :2]
+    for _ in range(_TURNS):
+        p = np.column_stack([states.p[:, :2] + level @ arm, np.zeros(len(flat))])
+        yaw, offset = fit_yaw(flat, p)
+        e = p[:, :2] - (_turned(flat[:, :2], yaw) + offset[:2])
+        arm = arm - np.linalg.lstsq((level - level.mean(axis=0)).reshape(-1, 3), e.ravel(), rcond=1e-3)[0]
+    return float(np.sqrt(np.mean(np.sum(e**2, axis=1))))
 
 
 def _turned(x: Array, yaw: float) -> Array:

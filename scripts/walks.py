@@ -3,6 +3,7 @@
     GRAPHNAV_DATA=... python scripts/walks.py
 
 Errors are the closure of loops, else the rms after yaw and offset are fitted to the truth; NEES per degree of freedom.
+"point fitted": the same with the place on the foot fitted that the truth is of, which no recording states.
 "plain filter" is what a nine-state zero-velocity filter of the usual kind reached on the same recordings.
 """
 
@@ -38,14 +39,18 @@ def main() -> None:
     options = parser.parse_args()
     folder = Path(os.environ["GRAPHNAV_DATA"])
     print("| walk | s | plain filter | " + " | ".join(f"{s}, {c} lateral" for c in CASES for s in SOLVERS), end="")
-    print(" | up, m: ekf, rts, batch | stride | NEES hor. | NEES up | s per min |")
-    print("|" + " --- |" * (3 + len(CASES) * len(SOLVERS) + 5))
+    print(f" | batch, point fitted | up, m: {', '.join(SOLVERS)} | stride | NEES hor. | NEES up | s per min |")
+    print("|" + " --- |" * (3 + len(CASES) * len(SOLVERS) + 6))
     for name in options.sets.split(","):
         rows = []
         for plain, path in zip(PLAIN[name], sorted((folder / name).glob("*.toml")), strict=True):
             rows.append(one(path, plain, SETS[name]))
         median = [f"{np.median([row[k] for row in rows]):.3f}" for k in range(len(rows[0]))]
-        print(f"| **{name}, median** | | {' | '.join(median)} |" + " |" * 5)
+        print(f"| **{name}, median** | | {' | '.join(median)} |" + " |" * 6)
+
+
+def shown(x: float, digits: int = 3) -> str:
+    return f"{x:.{digits}f}" if np.isfinite(x) else "-"
 
 
 def one(path: Path, plain: float, truth_sigma: float) -> list[float]:
@@ -60,11 +65,13 @@ def one(path: Path, plain: float, truth_sigma: float) -> list[float]:
             found[case, solver] = walk_errors(recording, solution, truth_sigma)
     horizontal = [found[case, solver].horizontal for case in CASES for solver in SOLVERS]
     b = found["without", "batch"]
-    up = ", ".join(f"{found['without', solver].up:.3f}" for solver in SOLVERS)
+    rate = 60.0 * spent / recording.duration
+    up = ", ".join(shown(found["without", solver].up) for solver in SOLVERS)
     print(
         f"| {recording.name} | {recording.duration:.0f} | {plain:g} | "
         + " | ".join(f"{x:.3f}" for x in horizontal)
-        + f" | {up} | {b.stride:.3f} | {b.nees_h:.2f} | {b.nees_up:.2f} | {60.0 * spent / recording.duration:.2f} |",
+        + f" | {b.of_point:.3f} | {up} | {shown(b.stride)} | {b.nees_h:.2f} | "
+        f"{shown(b.nees_up, 2)} | {rate:.2f} |",
         flush=True,
     )
     return [plain, *horizontal]

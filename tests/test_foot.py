@@ -293,6 +293,7 @@ def test_strides_and_shape_of_a_walk() -> None:
     exact = walk_errors(*line_walk(0.0))
     assert exact.horizontal == pytest.approx(0.0, abs=1e-9)
     assert exact.nees_h == pytest.approx(0.0, abs=1e-9)
+    assert exact.of_point == pytest.approx(0.0, abs=1e-6)
     long = walk_errors(*line_walk(0.02))
     assert long.stride == pytest.approx(1.02, rel=1e-6)
     # 2 % of the distance from the centre; and, against a sigma of 0.1 m, of that from the start
