@@ -75,7 +75,9 @@ def info(recording: Source) -> None:
 def smooth(
     recording: Source,
     out: Out,
-    solver: Annotated[str, typer.Option("--solver", metavar="NAME", help="batch, incremental, rts or ekf.")] = "batch",
+    solver: Annotated[
+        str, typer.Option("--solver", metavar="NAME", help="batch, incremental, isam2, rts or ekf.")
+    ] = "batch",
     config: Config = None,
     without: Without = None,
     rate: Rate = None,
@@ -99,7 +101,9 @@ def compare(
     out: Out,
     solvers: Annotated[
         str,
-        typer.Option("--solvers", metavar="NAMES", help="Some of ekf, rts, incremental, batch, with commas between."),
+        typer.Option(
+            "--solvers", metavar="NAMES", help="Some of ekf, rts, incremental, isam2, batch, with commas between."
+        ),
     ] = "ekf,rts,batch",
     config: Config = None,
     without: Without = None,

@@ -21,9 +21,10 @@ from graphnav.solution import Solution, joined
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import Filtered, Progress, Smoothed, backward, ekf, rts
 from graphnav.solvers.incremental import incremental
+from graphnav.solvers.isam import isam2
 
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
-KNOWN = ("ekf", "rts", "incremental", "batch")
+KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
 _FAR = 0.5  # rad between the stated and the found start attitude
 _SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
 
@@ -40,7 +41,7 @@ def run(
     ----------
     recording : from `graphnav.load`.
     settings : default settings when None.
-    solvers : out of "ekf", "rts", "incremental", "batch".
+    solvers : out of "ekf", "rts", "incremental", "isam2", "batch".
     progress : called now and then with a stage and its share done, 0 to 1.
 
     Returns
@@ -124,6 +125,8 @@ def _solve(
     if "incremental" in solvers:
         begin = aligned.state if astray else None
         out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
+    if "isam2" in solvers:
+        out["isam2"] = isam2(problem, progress).settled
     return {
         name: replace(
             out[name],

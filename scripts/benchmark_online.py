@@ -27,7 +27,7 @@ from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.online import Online, Row, rows_of, without_rows
 from graphnav.pipeline import judged, origin
-from graphnav.problem import pose
+from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf
@@ -95,13 +95,18 @@ def lazily(recording: Recording) -> Iterator[Row]:
 
 def filter_seconds(recording: Recording, settings: Settings) -> float:
     """Process time of the filter per keyframe."""
-    frame, stationary = LocalFrame(origin(recording)), detect(recording, settings).stationary
-    found = align(recording, settings, frame, lambda p, x: batch(p, x, wanted=(0,), reintegrate=False))
-    recording, settings, _ = judged(recording, settings, frame, found, stationary)
-    problem = pose(recording, settings, frame, found.state, found.sigma, stationary)
+    problem = posed(recording, settings)
     began = time.process_time()
     ekf(problem)
     return (time.process_time() - began) / len(problem.t)
+
+
+def posed(recording: Recording, settings: Settings) -> Problem:
+    """A recording aligned, judged and posed, as for any solver."""
+    frame, stationary = LocalFrame(origin(recording)), detect(recording, settings).stationary
+    found = align(recording, settings, frame, lambda p, x: batch(p, x, wanted=(0,), reintegrate=False))
+    recording, settings, _ = judged(recording, settings, frame, found, stationary)
+    return pose(recording, settings, frame, found.state, found.sigma, stationary)
 
 
 def report(hour: int, found: np.ndarray, errors: np.ndarray, cpu: float, rows: int) -> None:

@@ -248,7 +248,10 @@ BAD = {
     "no number": (["smooth", "kitti", "-o", "o", "--start", "soon"], "--start"),
     "output is a file": (["smooth", "kitti", "-o", "file"], "-o file: is a file"),
     "output under a file": (["smooth", "kitti", "-o", "file/o"], "-o file/o: cannot be made, file is a file"),
-    "unknown solver": (["smooth", "kitti", "-o", "o", "--solver", "isam"], "known: ekf, rts, incremental, batch"),
+    "unknown solver": (
+        ["smooth", "kitti", "-o", "o", "--solver", "lstm"],
+        "known: ekf, rts, incremental, isam2, batch",
+    ),
     "unknown among solvers": (["compare", "kitti", "-o", "o", "--solvers", "ekf,ukf"], "no solver 'ukf'"),
     "no solvers": (["compare", "kitti", "-o", "o", "--solvers", ","], "names no solver"),
     "unknown source": (["smooth", "kitti", "-o", "o", "--without", "gns:1-2"], "did you mean 'gnss'?"),

@@ -131,7 +131,7 @@ def incremental(
         iterations=1,
         stopped=f"every keyframe settled with {lag:g} s of the future, or all there was",
         timings={"incremental": spent},
-        notes=(*problem.notes, _said(seconds, solver.window.relinearized, lag)),
+        notes=(*problem.notes, f"lag {lag:g} s: {said(seconds)}; {solver.window.relinearized} were linearised again"),
         between=(dense(problem, states, covariance, _scale(at, values), smooth=True),),
     )
     live_states = States.stack(live)
@@ -185,10 +185,7 @@ def _parameters(problem: Problem, at: dict[str, slice], values: Array, sigma: Ar
     return out
 
 
-def _said(seconds: Array, relinearized: int, lag: float) -> str:
+def said(seconds: Array) -> str:
     """What a keyframe took, in words."""
     middle, high, most = 1e3 * np.quantile(seconds, [0.5, 0.99, 1.0])
-    return (
-        f"lag {lag:g} s: a keyframe took {middle:.1f} ms (median), {high:.1f} ms (99 %), {most:.0f} ms (most); "
-        f"{relinearized} were linearised again"
-    )
+    return f"a keyframe took {middle:.1f} ms (median), {high:.1f} ms (99 %), {most:.0f} ms (most)"
