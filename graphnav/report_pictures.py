@@ -53,7 +53,7 @@ def trajectory_picture(
     if recording.truth is not None and recording.truth.llh is not None:
         truth = frame.from_llh(recording.truth.llh)[:, :2]
     elif recording.truth is not None and recording.truth.xyz is not None:
-        truth = _laid_on(recording.truth.t, recording.truth.xyz, next(reversed(solutions.values())))
+        truth = _laid_on(recording.truth.t, recording.truth.xyz, list(solutions.values())[-1])
     tracks = {name: (s.t - start, s.states.p[:, :2]) for name, s in solutions.items()}
     figure = plots.trajectory(tracks, fixes=fixes, truth=truth, spans=spans)
     lat, lon = np.degrees(frame.origin[:2])
