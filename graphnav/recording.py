@@ -144,13 +144,19 @@ class Recording:
             return self
         lo = -np.inf if start is None else self.start + start
         hi = np.inf if end is None else self.start + end
-        parts = {
+        parts: dict[str, Any] = {
             name: _rows(sensor, (sensor.t >= lo) & (sensor.t <= hi))
             for name in ("imu", "gnss", "odometer")
             if (sensor := getattr(self, name)) is not None
         }
         if len(parts["imu"].t) < 2:
             raise RecordingError(f"nothing is left of '{self.name}' between {start} and {end} s")
+        if (
+            self.truth is not None
+            and self.truth.closed_loop_sigma is not None
+            and len(parts["imu"].t) < len(self.imu.t)
+        ):
+            parts["truth"] = None  # a part of a loop is none
         return replace(self, **parts)
 
 

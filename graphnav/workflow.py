@@ -245,6 +245,8 @@ def _score(
     truth = recording.truth
     gnss_withheld = any(source == "gnss" for source, _ in withheld)
     if truth is not None and truth.closed_loop_sigma is not None:
+        if any("closed_loop" in solution.records for solution in solutions.values()):
+            return {}, None, ()  # what was put in is no measure of what came out
         against, spans = "the start, where the loop ends", []
     elif truth is not None:
         against = "the recording's truth"

@@ -28,6 +28,7 @@ from graphnav.solution import Solution
 from graphnav.state import States
 from graphnav.strides import walk_errors
 from graphnav.unresolved import with_unresolved_motion
+from graphnav.workflow import Request, run_request
 
 PACES = ("slow", "normal", "fast")
 
@@ -256,6 +257,14 @@ def test_a_loop_is_closed_only_when_asked() -> None:
         assert np.linalg.norm(open_[solver].states.p[-1]) > 0.1
         assert np.linalg.norm(closed[solver].states.p[-1]) < 0.05
         assert any("closure is no measure" in note for note in closed[solver].notes)
+
+
+def test_a_loop_that_was_put_in_is_not_scored(shared_data: Path) -> None:
+    source = str(shared_data / "openshoe_loops" / "run34.toml")
+    asked = settings_from({"foot": {"closed_loop": 0.01}})
+    assert not run_request(Request(source, ("ekf",), asked)).metrics
+    assert run_request(Request(source, ("ekf",))).metrics["ekf"].closure is not None
+    assert not run_request(Request(source, ("ekf",), start=5.0)).metrics  # a part of a loop is none
 
 
 # --------------------------------------------------------------------------------------------------------- evaluation

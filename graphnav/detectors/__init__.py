@@ -1,4 +1,7 @@
-"""Where the vehicle stands. `detect` runs every detector on a recording and fuses their answers."""
+"""Where the vehicle stands, or a foot is on the floor.
+
+`detect` runs every detector on a recording and fuses their answers.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +31,10 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
     """Stationary intervals and the statistics they come from; never fails, and says what could not be done."""
     d = (settings or Settings()).detectors
     imu, period = recording.imu, period_of(recording.imu.t)
+    if recording.platform == "foot" and period > 0.0:
+        return detect_stances(imu, period, d.stance)
     if not recording.duration >= _SHORTEST or not period > 0.0:
         return Detections(NONE, (), (f"no detection: the recording is shorter than {_SHORTEST:g} s",))
-    if recording.platform == "foot":
-        return detect_stances(imu, period, d.stance)
     b = blocks(imu, period)
     low = low_pass(b)
     if not len(low.t):
