@@ -499,3 +499,24 @@ def test_real_recording_settles_on_the_batch_solution(shared_data: Path) -> None
     assert replace(recording).start == pytest.approx(track.t[0])
     assert online.status == "running"
     assert END == "E"
+
+
+def test_a_real_walk_settles_step_by_step(shared_data: Path) -> None:
+    """Shoe with nothing but its IMU: stances are found a second after they are over, and it is batch again."""
+    walk = read(shared_data / "pyshoe_vicon" / "2017-11-22-11-23-25.toml")
+    online, parts = Online(without_rows(walk), settings_from({"solver": {"lag": 20.0}})), []
+    behind = []
+    for row in rows_of(walk)[1]:
+        online.add(row)
+        parts += online.settled()
+        if online.tracker is not None:
+            behind.append(online.sensors.imu.newest - online.tracker.newest)
+    online.finish()
+    track = joined([*parts, *online.settled()])
+    best = run(walk, solvers=("batch",))["batch"]
+    t, states, P = best.at(track.t)
+    assert online.frame is not None
+    away = online.frame.from_llh(track.llh[np.isin(track.t, t)]) - states.p
+    assert np.abs(away).max() < 0.03
+    np.testing.assert_allclose(track.sd_p[-1], np.sqrt(np.diag(P[-1]))[3:6], rtol=0.15)
+    assert np.quantile(behind, 0.9) < 2.5

@@ -18,7 +18,7 @@ from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.online.sensors import Row, Sensors
-from graphnav.online.tracker import CONTEXT, Live, Tracker
+from graphnav.online.tracker import CONTEXT, SURE, Live, Tracker
 from graphnav.pipeline import judged, origin
 from graphnav.recording import Recording
 from graphnav.solution import to_trajectory
@@ -29,6 +29,7 @@ from graphnav.trajectory import Trajectory
 AFTER = 0.05  # s of IMU after a keyframe that a fix may look at
 _ODOMETER = 0.3  # s that a keyframe waits for the odometer
 _SILENT = 2.0  # s after which an odometer is not waited for
+_STEP = 0.5  # s between looks at a walk
 _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that level a vehicle without GNSS
 _PATIENCE = 300.0  # s of rows kept while there is no motion to align with
@@ -147,7 +148,11 @@ class Online:
         stated = with_known_heading(found, self.settings)
         self.notes += [*stated.notes, *said]
         self.tracker = Tracker(
-            settings, frame, first_message(stated.state, stated.sigma), recording.start, recording.imu.noise
+            settings,
+            frame,
+            first_message(stated.state, stated.sigma),
+            recording.start,
+            recording,
         )
         if found is not stated:
             self.tracker.window.head = self.tracker.window.head.moved(found.state.minus(stated.state)[0])
@@ -190,6 +195,9 @@ class Online:
         odometer = sensors.odometer.newest
         if not last and now - odometer < _SILENT:
             limit = min(limit, max(odometer, now - _ODOMETER))
+        if tracker.foot:
+            self._walk(tracker, now if last else now - SURE, last)
+            return
         T = tracker.newest
         begun = bool(len(tracker.window)) or tracker.opened
         anchors = [t for t in self._fixes if T + SAME_TIME < t <= limit]
@@ -217,6 +225,17 @@ class Online:
             self._collect(tracker)
         T = tracker.newest
         self._due = min([T + period, *(t for t in self._fixes if t > T)]) + AFTER
+
+    def _walk(self, tracker: Tracker, limit: float, last: bool) -> None:
+        """Make the keyframes of the steps that are over."""
+        times = tracker.steps_until(self.sensors, limit, last)
+        late = [t for t in self._fixes if t <= tracker.newest + SAME_TIME]
+        if len(times) or (late and len(tracker.window)):
+            dirty, self._dirty = min([self._dirty, *late]), np.inf
+            tracker.update(self.sensors, np.union1d(times, late), dirty)
+            self._collect(tracker)
+            self._fixes = [t for t in self._fixes if t > tracker.newest + SAME_TIME]
+        self._due = self.sensors.imu.newest + _STEP
 
     def _collect(self, tracker: Tracker) -> None:
         for part in tracker.settled:

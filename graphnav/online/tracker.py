@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints import registered
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import GnssPosition
 from graphnav.constraints.standstill import PLACE
@@ -23,8 +24,8 @@ from graphnav.dynamics import SCALE, Motion
 from graphnav.earth import LocalFrame
 from graphnav.online.sensors import Sensors
 from graphnav.preintegration import bridge_gaps, preintegrate
-from graphnav.problem import NODE_SPACING, Problem, pose
-from graphnav.recording import ImuNoise
+from graphnav.problem import NODE_SPACING, Problem, keyframe_times, pose
+from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solvers.stages import Place, Step
 from graphnav.solvers.window import Message, Smoothed, Window, turn_limit
@@ -35,6 +36,9 @@ from graphnav.wheels.faults import faults
 CONTEXT = 30.0  # s of rows before a keyframe that its constraints may look at
 _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
 _EVERY = 2.0  # s between looks of the detectors
+_WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector sees, and the least
+_SHORTEST = 0.05  # s between looks at a walk that are worth keyframes
+_STANDS = 3.0  # s, a stance as long as that is standing, and need not be over
 _WHEELS, _WHEELS_LOOK = 10.0, 40.0  # s between looks at the odometer, and what they see
 _LOOK = 30.0  # s that the detectors see
 _SEEN = 25.0  # s of these that they answer for; the first few lack what was before
@@ -59,12 +63,13 @@ class Tracker:
     Parameters
     ----------
     message, t0 : the prior and the time it is for.
-    noise : of the IMU.
+    setup : of the sensors.
     """
 
-    def __init__(self, settings: Settings, frame: LocalFrame, message: Message, t0: float, noise: ImuNoise) -> None:
+    def __init__(self, settings: Settings, frame: LocalFrame, message: Message, t0: float, setup: Recording) -> None:
         self.settings, self.frame = settings, frame
-        self.window = Window(message, turn_limit(noise))
+        self.foot = setup.platform == "foot"
+        self.window = Window(message, turn_limit(setup.imu.noise))
         self.head = t0  # time of the message before the window, or of the first keyframe as long as it is in it
         self.opened = False  # whether the first keyframe has left the window
         self.stops: Array = np.empty((0, 2))  # s, between keyframes
@@ -94,7 +99,7 @@ class Tracker:
         clock = [time.process_time()]
         edges = np.unique(np.concatenate([self.times, new]))
         now = float(edges[-1])
-        if now - self._detected >= _EVERY - SAME_TIME:
+        if not self.foot and now - self._detected >= _EVERY - SAME_TIME:
             dirty = min(dirty, self._classify(sensors, edges, now))
         if now - self._judged >= _WHEELS - SAME_TIME:
             dirty = min(dirty, self._judge_odometer(sensors, now))
@@ -248,6 +253,38 @@ class Tracker:
                 stages[k] = replace(stage, place=replace(stage.place, problem=None))
 
     # ----------------------------------------------------------------------------------------- stops, bad readings
+    def steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
+        """Keyframes of a walk, step by step: up to the newest stance that has begun or ended, whose spans are kept.
+
+        Only whole stances and swings say what phase a moment of them is in.
+        """
+        T = self.newest
+        whole = not np.isfinite(self._detected)
+        recording = sensors.recording(-np.inf if whole else min(T, limit) - _WALK, limit + SURE)
+        if recording.duration < _WALK_LEAST:
+            return np.empty(0)
+        spans = _clipped(detect(recording, self.settings).stationary, T, limit)
+        if not last and len(spans):
+            ongoing = spans[-1, 1] >= limit - SAME_TIME
+            if ongoing and limit - spans[-1, 0] < _STANDS:
+                limit, spans = float(spans[-1, 0]), spans[:-1]
+            elif not ongoing:
+                limit = float(spans[-1, 1])
+        elif not last and limit - T < _STANDS:
+            return np.empty(0)
+        if limit - T <= _SHORTEST:
+            return np.empty(0)
+        self._detected = limit
+        self.stops = merged(np.concatenate([self.stops, spans]), gap=SAME_TIME)
+        self.stops = self.stops[self.stops[:, 1] > self.head - CONTEXT]
+        # a swing is one because of the stance before it
+        begin = max([T - _WALK, *self.stops[self.stops[:, 0] <= T, 0].tolist()]) if len(self.stops) else T
+        part = sensors.recording(min(begin, T), limit)
+        around = _clipped(self.stops, part.start, limit)
+        epochs = [cls.epochs(part, self.settings, around) for cls in registered()]
+        times = keyframe_times(T, limit, np.concatenate([*epochs, np.empty(0)]), self.settings.keyframes.rate)
+        return times if not len(self.window) and not self.opened else times[1:]
+
     def _judge_odometer(self, sensors: Sensors, now: float) -> float:
         """Look for wrong readings of the odometer; returns the start of the first that was not known."""
         whole, self._judged = not np.isfinite(self._judged), now
