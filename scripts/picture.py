@@ -14,7 +14,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from graphnav.config import Settings
+from graphnav.config import Settings, settings_from
 from graphnav.evaluation import truth_of
 from graphnav.panels import PALETTE
 from graphnav.workflow import Request, parse_withheld, run_request
@@ -24,15 +24,23 @@ GAP = 2.5  # s; wider gaps of the truth break a line
 NAMES = {"ekf": "Kalman filter", "batch": "graph smoother"}
 
 
+INERTIAL = {
+    "vehicle": {"nhc": False, "odometer": False},
+    "standstill": {"zero_velocity": False, "zero_rate": False, "held_position": False},
+}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", help="with a truth of the antenna or of the IMU")
     parser.add_argument("--without", required=True, help="such as gnss:600-660")
     parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("--inertial", action="store_true", help="nothing of wheels and stops")
     options = parser.parse_args()
     source, span = parse_withheld(options.without)
     assert span is not None, "name a span"
-    outcome = run_request(Request(options.recording, tuple(NAMES), Settings(), ((source, span),)))
+    settings = settings_from(INERTIAL) if options.inertial else Settings()
+    outcome = run_request(Request(options.recording, tuple(NAMES), settings, ((source, span),)))
     recording = outcome.recording
     found = truth_of(recording)
     assert found is not None, "the recording has no truth to draw"
