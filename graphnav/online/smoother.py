@@ -45,7 +45,7 @@ class Online:
     """
 
     def __init__(self, setup: Recording, settings: Settings | None = None) -> None:
-        self.settings = settings or Settings()
+        self.settings, self._setup = settings or Settings(), setup
         self.sensors = Sensors(setup, self.settings.keyframes.bridge)
         self.frame: LocalFrame | None = None
         self.tracker: Tracker | None = None
@@ -177,6 +177,7 @@ class Online:
             self.tracker.settle(sensors)
             self._collect(self.tracker)
         self.tracker = None
+        sensors.setup = self._setup  # the IMU is judged anew as well
         sensors.drop_before(np.inf)
         for row in after:
             sensors.imu.add(float(row[0]), tuple(row[1:]))
