@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.alignment import align, ready, with_known_heading
+from graphnav.alignment import Alignment, align, ready, with_known_heading
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.detectors import detect
@@ -32,6 +32,7 @@ _SILENT = 2.0  # s after which an odometer is not waited for
 _STEP = 0.5  # s between looks at a walk
 _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that level a vehicle without GNSS
+_JUDGED = 120.0  # s of rows by which the sensors are judged again
 _PATIENCE = 300.0  # s of rows kept while there is no motion to align with
 
 
@@ -51,6 +52,7 @@ class Online:
         self.tracker: Tracker | None = None
         self.notes: list[str] = []
         self.late: Counter[str] = Counter()  # rows that came after the keyframe they belong before, and were used
+        self._found: Alignment | None = None  # until the sensors are judged again
         self._fixes: list[float] = []  # s, not yet in the graph
         self._due = -np.inf
         self._dirty = np.inf
@@ -143,22 +145,41 @@ class Online:
             self.notes.append(f"not aligned at {now:.1f} s: {error}")
             self._wait(now)
             return
-        # what the IMU was judged to be holds from here on
-        sensors.setup = _with_noise(sensors.setup, recording)
-        stated = with_known_heading(found, self.settings)
-        self.notes += [*stated.notes, *said]
-        self.tracker = Tracker(
-            settings,
-            frame,
-            first_message(stated.state, stated.sigma),
-            recording.start,
-            recording,
-        )
-        if found is not stated:
-            self.tracker.window.head = self.tracker.window.head.moved(found.state.minus(stated.state)[0])
+        self._found = found
+        tracker = self._track(found, recording, settings, said)
         self._fixes = [t for t in sensors.gnss.t.tolist() if t >= recording.start - SAME_TIME]
         sensors.oldest = recording.start
-        self._advance(self.tracker)
+        self._advance(tracker)
+
+    def _track(self, found: Alignment, recording: Recording, settings: Settings, said: tuple[str, ...]) -> Tracker:
+        """Begin at the first row of the buffer, with what the sensors were judged to be."""
+        assert self.frame is not None
+        self.sensors.setup = replace(self._setup, imu=replace(self._setup.imu, noise=recording.imu.noise))
+        stated = with_known_heading(found, self.settings)
+        self.notes += [note for note in (*stated.notes, *said) if note not in self.notes]
+        message = first_message(stated.state, stated.sigma)
+        self.tracker = Tracker(settings, self.frame, message, recording.start, recording)
+        if found is not stated:
+            self.tracker.window.head = message.moved(found.state.minus(stated.state)[0])
+        return self.tracker
+
+    def _judge_again(self, tracker: Tracker) -> Tracker:
+        """Judge the sensors by all rows before the first of them settles, and go through them again if need be."""
+        found, self._found = self._found, None
+        assert found is not None
+        assert self.frame is not None
+        self.sensors.setup = self._setup
+        recording = self.sensors.recording(-np.inf, tracker.newest)
+        try:
+            stationary = detect(recording, self.settings).stationary
+            recording, settings, said = judged(recording, self.settings, self.frame, found, stationary)
+        except EstimationError as error:
+            self.notes.append(f"not judged again: {error}")
+            return tracker
+        times = tracker.window.t
+        again = self._track(found, recording, settings, said)
+        again.update(self.sensors, times)
+        return again
 
     def _wait(self, now: float) -> None:
         """Keep what the next attempt may need."""
@@ -223,6 +244,8 @@ class Online:
             dirty, self._dirty = self._dirty, np.inf
             self._fixes = [t for t in self._fixes if t > limit and t > T + SAME_TIME]
             tracker.update(sensors, np.array(times), dirty)
+            if self._found is not None and tracker.newest - tracker.head > min(self.settings.solver.lag, _JUDGED):
+                tracker = self._judge_again(tracker) if not tracker.opened else tracker
             self._collect(tracker)
         T = tracker.newest
         self._due = min([T + period, *(t for t in self._fixes if t > T)]) + AFTER
@@ -252,7 +275,3 @@ class Online:
         if len(tracker.stops):
             begin = min(begin, max(float(tracker.stops[0, 0]), begin - 10.0 * CONTEXT))
         self.sensors.drop_before(begin - CONTEXT - 5.0)
-
-
-def _with_noise(setup: Recording, judged_as: Recording) -> Recording:
-    return replace(setup, imu=replace(setup.imu, noise=judged_as.imu.noise))
