@@ -65,7 +65,7 @@ def run(
         try:
             # matrices here have thirty rows: threads for them cost more than the work, twenty times on a busy machine
             with threadpool_limits(limits=1, user_api="blas"):
-                found.append(_solve(piece, settings, frame, solvers, progress))
+                found.append(_solved(piece, settings, frame, solvers, progress))
         except EstimationError as error:
             if len(pieces) == 1:
                 raise
@@ -73,6 +73,21 @@ def run(
     if not found:
         raise EstimationError(f"'{recording.name}': no piece between its IMU gaps can be solved")
     return {name: joined([one[name] for one in found], tuple(notes)) for name in solvers}
+
+
+def _solved(
+    recording: Recording, settings: Settings, frame: LocalFrame, solvers: tuple[str, ...], progress: Progress | None
+) -> dict[str, Solution]:
+    """`_solve`, and once more without what covariances may not have the digits for."""
+    try:
+        return _solve(recording, settings, frame, solvers, progress)
+    except (EstimationError, np.linalg.LinAlgError) as error:
+        if not settings.standstill.held_position:
+            raise
+        still = settings.standstill.model_copy(update={"held_position": False})
+        again = _solve(recording, settings.model_copy(update={"standstill": still}), frame, solvers, progress)
+        note = f"places of stops are not held: with them, {error}"
+        return {name: replace(one, notes=(note, *one.notes)) for name, one in again.items()}
 
 
 def _solve(

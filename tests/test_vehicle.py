@@ -236,3 +236,19 @@ def test_the_last_half_minute_of_a_motorway(shared_data: Path) -> None:
     recording = read(shared_data / "comma_highway_20180802")
     assert largest(recording, (30.0, 60.0), "batch") < 1.6
     assert largest(recording, (30.0, 60.0), "batch", vehicle={"nhc": False, "odometer": False}) > 5.0
+
+
+def test_sigma_survives_long_stops_in_the_dark(shared_data: Path) -> None:
+    """Eight minutes with nothing but stops: metres on the Earth, millimetres against the place of a stop."""
+    recording, _ = oracle.oracle_drive(shared_data, 5, rtk=False, odometer=False)
+    inertial = settings_from({"vehicle": {"nhc": False}})
+    found = run(recording.without("gnss", (135.0, 600.0)), inertial)
+    for name, solution in found.items():
+        variance = np.diagonal(solution.covariance, axis1=1, axis2=2)
+        assert np.isfinite(variance).all(), name
+        assert variance.min() > 0.0, name
+    # at the end a smoother knows no more than the filter
+    end = {name: np.sqrt(np.diagonal(s.covariance[-1])[3:5]) for name, s in found.items()}
+    assert end["ekf"].max() > 3.0
+    np.testing.assert_allclose(end["rts"], end["ekf"], rtol=1e-6)
+    np.testing.assert_allclose(end["batch"], end["ekf"], rtol=0.3)  # linearised elsewhere
