@@ -404,7 +404,7 @@ def test_tokyo_stops(shared_data, without):
     stops = np.minimum(stops, recording.end)
     t = np.arange(recording.start, recording.end, 0.02)
     still, called = covered(t, stops), covered(t, found.stationary)
-    # the published ends are late by the odometer's delay, and two "stops" are crawls at 0.3 to 0.5 m/s by the Doppler
+    # the published ends are late by the odometer's delay, and two "stops" may not be any: Doppler 0.1 to 0.45 m/s
     assert called[still].mean() > 0.945
     assert still[called].mean() > 0.999
     ok = np.isfinite(recording.gnss.v[:, 0])
