@@ -43,7 +43,6 @@ class Parameter:
     walk: float | Array = 0.0  # unit/sqrt(s) of a random walk, (k,) or one for all; 0 = constant
     correlation_time: float | None = None  # s; given, a Gauss-Markov process about zero with `sigma` at all times
     begins: Array | None = None  # (n,) s; given, `initial` and `sigma` hold anew from each of these times on
-    like: str | None = None  # the block of the state it then begins near: a filter starts it there
 
     @property
     def size(self) -> int:

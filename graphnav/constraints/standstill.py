@@ -32,7 +32,7 @@ from graphnav.state import Parameter, States
 PLACE = "stop_position"
 _NEIGHBOURS = 5  # intervals over which unrest is looked for
 _SWAY = 2.0 * np.pi  # rad/s, the slowest swaying of a body on springs
-_STILL_V, _STILL_P = 1e-3, 5e-3  # m/s, m: no body on springs stands stiller than this
+_STILL_V, _STILL_P = 1e-3, 1e-3  # m/s, m: no body stands stiller than this
 _FAR = 60.0  # m/s; times the seconds without a fix: how far from the last one a stop may be
 _ROLLING = 0.1  # rad/s; a foot that rolls over its stance turns quicker
 _SLOW = 0.3  # s, about a quarter of a period of a standing body's sway
@@ -198,4 +198,4 @@ def _places(scene: Scene, stops: Array) -> Parameter:
         after = np.clip(np.searchsorted(gnss.t, begins), 1, len(gnss.t) - 1)
         away = np.minimum(np.abs(gnss.t[after] - begins), np.abs(begins - gnss.t[after - 1]))
     sigma = np.repeat((100.0 + _FAR * away)[:, None], 3, axis=1)
-    return Parameter(PLACE, place, sigma, "m", begins=begins, like="p")
+    return Parameter(PLACE, place, sigma, "m", begins=begins)

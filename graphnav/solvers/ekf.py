@@ -42,12 +42,7 @@ from graphnav.errors import EstimationError
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
-from graphnav.state import BLOCKS, DIM, States
-
-# A stop known to a millimetre against its place and to many metres on the Earth leaves Cholesky hardly a digit. What is
-# then added, of each variance, as little as will do.
-_LOADING = (1e-12, 1e-10, 1e-8, 1e-7, 1e-6)
-_NEAR = 100.0  # m, more than a vehicle moves from one keyframe to the next
+from graphnav.state import DIM, States
 
 Progress = Callable[[str, float], None]
 
@@ -140,13 +135,6 @@ def _forward(problem: Problem, K: int, about: Smoothed | None = None, progress: 
                 F[:DIM, scale_at] = problem.motion.scale_columns(step, F15)[0]
             at_values = at_values.copy()
             for column, chain, j in steps.get(k, ()):
-                if chain.parameter.like is not None:
-                    # from the state, not from nowhere: a variance of kilometres would leave the others no digit
-                    block = BLOCKS[chain.parameter.like]
-                    F[column, column], F[column, block] = 0.0, np.eye(chain.parameter.size)
-                    at_values[_shift(column)] = getattr(at, chain.parameter.like)[0]
-                    added[column] = _NEAR**2
-                    continue
                 F[column, column] *= chain.decay[j]
                 at_values[_shift(column)] -= chain.mean[j - 1]
                 at_values[_shift(column)] = chain.mean[j] + chain.decay[j] * at_values[_shift(column)]
@@ -221,6 +209,7 @@ def _update(
     IKH = -K @ H
     IKH.flat[:: len(P) + 1] += 1.0
     P = IKH @ P @ IKH.T + (K * (sigma * sigma)) @ K.T
+    P = 0.5 * (P + P.T)  # rounding's asymmetry would grow, past what a stop leaves between its place and the state
     return at.plus(d[None, :DIM]), at_values + d[DIM:], P
 
 
@@ -271,10 +260,6 @@ def backward(problem: Problem, forward: Forward, progress: Progress | None = Non
     for k in range(K - 2, -1, -1):
         Pp = forward.P_predicted[k + 1]
         _, gain, info = dposv(Pp, forward.F[k] @ forward.P[k])
-        for more in _LOADING if info else ():
-            _, gain, info = dposv(Pp + np.diag(more * np.diag(Pp)), forward.F[k] @ forward.P[k])
-            if not info:
-                break
         if info:
             raise EstimationError(f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas")
         C = gain.T
