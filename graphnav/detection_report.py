@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav.detection_pictures import picture
+from graphnav import page, plots, report_pictures
 from graphnav.detectors import Detections
 from graphnav.detectors.base import intervals_text
 from graphnav.exporters.csv import rows_text
@@ -15,6 +15,7 @@ from graphnav.recording import Recording
 from graphnav.rotation import Array
 
 _LISTED = 30  # stops
+_WIDTH = 720.0  # points, of the PNG
 
 
 def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
@@ -25,8 +26,22 @@ def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
     # no name and no time in the header: the same recording gives the same bytes
     with statistics.open("wb") as raw, gzip.GzipFile("", "wb", 5, raw, mtime=0) as file:
         file.write(statistics_text(found).encode())
-    picture(recording, found).savefig(plot, dpi=110, metadata={"Software": None})
-    return [plot, intervals, statistics]
+    plots.detections(recording, found.all, width=_WIDTH).savefig(plot, dpi=110, metadata={"Software": None})
+    html = folder / "detections.html"
+    html.write_text(_page(recording, found), encoding="utf-8")
+    return [html, plot, intervals, statistics]
+
+
+def _page(recording: Recording, found: Detections) -> str:
+    spans = found.stationary - recording.start
+    rows = [[page.Raw(f"{a:.2f} s"), page.Raw(f"{b:.2f} s"), page.Raw(f"{b - a:.2f} s")] for a, b in spans]
+    lead = [page.paragraph(line) for line in _words(recording, found)]
+    sections = [
+        ("What they saw", [page.gallery(report_pictures.detection_pictures(recording, found.all))]),
+        ("Where it stands", [page.table(["from", "to", "for"], rows)] if rows else []),
+        ("Notes", [page.bullets(found.notes)] if found.notes else []),
+    ]
+    return page.page(f"{recording.name}: detectors", lead, sections)
 
 
 def statistics_text(found: Detections) -> str:
@@ -58,16 +73,25 @@ def _nearest(of: Array, t: Array) -> tuple[np.ndarray, np.ndarray]:
 def text(recording: Recording, found: Detections, files: list[Path]) -> str:
     """Stops, seconds, the idle line or why there is none, and where to look."""
     spans = found.stationary - recording.start
-    seconds = float(np.diff(spans).sum()) if len(spans) else 0.0
-    many = "1 stop" if len(spans) == 1 else f"{len(spans)} stops"
-    lines = [
-        f"{recording.name} ({recording.platform}): {recording.duration:.1f} s",
-        f"  {many}, {seconds:.1f} s in total" + (f" ({100.0 * seconds / recording.duration:.1f} %)" if seconds else ""),
-    ]
+    first, stops, each = _words(recording, found)
+    lines = [first, f"  {stops}"]
     lines += [f"    {a:9.2f} - {b:9.2f}  {b - a:8.2f} s" for a, b in spans[:_LISTED]]
     if len(spans) > _LISTED:
         lines.append(f"    ... and {len(spans) - _LISTED} more in detections.csv")
-    each = [f"{d.name} {float(np.diff(d.intervals).sum()) if len(d.intervals) else 0.0:.1f}" for d in found.all]
-    lines.append(f"  seconds by detector: {', '.join(each)}" if each else "  no detector has run")
+    lines.append(f"  {each}")
     lines += [f"  note: {note}" for note in found.notes]
     return "\n".join([*lines, "", "look at", *(f"  {file}" for file in files)])
+
+
+def _words(recording: Recording, found: Detections) -> tuple[str, str, str]:
+    """What was looked at, how much of it stands, and what each detector says."""
+    spans = found.stationary
+    seconds = float(np.diff(spans).sum()) if len(spans) else 0.0
+    many = "1 stop" if len(spans) == 1 else f"{len(spans)} stops"
+    share = f" ({100.0 * seconds / recording.duration:.1f} %)" if seconds else ""
+    each = [f"{d.name} {float(np.diff(d.intervals).sum()) if len(d.intervals) else 0.0:.1f}" for d in found.all]
+    return (
+        f"{recording.name} ({recording.platform}): {recording.duration:.1f} s",
+        f"{many}, {seconds:.1f} s in total{share}",
+        f"seconds by detector: {', '.join(each)}" if each else "no detector has run",
+    )

@@ -23,10 +23,11 @@ from graphnav.errors import ConfigError
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
-from graphnav.workflow import Outcome
+from graphnav.workflow import Outcome, outages
 
 if TYPE_CHECKING:
     from graphnav.metrics import Metrics
+    from graphnav.page import Raw
 
 
 def output_folder(path: str | Path) -> Path:
@@ -62,8 +63,9 @@ def write_comparison(outcome: Outcome, folder: Path) -> list[Path]:
     from graphnav.metrics import summary, write_comparison_csv
 
     provenance = _provenance(outcome)
+    detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
     for name in outcome.solutions:
-        write_solver(outcome, name, folder / name, provenance)
+        write_solver(outcome, name, folder / name, provenance, detectors)
     write_comparison_csv(folder / "comparison.csv", comparison(outcome))
     report.write_comparison(
         folder / "comparison.html",
@@ -73,13 +75,16 @@ def write_comparison(outcome: Outcome, folder: Path) -> list[Path]:
         metrics={name: summary(m) for name, m in outcome.metrics.items()},
         errors={name: m.errors for name, m in outcome.metrics.items() if m.errors is not None},
         withheld=outcome.used_withheld,
+        outages=outages(outcome.recording),
         findings=_odd(outcome),
         provenance=provenance,
     )
     return [folder / "comparison.html", folder / "comparison.csv"]
 
 
-def write_solver(outcome: Outcome, name: str, folder: Path, provenance: Mapping[str, Any]) -> None:
+def write_solver(
+    outcome: Outcome, name: str, folder: Path, provenance: Mapping[str, Any], detectors: Sequence[Raw] | None = None
+) -> None:
     """The files of one solver; a folder that holds older ones keeps none of them under the same names."""
     from graphnav import report
     from graphnav.exporters import write_all
@@ -100,8 +105,10 @@ def write_solver(outcome: Outcome, name: str, folder: Path, provenance: Mapping[
         metrics=None if metrics is None else summary(metrics),
         errors=None if metrics is None else metrics.errors,
         withheld=outcome.used_withheld,
+        outages=outages(outcome.recording),
         findings=_odd(outcome),
         provenance=provenance,
+        detectors=detectors,
     )
     spent = {"writing": written - began, "report": time.perf_counter() - written}
     write_json(folder / "summary.json", solver_summary(outcome, name, spent, provenance))

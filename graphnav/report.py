@@ -9,12 +9,18 @@ from typing import TYPE_CHECKING, Any
 from graphnav import page
 from graphnav import report_pictures as pictures
 from graphnav import report_tables as tables
+from graphnav import report_words as words
+from graphnav.panels.drawing import Spans
 from graphnav.recording import Recording
+from graphnav.report_pictures import Shades
+from graphnav.report_provenance import provenance_tables
 from graphnav.report_tables import Withheld
 from graphnav.solution import Solution
 
 if TYPE_CHECKING:
     from graphnav.metrics import Errors
+
+Sections = list[tuple[str, Sequence[str]]]
 
 
 def write_report(
@@ -26,8 +32,10 @@ def write_report(
     metrics: Mapping[str, Any] | None = None,
     errors: Errors | None = None,
     withheld: Withheld = (),
+    outages: Spans = (),
     findings: Sequence[str] = (),
     provenance: Mapping[str, Any] | None = None,
+    detectors: Sequence[page.Raw] | None = None,
 ) -> Path:
     """One solver's report as one self-contained HTML file.
 
@@ -36,35 +44,51 @@ def write_report(
     settings : resolved settings, nested plain values.
     metrics, errors : of `graphnav.evaluation`, where there is a truth.
     withheld : (source, span), span in s from the recording's start or None for all of it.
+    outages : s from the start, where the recording itself has no fixes.
     findings : sentences about what was odd in the recording.
-    provenance : version, input hashes and the like, plain values.
+    provenance : version, input hashes and the like, plain values; `options` are those of the command.
+    detectors : of `detector_pictures`, for who writes several reports of one recording; drawn here if None.
     """
-    name, start, times = solution.solver, recording.start, tables.times_of(withheld)
-    every = {} if errors is None else {name: errors}
-    metrics_of = {} if metrics is None else {name: metrics}
-    html = page.page(
-        f"{recording.name}: {name}",
-        [
-            page.paragraph(tables.what_was_done(recording, {name: solution}, withheld)),
-            tables.tiles(recording, {name: solution}, every),
-        ],
-        [
-            ("Trajectory", [page.gallery([pictures.trajectory_picture(recording, {name: solution}, times)])]),
-            ("Accuracy", [*_accuracy(every, metrics_of, withheld, start), *tables.metric_tables(metrics)]),
-            ("Errors against truth", _gallery(pictures.error_pictures(every, start, times))),
-            ("Uncertainty", _gallery(pictures.sigma_pictures({name: solution.trajectory()}, start, times))),
-            ("Biases", _gallery(pictures.bias_pictures(solution, start, times))),
-            (
-                "Constraints",
-                [*tables.constraint_table(solution), *_gallery(pictures.record_pictures(solution, start, times))],
-            ),
-            ("Calibration", tables.parameter_table(solution.parameters)),
-            ("What was odd", tables.odd(recording, findings)),
-            ("How it ran", tables.run_table({name: solution})),
-            ("Provenance", tables.provenance_tables(settings, provenance)),
-        ],
-    )
-    return _write(path, html)
+    name, start, track = solution.solver, recording.start, solution.trajectory()
+    only, every = {name: solution}, {} if errors is None else {name: errors}
+    spans = _shades(solution, start, withheld, outages)
+    if detectors is None:
+        detectors = detector_pictures(recording, solution)
+    moving = pictures.motion_pictures(track, name, start, spans)
+    sections: Sections = [
+        ("Trajectory", [page.gallery([pictures.trajectory_picture(recording, only, spans)])]),
+        ("Accuracy", [*tables.accuracy_tables(every, withheld, start, outages), *tables.metric_tables(metrics)]),
+        ("Errors against truth", _gallery(pictures.error_pictures(every, start, spans))),
+        ("Can sigma be believed?", _consistency(every, start, spans)),
+        ("Uncertainty", _gallery(pictures.sigma_pictures({name: track}, start, spans))),
+        ("Velocity and attitude", _gallery(moving)),
+        ("Biases", _gallery(pictures.bias_pictures(solution, start, spans))),
+        (
+            "Calibration",
+            [*tables.parameter_table(solution.parameters),
+             *_gallery(pictures.parameter_pictures(solution, start, spans))],
+        ),
+        (
+            "Constraints",
+            [
+                *_gallery(pictures.timeline_picture(solution, recording, spans)),
+                *tables.constraint_table(solution),
+                *tables.excluded_table(solution, start),
+                *tables.rejected_table(solution, start),
+                *_gallery(pictures.record_pictures(solution, start, spans)),
+            ],
+        ),
+        ("Detectors", _gallery(detectors)),
+        ("What was odd", tables.odd(recording, findings)),
+        ("How it ran", tables.run_table(only)),
+        ("Provenance", provenance_tables(settings, provenance)),
+    ]  # fmt: skip
+    lead = [
+        page.paragraph(words.what_was_done(recording, only, withheld, outages)),
+        *_verdicts(only, every, {} if metrics is None else {name: metrics}),
+        words.tiles(recording, only, every),
+    ]
+    return _write(path, page.page(f"{recording.name}: {name}", lead, sections))
 
 
 def write_comparison(
@@ -76,12 +100,17 @@ def write_comparison(
     metrics: Mapping[str, Mapping[str, Any]] | None = None,
     errors: Mapping[str, Errors] | None = None,
     withheld: Withheld = (),
+    outages: Spans = (),
     findings: Sequence[str] = (),
     provenance: Mapping[str, Any] | None = None,
 ) -> Path:
     """Several solvers on one recording as one self-contained HTML file; arguments as in `write_report`, per solver."""
-    start, times = recording.start, tables.times_of(withheld)
-    every, metrics_of = errors or {}, metrics or {}
+    start, every, metrics_of = recording.start, errors or {}, metrics or {}
+    spans = _shades(next(iter(solutions.values())), start, withheld, outages)
+    gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
+    zooms = pictures.zoom_pictures(every, start, gone)
+    if not gone:
+        zooms = pictures.zoom_pictures(every, start, outages, "no GNSS")
     rows = [
         [kind, page.solver(name), *tables.consistency_row(tables.consistency(solution.records[kind]))]
         for kind in dict.fromkeys(kind for s in solutions.values() for kind in s.records)
@@ -89,38 +118,57 @@ def write_comparison(
         if kind in solution.records
     ]
     measured = [table for name, values in metrics_of.items() for table in tables.metric_tables(values, name)]
-    html = page.page(
-        f"{recording.name}: comparison",
-        [
-            page.paragraph(tables.what_was_done(recording, solutions, withheld)),
-            tables.tiles(recording, solutions, every),
-        ],
-        [
-            ("Accuracy", [*_accuracy(every, metrics_of, withheld, start), *measured]),
-            ("Withheld spans", _gallery(pictures.zoom_pictures(every, start, times))),
-            ("Trajectory", [page.gallery([pictures.trajectory_picture(recording, solutions, times)])]),
-            ("Errors against truth", _gallery(pictures.error_pictures(every, start, times))),
-            (
-                "Uncertainty",
-                _gallery(pictures.sigma_pictures({n: s.trajectory() for n, s in solutions.items()}, start, times)),
-            ),
-            ("Constraints", [page.table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
-            ("What was odd", tables.odd(recording, findings)),
-            ("How they ran", tables.run_table(solutions)),
-            ("Provenance", tables.provenance_tables(settings, provenance)),
-        ],
-    )
-    return _write(path, html)
-
-
-def _accuracy(
-    errors: Mapping[str, Errors], metrics: Mapping[str, Mapping[str, Any]], withheld: Withheld, start: float
-) -> list[str]:
-    return [
-        *(tables.believe(name, e) for name, e in errors.items()),
-        *(note for name, values in metrics.items() for note in tables.closure_note(name, values)),
-        *tables.accuracy_tables(errors, withheld, start),
+    tracks = {name: s.trajectory() for name, s in solutions.items()}
+    sections: Sections = [
+        ("Accuracy", [*tables.accuracy_tables(every, withheld, start, outages), *measured]),
+        ("Spans without GNSS" if not gone else "Withheld spans", _gallery(zooms)),
+        ("Trajectory", [page.gallery([pictures.trajectory_picture(recording, solutions, spans)])]),
+        ("Errors against truth", _gallery(pictures.error_pictures(every, start, spans))),
+        ("Where they differ", _gallery(pictures.difference_pictures(solutions, start, spans))),
+        ("Can sigma be believed?", _consistency(every, start, spans)),
+        ("Uncertainty", _gallery(pictures.sigma_pictures(tracks, start, spans))),
+        ("Constraints", [page.table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
+        ("What was odd", tables.odd(recording, findings)),
+        ("How they ran", tables.run_table(solutions)),
+        ("Provenance", provenance_tables(settings, provenance)),
     ]
+    lead = [
+        page.paragraph(words.what_was_done(recording, solutions, withheld, outages)),
+        *_verdicts(solutions, every, metrics_of),
+        words.tiles(recording, solutions, every),
+    ]
+    return _write(path, page.page(f"{recording.name}: comparison", lead, sections))
+
+
+def detector_pictures(recording: Recording, solution: Solution) -> list[page.Raw]:
+    """What the detectors saw, for `write_report`: the same for every solver of a recording."""
+    return pictures.detection_pictures(recording, solution.detections)
+
+
+def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans) -> Shades:
+    """Spans of time worth a tint, s from the start, by what they are."""
+    excluded = [(part.t_start - start, part.t_end - start) for part in getattr(solution, "excluded", ())]
+    gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
+    return {"withheld": gone, "no GNSS": list(outages), "excluded": excluded}
+
+
+def _verdicts(
+    solutions: Mapping[str, Solution], errors: Mapping[str, Errors], metrics: Mapping[str, Mapping[str, Any]]
+) -> list[page.Raw]:
+    """Per solver, whether its sigma can be believed and, of a loop, how well it closes."""
+    said = [
+        words.believe(name, errors[name]) if name in errors else words.believe_without_truth(solution)
+        for name, solution in solutions.items()
+    ]
+    return [*said, *(note for name, values in metrics.items() for note in words.closure_note(name, values))]
+
+
+def _consistency(errors: Mapping[str, Errors], start: float, spans: Shades) -> list[str]:
+    table = tables.nees_table(errors)
+    if not table:
+        return []
+    note = "Errors of one drive are alike for seconds to minutes, so a true sigma scatters about 1 as well."
+    return [*table, page.paragraph(note, "soft"), *_gallery(pictures.nees_pictures(errors, start, spans))]
 
 
 def _gallery(images: Sequence[page.Raw]) -> list[str]:

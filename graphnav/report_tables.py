@@ -10,6 +10,7 @@ import numpy as np
 
 from graphnav import page
 from graphnav.page import Raw
+from graphnav.panels.drawing import Spans
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
@@ -17,6 +18,7 @@ from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
 if TYPE_CHECKING:
     from graphnav.metrics import Errors
 
+_LISTED = 40  # rejected measurements
 Withheld = Sequence[tuple[str, tuple[float, float] | None]]
 
 
@@ -94,63 +96,8 @@ def constraint_table(solution: Solution) -> list[Raw]:
     return out
 
 
-def times_of(withheld: Withheld) -> list[tuple[float, float]]:
-    """The spans of time that something was withheld in, each once."""
-    return list(dict.fromkeys(span for _, span in withheld if span is not None))
-
-
-def what_was_done(recording: Recording, solutions: Mapping[str, Solution], withheld: Withheld) -> str:
-    """The run in two or three sentences."""
-    used = recording
-    for source, span in withheld:
-        if getattr(used, source, None) is not None:
-            used = used.without(source, span)
-    rate = 1.0 / float(np.median(np.diff(used.imu.t)))
-    sources = [f"{len(used.imu.t)} IMU rows at {rate:.4g} Hz"]
-    if used.gnss is not None:
-        sources.append(f"{len(used.gnss.t)} GNSS fixes")
-    if used.odometer is not None:
-        sources.append(f"{len(used.odometer.t)} odometer rows")
-    solution = next(iter(solutions.values()))
-    several = len(solutions) > 1
-    who = f"The solvers {page.and_list(list(solutions))}" if several else f"The {solution.solver} solver"
-    words = (
-        f"{who} estimated the trajectory of the {recording.platform} recording '{recording.name}' "
-        f"({recording.duration:.1f} s) from {page.and_list(sources)}, at {len(solution.t)} keyframes."
-    )
-    if withheld:
-        listed = [f"{source} {span[0]:g} to {span[1]:g} s" if span else f"all of {source}" for source, span in withheld]
-        words += f" Withheld: {page.and_list(listed)} (seconds from the start)."
-    if not several and solution.stopped:
-        words += f" How it ended: {solution.stopped.rstrip('.')}."
-    return words
-
-
-def tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> Raw:
-    """The few numbers to see first."""
-    states = next(iter(solutions.values())).states
-    way = float(np.linalg.norm(np.diff(states.p, axis=0), axis=1).sum())
-    out = [
-        (f"{recording.duration:.1f} s", "duration"),
-        (f"{way / 1000:.2f} km" if way >= 1000 else f"{way:.1f} m", "distance"),
-    ]
-    several = len(solutions) > 1
-    for name, solution in solutions.items():
-        if name in errors:
-            value = f"{page.number(_rms(errors[name].horizontal), 3)} m"
-            out.append((value, f"horizontal error, RMS{', ' + name if several else ''}"))
-        else:
-            sd = solution.trajectory().sd_p
-            if sd is not None:
-                value = f"{page.number(float(np.median(np.hypot(sd[:, 0], sd[:, 1]))), 3)} m"
-                out.append((value, f"horizontal sigma, median{', ' + name if several else ''}"))
-    if not several:
-        seconds = sum(next(iter(solutions.values())).timings.values())
-        out.append((f"{seconds:.2f} s", "run time"))
-    return page.tiles(out)
-
-
-def _rms(x: Array) -> float:
+def rms(x: Array) -> float:
+    """Root mean square of what is finite."""
     return float(np.sqrt(_mean(x * x)))
 
 
@@ -164,26 +111,6 @@ def _mean(x: Array) -> float:
     return float(np.mean(x)) if x.size else float("nan")
 
 
-def believe(name: str, errors: Errors) -> Raw:
-    """One sentence that compares position errors with their sigma (and the truth's own, where it states one)."""
-    square = errors.nees_axis[np.isfinite(errors.nees_axis)]
-    if not len(square):
-        return page.paragraph(f"{name}: no epoch has both an error and a sigma, so sigma cannot be judged.", "verdict")
-    size, inside = float(np.sqrt(np.mean(square))), float(np.mean(square <= 9.0))
-    measured = (
-        f"position errors are {size:.2f} times their sigma (RMS), {100 * inside:.1f} % of them within 3 sigma "
-        "(a Gaussian: 1 and 99.7 %)"
-    )
-    if size > 1.5:
-        return page.paragraph(
-            f"{name}: the stated sigma is too small: {measured}. Errors of the truth itself count here as well.",
-            "verdict bad",
-        )
-    if size < 0.5:
-        return page.paragraph(f"{name}: the stated sigma is cautious: {measured}.", "verdict")
-    return page.paragraph(f"{name}: the stated sigma can be believed: {measured}.", "verdict good")
-
-
 COMPARED_SPAN = ("horizontal RMS [m]", "largest [m]", "at the end [m]", "largest, % of way", "up largest [m]",
                  "heading largest [deg]", "error / sigma, RMS")  # fmt: skip
 COMPARED = ("horizontal RMS [m]", "horizontal largest [m]", "up RMS [m]", "speed RMS [m/s]", "roll, pitch RMS [deg]",
@@ -194,12 +121,12 @@ def accuracy_row(errors: Errors) -> list[float]:
     """The numbers under `COMPARED`."""
     rph = np.degrees(errors.rph)
     return [
-        _rms(errors.horizontal),
+        rms(errors.horizontal),
         _largest(errors.horizontal),
-        _rms(errors.p[:, 2]),
-        _rms(np.linalg.norm(errors.v, axis=1)),
-        _rms(rph[:, :2]),
-        _rms(rph[:, 2]),
+        rms(errors.p[:, 2]),
+        rms(np.linalg.norm(errors.v, axis=1)),
+        rms(rph[:, :2]),
+        rms(rph[:, 2]),
         float(np.sqrt(_mean(errors.nees_axis))),
     ]
 
@@ -214,7 +141,7 @@ def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[fl
     h = errors.horizontal[rows]
     way = float(errors.distance[rows[-1]] - errors.distance[rows[0]])
     return [
-        _rms(h),
+        rms(h),
         _largest(h),
         float(h[-1]),
         100.0 * _largest(h) / way if way > 0 else float("nan"),
@@ -224,33 +151,84 @@ def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[fl
     ]
 
 
-def accuracy_tables(errors: Mapping[str, Errors], withheld: Withheld, start: float) -> list[Raw]:
+def accuracy_tables(errors: Mapping[str, Errors], withheld: Withheld, start: float, outages: Spans = ()) -> list[Raw]:
     """A table of all solvers over everything, and one for each withheld span."""
     if not errors:
         return []
     rows = [[page.solver(name), *accuracy_row(e)] for name, e in errors.items()]
     out = [page.heading("Whole recording"), page.table(["solver", *COMPARED], rows, best=range(1, 7))]
-    spans = times_of(withheld)
+    gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
+    spans = [("Withheld", span) for span in gone]
+    spans += [("No GNSS", (a, b)) for a, b in outages if not any(c < b and d > a for c, d in gone)]
     if len(errors) == 1 and spans:
         (only,) = errors.values()
-        rows = [[Raw(f"{a:g} to {b:g} s"), *span_row(only, (a, b), start)] for a, b in spans]
-        out += [page.heading("Withheld spans"), page.table(["span", *COMPARED_SPAN], rows)]
-        spans = []
-    for span in spans:
-        rows = [[page.solver(name), *span_row(e, span, start)] for name, e in errors.items()]
-        out.append(page.heading(f"Withheld {span[0]:g} to {span[1]:g} s"))
+        rows = [[Raw(f"{a:.1f} to {b:.1f} s"), what, *span_row(only, (a, b), start)] for what, (a, b) in spans]
+        return [
+            *out,
+            page.heading("Spans without"),
+            page.table(["span", "what", *COMPARED_SPAN], rows),
+            *_notes(errors),
+        ]
+    for what, (a, b) in spans:
+        rows = [[page.solver(name), *span_row(e, (a, b), start)] for name, e in errors.items()]
+        out.append(page.heading(f"{what} {a:g} to {b:g} s" if what == "Withheld" else f"{what} {a:.1f} to {b:.1f} s"))
         out.append(page.table(["solver", *COMPARED_SPAN], rows, best=range(1, 7)))
+    return [*out, *_notes(errors)]
+
+
+def _notes(errors: Mapping[str, Errors]) -> list[Raw]:
     notes = list(dict.fromkeys(note for e in errors.values() for note in e.notes))
-    return [*out, page.bullets(notes)] if notes else out
+    return [page.bullets(notes)] if notes else []
 
 
-def closure_note(name: str, metrics: Mapping[str, Any] | None) -> list[Raw]:
-    """How far from the start a loop ended, where that is the truth."""
-    if not metrics or metrics.get("closure_h_m") is None:
+def excluded_table(solution: Solution, start: float) -> list[Raw]:
+    """What the solver left out of itself, when and why."""
+    parts = getattr(solution, "excluded", ())
+    if not parts:
         return []
-    h, up, way, share = (page.text(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))
-    words = f"the loop of {way} m closes to {h} m horizontally ({share} % of the way) and {up} m in height."
-    return [page.paragraph(Raw(f"{page.text(name)}: {words}"), "verdict")]
+    rows = [[Raw(f"{p.t_start - start:.1f} to {p.t_end - start:.1f} s"), p.kind, int(p.count), p.reason] for p in parts]
+    head = ["when", "what", "rows", "why"]
+    return [page.heading("What was excluded"), page.table(head, rows)]
+
+
+def rejected_table(solution: Solution, start: float) -> list[Raw]:
+    """Every rejected measurement with its time; of many the largest."""
+    rows: list[tuple[float, list[Any]]] = []
+    for kind, r in solution.records.items():
+        white = np.abs(r.residual) / r.sigma
+        for k in np.flatnonzero(r.weight <= 1e-9):
+            worst = int(np.argmax(white[k]))
+            size = f"{r.residual[k, worst]:+.3g} {r.unit}, {r.axes[worst]}"
+            rows.append((float(r.t[k]), [Raw(f"{r.t[k] - start:.2f} s"), kind, size, float(white[k, worst])]))
+    if not rows:
+        return []
+    largest = sorted(rows, key=lambda row: -row[1][3])[:_LISTED]
+    table = page.table(
+        ["when", "constraint", "largest component", "over sigma"], [r for _, r in sorted(largest, key=lambda r: r[0])]
+    )
+    many = len(rows)
+    words = f"{many} rejected measurement{'s' if many > 1 else ''}"
+    if many > _LISTED:
+        words += f", the {_LISTED} farthest off"
+    return [page.folded(words, table)]
+
+
+def nees_table(errors: Mapping[str, Errors]) -> list[Raw]:
+    """Mean NEES per degree of freedom and the share of epochs inside the 95 % region, per solver."""
+    from graphnav.metrics import average_nees
+
+    rows = []
+    for name, e in errors.items():
+        for words, values, dof in (
+            ("position", e.nees_p, e.dof_p), ("velocity", e.nees_v, 3), ("attitude", e.nees_rph, 3),
+        ):  # fmt: skip
+            found = average_nees(values, dof)
+            if found is not None:
+                verdict = "sigma too small" if found.mean > 2.25 else "sigma cautious" if found.mean < 0.25 else "fits"
+                inside = Raw(f"{100 * found.inside:.1f} %")
+                rows.append([page.solver(name), words, found.mean, inside, found.n, verdict])
+    head = ["solver", "of", "mean NEES / dof", "epochs inside 95 %", "epochs", "what it says"]
+    return [page.table(head, rows)] if rows else []
 
 
 def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Raw]:
@@ -261,34 +239,36 @@ def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Raw]:
             Raw(page.measured(float(p.value[-1, k]), float(p.sigma[-1, k]))),
             Raw(page.measured(float(p.sigma[-1, k]), float(p.sigma[-1, k]))),
             float(p.prior_sigma[k]),
-            p.unit or "-",
             len(p.t),
             "yes" if p.observable[k] else "no: mostly the prior",
+            p.unit or "-",
         ]
         for name, p in parameters.items()
         for k in range(p.value.shape[1])
     ]
-    head = ["parameter", "value", "sigma", "sigma before", "unit", "nodes", "seen by the data"]
+    head = ["parameter", "value", "sigma", "sigma before", "nodes", "seen by the data", "unit"]
     return [page.table(head, rows)] if rows else []
 
 
 def run_table(solutions: Mapping[str, Solution]) -> list[Raw]:
-    """Seconds by stage, iterations and cost."""
+    """Seconds by stage, iterations and cost, a column per solver; why each stopped."""
     stages = list(dict.fromkeys(stage for s in solutions.values() for stage in s.timings))
-    rows = [
-        [
-            page.solver(name),
-            s.iterations,
-            float(s.cost),
-            *(Raw(f"{s.timings[k]:.3f}") if k in s.timings else None for k in stages),
-            Raw(f"{sum(s.timings.values()):.3f}"),
-            s.stopped or "-",
-        ]
-        for name, s in solutions.items()
+
+    def seconds(solution: Solution, stage: str) -> Raw | None:
+        return Raw(f"{solution.timings[stage]:.3f}") if stage in solution.timings else None
+
+    rows: list[list[Any]] = [[f"{stage} [s]", *(seconds(s, stage) for s in solutions.values())] for stage in stages]
+    rows += [
+        ["sum [s]", *(Raw(f"<b>{sum(s.timings.values()):.3f}</b>") for s in solutions.values())],
+        ["iterations", *(s.iterations for s in solutions.values())],
+        ["cost", *(float(s.cost) for s in solutions.values())],
     ]
-    head = ["solver", "iterations", "cost", *(f"{k} [s]" for k in stages), "sum [s]", "stopped because"]
-    notes = [f"{name}: {note}" if len(solutions) > 1 else note for name, s in solutions.items() for note in s.notes]
-    return [page.table(head, rows), page.bullets(notes) if notes else Raw("")]
+    several = len(solutions) > 1
+    notes = [f"{name} stopped: {s.stopped}" for name, s in solutions.items() if s.stopped and several]
+    shared = [note for note in next(iter(solutions.values())).notes if all(note in s.notes for s in solutions.values())]
+    own = [f"{name}: {note}" for name, s in solutions.items() for note in s.notes if note not in shared]
+    table = page.table(["stage", *(page.solver(name) for name in solutions)], rows)
+    return [table, page.bullets([*notes, *shared, *own]) if notes or shared or own else Raw("")]
 
 
 def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Raw]:
@@ -309,11 +289,3 @@ def odd(recording: Recording, findings: Sequence[str]) -> list[Raw]:
     if recording.imu.noise_assumed:
         lines.append("The recording states no IMU noise figures; consumer-grade ones were assumed.")
     return [page.bullets(lines)] if lines else [page.paragraph("Nothing odd was found in the recording.")]
-
-
-def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any] | None) -> list[Raw]:
-    """Version and inputs, then every setting as it was resolved."""
-    out = [page.pairs(page.flat(provenance))] if provenance else []
-    if settings:
-        out.append(page.folded("Settings as resolved", page.pairs({k: str(v) for k, v in page.flat(settings).items()})))
-    return out

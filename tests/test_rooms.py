@@ -19,12 +19,12 @@ ROOMS = [
     "preintegration", "unresolved", "dynamics", "constraints", "problem", "solution", "alignment",
     "dense", "solvers", "judgement", "pipeline",
     "interpolation", "metrics", "scoring", "strides", "evaluation", "exporters", "online",
-    "panels", "page", "plots", "report_tables", "report_pictures", "report",
-    "workflow", "outputs", "convert", "terminal", "detection_pictures", "detection_report", "cli_logs", "cli",
+    "panels", "page", "plots", "report_tables", "report_words", "report_pictures", "report_provenance", "report",
+    "workflow", "outputs", "convert", "terminal", "detection_report", "cli_logs", "cli",
 ]  # fmt: skip
 
 GTSAM_ROOMS = {"solvers"}
-MATPLOTLIB_ROOMS = {"allan", "panels", "plots", "detection_pictures"}
+MATPLOTLIB_ROOMS = {"allan", "panels"}
 PRINTING_ROOMS = {"cli"}
 
 FILES = sorted(PACKAGE.rglob("*.py"))

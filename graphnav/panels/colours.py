@@ -1,0 +1,32 @@
+"""Colours of everything drawn, for light pages and for dark ones."""
+
+from __future__ import annotations
+
+# Okabe and Ito, "Color Universal Design" (2008): told apart with every common colour vision. The second
+# colour of each is for dark pages.
+PALETTE = {
+    "ekf": ("#d55e00", "#f08a3c"),
+    "rts": ("#cc79a7", "#e3a3c6"),
+    "incremental": ("#009e73", "#27c79a"),
+    "batch": ("#0072b2", "#55aef0"),
+    "truth": ("#4a4a4b", "#d8d8d9"),
+    "other": ("#8a7a00", "#d9cc4a"),
+    "alert": ("#b3261e", "#ff8a80"),
+    "withheld": ("#e69f00", "#e6a41a"),
+    "outage": ("#71809c", "#8da0c4"),
+    "stop": ("#6f42a8", "#c3a1f0"),
+    "ink": ("#6a6a6b", "#a9a9aa"),
+    "paper": ("#ffffff", "#ffffff"),  # on dark ground of its own, whatever the page
+    "grid": ("#dededf", "#35373b"),
+}
+
+
+def colour(name: str) -> str:
+    """Colour of a solver (or of another drawn thing) for light pages, `#rrggbb`."""
+    return PALETTE.get(name, PALETTE["other"])[0]
+
+
+def css_colours() -> str:
+    """CSS variables of the palette, for light pages and, where preferred, dark ones."""
+    light, dark = ("".join(f"--{name}:{pair[i]};" for name, pair in PALETTE.items()) for i in (0, 1))
+    return f":root{{{light}}}\n@media (prefers-color-scheme: dark){{:root{{{dark}}}}}"

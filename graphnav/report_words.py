@@ -1,0 +1,145 @@
+"""The sentences and the few numbers that `graphnav.report` begins with, each from plain data to HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from graphnav import page
+from graphnav.page import Raw
+from graphnav.panels.drawing import Spans
+from graphnav.recording import Recording
+from graphnav.report_tables import Withheld, consistency, rms
+from graphnav.solution import Solution
+
+if TYPE_CHECKING:
+    from graphnav.metrics import Errors
+
+_LISTED = 6  # outages
+
+
+def what_was_done(recording: Recording, solutions: Mapping[str, Solution], withheld: Withheld, outages: Spans) -> str:
+    """The run in a few sentences."""
+    used = recording
+    for source, span in withheld:
+        if getattr(used, source, None) is not None:
+            used = used.without(source, span)
+    rate = 1.0 / float(np.median(np.diff(used.imu.t)))
+    sources = [f"{len(used.imu.t)} IMU rows at {rate:.4g} Hz"]
+    if used.gnss is not None:
+        sources.append(f"{len(used.gnss.t)} GNSS fixes")
+    if used.odometer is not None:
+        sources.append(f"{len(used.odometer.t)} odometer rows")
+    solution = next(iter(solutions.values()))
+    several = len(solutions) > 1
+    who = f"The solvers {page.and_list(list(solutions))}" if several else f"The {solution.solver} solver"
+    words = (
+        f"{who} estimated the trajectory of the {recording.platform} recording '{recording.name}' "
+        f"({recording.duration:.1f} s) from {page.and_list(sources)}, at {len(solution.t)} keyframes."
+    )
+    if withheld:
+        listed = [f"{source} {span[0]:g} to {span[1]:g} s" if span else f"all of {source}" for source, span in withheld]
+        words += f" Withheld: {page.and_list(listed)} (seconds from the start)."
+    spans = solution.stationary
+    if len(spans) and recording.platform == "vehicle":
+        stops = "1 stop was" if len(spans) == 1 else f"{len(spans)} stops were"
+        words += f" {stops} found, {np.diff(spans).sum():.0f} s in all."
+    elif len(spans):
+        words += f" The foot was found on the floor {len(spans)} times."
+    if outages:
+        listed = [f"{a:.0f} to {b:.0f} s" for a, b in outages[:_LISTED]]
+        more = [f"{len(outages) - _LISTED} more"] if len(outages) > _LISTED else []
+        words += f" There were no GNSS fixes from {page.and_list([*listed, *more])}."
+    excluded = sum(int(part.count) for part in getattr(solution, "excluded", ()))
+    if excluded:
+        words += f" {excluded} measurements were excluded as faulty."
+    if not several and solution.stopped:
+        words += f" How it ended: {solution.stopped.rstrip('.')}."
+    return words
+
+
+def tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> Raw:
+    """The few numbers to see first."""
+    states = next(iter(solutions.values())).states
+    way = float(np.linalg.norm(np.diff(states.p, axis=0), axis=1).sum())
+    out = [
+        (f"{recording.duration:.1f} s", "duration"),
+        (f"{way / 1000:.2f} km" if way >= 1000 else f"{way:.1f} m", "distance"),
+    ]
+    several = len(solutions) > 1
+    for name, solution in solutions.items():
+        if name in errors:
+            value = f"{page.number(rms(errors[name].horizontal), 3)} m"
+            out.append((value, f"horizontal error, RMS{', ' + name if several else ''}"))
+        else:
+            sd = solution.trajectory().sd_p
+            if sd is not None:
+                value = f"{page.number(float(np.median(np.hypot(sd[:, 0], sd[:, 1]))), 3)} m"
+                out.append((value, f"horizontal sigma, median{', ' + name if several else ''}"))
+    spans = next(iter(solutions.values())).stationary
+    if len(spans):
+        out.append((f"{len(spans)}", "stops" if recording.platform == "vehicle" else "steps"))
+    if not several:
+        seconds = sum(next(iter(solutions.values())).timings.values())
+        out.append((f"{seconds:.2f} s", "run time"))
+    return page.tiles(out)
+
+
+def believe(name: str, errors: Errors) -> Raw:
+    """One sentence that compares position errors with their sigma (and the truth's own, where it states one)."""
+    square = errors.nees_axis[np.isfinite(errors.nees_axis)]
+    if not len(square):
+        return page.paragraph(f"{name}: no epoch has both an error and a sigma, so sigma cannot be judged.", "verdict")
+    size, inside = float(np.sqrt(np.mean(square))), float(np.mean(square <= 9.0))
+    measured = (
+        f"position errors are {size:.2f} times their sigma (RMS), {100 * inside:.1f} % of them within 3 sigma "
+        "(a Gaussian: 1 and 99.7 %)"
+    )
+    if size > 1.5:
+        return page.paragraph(
+            f"{name}: the stated sigma is too small: {measured}. Errors of the truth itself count here as well.",
+            "verdict bad",
+        )
+    if size < 0.5:
+        return page.paragraph(f"{name}: the stated sigma is cautious: {measured}.", "verdict")
+    return page.paragraph(f"{name}: the stated sigma can be believed: {measured}.", "verdict good")
+
+
+def believe_without_truth(solution: Solution) -> Raw:
+    """One sentence on what innovations or residuals say of the sigma, where there is no truth to say it."""
+    every = [consistency(record) for record in solution.records.values() if len(record.t)]
+    every = [c for c in every if np.isfinite(c.mean_nis)]
+    used = sum(c.count - c.rejected for c in every)
+    name = solution.solver
+    missing = "there is no truth to compare with"
+    if used < 10:
+        return page.paragraph(
+            f"{name}: no truth and too few measurements to say whether sigma can be believed.", "verdict"
+        )
+    size = float(np.sqrt(sum((c.count - c.rejected) * c.mean_nis / c.dof for c in every) / used))
+    if every[0].kind == "innovation":
+        measured = f"they are {size:.2f} times as large as predicted (RMS; 1 where sigma is true)"
+        if size > 1.5:
+            return page.paragraph(
+                f"{name}: {missing}, and sigma looks too small for the innovations: {measured}.", "verdict bad"
+            )
+        if size < 0.5:
+            return page.paragraph(
+                f"{name}: {missing}; the stated sigma looks cautious for the innovations: {measured}.", "verdict"
+            )
+        return page.paragraph(f"{name}: {missing}. Innovations speak for the stated sigma: {measured}.", "verdict good")
+    measured = f"residuals are {size:.2f} times the measurements' sigma (RMS; a fit leaves no more than 1)"
+    if size > 1.15:
+        return page.paragraph(f"{name}: {missing}, and sigma looks too small: {measured}.", "verdict bad")
+    return page.paragraph(f"{name}: {missing}. Nothing speaks against the stated sigma: {measured}.", "verdict good")
+
+
+def closure_note(name: str, metrics: Mapping[str, Any] | None) -> list[Raw]:
+    """How far from the start a loop ended, where that is the truth."""
+    if not metrics or metrics.get("closure_h_m") is None:
+        return []
+    h, up, way, share = (page.text(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))
+    words = f"the loop of {way} m closes to {h} m horizontally ({share} % of the way) and {up} m in height."
+    return [page.paragraph(Raw(f"{page.text(name)}: {words}"), "verdict")]
