@@ -46,9 +46,9 @@ th:first-child,td:first-child{text-align:left;white-space:nowrap}
 .pairs td{overflow-wrap:anywhere}
 td.best{font-weight:700}
 .figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,440px),1fr));gap:28px 32px;margin:1em 0}
-.figures:has(>:nth-child(3):last-child){grid-template-columns:repeat(auto-fit,minmax(min(100%,340px),1fr))}
+.figures:has(>:nth-child(3)){grid-template-columns:repeat(auto-fit,minmax(min(100%,340px),1fr))}
 figure{margin:0;min-width:0;max-width:640px}
-figure.large{grid-column:1/-1;max-width:none}
+figure.large,figure.map,figure:only-child{grid-column:1/-1;max-width:none}
 figcaption{font-weight:600;font-size:.95rem;margin-bottom:2px}
 .legend{display:flex;flex-wrap:wrap;gap:2px 14px;font-size:.82rem;color:var(--soft);margin:3px 0 6px}
 .legend>*{display:inline-flex;align-items:center;gap:6px;font:inherit;color:inherit;background:none;border:0;
@@ -60,12 +60,15 @@ padding:2px 0}
 .legend .band{height:11px;border-radius:2px;opacity:.4}
 .legend .dots{width:7px;height:7px;border-radius:50%}
 .plot{width:100%;position:relative;overflow:hidden;aspect-ratio:var(--w)/var(--h)}
-@media (min-width:700px){.large .plot{aspect-ratio:auto;height:calc(1.4px*var(--h))}}
+@media (min-width:700px){
+:is(.large,.map,figure:only-child)>.plot{aspect-ratio:auto;height:calc(1.4px*var(--h))}
+.map>.plot{height:640px}
+nav{flex-wrap:wrap}}
 .plot svg{display:block;width:100%;height:100%}
 .note{margin:4px 0 0}
 .plot>svg text{font-size:10px;fill:var(--soft)}
 .plot .modebar{left:auto!important;right:0!important;top:-1px!important}
-.plot .modebar-group{background:var(--page)!important;padding-left:0!important}
+.plot .modebar-group{background:none!important;padding-left:0!important}
 .plot .modebar-btn path{fill:var(--ink)!important}
 .plot .modebar-btn.active path{fill:var(--words)!important}
 .verdict{border-left:4px solid var(--ink);background:var(--card);padding:9px 14px;border-radius:0 8px 8px 0;
@@ -75,6 +78,7 @@ margin:.8em 0}
 .solver i{display:inline-block;width:.8em;height:.8em;border-radius:2px;margin-right:.45em;vertical-align:-.05em}
 details{margin:.8em 0} summary{cursor:pointer}
 code,pre{font:.8125rem/1.45 ui-monospace,SFMono-Regular,Consolas,"DejaVu Sans Mono",monospace;overflow-wrap:anywhere}
+td code{white-space:nowrap}
 pre{background:var(--card);border:1px solid var(--edge);border-radius:8px;padding:10px 14px;margin:.6em 0;
 overflow-x:auto;white-space:pre-wrap}
 @media print{nav{display:none} h2{break-after:avoid} figure{break-inside:avoid}}
@@ -127,8 +131,18 @@ def solver(name: str) -> Raw:
 
 
 def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int] = ()) -> Raw:
-    """A table, words left and numbers right; in the columns `best` the smallest number is bold."""
+    """A table, words left and numbers right; in the columns `best` the smallest number is bold.
+
+    A column in which no row has its number is left out.
+    """
     rows = [list(row) for row in rows]
+    missing = [bool(rows) and all(isinstance(r[k], float) and math.isnan(r[k]) for r in rows) for k in range(len(head))]
+    kept = [k for k in range(len(head)) if not missing[k]]
+    head, rows, best = (
+        [head[k] for k in kept],
+        [[r[k] for k in kept] for r in rows],
+        [kept.index(k) for k in best if k in kept],
+    )
     least = {
         k: min((row[k] for row in rows if isinstance(row[k], float) and math.isfinite(row[k])), default=None)
         for k in (best if len(rows) > 1 else ())
@@ -193,10 +207,14 @@ def bullets(lines: Iterable[str]) -> Raw:
     return Raw("<ul>" + "".join(f"<li>{text(line)}</li>" for line in lines) + "</ul>")
 
 
-def picture(drawing: Drawing, title: str, note: str = "", large: bool = False) -> Raw:
+def picture(drawing: Drawing, title: str, note: str = "", kind: str = "") -> Raw:
     """A drawing with its title above, its legend, and a note below.
 
     It is still until the page's script, where plotly is there, puts something to zoom and hover in its place.
+
+    Parameters
+    ----------
+    kind : "large" takes the whole width, "map" all the room there is; empty shares the width with others.
     """
     live = interactive.library() is not None
     tag = 'button type="button"' if live else "span"
@@ -212,7 +230,8 @@ def picture(drawing: Drawing, title: str, note: str = "", large: bool = False) -
         f'<script type="application/json">{interactive.text(drawing)}</script>' if live else "",
         f'<p class="note">{text(note)}</p>' if note else "",
     ]
-    return Raw(f"<figure{' class=large' if large else ''}>{''.join(parts)}</figure>")
+    mark = f' class="{kind}"' if kind else ""
+    return Raw(f"<figure{mark}>{''.join(parts)}</figure>")
 
 
 def _swatch(name: str, kind: str) -> str:

@@ -52,7 +52,7 @@ def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], 
     where = f"North is up; the origin is latitude {lat:.6f}, longitude {lon:.6f} deg."
     if recording.gnss is None:
         where = "Nothing says where on the Earth this is: place and heading count from the start."
-    return page.picture(drawing, "Seen from above", where, large=True)
+    return page.picture(drawing, "Seen from above", where, kind="map")
 
 
 def _fixes(recording: Recording, solution: Solution) -> plots.Fixes | None:
@@ -200,7 +200,7 @@ def zoom_pictures(errors: Mapping[str, Errors], start: float, spans: Spans, what
         s = error_series(e, start)["position"]
         series[name] = Series(s.t, np.hypot(s.value[:, 0], s.value[:, 1])[:, None])
     drawing = plots.span_zoom(series, spans, what=what)
-    return [page.picture(drawing, "Horizontal error in and around each span", large=len(spans) > 1)]
+    return [page.picture(drawing, "Horizontal error in and around each span", kind="large" if len(spans) > 1 else "")]
 
 
 def difference_pictures(solutions: Mapping[str, Solution], start: float, spans: Shades) -> list[Raw]:
@@ -238,7 +238,7 @@ def timeline_picture(solution: Solution, recording: Recording, spans: Shades) ->
     if not records:
         return []
     drawing = plots.timeline(records, recording.start, recording.end, solution.solver, spans=spans)
-    return [page.picture(drawing, "What was used when", large=True)]
+    return [page.picture(drawing, "What was used when", kind="large")]
 
 
 def detection_pictures(recording: Recording, found: Sequence[Detection]) -> list[Raw]:
@@ -246,5 +246,7 @@ def detection_pictures(recording: Recording, found: Sequence[Detection]) -> list
     if not found:
         return []
     drawing = plots.detections(recording, found)
-    note = "Tinted: the intervals in which it stands, all detectors together (a light strip under the spectrogram)."
-    return [page.picture(drawing, "What the detectors saw", note, large=True)]
+    note = "Tinted: the intervals in which it stands, all detectors together."
+    if any("spectrogram" in d.details for d in found):
+        note += " In the spectrogram, a strip along the lower edge."
+    return [page.picture(drawing, "What the detectors saw", note, kind="large")]

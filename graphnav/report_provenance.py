@@ -21,8 +21,8 @@ def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any]
     options = provenance.pop("options", None)
     toml = toml_text(settings)
     if options:
-        kept = f" the settings below as {SETTINGS} and" if toml else ""
-        out.append(page.paragraph(f"To make this again, take the inputs and versions listed,{kept} run"))
+        saved = f"save the settings below as {SETTINGS}, " if toml else ""
+        out.append(page.paragraph(f"To repeat this run, {saved}take the inputs and versions listed, and call"))
         out.append(page.code(command(options, bool(toml)), "command"))
     if toml:
         data = base64.b64encode(toml.encode()).decode("ascii")

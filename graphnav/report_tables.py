@@ -144,7 +144,7 @@ def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[fl
         rms(h),
         _largest(h),
         float(h[-1]),
-        100.0 * _largest(h) / way if way > 0 else float("nan"),
+        100.0 * _largest(h) / way if way >= 1.0 else float("nan"),
         _largest(errors.p[rows, 2]),
         float(np.degrees(_largest(errors.rph[rows, 2]))),
         float(np.sqrt(_mean(errors.nees_axis[rows]))),
@@ -165,7 +165,7 @@ def accuracy_tables(errors: Mapping[str, Errors], withheld: Withheld, start: flo
         rows = [[Raw(f"{a:.1f} to {b:.1f} s"), what, *span_row(only, (a, b), start)] for what, (a, b) in spans]
         return [
             *out,
-            page.heading("Spans without"),
+            page.heading("Spans without a source"),
             page.table(["span", "what", *COMPARED_SPAN], rows),
             *_notes(errors),
         ]

@@ -68,6 +68,9 @@ def tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mappi
         (f"{recording.duration:.1f} s", "duration"),
         (f"{way / 1000:.2f} km" if way >= 1000 else f"{way:.1f} m", "distance"),
     ]
+    spans = next(iter(solutions.values())).stationary
+    if len(spans):
+        out.append((f"{len(spans)}", "stops" if recording.platform == "vehicle" else "steps"))
     several = len(solutions) > 1
     for name, solution in solutions.items():
         if name in errors:
@@ -78,9 +81,6 @@ def tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mappi
             if sd is not None:
                 value = f"{page.number(float(np.median(np.hypot(sd[:, 0], sd[:, 1]))), 3)} m"
                 out.append((value, f"horizontal sigma, median{', ' + name if several else ''}"))
-    spans = next(iter(solutions.values())).stationary
-    if len(spans):
-        out.append((f"{len(spans)}", "stops" if recording.platform == "vehicle" else "steps"))
     if not several:
         seconds = sum(next(iter(solutions.values())).timings.values())
         out.append((f"{seconds:.2f} s", "run time"))
@@ -98,8 +98,9 @@ def believe(name: str, errors: Errors) -> Raw:
         "(a Gaussian: 1 and 99.7 %)"
     )
     if size > 1.5:
+        when = " at times" if inside > 0.9 else ""
         return page.paragraph(
-            f"{name}: the stated sigma is too small: {measured}. Errors of the truth itself count here as well.",
+            f"{name}: the stated sigma is too small{when}: {measured}. Errors of the truth itself count here as well.",
             "verdict bad",
         )
     if size < 0.5:

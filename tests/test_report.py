@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+import tomllib
+from dataclasses import dataclass, replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
-from graphnav import page, panels, plots, rotation
+from graphnav import page, report_pictures, rotation
+from graphnav.config import Settings
+from graphnav.detectors.base import Detection
 from graphnav.earth import LocalFrame
 from graphnav.metrics import Errors
+from graphnav.panels import interactive
 from graphnav.recording import Gnss, Imu, Recording, Truth
 from graphnav.report import write_comparison, write_report
+from graphnav.report_provenance import command, toml_text
 from graphnav.report_tables import accuracy_row, consistency, span_row
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.state import States
@@ -96,13 +101,15 @@ class Strict(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.open, self.ids, self.references, self.words, self.tags = [], [], [], [], []
+        self.open, self.ids, self.references, self.words, self.tags, self.figures = [], [], [], [], [], []
         self.feed(text)
         self.close()
         assert not self.open
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
+        if tag == "figure":
+            self.figures.append(dict(attrs))
         if tag not in self.VOID:
             self.open.append(tag)
         self._attributes(attrs)
@@ -122,7 +129,8 @@ class Strict(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        self.words.append(data)
+        if not self.open or self.open[-1] not in ("script", "style"):
+            self.words.append(data)
 
 
 def checked(path):
@@ -131,14 +139,23 @@ def checked(path):
     parser = Strict(html)
     assert len(parser.ids) == len(set(parser.ids))
     assert parser.references
-    assert all(r.startswith("#") and r[1:] in parser.ids for r in parser.references)
-    assert all(target in parser.ids for target in re.findall(r"url\(#([^)]*)\)", html))
-    assert not re.search(r"url\((?!#)|@import", html)
-    assert "script" not in parser.tags
+    assert all(r[1:] in parser.ids for r in parser.references if r.startswith("#"))
+    assert all(r.startswith(("#", "data:")) for r in parser.references)
+    assert not re.search(r"url\(|@import", re.sub(r'id="plotly-library">[^<]*<', "<", html))
+    # two elements of the library and its use, and the data of every picture
+    assert parser.tags.count("script") == (len(parser.figures) + 2 if "plotly-library" in parser.ids else 0)
     assert set(re.findall(r"var\(--([\w-]+)\)", html)) <= set(re.findall(r"--([\w-]+):", html))
     text = " ".join(parser.words)
     assert NAME in text
     return parser, text
+
+
+@pytest.fixture(autouse=True, params=["zoom", "still"])
+def library(request, monkeypatch):
+    """Every page, with plotly and without."""
+    if request.param == "still":
+        monkeypatch.setattr(interactive, "library", lambda: None)
+    return request.param
 
 
 def write(tmp_path, recording, **kw):
@@ -156,8 +173,8 @@ def test_report_holds_what_it_was_given(tmp_path, recording):
     for words in (
         "539 GNSS fixes", "gnss 99.5 to 160.5 s", "all of odometer",
         "1.0123", "0.0004", "599 gnss_position", "0.321", "1.821", "1237",
-        "the IMU clock drifts by 12 ppm", "3 rows < NaN were left out", "9.8.7", "deadbeef", "gnss.robust_scale",
-        "3.25", "0.8765", "6000 IMU rows at 10 Hz", "Withheld spans",
+        "the IMU clock drifts by 12 ppm", "3 rows < NaN were left out", "9.8.7", "deadbeef", "[gnss]",
+        "robust_scale = 3.25", "0.8765", "6000 IMU rows at 10 Hz", "Spans without", "99.5 to 160.5 s",
     ):  # fmt: skip
         assert words in text, words
 
@@ -166,8 +183,9 @@ def test_report_without_truth_shows_sigma_instead(tmp_path, recording):
     parser, text = checked(write(tmp_path, recording))
     assert "Accuracy" not in text
     assert "1 sigma as stated" in text
-    # way, position and attitude sigma, two biases, one constraint
-    assert parser.tags.count("svg") == 6
+    assert "there is no truth to compare with" in text
+    # way, three sigmas, velocity and attitude, two biases, what was used when, one constraint
+    assert len(parser.figures) == 10
 
 
 def test_report_of_next_to_nothing(tmp_path, recording):
@@ -176,6 +194,80 @@ def test_report_of_next_to_nothing(tmp_path, recording):
     small = Solution("batch", bare.frame, bare.t[two], bare.states[two], bare.covariance[two])
     path = write_report(tmp_path / "r.html", recording, small, settings={})
     checked(path)
+
+
+def test_pages_say_how_to_zoom_only_where_they_cannot(tmp_path, recording, library):
+    parser, text = checked(write(tmp_path, recording))
+    assert ("graphnav[plots]" in text) == (library == "still")
+    assert ("button" in parser.tags) == (library == "zoom")
+
+
+@dataclass(frozen=True)
+class Excluded:
+    t_start: float
+    t_end: float
+    kind: str
+    count: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Excluding(Solution):
+    excluded: tuple[Excluded, ...] = ()
+
+
+def test_what_was_excluded_is_listed_and_marked(tmp_path, recording):
+    part = Excluded(START + 200.0, START + 219.5, "gnss_position", 20, "jumped by 31 m <sideways>")
+    found = Excluding(**vars(solution()), excluded=(part,))
+    _, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}))
+    for words in ("200.0 to 219.5 s", "jumped by 31 m <sideways>", "20 measurements were excluded", "excluded fix"):
+        assert words in text, words
+    # seconds 200 to 219, and the one that the record says was rejected
+    fixes = report_pictures._fixes(recording, found)
+    np.testing.assert_allclose(fixes.t[fixes.excluded], [51.0, *np.arange(200.0, 220.0)])
+    assert "excluded fix" in checked(write(tmp_path, recording))[1]
+    kept = replace(solution(), records={})
+    assert "excluded" not in checked(write_report(tmp_path / "r.html", recording, kept, settings={}))[1]
+
+
+def test_rejected_measurements_are_listed_with_their_times(tmp_path, recording):
+    _, text = checked(write(tmp_path, recording))
+    assert "1 rejected measurement" in text
+    # of row 50, at 51 s: every component is 40 sigma, which is 20 m
+    assert "51.00 s" in text
+    assert "+20 m, east" in text
+
+
+def test_stops_and_outages_are_told(tmp_path, recording):
+    spans = START + np.array([[100.0, 130.0], [400.0, 412.0]])
+    t = START + np.arange(0.5, COUNT)
+    still = Detection("sway", t, np.full(len(t), 0.5), 3.0, t > 0, spans)
+    found = replace(solution(), detections=(still, replace(still, name="fused")))
+    parser, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}, outages=[(200.0, 230.0)]))
+    assert "2 stops were found, 42 s in all" in text
+    assert "no GNSS fixes from 200 to 230 s" in text
+    assert "What the detectors saw" in text
+    assert "threshold: below it stands" in text
+    assert len(parser.figures) == 11
+
+
+def test_settings_and_command_come_back_as_they_were():
+    settings = Settings().model_dump()
+    settings["gnss"]["robust"] = 'a "quoted" \\ word, µ'
+    assert tomllib.loads(toml_text(settings)) == without_none(settings)
+    options = {"recording": "a b", "solvers": "ekf,rts", "without": ["gnss:4-6", "odometer"], "rate": 5.0}
+    assert command(options) == (
+        "graphnav compare 'a b' --solvers ekf,rts --without gnss:4-6 --without odometer --rate 5.0 "
+        "--config settings.toml -o again"
+    )
+
+
+def without_none(values):
+    return {
+        key: without_none(value) if isinstance(value, dict) else list(value) if isinstance(value, tuple) else value
+        for key, value in values.items()
+        if value is not None
+    }
 
 
 def test_comparison_has_a_row_per_solver_and_span(tmp_path, recording):
@@ -240,138 +332,3 @@ def test_consistency_counts_and_judges():
     assert "wider" in consistency(record(0.5)).verdict
     assert "within" in consistency(record(0.5, "residual")).verdict
     assert "too small" in consistency(record(2.0, "residual")).verdict
-
-
-def test_thin_keeps_extremes_ends_and_breaks():
-    rng = np.random.default_rng(3)
-    t = np.sort(rng.uniform(0, 1000, 50_000))
-    y = rng.normal(size=len(t))
-    y[123], y[45_678] = 99.0, -99.0
-    y[20_000:20_100] = np.nan
-    rows = panels.thin(t, y, 200)
-    assert len(rows) <= 4 * 200 + 1
-    assert (np.diff(rows) > 0).all()
-    assert {0, 123, 45_678, len(t) - 1, 20_000} <= set(rows.tolist())
-    column = np.minimum((t - t[0]) * 200 / (t[-1] - t[0]), 199).astype(int)
-    for c in range(200):
-        inside, kept = y[column == c], y[rows[column[rows] == c]]
-        assert np.nanmin(kept) == np.nanmin(inside)
-        assert np.nanmax(kept) == np.nanmax(inside)
-
-
-def test_thin_leaves_short_series_and_survives_odd_ones():
-    np.testing.assert_array_equal(panels.thin(np.arange(9.0), np.ones(9)), np.arange(9))
-    assert len(panels.thin(np.zeros(9999), np.arange(9999.0), 10)) >= 2
-    assert len(panels.thin(np.arange(9999.0), np.full(9999, np.nan), 10)) >= 1
-
-
-def drawn_as(figure, label):
-    return [artist for artist in figure.artists if artist.get_label() == label]
-
-
-def test_bands_draw_the_values_given():
-    t = np.arange(200.0)
-    value, sigma = np.random.default_rng(0).normal(size=(200, 3)), np.full((200, 3), 2.0)
-    figure = plots.bands({"batch": plots.Series(t, value, sigma)}, ("east", "north", "up"), "m")
-    drawn = drawn_as(figure, "batch")
-    assert len(drawn) == 3
-    for k, line in enumerate(drawn):
-        np.testing.assert_array_equal(line.get_xdata(), t)
-        np.testing.assert_array_equal(line.get_ydata(), value[:, k])
-    tints = drawn_as(figure, "batch 3 sigma")
-    assert len(tints) == 3
-    assert set(np.abs(tints[0].get_path().vertices[:, 1])) == {6.0}
-
-
-def test_lines_and_bands_do_not_lead_across_gaps():
-    t = np.concatenate([np.arange(100.0), 500 + np.arange(100.0)])
-    value = np.ones((200, 1))
-    figure = plots.bands({"ekf": plots.Series(t, value, value)}, ("east",), "m")
-    x, y = drawn_as(figure, "ekf")[0].get_data()
-    assert np.flatnonzero(np.isnan(y)).tolist() == [100]
-    np.testing.assert_array_equal(x[np.isfinite(y)], t)
-    (tint,) = drawn_as(figure, "ekf 3 sigma")
-    assert not tint.get_path().contains_point((300.0, 0.0))
-    assert tint.get_path().contains_point((50.0, 0.0))
-    assert tint.get_path().contains_point((550.0, 0.0))
-
-
-def test_the_scale_shows_every_value_but_not_the_first_sigma():
-    t = np.arange(400.0)
-    value, sigma = np.zeros((400, 1)), np.full((400, 1), 0.1)
-    value[7], sigma[0] = 5.0, 1000.0
-    figure = plots.bands({"ekf": plots.Series(t, value, sigma)}, ("heading",), "deg")
-    line = drawn_as(figure, "ekf")[0]
-    zero, top = line.get_transform().transform([[7.0, 0.0], [7.0, 5.0]])[:, 1]
-    (frame,) = [a for a in drawn_as(figure, "_frame") if len(a.get_xdata()) == 5]
-    edges = frame.get_transform().transform(frame.get_xydata())[:, 1]
-    assert edges.min() < zero < top < edges.max()
-    assert top - zero > 0.4 * np.ptp(edges)
-
-
-def test_trajectory_is_to_scale():
-    t = np.arange(100.0)
-    en = np.stack([3 * t, t], -1)
-    figure = plots.trajectory({"batch": (t, en)}, fixes=en + 1, spans=[(10, 20)])
-    (line,) = drawn_as(figure, "batch")
-    np.testing.assert_array_equal(line.get_xydata(), en)
-    origin, east, north = line.get_transform().transform([[0, 0], [10, 0], [0, 10]])
-    assert east[0] - origin[0] == pytest.approx(north[1] - origin[1], rel=1e-9)
-    (under,) = drawn_as(figure, "withheld")
-    drawn = under.get_xydata()[np.isfinite(under.get_xydata()).all(axis=1)]
-    np.testing.assert_array_equal(drawn, en[10:21])
-    (fixes,) = drawn_as(figure, "fixes")
-    np.testing.assert_array_equal(fixes.get_path().vertices[::2], en + 1)
-
-
-def test_residuals_mark_what_was_rejected():
-    figure = plots.residuals("gnss", record(), START, "ekf")
-    marks = drawn_as(figure, "rejected")
-    assert len(marks) == 4
-    assert [m.get_xdata().tolist() for m in marks] == [[51.0]] * 4
-    reduced = drawn_as(figure, "weight < 0.5")
-    assert reduced[0].get_path().vertices[::2, 0].tolist() == [61.0, 62.0, 63.0]
-
-
-def test_sigmas_are_drawn_as_logarithms():
-    t = np.arange(50.0)
-    sd = np.geomspace(0.01, 10, 50)[:, None]
-    figure = plots.sigmas({"rts": plots.Series(t, sd)}, ("east",), "m")
-    np.testing.assert_allclose(10 ** drawn_as(figure, "rts")[0].get_ydata(), sd[:, 0])
-
-
-def test_span_zoom_has_a_panel_per_span():
-    t = np.arange(1000.0)
-    figure = plots.span_zoom({"ekf": plots.Series(t, t[:, None])}, [(100, 200), (400, 440), (700, 760)])
-    drawn = drawn_as(figure, "ekf")
-    assert [(d.get_xdata()[0], d.get_xdata()[-1]) for d in drawn] == [(65, 235), (386, 454), (679, 781)]
-
-
-@pytest.mark.parametrize(("lo", "hi"), [(-1e-6, 3e-6), (0.0, 1.0), (-3700.0, 12345.0), (1e7, 1.0001e7)])
-def test_ticks_are_inside_and_told_apart(lo, hi):
-    values, names = panels.ticks(lo, hi, 5)
-    assert 2 <= len(values) <= 6
-    assert values.min() >= lo - 1e-9 * (hi - lo)
-    assert values.max() <= hi + 1e-9 * (hi - lo)
-    assert len(set(names)) == len(names)
-
-
-def test_labels_keep_their_digits_in_svg():
-    t = np.arange(50.0)
-    figure = plots.sigmas({"rts": plots.Series(t, np.geomspace(0.002, 0.008, 50)[:, None])}, ("east",), "m")
-    text = panels.svg(figure, "x")
-    assert ">0.005<" in text
-    assert ">0.00<" not in text
-
-
-def test_drawing_never_touches_pyplot():
-    import subprocess
-    import sys
-
-    code = (
-        "import sys, graphnav.report, graphnav.plots as p; assert 'matplotlib' not in sys.modules\n"
-        "import numpy as np; from graphnav.panels import svg\n"
-        "svg(p.sigmas({'ekf': p.Series(np.arange(3.), np.ones((3, 1)))}, ('e',), 'm'), 'x')\n"
-        "assert 'matplotlib.pyplot' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -134,7 +134,7 @@ def timeline(
     count = max(len(records), 1)
     names = {float(count - 1 - k): name for k, name in enumerate(records)}
     drawing = Drawing.stack(
-        [""], (0.0, end - start), [(-0.6, count - 0.4)], height=20.0 * count, left=_NAMES, names=names
+        [" "], (0.0, end - start), [(-0.6, count - 0.4)], height=20.0 * count, left=_NAMES, names=names
     )
     (panel,) = drawing.panels
     panel.shade(spans or {})

@@ -104,7 +104,8 @@ def _spectrogram(panel: Panel, pictured: Sequence[Detection], t0: float, stands:
             for k, words in ((1, f"idle line {line:.1f} Hz"), (2, "")):
                 if k * line < f[-1]:
                     panel.line(t[[0, -1]], np.full(2, k * line), "paper", size=0.9, dash=True, quiet=True)
-                    panel.label(float(t[0]), k * line, words, name="paper", dx=3, dy=1)
+                    under = k * line > 0.8 * f[-1]
+                    panel.label(float(t[0]), k * line, words, name="paper", dx=3, dy=-14 if under else 1)
     # a strip along the lower edge: tinting the whole would change the colours
     low = np.array([panel.ylim[0], panel.ylim[0] + 0.04 * (panel.ylim[1] - panel.ylim[0])])
     if stands:

@@ -104,13 +104,14 @@ def _stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) -> No
         return
     begin, end = np.array(stops).T
     x, y = (np.interp(0.5 * (begin + end), t, en[:, k]) for k in (0, 1))
-    size = 6.0 if len(stops) <= _FEW else 3.5
+    size = 5.0 if len(stops) <= _FEW else 3.0
     panel.marks(x, y, "stop", "D", label=standing, size=size, z=4.2, way=True, hover=begin)
 
 
 def _ends(panel: Panel, en: Array, scale: float) -> None:
     """Where the track starts and ends, the words on the side where the track is not."""
     few = max(1, len(en) // 30)
+    together = bool(np.linalg.norm(en[-1] - en[0]) < 16.0 * scale)
     _, _, w, h = panel.box
     for row, inner, marker, words in ((0, few, "^", "start"), (-1, -1 - few, "s", "end")):
         panel.marks(en[[row], 0], en[[row], 1], "truth", marker, size=6.5, quiet=True)
@@ -118,5 +119,8 @@ def _ends(panel: Panel, en: Array, scale: float) -> None:
         x, y = (en[row] - (panel.xlim[0], panel.ylim[0])) / scale
         right = x < 0.1 * w or (away[0] >= 0 and x < 0.88 * w)
         down = y > 0.05 * h and away[1] < 0
+        if together and row == 0:
+            continue
+        words = "start and end" if together else words
         align, dx = ("left", 6) if right else ("right", -6)
         panel.label(float(en[row, 0]), float(en[row, 1]), words, align=align, dx=dx, dy=-13 if down else 3)

@@ -23,8 +23,11 @@ _MARKS = {
     "^": "m0 -{0}l{0} {1}h-{1}z",
     "D": "m0 -{0}l{0} {0}l-{0} {0}l-{0} -{0}z",
 }
-# every 28th colour of viridis (Smith and van der Walt 2015), which is nearly straight between them
-_VIRIDIS = ("440154", "482878", "3e4989", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b", "fde725")
+# every 17th of the 256 colours of viridis (Smith and van der Walt 2015), which is nearly straight between them
+_VIRIDIS = (
+    "440154", "481a6c", "472f7d", "414487", "39568c", "31688e", "2a788e", "23888e",
+    "1f988b", "22a884", "35b779", "54c568", "7ad151", "a5db36", "d2e21b", "fde725",
+)  # fmt: skip
 
 
 def svg(drawing: Drawing, words: str) -> str:
