@@ -61,12 +61,13 @@ class Browser:
         for domain in ("Page", "Runtime", "Log", "Network"):
             self._call(f"{domain}.enable")
 
-    def open(self, path: Path, size: tuple[int, int] = DESKTOP, dark: bool = False) -> None:
+    def open(self, path: Path, size: tuple[int, int] = DESKTOP, dark: bool = False, scripts: bool = True) -> None:
         """Go to a file, in a window of this size, as a reader with light or dark taste."""
         width, height = size
         phone = width < 600
         self._call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=2, mobile=phone)
         self._call("Emulation.setTouchEmulationEnabled", enabled=phone)
+        self._call("Emulation.setScriptExecutionDisabled", value=not scripts)
         self.colours(dark)
         self.trouble.clear()
         self.asked.clear()
@@ -77,6 +78,12 @@ class Browser:
         """Change the reader's taste."""
         feature = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self._call("Emulation.setEmulatedMedia", features=[feature])
+
+    def mouse(self, what: str, x: float, y: float, pressed: bool = False) -> None:
+        """mouseMoved, mousePressed or mouseReleased."""
+        left = "left" if pressed or what != "mouseMoved" else "none"
+        buttons = int(pressed or what == "mousePressed")
+        self._call("Input.dispatchMouseEvent", type=what, x=x, y=y, button=left, buttons=buttons, clickCount=1)
 
     def run(self, expression: str) -> Any:
         """The value of an expression, waited for if it is a promise."""

@@ -7,8 +7,11 @@ import hashlib
 import importlib.util
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -229,6 +232,31 @@ def test_without_a_truth_the_summary_says_so(tmp_path):
     assert cli.run(["smooth", "kitti", "--end", "90", "--solver", "ekf", "--quiet", "-o", str(tmp_path)]) == 0
     s = summary(tmp_path)
     assert (s["errors"], s["against"], s["spans"], s["nees"]) == (None, None, [], None)
+
+
+def test_a_run_is_repeated_from_the_provenance_of_its_report_alone(drive, tmp_path):
+    config = tmp_path / "mine.toml"
+    config.write_text('[gnss]\nsd_factor = 2.5\nrobust = "huber"\n[keyframes]\nrate = 2.0\n', encoding="utf-8")
+    part = ["--start", "10", "--end", "90", "--without", "gnss:40-60", "--without", "odometer", "--rate", "5"]
+    first = program("smooth", drive, "--solver", "rts", *part, "--config", config, "-o", tmp_path / "out")
+    assert first.returncode == 0, first.stderr
+    html = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    config.unlink()
+    words, settings = (unescape(re.search(f'<pre id="{key}">(.*?)</pre>', html, re.S).group(1))
+                       for key in ("command", "settings"))  # fmt: skip
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "settings.toml").write_text(settings, encoding="utf-8")
+    name, *arguments = shlex.split(words)
+    assert name == "graphnav"
+    second = program(*arguments, cwd=elsewhere)
+    assert second.returncode == 0, second.stderr
+    track, again = (folder / "trajectory.csv" for folder in (tmp_path / "out", elsewhere / "again"))
+    assert again.read_bytes() == track.read_bytes()
+    # and that needed the settings: without them it is another trajectory
+    plain = program(*arguments[: arguments.index("--config")], "-o", "plain", cwd=elsewhere)
+    assert plain.returncode == 0, plain.stderr
+    assert (elsewhere / "plain" / "trajectory.csv").read_bytes() != track.read_bytes()
 
 
 # ---------------------------------------------------------------------------------------------------------------- info

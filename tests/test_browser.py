@@ -1,0 +1,109 @@
+"""The pages in a real browser: from a file, without a network, light and dark, on a desk and on a phone."""
+
+from __future__ import annotations
+
+import os
+
+import browser
+import pytest
+
+from graphnav import cli
+from graphnav.panels import interactive
+
+PAGES = ("comparison.html", "batch/report.html", "stops/detections.html")
+SPAN = "gnss:60-80"
+
+
+@pytest.fixture(scope="session")
+def pages(tmp_path_factory):
+    """Reports of two minutes of a real drive."""
+    out = tmp_path_factory.mktemp("pages")
+    part = ["kitti", "--end", "120", "--quiet", "--without", SPAN]
+    assert cli.run(["compare", *part, "-o", str(out)]) == 0
+    assert cli.run(["detect", *part, "-o", str(out / "stops")]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def tab():
+    """A browser; without one the test is skipped, except in CI, where that would hide a failure."""
+    if browser.find() is None:
+        reason = f"no browser: none of {', '.join(browser.NAMES)} is installed"
+        if os.environ.get("CI"):
+            pytest.fail(reason)
+        pytest.skip(reason)
+    with browser.browser() as one:
+        yield one
+
+
+def checked(tab, width):
+    """What holds for every page: nothing went wrong, nothing was fetched, nothing sticks out, all can be read."""
+    assert tab.trouble == []
+    assert [url for url in tab.asked if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert tab.run("document.documentElement.scrollWidth") <= width
+    sizes = "[...document.querySelectorAll('.plot text')].map(t => parseFloat(getComputedStyle(t).fontSize))"
+    shrunk = "[...document.querySelectorAll('.plot > svg')].map(s => s.getBoundingClientRect().width / 370)"
+    assert min(tab.run(sizes)) * min([1.0, *tab.run(shrunk)]) > 9.0
+
+
+@pytest.mark.parametrize("size", [browser.DESKTOP, browser.PHONE], ids=["desktop", "phone"])
+@pytest.mark.parametrize("page", PAGES)
+def test_every_picture_comes_alive_in_both_colours(tab, pages, page, size):
+    tab.open(pages / page, size)
+    tab.wait("!!window.Plotly")
+    tab.read()
+    tab.wait("document.querySelectorAll('.plot').length === document.querySelectorAll('.js-plotly-plot').length")
+    checked(tab, size[0])
+    ink = "getComputedStyle(document.querySelector('.js-plotly-plot .xtick text')).fill"
+    wanted = "(p => (p.style.color = 'var(--soft)', getComputedStyle(p).color))(document.querySelector('nav'))"
+    light = tab.run(ink)
+    assert light == tab.run(wanted)
+    tab.colours(dark=True)
+    tab.wait(f"{ink} !== '{light}'")
+    assert tab.run(ink) == tab.run(wanted)
+    checked(tab, size[0])
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_pages_are_whole_without_scripts(tab, pages, page):
+    for size in (browser.DESKTOP, browser.PHONE):
+        tab.open(pages / page, size, scripts=False)
+        assert tab.run("document.querySelectorAll('.plot > svg').length") == tab.run(
+            "document.querySelectorAll('figure').length"
+        )
+        checked(tab, size[0])
+
+
+def test_pages_are_whole_without_plotly(tab, tmp_path, monkeypatch):
+    monkeypatch.setattr(interactive, "library", lambda: None)
+    part = ["kitti", "--end", "60", "--quiet", "--solver", "rts", "-o", str(tmp_path)]
+    assert cli.run(["smooth", *part]) == 0
+    assert (tmp_path / "report.html").stat().st_size < 1_000_000
+    for size in (browser.DESKTOP, browser.PHONE):
+        tab.open(tmp_path / "report.html", size)
+        assert tab.run("document.querySelectorAll('.plot > svg').length") > 8
+        checked(tab, size[0])
+
+
+def test_hovering_zooming_and_hiding(tab, pages):
+    tab.open(pages / "comparison.html")
+    place = "[...document.querySelectorAll('figure')].find(f => f.innerText.startsWith('Position error'))"
+    tab.run(f"{place}.scrollIntoView()")
+    tab.wait(f"!!{place}.querySelector('.js-plotly-plot .plotly')")
+    box = tab.run(f"(r => [r.left, r.top, r.width, r.height])({place}.querySelector('.plot').getBoundingClientRect())")
+    x, y = box[0] + 0.5 * box[2], box[1] + 0.2 * box[3]
+    tab.mouse("mouseMoved", x, y)
+    tab.mouse("mouseMoved", x + 3, y)
+    tab.wait(f"{place}.querySelectorAll('.hoverlayer .hovertext').length > 0")
+    spread = f"(r => r[1] - r[0])({place}.querySelector('.plot').layout.xaxis.range)"
+    whole = tab.run(spread)
+    tab.mouse("mousePressed", x, y)
+    for step in range(1, 6):
+        tab.mouse("mouseMoved", x + 30 * step, y, pressed=True)
+    tab.mouse("mouseReleased", x + 150, y)
+    tab.wait(f"{spread} < 0.6 * {whole}")
+    shown = f"{place}.querySelector('.plot').data.filter(t => t.legendgroup === 'ekf').map(t => t.visible !== false)"
+    assert tab.run(shown) == [True] * 3
+    tab.run(f"[...{place}.querySelectorAll('button')].find(b => b.innerText === 'ekf').click()")
+    assert tab.run(shown) == [False] * 3
+    assert tab.trouble == []
