@@ -62,7 +62,7 @@ padding:2px 0}
 .plot{width:100%;position:relative;overflow:hidden;aspect-ratio:var(--w)/var(--h)}
 @media (min-width:700px){
 :is(.large,.map,figure:only-child)>.plot{aspect-ratio:auto;height:calc(1.4px*var(--h))}
-.map>.plot{height:640px}
+figure.map>.plot{height:640px}
 nav{flex-wrap:wrap}}
 .plot svg{display:block;width:100%;height:100%}
 .note{margin:4px 0 0}

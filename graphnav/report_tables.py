@@ -92,7 +92,7 @@ def constraint_table(solution: Solution) -> list[Raw]:
         out.append(page.paragraph(note, "soft"))
     if solution.counts:
         counted = page.and_list([f"{count} {kind}" for kind, count in solution.counts.items()])
-        out.append(page.paragraph(f"Factors or updates by kind: {counted}."))
+        out.append(page.paragraph(f"Factors or updates by kind: {counted}.", "soft"))
     return out
 
 

@@ -131,7 +131,7 @@ def believe_without_truth(solution: Solution) -> Raw:
                 f"{name}: {missing}; the stated sigma looks cautious for the innovations: {measured}.", "verdict"
             )
         return page.paragraph(f"{name}: {missing}. Innovations speak for the stated sigma: {measured}.", "verdict good")
-    measured = f"residuals are {size:.2f} times the measurements' sigma (RMS; a fit leaves no more than 1)"
+    measured = f"residuals are {size:.2f} times the measurements' sigma (RMS; 1 or a little less where sigma is true)"
     if size > 1.15:
         return page.paragraph(f"{name}: {missing}, and sigma looks too small: {measured}.", "verdict bad")
     return page.paragraph(f"{name}: {missing}. Nothing speaks against the stated sigma: {measured}.", "verdict good")

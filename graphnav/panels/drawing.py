@@ -200,9 +200,10 @@ class Drawing:
         """(words, colour, kind) of everything labelled, each once, tinted areas last; a mark is its own kind."""
         items = [item for panel in self.panels for item in panel.items if item.label]
         items.sort(key=lambda item: (item.label in SHADES) + (item.kind == "band"))
-        every = {item.label: (item.label, item.name, item.marker if item.kind == "marks" else item.kind)
-                 for item in reversed(items)}  # fmt: skip
-        return list(reversed(every.values()))
+        every: dict[str, tuple[str, str, str]] = {}
+        for item in items:
+            every.setdefault(item.label, (item.label, item.name, item.marker if item.kind == "marks" else item.kind))
+        return list(every.values())
 
     def savefig(self, path: str | Path, **kw: Any) -> None:
         """Write it with its legend, in the format of the file's name; further arguments as matplotlib's."""
