@@ -163,6 +163,8 @@ def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int
 
 def _words(value: Any) -> str:
     """The class attribute of a cell of words, wider for a sentence."""
+    if isinstance(value, Raw) and value.startswith('<span class="solver"'):
+        return ' class="words"'
     if not isinstance(value, str) or isinstance(value, Raw):
         return ""
     return ' class="words long"' if len(value) > 24 else ' class="words"'

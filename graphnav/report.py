@@ -156,10 +156,11 @@ def _verdicts(
     solutions: Mapping[str, Solution], errors: Mapping[str, Errors], metrics: Mapping[str, Mapping[str, Any]]
 ) -> list[page.Raw]:
     """Per solver, whether its sigma can be believed and, of a loop, how well it closes."""
-    said = [
-        words.believe(name, errors[name]) if name in errors else words.believe_without_truth(solution)
-        for name, solution in solutions.items()
-    ]
+    # where there is no truth a filter's innovations judge the model that all share better than any residuals
+    met = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
+    said = [words.believe(name, e) for name, e in errors.items()]
+    if not errors:
+        said = [words.believe_without_truth(solution) for solution in met or solutions.values()]
     return [*said, *(note for name, values in metrics.items() for note in words.closure_note(name, values))]
 
 

@@ -134,7 +134,8 @@ def believe_without_truth(solution: Solution) -> Raw:
     measured = f"residuals are {size:.2f} times the measurements' sigma (RMS; 1 or a little less where sigma is true)"
     if size > 1.15:
         return page.paragraph(f"{name}: {missing}, and sigma looks too small: {measured}.", "verdict bad")
-    return page.paragraph(f"{name}: {missing}. Nothing speaks against the stated sigma: {measured}.", "verdict good")
+    said = f"{name}: {missing}, and residuals of a fit tell little; a filter's innovations tell more. The {measured}."
+    return page.paragraph(said, "verdict")
 
 
 def closure_note(name: str, metrics: Mapping[str, Any] | None) -> list[Raw]:
