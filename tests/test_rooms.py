@@ -91,4 +91,4 @@ def test_help_loads_nothing_heavy():
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = ast.literal_eval(run.stdout.splitlines()[-1])
     assert "graphnav.cli" in loaded
-    assert not {"gtsam", "matplotlib", "numpy", "scipy", "rich"} & set(loaded)
+    assert not {"gtsam", "matplotlib", "numpy", "plotly", "scipy", "rich"} & set(loaded)

@@ -28,13 +28,13 @@ def thin(t: Array, y: Array, bins: int = BINS) -> np.ndarray:
         return np.arange(n)
     finite = np.isfinite(y)
     span = float(t[-1] - t[0])
-    column = np.minimum((t - t[0]) * (bins / span if span > 0 else 0.0), bins - 1).astype(int)
-    starts = np.flatnonzero(np.diff(column, prepend=-1))
-    order = np.lexsort((np.where(finite, y, np.nan), column))  # NaN sorts behind the numbers of its column
-    highest = starts + np.maximum(np.add.reduceat(finite.astype(int), starts), 1) - 1
+    starts = np.unique(np.searchsorted(t, t[0] + span / bins * np.arange(bins))) if span > 0 else np.zeros(1, dtype=int)
+    lengths = np.diff(starts, append=n)
+    # the first row that is as low, or as high, as its column gets; none where a column has no number
+    extremes = [np.flatnonzero(y == np.repeat(f.reduceat(y, starts), lengths)) for f in (np.fmin, np.fmax)]
+    extremes = [rows[np.diff(np.searchsorted(starts, rows, side="right"), prepend=0) > 0] for rows in extremes]
     breaks = np.flatnonzero(~finite & np.concatenate([[True], finite[:-1]]))
-    ends = np.append(starts[1:], n) - 1
-    return np.unique(np.concatenate([starts, ends, order[starts], order[highest], breaks]))
+    return np.unique(np.concatenate([starts, starts + lengths - 1, *extremes, breaks]))
 
 
 def with_breaks(t: Array, rows: np.ndarray, *columns: Array) -> Any:
