@@ -251,6 +251,37 @@ def test_stops_and_outages_are_told(tmp_path, recording):
     assert len(parser.figures) == 11
 
 
+@pytest.mark.parametrize(
+    ("scale", "kind", "words"),
+    [
+        (1.0, "innovation", "Innovations speak for the stated sigma: they are 1.0"),
+        (2.0, "innovation", "sigma looks too small for the innovations: they are 2.0"),
+        (0.4, "innovation", "cautious for the innovations: they are 0.4"),
+        (0.9, "residual", "residuals of a fit tell little"),
+        (1.5, "residual", "sigma looks too small: residuals are 1.5"),
+    ],
+)
+def test_sigma_is_judged_by_what_was_met_where_there_is_no_truth(tmp_path, recording, scale, kind, words):
+    found = replace(solution(), records={"gnss_position": record(scale, kind)})
+    _, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}))
+    assert words in text
+
+
+def test_innovations_speak_for_all_solvers(tmp_path, recording):
+    met, fitted = solution("ekf"), replace(solution("batch"), records={"gnss_position": record(kind="residual")})
+    _, text = checked(write_comparison(tmp_path / "c.html", recording, {"ekf": met, "batch": fitted}, settings={}))
+    assert "ekf: there is no truth to compare with. Innovations speak for" in text
+    assert "residuals of a fit tell little" not in text
+
+
+def test_a_column_without_any_number_is_left_out():
+    nan = float("nan")
+    rows = [["ekf", 2.0, nan, nan], ["rts", 1.0, nan, 5.0]]
+    assert page.table(["solver", "a", "b", "c"], rows, best=[1, 2, 3]).count("<td") == 6
+    assert page.table(["solver", "a", "b", "c"], rows, best=[1, 2, 3]).count('class="best"') == 2
+    assert "b" not in re.findall(r"<th[^>]*>(\w+)</th>", page.table(["solver", "a", "b", "c"], rows))
+
+
 def test_settings_and_command_come_back_as_they_were():
     settings = Settings().model_dump()
     settings["gnss"]["robust"] = 'a "quoted" \\ word, µ'
