@@ -218,7 +218,7 @@ class Excluding(Solution):
 
 def test_what_was_excluded_is_listed_and_marked(tmp_path, recording):
     part = Excluded(START + 200.0, START + 219.5, "gnss_position", 20, "jumped by 31 m <sideways>")
-    found = Excluding(**vars(solution()), excluded=(part,))
+    found = Excluding(**{**vars(solution()), "excluded": (part,)})
     _, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}))
     for words in ("200.0 to 219.5 s", "jumped by 31 m <sideways>", "20 measurements were excluded", "excluded fix"):
         assert words in text, words
