@@ -30,7 +30,7 @@ from scipy.special import chdtr, chdtri, gammaincinv
 
 from graphnav.config import Settings
 from graphnav.constraints.base import Constraint, assemble
-from graphnav.constraints.gnss import GnssPosition
+from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.problem import Problem
 from graphnav.recording import ImuNoise, Recording
@@ -100,26 +100,25 @@ def stretch(recording: Recording, begin: float) -> Recording:
     return recording.crop(0.0, float(later[FIXES]) - recording.start)
 
 
-def outliers(problem: Problem, smoothed: Smoothed) -> Array | None:
-    """Weights (N,) of the fixes if there are outliers among them, None if not.
+def outliers(problem: Problem, smoothed: Smoothed) -> dict[str, Array]:
+    """Weights (N,) of the fixes and their velocities if there are outliers among them, empty if not.
 
     What one outlier does to the states around it would otherwise pass for noise of the IMU. The weight is the one
     that a batch solution with Cauchy's kernel leaves it.
     """
-    rows = _fixes(problem)
-    if rows is None or np.sqrt(_record(problem, rows, smoothed).nis.max(initial=0.0)) < _OUTLIER:
-        return None
-    robust = replace(problem, constraints=_with(problem, replace(rows, robust="cauchy")))
-    solved = batch(robust, smoothed.states, wanted=(), reintegrate=False)
-    return np.maximum(solved.records[rows.name].weight, 1e-8)
+    kinds = [c for c in problem.constraints if isinstance(c, GnssPosition | GnssVelocity)]
+    if all(np.sqrt(_record(problem, rows, smoothed).nis.max(initial=0.0)) < _OUTLIER for rows in kinds):
+        return {}
+    robust = {rows.name: replace(rows, robust="cauchy") for rows in kinds}
+    trial = replace(problem, constraints=tuple(robust.get(c.name, c) for c in problem.constraints))
+    solved = batch(trial, smoothed.states, wanted=(), reintegrate=False)
+    return {name: np.maximum(solved.records[name].weight, 1e-8) for name in robust}
 
 
-def weighted(problem: Problem, weight: Array | None) -> Problem:
-    """A problem with its fixes weighted."""
-    rows = _fixes(problem)
-    if weight is None or rows is None:
-        return problem
-    return replace(problem, constraints=_with(problem, replace(rows, sigma=rows.sigma / np.sqrt(weight)[:, None])))
+def weighted(problem: Problem, weight: dict[str, Array]) -> Problem:
+    """A problem with its rows weighted."""
+    constraints = (replace(c, weight=weight[c.name]) if c.name in weight else c for c in problem.constraints)
+    return replace(problem, constraints=tuple(constraints))
 
 
 def judge_fixes(problem: Problem, smoothed: Smoothed) -> FixQuality | None:
@@ -245,7 +244,7 @@ def _with(problem: Problem, rows: GnssPosition) -> tuple[Constraint, ...]:
     return tuple(rows if isinstance(c, GnssPosition) else c for c in problem.constraints)
 
 
-def _record(problem: Problem, rows: GnssPosition, smoothed: Smoothed) -> ConstraintRecord:
+def _record(problem: Problem, rows: Constraint, smoothed: Smoothed) -> ConstraintRecord:
     return residual_record(problem, rows, smoothed.states, _values(problem, smoothed))
 
 

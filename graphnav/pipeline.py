@@ -163,7 +163,7 @@ def judged(
     free = settings.without_wheels()  # wheels are judged by what comes of this, so they have no say in it
     plain = free.model_copy(update={"gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0})})
     part = judgement.stretch(recording, aligned.motion)
-    noise, weight = stated, None
+    noise, weight = stated, {}
 
     def smoothed(how: Settings) -> tuple[Problem, Filtered, Smoothed]:
         noisy = replace(part, imu=replace(part.imu, noise=noise))
@@ -173,7 +173,7 @@ def judged(
 
     problem, forward, back = smoothed(plain)
     weight = judgement.outliers(problem, back)
-    if weight is not None:
+    if weight:
         problem, forward, back = smoothed(plain)
     fixes = judgement.judge_fixes(problem, back)
     if not settings.imu.as_stated and judgement.judge_imu(problem, forward, back).clear:

@@ -1,0 +1,124 @@
+"""Watches a filter's fixes for errors that last: a bank of generalised likelihood ratio tests.
+
+A fault that grows slowly passes every test of one fix: the filter follows it. What it cannot do is follow without
+having been pushed in the same direction again and again. If the fixes have had a common error b since fix s, the
+innovations have the mean G b, where G is what a unit error does to them through the filter (Willsky and Jones 1976,
+"A generalized likelihood ratio approach to the detection and estimation of jumps in linear systems"),
+
+    X <- F X                       its effect on the predicted state
+    G = I - H X    X <- X + K G    at a fix since s (without I at other measurements)
+
+and with nu ~ N(0, S) white but for that, the error most likely and how much more likely it makes the innovations are
+
+    score = sum G^T S^-1 nu    info = sum G^T S^-1 G    b = info^-1 score    T = score^T info^-1 score
+
+Without a fault T is chi-square with as many degrees of freedom as a fix has components. Onsets are 1, 2, 4 ... fixes
+old, more or less: slot l of the bank begins anew at every odd multiple of 2^l.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from graphnav.constraints.base import Constraint
+from graphnav.rotation import Array
+
+FALSE_ALARM = 1e-7  # per test: one drive in a hundred of an hour, if errors were Gaussian
+LONGEST = 600.0  # s, about, of the oldest onset: what inertial sensors knew ten minutes ago says little
+
+
+@dataclass
+class _Slots:
+    """The tests of one constraint."""
+
+    columns: slice  # in the bank
+    threshold: float
+    first: Array  # (L,) row at which each slot began, -1 before
+    score: Array  # (L, m)
+    info: Array  # (L, m, m)
+    seen: int = 0
+
+    def copy(self) -> _Slots:
+        return replace(self, first=self.first.copy(), score=self.score.copy(), info=self.info.copy())
+
+
+class Bank:
+    """All tests of a filter.
+
+    Parameters
+    ----------
+    constraints : those whose rows are tested.
+    t : (K,) times of the keyframes, s.
+    width : of the error state.
+    """
+
+    def __init__(self, constraints: Iterable[Constraint], t: Array, width: int) -> None:
+        self._slots: dict[str, _Slots] = {}
+        end = 0
+        for rows in constraints:
+            m = len(rows.axes)
+            times = t[rows.keyframe]
+            period = float(np.median(np.diff(times))) if len(times) > 1 else LONGEST
+            L = 1 + int(np.clip(np.log2(LONGEST / max(period, 1e-3)), 0, 12))
+            self._slots[rows.name] = _Slots(
+                slice(end, end + L * m),
+                float(chdtri(m, FALSE_ALARM)),
+                np.full(L, -1),
+                np.zeros((L, m)),
+                np.tile(np.eye(m), (L, 1, 1)),
+            )
+            end += L * m
+        self.X = np.zeros((width, end))
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._slots
+
+    def copy(self) -> Bank:
+        """The same, on its own."""
+        other = Bank((), np.empty(0), 0)
+        other.X, other._slots = self.X.copy(), {name: slots.copy() for name, slots in self._slots.items()}
+        return other
+
+    def predicted(self, F: Array) -> None:
+        """The filter has gone on to the next keyframe."""
+        self.X = F @ self.X
+
+    def signature(self, name: str, row: int, H: Array) -> Array:
+        """(n m, C) mean of an innovation for unit errors since each onset; a fix of a watched kind is itself one."""
+        G = -H @ self.X
+        slots = self._slots.get(name)
+        if slots is not None:
+            L, m = slots.score.shape
+            slots.seen += 1
+            new = min((slots.seen & -slots.seen).bit_length() - 1, L - 1)
+            at = slice(slots.columns.start + new * m, slots.columns.start + (new + 1) * m)
+            self.X[:, at], G[:, at] = 0.0, 0.0
+            slots.first[new], slots.score[new], slots.info[new] = row, 0.0, 0.0
+            for start in slots.columns.start + m * np.flatnonzero(slots.first >= 0):
+                G[:, start : start + m] += np.tile(np.eye(m), (len(G) // m, 1))
+        return G
+
+    def updated(self, name: str, K: Array, G: Array, weighted: Array, r: Array) -> int | None:
+        """The filter has used an innovation; the first row of a fault, or None.
+
+        Parameters
+        ----------
+        K : (D, n m) gain.
+        G : (n m, C) its signature, and `weighted` S^-1 G.
+        r : (n m,) residual, -nu.
+        """
+        self.X += K @ G
+        slots = self._slots.get(name)
+        if slots is None:
+            return None
+        L, m = slots.score.shape
+        own = weighted[:, slots.columns].reshape(-1, L, m)
+        slots.score -= np.tensordot(r, own, axes=1)
+        slots.info += np.einsum("nla,nlb->lab", G[:, slots.columns].reshape(-1, L, m), own)
+        T = np.sum(slots.score * np.linalg.solve(slots.info, slots.score[..., None])[..., 0], axis=1)
+        worst = int(np.argmax(T))
+        return int(slots.first[worst]) if T[worst] > slots.threshold else None
