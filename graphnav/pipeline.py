@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from graphnav import judgement
+from graphnav import faults, judgement
 from graphnav.alignment import Alignment, align, with_known_heading
 from graphnav.config import Settings
+from graphnav.constraints.prior import InitialPrior
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
@@ -26,6 +27,7 @@ from graphnav.solvers.isam import isam2
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
 _FAR = 0.5  # rad between the stated and the found start attitude
+_REVIEWS = 2  # of what was left out
 _SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
 
 
@@ -101,32 +103,52 @@ def _solve(
         recording, settings, frame, lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)
     )
     after = time.perf_counter()
-    recording, settings, said = judged(recording, settings, frame, aligned, stationary)
-    done = time.perf_counter()
     stated = with_known_heading(aligned, settings)
-    problem = pose(recording, settings, frame, stated.state, stated.sigma, stationary)
+    # A stated heading far from the one found sends the filter, and its linearisation with it, astray for a while. It
+    # stays in the problem as its prior, but all else is judged, and the smoother sets out, from what was found.
+    found_heading = aligned.motion is not None  # without motion heading zero is only a convention
+    astray = found_heading and bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
+
+    def posed(wrong: tuple[faults.Fault, ...] = ()) -> tuple[Problem, tuple[str, ...]]:
+        sensed, how, said = judged(recording, settings, frame, aligned, stationary, wrong)
+        begin = aligned if astray else stated
+        return pose(sensed, how, frame, begin.state, begin.sigma, stationary), said
+
+    def watched(problem: Problem) -> tuple[Problem, Filtered]:
+        forward = ekf(problem, progress, aligned.until, watch=True)
+        return faults.weighted(problem, forward.weights), forward
+
+    problem, said = posed()
+    done = time.perf_counter()
+    problem, forward = watched(problem)
+    if faults.count(problem):
+        # what faults did to the states around them may have passed for noise of the IMU
+        other, says = posed(faults.spans(problem))
+        if judgement.calmer(other.recording.imu.noise, problem.recording.imu.noise):
+            other, ahead = watched(other)
+            if faults.count(other) <= faults.count(problem):
+                problem, forward, said = other, ahead, says
     timings = {
         "detection": detected - began,
         "alignment": after - detected,
         "judgement": done - after,
-        "preintegration": time.perf_counter() - done,
     }
-    # A stated heading far from the one found sends the filter, and its linearisation with it, astray for a while. It
-    # stays in the problem as its prior, but wheels are judged, and the smoother sets out, from what was found.
-    found_heading = aligned.motion is not None  # without motion heading zero is only a convention
-    astray = found_heading and bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
-    prior = problem.prior
-    if astray:
-        problem = replace(problem, prior=replace(prior, mean=aligned.state, sigma=aligned.sigma[None]))
-    forward = ekf(problem, progress, aligned.until)
     began, smoothed = time.perf_counter(), backward(problem, forward, progress)
     problem, raised = judgement.judge_wheels(problem, smoothed)
-    if raised:
-        forward = ekf(problem, progress, aligned.until)
-        smoothed, said = backward(problem, forward, progress), (*said, *raised)
+    said = (*said, *raised)
+    for again in range(_REVIEWS):
+        reviewed = faults.readmitted(problem, smoothed)
+        changed = faults.count(reviewed) != faults.count(problem)
+        if not changed and not (raised and again == 0):
+            break
+        problem, forward = watched(reviewed) if changed else (problem, ekf(problem, progress, aligned.until))
+        smoothed = backward(problem, forward, progress)
+    wrong = faults.spans(problem, smoothed)
+    said = (*said, *faults.notes(wrong, problem))
     timings["smoother"] = time.perf_counter() - began
     start = smoothed
     if astray:
+        prior = InitialPrior(keyframe=problem.prior.keyframe, mean=stated.state, sigma=stated.sigma[None])
         problem = replace(problem, prior=prior)
         forward = ekf(problem, progress, aligned.until)
         smoothed = backward(problem, forward, progress)
@@ -147,6 +169,7 @@ def _solve(
             out[name],
             notes=(*stated.notes, *found.notes, *said, *out[name].notes),
             detections=found.all,
+            excluded=wrong,
             timings={k: timings.get(k, 0.0) + out[name].timings.get(k, 0.0) for k in (*timings, *out[name].timings)},
         )
         for name in solvers
@@ -154,7 +177,12 @@ def _solve(
 
 
 def judged(
-    recording: Recording, settings: Settings, frame: LocalFrame, aligned: Alignment, stationary: np.ndarray
+    recording: Recording,
+    settings: Settings,
+    frame: LocalFrame,
+    aligned: Alignment,
+    stationary: np.ndarray,
+    wrong: tuple[faults.Fault, ...] = (),
 ) -> tuple[Recording, Settings, tuple[str, ...]]:
     """Recording and settings with the figures of IMU and fixes judged by the first part of the drive."""
     gnss, stated = settings.gnss, recording.imu.noise
@@ -163,17 +191,30 @@ def judged(
     free = settings.without_wheels()  # wheels are judged by what comes of this, so they have no say in it
     plain = free.model_copy(update={"gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0})})
     part = judgement.stretch(recording, aligned.motion)
-    noise, weight = stated, {}
+    noise = stated
+    weight: dict[str, np.ndarray] = {}
+
+    def posed(how: Settings) -> Problem:
+        noisy = replace(part, imu=replace(part.imu, noise=noise))
+        problem = faults.weighted(pose(noisy, how, frame, aligned.state, aligned.sigma, stationary), weight)
+        return faults.without(problem, wrong)
 
     def smoothed(how: Settings) -> tuple[Problem, Filtered, Smoothed]:
-        noisy = replace(part, imu=replace(part.imu, noise=noise))
-        problem = judgement.weighted(pose(noisy, how, frame, aligned.state, aligned.sigma, stationary), weight)
+        problem = posed(how)
         forward = ekf(problem, opening=aligned.until)
         return problem, forward, backward(problem, forward)
 
-    problem, forward, back = smoothed(plain)
-    weight = judgement.outliers(problem, back)
-    if weight:
+    try:
+        problem, forward, back = smoothed(plain)
+        suspicious = judgement.suspicious(problem, back)
+    except EstimationError:
+        suspicious = True
+    if suspicious:
+        noise = judgement.noisiest(stated)
+        weight = ekf(posed(plain), opening=aligned.until, watch=True).weights
+        noise = stated
+        problem, forward, back = smoothed(plain)
+        weight = judgement.outliers(problem, back)
         problem, forward, back = smoothed(plain)
     fixes = judgement.judge_fixes(problem, back)
     if not settings.imu.as_stated and judgement.judge_imu(problem, forward, back).clear:

@@ -43,7 +43,7 @@ from graphnav.errors import EstimationError
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
-from graphnav.solvers.watch import LONGEST, Bank
+from graphnav.solvers.watch import Bank, Verdicts
 from graphnav.state import BLOCKS, DIM, States
 
 Progress = Callable[[str, float], None]
@@ -133,7 +133,9 @@ def _forward(
     watched = [rows for rows in problem.constraints if watch and rows.watched]
     bank = Bank(watched, problem.t, D) if watched else None
     banks: dict[int, Bank] = {}  # as they were before the latest keyframes with fixes
-    lost: dict[int, str] = {}  # keyframes at which the filter, not the fixes, is taken to have lost its way
+    verdicts = Verdicts(watched, problem.t)
+    for rows in watched:
+        records[rows.name].used = verdicts.used[rows.name]
     begun = (state, values, P)
 
     all_P, all_Pp, all_F = np.empty((K, D, D)), np.empty((K, D, D)), np.empty((K - 1, D, D))
@@ -175,9 +177,10 @@ def _forward(
                 e = F @ about.offset(k - 1, state, values)
                 ahead, at_values = ahead.plus(e[None, :DIM]), at_values + e[DIM:]
             state, values = ahead, at_values
-        if k in lost:
-            block = BLOCKS["p" if lost[k] == GnssPosition.name else "v"]
-            P[block, block] += 1e6 * np.eye(3)
+        for rows in watched:
+            if (rows.name, first[rows.name][k]) in verdicts.anew:
+                block = BLOCKS["p" if rows.name == GnssPosition.name else "v"]
+                P[block, block] += 1e6 * np.eye(3)
         predicted[k] = state
         all_vp[k] = values
         all_Pp[k] = P
@@ -189,12 +192,7 @@ def _forward(
                 at_point = about if k < n else None
                 state, values, P, fault = _update(rows, lo, hi, *x, columns, record, at_point, k, bank)
                 if fault is not None:
-                    record.used[fault:hi] = 0.0
-                    begin = int(np.max(np.flatnonzero(record.used[:hi]), initial=-1)) + 1
-                    back = int(rows.keyframe[fault])
-                    if problem.t[k] - problem.t[rows.keyframe[begin]] > LONGEST:
-                        record.used[fault:hi] = 1.0
-                        lost[back] = rows.name
+                    back = verdicts.settle(rows.name, fault, hi)
                     break
         if back is not None:  # once more from before the fault, without it
             bank = banks.get(back) or Bank(watched, problem.t, D)

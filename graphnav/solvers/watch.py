@@ -18,7 +18,7 @@ old, more or less: slot l of the bank begins anew at every odd multiple of 2^l.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -122,3 +122,43 @@ class Bank:
         T = np.sum(slots.score * np.linalg.solve(slots.info, slots.score[..., None])[..., 0], axis=1)
         worst = int(np.argmax(T))
         return int(slots.first[worst]) if T[worst] > slots.threshold else None
+
+
+class Verdicts:
+    """Which fixes to give up when a fault is found: those from its onset on.
+
+    Unless that has gone on for longer than `LONGEST`. Then it is more likely the filter that has lost its way, with
+    the last fixes that it did use: it drifts while fixes are refused, and a fault that grows meets it again. So what
+    it used, of any kind, since the fault before is given up instead, and the fixes are taken back; if they are refused
+    even so, the filter begins anew where they are.
+    """
+
+    def __init__(self, watched: Sequence[Constraint], t: Array) -> None:
+        self.used = {c.name: np.ones(len(c)) if c.weight is None else c.weight.copy() for c in watched}
+        self.anew: set[tuple[str, int]] = set()  # rows at which the filter begins anew
+        self._keyframe = {c.name: c.keyframe for c in watched}
+        self._t = t
+        self._tried: set[tuple[str, int]] = set()
+
+    def settle(self, name: str, fault: int, end: int) -> int:
+        """Take from use what a fault in rows `fault` to `end` gives reason to; the keyframe to go on from."""
+        used, at = self.used[name], self._keyframe[name]
+        used[fault:end] = 0.0
+        begin = _begin(used, end, 0.0)
+        if self._t[at[end - 1]] - self._t[at[begin]] < LONGEST:
+            return int(at[fault])
+        used[begin:end] = 1.0
+        before = _begin(used, _begin(used, begin, 1.0), 0.0)
+        if (name, begin) in self._tried or self._t[at[begin]] - self._t[at[before]] > 2.0 * LONGEST:
+            self.anew.add((name, begin))
+            return int(at[begin])
+        self._tried.add((name, begin))
+        for other, keyframe in self._keyframe.items():
+            self.used[other][(keyframe >= at[before]) & (keyframe < at[begin])] = 0.0
+        return int(at[before])
+
+
+def _begin(used: Array, end: int, value: float) -> int:
+    """First of the rows before `end` that are all used, or all not."""
+    other = np.flatnonzero((used[:end] > 0.0) != (value > 0.0))
+    return int(other[-1]) + 1 if len(other) else 0
