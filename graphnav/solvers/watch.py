@@ -27,6 +27,7 @@ from scipy.special import chdtri
 from graphnav.constraints.base import Constraint
 from graphnav.rotation import Array
 
+_PATIENCE = 60.0  # s
 FALSE_ALARM = 1e-7  # per test: one drive in a hundred of an hour, if errors were Gaussian
 LONGEST = 600.0  # s, about, of the oldest onset: what inertial sensors knew ten minutes ago says little
 
@@ -127,10 +128,10 @@ class Bank:
 class Verdicts:
     """Which fixes to give up when a fault is found: those from its onset on.
 
-    Unless that has gone on for longer than `LONGEST`. Then it is more likely the filter that has lost its way, with
-    the last fixes that it did use: it drifts while fixes are refused, and a fault that grows meets it again. So what
-    it used, of any kind, since the fault before is given up instead, and the fixes are taken back; if they are refused
-    even so, the filter begins anew where they are.
+    Unless that outlasts what was used since the fault before, and a minute. Then it is more likely the filter that has
+    lost its way with those: it drifts while fixes are refused, and a fault that grows meets it again. So what it used
+    since, of any kind, is given up instead, and the fixes are taken back; this in turn is undone if they are refused
+    even so. After `LONGEST` of a fault the filter begins anew where the fixes are.
     """
 
     def __init__(self, watched: Sequence[Constraint], t: Array) -> None:
@@ -139,23 +140,36 @@ class Verdicts:
         self._keyframe = {c.name: c.keyframe for c in watched}
         self._t = t
         self._tried: set[tuple[str, int]] = set()
+        self._trial: tuple[str, int, int, dict[str, Array]] | None = None  # fixes taken back, and what was used before
 
     def settle(self, name: str, fault: int, end: int) -> int:
         """Take from use what a fault in rows `fault` to `end` gives reason to; the keyframe to go on from."""
-        used, at = self.used[name], self._keyframe[name]
+        at, back = self._keyframe[name], fault
+        if self._trial is not None and self._trial[0] == name:
+            _, begin, until, were = self._trial
+            self._trial = None
+            if fault < until:
+                for other, used in were.items():
+                    self.used[other][:] = used
+                back = _begin(were[name], _begin(were[name], begin, 1.0), 0.0)
+        used = self.used[name]
         used[fault:end] = 0.0
         begin = _begin(used, end, 0.0)
-        if self._t[at[end - 1]] - self._t[at[begin]] < LONGEST:
-            return int(at[fault])
-        used[begin:end] = 1.0
-        before = _begin(used, _begin(used, begin, 1.0), 0.0)
-        if (name, begin) in self._tried or self._t[at[begin]] - self._t[at[before]] > 2.0 * LONGEST:
+        before = _begin(used, begin, 1.0)  # of what was used between two faults
+        lasted = self._t[at[end - 1]] - self._t[at[begin]]
+        if lasted > LONGEST:
+            used[begin:end] = 1.0
             self.anew.add((name, begin))
-            return int(at[begin])
-        self._tried.add((name, begin))
-        for other, keyframe in self._keyframe.items():
-            self.used[other][(keyframe >= at[before]) & (keyframe < at[begin])] = 0.0
-        return int(at[before])
+            return int(at[min(back, begin)])
+        if (name, begin) not in self._tried and lasted > _PATIENCE and before > 0 and begin - before < end - begin:
+            self._tried.add((name, begin))
+            self._trial = name, begin, end, {other: u.copy() for other, u in self.used.items()}
+            used[begin:end] = 1.0
+            first = int(at[_begin(used, before, 0.0)])
+            for other, keyframe in self._keyframe.items():
+                self.used[other][(keyframe >= first) & (keyframe < at[begin])] = 0.0
+            return first
+        return int(at[back])
 
 
 def _begin(used: Array, end: int, value: float) -> int:
