@@ -1,8 +1,8 @@
 """Spans of fixes that are wrong: looked at again from both sides, and the problem without them.
 
-The filter finds faults as they happen (`graphnav.solvers.watch`); what it can know at a time is not all. It may refuse
-good fixes for a while after a fault, because it has drifted. With the whole drive smoothed without them, their
-residuals r are predictions from both sides: a window of n of them with mean m has
+The filter finds faults as they happen (`graphnav.solvers.watch`); what it can know at a time is not all. It finds late
+what grows, and may refuse good fixes for a while after a fault, because it has drifted. With the whole drive smoothed
+without a fault and its surroundings, their residuals r are predictions from both sides: a window of n of them with mean m has
 
     T = m^T (R / n + H P H^T)^-1 m
 
@@ -25,6 +25,7 @@ from graphnav.solution import Fault
 from graphnav.solvers.ekf import Smoothed
 from graphnav.state import DIM
 
+_EDGE = 60.0  # s
 _DISAGREES = 1e-3  # chance of T by which a window next to a fault is taken for a part of it
 
 
@@ -82,6 +83,18 @@ def without(problem: Problem, faults: Iterable[Fault]) -> Problem:
             for fault in own:
                 weights[rows.name][(t >= fault.t_start - SAME_TIME) & (t <= fault.t_end + SAME_TIME)] = 0.0
     return weighted(problem, weights)
+
+
+def widened(problem: Problem) -> Problem:
+    """The problem with as much again left out on either side of every fault, at most `_EDGE`.
+
+    A fault that grows is found late, and what the filter used of it before would hide it from a smoother.
+    """
+    wider = []
+    for fault in spans(problem):
+        more = min(fault.t_end - fault.t_start, _EDGE)
+        wider.append(replace(fault, t_start=fault.t_start - more, t_end=fault.t_end + more))
+    return without(problem, wider)
 
 
 def count(problem: Problem) -> int:

@@ -27,7 +27,6 @@ from graphnav.solvers.isam import isam2
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
 _FAR = 0.5  # rad between the stated and the found start attitude
-_REVIEWS = 2  # of what was left out
 _SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
 
 
@@ -133,16 +132,18 @@ def _solve(
         "alignment": after - detected,
         "judgement": done - after,
     }
-    began, smoothed = time.perf_counter(), backward(problem, forward, progress)
+    began, dirty = time.perf_counter(), faults.count(problem) > 0
+    if dirty:
+        problem = faults.widened(problem)
+        forward = ekf(problem, progress, aligned.until)
+    smoothed = backward(problem, forward, progress)
     problem, raised = judgement.judge_wheels(problem, smoothed)
-    said = (*said, *raised)
-    for again in range(_REVIEWS):
-        reviewed = faults.readmitted(problem, smoothed)
-        changed = faults.count(reviewed) != faults.count(problem)
-        if not changed and not (raised and again == 0):
-            break
-        problem, forward = watched(reviewed) if changed else (problem, ekf(problem, progress, aligned.until))
-        smoothed = backward(problem, forward, progress)
+    if dirty:
+        problem, forward = watched(faults.readmitted(problem, smoothed))
+    elif raised:
+        forward = ekf(problem, progress, aligned.until)
+    if dirty or raised:
+        smoothed, said = backward(problem, forward, progress), (*said, *raised)
     wrong = faults.spans(problem, smoothed)
     said = (*said, *faults.notes(wrong, problem))
     timings["smoother"] = time.perf_counter() - began

@@ -36,7 +36,7 @@ from scipy.linalg.lapack import dposv
 
 from graphnav import rotation
 from graphnav.constraints.base import Constraint, assemble
-from graphnav.constraints.gnss import GnssPosition
+from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.dense import dense
 from graphnav.dynamics import SCALE
 from graphnav.errors import EstimationError
@@ -47,6 +47,7 @@ from graphnav.solvers.watch import Bank, Verdicts
 from graphnav.state import BLOCKS, DIM, States
 
 Progress = Callable[[str, float], None]
+_NOTHING = np.empty((1, 0))
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
 
 
@@ -130,7 +131,7 @@ def _forward(
     P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
     records = {rows.name: _Innovations(rows) for rows in problem.constraints}
     first = {rows.name: np.searchsorted(rows.keyframe, np.arange(K + 1)) for rows in problem.constraints}
-    watched = [rows for rows in problem.constraints if watch and rows.watched]
+    watched = [c for c in problem.constraints if watch and c.watched and isinstance(c, GnssPosition | GnssVelocity)]
     bank = Bank(watched, problem.t, D) if watched else None
     banks: dict[int, Bank] = {}  # as they were before the latest keyframes with fixes
     verdicts = Verdicts(watched, problem.t)
@@ -243,11 +244,11 @@ def _update(
     PHt = P @ H.T
     S = H @ PHt
     S.flat[:: len(r) + 1] += sigma * sigma
-    G = np.empty((len(r), 0))
-    if bank is not None and weight > 0.0:
-        G = bank.signature(rows.name, lo, H)
+    G = _NOTHING if bank is None or weight == 0.0 else bank.signature(rows.name, lo, H)
     # LAPACK called directly: for matrices this small the checks around it would cost more than the work
-    right = np.concatenate([r[:, None], PHt.T, G], axis=1)
+    D = len(P)
+    right = np.empty((len(r), D + 1 + G.shape[1]))
+    right[:, 0], right[:, 1 : D + 1], right[:, D + 1 :] = r, PHt.T, G
     _, solved, info = dposv(S, right)
     if info:
         raise EstimationError(f"the filter's covariance broke down at '{rows.name}' row {lo}: check sigmas and units")
@@ -257,13 +258,13 @@ def _update(
     record.set(slice(lo, hi), r.reshape(n, -1), np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1), nis / n, weight)
     if weight == 0.0:
         return state, values, P, None
-    K = solved[:, 1 : len(P) + 1].T
+    K = solved[:, 1 : D + 1].T
     d = e - K @ r
     IKH = -K @ H
     IKH.flat[:: len(P) + 1] += 1.0
     P = IKH @ P @ IKH.T + (K * (sigma * sigma)) @ K.T
     P = 0.5 * (P + P.T)  # rounding's asymmetry would grow, past what a stop leaves between its place and the state
-    fault = None if bank is None else bank.updated(rows.name, K, G, solved[:, len(P) + 1 :], r)
+    fault = None if bank is None else bank.updated(rows.name, K, G, solved[:, D + 1 :], r)
     return at.plus(d[None, :DIM]), at_values + d[DIM:], P, fault
 
 

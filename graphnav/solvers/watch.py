@@ -19,32 +19,47 @@ old, more or less: slot l of the bank begins anew at every odd multiple of 2^l.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri
 
 from graphnav.constraints.base import Constraint
+from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.rotation import Array
 
 _PATIENCE = 60.0  # s
+LARGE = 3.0  # stated sigmas: less is no fault, however certain; a filter's model has errors too
 FALSE_ALARM = 1e-7  # per test: one drive in a hundred of an hour, if errors were Gaussian
 LONGEST = 600.0  # s, about, of the oldest onset: what inertial sensors knew ten minutes ago says little
 
 
-@dataclass
 class _Slots:
-    """The tests of one constraint."""
+    """The tests of one constraint: slot l has columns 3 l to 3 l + 2 of those it has in the bank."""
 
-    columns: slice  # in the bank
-    threshold: float
-    first: Array  # (L,) row at which each slot began, -1 before
-    score: Array  # (L, m)
-    info: Array  # (L, m, m)
-    seen: int = 0
+    def __init__(self, columns: slice, L: int, m: int, stated: Array) -> None:
+        self.columns, self.L, self.m = columns, L, m
+        self.threshold = float(chdtri(m, FALSE_ALARM))
+        self.stated = stated  # (m,) typical sigma of a whole error
+        self.first = np.full(L, -1)  # row at which each slot began, -1 before
+        self.inputs = np.zeros((m, L * m))  # what a unit error is to each column: the identity since its slot began
+        self.score, self.info = np.zeros((L, m)), np.tile(np.eye(m), (L, 1, 1))
+        self.seen = 0
 
     def copy(self) -> _Slots:
-        return replace(self, first=self.first.copy(), score=self.score.copy(), info=self.info.copy())
+        other = object.__new__(_Slots)
+        other.__dict__ |= self.__dict__
+        other.first, other.inputs = self.first.copy(), self.inputs.copy()
+        other.score, other.info = self.score.copy(), self.info.copy()
+        return other
+
+    def begin(self, row: int) -> slice:
+        """Begin the slot whose turn it is; its columns in the bank."""
+        self.seen += 1
+        slot = min((self.seen & -self.seen).bit_length() - 1, self.L - 1)
+        own = slice(slot * self.m, (slot + 1) * self.m)
+        self.first[slot], self.score[slot], self.info[slot] = row, 0.0, 0.0
+        self.inputs[:, own] = np.eye(self.m)
+        return slice(self.columns.start + own.start, self.columns.start + own.stop)
 
 
 class Bank:
@@ -57,7 +72,7 @@ class Bank:
     width : of the error state.
     """
 
-    def __init__(self, constraints: Iterable[Constraint], t: Array, width: int) -> None:
+    def __init__(self, constraints: Iterable[GnssPosition | GnssVelocity], t: Array, width: int) -> None:
         self._slots: dict[str, _Slots] = {}
         end = 0
         for rows in constraints:
@@ -65,22 +80,14 @@ class Bank:
             times = t[rows.keyframe]
             period = float(np.median(np.diff(times))) if len(times) > 1 else LONGEST
             L = 1 + int(np.clip(np.log2(LONGEST / max(period, 1e-3)), 0, 12))
-            self._slots[rows.name] = _Slots(
-                slice(end, end + L * m),
-                float(chdtri(m, FALSE_ALARM)),
-                np.full(L, -1),
-                np.zeros((L, m)),
-                np.tile(np.eye(m), (L, 1, 1)),
-            )
+            stated = rows.stated if isinstance(rows, GnssPosition) else rows.sigma
+            self._slots[rows.name] = _Slots(slice(end, end + L * m), L, m, np.median(stated, axis=0))
             end += L * m
         self.X = np.zeros((width, end))
 
-    def __contains__(self, name: str) -> bool:
-        return name in self._slots
-
     def copy(self) -> Bank:
         """The same, on its own."""
-        other = Bank((), np.empty(0), 0)
+        other = object.__new__(Bank)
         other.X, other._slots = self.X.copy(), {name: slots.copy() for name, slots in self._slots.items()}
         return other
 
@@ -90,17 +97,12 @@ class Bank:
 
     def signature(self, name: str, row: int, H: Array) -> Array:
         """(n m, C) mean of an innovation for unit errors since each onset; a fix of a watched kind is itself one."""
-        G = -H @ self.X
         slots = self._slots.get(name)
-        if slots is not None:
-            L, m = slots.score.shape
-            slots.seen += 1
-            new = min((slots.seen & -slots.seen).bit_length() - 1, L - 1)
-            at = slice(slots.columns.start + new * m, slots.columns.start + (new + 1) * m)
-            self.X[:, at], G[:, at] = 0.0, 0.0
-            slots.first[new], slots.score[new], slots.info[new] = row, 0.0, 0.0
-            for start in slots.columns.start + m * np.flatnonzero(slots.first >= 0):
-                G[:, start : start + m] += np.tile(np.eye(m), (len(G) // m, 1))
+        if slots is None:
+            return -(H @ self.X)
+        self.X[:, slots.begin(row)] = 0.0
+        G = -(H @ self.X)
+        G.reshape(-1, slots.m, G.shape[1])[:, :, slots.columns] += slots.inputs
         return G
 
     def updated(self, name: str, K: Array, G: Array, weighted: Array, r: Array) -> int | None:
@@ -116,11 +118,12 @@ class Bank:
         slots = self._slots.get(name)
         if slots is None:
             return None
-        L, m = slots.score.shape
-        own = weighted[:, slots.columns].reshape(-1, L, m)
-        slots.score -= np.tensordot(r, own, axes=1)
-        slots.info += np.einsum("nla,nlb->lab", G[:, slots.columns].reshape(-1, L, m), own)
-        T = np.sum(slots.score * np.linalg.solve(slots.info, slots.score[..., None])[..., 0], axis=1)
+        L, m = slots.L, slots.m
+        slots.score -= (r @ weighted[:, slots.columns]).reshape(L, m)
+        G3, S3 = (x[:, slots.columns].reshape(-1, L, m).swapaxes(0, 1) for x in (G, weighted))
+        slots.info += G3.swapaxes(1, 2) @ S3
+        b = np.linalg.solve(slots.info, slots.score[..., None])[..., 0]
+        T = np.where(np.sum((b / slots.stated) ** 2, axis=1) > LARGE**2, np.sum(slots.score * b, axis=1), 0.0)
         worst = int(np.argmax(T))
         return int(slots.first[worst]) if T[worst] > slots.threshold else None
 
