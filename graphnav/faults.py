@@ -2,7 +2,8 @@
 
 The filter finds faults as they happen (`graphnav.solvers.watch`); what it can know at a time is not all. It finds late
 what grows, and may refuse good fixes for a while after a fault, because it has drifted. With the whole drive smoothed
-without a fault and its surroundings, their residuals r are predictions from both sides: a window of n of them with mean m has
+without a fault and its surroundings, their residuals r are predictions from both sides: a window of n of them with
+mean m has
 
     T = m^T (R / n + H P H^T)^-1 m
 

@@ -160,7 +160,7 @@ class Verdicts:
         begin = _begin(used, end, 0.0)
         before = _begin(used, begin, 1.0)  # of what was used between two faults
         lasted = self._t[at[end - 1]] - self._t[at[begin]]
-        if lasted > LONGEST:
+        if lasted > LONGEST and (name, begin) not in self.anew:
             used[begin:end] = 1.0
             self.anew.add((name, begin))
             return int(at[min(back, begin)])
