@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from graphnav import rotation
 from graphnav.config import Settings
@@ -37,6 +38,7 @@ _FIXES = 10  # and fixes
 _AT_ONCE = 0.05  # s from the start within which a foot that stands is found
 _WALKING = 3.0  # m/s, 1-sigma of the start velocity of a foot in the air
 _BASE = 5.0  # s between fixes that tell the first velocity
+_JUMP = 6.0  # times what fixes usually are off their running median, or their sigma
 _GOOD_FIT = 2.0  # squared sigmas per row below which no other start heading is tried
 
 Smoother = Callable[[Problem, States], Solution]
@@ -71,6 +73,7 @@ def align(recording: Recording, settings: Settings, frame: LocalFrame, smooth: S
     EstimationError
         If nothing in the recording can give an attitude.
     """
+    recording = _plausible(recording)
     span = _motion(recording, settings)
     if span is None:
         return _at_rest(recording, settings, frame)
@@ -79,7 +82,7 @@ def align(recording: Recording, settings: Settings, frame: LocalFrame, smooth: S
 
 def ready(recording: Recording, settings: Settings) -> bool:
     """Whether the fixes so far show all the motion that an alignment wants to see."""
-    span = _motion(recording, settings)
+    span = _motion(_plausible(recording), settings)
     return span is not None and recording.gnss is not None and span[1] < recording.gnss.t[-1]
 
 
@@ -102,6 +105,17 @@ def with_known_heading(found: Alignment, settings: Settings) -> Alignment:
             f"(found: {np.degrees(found.rph[2]):.1f} deg)",
         ),
     )
+
+
+def _plausible(recording: Recording) -> Recording:
+    """Without the fixes that lie far off the running median of five: they would be taken for motion."""
+    gnss = recording.gnss
+    if gnss is None or len(gnss.t) < 5:
+        return recording
+    p = LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
+    off = np.linalg.norm(p - median_filter(p, size=(5, 1), mode="nearest"), axis=1)
+    usual = np.maximum(np.median(off), np.linalg.norm(gnss.sd[:, :2], axis=1))
+    return replace(recording, gnss=_some(gnss, off <= _JUMP * usual))
 
 
 def _motion(recording: Recording, settings: Settings) -> tuple[float, float] | None:
@@ -265,7 +279,11 @@ def _thinned(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss
         if gnss.t[i] - last >= spacing:
             keep.append(i)
             last = gnss.t[i]
-    rows = np.array(keep)
+    return _some(gnss, np.array(keep))
+
+
+def _some(gnss: Gnss, rows: Array) -> Gnss:
+    """Fixes picked by index or mask."""
     pick = {"t": gnss.t[rows], "llh": gnss.llh[rows], "sd": gnss.sd[rows]}
     if gnss.v is not None and gnss.sd_v is not None:
         pick |= {"v": gnss.v[rows], "sd_v": gnss.sd_v[rows]}

@@ -52,6 +52,7 @@ class GnssSettings(_Section):
 
     position: bool = Field(True, description="use the positions")
     velocity: bool = Field(True, description="use the velocities where there are any")
+    faults: bool = Field(True, description="find fixes, and spans of fixes, that are wrong, and leave them out")
     robust: Kernel = Field("none", description="robust kernel of the smoother")
     robust_scale: float = Field(3.0, gt=0, description="whitened norm of a whole fix at which the kernel bends")
     gate: float | None = Field(None, gt=0, description="whitened norm above which the filter rejects a fix")

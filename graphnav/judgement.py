@@ -30,7 +30,7 @@ from scipy.special import chdtr, chdtri, gammaincinv
 
 from graphnav.config import Settings
 from graphnav.constraints.base import Constraint, assemble
-from graphnav.constraints.gnss import GnssPosition
+from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.problem import Problem
 from graphnav.recording import ImuNoise, Recording
@@ -45,6 +45,7 @@ ROUNDS = 4
 MOST_RAISED = 10.0  # an IMU ten times worse than stated is not the explanation: the fixes are, and are judged next
 _SIGNIFICANT = 3.0  # standard deviations of the estimate of a factor that it must differ from 1
 _OUTLIER = 6.0  # whitened norm of a fix that no Gaussian would have
+_CLEARLY = 1.3  # ratio of two figures of noise that makes a difference
 _MOST = 0.98  # the largest share called slow
 _TRIMMED = 0.01
 _BLOCK = 10.0  # s
@@ -100,26 +101,21 @@ def stretch(recording: Recording, begin: float) -> Recording:
     return recording.crop(0.0, float(later[FIXES]) - recording.start)
 
 
-def outliers(problem: Problem, smoothed: Smoothed) -> Array | None:
-    """Weights (N,) of the fixes if there are outliers among them, None if not.
+def suspicious(problem: Problem, smoothed: Smoothed) -> bool:
+    """Whether there are outliers among the fixes."""
+    return any(np.sqrt(_record(problem, rows, smoothed).nis.max(initial=0.0)) > _OUTLIER for rows in _kinds(problem))
 
-    What one outlier does to the states around it would otherwise pass for noise of the IMU. The weight is the one
-    that a batch solution with Cauchy's kernel leaves it.
+
+def outliers(problem: Problem, smoothed: Smoothed) -> dict[str, Array]:
+    """Weights (N,) of the fixes and their velocities, those that a batch solution with Cauchy's kernel leaves them.
+
+    What one outlier does to the states around it would otherwise pass for noise of the IMU.
     """
-    rows = _fixes(problem)
-    if rows is None or np.sqrt(_record(problem, rows, smoothed).nis.max(initial=0.0)) < _OUTLIER:
-        return None
-    robust = replace(problem, constraints=_with(problem, replace(rows, robust="cauchy")))
-    solved = batch(robust, smoothed.states, wanted=(), reintegrate=False)
-    return np.maximum(solved.records[rows.name].weight, 1e-8)
-
-
-def weighted(problem: Problem, weight: Array | None) -> Problem:
-    """A problem with its fixes weighted."""
-    rows = _fixes(problem)
-    if weight is None or rows is None:
-        return problem
-    return replace(problem, constraints=_with(problem, replace(rows, sigma=rows.sigma / np.sqrt(weight)[:, None])))
+    kinds = _kinds(problem)
+    robust = {rows.name: replace(rows, weight=None, robust="cauchy") for rows in kinds}
+    trial = replace(problem, constraints=tuple(robust.get(c.name, c) for c in problem.constraints))
+    solved = batch(trial, smoothed.states, wanted=(), reintegrate=False)
+    return {name: np.maximum(solved.records[name].weight, 1e-8) for name in robust}
 
 
 def judge_fixes(problem: Problem, smoothed: Smoothed) -> FixQuality | None:
@@ -229,11 +225,26 @@ def judge_imu(problem: Problem, forward: Filtered, smoothed: Smoothed) -> ImuQua
     return ImuQuality(factors, tuple(clear))
 
 
+def noisiest(noise: ImuNoise) -> ImuNoise:
+    """The worst that an IMU will be judged to be: what contradicts even that is gross."""
+    return replace(noise, **{name: MOST_RAISED * getattr(noise, name) for name in _FIGURES})
+
+
+def calmer(noise: ImuNoise, than: ImuNoise) -> bool:
+    """Whether an IMU is clearly less noisy by some figure, and by none clearly more."""
+    ratio = [getattr(noise, name) / getattr(than, name) for name in _FIGURES]
+    return min(ratio) < 1.0 / _CLEARLY and max(ratio) < _CLEARLY
+
+
 def imu_notes(stated: ImuNoise, used: ImuNoise) -> tuple[str, ...]:
     """A sentence on figures that were raised."""
     ratios = {words: getattr(used, name) / getattr(stated, name) for name, words in _WORDS.items()}
     up = [f"{words} {ratio:.1f}" for words, ratio in ratios.items() if ratio > 1.0]
     return (f"the IMU is noisier on this drive than stated; figures were multiplied: {', '.join(up)}",) if up else ()
+
+
+def _kinds(problem: Problem) -> list[Constraint]:
+    return [c for c in problem.constraints if isinstance(c, GnssPosition | GnssVelocity)]
 
 
 def _fixes(problem: Problem) -> GnssPosition | None:
@@ -245,7 +256,7 @@ def _with(problem: Problem, rows: GnssPosition) -> tuple[Constraint, ...]:
     return tuple(rows if isinstance(c, GnssPosition) else c for c in problem.constraints)
 
 
-def _record(problem: Problem, rows: GnssPosition, smoothed: Smoothed) -> ConstraintRecord:
+def _record(problem: Problem, rows: Constraint, smoothed: Smoothed) -> ConstraintRecord:
     return residual_record(problem, rows, smoothed.states, _values(problem, smoothed))
 
 

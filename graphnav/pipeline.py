@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from graphnav import judgement
+from graphnav import faults, judgement
 from graphnav.alignment import Alignment, align, with_known_heading
 from graphnav.config import Settings
+from graphnav.constraints.prior import InitialPrior
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
@@ -101,32 +102,54 @@ def _solve(
         recording, settings, frame, lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)
     )
     after = time.perf_counter()
-    recording, settings, said = judged(recording, settings, frame, aligned, stationary)
-    done = time.perf_counter()
     stated = with_known_heading(aligned, settings)
-    problem = pose(recording, settings, frame, stated.state, stated.sigma, stationary)
+    # A stated heading far from the one found sends the filter, and its linearisation with it, astray for a while. It
+    # stays in the problem as its prior, but all else is judged, and the smoother sets out, from what was found.
+    found_heading = aligned.motion is not None  # without motion heading zero is only a convention
+    astray = found_heading and bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
+
+    def posed(wrong: tuple[faults.Fault, ...] = ()) -> tuple[Problem, tuple[str, ...]]:
+        sensed, how, said = judged(recording, settings, frame, aligned, stationary, wrong)
+        begin = aligned if astray else stated
+        return pose(sensed, how, frame, begin.state, begin.sigma, stationary), said
+
+    def watched(problem: Problem) -> tuple[Problem, Filtered]:
+        forward = ekf(problem, progress, aligned.until, watch=True)
+        return faults.weighted(problem, forward.weights), forward
+
+    problem, said = posed()
+    done = time.perf_counter()
+    problem, forward = watched(problem)
+    if faults.count(problem):
+        # what faults did to the states around them may have passed for noise of the IMU
+        other, says = posed(faults.spans(problem))
+        if judgement.calmer(other.recording.imu.noise, problem.recording.imu.noise):
+            other, ahead = watched(other)
+            if faults.count(other) <= faults.count(problem):
+                problem, forward, said = other, ahead, says
     timings = {
         "detection": detected - began,
         "alignment": after - detected,
         "judgement": done - after,
-        "preintegration": time.perf_counter() - done,
     }
-    # A stated heading far from the one found sends the filter, and its linearisation with it, astray for a while. It
-    # stays in the problem as its prior, but wheels are judged, and the smoother sets out, from what was found.
-    found_heading = aligned.motion is not None  # without motion heading zero is only a convention
-    astray = found_heading and bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
-    prior = problem.prior
-    if astray:
-        problem = replace(problem, prior=replace(prior, mean=aligned.state, sigma=aligned.sigma[None]))
-    forward = ekf(problem, progress, aligned.until)
-    began, smoothed = time.perf_counter(), backward(problem, forward, progress)
-    problem, raised = judgement.judge_wheels(problem, smoothed)
-    if raised:
+    began, dirty = time.perf_counter(), faults.count(problem) > 0
+    if dirty:
+        problem = faults.widened(problem)
         forward = ekf(problem, progress, aligned.until)
+    smoothed = backward(problem, forward, progress)
+    problem, raised = judgement.judge_wheels(problem, smoothed)
+    if dirty:
+        problem, forward = watched(faults.readmitted(problem, smoothed))
+    elif raised:
+        forward = ekf(problem, progress, aligned.until)
+    if dirty or raised:
         smoothed, said = backward(problem, forward, progress), (*said, *raised)
+    wrong = faults.spans(problem, smoothed)
+    said = (*said, *faults.notes(wrong, problem))
     timings["smoother"] = time.perf_counter() - began
     start = smoothed
     if astray:
+        prior = InitialPrior(keyframe=problem.prior.keyframe, mean=stated.state, sigma=stated.sigma[None])
         problem = replace(problem, prior=prior)
         forward = ekf(problem, progress, aligned.until)
         smoothed = backward(problem, forward, progress)
@@ -147,6 +170,7 @@ def _solve(
             out[name],
             notes=(*stated.notes, *found.notes, *said, *out[name].notes),
             detections=found.all,
+            excluded=wrong,
             timings={k: timings.get(k, 0.0) + out[name].timings.get(k, 0.0) for k in (*timings, *out[name].timings)},
         )
         for name in solvers
@@ -154,7 +178,12 @@ def _solve(
 
 
 def judged(
-    recording: Recording, settings: Settings, frame: LocalFrame, aligned: Alignment, stationary: np.ndarray
+    recording: Recording,
+    settings: Settings,
+    frame: LocalFrame,
+    aligned: Alignment,
+    stationary: np.ndarray,
+    wrong: tuple[faults.Fault, ...] = (),
 ) -> tuple[Recording, Settings, tuple[str, ...]]:
     """Recording and settings with the figures of IMU and fixes judged by the first part of the drive."""
     gnss, stated = settings.gnss, recording.imu.noise
@@ -163,17 +192,30 @@ def judged(
     free = settings.without_wheels()  # wheels are judged by what comes of this, so they have no say in it
     plain = free.model_copy(update={"gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0})})
     part = judgement.stretch(recording, aligned.motion)
-    noise, weight = stated, None
+    noise = stated
+    weight: dict[str, np.ndarray] = {}
+
+    def posed(how: Settings) -> Problem:
+        noisy = replace(part, imu=replace(part.imu, noise=noise))
+        problem = faults.weighted(pose(noisy, how, frame, aligned.state, aligned.sigma, stationary), weight)
+        return faults.without(problem, wrong)
 
     def smoothed(how: Settings) -> tuple[Problem, Filtered, Smoothed]:
-        noisy = replace(part, imu=replace(part.imu, noise=noise))
-        problem = judgement.weighted(pose(noisy, how, frame, aligned.state, aligned.sigma, stationary), weight)
+        problem = posed(how)
         forward = ekf(problem, opening=aligned.until)
         return problem, forward, backward(problem, forward)
 
-    problem, forward, back = smoothed(plain)
-    weight = judgement.outliers(problem, back)
-    if weight is not None:
+    try:
+        problem, forward, back = smoothed(plain)
+        suspicious = judgement.suspicious(problem, back)
+    except EstimationError:
+        suspicious = True
+    if suspicious:
+        noise = judgement.noisiest(stated)
+        weight = ekf(posed(plain), opening=aligned.until, watch=True).weights
+        noise = stated
+        problem, forward, back = smoothed(plain)
+        weight = judgement.outliers(problem, back)
         problem, forward, back = smoothed(plain)
     fixes = judgement.judge_fixes(problem, back)
     if not settings.imu.as_stated and judgement.judge_imu(problem, forward, back).clear:

@@ -68,6 +68,17 @@ class ParameterEstimate:
 
 
 @dataclass(frozen=True)
+class Fault:
+    """Consecutive rows of one constraint that no solver uses."""
+
+    kind: str  # name of the constraint
+    t_start: float  # s, of the first row
+    t_end: float  # s, of the last
+    count: int
+    reason: str = ""
+
+
+@dataclass(frozen=True)
 class Solution:
     """One solver's answer. Covariance blocks are of the error state of `graphnav.state`, (K, 15, 15)."""
 
@@ -85,6 +96,7 @@ class Solution:
     timings: dict[str, float] = field(default_factory=dict)  # s by stage
     notes: tuple[str, ...] = ()
     detections: tuple[Detection, ...] = ()  # where the platform was found to stand, the fused answer last
+    excluded: tuple[Fault, ...] = ()  # spans of measurements found to be wrong, which no solver used
     between: tuple[Between, ...] = ()  # gives states between keyframes, one for each piece of the recording
 
     @property
@@ -169,6 +181,7 @@ def joined(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:
         stopped="; ".join(dict.fromkeys(p.stopped for p in parts)),
         notes=(*notes, *dict.fromkeys(note for part in parts for note in part.notes)),
         detections=tuple(d for p in parts for d in p.detections),
+        excluded=tuple(f for p in parts for f in p.excluded),
         between=tuple(b for p in parts for b in p.between),
     )
 

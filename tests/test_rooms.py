@@ -17,7 +17,7 @@ ROOMS = [
     "formats", "draft", "allan", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding",
     "checks", "detectors",
     "preintegration", "unresolved", "dynamics", "constraints", "problem", "solution", "alignment",
-    "dense", "solvers", "judgement", "pipeline",
+    "dense", "solvers", "faults", "judgement", "pipeline",
     "interpolation", "metrics", "scoring", "strides", "evaluation", "exporters", "online",
     "panels", "page", "plots", "report_tables", "report_words", "report_pictures", "report_provenance", "report",
     "workflow", "outputs", "convert", "terminal", "detection_report", "cli_logs", "cli",

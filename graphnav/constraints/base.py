@@ -4,7 +4,7 @@ A constraint is N rows of m numbers, each row tied to one keyframe. `linearize` 
 parameter values of some rows, the residual (predicted minus measured), its derivative with respect to
 the error-state blocks and parameters it depends on, and the measurement's sigma. It knows nothing of
 filters or graphs, and no weights, gates or robust kernels: those belong to the solvers, which read
-`robust`, `robust_scale` and `gate`.
+`robust`, `robust_scale`, `gate`, `watched` and `weight`.
 """
 
 from __future__ import annotations
@@ -69,6 +69,8 @@ class Constraint(ABC):
     robust: str = "none"
     robust_scale: float = 3.0
     gate: float | None = None
+    watched: bool = False  # for errors that last
+    weight: Array | None = None  # (N,) of each row's information, 0 = not used; all 1 when None
     notes: tuple[str, ...] = ()  # sentences that whoever reads the result must know
 
     def __len__(self) -> int:
@@ -99,3 +101,11 @@ def assemble(linearized: Linearized, parameters: dict[str, slice] | None = None,
         elif parameters is not None and key in parameters:
             H[:, :, parameters[key]] = J
     return H
+
+
+def weighted_sigma(rows: Constraint, sigma: Array, which: slice | Array = slice(None)) -> Array:
+    """(n, m) sigma of some rows with their weights in it: infinite where the weight is 0."""
+    if rows.weight is None:
+        return sigma
+    with np.errstate(divide="ignore"):
+        return sigma / np.sqrt(rows.weight[which])[:, None]

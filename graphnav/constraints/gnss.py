@@ -66,6 +66,7 @@ def _common(scene: Scene, offset: str) -> dict[str, Any]:
         "robust": settings.robust,
         "robust_scale": settings.robust_scale,
         "gate": settings.gate,
+        "watched": settings.faults,
     }
 
 

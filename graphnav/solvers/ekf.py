@@ -36,15 +36,19 @@ from scipy.linalg.lapack import dposv
 
 from graphnav import rotation
 from graphnav.constraints.base import Constraint, assemble
+from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.dense import dense
 from graphnav.dynamics import SCALE
 from graphnav.errors import EstimationError
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
-from graphnav.state import DIM, States
+from graphnav.solvers.watch import Bank, Verdicts
+from graphnav.state import BLOCKS, DIM, States
 
 Progress = Callable[[str, float], None]
+_NOTHING = np.empty((1, 0))
+_REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ class Forward:
     P_predicted: Array  # (K, D, D)
     F: Array  # (K-1, D, D)
     records: dict[str, _Innovations]
+    weights: dict[str, Array]  # (N,) of the rows of watched constraints: 0 where a fault was found
     about: Smoothed | None  # points at which the first keyframes were linearised; their P is of errors about these
 
 
@@ -69,19 +74,23 @@ class Filtered(Forward):
     solution: Solution
 
 
-def ekf(problem: Problem, progress: Progress | None = None, opening: float | None = None) -> Filtered:
+def ekf(
+    problem: Problem, progress: Progress | None = None, opening: float | None = None, watch: bool = False
+) -> Filtered:
     """Run the filter over all keyframes.
 
     Parameters
     ----------
     opening : s, the end of what the alignment has seen of the recording; up to there the filter runs twice. Estimates
         after it depend on nothing later than themselves.
+    watch : look for errors that last in the rows that are to be watched, and go back to before them.
     """
     began = time.perf_counter()
     K, about = len(problem.t), None
     if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
-        about = backward(problem, _forward(problem, n))
-    one = _forward(problem, K, about, progress)
+        first = _forward(problem, n, watch=watch)
+        about = backward(problem, first)
+    one = _forward(problem, K, about, progress, watch)
     seconds = time.perf_counter() - began
     filtered, P = States.stack(one.states), one.P[:, :DIM, :DIM]
     if about is not None:
@@ -106,7 +115,13 @@ def ekf(problem: Problem, progress: Progress | None = None, opening: float | Non
     return Filtered(**vars(one), solution=solution)
 
 
-def _forward(problem: Problem, K: int, about: Smoothed | None = None, progress: Progress | None = None) -> Forward:
+def _forward(
+    problem: Problem,
+    K: int,
+    about: Smoothed | None = None,
+    progress: Progress | None = None,
+    watch: bool = False,
+) -> Forward:
     """Filter the first K keyframes, of which the first few are linearised at given points."""
     columns, n = problem.columns, 0 if about is None else len(about.values)
     D = DIM + sum(s.stop - s.start for s in columns.values())
@@ -116,20 +131,33 @@ def _forward(problem: Problem, K: int, about: Smoothed | None = None, progress: 
     P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
     records = {rows.name: _Innovations(rows) for rows in problem.constraints}
     first = {rows.name: np.searchsorted(rows.keyframe, np.arange(K + 1)) for rows in problem.constraints}
+    watched = [c for c in problem.constraints if watch and c.watched and isinstance(c, GnssPosition | GnssVelocity)]
+    bank = Bank(watched, problem.t, D) if watched else None
+    banks: dict[int, Bank] = {}  # as they were before the latest keyframes with fixes
+    verdicts = Verdicts(watched, problem.t)
+    for rows in watched:
+        records[rows.name].used = verdicts.used[rows.name]
+    begun = (state, values, P)
 
     all_P, all_Pp, all_F = np.empty((K, D, D)), np.empty((K, D, D)), np.empty((K - 1, D, D))
     all_values, all_vp = np.empty((K, D - DIM)), np.empty((K, D - DIM))
-    states, predicted = [], []
-    all_F[:] = np.eye(D)
+    states, predicted = [state] * K, [state] * K
+    identity = np.eye(D)
     scale_at = columns.get(SCALE)
     steps, added = _node_steps(problem), np.zeros(D)
-    for k in range(K):
+    k = 0
+    while k < K:
+        if bank is not None and any(first[rows.name][k] < first[rows.name][k + 1] for rows in watched):
+            banks[k] = bank.copy()
+            if len(banks) > _REMEMBERED:
+                del banks[next(iter(banks))]
         if k:
             step = slice(k - 1, k)
             at, at_values = (state, values) if about is None or k >= n else about.at(k - 1)
             scale = None if scale_at is None else at_values[_shift(scale_at)]
             ahead, F15 = problem.motion.propagate(step, at, scale)
             F = all_F[k - 1]
+            F[:] = identity
             F[:DIM, :DIM] = F15[0]
             if scale_at is not None:
                 F[:DIM, scale_at] = problem.motion.scale_columns(step, F15)[0]
@@ -141,6 +169,8 @@ def _forward(problem: Problem, K: int, about: Smoothed | None = None, progress: 
                 added[column] = chain.sigma[j] ** 2
             P = F @ P @ F.T
             P[:DIM, :DIM] += problem.motion.noise(step, at.R_nb)[0]
+            if bank is not None:
+                bank.predicted(F)
             if k in steps:
                 P.flat[:: D + 1] += added
                 added[:] = 0.0
@@ -148,21 +178,38 @@ def _forward(problem: Problem, K: int, about: Smoothed | None = None, progress: 
                 e = F @ about.offset(k - 1, state, values)
                 ahead, at_values = ahead.plus(e[None, :DIM]), at_values + e[DIM:]
             state, values = ahead, at_values
-        predicted.append(state)
+        for rows in watched:
+            if (rows.name, first[rows.name][k]) in verdicts.anew:
+                block = BLOCKS["p" if rows.name == GnssPosition.name else "v"]
+                P[block, block] += 1e6 * np.eye(3)
+        predicted[k] = state
         all_vp[k] = values
         all_Pp[k] = P
+        back: int | None = None
         for rows in problem.constraints:
             lo, hi = first[rows.name][k], first[rows.name][k + 1]
             if hi > lo:
                 x, record = (state, values, P), records[rows.name]
-                state, values, P = _update(rows, lo, hi, *x, columns, record, about if k < n else None, k)
+                at_point = about if k < n else None
+                state, values, P, fault = _update(rows, lo, hi, *x, columns, record, at_point, k, bank)
+                if fault is not None:
+                    back = verdicts.settle(rows.name, fault, hi)
+                    break
+        if back is not None:  # once more from before the fault, without it
+            bank = banks.get(back) or Bank(watched, problem.t, D)
+            banks = {key: old for key, old in banks.items() if key < back}
+            state, values, P = (states[back - 1], all_values[back - 1], all_P[back - 1]) if back else begun
+            k = back
+            continue
         if about is not None and k == n - 1:
             P = _about_own(P, about.offset(k, state, values)[:3])  # from here on linearised where the filter is
-        states.append(state)
+        states[k] = state
         all_P[k], all_values[k] = P, values
         if progress is not None and k % 256 == 0:
             progress("filter", k / K)
-    return Forward(states, all_values, all_vp, all_P, predicted, all_Pp, all_F, records, about)
+        k += 1
+    weights = {rows.name: records[rows.name].used for rows in watched}
+    return Forward(states, all_values, all_vp, all_P, predicted, all_Pp, all_F, records, weights, about)
 
 
 def _update(
@@ -176,8 +223,9 @@ def _update(
     record: _Innovations,
     about: Smoothed | None,
     k: int,
-) -> tuple[States, Array, Array]:
-    """One measurement update with rows lo..hi of a constraint at keyframe k."""
+    bank: Bank | None,
+) -> tuple[States, Array, Array, int | None]:
+    """One measurement update with rows lo..hi of a constraint at keyframe k; the first row of a fault comes last."""
     n = hi - lo
     at, at_values = (state, values) if about is None else about.at(k)
     here = at if n == 1 else at[np.zeros(n, dtype=int)]
@@ -187,30 +235,37 @@ def _update(
     linear = rows.linearize(here, given, slice(lo, hi))
     H = assemble(linear, columns, len(P)).reshape(-1, len(P))
     r, sigma, e = linear.residual.ravel(), linear.sigma.ravel(), np.zeros(len(P))
+    weight = float(np.min(record.used[lo:hi]))
+    if 0.0 < weight < 1.0:
+        sigma = sigma / np.sqrt(weight)
     if about is not None:
         e = about.offset(k, state, values)
         r = r + H @ e
     PHt = P @ H.T
     S = H @ PHt
     S.flat[:: len(r) + 1] += sigma * sigma
+    G = _NOTHING if bank is None or weight == 0.0 else bank.signature(rows.name, lo, H)
     # LAPACK called directly: for matrices this small the checks around it would cost more than the work
-    right = np.empty((len(r), len(P) + 1))
-    right[:, 0], right[:, 1:] = r, PHt.T
+    D = len(P)
+    right = np.empty((len(r), D + 1 + G.shape[1]))
+    right[:, 0], right[:, 1 : D + 1], right[:, D + 1 :] = r, PHt.T, G
     _, solved, info = dposv(S, right)
     if info:
         raise EstimationError(f"the filter's covariance broke down at '{rows.name}' row {lo}: check sigmas and units")
     nis = float(r @ solved[:, 0])
-    used = rows.gate is None or nis <= rows.gate**2
-    record.set(slice(lo, hi), r.reshape(n, -1), np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1), nis / n, float(used))
-    if not used:
-        return state, values, P
-    K = solved[:, 1:].T
+    if rows.gate is not None and nis > rows.gate**2:
+        weight = 0.0
+    record.set(slice(lo, hi), r.reshape(n, -1), np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1), nis / n, weight)
+    if weight == 0.0:
+        return state, values, P, None
+    K = solved[:, 1 : D + 1].T
     d = e - K @ r
     IKH = -K @ H
     IKH.flat[:: len(P) + 1] += 1.0
     P = IKH @ P @ IKH.T + (K * (sigma * sigma)) @ K.T
     P = 0.5 * (P + P.T)  # rounding's asymmetry would grow, past what a stop leaves between its place and the state
-    return at.plus(d[None, :DIM]), at_values + d[DIM:], P
+    fault = None if bank is None else bank.updated(rows.name, K, G, solved[:, D + 1 :], r)
+    return at.plus(d[None, :DIM]), at_values + d[DIM:], P, fault
 
 
 def _about_own(P: Array, e: Array) -> Array:
@@ -314,6 +369,8 @@ def residual_record(
     linear = rows.linearize(states[at], {p.name: values[p.name][at] for p in rows.parameters}, slice(None))
     nis = np.sum((linear.residual / linear.sigma) ** 2, axis=-1)
     weight = np.ones(len(rows)) if weight is None else weight
+    if rows.weight is not None:
+        weight = weight * rows.weight
     return ConstraintRecord("residual", problem.t[at], linear.residual, linear.sigma, nis, weight, rows.axes, rows.unit)
 
 
@@ -325,6 +382,7 @@ class _Innovations:
         shape = (len(rows), len(rows.axes))
         self.residual, self.sigma = np.zeros(shape), np.ones(shape)
         self.nis, self.weight = np.zeros(len(rows)), np.ones(len(rows))
+        self.used = np.ones(len(rows)) if rows.weight is None else rows.weight.copy()
 
     def set(self, at: slice, residual: Array, sigma: Array, nis: float, weight: float) -> None:
         self.residual[at], self.sigma[at], self.nis[at], self.weight[at] = residual, sigma, nis, weight

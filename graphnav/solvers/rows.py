@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav.constraints.base import Constraint, assemble
+from graphnav.constraints.base import Constraint, assemble, weighted_sigma
 from graphnav.dynamics import SCALE
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array, mv
@@ -127,8 +127,9 @@ def whitened(problem: Problem, point: Point, layout: Layout) -> Rows:
     out: Rows = [(links, -mv(W, r))]
     for rows in (problem.prior, *problem.constraints):
         linear = rows.linearize(x[rows.keyframe], _of_rows(rows, at_keyframes), slice(None))
-        weight, _ = weight_and_cost(rows.robust, norms(linear.residual, linear.sigma), rows.robust_scale)
-        scale = np.sqrt(weight)[:, None] / linear.sigma
+        sigma = weighted_sigma(rows, linear.sigma)
+        weight, _ = weight_and_cost(rows.robust, norms(linear.residual, sigma), rows.robust_scale)
+        scale = np.sqrt(weight)[:, None] / sigma
         weighted = {p.name: scale[..., None] * linear.jacobians[p.name] for p in rows.parameters}
         blocks = [(rows.keyframe, scale[..., None] * assemble(linear))]
         out.append((blocks + layout.parameter_blocks(rows.keyframe, weighted), -scale * linear.residual))
@@ -143,7 +144,8 @@ def cost(problem: Problem, point: Point, layout: Layout) -> float:
     total = 0.5 * float(np.sum(mv(layout.whitener, problem.motion.residual(x, point.scale)) ** 2))
     for rows in (problem.prior, *problem.constraints):
         linear = rows.linearize(x[rows.keyframe], _of_rows(rows, at_keyframes), slice(None))
-        total += float(np.sum(weight_and_cost(rows.robust, norms(linear.residual, linear.sigma), rows.robust_scale)[1]))
+        s = norms(linear.residual, weighted_sigma(rows, linear.sigma))
+        total += float(np.sum(weight_and_cost(rows.robust, s, rows.robust_scale)[1]))
     for chain in problem.chains:
         for _, b in _chain_rows(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name]):
             total += 0.5 * float(np.sum(b * b))

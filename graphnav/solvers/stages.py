@@ -21,7 +21,7 @@ import numpy as np
 from scipy.linalg.lapack import dgeqrf, dtrtri
 
 from graphnav import rotation
-from graphnav.constraints.base import assemble
+from graphnav.constraints.base import assemble, weighted_sigma
 from graphnav.dynamics import SCALE, Motion
 from graphnav.errors import EstimationError
 from graphnav.problem import Problem
@@ -216,8 +216,9 @@ def at_points(
         at = constraint.keyframe[lo:hi] - first + skip
         given = {p.name: values[at, _shift(columns[p.name])] for p in constraint.parameters}
         linear = constraint.linearize(states[at], given, slice(lo, hi))
-        H = assemble(linear, columns, D) / linear.sigma[..., None]
-        b = -linear.residual / linear.sigma
+        sigma = weighted_sigma(constraint, linear.sigma, slice(lo, hi))
+        H = assemble(linear, columns, D) / sigma[..., None]
+        b = -linear.residual / sigma
         edge = np.searchsorted(at, np.arange(n + 1) + skip)
         for i in np.flatnonzero(np.diff(edge)):
             own = slice(edge[i], edge[i + 1])

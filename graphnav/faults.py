@@ -1,0 +1,152 @@
+"""Spans of fixes that are wrong: looked at again from both sides, and the problem without them.
+
+The filter finds faults as they happen (`graphnav.solvers.watch`); what it can know at a time is not all. It finds late
+what grows, and may refuse good fixes for a while after a fault, because it has drifted. With the whole drive smoothed
+without a fault and its surroundings, their residuals r are predictions from both sides: a window of n of them with
+mean m has
+
+    T = m^T (R / n + H P H^T)^-1 m
+
+chi-square without a fault; H P H^T counts in full, as if the state's error were the same all along. From both ends of
+a fault inwards fixes are used again, as far as no window of them disagrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, assemble
+from graphnav.problem import Problem
+from graphnav.rotation import Array
+from graphnav.solution import Fault
+from graphnav.solvers.ekf import Smoothed
+from graphnav.state import DIM
+
+_EDGE = 60.0  # s
+_DISAGREES = 1e-3  # chance of T by which a window next to a fault is taken for a part of it
+
+
+def spans(problem: Problem, smoothed: Smoothed | None = None) -> tuple[Fault, ...]:
+    """The rows of weight 0, by constraint and in order of time; with a smoothed solution, what is wrong with them."""
+    out = []
+    for rows in problem.constraints:
+        if rows.weight is None:
+            continue
+        lost = np.flatnonzero(rows.weight == 0.0)
+        if not len(lost):
+            continue
+        t = problem.t[rows.keyframe]
+        off = None if smoothed is None else np.linalg.norm(_linear(problem, rows, smoothed, lost).residual, axis=1)
+        for run in np.split(np.arange(len(lost)), np.flatnonzero(np.diff(lost) > 1) + 1):
+            reason = ""
+            if off is not None:
+                reason = f"{np.median(off[run]):.2g} {rows.unit} from where everything else puts it"
+                if len(run) > 1:
+                    reason += f", {np.max(off[run]):.2g} at most"
+            first, last = lost[run[0]], lost[run[-1]]
+            out.append(Fault(rows.name, float(t[first]), float(t[last]), len(run), reason))
+    return tuple(out)
+
+
+def notes(faults: tuple[Fault, ...], problem: Problem) -> tuple[str, ...]:
+    """A sentence for each kind of fix that some are left out of."""
+    out = []
+    for rows in problem.constraints:
+        own = [fault for fault in faults if fault.kind == rows.name]
+        if own:
+            longest = max(own, key=lambda f: f.t_end - f.t_start)
+            begin = longest.t_start - problem.recording.start
+            out.append(
+                f"{rows.name}: {sum(f.count for f in own)} of {len(rows)} are wrong and left out, in {len(own)} spans; "
+                f"the longest, from {begin:.1f} s for {longest.t_end - longest.t_start:.1f} s, is {longest.reason}"
+            )
+    return tuple(out)
+
+
+def weighted(problem: Problem, weights: dict[str, Array]) -> Problem:
+    """A problem with its rows weighted, (N,) by constraint."""
+    constraints = (replace(c, weight=weights[c.name]) if c.name in weights else c for c in problem.constraints)
+    return replace(problem, constraints=tuple(constraints))
+
+
+def without(problem: Problem, faults: Iterable[Fault]) -> Problem:
+    """The problem with the rows inside faults given no weight."""
+    weights = {}
+    for rows in problem.constraints:
+        own = [fault for fault in faults if fault.kind == rows.name]
+        if own:
+            t = problem.t[rows.keyframe]
+            weights[rows.name] = np.ones(len(rows)) if rows.weight is None else rows.weight.copy()
+            for fault in own:
+                weights[rows.name][(t >= fault.t_start - SAME_TIME) & (t <= fault.t_end + SAME_TIME)] = 0.0
+    return weighted(problem, weights)
+
+
+def widened(problem: Problem) -> Problem:
+    """The problem with as much again left out on either side of every fault, at most `_EDGE`.
+
+    A fault that grows is found late, and what the filter used of it before would hide it from a smoother.
+    """
+    wider = []
+    for fault in spans(problem):
+        more = min(fault.t_end - fault.t_start, _EDGE)
+        wider.append(replace(fault, t_start=fault.t_start - more, t_end=fault.t_end + more))
+    return without(problem, wider)
+
+
+def count(problem: Problem) -> int:
+    """How many rows are left out."""
+    return sum(int(np.sum(c.weight == 0.0)) for c in problem.constraints if c.weight is not None)
+
+
+def readmitted(problem: Problem, smoothed: Smoothed) -> Problem:
+    """The problem with those fixes back in use that agree with a smoothed solution made without them."""
+    back = {}
+    for rows in problem.constraints:
+        if rows.watched and rows.weight is not None and np.any(rows.weight == 0.0):
+            weight = rows.weight.copy()
+            weight[_consistent(problem, rows, smoothed)] = 1.0
+            back[rows.name] = weight
+    return weighted(problem, back)
+
+
+def _consistent(problem: Problem, rows: Constraint, smoothed: Smoothed) -> Array:
+    """Unused rows at the ends of faults that agree with what they were predicted to be."""
+    assert rows.weight is not None
+    lost = np.flatnonzero(rows.weight == 0.0)
+    at = rows.keyframe[lost]
+    linear = _linear(problem, rows, smoothed, lost)
+    H, m = assemble(linear, problem.columns, smoothed.P.shape[-1]), linear.residual.shape[1]
+    HPH = H @ smoothed.P[at] @ np.swapaxes(H, -1, -2)
+    R = linear.sigma[..., None] ** 2 * np.eye(m)
+    limit = float(chdtri(m, _DISAGREES))
+    agree = np.zeros(len(lost), dtype=bool)
+    for run in np.split(np.arange(len(lost)), np.flatnonzero(np.diff(lost) > 1) + 1):
+        earliest, latest, n = len(run), 0, 1  # end of the window that ends first, start of that which starts last
+        sums = [np.cumsum(np.concatenate([np.zeros((1, *x.shape[1:])), x[run]]), axis=0)
+                for x in (linear.residual, R, HPH)]  # fmt: skip
+        while n <= len(run):
+            first = np.arange(len(run) - n + 1)
+            mean, noise, drift = ((s[first + n] - s[first]) / n for s in sums)
+            T = np.sum(mean * np.linalg.solve(noise / n + drift, mean[..., None])[..., 0], axis=1)
+            disagree = first[limit < T]
+            if len(disagree):
+                earliest, latest = min(earliest, int(disagree[0]) + n - 1), max(latest, int(disagree[-1]) + 1)
+            n *= 2
+        agree[run[:earliest]] = True
+        agree[run[latest:]] = True
+    return lost[agree]
+
+
+def _linear(problem: Problem, rows: Constraint, smoothed: Smoothed, which: Array) -> Linearized:
+    at = rows.keyframe[which]
+    values = {p.name: smoothed.values[at][:, _shift(problem.columns[p.name])] for p in rows.parameters}
+    return rows.linearize(smoothed.states[at], values, which)
+
+
+def _shift(columns: slice) -> slice:
+    return slice(columns.start - DIM, columns.stop - DIM)
