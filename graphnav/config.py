@@ -127,9 +127,9 @@ class FootSettings(_Section):
     closed_loop: float | None = Field(
         None, gt=0, description="m, 1-sigma; given, the end is the start (only without GNSS)"
     )
-    robust: Kernel = Field("none", description="robust kernel of the smoother")
+    robust: Kernel = Field("cauchy", description="robust kernel of the smoother")
     robust_scale: float = Field(3.0, gt=0, description="whitened norm of a row at which the kernel bends")
-    gate: float | None = Field(None, gt=0, description="whitened norm above which the filter rejects a row")
+    gate: float | None = Field(6.0, gt=0, description="whitened norm above which the filter rejects a row")
 
 
 class StanceSettings(_Section):

@@ -16,7 +16,7 @@ from graphnav.preintegration import Intervals, Samples, bridge_gaps, preintegrat
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.state import DIM, Parameter, States
-from graphnav.unresolved import with_unresolved_motion
+from graphnav.unresolved import with_coning, with_unresolved_motion
 from graphnav.wheels import MeanSpeed
 
 NODE_SPACING = 5.0  # s between the nodes of a slowly moving parameter: a twentieth of the shortest correlation time
@@ -98,7 +98,7 @@ def pose(
     t = times
     samples = bridge_gaps(recording.imu)
     if recording.platform == "foot":
-        samples = with_unresolved_motion(samples, recording.imu.noise)
+        samples = with_coning(with_unresolved_motion(samples, recording.imu.noise))
     intervals = preintegrate(samples, recording.imu, t, start.ba[0], start.bg[0])
     scene = Scene(recording, settings, frame, t, stops, intervals, speed)
     built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))

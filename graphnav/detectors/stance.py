@@ -15,12 +15,18 @@ be sharp, because the rows of `graphnav.constraints.foot` account for the rollin
 is. What must not happen is to take part of a swing for a stance: the slow first step of a walk has a moment in which
 force and rate are low. But such a moment is not as deep as stances are. So spans whose lowest e stands out from
 that of all spans, by three of their spreads (median absolute deviation, in log e), are left out.
+
+What e cannot see is a force that lasts: a foot that is carried level to its last footprint and slows down there turns
+little, and what slows it tilts the mean force more than it lengthens it. But over the whole span it adds up. So from
+the quietest moment near either end the gyro carries the axes outward, and the force beyond what it was there is
+integrated; the span ends where that velocity exceeds the threshold times `_REACH`, the most that rolling allows.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from graphnav import rotation
 from graphnav.config import StanceSettings
 from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, merged, spans_of
 from graphnav.detectors.glrt import glrt_statistic
@@ -29,10 +35,11 @@ from graphnav.recording import Imu
 from graphnav.rotation import Array
 
 _QUIET = 1.0  # s; the quietest of the recording says what bias and gravity are
-_GAP = 3.0  # sample periods; a longer silence is no stance
 _ENOUGH = 5  # spans, to say what is usual
 _LEAST_SPREAD = 0.3  # of log e, between the stances of the most even walk
 _SPREADS = 3.0
+_NEAR = 0.4  # s from an end of a span within which its quietest moment is looked for
+_REACH = 0.2  # m, from an IMU on a shoe to where the shoe touches the floor, at most
 
 
 def detect_stances(imu: Imu, period: float, settings: StanceSettings) -> Detections:
@@ -48,7 +55,7 @@ def detect_stances(imu: Imu, period: float, settings: StanceSettings) -> Detecti
     bias, g = _quietest(imu, period)
     e = np.sqrt(glrt_statistic(imu.accel, imu.gyro - bias, window, settings.force_per_rate, 1.0, g))
     t = 0.5 * (imu.t[: len(e)] + imu.t[window - 1 :]) - 0.5 * period  # a row speaks for the period before it
-    whole = unbroken(np.r_[True, np.diff(imu.t) < _GAP * period], window)
+    whole = unbroken(np.r_[True, np.diff(imu.t) < period + settings.bridge], window)
     e = np.where(whole, e, np.nan)
     below = e < settings.threshold
     spans = longer_than(merged(spans_of(below, t, 0.5 * period), settings.bridge), settings.shortest)
@@ -63,6 +70,7 @@ def detect_stances(imu: Imu, period: float, settings: StanceSettings) -> Detecti
         () if len(kept) == len(spans)
         else (f"{len(spans) - len(kept)} short lulls that do not reach as deep as the stances were left out",)
     )  # fmt: skip
+    kept = _without_sliding(kept, imu, period, t, e, bias, settings.threshold * _REACH)
     found = Detection("stance", t, e, settings.threshold, below, spans)
     answer = Detection("fused", t, e, settings.threshold, inside(t, kept), kept, notes)
     return Detections(kept, (found, answer), notes)
@@ -88,3 +96,32 @@ def _as_deep_as_others(spans: Array, t: Array, e: Array) -> Array:
     middle = float(np.median(depth))
     spread = max(1.4826 * float(np.median(np.abs(depth - middle))), _LEAST_SPREAD)
     return np.asarray(depth < middle + _SPREADS * spread)
+
+
+def _without_sliding(
+    spans: Array, imu: Imu, period: float, t: Array, e: Array, bias: Array, fastest: float
+) -> Array:  # fmt: skip
+    """The spans (M, 2) cut where the foot moves at more than `fastest` m/s against their quietest moments."""
+    out = spans.copy()
+    for side, way in ((0, -1), (1, 1)):
+        quiet = np.empty(len(spans))
+        for k, span in enumerate(spans):
+            lo, hi = (span[0], min(span[0] + _NEAR, span[1])) if side == 0 else (max(span[1] - _NEAR, span[0]), span[1])
+            rows = slice(*np.searchsorted(t, [lo, hi]))
+            quiet[k] = t[rows][np.nanargmin(e[rows])] if np.isfinite(e[rows]).any() else 0.5 * (lo + hi)
+        # rows outward from the quiet moment: row k speaks for the period before its time
+        first = np.searchsorted(imu.t, quiet) + (0 if side == 0 else 1)
+        steps = np.rint(np.abs(spans[:, side] - quiet) / period).astype(int)
+        at = np.clip(first + way * np.arange(steps.max(initial=0))[:, None], 0, len(imu.t) - 1)
+        R = np.tile(np.eye(3), (len(spans), 1, 1))
+        v = np.zeros((len(spans), 3))
+        usual = imu.accel[np.clip(first + way * np.arange(3)[:, None], 0, len(imu.t) - 1)].mean(axis=0)
+        gone = np.zeros(len(spans), dtype=bool)
+        for k, row in enumerate(at):
+            half = rotation.exp(0.5 * way * period * (imu.gyro[row] - bias))
+            v += period * ((R @ half @ imu.accel[row][..., None])[..., 0] - usual)
+            R = R @ half @ half
+            now = (k < steps) & ~gone & (np.linalg.norm(v, axis=1) > fastest)
+            out[now, side] = imu.t[row[now]] - (0.0 if side == 0 else period)
+            gone |= now
+    return out

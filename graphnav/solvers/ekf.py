@@ -180,32 +180,37 @@ def _update(
     """One measurement update with rows lo..hi of a constraint at keyframe k."""
     n = hi - lo
     at, at_values = (state, values) if about is None else about.at(k)
-    here = at if n == 1 else at[np.zeros(n, dtype=int)]
-    given = {p.name: at_values[None, _shift(columns[p.name])] for p in rows.parameters}
-    if n > 1:
-        given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
-    linear = rows.linearize(here, given, slice(lo, hi))
-    H = assemble(linear, columns, len(P)).reshape(-1, len(P))
-    r, sigma, e = linear.residual.ravel(), linear.sigma.ravel(), np.zeros(len(P))
-    if about is not None:
-        e = about.offset(k, state, values)
-        r = r + H @ e
-    PHt = P @ H.T
-    S = H @ PHt
-    S.flat[:: len(r) + 1] += sigma * sigma
-    # LAPACK called directly: for matrices this small the checks around it would cost more than the work
-    right = np.empty((len(r), len(P) + 1))
-    right[:, 0], right[:, 1:] = r, PHt.T
-    _, solved, info = dposv(S, right)
-    if info:
-        raise EstimationError(f"the filter's covariance broke down at '{rows.name}' row {lo}: check sigmas and units")
+    e = np.zeros(len(P)) if about is None else about.offset(k, state, values)
+    passes = rows.passes if about is None else 1
+    for left in range(passes - 1, -1, -1):
+        here = at if n == 1 else at[np.zeros(n, dtype=int)]
+        given = {p.name: at_values[None, _shift(columns[p.name])] for p in rows.parameters}
+        if n > 1:
+            given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
+        linear = rows.linearize(here, given, slice(lo, hi))
+        H = assemble(linear, columns, len(P)).reshape(-1, len(P))
+        r, sigma = linear.residual.ravel() + H @ e, linear.sigma.ravel()
+        PHt = P @ H.T
+        S = H @ PHt
+        S.flat[:: len(r) + 1] += sigma * sigma
+        # LAPACK called directly: for matrices this small the checks around it would cost more than the work
+        right = np.empty((len(r), len(P) + 1))
+        right[:, 0], right[:, 1:] = r, PHt.T
+        _, solved, info = dposv(S, right)
+        if info:
+            raise EstimationError(
+                f"the filter's covariance broke down at '{rows.name}' row {lo}: check sigmas and units"
+            )
+        K = solved[:, 1:].T
+        d = e - K @ r
+        if left:  # again about where this leads (Jazwinski 1970, theorem 8.2)
+            at, at_values = at.plus(d[None, :DIM]), at_values + d[DIM:]
+            e = np.concatenate([state.minus(at)[0], values - at_values])
     nis = float(r @ solved[:, 0])
     used = rows.gate is None or nis <= rows.gate**2
     record.set(slice(lo, hi), r.reshape(n, -1), np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1), nis / n, float(used))
     if not used:
         return state, values, P
-    K = solved[:, 1:].T
-    d = e - K @ r
     IKH = -K @ H
     IKH.flat[:: len(P) + 1] += 1.0
     P = IKH @ P @ IKH.T + (K * (sigma * sigma)) @ K.T
