@@ -28,6 +28,7 @@ _NEAR = 0.95  # of the highest reading: a range that ends lower than that for so
 _BAND = 0.01  # b
 _TOO_FLAT = 2.5  # q
 _FEWEST = 3  # rows of a flat top
+_LEAST = {"gyro": 4.0, "accel": 19.0}  # rad/s, m/s^2: no range ends lower (250 deg/s, 2 g)
 _DOUBT = 0.5  # of what is added
 
 
@@ -40,12 +41,13 @@ class Peak:
     values: Array
 
 
-def cut_peaks(t: Array, x: Array) -> list[Peak]:
-    """The peaks of one axis (N,), read at times (N,) s, that were cut off."""
+def cut_peaks(t: Array, x: Array, least: float) -> list[Peak]:
+    """The peaks above `least` of one axis (N,), read at times (N,) s, that were cut off."""
     found = []
     for sign in (1.0, -1.0):
         y = sign * x
-        high = np.flatnonzero(np.diff(np.r_[False, y >= _NEAR * y.max(), False].astype(int))) if y.max() > 0.0 else []
+        limit = max(_NEAR * float(y.max(initial=0.0)), least)
+        high = np.flatnonzero(np.diff(np.r_[False, y >= limit, False].astype(int)))
         for begin, end in zip(high[::2], high[1::2], strict=True):
             top = y[begin:end].max()
             rows = begin + np.flatnonzero(y[begin:end] >= (1.0 - _BAND) * top)
@@ -71,7 +73,7 @@ def with_whole_peaks(samples: Samples, R_bs: Array) -> tuple[Samples, tuple[str,
         x, cut = getattr(samples, name) @ R_bs, False
         extra = getattr(samples, f"extra_{name}").copy()
         for axis in range(3):
-            peaks = cut_peaks(samples.t, x[:, axis])
+            peaks = cut_peaks(samples.t, x[:, axis], _LEAST[name])
             if not peaks:
                 continue
             cut = True

@@ -37,6 +37,11 @@ class AlignmentSettings(_Section):
     )
     heading: float | None = Field(None, ge=-360, le=360, description="deg, a start heading that is known")
     heading_sigma: float = Field(10.0, gt=0, description="deg, 1-sigma of the known start heading")
+    gyro_bias: tuple[float, float, float] | None = Field(
+        None,
+        description="rad/s, body axes (right, forward, up): what an earlier recording found, where no fixes tell it",
+    )
+    gyro_bias_sigma: float = Field(5e-4, gt=0, description="rad/s, 1-sigma of that bias")
 
 
 class ImuSettings(_Section):
@@ -44,6 +49,9 @@ class ImuSettings(_Section):
 
     as_stated: bool = Field(
         False, description="take the noise figures as stated, even where the drive shows them to be too small"
+    )
+    coning: bool = Field(
+        True, description="of a foot: rows are plain means; false for a unit that makes up for coning and sculling"
     )
 
 

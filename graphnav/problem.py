@@ -101,7 +101,8 @@ def pose(
     said: tuple[str, ...] = ()
     if recording.platform == "foot":
         samples, said = with_whole_peaks(samples, recording.imu.R_bs)
-        samples = with_coning(with_unresolved_motion(samples, recording.imu.noise))
+        samples = with_unresolved_motion(samples, recording.imu.noise)
+        samples = with_coning(samples) if settings.imu.coning else samples
     intervals = preintegrate(samples, recording.imu, t, start.ba[0], start.bg[0])
     scene = Scene(recording, settings, frame, t, stops, intervals, speed)
     built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))

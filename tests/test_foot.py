@@ -11,10 +11,11 @@ import pytest
 from helpers import Array
 
 from graphnav import rotation as ro
+from graphnav.clipping import cut_peaks, with_whole_peaks
 from graphnav.config import Settings, settings_from
 from graphnav.constraints.base import Scene
 from graphnav.constraints.foot import FOOT_AXIS, PIVOT, TRAVEL, FootLateral, Stance
-from graphnav.constraints.standstill import ZeroRate
+from graphnav.constraints.standstill import ZeroRate, _swaying
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.formats import read
@@ -27,7 +28,7 @@ from graphnav.simulation import Simulated, simulate
 from graphnav.solution import Solution
 from graphnav.state import States
 from graphnav.strides import walk_errors
-from graphnav.unresolved import with_unresolved_motion
+from graphnav.unresolved import with_coning, with_unresolved_motion
 from graphnav.workflow import Request, run_request
 
 PACES = ("slow", "normal", "fast")
@@ -108,6 +109,37 @@ def test_a_lull_in_a_swing_is_left_out() -> None:
     assert np.any((raw[:, 0] < middle) & (raw[:, 1] > middle))
     assert not np.any((lull.stationary[:, 0] < middle) & (lull.stationary[:, 1] > middle))
     assert "1 short lulls" in lull.notes[0]
+
+
+def test_a_foot_that_slides_level_is_not_in_stance() -> None:
+    """Carried level to its last footprint and slowing down evenly there, it turns little and its force is even."""
+    walk = made("normal").recording
+    spans = detect(walk).stationary
+    k = len(spans) // 2
+    begin = spans[k, 0]
+    slides = (walk.imu.t > begin - 0.3) & (walk.imu.t <= begin)
+    gyro, accel = walk.imu.gyro.copy(), walk.imu.accel.copy()
+    gyro[slides] = [0.5, 0.0, 0.0]
+    accel[slides] = [0.0, -3.0, 9.8]  # from 0.9 m/s
+    found = detect(replace(walk, imu=replace(walk.imu, gyro=gyro, accel=accel)))
+    raw = found["stance"].intervals
+    of_raw = raw[np.argmin(np.abs(raw[:, 1] - spans[k, 1]))]
+    of_answer = found.stationary[np.argmin(np.abs(found.stationary[:, 1] - spans[k, 1]))]
+    assert of_raw[0] < begin - 0.2  # what force and rate alone say
+    assert begin - 0.13 < of_answer[0] < begin + 0.03  # 3 m/s^2 for 0.13 s are 0.4 m/s
+
+
+def test_a_lost_packet_does_not_end_a_stance() -> None:
+    walk = made("normal").recording
+    spans = detect(walk).stationary
+    kept = np.ones(len(walk.imu.t), dtype=bool)
+    for a, b in spans:
+        at = int(np.searchsorted(walk.imu.t, 0.5 * (a + b)))
+        kept[at : at + 4] = False
+    imu = replace(walk.imu, t=walk.imu.t[kept], gyro=walk.imu.gyro[kept], accel=walk.imu.accel[kept])
+    found = detect(replace(walk, imu=imu)).stationary
+    assert len(found) == len(spans)
+    assert np.abs(found - spans).max() < 0.03
 
 
 # -------------------------------------------------------------------------------------------------------------- pivot
@@ -230,6 +262,93 @@ def test_the_sensors_own_noise_is_not_counted_twice() -> None:
     out = with_unresolved_motion(Samples(t, gyro, accel, zero, zero, 0.0, np.empty((0, 2))), noise)
     assert out.extra_gyro.mean() < 0.1 * 1e-3**2
     assert out.extra_accel.mean() < 0.1 * 2e-3**2
+
+
+# ------------------------------------------------------------------------------------------------ what rows stand for
+@pytest.mark.parametrize("rate", [100.0, 200.0])
+def test_coning_and_sculling_are_made_up_for(rate: float) -> None:
+    """Plain means over a walk against a unit that integrates inside: attitude, velocity and place of each swing."""
+    plain, whole = (
+        simulate("ren2021", 0, walk=1, exact=True, rate=rate, compensated=c).recording for c in (False, True)
+    )
+    t = np.append(plain.start, detect(plain).stationary.mean(axis=1))
+    of = {
+        name: preintegrate(samples, plain.imu, t, np.zeros(3), np.zeros(3))
+        for name, samples in {
+            "true": bridge_gaps(whole.imu),
+            "means": bridge_gaps(plain.imu),
+            "made up": with_coning(bridge_gaps(plain.imu)),
+        }.items()
+    }
+    left = {
+        name: [
+            np.linalg.norm(ro.log(np.swapaxes(of["true"].dR, -1, -2) @ iv.dR).sum(axis=0)),
+            np.sqrt(np.mean((iv.dV - of["true"].dV) ** 2)),
+            np.sqrt(np.mean((iv.dP - of["true"].dP) ** 2)),
+        ]
+        for name, iv in of.items()
+    }
+    assert left["means"][0] > 3e-4
+    assert left["made up"][0] < 0.03 * left["means"][0]
+    assert left["made up"][1] < 0.3 * left["means"][1]
+    assert left["made up"][2] < 0.4 * left["means"][2]
+
+
+@pytest.mark.parametrize("pace", PACES)
+def test_whole_peaks_stay_as_they_are(pace: str) -> None:
+    imu = made(pace).recording.imu
+    for x, least in ((imu.gyro, 4.0), (imu.accel, 19.0)):
+        for axis in range(3):
+            assert not cut_peaks(imu.t, x[:, axis], least)
+    samples = bridge_gaps(imu)
+    assert with_whole_peaks(samples, np.eye(3)) == (samples, ())
+
+
+def test_cut_peaks_are_put_back_and_doubted() -> None:
+    """A gyro that ends at 85 % of the fastest swing, in axes turned against the body's: half the lost turn at least."""
+    imu = made("normal", exact=True).recording.imu
+    R_bs = ro.from_rph(np.array([0.3, -0.2, 0.5]))
+    true = imu.gyro @ R_bs
+    limit = 0.85 * np.abs(true[:, 0]).max()
+    read_ = np.clip(true, -limit, limit)
+    whole = bridge_gaps(replace(imu, gyro=true @ R_bs.T))
+    cut = bridge_gaps(replace(imu, gyro=read_ @ R_bs.T))
+    mended, notes = with_whole_peaks(cut, R_bs)
+    lost, left = (np.sum(whole.gyro - x.gyro, axis=0) @ R_bs for x in (cut, mended))
+    assert abs(lost[0]) > 1.0
+    assert abs(left[0]) < 0.5 * abs(lost[0])
+    doubted = mended.extra_gyro > 0.0
+    assert np.all(np.any(read_[doubted] > 0.99 * limit, axis=1) | np.any(read_[doubted] < -0.99 * limit, axis=1))
+    assert any("gyro x" in note for note in notes)
+
+
+# ------------------------------------------------------------------------------------------------------------ honesty
+def test_a_filter_does_not_believe_to_learn_the_heading() -> None:
+    """Nothing in a walk tells it. Linearised where a landing is expected, stances would seem to; 0.7 of this sigma."""
+    walk = made("normal").recording
+    found = run(walk, None, ("ekf", "batch"))
+    of_filter, of_batch = (np.sqrt(found[name].covariance[-1, 2, 2]) for name in ("ekf", "batch"))
+    assert of_filter > 0.88 * of_batch
+
+
+def test_a_swaying_body_in_units_of_white_rate() -> None:
+    """An angle that walks at random with density q departs from a line by q T / 15: q is found again on average."""
+    rng = np.random.default_rng(2)
+    q, T, n, runs = 3e-6, 0.05, 60, 400
+    rate = np.sqrt(q / T) * rng.standard_normal((runs * n, 3))
+    sigma = _swaying(rate, np.full(runs * n, T), np.repeat(np.arange(runs), n))
+    assert np.mean(sigma**2) * T == pytest.approx(q, rel=0.08)
+
+
+def test_a_gyro_bias_known_from_before() -> None:
+    """As sure of the heading as one knows of the bias, and by as much nearer to the truth as it was wrong."""
+    walk = made("normal")
+    assert walk.truth.gyro_bias is not None
+    known = {"gyro_bias": walk.truth.gyro_bias[-1].tolist(), "gyro_bias_sigma": 1e-4}
+    plain = run(walk.recording, None, ("batch",))["batch"]
+    helped = run(walk.recording, settings_from({"alignment": known}), ("batch",))["batch"]
+    assert helped.covariance[-1, 14, 14] < 0.5 * plain.covariance[-1, 14, 14]
+    assert np.abs(helped.states.bg[-1] - walk.truth.gyro_bias[-1]).max() < 2e-4
 
 
 # ------------------------------------------------------------------------------------------------------- start and end

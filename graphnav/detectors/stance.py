@@ -38,7 +38,7 @@ _QUIET = 1.0  # s; the quietest of the recording says what bias and gravity are
 _ENOUGH = 5  # spans, to say what is usual
 _LEAST_SPREAD = 0.3  # of log e, between the stances of the most even walk
 _SPREADS = 3.0
-_NEAR = 0.4  # s from an end of a span within which its quietest moment is looked for
+_NEAR = 0.8  # s from an end of a span within which its quietest moment is looked for: twice what a slide lasts
 _REACH = 0.2  # m, from an IMU on a shoe to where the shoe touches the floor, at most
 
 
