@@ -68,7 +68,7 @@ def cut_peaks(t: Array, x: Array, least: float) -> list[Peak]:
 def with_whole_peaks(samples: Samples, R_bs: Array) -> tuple[Samples, tuple[str, ...]]:
     """The samples with cut peaks put back, and sentences that say so. R_bs: body from the sensors' own axes."""
     notes = []
-    values: dict[str, Array] = {}
+    out = samples
     for name, what, unit in (("gyro", "gyro", "rad/s"), ("accel", "accelerometer", "m/s^2")):
         x, cut = getattr(samples, name) @ R_bs, False
         extra = getattr(samples, f"extra_{name}").copy()
@@ -89,5 +89,6 @@ def with_whole_peaks(samples: Samples, R_bs: Array) -> tuple[Samples, tuple[str,
                 "back by their sides"
             )
         if cut:
-            values |= {name: x @ R_bs.T, f"extra_{name}": extra}
-    return (replace(samples, **values) if values else samples), tuple(notes)
+            x = x @ R_bs.T
+            out = replace(out, gyro=x, extra_gyro=extra) if name == "gyro" else replace(out, accel=x, extra_accel=extra)
+    return out, tuple(notes)

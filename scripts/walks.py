@@ -5,7 +5,7 @@
 Errors are the closure of loops, else the rms after yaw and offset are fitted to the truth; NEES per degree of freedom.
 "in stance": the same over the epochs in a stance only. "point fitted": with the place on the foot fitted that the truth
 is of, which no recording states. "bias before": with the gyro bias as the walk before on the same sensor and day had
-it. "plain filter" is what a nine-state zero-velocity filter of the usual kind reached on the same recordings, in stance.
+it. "plain filter": what a nine-state zero-velocity filter of the usual kind reached on the same recordings, in stance.
 """
 
 from __future__ import annotations
@@ -52,9 +52,8 @@ def main() -> None:
     options = parser.parse_args()
     folder = Path(os.environ["GRAPHNAV_DATA"])
     print("| walk | s | plain filter | " + " | ".join(f"{s}, {c} lateral" for c in CASES for s in SOLVERS), end="")
-    print(
-        f" | batch, in stance | batch, point fitted | batch, bias before | up, m: {', '.join(SOLVERS)} | stride | NEES hor. | NEES up | s per min |"
-    )
+    print(" | batch, in stance | batch, point fitted | batch, bias before", end="")
+    print(f" | up, m: {', '.join(SOLVERS)} | stride | NEES hor. | NEES up | s per min |")
     print("|" + " --- |" * (3 + len(CASES) * len(SOLVERS) + 8))
     for name in options.sets.split(","):
         rows, before = [], None
