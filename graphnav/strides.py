@@ -31,7 +31,7 @@ class WalkErrors:
     """Of one solution; NaN where the truth does not tell. Sizes in m, NEES per degree of freedom (1 where true)."""
 
     horizontal: float  # rms after the fit; of a loop, start to end
-    standing: float  # the same over the epochs in a stance only
+    in_stance: float  # the same over the epochs in a stance only
     of_point: float  # the same with the place on the foot fitted that the truth is of
     up: float  # rms with the start's height taken off; of a loop, end less start
     stride: float  # median of stride length over its truth; 1 where there is no bias
@@ -81,8 +81,10 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     else:
         true, mine = (np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1) for x in (X, p))
         stride = float(np.median((mine / true)[true > _A_STRIDE]))
-    horizontal, standing = _shape(p, flat), _shape(*(x[_in_stance(solution, t)] for x in (p, flat)))
-    return WalkErrors(horizontal, standing, _of_point(states, flat), up, stride, float(np.mean(nees_h)), nees_up)
+    # points are measured where a foot stands; a dense truth has it in the air as well
+    standing = _in_stance(solution, t) if X.shape[1] == 3 else np.ones(len(t), dtype=bool)
+    horizontal, in_stance = _shape(p, flat), _shape(p[standing], flat[standing])
+    return WalkErrors(horizontal, in_stance, _of_point(states, flat), up, stride, float(np.mean(nees_h)), nees_up)
 
 
 def _of_loop(solution: Solution, sigma: float) -> WalkErrors:
