@@ -70,7 +70,7 @@ def detect_stances(imu: Imu, period: float, settings: StanceSettings) -> Detecti
         () if len(kept) == len(spans)
         else (f"{len(spans) - len(kept)} short lulls that do not reach as deep as the stances were left out",)
     )  # fmt: skip
-    kept = _without_sliding(kept, imu, period, t, e, bias, settings.threshold * _REACH)
+    kept = _without_sliding(kept, imu, t, e, bias, settings.threshold * _REACH)
     found = Detection("stance", t, e, settings.threshold, below, spans)
     answer = Detection("fused", t, e, settings.threshold, inside(t, kept), kept, notes)
     return Detections(kept, (found, answer), notes)
@@ -98,30 +98,35 @@ def _as_deep_as_others(spans: Array, t: Array, e: Array) -> Array:
     return np.asarray(depth < middle + _SPREADS * spread)
 
 
-def _without_sliding(
-    spans: Array, imu: Imu, period: float, t: Array, e: Array, bias: Array, fastest: float
-) -> Array:  # fmt: skip
-    """The spans (M, 2) cut where the foot moves at more than `fastest` m/s against their quietest moments."""
+def _without_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fastest: float) -> Array:
+    """The spans (M, 2) cut where the foot moves at more than `fastest` m/s against their quietest moments.
+
+    t, e (W,) are of the windows that begin with each row.
+    """
     out = spans.copy()
+    window = len(imu.t) - len(t) + 1
+    force = running(imu.accel).means(window)
+    T = np.diff(imu.t, prepend=2.0 * imu.t[0] - imu.t[1])
     for side, way in ((0, -1), (1, 1)):
-        quiet = np.empty(len(spans))
-        for k, span in enumerate(spans):
-            lo, hi = (span[0], min(span[0] + _NEAR, span[1])) if side == 0 else (max(span[1] - _NEAR, span[0]), span[1])
-            rows = slice(*np.searchsorted(t, [lo, hi]))
-            quiet[k] = t[rows][np.nanargmin(e[rows])] if np.isfinite(e[rows]).any() else 0.5 * (lo + hi)
-        # rows outward from the quiet moment: row k speaks for the period before its time
-        first = np.searchsorted(imu.t, quiet) + (0 if side == 0 else 1)
-        steps = np.rint(np.abs(spans[:, side] - quiet) / period).astype(int)
-        at = np.clip(first + way * np.arange(steps.max(initial=0))[:, None], 0, len(imu.t) - 1)
-        R = np.tile(np.eye(3), (len(spans), 1, 1))
-        v = np.zeros((len(spans), 3))
-        usual = imu.accel[np.clip(first + way * np.arange(3)[:, None], 0, len(imu.t) - 1)].mean(axis=0)
-        gone = np.zeros(len(spans), dtype=bool)
-        for k, row in enumerate(at):
-            half = rotation.exp(0.5 * way * period * (imu.gyro[row] - bias))
-            v += period * ((R @ half @ imu.accel[row][..., None])[..., 0] - usual)
-            R = R @ half @ half
-            now = (k < steps) & ~gone & (np.linalg.norm(v, axis=1) > fastest)
-            out[now, side] = imu.t[row[now]] - (0.0 if side == 0 else period)
-            gone |= now
+        for n, (begin, end) in enumerate(spans):
+            lo, hi = (begin, min(begin + _NEAR, end)) if side == 0 else (max(end - _NEAR, begin), end)
+            first, last = np.searchsorted(t, [lo, hi])
+            if not np.isfinite(e[first:last]).any():
+                continue
+            k = int(first + np.nanargmin(e[first:last]))
+            middle = int(np.searchsorted(imu.t, t[k]))
+            edge = int(np.searchsorted(imu.t, (begin, end)[side]))
+            # rows from the quiet moment outward; each speaks for the period before its time
+            rows = np.arange(middle, edge, -1) if side == 0 else np.arange(middle + 1, min(edge + 1, len(imu.t)))
+            if not len(rows):
+                continue
+            turn = rotation.exp(0.5 * way * T[rows, None] * (imu.gyro[rows] - bias))
+            R, v = np.eye(3), np.zeros(3)
+            for row, half in zip(rows, turn, strict=True):
+                R = R @ half
+                v = v + T[row] * (R @ imu.accel[row] - force[k])
+                R = R @ half
+                if v @ v > fastest**2:
+                    out[n, side] = imu.t[row] - (0.0 if side == 0 else T[row])
+                    break
     return out
