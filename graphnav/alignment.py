@@ -163,11 +163,14 @@ def _at_rest(recording: Recording, settings: Settings, frame: LocalFrame) -> Ali
     begin, seconds = _standing(recording, settings)
     R = rotation.from_rph(np.array([*_level(recording, begin, seconds), 0.0]))
     tilt, sd_v = noise.accel_bias_sigma / 9.8 + np.radians(1.0), 0.5
+    bias, sd_bias = np.zeros(3), noise.gyro_bias_sigma
+    if settings.alignment.gyro_bias is not None:
+        bias, sd_bias = np.array(settings.alignment.gyro_bias), settings.alignment.gyro_bias_sigma
     if begin > recording.start:
-        dR, _, _ = prefix(bridge_gaps(recording.imu), recording.start, np.array([begin]), np.zeros(3), np.zeros(3))
+        dR, _, _ = prefix(bridge_gaps(recording.imu), recording.start, np.array([begin]), np.zeros(3), bias)
         R = R @ dR[0].T
         R = rotation.from_rph(rotation.to_rph(R) * [1.0, 1.0, 0.0])
-        tilt, sd_v = np.hypot(tilt, noise.gyro_bias_sigma * (begin - recording.start)), _WALKING
+        tilt, sd_v = np.hypot(tilt, sd_bias * (begin - recording.start)), _WALKING
     own = np.array([tilt, tilt, np.pi])
     if gnss is None or not len(gnss.t):
         # without fixes the first pose defines the frame: position and heading are exact by definition
@@ -182,7 +185,7 @@ def _at_rest(recording: Recording, settings: Settings, frame: LocalFrame) -> Ali
         p[None],
         np.zeros((1, 3)),
         np.zeros((1, 3)),
-        np.zeros((1, 3)),
+        bias[None],
     )
     sigma = np.concatenate(
         [
@@ -191,7 +194,7 @@ def _at_rest(recording: Recording, settings: Settings, frame: LocalFrame) -> Ali
             sd_p,
             [sd_v] * 3,
             [noise.accel_bias_sigma] * 3,
-            [noise.gyro_bias_sigma] * 3,
+            [sd_bias] * 3,
         ]
     )
     return Alignment(state, sigma, own, (note,))

@@ -37,6 +37,11 @@ class AlignmentSettings(_Section):
     )
     heading: float | None = Field(None, ge=-360, le=360, description="deg, a start heading that is known")
     heading_sigma: float = Field(10.0, gt=0, description="deg, 1-sigma of the known start heading")
+    gyro_bias: tuple[float, float, float] | None = Field(
+        None,
+        description="rad/s, body axes (right, forward, up): what an earlier recording found, where no fixes tell it",
+    )
+    gyro_bias_sigma: float = Field(5e-4, gt=0, description="rad/s, 1-sigma of that bias")
 
 
 class ImuSettings(_Section):
@@ -44,6 +49,9 @@ class ImuSettings(_Section):
 
     as_stated: bool = Field(
         False, description="take the noise figures as stated, even where the drive shows them to be too small"
+    )
+    coning: bool = Field(
+        True, description="of a foot: rows are plain means; false for a unit that makes up for coning and sculling"
     )
 
 
@@ -128,9 +136,9 @@ class FootSettings(_Section):
     closed_loop: float | None = Field(
         None, gt=0, description="m, 1-sigma; given, the end is the start (only without GNSS)"
     )
-    robust: Kernel = Field("none", description="robust kernel of the smoother")
+    robust: Kernel = Field("cauchy", description="robust kernel of the smoother")
     robust_scale: float = Field(3.0, gt=0, description="whitened norm of a row at which the kernel bends")
-    gate: float | None = Field(None, gt=0, description="whitened norm above which the filter rejects a row")
+    gate: float | None = Field(6.0, gt=0, description="whitened norm above which the filter rejects a row")
 
 
 class StanceSettings(_Section):

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphnav.clipping import with_whole_peaks
 from graphnav.config import Settings
 from graphnav.constraints import registered
 from graphnav.constraints.base import SAME_TIME, Constraint, Scene
@@ -16,7 +17,7 @@ from graphnav.preintegration import Intervals, Samples, bridge_gaps, preintegrat
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.state import DIM, Parameter, States
-from graphnav.unresolved import with_unresolved_motion
+from graphnav.unresolved import with_coning, with_unresolved_motion
 from graphnav.wheels import MeanSpeed
 
 NODE_SPACING = 5.0  # s between the nodes of a slowly moving parameter: a twentieth of the shortest correlation time
@@ -97,8 +98,11 @@ def pose(
         times = keyframe_times(recording.start, recording.end, epochs, settings.keyframes.rate)
     t = times
     samples = bridge_gaps(recording.imu)
+    said: tuple[str, ...] = ()
     if recording.platform == "foot":
+        samples, said = with_whole_peaks(samples, recording.imu.R_bs)
         samples = with_unresolved_motion(samples, recording.imu.noise)
+        samples = with_coning(samples) if settings.imu.coning else samples
     intervals = preintegrate(samples, recording.imu, t, start.ba[0], start.bg[0])
     scene = Scene(recording, settings, frame, t, stops, intervals, speed)
     built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
@@ -114,7 +118,7 @@ def pose(
         prior=prior,
         constraints=built,
         chains=_chains((*scale_parameter(recording.imu.noise), *(p for rows in built for p in rows.parameters)), t),
-        notes=(*_notes(samples, recording), *(note for rows in built for note in rows.notes)),
+        notes=(*_notes(samples, recording), *said, *(note for rows in built for note in rows.notes)),
     )
 
 

@@ -22,7 +22,7 @@ from graphnav.trajectory import Trajectory
 
 _SPACING = 0.1  # s between the epochs compared with a dense truth
 _STANDS = 1.0  # s at the start of which a dense truth is averaged to place it
-_TURNS = 10
+_TURNS = 10  # of fitting a place on the foot; and epochs that make a shape
 _A_STRIDE = 0.3  # m; points closer together are no stride
 
 
@@ -31,6 +31,7 @@ class WalkErrors:
     """Of one solution; NaN where the truth does not tell. Sizes in m, NEES per degree of freedom (1 where true)."""
 
     horizontal: float  # rms after the fit; of a loop, start to end
+    in_stance: float  # the same over the epochs in a stance only
     of_point: float  # the same with the place on the foot fitted that the truth is of
     up: float  # rms with the start's height taken off; of a loop, end less start
     stride: float  # median of stride length over its truth; 1 where there is no bias
@@ -66,8 +67,6 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     _, states, covariance = solution.at(t)
     p, P = states.p, covariance[:, 3:6, 3:6]
     flat = np.column_stack([X[:, :2], np.zeros(len(X))])
-    yaw, offset = fit_yaw(flat, p * [1.0, 1.0, 0.0])
-    fitted = _turned(X[:, :2], yaw) + offset[:2]
     # about the start
     at_start = p[0, :2] if X.shape[1] == 2 else p[t <= t[0] + _STANDS, :2].mean(axis=0)
     a, b = X[:, :2] - first[:2], p[:, :2] - at_start
@@ -82,8 +81,10 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     else:
         true, mine = (np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1) for x in (X, p))
         stride = float(np.median((mine / true)[true > _A_STRIDE]))
-    horizontal = float(np.sqrt(np.mean(np.sum((p[:, :2] - fitted) ** 2, axis=1))))
-    return WalkErrors(horizontal, _of_point(states, flat), up, stride, float(np.mean(nees_h)), nees_up)
+    # points are measured where a foot stands; a dense truth has it in the air as well
+    standing = _in_stance(solution, t) if X.shape[1] == 3 else np.ones(len(t), dtype=bool)
+    horizontal, in_stance = _shape(p, flat), _shape(p[standing], flat[standing])
+    return WalkErrors(horizontal, in_stance, _of_point(states, flat), up, stride, float(np.mean(nees_h)), nees_up)
 
 
 def _of_loop(solution: Solution, sigma: float) -> WalkErrors:
@@ -91,7 +92,21 @@ def _of_loop(solution: Solution, sigma: float) -> WalkErrors:
     found = closure(Trajectory(solution.t, p, frame="local"))
     off = p[-1] - p[0]
     nees_h = 0.5 * float(off[:2] @ np.linalg.solve(P[:2, :2], off[:2]))
-    return WalkErrors(found.horizontal, found.horizontal, found.vertical, np.nan, nees_h, float(off[2] ** 2 / P[2, 2]))
+    h, up = found.horizontal, found.vertical
+    return WalkErrors(h, h, h, up, np.nan, nees_h, float(off[2] ** 2 / P[2, 2]))
+
+
+def _in_stance(solution: Solution, t: Array) -> Array:
+    """(N,) bool, which epochs lie in a stance; all of them where none does."""
+    spans = next((d.intervals for d in solution.detections if d.name == "fused"), np.empty((0, 2)))
+    inside = np.any((t[:, None] >= spans[:, 0]) & (t[:, None] <= spans[:, 1]), axis=1)
+    return inside if np.count_nonzero(inside) > _TURNS else np.ones(len(t), dtype=bool)
+
+
+def _shape(p: Array, flat: Array) -> float:
+    """Horizontal rms of places (N, 3) against a flat truth (N, 3) after fitting yaw and offset, m."""
+    yaw, offset = fit_yaw(flat, p * [1.0, 1.0, 0.0])
+    return float(np.sqrt(np.mean(np.sum((p[:, :2] - _turned(flat[:, :2], yaw) - offset[:2]) ** 2, axis=1))))
 
 
 def _of_point(states: States, flat: Array) -> float:

@@ -38,3 +38,25 @@ def _density(x: Array, white: float, period: float) -> Array:
     change = np.maximum(change - 2.0 * white**2 / period, 0.0)
     both = 0.5 * (np.sqrt(np.r_[change[:1], change]) + np.sqrt(np.r_[change, change[-1:]]))
     return np.asarray(both**2 / 12.0 * period)
+
+
+def with_coning(samples: Samples) -> Samples:
+    """The samples as rates and forces that, constant over a period, lead where changing ones of the same means would.
+
+    For a rate w and a force f that change evenly, w', f' per second, in a period T (Savage 1998, part 1, eq. 36-49 and
+    part 2, eq. 44-55, with slopes by central instead of backward differences, because all rows are there)::
+
+        coning      w + T^2/12 w x w'
+        sculling    f + T^2/12 (w x f' + f x w')
+
+    """
+    if len(samples.t) < 3:
+        return samples
+    T = np.diff(samples.t, prepend=samples.start)
+    middle = samples.t - 0.5 * T
+    w, f = samples.gyro, samples.accel
+    dw, df = np.zeros_like(w), np.zeros_like(f)
+    across = (middle[2:] - middle[:-2])[:, None]
+    dw[1:-1], df[1:-1] = (w[2:] - w[:-2]) / across, (f[2:] - f[:-2]) / across
+    part = (T * T / 12.0)[:, None]
+    return replace(samples, gyro=w + part * np.cross(w, dw), accel=f + part * (np.cross(w, df) + np.cross(f, dw)))

@@ -16,7 +16,7 @@ ROOMS = [
     "errors", "rotation", "earth", "state", "config", "recording", "trajectory",
     "formats", "draft", "allan", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding",
     "checks", "detectors",
-    "preintegration", "unresolved", "dynamics", "constraints", "problem", "solution", "alignment",
+    "preintegration", "unresolved", "clipping", "dynamics", "constraints", "problem", "solution", "alignment",
     "dense", "solvers", "faults", "judgement", "pipeline",
     "interpolation", "metrics", "scoring", "strides", "evaluation", "exporters", "online",
     "panels", "page", "plots", "report_tables", "report_words", "report_pictures", "report_provenance", "report",

@@ -63,6 +63,7 @@ class Constraint(ABC):
     name: ClassVar[str]
     axes: ClassVar[tuple[str, ...]]
     unit: ClassVar[str]
+    passes: ClassVar[int] = 1  # of a filter's update; more for rows that are far from linear over its uncertainty
 
     keyframe: Array  # (N,) int, ascending
     parameters: tuple[Parameter, ...] = ()

@@ -55,6 +55,9 @@ class Stance(Constraint):
     name: ClassVar[str] = "stance"
     axes: ClassVar[tuple[str, ...]] = ("right", "forward", "up")
     unit: ClassVar[str] = "m/s"
+    # velocity in the body turns with the attitude by as much as there is of it, and at a landing a filter expects a
+    # decimetre per second that the foot does not have: linearised there, it believes to learn of the heading
+    passes: ClassVar[int] = 2
 
     past: Past | None = None
     phase: Array = field(default_factory=lambda: np.empty(0))  # (N,) c

@@ -35,7 +35,7 @@ _SWAY = 2.0 * np.pi  # rad/s, the slowest swaying of a body on springs
 _STILL_V, _STILL_P = 1e-3, 1e-3  # m/s, m: no body stands stiller than this
 _FAR = 60.0  # m/s; times the seconds without a fix: how far from the last one a stop may be
 _ROLLING = 0.1  # rad/s; a foot that rolls over its stance turns quicker
-_SLOW = 0.3  # s, about a quarter of a period of a standing body's sway
+_LIFTING = 0.15  # s at either end of standing, in which the heel may have begun to lift
 _STANDING = 0.6  # s; in a walk no stance is that quiet for so long
 _I3 = np.eye(3)
 
@@ -65,7 +65,32 @@ def _unmoved(scene: Scene, rows: Array, stop: Array) -> tuple[Array, Array]:
     run = np.cumsum(np.r_[True, (np.diff(stop) != 0) | (np.diff(still) != 0)][: len(rows)]) - 1
     lasts = np.bincount(run, weights=iv.T[rows])
     keep = still & (lasts[run] >= _STANDING)
+    begins, ends = np.full(len(lasts), np.inf), np.full(len(lasts), -np.inf)
+    np.minimum.at(begins, run, iv.t0[rows])
+    np.maximum.at(ends, run, iv.t1[rows])
+    keep &= (iv.t0[rows] >= begins[run] + _LIFTING) | (begins[run] <= scene.t[0] + SAME_TIME)
+    keep &= (iv.t1[rows] <= ends[run] - _LIFTING) | (ends[run] >= scene.t[-1] - SAME_TIME)
     return rows[keep], run[keep]
+
+
+def _swaying(rate: Array, T: Array, run: Array) -> Array:
+    """1-sigma (N, 3), rad/s, of the mean rates (N, 3) of intervals in which a foot stands, from how its angle wanders.
+
+    A standing body sways slowly: where its rate passes zero it is not still, and what it does in one interval it does
+    in the next. So the rates are taken to be white with the density q by which the angle of a whole run of intervals
+    departs from a straight line. For a random walk of length T that departure has the variance q T / 15 (regression
+    of a Wiener process on time); a body that sways about its balance departs no less for its q.
+    """
+    out = np.zeros_like(rate)
+    for one in np.unique(run):
+        here = run == one
+        edge = np.concatenate([[0.0], np.cumsum(T[here])])
+        angle = np.concatenate([np.zeros((1, 3)), np.cumsum(rate[here] * T[here, None], axis=0)])
+        line = np.column_stack([np.ones(len(edge)), edge])
+        departs = angle - line @ np.linalg.lstsq(line, angle, rcond=None)[0]
+        q = 15.0 * np.mean(departs**2, axis=0) / edge[-1]
+        out[here] = np.sqrt(q / T[here, None])
+    return out
 
 
 def unrest(scene: Scene, rows: Array, stop: Array) -> tuple[Array, Array]:
@@ -136,10 +161,9 @@ class ZeroRate(_Standing):
         if not len(rows) or not scene.settings.standstill.zero_rate:
             return None
         _, rate = unrest(scene, rows, stop)
-        if scene.recording.platform == "foot":
-            # a body sways slowly: what it does in one interval it does in the next
-            rate *= np.sqrt(np.maximum(1.0, _SLOW / scene.intervals.T[rows]))[:, None]
         own = scene.recording.imu.noise.gyro_noise_density / np.sqrt(scene.intervals.T[rows])
+        if scene.recording.platform == "foot":
+            rate = np.hypot(rate, _swaying(scene.intervals.rate[rows], scene.intervals.T[rows], stop))
         return cls(
             keyframe=rows + 1,
             rate=scene.intervals.rate[rows] + scene.intervals.bg[rows],

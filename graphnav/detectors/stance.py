@@ -15,12 +15,18 @@ be sharp, because the rows of `graphnav.constraints.foot` account for the rollin
 is. What must not happen is to take part of a swing for a stance: the slow first step of a walk has a moment in which
 force and rate are low. But such a moment is not as deep as stances are. So spans whose lowest e stands out from
 that of all spans, by three of their spreads (median absolute deviation, in log e), are left out.
+
+What e cannot see is a force that lasts: a foot that is carried level to its last footprint and slows down there turns
+little, and what slows it tilts the mean force more than it lengthens it. But over the whole span it adds up. So from
+the quietest moment near either end the gyro carries the axes outward, and the force beyond what it was there is
+integrated; the span ends where that velocity exceeds the threshold times `_REACH`, the most that rolling allows.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from graphnav import rotation
 from graphnav.config import StanceSettings
 from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, merged, spans_of
 from graphnav.detectors.glrt import glrt_statistic
@@ -29,10 +35,11 @@ from graphnav.recording import Imu
 from graphnav.rotation import Array
 
 _QUIET = 1.0  # s; the quietest of the recording says what bias and gravity are
-_GAP = 3.0  # sample periods; a longer silence is no stance
 _ENOUGH = 5  # spans, to say what is usual
 _LEAST_SPREAD = 0.3  # of log e, between the stances of the most even walk
 _SPREADS = 3.0
+_NEAR = 0.8  # s from an end of a span within which its quietest moment is looked for: twice what a slide lasts
+_REACH = 0.2  # m, from an IMU on a shoe to where the shoe touches the floor, at most
 
 
 def detect_stances(imu: Imu, period: float, settings: StanceSettings) -> Detections:
@@ -48,7 +55,7 @@ def detect_stances(imu: Imu, period: float, settings: StanceSettings) -> Detecti
     bias, g = _quietest(imu, period)
     e = np.sqrt(glrt_statistic(imu.accel, imu.gyro - bias, window, settings.force_per_rate, 1.0, g))
     t = 0.5 * (imu.t[: len(e)] + imu.t[window - 1 :]) - 0.5 * period  # a row speaks for the period before it
-    whole = unbroken(np.r_[True, np.diff(imu.t) < _GAP * period], window)
+    whole = unbroken(np.r_[True, np.diff(imu.t) < period + settings.bridge], window)
     e = np.where(whole, e, np.nan)
     below = e < settings.threshold
     spans = longer_than(merged(spans_of(below, t, 0.5 * period), settings.bridge), settings.shortest)
@@ -63,6 +70,7 @@ def detect_stances(imu: Imu, period: float, settings: StanceSettings) -> Detecti
         () if len(kept) == len(spans)
         else (f"{len(spans) - len(kept)} short lulls that do not reach as deep as the stances were left out",)
     )  # fmt: skip
+    kept = _without_sliding(kept, imu, t, e, bias, settings.threshold * _REACH)
     found = Detection("stance", t, e, settings.threshold, below, spans)
     answer = Detection("fused", t, e, settings.threshold, inside(t, kept), kept, notes)
     return Detections(kept, (found, answer), notes)
@@ -88,3 +96,37 @@ def _as_deep_as_others(spans: Array, t: Array, e: Array) -> Array:
     middle = float(np.median(depth))
     spread = max(1.4826 * float(np.median(np.abs(depth - middle))), _LEAST_SPREAD)
     return np.asarray(depth < middle + _SPREADS * spread)
+
+
+def _without_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fastest: float) -> Array:
+    """The spans (M, 2) cut where the foot moves at more than `fastest` m/s against their quietest moments.
+
+    t, e (W,) are of the windows that begin with each row.
+    """
+    out = spans.copy()
+    window = len(imu.t) - len(t) + 1
+    force = running(imu.accel).means(window)
+    T = np.diff(imu.t, prepend=2.0 * imu.t[0] - imu.t[1])
+    for side, way in ((0, -1), (1, 1)):
+        for n, (begin, end) in enumerate(spans):
+            lo, hi = (begin, min(begin + _NEAR, end)) if side == 0 else (max(end - _NEAR, begin), end)
+            first, last = np.searchsorted(t, [lo, hi])
+            if not np.isfinite(e[first:last]).any():
+                continue
+            k = int(first + np.nanargmin(e[first:last]))
+            middle = int(np.searchsorted(imu.t, t[k]))
+            edge = int(np.searchsorted(imu.t, (begin, end)[side]))
+            # rows from the quiet moment outward; each speaks for the period before its time
+            rows = np.arange(middle, edge, -1) if side == 0 else np.arange(middle + 1, min(edge + 1, len(imu.t)))
+            if not len(rows):
+                continue
+            turn = rotation.exp(0.5 * way * T[rows, None] * (imu.gyro[rows] - bias))
+            R, v = np.eye(3), np.zeros(3)
+            for row, half in zip(rows, turn, strict=True):
+                R = R @ half
+                v = v + T[row] * (R @ imu.accel[row] - force[k])
+                R = R @ half
+                if v @ v > fastest**2:
+                    out[n, side] = imu.t[row] - (0.0 if side == 0 else T[row])
+                    break
+    return out

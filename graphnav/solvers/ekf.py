@@ -135,8 +135,8 @@ def _forward(
     bank = Bank(watched, problem.t, D) if watched else None
     banks: dict[int, Bank] = {}  # as they were before the latest keyframes with fixes
     verdicts = Verdicts(watched, problem.t)
-    for rows in watched:
-        records[rows.name].used = verdicts.used[rows.name]
+    for kind in watched:
+        records[kind.name].used = verdicts.used[kind.name]
     begun = (state, values, P)
 
     all_P, all_Pp, all_F = np.empty((K, D, D)), np.empty((K, D, D)), np.empty((K - 1, D, D))
@@ -178,9 +178,9 @@ def _forward(
                 e = F @ about.offset(k - 1, state, values)
                 ahead, at_values = ahead.plus(e[None, :DIM]), at_values + e[DIM:]
             state, values = ahead, at_values
-        for rows in watched:
-            if (rows.name, first[rows.name][k]) in verdicts.anew:
-                block = BLOCKS["p" if rows.name == GnssPosition.name else "v"]
+        for kind in watched:
+            if (kind.name, first[kind.name][k]) in verdicts.anew:
+                block = BLOCKS["p" if isinstance(kind, GnssPosition) else "v"]
                 P[block, block] += 1e6 * np.eye(3)
         predicted[k] = state
         all_vp[k] = values
@@ -228,38 +228,43 @@ def _update(
     """One measurement update with rows lo..hi of a constraint at keyframe k; the first row of a fault comes last."""
     n = hi - lo
     at, at_values = (state, values) if about is None else about.at(k)
-    here = at if n == 1 else at[np.zeros(n, dtype=int)]
-    given = {p.name: at_values[None, _shift(columns[p.name])] for p in rows.parameters}
-    if n > 1:
-        given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
-    linear = rows.linearize(here, given, slice(lo, hi))
-    H = assemble(linear, columns, len(P)).reshape(-1, len(P))
-    r, sigma, e = linear.residual.ravel(), linear.sigma.ravel(), np.zeros(len(P))
-    weight = float(np.min(record.used[lo:hi]))
-    if 0.0 < weight < 1.0:
-        sigma = sigma / np.sqrt(weight)
-    if about is not None:
-        e = about.offset(k, state, values)
-        r = r + H @ e
-    PHt = P @ H.T
-    S = H @ PHt
-    S.flat[:: len(r) + 1] += sigma * sigma
-    G = _NOTHING if bank is None or weight == 0.0 else bank.signature(rows.name, lo, H)
-    # LAPACK called directly: for matrices this small the checks around it would cost more than the work
     D = len(P)
-    right = np.empty((len(r), D + 1 + G.shape[1]))
-    right[:, 0], right[:, 1 : D + 1], right[:, D + 1 :] = r, PHt.T, G
-    _, solved, info = dposv(S, right)
-    if info:
-        raise EstimationError(f"the filter's covariance broke down at '{rows.name}' row {lo}: check sigmas and units")
+    e = np.zeros(D) if about is None else about.offset(k, state, values)
+    weight, G = float(np.min(record.used[lo:hi])), _NOTHING
+    for left in range(rows.passes - 1 if about is None else 0, -1, -1):
+        here = at if n == 1 else at[np.zeros(n, dtype=int)]
+        given = {p.name: at_values[None, _shift(columns[p.name])] for p in rows.parameters}
+        if n > 1:
+            given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
+        linear = rows.linearize(here, given, slice(lo, hi))
+        H = assemble(linear, columns, D).reshape(-1, D)
+        r, sigma = linear.residual.ravel() + H @ e, linear.sigma.ravel()
+        if 0.0 < weight < 1.0:
+            sigma = sigma / np.sqrt(weight)
+        PHt = P @ H.T
+        S = H @ PHt
+        S.flat[:: len(r) + 1] += sigma * sigma
+        if bank is not None and weight > 0.0 and not left:
+            G = bank.signature(rows.name, lo, H)
+        # LAPACK called directly: for matrices this small the checks around it would cost more than the work
+        right = np.empty((len(r), D + 1 + G.shape[1]))
+        right[:, 0], right[:, 1 : D + 1], right[:, D + 1 :] = r, PHt.T, G
+        _, solved, info = dposv(S, right)
+        if info:
+            raise EstimationError(
+                f"the filter's covariance broke down at '{rows.name}' row {lo}: check sigmas and units"
+            )
+        K = solved[:, 1 : D + 1].T
+        d = e - K @ r
+        if left:  # again about where this leads (Jazwinski 1970, theorem 8.2)
+            at, at_values = at.plus(d[None, :DIM]), at_values + d[DIM:]
+            e = np.concatenate([state.minus(at)[0], values - at_values])
     nis = float(r @ solved[:, 0])
     if rows.gate is not None and nis > rows.gate**2:
         weight = 0.0
     record.set(slice(lo, hi), r.reshape(n, -1), np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1), nis / n, weight)
     if weight == 0.0:
         return state, values, P, None
-    K = solved[:, 1 : D + 1].T
-    d = e - K @ r
     IKH = -K @ H
     IKH.flat[:: len(P) + 1] += 1.0
     P = IKH @ P @ IKH.T + (K * (sigma * sigma)) @ K.T
