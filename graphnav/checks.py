@@ -53,6 +53,11 @@ class Inspection:
         """The sentences of the warnings."""
         return tuple(f.sentence for f in self.findings if f.severity == "warning")
 
+    def values(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        said = [{"severity": f.severity, "sentence": f.sentence} for f in self.findings]
+        return {"name": self.name, "platform": self.platform, **self.facts, "findings": said}
+
     def text(self) -> str:
         """A summary of several lines for people."""
         lines = [f"{self.name} ({self.platform})"]

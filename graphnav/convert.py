@@ -17,7 +17,6 @@ from graphnav.formats import formats, load
 from graphnav.formats.clocks import gps_to_utc, parse_clock
 from graphnav.formats.registry import Log
 from graphnav.formats.trajectories import read_trajectory
-from graphnav.formats.writer import write_recording
 from graphnav.interpolation import interpolate
 from graphnav.outputs import antenna_lever_arm
 from graphnav.rotation import Array
@@ -41,8 +40,20 @@ def is_export(source: Path, out: Path, name: str | None) -> bool:
     return name not in known or not known[name].recognises(source)
 
 
-def convert_log(source: str, out: Path, name: str | None) -> tuple[Log, list[Path]]:
-    """Read a log of any kind that is known and write it as a recording folder.
+def check_rate(rate: float | None) -> None:
+    """Refuse an output rate (Hz) that makes no sense.
+
+    Raises
+    ------
+    ConfigError
+        Naming the option.
+    """
+    if rate is not None and not 0.0 < rate <= 10_000.0:
+        raise ConfigError(f"--rate {rate:g}: must be above 0 and at most 10000 Hz")
+
+
+def load_log(source: str, out: Path, name: str | None) -> Log:
+    """Read a log of any kind that is known, to be written as a recording into `out`.
 
     Raises
     ------
@@ -59,7 +70,7 @@ def convert_log(source: str, out: Path, name: str | None) -> tuple[Log, list[Pat
     log = load(source, name)
     if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
         raise ConfigError(f"-o {out}: the recording is read from there; name another folder")
-    return log, write_recording(log, out)
+    return log
 
 
 def parse_names(text: str, option: str) -> tuple[str, ...]:
@@ -213,6 +224,13 @@ def _run(source: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return values if isinstance(values, dict) else {}
+
+
+def log_values(log: Log) -> dict[str, Any]:
+    """What was read and what was assumed, for JSON."""
+    sensors = {name: getattr(log, name) for name in ("imu", "gnss", "odometer", "truth")}
+    rows = {name: len(sensor.t) for name, sensor in sensors.items() if sensor is not None}
+    return {"name": log.name, "platform": log.platform, "rows": rows, "assumed": log.remarks}
 
 
 def log_text(log: Log, files: Sequence[Path]) -> str:

@@ -14,12 +14,13 @@ from graphnav.alignment import Alignment, align, with_known_heading
 from graphnav.config import Settings
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
-from graphnav.errors import EstimationError
+from graphnav.errors import ConfigError, EstimationError
 from graphnav.problem import Problem, pose
+from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
 from graphnav.solution import Solution, joined
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import Filtered, Progress, Smoothed, backward, ekf, rts
+from graphnav.solvers.ekf import Filtered, Smoothed, backward, ekf, rts
 from graphnav.solvers.incremental import incremental
 from graphnav.solvers.isam import isam2
 
@@ -53,13 +54,24 @@ def run(
     ------
     EstimationError
         If the recording does not determine a trajectory.
+    ConfigError
+        If the settings' profile is of another platform.
     """
     settings = settings or Settings()
+    with listening(progress):
+        return _run(recording, settings, solvers, progress)
+
+
+def _run(
+    recording: Recording, settings: Settings, solvers: tuple[str, ...], progress: Progress | None
+) -> dict[str, Solution]:
     unknown = [name for name in solvers if name not in KNOWN]
     if unknown:
         raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}")
     frame = LocalFrame(origin(recording))
+    said = fitting(recording, settings)
     pieces, notes = _pieces(recording, settings)
+    notes = [*said, *notes]
     found: list[dict[str, Solution]] = []
     for piece in pieces:
         try:
@@ -94,16 +106,20 @@ def _solve(
     recording: Recording, settings: Settings, frame: LocalFrame, solvers: tuple[str, ...], progress: Progress | None
 ) -> dict[str, Solution]:
     began = time.perf_counter()
+    tell("detection")
     found = detect(recording, settings)
     stationary = found.stationary
     detected = time.perf_counter()
+    tell("alignment")
     aligned = align(
         recording, settings, frame, lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)
     )
     after = time.perf_counter()
+    tell("judgement")
     recording, settings, said = judged(recording, settings, frame, aligned, stationary)
     done = time.perf_counter()
     stated = with_known_heading(aligned, settings)
+    tell("preintegration")
     problem = pose(recording, settings, frame, stated.state, stated.sigma, stationary)
     timings = {
         "detection": detected - began,
@@ -193,6 +209,26 @@ def judged(
     if fixes is None:
         return recording, settings, notes
     return recording, fixes.applied(settings), (*notes, *fixes.notes)
+
+
+def fitting(recording: Recording, settings: Settings) -> list[str]:
+    """What the settings' profile asks for and the recording lacks, in sentences.
+
+    Raises
+    ------
+    ConfigError
+        If the profile is of another platform.
+    """
+    profile = settings.profile
+    if profile is None:
+        return []
+    if (profile == "foot") != (recording.platform == "foot"):
+        raise ConfigError(
+            f"profile '{profile}': but '{recording.name}' says platform = \"{recording.platform}\"; change one of them"
+        )
+    if profile == "car+odometer" and recording.odometer is None:
+        return [f"profile '{profile}': there is no odometer in '{recording.name}', so it is solved without"]
+    return []
 
 
 def origin(recording: Recording) -> np.ndarray:

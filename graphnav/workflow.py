@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ import numpy as np
 from graphnav import rotation
 from graphnav.config import Settings
 from graphnav.errors import ConfigError, RecordingError
+from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import Solution, to_trajectory
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 Span = tuple[float, float]
 Withheld = tuple[str, Span | None]
-Progress = Callable[[str, float], None]
 
 SOURCES = ("gnss", "odometer")
 _DENSEST, _MOST = 0.1, 5_000  # s between, and number of, the epochs of a truth that are met exactly
@@ -131,17 +131,22 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
     GraphnavError
         In one plain sentence, for anything that cannot be used as it is.
     """
+    with listening(progress):
+        return _run(request, progress)
+
+
+def _run(request: Request, progress: Progress | None) -> Outcome:
     from graphnav.checks import inspect
     from graphnav.formats import read
 
     timings: dict[str, float] = {}
-    with _timed(timings, "reading", progress):
+    with _timed(timings, "reading"):
         whole = read(request.source)
     recording = _cropped(whole, request)
     zero = recording.start - whole.start if recording is not whole else 0.0
     moved = _moved(request.withheld, zero)
     used, notes = _withhold(recording, moved, zero)
-    with _timed(timings, "checks", progress):
+    with _timed(timings, "checks"):
         inspection = inspect(recording)
     findings = [f.sentence for f in inspection.findings]
 
@@ -152,7 +157,7 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
         name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
     }
     own: dict[str, float] = {}
-    with _timed(own, "evaluation", progress):
+    with _timed(own, "evaluation"):
         metrics, against, names = _score(recording, used, solutions, moved)
     for found in metrics.values():
         if found.notes:
@@ -182,9 +187,8 @@ def read_part(
 
 
 @contextmanager
-def _timed(timings: dict[str, float], stage: str, progress: Progress | None) -> Iterator[None]:
-    if progress is not None:
-        progress(stage, 0.0)
+def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+    tell(stage)
     began = time.perf_counter()
     yield
     timings[stage] = time.perf_counter() - began

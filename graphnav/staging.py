@@ -1,0 +1,45 @@
+"""Results appear whole or not at all, whatever stops the writing: Ctrl-C, a full disk, an error."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+
+@contextmanager
+def staged(folder: Path) -> Iterator[Path]:
+    """A folder to write into, whose files move to `folder` at the end; if that is not reached, nothing of them is left.
+
+    It lies inside `folder`, which is made if need be and taken away again if nothing came of it, so that moving is
+    renaming. A file that was there under the same name is replaced in one step.
+    """
+    made = _missing(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        part = Path(tempfile.mkdtemp(prefix=".graphnav-", dir=folder))
+        try:
+            yield part
+            for file in sorted(path for path in part.rglob("*") if path.is_file()):
+                target = folder / file.relative_to(part)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(file, target)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+    finally:
+        for path in made:
+            with suppress(OSError):  # not empty: something came of it
+                path.rmdir()
+
+
+def _missing(folder: Path) -> list[Path]:
+    """The folders on the way to `folder` that are not there, innermost first."""
+    return [path for path in (folder, *folder.parents) if not path.exists()]
+
+
+def moved(files: list[Path], part: Path, folder: Path) -> list[Path]:
+    """Where files of a staged folder are in the end; others stay where they are."""
+    return [folder / file.relative_to(part) if file.is_relative_to(part) else file for file in files]
