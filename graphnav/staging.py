@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import tempfile
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -23,16 +25,33 @@ def staged(folder: Path) -> Iterator[Path]:
         part = Path(tempfile.mkdtemp(prefix=".graphnav-", dir=folder))
         try:
             yield part
-            for file in sorted(path for path in part.rglob("*") if path.is_file()):
-                target = folder / file.relative_to(part)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                os.replace(file, target)
+            with uninterrupted():
+                for file in sorted(path for path in part.rglob("*") if path.is_file()):
+                    target = folder / file.relative_to(part)
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    os.replace(file, target)
         finally:
             shutil.rmtree(part, ignore_errors=True)
     finally:
         for path in made:
             with suppress(OSError):  # not empty: something came of it
                 path.rmdir()
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Ctrl-C waits until the end of what is inside, which is to be short."""
+    if threading.current_thread() is not threading.main_thread():  # which alone may say so, and alone is interrupted
+        yield
+        return
+    waiting: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: waiting.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if waiting:
+        raise KeyboardInterrupt
 
 
 def _missing(folder: Path) -> list[Path]:

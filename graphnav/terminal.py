@@ -13,6 +13,7 @@ import numpy as np
 from graphnav.metrics import Span
 from graphnav.outputs import stated
 from graphnav.progress import Progress
+from graphnav.staging import uninterrupted
 from graphnav.workflow import Outcome
 
 _ERRORS = (
@@ -190,9 +191,11 @@ def progress_bar(quiet: bool, work: Sequence[str]) -> Iterator[Progress | None]:
         said = "" if left is None else f"{left:.0f} s left" if left < 90 else f"{left / 60:.0f} min left"
         bar.update(task, description=stage, completed=pace.done, left=said)
         if elapsed > 0.5 and not bar.live.is_started:
-            bar.start()
+            with uninterrupted():
+                bar.start()
 
     try:
         yield update
     finally:
-        bar.stop()
+        with uninterrupted():
+            bar.stop()

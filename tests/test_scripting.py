@@ -230,6 +230,20 @@ def test_a_staged_folder_replaces_at_the_end_or_not_at_all(tmp_path):
     assert not (tmp_path / "x").exists()
 
 
+def test_ctrl_c_waits_for_what_must_not_be_cut():
+    done = []
+
+    def move():
+        with staging.uninterrupted():
+            os.kill(os.getpid(), signal.SIGINT)
+            done.append("moved")
+        done.append("more")
+
+    with pytest.raises(KeyboardInterrupt):
+        move()
+    assert done == ["moved"]
+
+
 def test_a_full_disk_leaves_the_older_results_as_they_were(tmp_path):
     """A limit on the size of files stands for the disk."""
 
