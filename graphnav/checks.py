@@ -31,6 +31,14 @@ from graphnav.checks_imu import (
     repeats,
     saturation,
 )
+from graphnav.checks_stated import (
+    lever_arms,
+    rounded_positions,
+    stated_noise,
+    too_fast_for_a_foot,
+    truth_findings,
+    velocities,
+)
 from graphnav.crosschecks import Track
 from graphnav.findings import Finding, period_of, runs_of
 from graphnav.recording import Recording
@@ -98,6 +106,9 @@ def inspect(recording: Recording) -> Inspection:
     findings += repeats(recording.imu)
     findings += saturation(recording.imu)
     findings += imu_units(recording)
+    findings += stated_noise(recording.imu.noise)
+    findings += lever_arms(recording)
+    findings += too_fast_for_a_foot(recording, track)
     if rest.any():
         facts["imu"]["still_s"] = float(rest.sum() * period_of(recording.imu.t))
         findings += force_at_rest(recording, rest, facts["imu"])
@@ -106,7 +117,9 @@ def inspect(recording: Recording) -> Inspection:
     if recording.gnss is not None:
         facts["gnss"] = _gnss_facts(recording, track)
         findings += gnss_coverage(recording)
-        findings += gnss_jumps(recording, track)
+        findings += rounded_positions(recording.gnss)
+        wrong = list(velocities(recording.gnss))
+        findings += wrong or gnss_jumps(recording, track)  # against wrong velocities every position jumps
     if vehicle and overlap and track is not None:
         forward, yaw = crosschecks.forward_fit(recording.imu, track), crosschecks.yaw_fit(recording.imu, track)
         findings += imu_clock(forward)
@@ -125,6 +138,7 @@ def inspect(recording: Recording) -> Inspection:
         facts["truth"] = {"rows": len(recording.truth.t), "of": recording.truth.of}
         if recording.truth.closed_loop_sigma:
             facts["truth"] = {"closed_loop_sigma_m": recording.truth.closed_loop_sigma}
+        findings += truth_findings(recording)
     return Inspection(recording.name, recording.platform, facts, tuple(findings))
 
 

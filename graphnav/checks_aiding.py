@@ -22,16 +22,28 @@ def overlap_s(recording: Recording) -> float:
     return float(min(t[-1], recording.end) - max(t[0], recording.start))
 
 
+def gnss_apart(recording: Recording) -> str | None:
+    """That GNSS and IMU share no time, and what may mend it; None if they do."""
+    gnss = recording.gnss
+    if gnss is None or not len(gnss.t) or overlap_s(recording) >= 0:
+        return None
+    offset = recording.start - gnss.t[0]
+    hours = round(offset / 1800.0) / 2.0
+    local = (
+        f"; {abs(hours):g} h apart, one may be in local time" if hours and abs(offset - 3600.0 * hours) < 60.0 else ""
+    )
+    return (
+        f"GNSS ({gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) "
+        f"do not overlap in time; if their clocks differ, say time_offset in [gnss] ({offset:.3f} would start both "
+        f"together){local}"
+    )
+
+
 def gnss_coverage(recording: Recording) -> Iterator[Finding]:
     gnss = recording.gnss
     assert gnss is not None
-    if overlap_s(recording) < 0:
-        yield Finding(
-            "warning",
-            f"GNSS ({gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) "
-            f"do not overlap in time; if their clocks differ, say time_offset in [gnss] "
-            f"({recording.start - gnss.t[0]:.3f} would start both together)",
-        )
+    if (sentence := gnss_apart(recording)) is not None:
+        yield Finding("warning", sentence)
         return
     for late, what in ((gnss.t[0] - recording.start, "starts"), (recording.end - gnss.t[-1], "ends")):
         if late > 5.0:

@@ -39,7 +39,6 @@ def convert(
 ) -> None:
     """Turn another program's log into a recording folder, or a trajectory into gpx, nav, nmea, tum, kml or csv."""
     from graphnav import convert as conversion
-    from graphnav.formats.writer import write_recording
     from graphnav.outputs import output_folder
     from graphnav.staging import moved, staged
 
@@ -64,10 +63,7 @@ def convert(
     folder = output_folder(out)
     with bar(quiet, "convert"):
         tell("reading")
-        log = conversion.load_log(source, folder, format)
-        with staged(folder) as part:
-            files = write_recording(log, part)
-    files = moved(files, part, folder)
+        log, files = conversion.convert_log(source, folder, format)
     show(
         lambda: conversion.log_text(log, files),
         lambda: {**conversion.log_values(log), "files": files},

@@ -75,12 +75,14 @@ def _suggestion(loc: tuple[str, ...], model: type[BaseModel]) -> str:
     while here not in tables:
         here = here[:-1]
     known = list(tables[here].model_fields)
-    if close := difflib.get_close_matches(loc[-1], known, n=1, cutoff=0.5):
-        return f"; did you mean '{close[0]}'?"
     elsewhere: dict[str, tuple[str, ...]] = {}
     for at, table in tables.items():
         for name in table.model_fields if at else ():
             elsewhere.setdefault(name, at)
+    if loc[-1] in elsewhere:
+        return f"; did you mean '{loc[-1]}' in [{'.'.join(elsewhere[loc[-1]])}]?"
+    if close := difflib.get_close_matches(loc[-1], known, n=1, cutoff=0.5):
+        return f"; did you mean '{close[0]}'?"
     if close := difflib.get_close_matches(loc[-1], list(elsewhere), n=1, cutoff=0.8):
         return f"; did you mean '{close[0]}' in [{'.'.join(elsewhere[close[0]])}]?"
     return f"; known keys: {', '.join(known)}"

@@ -17,9 +17,11 @@ from graphnav.formats import formats, load
 from graphnav.formats.clocks import gps_to_utc, parse_clock
 from graphnav.formats.registry import Log
 from graphnav.formats.trajectories import read_trajectory
+from graphnav.formats.writer import write_recording
 from graphnav.interpolation import interpolate
 from graphnav.outputs import antenna_lever_arm
 from graphnav.rotation import Array
+from graphnav.staging import moved, staged
 from graphnav.trajectory import Trajectory
 from graphnav.workflow import Outcome
 
@@ -52,8 +54,8 @@ def check_rate(rate: float | None) -> None:
         raise ConfigError(f"--rate {rate:g}: must be above 0 and at most 10000 Hz")
 
 
-def load_log(source: str, out: Path, name: str | None) -> Log:
-    """Read a log of any kind that is known, to be written as a recording into `out`.
+def convert_log(source: str, out: Path, name: str | None) -> tuple[Log, list[Path]]:
+    """Read a log of any kind that is known and write it as a recording folder.
 
     Raises
     ------
@@ -70,7 +72,9 @@ def load_log(source: str, out: Path, name: str | None) -> Log:
     log = load(source, name)
     if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
         raise ConfigError(f"-o {out}: the recording is read from there; name another folder")
-    return log
+    with staged(out) as part:
+        files = write_recording(log, part)
+    return log, moved(files, part, out)
 
 
 def parse_names(text: str, option: str) -> tuple[str, ...]:

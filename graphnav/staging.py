@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from graphnav.errors import ConfigError
+
 
 @contextmanager
 def staged(folder: Path) -> Iterator[Path]:
@@ -18,6 +20,11 @@ def staged(folder: Path) -> Iterator[Path]:
 
     It lies inside `folder`, which is made if need be and taken away again if nothing came of it, so that moving is
     renaming. A file that was there under the same name is replaced in one step.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be written, as when the disk is full.
     """
     made = _missing(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -32,6 +39,10 @@ def staged(folder: Path) -> Iterator[Path]:
                     os.replace(file, target)
         finally:
             shutil.rmtree(part, ignore_errors=True)
+    except OSError as error:
+        raise ConfigError(
+            f"-o {folder}: cannot be written ({error.strerror or error}); what was there before is unchanged"
+        ) from None
     finally:
         for path in made:
             with suppress(OSError):  # not empty: something came of it

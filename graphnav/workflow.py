@@ -137,6 +137,8 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
 
 def _run(request: Request, progress: Progress | None) -> Outcome:
     from graphnav.checks import inspect
+    from graphnav.checks_aiding import gnss_apart
+    from graphnav.checks_stated import truth_apart
     from graphnav.formats import read
 
     timings: dict[str, float] = {}
@@ -149,6 +151,10 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     with _timed(timings, "checks"):
         inspection = inspect(recording)
     findings = [f.sentence for f in inspection.findings]
+    if (sentence := gnss_apart(used)) is not None:  # it would be solved as if there were no GNSS
+        raise RecordingError(f"'{recording.name}': {sentence}")
+    if truth_apart(recording):
+        recording = replace(recording, truth=None)
 
     from graphnav.pipeline import run
 

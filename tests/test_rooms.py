@@ -15,7 +15,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "graphnav"
 ROOMS = [
     "errors", "complaints", "progress", "rotation", "earth", "state", "config", "recording", "trajectory",
     "formats", "draft", "allan", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding",
-    "checks", "detectors",
+    "checks_stated", "checks", "detectors",
     "preintegration", "unresolved", "dynamics", "constraints", "problem", "solution", "alignment",
     "dense", "solvers", "judgement", "pipeline",
     "interpolation", "metrics", "gates", "scoring", "strides", "evaluation", "exporters", "online",

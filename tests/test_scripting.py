@@ -225,7 +225,7 @@ def test_a_staged_folder_replaces_at_the_end_or_not_at_all(tmp_path):
         assert old.read_text() == "old"
     assert (old.read_text(), (old.parent / "sub" / "b.txt").read_text()) == ("new", "new")
     assert {p.name for p in old.parent.iterdir()} == {"a.txt", "sub"}
-    with pytest.raises(OSError, match="full"):
+    with pytest.raises(ConfigError, match=r"cannot be written \(full\); what was there before is unchanged"):
         stopped(tmp_path / "x" / "y", OSError("full"))
     assert not (tmp_path / "x").exists()
 
@@ -256,7 +256,7 @@ def test_a_full_disk_leaves_the_older_results_as_they_were(tmp_path):
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
     run = smooth(90, 20_000)
     assert run.returncode == 2
-    assert re.fullmatch(r"graphnav: .*File too large\n", run.stderr)
+    assert re.fullmatch(r"graphnav: -o .*: cannot be written \(File too large\); .*\n", run.stderr)
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
 
 
