@@ -6,7 +6,7 @@ Nothing is changed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -120,9 +120,10 @@ def inspect(recording: Recording) -> Inspection:
         findings += rounded_positions(recording.gnss)
         wrong = list(velocities(recording.gnss))
         findings += wrong or gnss_jumps(recording, track)  # against wrong velocities every position jumps
-    if vehicle and overlap and track is not None:
+    if vehicle and overlap and track is not None and recording.gnss is not None:
         forward, yaw = crosschecks.forward_fit(recording.imu, track), crosschecks.yaw_fit(recording.imu, track)
-        findings += imu_clock(forward)
+        places = crosschecks.track(replace(recording.gnss, v=None)) if recording.gnss.v is not None else None
+        findings += imu_clock(forward, crosschecks.forward_fit(recording.imu, places) if places is not None else None)
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
         findings += reversed_sign(recording.imu) if turns_back else imu_axes(recording.imu, forward)
         findings += yaw_scale(yaw)

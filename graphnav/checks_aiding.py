@@ -91,7 +91,19 @@ def gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Finding]:
         )
 
 
-def imu_clock(forward: Fit | None) -> Iterator[Finding]:
+def imu_clock(forward: Fit | None, by_places: Fit | None) -> Iterator[Finding]:
+    """By GNSS speed, and by the positions alone, which in some receivers are of another time."""
+    if forward is not None and by_places is not None and min(forward.correlation, by_places.correlation) > 0.8:
+        apart = abs(forward.lag - by_places.lag)
+        if apart > 0.05 + 4.0 * np.hypot(forward.spread, by_places.spread):
+            yield Finding(
+                "note",
+                f"the stamps of GNSS positions and velocities are {apart:.2f} s apart (forward force against each): they "
+                "cannot both be right, and what is left after time_offset is estimated of each",
+            )
+            if forward.lag * by_places.lag <= 0.0:
+                return  # between the two already
+            forward = min(forward, by_places, key=lambda fit: abs(fit.lag))
     # 4 sigma, because the sigma comes from four parts only; the course, which leads or lags with the lever arm, is
     # not asked
     if forward is None or forward.correlation < 0.6 or abs(forward.lag) < 0.05 + 4.0 * forward.spread:
