@@ -101,9 +101,8 @@ def imu_clock(forward: Fit | None, by_places: Fit | None) -> Iterator[Finding]:
                 f"the stamps of GNSS positions and velocities are {apart:.2f} s apart (forward force against each): they "
                 "cannot both be right, and what is left after time_offset is estimated of each",
             )
-            if forward.lag * by_places.lag <= 0.0:
-                return  # between the two already
-            forward = min(forward, by_places, key=lambda fit: abs(fit.lag))
+            if forward.lag * by_places.lag <= 0.0 or abs(by_places.lag) < 0.05:
+                return  # between the two already, or right for the positions
     # 4 sigma, because the sigma comes from four parts only; the course, which leads or lags with the lever arm, is
     # not asked
     if forward is None or forward.correlation < 0.6 or abs(forward.lag) < 0.05 + 4.0 * forward.spread:
