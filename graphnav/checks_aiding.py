@@ -98,8 +98,8 @@ def imu_clock(forward: Fit | None, by_places: Fit | None) -> Iterator[Finding]:
         if apart > 0.05 + 4.0 * np.hypot(forward.spread, by_places.spread):
             yield Finding(
                 "note",
-                f"the stamps of GNSS positions and velocities are {apart:.2f} s apart (forward force against each): they "
-                "cannot both be right, and what is left after time_offset is estimated of each",
+                f"the stamps of GNSS positions and velocities are {apart:.2f} s apart (forward force against each): "
+                "they cannot both be right, and what is left after time_offset is estimated of each",
             )
             if forward.lag * by_places.lag <= 0.0 or abs(by_places.lag) < 0.05:
                 return  # between the two already, or right for the positions

@@ -40,10 +40,14 @@ def run(
 
     Parameters
     ----------
-    recording : from `graphnav.load`.
-    settings : default settings when None.
-    solvers : out of "ekf", "rts", "incremental", "isam2", "batch".
-    progress : called now and then with a stage and its share done, 0 to 1.
+    recording
+        From `graphnav.load`.
+    settings
+        The defaults when None.
+    solvers
+        Out of "ekf", "rts", "incremental", "isam2", "batch".
+    progress
+        Called now and then with a stage and its share done, 0 to 1.
 
     Returns
     -------
