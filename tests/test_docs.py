@@ -41,6 +41,8 @@ def blocks(kind):
     ]
 
 
+PROGRAM = Path(sys.executable).with_name("graphnav")
+
 # the commands of a block belong together: one may need what another wrote
 COMMANDS = sorted(
     {
@@ -70,9 +72,36 @@ def test_commands_run(lines, clone):
     for line in lines.splitlines():
         program, *arguments = shlex.split(line)
         assert program == "graphnav", "a console block holds commands of graphnav and make; use another kind for others"
-        command = [Path(sys.executable).with_name(program), *arguments]
+        command = [PROGRAM, *arguments]
         run = subprocess.run(command, cwd=clone, capture_output=True, text=True, timeout=300)
         assert run.returncode == 0, run.stderr
+
+
+SHOWN = [text for _, text in blocks("text") if text.startswith("$ graphnav ")]
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]\d+)?")
+
+
+@pytest.mark.parametrize("text", SHOWN, ids=lambda text: text.splitlines()[0])
+def test_what_a_page_shows_of_a_command_is_what_it_prints(text, clone):
+    """Word for word; numbers nearly, but for run times; a line of dots stands for some."""
+    command, *shown = text.splitlines()
+    _, *arguments = shlex.split(command.removeprefix("$ "))
+    run = subprocess.run([PROGRAM, *arguments], cwd=clone, capture_output=True, text=True, timeout=300)
+    assert run.returncode == 0, run.stderr
+    printed = run.stdout.splitlines()
+    if "  ..." in shown:
+        k = shown.index("  ...")
+        rest = len(shown) - k - 1
+        shown, printed = shown[:k] + shown[-rest:], printed[:k] + printed[-rest:]
+    assert [NUMBER.sub("#", " ".join(line.split())) for line in shown] == [
+        NUMBER.sub("#", " ".join(line.split())) for line in printed
+    ]
+    timed = False
+    for one, other in zip(shown, printed, strict=True):
+        timed = one.endswith("seconds") or (timed and one.startswith("  "))
+        numbers = [[float(x) for x in NUMBER.findall(line)] for line in (one, other)]
+        last = -1 if timed and numbers[0] else None
+        assert numbers[0][:last] == pytest.approx(numbers[1][:last], rel=0.05, abs=0.02)
 
 
 @pytest.mark.parametrize(("page", "text"), PYTHON, ids=[f"{page.stem}-{k}" for k, (page, _) in enumerate(PYTHON)])
