@@ -99,7 +99,7 @@ def smooth(
 ) -> None:
     """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
     asked = _Asked(recording, out, profile, config, without, rate, start, end, require, quiet, json)
-    _solve(asked, (solver,), "--solver", export, point)
+    _solve(asked, solver, "--solver", export, point)
 
 
 @app.command(epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out/kitti")
@@ -124,7 +124,7 @@ def compare(
 ) -> None:
     """Put the same recording through several solvers and compare them, against the truth where there is one."""
     asked = _Asked(recording, out, profile, config, without, rate, start, end, require, quiet, json)
-    _solve(asked, tuple(name.strip() for name in solvers.split(",") if name.strip()), "--solvers")
+    _solve(asked, solvers, "--solvers")
 
 
 @app.command(epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")
@@ -230,16 +230,18 @@ class _Asked:
     json: bool
 
 
-def _solve(
-    asked: _Asked, solvers: tuple[str, ...], option: str, export: str | None = None, point: str | None = None
-) -> None:
-    from graphnav import convert, gates, outputs, terminal, workflow
+def _solve(asked: _Asked, solvers: str, option: str, export: str | None = None, point: str | None = None) -> None:
+    from graphnav import convert, gates, outputs, pipeline, terminal, workflow
+    from graphnav.complaints import listed
     from graphnav.config import read_settings
+    from graphnav.exporters import NAMES
     from graphnav.staging import moved, staged
 
     withheld = _withheld(asked.without, asked.start, asked.end)
     convert.check_rate(asked.rate)
-    chosen = workflow.known_solvers(solvers, option)
+    chosen, alone = listed(solvers, pipeline.KNOWN, option, "solver"), option == "--solver"
+    if alone and len(chosen) > 1:
+        raise ConfigError(f"--solver {solvers}: smooth uses one; several are for graphnav compare")
     requirements = [gates.parse_requirement(one, chosen) for one in asked.require or ()]
     given: dict[str, Any] = {
         "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
@@ -249,13 +251,12 @@ def _solve(
     folder = outputs.output_folder(asked.out)
     if point is not None and export is None:
         raise ConfigError(f"--point {point}: is of the files of --export; name some")
-    exported = convert.parse_names(export, "--export") if export is not None else ()
+    exported = listed(export, NAMES, "--export", "format to write") if export is not None else ()
     convert.parse_point(point)
     request = workflow.Request(
         asked.recording, chosen, read_settings(asked.config, asked.profile), withheld, asked.start, asked.end,
         asked.rate, {k: v for k, v in given.items() if v is not None},
     )  # fmt: skip
-    alone = option == "--solver"
     with bar(asked.quiet, *chosen) as progress:
         outcome = workflow.run_request(request, progress)
         tell("writing")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from graphnav.errors import GraphnavError
+from graphnav.errors import ConfigError, GraphnavError
 
 _TABLE = re.compile(r"\[([^\[\]]+)\]")
 _KEY = re.compile(r"([\w\-.\"']+)\s*=")
@@ -56,6 +56,29 @@ def complaint(source: str | Path, error: ValidationError, model: type[BaseModel]
     if first["type"] in ("model_type", "model_attributes_type"):
         return f"{where}'{key}' must be a table: [{key}]"
     return f"{where}'{key}' = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}{_meaning(loc, model)}"
+
+
+def nearest(name: str, known: Sequence[str]) -> str:
+    """What may have been meant: the nearest of the names there are, else all of them."""
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known) or 'none'}"
+
+
+def listed(text: str, known: Sequence[str], option: str, what: str) -> tuple[str, ...]:
+    """The names of an option with commas between, each once.
+
+    Raises
+    ------
+    ConfigError
+        If one is not known, or there is none.
+    """
+    names = tuple(dict.fromkeys(name.strip().lstrip(".") for name in text.split(",") if name.strip()))
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"{option} {text}: no {what} '{name}'; known: {', '.join(known)}")
+    if not names:
+        raise ConfigError(f"{option}: names no {what}; known: {', '.join(known)}")
+    return names
 
 
 def _tables(model: type[BaseModel], at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], type[BaseModel]]]:

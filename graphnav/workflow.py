@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import time
 from collections.abc import Iterator, Mapping
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from graphnav import rotation
+from graphnav.complaints import nearest
 from graphnav.config import Settings
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.progress import Progress, listening, tell
@@ -91,9 +91,7 @@ def parse_withheld(text: str) -> Withheld:
         raise ConfigError(f"--without {text}: not a source and a span; {usage}")
     source, first, last = found.groups()
     if source not in SOURCES:
-        close = difflib.get_close_matches(source, SOURCES, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else f"one of {', '.join(SOURCES)}"
-        raise ConfigError(f"--without {text}: no source '{source}' can be withheld; {hint}")
+        raise ConfigError(f"--without {text}: no source '{source}' can be withheld; {nearest(source, SOURCES)}")
     if first is None:
         return source, None
     try:
@@ -103,24 +101,6 @@ def parse_withheld(text: str) -> Withheld:
     if not (np.isfinite(span).all() and span[0] < span[1]):
         raise ConfigError(f"--without {text}: the span must end after it begins; {usage}")
     return source, span
-
-
-def known_solvers(names: tuple[str, ...], option: str) -> tuple[str, ...]:
-    """The names, each once.
-
-    Raises
-    ------
-    ConfigError
-        If one is not a solver, listing those that are.
-    """
-    from graphnav.pipeline import KNOWN
-
-    for name in names:
-        if name not in KNOWN:
-            raise ConfigError(f"{option} {name}: no solver '{name}'; known: {', '.join(KNOWN)}")
-    if not names:
-        raise ConfigError(f"{option}: names no solver; known: {', '.join(KNOWN)}")
-    return tuple(dict.fromkeys(names))
 
 
 def run_request(request: Request, progress: Progress | None = None) -> Outcome:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
@@ -22,7 +21,7 @@ from pydantic import (
 )
 from pydantic.types import Strict
 
-from graphnav.complaints import complaint, read_toml
+from graphnav.complaints import complaint, nearest, read_toml
 from graphnav.errors import RecordingError
 from graphnav.formats.clocks import parse_clock
 from graphnav.formats.figures import parse_figure
@@ -95,7 +94,7 @@ class _Sensor(_Section):
         known = (*cls.required, *cls.optional)
         for name in columns:
             if name not in known:
-                raise ValueError(f"'{name}' is not one of graphnav's columns; {_nearest(name, known)}")
+                raise ValueError(f"'{name}' is not one of graphnav's columns; {nearest(name, known)}")
         return columns
 
 
@@ -160,7 +159,7 @@ class ImuTable(_Sensor):
     @classmethod
     def _known_model(cls, model: str | None) -> str | None:
         if model is not None and find_model(model) is None:
-            raise ValueError(f"no figures of an IMU called '{model}' are known; {_nearest(model, tuple(MODELS))}")
+            raise ValueError(f"no figures of an IMU called '{model}' are known; {nearest(model, tuple(MODELS))}")
         return model
 
     @model_validator(mode="after")
@@ -280,11 +279,6 @@ class RecordingFile(_Section):
         if getattr(self, of) is None:
             raise ValueError(f"truth.of = '{of}', but there is no [{of}] table whose lever arm would apply")
         return self
-
-
-def _nearest(name: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"did you mean '{close[0]}'?" if close else f"known are {', '.join(known)}"
 
 
 def rotation_from_letters(axes: str) -> Array:
