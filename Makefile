@@ -29,11 +29,13 @@ docs: $(VENV)/installed-dev
 
 # Stamps: installed again only when pyproject.toml has changed.
 $(VENV)/installed: pyproject.toml
+	@echo "installing graphnav and what it needs into $(VENV), once: about 500 MB, a minute or two"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet -e .
 	@touch $@
 
 $(VENV)/installed-dev: pyproject.toml
+	@echo "installing what the tests need as well into $(VENV), once"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet -e '.[dev]'
 	@touch $(VENV)/installed $@
