@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from json import loads
 from pathlib import Path
 from typing import Annotated, Any
@@ -61,16 +61,27 @@ def _program(
 
 
 @app.command(epilog="\b\nExample:\n  graphnav info kitti")
-def info(recording: Source, quiet: Quiet = False, json: Json = False) -> None:
+def info(
+    recording: Source,
+    antenna: Annotated[
+        bool, typer.Option("--antenna", help="Also find the antenna from the drive, and compare with its lever arm.")
+    ] = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
     """Check a recording and say what it holds: sensors, rates, gaps, distance, stops, and what is odd."""
     from graphnav.checks import inspect
     from graphnav.formats import read
 
-    with bar(quiet, "info"):
+    with bar(quiet, "ekf" if antenna else "info"):
         tell("reading")
         whole = read(recording)
         tell("checks")
         found = inspect(whole)
+        if antenna:
+            from graphnav.lever_arm import find_antenna
+
+            found = replace(found, findings=(*found.findings, find_antenna(whole).finding))
     show(found.text, found.values, quiet, json)
 
 

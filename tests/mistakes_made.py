@@ -246,6 +246,12 @@ MISTAKES: dict[str, list[Mistake]] = {
             "the odometer counts backward", scaled("odometer", "speed_mps", -1.0), ("odometer's sign is reversed",)
         ),
         Mistake(
+            "the lever arm's sign",
+            toml("[0.0, 0.0, 0.6]", "[0.0, 0.0, -0.6]"),
+            ("antenna: the drive finds it at", "lever_arm in [gnss]", "signs"),
+            ("info", "drive", "--antenna"),
+        ),
+        Mistake(
             "a foot's platform on a car",
             toml('platform = "vehicle"', 'platform = "foot"'),
             ("too fast for a foot", 'platform = "vehicle"'),

@@ -17,7 +17,7 @@ ROOMS = [
     "formats", "draft", "allan", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding",
     "checks_stated", "checks", "detectors",
     "preintegration", "unresolved", "dynamics", "constraints", "problem", "solution", "alignment",
-    "dense", "solvers", "judgement", "pipeline",
+    "dense", "solvers", "judgement", "pipeline", "lever_arm",
     "interpolation", "metrics", "gates", "scoring", "strides", "evaluation", "exporters", "online",
     "panels", "page", "plots", "report_tables", "report_pictures", "report",
     "workflow", "staging", "outputs", "convert", "terminal", "detection_pictures", "detection_report",
