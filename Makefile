@@ -1,4 +1,5 @@
-# make demo: the program on a real drive.  make test: everything that must hold.  make clean: away with what they made.
+# make demo: the program on a real drive.  make test: everything that must hold.  make docs: the pages as a site.
+# make clean: away with what they made.
 PYTHON ?= python3
 JOBS ?= 2
 VENV := .venv
@@ -7,7 +8,7 @@ BIN := $(VENV)/bin
 # the matrices are small: threads would only wait for each other
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test clean
+.PHONY: demo test docs clean
 
 demo: $(VENV)/installed
 	$(BIN)/graphnav compare kitti --without gnss:400-460 -o out/demo
@@ -22,13 +23,19 @@ test: $(VENV)/installed-dev
 	$(BIN)/mypy
 	$(BIN)/pytest -n $(JOBS)
 
+docs: $(VENV)/installed-dev
+	$(BIN)/mkdocs build
+	@echo "build/site/index.html"
+
 # Stamps: installed again only when pyproject.toml has changed.
 $(VENV)/installed: pyproject.toml
+	@echo "installing graphnav and what it needs into $(VENV), once: about 500 MB, a minute or two"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet -e .
 	@touch $@
 
 $(VENV)/installed-dev: pyproject.toml
+	@echo "installing what the tests need as well into $(VENV), once"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet -e '.[dev]'
 	@touch $(VENV)/installed $@

@@ -6,7 +6,7 @@ Nothing is changed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,14 @@ from graphnav.checks_imu import (
     repeats,
     saturation,
 )
+from graphnav.checks_stated import (
+    lever_arms,
+    rounded_positions,
+    stated_noise,
+    too_fast_for_a_foot,
+    truth_findings,
+    velocities,
+)
 from graphnav.crosschecks import Track
 from graphnav.findings import Finding, period_of, runs_of
 from graphnav.recording import Recording
@@ -52,6 +60,11 @@ class Inspection:
     def warnings(self) -> tuple[str, ...]:
         """The sentences of the warnings."""
         return tuple(f.sentence for f in self.findings if f.severity == "warning")
+
+    def values(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        said = [{"severity": f.severity, "sentence": f.sentence} for f in self.findings]
+        return {"name": self.name, "platform": self.platform, **self.facts, "findings": said}
 
     def text(self) -> str:
         """A summary of several lines for people."""
@@ -93,6 +106,9 @@ def inspect(recording: Recording) -> Inspection:
     findings += repeats(recording.imu)
     findings += saturation(recording.imu)
     findings += imu_units(recording)
+    findings += stated_noise(recording.imu.noise)
+    findings += lever_arms(recording)
+    findings += too_fast_for_a_foot(recording, track)
     if rest.any():
         facts["imu"]["still_s"] = float(rest.sum() * period_of(recording.imu.t))
         findings += force_at_rest(recording, rest, facts["imu"])
@@ -101,10 +117,13 @@ def inspect(recording: Recording) -> Inspection:
     if recording.gnss is not None:
         facts["gnss"] = _gnss_facts(recording, track)
         findings += gnss_coverage(recording)
-        findings += gnss_jumps(recording, track)
-    if vehicle and overlap and track is not None:
+        findings += rounded_positions(recording.gnss)
+        wrong = list(velocities(recording.gnss))
+        findings += wrong or gnss_jumps(recording, track)  # against wrong velocities every position jumps
+    if vehicle and overlap and track is not None and recording.gnss is not None:
         forward, yaw = crosschecks.forward_fit(recording.imu, track), crosschecks.yaw_fit(recording.imu, track)
-        findings += imu_clock(forward)
+        places = crosschecks.track(replace(recording.gnss, v=None)) if recording.gnss.v is not None else None
+        findings += imu_clock(forward, crosschecks.forward_fit(recording.imu, places) if places is not None else None)
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
         findings += reversed_sign(recording.imu) if turns_back else imu_axes(recording.imu, forward)
         findings += yaw_scale(yaw)
@@ -120,6 +139,7 @@ def inspect(recording: Recording) -> Inspection:
         facts["truth"] = {"rows": len(recording.truth.t), "of": recording.truth.of}
         if recording.truth.closed_loop_sigma:
             facts["truth"] = {"closed_loop_sigma_m": recording.truth.closed_loop_sigma}
+        findings += truth_findings(recording)
     return Inspection(recording.name, recording.platform, facts, tuple(findings))
 
 

@@ -22,16 +22,28 @@ def overlap_s(recording: Recording) -> float:
     return float(min(t[-1], recording.end) - max(t[0], recording.start))
 
 
+def gnss_apart(recording: Recording) -> str | None:
+    """That GNSS and IMU share no time, and what may mend it; None if they do."""
+    gnss = recording.gnss
+    if gnss is None or not len(gnss.t) or overlap_s(recording) >= 0:
+        return None
+    offset = recording.start - gnss.t[0]
+    hours = round(offset / 1800.0) / 2.0
+    local = (
+        f"; {abs(hours):g} h apart, one may be in local time" if hours and abs(offset - 3600.0 * hours) < 60.0 else ""
+    )
+    return (
+        f"GNSS ({gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) "
+        f"do not overlap in time; if their clocks differ, say time_offset in [gnss] ({offset:.3f} would start both "
+        f"together){local}"
+    )
+
+
 def gnss_coverage(recording: Recording) -> Iterator[Finding]:
     gnss = recording.gnss
     assert gnss is not None
-    if overlap_s(recording) < 0:
-        yield Finding(
-            "warning",
-            f"GNSS ({gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) "
-            f"do not overlap in time; if their clocks differ, say time_offset in [gnss] "
-            f"({recording.start - gnss.t[0]:.3f} would start both together)",
-        )
+    if (sentence := gnss_apart(recording)) is not None:
+        yield Finding("warning", sentence)
         return
     for late, what in ((gnss.t[0] - recording.start, "starts"), (recording.end - gnss.t[-1], "ends")):
         if late > 5.0:
@@ -79,7 +91,18 @@ def gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Finding]:
         )
 
 
-def imu_clock(forward: Fit | None) -> Iterator[Finding]:
+def imu_clock(forward: Fit | None, by_places: Fit | None) -> Iterator[Finding]:
+    """By GNSS speed, and by the positions alone, which in some receivers are of another time."""
+    if forward is not None and by_places is not None and min(forward.correlation, by_places.correlation) > 0.8:
+        apart = abs(forward.lag - by_places.lag)
+        if apart > 0.05 + 4.0 * np.hypot(forward.spread, by_places.spread):
+            yield Finding(
+                "note",
+                f"the stamps of GNSS positions and velocities are {apart:.2f} s apart (forward force against each): "
+                "they cannot both be right, and what is left after time_offset is estimated of each",
+            )
+            if forward.lag * by_places.lag <= 0.0 or abs(by_places.lag) < 0.05:
+                return  # between the two already, or right for the positions
     # 4 sigma, because the sigma comes from four parts only; the course, which leads or lags with the lever arm, is
     # not asked
     if forward is None or forward.correlation < 0.6 or abs(forward.lag) < 0.05 + 4.0 * forward.spread:

@@ -8,19 +8,35 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+from dataclasses import dataclass, replace
+from json import loads
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from graphnav import __version__, cli_logs
+from graphnav.cli_options import (
+    Config,
+    End,
+    Json,
+    Out,
+    Profile,
+    Quiet,
+    Rate,
+    Require,
+    Source,
+    Start,
+    Without,
+)
 from graphnav.errors import ConfigError, GraphnavError
+from graphnav.progress import tell
+from graphnav.talk import BAD_INPUT, DEBUG, INTERNAL, INTERRUPTED, PIPE_CLOSED, bar, fail, insist, say, show
+
+__all__ = ["DEBUG", "PIPE_CLOSED", "app", "main", "run"]
 
 # Before NumPy is imported: see `graphnav.pipeline`, which limits threads for those who do not come this way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-BAD_INPUT, INTERNAL, INTERRUPTED, PIPE_CLOSED = 2, 1, 130, 141
-DEBUG = "GRAPHNAV_DEBUG"  # set, a traceback is shown
 
 app = typer.Typer(
     name="graphnav",
@@ -29,24 +45,6 @@ app = typer.Typer(
     help="Smooths recorded drives with a factor graph, beside the Kalman filter it replaces.",
     epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out",
 )
-
-Source = Annotated[
-    str, typer.Argument(metavar="RECORDING", help="A folder, a .toml in one, or a built-in name such as kitti.")
-]
-Out = Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into; made if need be.")]
-Config = Annotated[Path | None, typer.Option("--config", metavar="FILE", help="Settings, TOML.")]
-Without = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--without",
-        metavar="SOURCE[:FROM-TO]",
-        help="Withhold gnss or odometer, in a span in s from the start or throughout; may be repeated.",
-    ),
-]
-Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Output rate; default: at the keyframes.")]
-Start = Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from the recording's start.")]
-End = Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from the recording's start.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 
 
 @app.callback(invoke_without_command=True)
@@ -63,12 +61,28 @@ def _program(
 
 
 @app.command(epilog="\b\nExample:\n  graphnav info kitti")
-def info(recording: Source) -> None:
+def info(
+    recording: Source,
+    antenna: Annotated[
+        bool, typer.Option("--antenna", help="Also find the antenna from the drive, and compare with its lever arm.")
+    ] = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
     """Check a recording and say what it holds: sensors, rates, gaps, distance, stops, and what is odd."""
     from graphnav.checks import inspect
     from graphnav.formats import read
 
-    say(inspect(read(recording)).text())
+    with bar(quiet, "ekf" if antenna else "info"):
+        tell("reading")
+        whole = read(recording)
+        tell("checks")
+        found = inspect(whole)
+        if antenna:
+            from graphnav.lever_arm import find_antenna
+
+            found = replace(found, findings=(*found.findings, find_antenna(whole).finding))
+    show(found.text, found.values, quiet, json)
 
 
 @app.command(epilog="\b\nExample:\n  graphnav smooth kitti -o out/kitti")
@@ -78,21 +92,25 @@ def smooth(
     solver: Annotated[
         str, typer.Option("--solver", metavar="NAME", help="batch, incremental, isam2, rts or ekf.")
     ] = "batch",
+    profile: Profile = None,
     config: Config = None,
     without: Without = None,
     rate: Rate = None,
     start: Start = None,
     end: End = None,
-    quiet: Quiet = False,
     export: Annotated[
         str | None, typer.Option("--export", metavar="NAMES", help="More formats: some of gpx,nav,nmea,csv,tum,kml.")
     ] = None,
     point: Annotated[
         str | None, typer.Option("--point", metavar="POINT", help="Of --export: imu, antenna or x,y,z (m; RFU).")
     ] = None,
+    require: Require = None,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
-    _solve((solver,), "--solver", out, recording, config, without, rate, start, end, quiet, export, point)
+    asked = _Asked(recording, out, profile, config, without, rate, start, end, require, quiet, json)
+    _solve(asked, solver, "--solver", export, point)
 
 
 @app.command(epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out/kitti")
@@ -105,16 +123,19 @@ def compare(
             "--solvers", metavar="NAMES", help="Some of ekf, rts, incremental, isam2, batch, with commas between."
         ),
     ] = "ekf,rts,batch",
+    profile: Profile = None,
     config: Config = None,
     without: Without = None,
     rate: Rate = None,
     start: Start = None,
     end: End = None,
+    require: Require = None,
     quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Put the same recording through several solvers and compare them, against the truth where there is one."""
-    names = tuple(name.strip() for name in solvers.split(",") if name.strip())
-    _solve(names, "--solvers", out, recording, config, without, rate, start, end, quiet)
+    asked = _Asked(recording, out, profile, config, without, rate, start, end, require, quiet, json)
+    _solve(asked, solvers, "--solvers")
 
 
 @app.command(epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")
@@ -126,133 +147,153 @@ def detect(
     start: Start = None,
     end: End = None,
     quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Find where the vehicle stands, and write the intervals, the statistics they come from and a picture."""
     from graphnav import detection_report, outputs, workflow
-    from graphnav.config import Settings, read_settings
+    from graphnav.config import read_settings
     from graphnav.detectors import detect as detected
+    from graphnav.staging import moved, staged
 
-    withheld = tuple(workflow.parse_withheld(one) for one in without or ())
-    if start is not None and end is not None and not start < end:
-        raise ConfigError(f"--end {end:g}: must be later than --start {start:g}")
-    settings = Settings() if config is None else read_settings(config)
+    withheld = _withheld(without, start, end)
+    settings = read_settings(config)
     folder = outputs.output_folder(out)
-    used = workflow.read_part(recording, start, end, withheld)
-    found = detected(used, settings)
-    files = detection_report.write(used, found, folder)
-    if not quiet:
-        say(detection_report.text(used, found, files))
+    with bar(quiet, "detect"):
+        tell("reading")
+        used = workflow.read_part(recording, start, end, withheld)
+        tell("detection")
+        found = detected(used, settings)
+        tell("writing")
+        with staged(folder) as part:
+            files = detection_report.write(used, found, part)
+    files = moved(files, part, folder)
+    show(
+        lambda: detection_report.text(used, found, files),
+        lambda: {**detection_report.values(used, found), "files": files},
+        quiet,
+        json,
+    )
 
 
-@app.command(epilog="\b\nExample:\n  graphnav evaluate out/kitti/trajectory.csv truth.csv --json")
+@app.command(epilog="\b\nExample:\n  graphnav evaluate out/kitti/trajectory.csv truth.csv --require 'h_rms<0.5'")
 def evaluate(
     trajectory: Annotated[Path, typer.Argument(metavar="TRAJECTORY", help="CSV, TUM, KF-GINS .nav or RTKLIB .pos.")],
     truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="The same kinds, or a recording with a truth.")],
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="OUT", help="Folder for evaluation.json and errors.csv.")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    require: Require = None,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Compare any trajectory file with any truth file, ours or another program's."""
-    from graphnav import outputs
+    from graphnav import gates, outputs
     from graphnav.evaluation import evaluate as compared
-    from graphnav.metrics import summary, text
+    from graphnav.metrics import comparison_rows, summary, text
+    from graphnav.staging import staged
 
+    requirements = [gates.parse_requirement(one) for one in require or ()]
     folder = None if out is None else outputs.output_folder(out)
-    metrics = compared(trajectory, truth)
+    with bar(quiet, "evaluate"):
+        tell("reading")
+        metrics = compared(trajectory, truth)
     values = {"trajectory": str(trajectory), "truth": str(truth), **summary(metrics)}
+    verdicts = gates.judge(requirements, comparison_rows({trajectory.stem: metrics}))
+    if verdicts:
+        values["requirements"] = gates.values(verdicts)
     if folder is not None:
-        outputs.write_evaluation(folder, values, metrics)
-    say(outputs.json_text(values) if json else text(metrics))
+        with staged(folder) as part:
+            outputs.write_evaluation(part, values, metrics)
+    show(lambda: text(metrics) + gates.text(verdicts), lambda: values, quiet, json)
+    insist(verdicts)
 
 
-@app.command(epilog="\b\nExample:\n  graphnav simulate urban -o out/urban --seed 1")
-def simulate(
-    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help="Its name; none lists them.")] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Folder for the recording; made if need be.")
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed", metavar="N", help="The same seed gives the same recording.")] = 0,
-    option: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="An option of the scenario; may be repeated. See --list."),
-    ] = None,
-    listing: Annotated[bool, typer.Option("--list", help="List the scenarios and their options.")] = False,
+@app.command(epilog="\b\nExample:\n  graphnav settings --profile car > settings.toml")
+def settings(
+    profile: Profile = None,
+    config: Config = None,
+    json: Json = False,
 ) -> None:
-    """Make a recording with truth: a simulated drive, with the errors of simulated sensors."""
-    from graphnav import outputs
-    from graphnav.simulation import catalogue, options_from
-    from graphnav.simulation import simulate as simulated
+    """Print all settings as a file for --config: the defaults, a profile's, or those that a file or a run comes to."""
+    from graphnav.config import read_settings, settings_text
 
-    if listing or scenario is None:
-        say(catalogue())
-        return
-    if out is None:
-        raise ConfigError("say where to write the recording: -o DIR")
-    folder = outputs.output_folder(out)
-    made = simulated(scenario, seed, **options_from(scenario, option or []))
-    files = made.write(folder)
-    say("\n".join([made.text(), *(f"  {file}" for file in files)]))
+    found = read_settings(config, profile)
+    show(lambda: settings_text(found), found.model_dump, False, json)
 
 
-cli_logs.register(app, lambda text: say(text))
+app.add_typer(cli_logs.commands)
 
 
-def _solve(
-    solvers: tuple[str, ...],
-    option: str,
-    out: Path,
-    recording: str,
-    config: Path | None,
-    without: list[str] | None,
-    rate: float | None,
-    start: float | None,
-    end: float | None,
-    quiet: bool,
-    export: str | None = None,
-    point: str | None = None,
-) -> None:
-    from graphnav import convert, outputs, terminal, workflow
-    from graphnav.config import Settings, read_settings
+@dataclass(frozen=True)
+class _Asked:
+    """The options that smooth and compare share."""
 
-    withheld = tuple(workflow.parse_withheld(one) for one in without or ())
-    if start is not None and end is not None and not start < end:
-        raise ConfigError(f"--end {end:g}: must be later than --start {start:g}")
-    if rate is not None and not 0.0 < rate <= 10_000.0:
-        raise ConfigError(f"--rate {rate:g}: must be above 0 and at most 10000 Hz")
-    settings = Settings() if config is None else read_settings(config)
-    chosen = workflow.known_solvers(solvers, option)
+    recording: str
+    out: Path
+    profile: str | None
+    config: Path | None
+    without: list[str] | None
+    rate: float | None
+    start: float | None
+    end: float | None
+    require: list[str] | None
+    quiet: bool
+    json: bool
+
+
+def _solve(asked: _Asked, solvers: str, option: str, export: str | None = None, point: str | None = None) -> None:
+    from graphnav import convert, gates, outputs, pipeline, terminal, workflow
+    from graphnav.complaints import listed
+    from graphnav.config import read_settings
+    from graphnav.exporters import NAMES
+    from graphnav.staging import moved, staged
+
+    withheld = _withheld(asked.without, asked.start, asked.end)
+    convert.check_rate(asked.rate)
+    chosen, alone = listed(solvers, pipeline.KNOWN, option, "solver"), option == "--solver"
+    if alone and len(chosen) > 1:
+        raise ConfigError(f"--solver {solvers}: smooth uses one; several are for graphnav compare")
+    requirements = [gates.parse_requirement(one, chosen) for one in asked.require or ()]
     given: dict[str, Any] = {
-        "recording": recording, option.lstrip("-"): ",".join(chosen), "config": config and str(config),
-        "without": without, "rate": rate, "start": start, "end": end,
+        "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
+        "config": asked.config and str(asked.config), "without": asked.without, "rate": asked.rate,
+        "start": asked.start, "end": asked.end,
     }  # fmt: skip
-    folder = outputs.output_folder(out)
+    folder = outputs.output_folder(asked.out)
     if point is not None and export is None:
         raise ConfigError(f"--point {point}: is of the files of --export; name some")
-    exported = convert.parse_names(export, "--export") if export is not None else ()
+    exported = listed(export, NAMES, "--export", "format to write") if export is not None else ()
     convert.parse_point(point)
     request = workflow.Request(
-        recording, chosen, settings, withheld, start, end, rate, {k: v for k, v in given.items() if v is not None}
-    )
-    with terminal.progress_bar(quiet) as progress:
+        asked.recording, chosen, read_settings(asked.config, asked.profile), withheld, asked.start, asked.end,
+        asked.rate, {k: v for k, v in given.items() if v is not None},
+    )  # fmt: skip
+    with bar(asked.quiet, *chosen) as progress:
         outcome = workflow.run_request(request, progress)
-        if progress is not None:
-            progress("writing", 0.0)
-        write = outputs.write_run if option == "--solver" else outputs.write_comparison
-        files = write(outcome, folder)
-        files += convert.export_run(outcome, folder, exported, point) if exported else []
-    if not quiet:
-        say(terminal.run_text(outcome, files))
+        tell("writing")
+        with staged(folder) as part:
+            files = (outputs.write_run if alone else outputs.write_comparison)(outcome, part)
+            files += convert.export_run(outcome, part, exported, point) if exported else []
+    files = moved(files, part, folder)
+    verdicts = gates.judge(requirements, outputs.comparison(outcome)) if requirements else []
+
+    def values() -> dict[str, Any]:
+        places = {name: folder if alone else folder / name for name in chosen}
+        each = {name: loads((at / "summary.json").read_text(encoding="utf-8")) for name, at in places.items()}
+        found = each[chosen[0]] if alone else {"recording": outcome.recording.name, "solvers": each}
+        return {**found, "requirements": gates.values(verdicts), "files": files}
+
+    show(lambda: terminal.run_text(outcome, files) + gates.text(verdicts), values, asked.quiet, asked.json)
+    insist(verdicts)
 
 
-def say(text: str) -> None:
-    """Print to stdout; whoever reads may stop early."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        # what is still in the buffer would fail again at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise typer.Exit(PIPE_CLOSED) from None
+def _withheld(without: list[str] | None, start: float | None, end: float | None) -> tuple[Any, ...]:
+    """What is withheld; the span asked for must not be empty."""
+    from graphnav import workflow
+
+    if start is not None and end is not None and not start < end:
+        raise ConfigError(f"--end {end:g}: must be later than --start {start:g}")
+    return tuple(workflow.parse_withheld(one) for one in without or ())
 
 
 def main() -> None:
@@ -270,28 +311,21 @@ def run(arguments: list[str]) -> int:
     try:
         code = app(arguments, prog_name="graphnav", standalone_mode=False)
     except GraphnavError as error:
-        return _fail(str(error), BAD_INPUT, debug)
+        return fail(str(error), BAD_INPUT, debug)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except MemoryError:
-        return _fail("out of memory; use a shorter part (--start, --end)", INTERNAL, debug)
+        return fail("out of memory; use a shorter part (--start, --end)", INTERNAL, debug)
     except OSError as error:
         # files are read and written by modules that turn what they expect into sentences; this is a full disk or so
-        return _fail(f"{error.filename or 'input or output'}: {error.strerror or error}", BAD_INPUT, debug)
+        return fail(f"{error.filename or 'input or output'}: {error.strerror or error}", BAD_INPUT, debug)
     except Exception as error:
         if hasattr(error, "format_message"):  # typer's own: a usage error
-            return _fail(_usage(error), BAD_INPUT, debug)
-        return _fail(_internal(error), INTERNAL, debug)
+            return fail(_usage(error), BAD_INPUT, debug)
+        return fail(_internal(error), INTERNAL, debug)
     if code == INTERRUPTED:
-        return _fail("interrupted", INTERRUPTED, False)
+        return fail("interrupted", INTERRUPTED, False)
     return code if isinstance(code, int) else 0
-
-
-def _fail(reason: str, code: int, debug: bool) -> int:
-    if debug:
-        traceback.print_exc()
-    print(f"graphnav: {' '.join(reason.split())}", file=sys.stderr)
-    return code
 
 
 def _usage(error: Any) -> str:
@@ -309,7 +343,3 @@ def _internal(error: Exception) -> str:
         f"internal error: {type(error).__name__}: {error} in {Path(at.filename).name}:{at.lineno}; "
         f"please report this with the command ({DEBUG}=1 shows a traceback)"
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,73 +1,97 @@
-"""Commands about logs: `convert`, `init` and `allan`. `graphnav.cli` puts them on the program."""
+"""Commands that make or describe recordings: `convert`, `init`, `allan`, `simulate`. `graphnav.cli` has the others."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
+from tomllib import loads
 from typing import Annotated
 
 import typer
 
+from graphnav.cli_options import Json, Quiet
 from graphnav.errors import ConfigError
+from graphnav.progress import tell
+from graphnav.talk import bar, say, show
+
+commands = typer.Typer()
 
 
-def register(app: typer.Typer, say: Callable[[str], None]) -> None:
-    """Add the commands to the program; `say` prints."""
+@commands.command(
+    epilog="\b\nExamples:\n  graphnav convert dataset/kf-gins.yaml -o drive\n"
+    "  graphnav convert out/trajectory.csv -o track.gpx --point antenna"
+)
+def convert(
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help="Another program's log, or a trajectory file.")],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder; for a trajectory, a file will do.")],
+    format: Annotated[
+        str | None, typer.Option("--format", metavar="NAME", help="What the log is, or what to write a trajectory as.")
+    ] = None,
+    point: Annotated[
+        str | None, typer.Option("--point", metavar="POINT", help="Trajectory: imu, antenna or x,y,z (m; RFU).")
+    ] = None,
+    rate: Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Trajectory: interpolate to.")] = None,
+    clock: Annotated[
+        str | None,
+        typer.Option("--clock", metavar="TEXT", help="Trajectory: unix, 'gps week 2313' or a UTC date of t = 0."),
+    ] = None,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Turn another program's log into a recording folder, or a trajectory into gpx, nav, nmea, tum, kml or csv."""
+    from graphnav import convert as conversion
+    from graphnav.outputs import output_folder
+    from graphnav.staging import moved, staged
 
-    @app.command(
-        epilog="\b\nExamples:\n  graphnav convert dataset/kf-gins.yaml -o drive\n"
-        "  graphnav convert out/trajectory.csv -o track.gpx --point antenna"
+    if conversion.is_export(Path(source), out, format):
+        conversion.check_rate(rate)
+        alone = bool(out.suffix) and not out.is_dir()
+        folder = output_folder(out.parent if alone else out)
+        with bar(quiet, "convert"), staged(folder) as part:
+            target = part / out.name if alone else part
+            _, files, notes = conversion.export_file(Path(source), target, format, point, rate, clock)
+        files = moved(files, part, folder)
+        show(
+            lambda: "\n".join([*(f"note: {note}" for note in notes), *(f"wrote {file}" for file in files)]),
+            lambda: {"notes": notes, "files": files},
+            quiet,
+            json,
+        )
+        return
+    for option, value in (("--point", point), ("--rate", rate), ("--clock", clock)):
+        if value is not None:
+            raise ConfigError(f"{option}: is for trajectories; a log keeps its own")
+    folder = output_folder(out)
+    with bar(quiet, "convert"):
+        tell("reading")
+        log, files = conversion.convert_log(source, folder, format)
+    show(
+        lambda: conversion.log_text(log, files),
+        lambda: {**conversion.log_values(log), "files": files},
+        quiet,
+        json,
     )
-    def convert(
-        source: Annotated[str, typer.Argument(metavar="SOURCE", help="Another program's log, or a trajectory file.")],
-        out: Annotated[
-            Path, typer.Option("-o", "--out", metavar="OUT", help="Folder; for a trajectory, a file will do.")
-        ],
-        format: Annotated[
-            str | None,
-            typer.Option("--format", metavar="NAME", help="What the log is, or what to write a trajectory as."),
-        ] = None,
-        point: Annotated[
-            str | None, typer.Option("--point", metavar="POINT", help="Trajectory: imu, antenna or x,y,z (m; RFU).")
-        ] = None,
-        rate: Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Trajectory: interpolate to.")] = None,
-        clock: Annotated[
-            str | None,
-            typer.Option("--clock", metavar="TEXT", help="Trajectory: unix, 'gps week 2313' or a UTC date of t = 0."),
-        ] = None,
-    ) -> None:
-        """Turn another program's log into a recording folder, or a trajectory into gpx, nav, nmea, tum, kml or csv."""
-        from graphnav import convert as conversion
-        from graphnav.outputs import output_folder
 
-        if conversion.is_export(Path(source), out, format):
-            if rate is not None and not 0.0 < rate <= 10_000.0:
-                raise ConfigError(f"--rate {rate:g}: must be above 0 and at most 10000 Hz")
-            output_folder(out.parent if out.suffix else out)
-            _, files, notes = conversion.export_file(Path(source), out, format, point, rate, clock)
-            say("\n".join([*(f"note: {note}" for note in notes), *(f"wrote {file}" for file in files)]))
-            return
-        for option, value in (("--point", point), ("--rate", rate), ("--clock", clock)):
-            if value is not None:
-                raise ConfigError(f"{option}: is for trajectories; a log keeps its own")
-        log, files = conversion.convert_log(source, output_folder(out), format)
-        say(conversion.log_text(log, files))
 
-    @app.command(epilog="\b\nExample:\n  graphnav allan rest.csv -o out/allan")
-    def allan(
-        log: Annotated[str, typer.Argument(metavar="LOG", help="A log at rest: CSV, a recording or a known log.")],
-        out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into.")],
-        start: Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from its start.")] = None,
-        end: Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from its start.")] = None,
-    ) -> None:
-        """Measure the noise figures of an IMU from a log at rest, and print them as lines for recording.toml."""
-        from graphnav.allan import allan_of, files
-        from graphnav.draft import imu_of
-        from graphnav.errors import RecordingError
-        from graphnav.formats import load
-        from graphnav.outputs import output_folder
+@commands.command(epilog="\b\nExample:\n  graphnav allan rest.csv -o out/allan")
+def allan(
+    log: Annotated[str, typer.Argument(metavar="LOG", help="A log at rest: CSV, a recording or a known log.")],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into.")],
+    start: Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from its start.")] = None,
+    end: Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from its start.")] = None,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Measure the noise figures of an IMU from a log at rest, and print them as lines for recording.toml."""
+    from graphnav.allan import allan_of, files
+    from graphnav.draft import imu_of
+    from graphnav.errors import RecordingError
+    from graphnav.formats import load
+    from graphnav.outputs import output_folder
+    from graphnav.staging import moved, staged
 
-        folder = output_folder(out)
+    folder = output_folder(out)
+    with bar(quiet, "allan"):
+        tell("reading")
         if log.endswith((".csv", ".csv.gz")):
             t, gyro, accel = imu_of(Path(log))
         else:
@@ -76,42 +100,112 @@ def register(app: typer.Typer, say: Callable[[str], None]) -> None:
                 raise RecordingError(f"{log}: holds no IMU")
             t, gyro, accel = imu.t, imu.gyro, imu.accel
         since = t - t[0]
-        part = (since >= (start or 0.0)) & (since <= (since[-1] if end is None else end))
-        if part.sum() < 2:
+        part_asked = (since >= (start or 0.0)) & (since <= (since[-1] if end is None else end))
+        if part_asked.sum() < 2:
             raise ConfigError(f"--start, --end: nothing of {log} lies between them; it runs to {since[-1]:.1f} s")
+        tell("variances")
         try:
-            result = allan_of(t[part], gyro[part], accel[part])
+            result = allan_of(t[part_asked], gyro[part_asked], accel[part_asked])
         except RecordingError as error:
             raise RecordingError(f"{log}: {error}") from None
-        written = files.write(result, folder)
-        lines = [f"{result.duration:.0f} s at rest, {result.rate:.4g} Hz", "", "[imu.noise]", *result.lines(), ""]
-        say("\n".join([*lines, *(f"wrote {path}" for path in written)]))
+        tell("writing")
+        with staged(folder) as part:
+            written = files.write(result, part)
+    written = moved(written, part, folder)
+    lines = [f"{result.duration:.0f} s at rest, {result.rate:.4g} Hz", "", "[imu.noise]", *result.lines(), ""]
+    show(
+        lambda: "\n".join([*lines, *(f"wrote {path}" for path in written)]),
+        lambda: {
+            "duration_s": result.duration,
+            "rate_hz": result.rate,
+            "noise": loads("\n".join(result.lines())),
+            "files": written,
+        },
+        quiet,
+        json,
+    )
 
-    @app.command(epilog="\b\nExample:\n  graphnav init imu.csv ride.nmea -o recording.toml")
-    def init(
-        logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="CSV files, or logs of a known kind.")],
-        out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The .toml to write.")] = Path(
-            "recording.toml"
-        ),
-        name: Annotated[str | None, typer.Option("--name", help="Of the recording; default: its folder's.")] = None,
-        force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
-    ) -> None:
-        """Draft a recording.toml from logs: columns, units, axes and clocks as they seem to be, and why."""
-        from graphnav.draft import draft
-        from graphnav.formats.writer import write_csv
-        from graphnav.outputs import output_folder
 
-        out = out / "recording.toml" if out.is_dir() else out
-        if out.suffix != ".toml":
-            raise ConfigError(f"-o {out}: name a .toml file, or a folder for recording.toml")
-        if out.exists() and not force:
-            raise ConfigError(f"-o {out}: is there already; name another file, or say --force")
-        folder = output_folder(out.parent)
+@commands.command(epilog="\b\nExample:\n  graphnav init imu.csv ride.nmea -o recording.toml")
+def init(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="CSV files, or logs of a known kind.")],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The .toml to write.")] = Path(
+        "recording.toml"
+    ),
+    name: Annotated[str | None, typer.Option("--name", help="Of the recording; default: its folder's.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Draft a recording.toml from logs: columns, units, axes and clocks as they seem to be, and why."""
+    from graphnav.draft import draft
+    from graphnav.formats.writer import write_csv
+    from graphnav.outputs import output_folder
+    from graphnav.staging import staged
+
+    out = out / "recording.toml" if out.is_dir() else out
+    if out.suffix != ".toml":
+        raise ConfigError(f"-o {out}: name a .toml file, or a folder for recording.toml")
+    if out.exists() and not force:
+        raise ConfigError(f"-o {out}: is there already; name another file, or say --force")
+    folder = output_folder(out.parent)
+    with bar(quiet, "init"):
+        tell("reading")
         drafted = draft(logs, folder, name)
-        folder.mkdir(parents=True, exist_ok=True)
-        for made, columns in drafted.made.items():
+        for made in drafted.made:
             if (folder / made).exists() and not force:
                 raise ConfigError(f"{folder / made}: is there already; say --force to write over it")
-            write_csv(folder / made, list(columns), list(columns.values()))
-        out.write_text(drafted.text, encoding="utf-8")
-        say("\n".join([*(f"  {line}" for line in drafted.decisions), f"wrote {out}; look at the lines marked CHECK"]))
+        with staged(folder) as part:
+            for made, columns in drafted.made.items():
+                write_csv(part / made, list(columns), list(columns.values()))
+            (part / out.name).write_text(drafted.text, encoding="utf-8")
+    files = [out, *(folder / made for made in drafted.made)]
+    show(
+        lambda: "\n".join(
+            [*(f"  {line}" for line in drafted.decisions), f"wrote {out}; look at the lines marked CHECK"]
+        ),
+        lambda: {"decisions": drafted.decisions, "files": files},
+        quiet,
+        json,
+    )
+
+
+@commands.command(epilog="\b\nExample:\n  graphnav simulate urban -o out/urban --seed 1")
+def simulate(
+    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help="Its name; none lists them.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Folder for the recording; made if need be.")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", help="The same seed gives the same recording.")] = 0,
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="An option of the scenario; may be repeated. See --list."),
+    ] = None,
+    listing: Annotated[bool, typer.Option("--list", help="List the scenarios and their options.")] = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Make a recording with truth: a simulated drive, with the errors of simulated sensors."""
+    from graphnav import outputs
+    from graphnav.simulation import catalogue, options_from
+    from graphnav.simulation import simulate as simulated
+    from graphnav.staging import moved, staged
+
+    if listing or scenario is None:
+        say(catalogue())
+        return
+    if out is None:
+        raise ConfigError("say where to write the recording: -o DIR")
+    folder = outputs.output_folder(out)
+    options = options_from(scenario, option or [])
+    with bar(quiet, "simulate"):
+        made = simulated(scenario, seed, **options)
+        with staged(folder) as part:
+            files = made.write(part)
+    files = moved(files, part, folder)
+    show(
+        lambda: "\n".join([made.text(), *(f"  {file}" for file in files)]),
+        lambda: {"scenario": scenario, "seed": seed, "options": options, "stops": made.stops, "files": files},
+        quiet,
+        json,
+    )

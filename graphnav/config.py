@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-import difflib
-import tomllib
+import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from graphnav.complaints import complaint, read_toml
 from graphnav.errors import ConfigError
 
 Kernel = Literal["none", "huber", "cauchy", "geman-mcclure", "tukey", "welsch"]
+Profile = Literal["car", "car+odometer", "foot"]
+
+# What is made of the platform, below whatever the settings say themselves.
+PROFILES: dict[str, dict[str, dict[str, Any]]] = {
+    "car": {"vehicle": {"nhc": True, "odometer": False}},
+    "car+odometer": {"vehicle": {"nhc": True, "odometer": True}},
+    "foot": {"vehicle": {"nhc": False, "odometer": False}, "foot": {"stance": True}},
+}
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class KeyframeSettings(_Section):
@@ -220,8 +228,12 @@ class SolverSettings(_Section):
 
 
 class Settings(_Section):
-    """Everything that can be set; `Settings()` is the default."""
+    """Everything that can be set; `Settings()` is the default, `Settings(profile="car")` one of `PROFILES`.
 
+    Without a profile everything is used that the recording's platform and sensors allow.
+    """
+
+    profile: Profile | None = Field(None, description="what the recording is of: car, car+odometer or foot")
     keyframes: KeyframeSettings = KeyframeSettings()
     alignment: AlignmentSettings = AlignmentSettings()
     imu: ImuSettings = ImuSettings()
@@ -232,64 +244,98 @@ class Settings(_Section):
     foot: FootSettings = FootSettings()
     solver: SolverSettings = SolverSettings()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _with_profile(cls, values: Any) -> Any:
+        """The profile's values where none are given."""
+        chosen = PROFILES.get(str(values.get("profile"))) if isinstance(values, Mapping) else None
+        if chosen is None:
+            return values
+        merged = dict(values)
+        for name, table in chosen.items():
+            given = merged.get(name, {})
+            merged[name] = {**table, **given} if isinstance(given, Mapping) else given
+        return merged
+
     def without_wheels(self) -> Settings:
         """The same with nothing assumed of wheels."""
         return self.model_copy(update={"vehicle": self.vehicle.model_copy(update={"nhc": False, "odometer": False})})
 
 
-def settings_from(values: Mapping[str, Any], source: str = "settings") -> Settings:
-    """Validate a nested mapping.
+def settings_from(values: Mapping[str, Any], source: str = "settings", text: str = "") -> Settings:
+    """Validate a nested mapping, that of the file whose `text` is given.
 
     Raises
     ------
     ConfigError
-        Naming the source, the key, the value, and the nearest known key for an unknown one.
+        Naming the source, the line, the key, the value and its unit, and the nearest known key for an unknown one.
     """
     try:
         return Settings.model_validate(dict(values))
     except ValidationError as error:
-        raise ConfigError(f"{source}: {explain(error, Settings)}") from None
+        raise ConfigError(complaint(source, error, Settings, text)) from None
 
 
-def read_settings(path: str | Path) -> Settings:
-    """Read a settings file (TOML).
+def read_settings(path: str | Path | None = None, profile: str | None = None) -> Settings:
+    """Settings from a file over those of a profile over the defaults.
+
+    Parameters
+    ----------
+    path
+        TOML, or the summary.json of a run, whose settings are then used again; None: no file.
+    profile
+        One of `PROFILES`; it goes before the file's own.
 
     Raises
     ------
     ConfigError
-        If the file cannot be read or holds something that is not a setting.
+        If the file cannot be read or holds something that is not a setting, or there is no such profile.
     """
-    path = Path(path)
+    values: Mapping[str, Any] = {}
+    text = ""
+    if path is not None and Path(path).suffix == ".json":
+        values = _settings_of_run(Path(path))
+    elif path is not None:
+        values, text = read_toml(Path(path), ConfigError)
+    if profile is not None:
+        if profile not in PROFILES:
+            raise ConfigError(f"--profile {profile}: no such profile; known: {', '.join(get_args(Profile))}")
+        values = {**values, "profile": profile}
+    return settings_from(values, "settings" if path is None else str(path), text)
+
+
+def _settings_of_run(path: Path) -> Mapping[str, Any]:
+    """What a summary.json keeps."""
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(path.read_text(encoding="utf-8"))["settings"]
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid TOML ({error})") from None
-    return settings_from(values, str(path))
+    except (ValueError, KeyError, TypeError):
+        raise ConfigError(f"{path}: holds no settings; name a settings file (TOML) or a summary.json") from None
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{path}: holds no settings; name a settings file (TOML) or a summary.json")
+    return values
 
 
-def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """The first complaint of pydantic as one plain sentence."""
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
-        return f"unknown key '{where}'{suggestion(first['loc'], model)}"
-    if first["type"] == "missing":
-        return f"'{where}' is missing"
-    return f"'{where}' = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"
+def settings_text(settings: Settings) -> str:
+    """A file that `read_settings` reads: every key with its unit and sentence, those that are unset as comments."""
+    lines: list[str] = []
 
+    def table(section: BaseModel, at: str) -> None:
+        nested = {}
+        for name, field in type(section).model_fields.items():
+            value = getattr(section, name)
+            if isinstance(value, BaseModel):
+                nested[name] = value
+                continue
+            # JSON's numbers, texts and lists are TOML's as well
+            said = f"# {name} =" if value is None else f"{name} = {json.dumps(value)}"
+            lines.append(f"{said:<30} # {field.description}")
+        for name, inner in nested.items():
+            place = f"{at}.{name}" if at else name
+            if any(not isinstance(getattr(inner, key), BaseModel) for key in type(inner).model_fields):
+                lines.extend(["", f"[{place}]"])
+            table(inner, place)
 
-def suggestion(loc: tuple[Any, ...], model: type[BaseModel]) -> str:
-    """'; did you mean ...' with the nearest known key of the table `loc` lies in."""
-    table: type[BaseModel] = model
-    for part in loc[:-1]:
-        annotation = table.model_fields[part].annotation if part in table.model_fields else None
-        options = [annotation, *getattr(annotation, "__args__", ())]
-        inner = [o for o in options if isinstance(o, type) and issubclass(o, BaseModel)]
-        if not inner:
-            break
-        table = inner[0]
-    known = [field.alias or name for name, field in table.model_fields.items()]
-    close = difflib.get_close_matches(str(loc[-1]), known, n=1, cutoff=0.5)
-    return f"; did you mean '{close[0]}'?" if close else f"; known keys: {', '.join(known)}"
+    table(settings, "")
+    return "\n".join(lines) + "\n"

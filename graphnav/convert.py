@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.complaints import listed, nearest
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.exporters import NAMES, write_as
 from graphnav.formats import formats, load
@@ -21,6 +21,7 @@ from graphnav.formats.writer import write_recording
 from graphnav.interpolation import interpolate
 from graphnav.outputs import antenna_lever_arm
 from graphnav.rotation import Array
+from graphnav.staging import moved, staged
 from graphnav.trajectory import Trajectory
 from graphnav.workflow import Outcome
 
@@ -41,6 +42,18 @@ def is_export(source: Path, out: Path, name: str | None) -> bool:
     return name not in known or not known[name].recognises(source)
 
 
+def check_rate(rate: float | None) -> None:
+    """Refuse an output rate (Hz) that makes no sense.
+
+    Raises
+    ------
+    ConfigError
+        Naming the option.
+    """
+    if rate is not None and not 0.0 < rate <= 10_000.0:
+        raise ConfigError(f"--rate {rate:g}: must be above 0 and at most 10000 Hz")
+
+
 def convert_log(source: str, out: Path, name: str | None) -> tuple[Log, list[Path]]:
     """Read a log of any kind that is known and write it as a recording folder.
 
@@ -52,31 +65,13 @@ def convert_log(source: str, out: Path, name: str | None) -> tuple[Log, list[Pat
         If it would be written over itself.
     """
     if name is not None and name not in formats():
-        known = [*formats(), *NAMES]
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
-        raise ConfigError(f"--format {name}: no such format; {hint}")
+        raise ConfigError(f"--format {name}: no such format; {nearest(name, [*formats(), *NAMES])}")
     log = load(source, name)
     if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
         raise ConfigError(f"-o {out}: the recording is read from there; name another folder")
-    return log, write_recording(log, out)
-
-
-def parse_names(text: str, option: str) -> tuple[str, ...]:
-    """Formats to write, such as ``gpx,nav``.
-
-    Raises
-    ------
-    ConfigError
-        If one is not known.
-    """
-    names = tuple(name.strip().lstrip(".") for name in text.split(",") if name.strip())
-    for name in names:
-        if name not in NAMES:
-            raise ConfigError(f"{option} {text}: no format '{name}' can be written; known: {', '.join(NAMES)}")
-    if not names:
-        raise ConfigError(f"{option}: names no format; known: {', '.join(NAMES)}")
-    return tuple(dict.fromkeys(names))
+    with staged(out) as part:
+        files = write_recording(log, part)
+    return log, moved(files, part, out)
 
 
 def parse_point(text: str | None) -> str | Array:
@@ -123,7 +118,7 @@ def export_file(
         targets = {out.suffix[1:]: out}
     else:
         assert name is not None
-        targets = {one: out / f"{source.stem}.{one}" for one in parse_names(name, "--format")}
+        targets = {one: out / f"{source.stem}.{one}" for one in listed(name, NAMES, "--format", "format to write")}
     run = _run(source)
     arm = parse_point(point)
     if isinstance(arm, str) and arm == "antenna":
@@ -213,6 +208,13 @@ def _run(source: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return values if isinstance(values, dict) else {}
+
+
+def log_values(log: Log) -> dict[str, Any]:
+    """What was read and what was assumed, for JSON."""
+    sensors = {name: getattr(log, name) for name in ("imu", "gnss", "odometer", "truth")}
+    rows = {name: len(sensor.t) for name, sensor in sensors.items() if sensor is not None}
+    return {"name": log.name, "platform": log.platform, "rows": rows, "assumed": log.remarks}
 
 
 def log_text(log: Log, files: Sequence[Path]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -68,6 +69,17 @@ def _nearest(of: Array, t: Array) -> tuple[np.ndarray, np.ndarray]:
     k = np.clip(np.searchsorted(of, t), 1, len(of) - 1)
     k = k - (t - of[k - 1] < of[k] - t)
     return k, np.abs(of[k] - t) <= 0.51 * float(np.median(np.diff(of))) + 1e-6
+
+
+def values(recording: Recording, found: Detections) -> dict[str, Any]:
+    """The same for JSON; times are on the recording's clock, as in detections.csv."""
+    return {
+        "recording": recording.name,
+        "duration_s": recording.duration,
+        "stationary": found.stationary,
+        "seconds_by_detector": {d.name: float(np.diff(d.intervals).sum()) for d in found.all},
+        "notes": found.notes,
+    }
 
 
 def text(recording: Recording, found: Detections, files: list[Path]) -> str:

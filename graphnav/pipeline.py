@@ -15,12 +15,13 @@ from graphnav.config import Settings
 from graphnav.constraints.prior import InitialPrior
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
-from graphnav.errors import EstimationError
+from graphnav.errors import ConfigError, EstimationError
 from graphnav.problem import Problem, pose
+from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
 from graphnav.solution import Solution, joined
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import Filtered, Progress, Smoothed, backward, ekf, rts
+from graphnav.solvers.ekf import Filtered, Smoothed, backward, ekf, rts
 from graphnav.solvers.incremental import incremental
 from graphnav.solvers.isam import isam2
 
@@ -40,10 +41,14 @@ def run(
 
     Parameters
     ----------
-    recording : from `graphnav.load`.
-    settings : default settings when None.
-    solvers : out of "ekf", "rts", "incremental", "isam2", "batch".
-    progress : called now and then with a stage and its share done, 0 to 1.
+    recording
+        From `graphnav.load`.
+    settings
+        The defaults when None.
+    solvers
+        Out of "ekf", "rts", "incremental", "isam2", "batch".
+    progress
+        Called now and then with a stage and its share done, 0 to 1.
 
     Returns
     -------
@@ -54,13 +59,24 @@ def run(
     ------
     EstimationError
         If the recording does not determine a trajectory.
+    ConfigError
+        If the settings' profile is of another platform.
     """
     settings = settings or Settings()
+    with listening(progress):
+        return _run(recording, settings, solvers, progress)
+
+
+def _run(
+    recording: Recording, settings: Settings, solvers: tuple[str, ...], progress: Progress | None
+) -> dict[str, Solution]:
     unknown = [name for name in solvers if name not in KNOWN]
     if unknown:
         raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}")
     frame = LocalFrame(origin(recording))
+    said = fitting(recording, settings)
     pieces, notes = _pieces(recording, settings)
+    notes = [*said, *notes]
     found: list[dict[str, Solution]] = []
     for piece in pieces:
         try:
@@ -95,9 +111,11 @@ def _solve(
     recording: Recording, settings: Settings, frame: LocalFrame, solvers: tuple[str, ...], progress: Progress | None
 ) -> dict[str, Solution]:
     began = time.perf_counter()
+    tell("detection")
     found = detect(recording, settings)
     stationary = found.stationary
     detected = time.perf_counter()
+    tell("alignment")
     aligned = align(
         recording, settings, frame, lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)
     )
@@ -109,8 +127,10 @@ def _solve(
     astray = found_heading and bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
 
     def posed(wrong: tuple[faults.Fault, ...] = ()) -> tuple[Problem, tuple[str, ...]]:
+        tell("judgement")
         sensed, how, said = judged(recording, settings, frame, aligned, stationary, wrong)
         begin = aligned if astray else stated
+        tell("preintegration")
         return pose(sensed, how, frame, begin.state, begin.sigma, stationary), said
 
     def watched(problem: Problem) -> tuple[Problem, Filtered]:
@@ -235,6 +255,26 @@ def judged(
     if fixes is None:
         return recording, settings, notes
     return recording, fixes.applied(settings), (*notes, *fixes.notes)
+
+
+def fitting(recording: Recording, settings: Settings) -> list[str]:
+    """What the settings' profile asks for and the recording lacks, in sentences.
+
+    Raises
+    ------
+    ConfigError
+        If the profile is of another platform.
+    """
+    profile = settings.profile
+    if profile is None:
+        return []
+    if (profile == "foot") != (recording.platform == "foot"):
+        raise ConfigError(
+            f"profile '{profile}': but '{recording.name}' says platform = \"{recording.platform}\"; change one of them"
+        )
+    if profile == "car+odometer" and recording.odometer is None:
+        return [f"profile '{profile}': there is no odometer in '{recording.name}', so it is solved without"]
+    return []
 
 
 def origin(recording: Recording) -> np.ndarray:

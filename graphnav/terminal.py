@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,9 @@ import numpy as np
 
 from graphnav.metrics import Span
 from graphnav.outputs import stated
-from graphnav.workflow import Outcome, Progress
+from graphnav.progress import Progress
+from graphnav.staging import uninterrupted
+from graphnav.workflow import Outcome
 
 _ERRORS = (
     ("hor. rms", "h", "rms", "m"), ("hor. max", "h", "max", "m"), ("up rms", "up", "rms", "m"),
@@ -126,30 +129,73 @@ def short(x: float) -> str:
     return f"{x:.0f}" if abs(x) >= 1000 else f"{x:.3g}" if abs(x) >= 1e-3 or x == 0 else f"{x:.1e}"
 
 
+# What the stages weigh against each other: seconds of an hour's drive at 200 Hz, for the time left and nothing else.
+_STAGES = {
+    "reading": 0.5, "checks": 0.6, "driving": 5.0, "detection": 0.2, "alignment": 0.1, "judgement": 0.4,
+    "preintegration": 0.7, "filter": 2.5, "smoother": 0.4, "batch": 0.9, "covariances": 0.2, "incremental": 4.8,
+    "isam2": 44.0, "evaluation": 0.1, "writing": 0.7,
+}  # fmt: skip
+_BEFORE = ("reading", "checks", "detection", "alignment", "judgement", "preintegration", "filter", "smoother")
+_WORK = {
+    "info": ("reading", "checks"), "detect": ("reading", "detection", "writing"), "evaluate": ("reading",),
+    "simulate": ("driving", "writing"), "convert": ("reading", "writing"), "init": ("reading", "writing"),
+    "ekf": (*_BEFORE, "evaluation", "writing"), "rts": (*_BEFORE, "evaluation", "writing"),
+    "batch": (*_BEFORE, "batch", "covariances", "evaluation", "writing"),
+    "incremental": (*_BEFORE, "incremental", "evaluation", "writing"),
+    "isam2": (*_BEFORE, "isam2", "batch", "covariances", "evaluation", "writing"),
+}  # fmt: skip
+
+
+class Pace:
+    """How much of some work is done when a stage has come to a share of its own, and how long the rest will take."""
+
+    def __init__(self, work: Sequence[str]) -> None:
+        wanted = {stage for one in work for stage in _WORK.get(one, ())}
+        self._stages = [stage for stage in _STAGES if stage in wanted]
+        self._total = sum(_STAGES[stage] for stage in self._stages) or 1.0
+        self.done = 0.0
+
+    def reach(self, stage: str, share: float) -> None:
+        """Take note; what is done a second time takes nothing back."""
+        name = stage.split()[0]
+        if name in self._stages:
+            before = self._stages[: self._stages.index(name)]
+            self.done = max(self.done, (sum(_STAGES[s] for s in before) + share * _STAGES[name]) / self._total)
+
+    def left(self, elapsed: float) -> float | None:
+        """s, as the time up to here tells; None where that is too little."""
+        return elapsed * (1.0 / self.done - 1.0) if self.done > 0.03 and elapsed > 1.0 else None
+
+
 @contextmanager
-def progress_bar(quiet: bool) -> Iterator[Progress | None]:
-    """A bar per stage with the time left, on stderr if that is a terminal; else nothing."""
+def progress_bar(quiet: bool, work: Sequence[str]) -> Iterator[Progress | None]:
+    """A bar with stage and time left, on stderr if that is a terminal, of what takes longer than half a second."""
     if quiet or not sys.stderr.isatty():
         yield None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, TaskID, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as Bar
 
-    with Bar(
-        TextColumn("{task.description:<14}"), BarColumn(), TimeRemainingColumn(elapsed_when_finished=True),
+    began, pace = time.monotonic(), Pace(work)
+    bar = Bar(
+        TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[left]}"),
         console=Console(stderr=True), transient=True,
-    ) as bar:  # fmt: skip
-        tasks: dict[str, TaskID] = {}
-        last: list[str] = []
+    )  # fmt: skip
+    task = bar.add_task("", total=1.0, left="")
 
-        def update(stage: str, share: float) -> None:
-            if last and last[-1] != stage:
-                bar.update(tasks[last[-1]], completed=1.0, total=1.0)
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=1.0 if share else None)
-            if share:
-                bar.update(tasks[stage], total=1.0, completed=share)
-            last[:] = [stage]
+    def update(stage: str, share: float) -> None:
+        elapsed = time.monotonic() - began
+        pace.reach(stage, share)
+        left = pace.left(elapsed)
+        said = "" if left is None else f"{left:.0f} s left" if left < 90 else f"{left / 60:.0f} min left"
+        bar.update(task, description=stage, completed=pace.done, left=said)
+        if elapsed > 0.5 and not bar.live.is_started:
+            with uninterrupted():
+                bar.start()
 
+    try:
         yield update
+    finally:
+        with uninterrupted():
+            bar.stop()

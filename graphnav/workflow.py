@@ -5,10 +5,9 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -16,8 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from graphnav import rotation
+from graphnav.complaints import nearest
 from graphnav.config import Settings
 from graphnav.errors import ConfigError, RecordingError
+from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import Solution, to_trajectory
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 Span = tuple[float, float]
 Withheld = tuple[str, Span | None]
-Progress = Callable[[str, float], None]
 
 SOURCES = ("gnss", "odometer")
 _DENSEST, _MOST = 0.1, 5_000  # s between, and number of, the epochs of a truth that are met exactly
@@ -91,9 +91,7 @@ def parse_withheld(text: str) -> Withheld:
         raise ConfigError(f"--without {text}: not a source and a span; {usage}")
     source, first, last = found.groups()
     if source not in SOURCES:
-        close = difflib.get_close_matches(source, SOURCES, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else f"one of {', '.join(SOURCES)}"
-        raise ConfigError(f"--without {text}: no source '{source}' can be withheld; {hint}")
+        raise ConfigError(f"--without {text}: no source '{source}' can be withheld; {nearest(source, SOURCES)}")
     if first is None:
         return source, None
     try:
@@ -105,24 +103,6 @@ def parse_withheld(text: str) -> Withheld:
     return source, span
 
 
-def known_solvers(names: tuple[str, ...], option: str) -> tuple[str, ...]:
-    """The names, each once.
-
-    Raises
-    ------
-    ConfigError
-        If one is not a solver, listing those that are.
-    """
-    from graphnav.pipeline import KNOWN
-
-    for name in names:
-        if name not in KNOWN:
-            raise ConfigError(f"{option} {name}: no solver '{name}'; known: {', '.join(KNOWN)}")
-    if not names:
-        raise ConfigError(f"{option}: names no solver; known: {', '.join(KNOWN)}")
-    return tuple(dict.fromkeys(names))
-
-
 def run_request(request: Request, progress: Progress | None = None) -> Outcome:
     """Read, check, withhold, solve and score.
 
@@ -131,19 +111,30 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
     GraphnavError
         In one plain sentence, for anything that cannot be used as it is.
     """
+    with listening(progress):
+        return _run(request, progress)
+
+
+def _run(request: Request, progress: Progress | None) -> Outcome:
     from graphnav.checks import inspect
+    from graphnav.checks_aiding import gnss_apart
+    from graphnav.checks_stated import truth_apart
     from graphnav.formats import read
 
     timings: dict[str, float] = {}
-    with _timed(timings, "reading", progress):
+    with _timed(timings, "reading"):
         whole = read(request.source)
     recording = _cropped(whole, request)
     zero = recording.start - whole.start if recording is not whole else 0.0
     moved = _moved(request.withheld, zero)
     used, notes = _withhold(recording, moved, zero)
-    with _timed(timings, "checks", progress):
+    with _timed(timings, "checks"):
         inspection = inspect(recording)
     findings = [f.sentence for f in inspection.findings]
+    if (sentence := gnss_apart(used)) is not None:  # it would be solved as if there were no GNSS
+        raise RecordingError(f"'{recording.name}': {sentence}")
+    if truth_apart(recording):
+        recording = replace(recording, truth=None)
 
     from graphnav.pipeline import run
 
@@ -152,7 +143,7 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
         name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
     }
     own: dict[str, float] = {}
-    with _timed(own, "evaluation", progress):
+    with _timed(own, "evaluation"):
         metrics, against, names = _score(recording, used, solutions, moved)
     for found in metrics.values():
         if found.notes:
@@ -182,9 +173,8 @@ def read_part(
 
 
 @contextmanager
-def _timed(timings: dict[str, float], stage: str, progress: Progress | None) -> Iterator[None]:
-    if progress is not None:
-        progress(stage, 0.0)
+def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+    tell(stage)
     began = time.perf_counter()
     yield
     timings[stage] = time.perf_counter() - began

@@ -144,7 +144,10 @@ BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
     "binary file": (content("imu.csv", bytes(range(256)) * 20), ("imu.csv", "binary")),
     "not utf-8": (content("imu.csv", "t,gx,gy,gz,ax,ay,\xe4z\n".encode("latin-1")), ("imu.csv", "line 1", "UTF-8")),
     "no header": (line("imu.csv", 1, None), ("imu.csv, line 1", "must name the columns")),
-    "semicolons": (content("imu.csv", b"t;gx;gy;gz;ax;ay;az\n1;2;3;4;5;6;7\n"), ("line 1", "separated by commas")),
+    "semicolons": (
+        content("imu.csv", b"t;gx;gy;gz;ax;ay;az\n1;2;3;4;5;6;7\n"),
+        ("line 1", "by a semicolon", "by commas"),
+    ),
     "gz that is none": (zipped(b"t,gx\n1,2\n"), ("imu.csv.gz", "not gzip-compressed")),
     "gz cut off": (zipped(gzip.compress(b"t,gx,gy,gz,ax,ay,az\n" * 50)[:30]), ("imu.csv.gz", "cut off")),
     "gz without the name": (content("imu.csv", gzip.compress(b"t,gx\n")), ("imu.csv", "must end in .gz")),

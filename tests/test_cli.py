@@ -280,6 +280,7 @@ BAD = {
         ["smooth", "kitti", "-o", "o", "--solver", "lstm"],
         "known: ekf, rts, incremental, isam2, batch",
     ),
+    "two solvers": (["smooth", "kitti", "-o", "o", "--solver", "ekf,rts"], "several are for graphnav compare"),
     "unknown among solvers": (["compare", "kitti", "-o", "o", "--solvers", "ekf,ukf"], "no solver 'ukf'"),
     "no solvers": (["compare", "kitti", "-o", "o", "--solvers", ","], "names no solver"),
     "unknown source": (["smooth", "kitti", "-o", "o", "--without", "gns:1-2"], "did you mean 'gnss'?"),

@@ -18,13 +18,15 @@ from helpers import STEPS, difference, random_states
 from graphnav.config import Settings, read_settings
 from graphnav.constraints import registered
 from graphnav.constraints.base import Scene, assemble
+from graphnav.detectors.windows import blocks as blocks_of
+from graphnav.detectors.windows import low_pass
 from graphnav.earth import LocalFrame
 from graphnav.formats import read
 from graphnav.pipeline import SOLVERS
 from graphnav.preintegration import bridge_gaps, preintegrate
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "data").rglob("*.md"))]
 # a fence may be indented, as in a list
 FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 
@@ -39,6 +41,8 @@ def blocks(kind):
     ]
 
 
+PROGRAM = Path(sys.executable).with_name("graphnav")
+
 # the commands of a block belong together: one may need what another wrote
 COMMANDS = sorted(
     {
@@ -47,7 +51,15 @@ COMMANDS = sorted(
         if (lines := "\n".join(line for line in text.splitlines() if not line.startswith("make ")))
     }
 )
-PYTHON = blocks("python")
+JERK = "from graphnav.detectors.jerk import"  # which the reader writes
+PYTHON = [(page, text) for page, text in blocks("python") if JERK not in text]
+
+
+@pytest.fixture
+def clone(tmp_path):
+    """A folder that looks like the clone from inside, to run in: the recordings are there."""
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    return tmp_path
 
 
 def test_the_pages_show_commands_and_python():
@@ -56,24 +68,51 @@ def test_the_pages_show_commands_and_python():
 
 
 @pytest.mark.parametrize("lines", COMMANDS)
-def test_commands_run(lines, tmp_path):
+def test_commands_run(lines, clone):
     for line in lines.splitlines():
         program, *arguments = shlex.split(line)
         assert program == "graphnav", "a console block holds commands of graphnav and make; use another kind for others"
-        command = [Path(sys.executable).with_name(program), *arguments]
-        run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        command = [PROGRAM, *arguments]
+        run = subprocess.run(command, cwd=clone, capture_output=True, text=True, timeout=300)
         assert run.returncode == 0, run.stderr
 
 
+SHOWN = [text for _, text in blocks("text") if text.startswith("$ graphnav ")]
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]\d+)?")
+
+
+@pytest.mark.parametrize("text", SHOWN, ids=lambda text: text.splitlines()[0])
+def test_what_a_page_shows_of_a_command_is_what_it_prints(text, clone):
+    """Word for word; numbers nearly, but for run times; a line of dots stands for some."""
+    command, *shown = text.splitlines()
+    _, *arguments = shlex.split(command.removeprefix("$ "))
+    run = subprocess.run([PROGRAM, *arguments], cwd=clone, capture_output=True, text=True, timeout=300)
+    assert run.returncode == 0, run.stderr
+    printed = run.stdout.splitlines()
+    if "  ..." in shown:
+        k = shown.index("  ...")
+        rest = len(shown) - k - 1
+        shown, printed = shown[:k] + shown[-rest:], printed[:k] + printed[-rest:]
+    assert [NUMBER.sub("#", " ".join(line.split())) for line in shown] == [
+        NUMBER.sub("#", " ".join(line.split())) for line in printed
+    ]
+    timed = False
+    for one, other in zip(shown, printed, strict=True):
+        timed = one.endswith("seconds") or (timed and one.startswith("  "))
+        numbers = [[float(x) for x in NUMBER.findall(line)] for line in (one, other)]
+        last = -1 if timed and numbers[0] else None
+        assert numbers[0][:last] == pytest.approx(numbers[1][:last], rel=0.05, abs=0.02)
+
+
 @pytest.mark.parametrize(("page", "text"), PYTHON, ids=[f"{page.stem}-{k}" for k, (page, _) in enumerate(PYTHON)])
-def test_python_runs(page, text, tmp_path):
+def test_python_runs(page, text, clone):
     environment = {**os.environ, "MPLBACKEND": "Agg", "PYTHONWARNINGS": "error::DeprecationWarning:__main__"}
     run = subprocess.run(
-        [sys.executable, "-c", text], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", text], cwd=clone, env=environment, capture_output=True, text=True, timeout=300
     )
     assert run.returncode == 0, run.stderr
     for name in re.findall(r'savefig\("(.+?)"\)', text):
-        assert (tmp_path / name).stat().st_size > 5000
+        assert (clone / name).stat().st_size > 5000
 
 
 def test_the_readme_goes_from_a_recording_to_a_plot_in_five_lines():
@@ -99,6 +138,33 @@ def test_the_example_of_a_constraint_keeps_the_contract():
         return rows.linearize(states.plus(np.tile(delta, (len(rows), 1))), {}, slice(None)).residual
 
     assert assemble(found) == pytest.approx(difference(moved, STEPS), abs=1e-8)
+
+
+def test_the_example_of_a_detector_finds_the_stops(clone, monkeypatch, capsys):
+    written, shown = (text for page, text in blocks("python") if page.name == "detectors.md" and "jerk" in text)
+    module = types.ModuleType("graphnav.detectors.jerk")
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.chdir(clone)
+    exec(compile(written, "detectors.md", "exec"), module.__dict__)
+    names: dict[str, object] = {}
+    exec(compile(shown, "detectors.md", "exec"), names)
+    assert "beside" in capsys.readouterr().out
+    found, known = names["found"], names["detect"](names["recording"]).stationary
+    assert len(found.t) == len(found.statistic) == len(found.mask)
+    assert found.intervals == pytest.approx(known, abs=0.5)
+    nothing = module.detect_jerk(low_pass(blocks_of(names["recording"].crop(0.0, 1.0).imu, 0.02)))
+    assert len(nothing.intervals) == 0
+
+
+def test_the_site_builds_and_every_link_in_it_leads_somewhere(tmp_path):
+    """Strict: a page that is in no menu, a link, an anchor or a name that is not there fails it."""
+    command = [sys.executable, "-m", "mkdocs", "build", "--site-dir", tmp_path / "site"]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert run.returncode == 0, run.stderr
+    reference = (tmp_path / "site" / "api.html").read_text(encoding="utf-8")
+    for name in ("graphnav.pipeline.run", "graphnav.recording.Imu.gyro", "graphnav.errors.GraphnavError"):
+        assert f'id="{name}"' in reference
+    assert "(K, 3) latitude, longitude (rad), ellipsoidal height (m)" in reference  # units of the fields
 
 
 def test_toml_examples_are_valid(tmp_path):
@@ -142,5 +208,5 @@ def test_links_and_files_named_exist(page):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
         assert target.startswith("https://") or (page.parent / target).exists(), f"{page.name}: {target}"
     for name in re.findall(r"`((?:graphnav|scripts|tests|docs)/[\w/]+\.\w+)", text):
-        if name != "graphnav/constraints/road.py":  # the one the reader writes
+        if name not in ("graphnav/constraints/road.py", "graphnav/detectors/jerk.py"):  # that the reader writes
             assert (ROOT / name).exists(), f"{page.name}: {name}"

@@ -67,7 +67,7 @@ def test_the_example_in_every_error_is_understood(key):
     ],
 )
 def test_a_figure_that_cannot_be_read_says_why(tmp_path, line, sentence):
-    with pytest.raises(RecordingError, match=rf"recording\.toml: .*{sentence}") as caught:
+    with pytest.raises(RecordingError, match=rf"recording\.toml, line 6: .*{sentence}") as caught:
         read(describe(tmp_path, f"[imu.noise]\n{line}"))
     assert "\n" not in str(caught.value)
 

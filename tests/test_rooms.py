@@ -13,19 +13,20 @@ PACKAGE = Path(__file__).resolve().parents[1] / "graphnav"
 
 # Modules and packages of graphnav, left to right. A new one needs a place here, as far left as it can stand.
 ROOMS = [
-    "errors", "rotation", "earth", "state", "config", "recording", "trajectory",
+    "errors", "complaints", "progress", "rotation", "earth", "state", "config", "recording", "trajectory",
     "formats", "draft", "allan", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding",
-    "checks", "detectors",
+    "checks_stated", "checks", "detectors",
     "preintegration", "unresolved", "clipping", "dynamics", "constraints", "problem", "solution", "alignment",
-    "dense", "solvers", "faults", "judgement", "pipeline",
-    "interpolation", "metrics", "scoring", "strides", "evaluation", "exporters", "online",
+    "dense", "solvers", "faults", "judgement", "pipeline", "lever_arm",
+    "interpolation", "metrics", "gates", "scoring", "strides", "evaluation", "exporters", "online",
     "panels", "page", "plots", "report_tables", "report_words", "report_pictures", "report_provenance", "report",
-    "workflow", "outputs", "convert", "terminal", "detection_report", "cli_logs", "cli",
+    "workflow", "staging", "outputs", "convert", "terminal", "detection_report",
+    "talk", "cli_options", "cli_logs", "cli", "__main__",
 ]  # fmt: skip
 
 GTSAM_ROOMS = {"solvers"}
 MATPLOTLIB_ROOMS = {"allan", "panels"}
-PRINTING_ROOMS = {"cli"}
+PRINTING_ROOMS = {"talk"}
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 

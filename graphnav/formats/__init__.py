@@ -5,11 +5,11 @@ A new format is a new module in this package with a module-level ``FORMAT = Form
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import pkgutil
 from pathlib import Path
 
+from graphnav.complaints import nearest
 from graphnav.errors import RecordingError
 from graphnav.formats.registry import Format, Log
 from graphnav.recording import Recording
@@ -59,9 +59,7 @@ def load(source: str | Path, name: str | None = None) -> Log:
     """
     known = formats()
     if name is not None and name not in known:
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
-        raise RecordingError(f"--format {name}: no such format; {hint}")
+        raise RecordingError(f"--format {name}: no such format; {nearest(name, list(known))}")
     chosen = known[name] if name else next((f for f in known.values() if f.recognises(source)), None)
     if chosen is None:
         raise _unknown(source, known)

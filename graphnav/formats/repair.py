@@ -10,6 +10,7 @@ from graphnav.formats.table import Mask, Table
 from graphnav.rotation import Array
 
 _LABEL = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"}
+_HIGHEST = 9000.0  # m, that a drive on Earth may come to
 _RADIANS = (1.58, 3.15)  # |lat|, |lon| that angles in radians cannot exceed
 
 
@@ -69,6 +70,11 @@ def usable_rows(
         rows = rows.take(np.argsort(t, kind="stable"))
         t = rows["t"]
     repeated = np.r_[False, np.diff(t) == 0]
+    if repeated.mean() > 0.6 and (~repeated).sum() > 1:
+        raise RecordingError(
+            f"{rows.path}: {repeated.sum()} of {len(rows)} rows have the time of the row before: the fraction of the "
+            "seconds was lost; log t with milliseconds"
+        )
     if repeated.any():
         remarks.add(
             f"{_rows(repeated, label)} with the time of the row before dropped (first at t = {t[repeated][0]:.3f} s)"
@@ -92,6 +98,8 @@ def _check_imu_time(rows: Table, unit: str) -> None:
         return
     fitting = [u for u in TIME if 2.5e-4 <= step / TIME[unit] * TIME[u] <= 0.1 and u != unit]
     hint = f'; if t is in {fitting[0]}, say units = {{ t = "{fitting[0]}" }}' if fitting else ""
+    if step == 1.0:
+        hint += "; if it counts rows, write times instead"
     raise RecordingError(f"{rows.path}: IMU rows are {step:g} s apart, which no usable IMU is{hint}")
 
 
@@ -121,18 +129,29 @@ def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tup
     if len(beyond):
         k = beyond[0]
         swapped = np.abs(lon * scale).max() <= np.pi / 2
-        hint = "; are lat and lon swapped?" if swapped else ""
+        hint = "; are lat and lon swapped?" if swapped else _other_form(lat, lon, label)
         raise RecordingError(f"{rows.where(k, 'lat')}: {lat[k]:g} is not a latitude{hint}")
     beyond = np.flatnonzero((lon * scale < -np.pi - 1e-9) | (lon * scale > 2 * np.pi))
     if len(beyond):
-        raise RecordingError(f"{rows.where(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude")
+        hint = _other_form(lat, lon, label)
+        raise RecordingError(f"{rows.where(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude{hint}")
     beyond = np.flatnonzero((h < -1000.0) | (h > 50000.0))
+    if not len(beyond) and np.median(h) > _HIGHEST:
+        beyond = np.flatnonzero(h > _HIGHEST)
     if len(beyond):
         k = beyond[0]
-        hint = "; is it in millimetres?" if abs(h[k]) > 1e5 else ""
+        hint = "; is it in millimetres?" if abs(h[k]) > _HIGHEST else ""
         raise RecordingError(f"{rows.where(k, 'h')}: {h[k]:g} m is not the height of a drive{hint}")
     lon = np.where(lon * scale > np.pi, lon * scale - 2 * np.pi, lon * scale)
     return np.stack([lat * scale, lon, h], -1), rows
+
+
+def _other_form(lat: Array, lon: Array, label: str) -> str:
+    """What latitudes and longitudes out of range may be instead."""
+    if all((np.abs(x) % 100.0 < 60.0).all() and np.abs(x).max() < 100.0 * top for x, top in ((lat, 91), (lon, 181))):
+        whole, minutes = divmod(abs(lat[0]), 100.0)
+        return f"; degrees and minutes together, as in NMEA? {lat[0]:g} is then {whole:g} deg {minutes:g} min"
+    return '; if they are metres, name them x and y and say frame = "local"' if label == "truth" else ""
 
 
 def sigmas(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
-import tomllib
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
@@ -23,7 +21,7 @@ from pydantic import (
 )
 from pydantic.types import Strict
 
-from graphnav.config import explain, suggestion
+from graphnav.complaints import complaint, nearest, read_toml
 from graphnav.errors import RecordingError
 from graphnav.formats.clocks import parse_clock
 from graphnav.formats.figures import parse_figure
@@ -86,8 +84,8 @@ class _Sensor(_Section):
     optional: ClassVar[tuple[str, ...]] = ()
 
     file: str = Field(min_length=1)
-    columns: dict[str, str] = {}  # our name = the file's name
-    time_offset: Number = 0.0  # s, added to the file's stamps
+    columns: dict[str, str] = Field({}, description="our name = the file's")
+    time_offset: Number = Field(0.0, description="s, added to the file's stamps")
     keep: Keep | None = None
 
     @field_validator("columns")
@@ -96,9 +94,7 @@ class _Sensor(_Section):
         known = (*cls.required, *cls.optional)
         for name in columns:
             if name not in known:
-                raise ValueError(
-                    f"'{name}' is not one of graphnav's columns; {_nearest(name, known)} (ours = the file's)"
-                )
+                raise ValueError(f"'{name}' is not one of graphnav's columns; {nearest(name, known)}")
         return columns
 
 
@@ -135,8 +131,15 @@ def _figure(key: str) -> Any:
     return Annotated[number | None, BeforeValidator(partial(parse_figure, key))]
 
 
+NOISE_UNITS = {
+    "gyro_noise_density": "rad/s/sqrt(Hz)", "accel_noise_density": "m/s2/sqrt(Hz)", "gyro_bias_walk": "rad/s/sqrt(s)",
+    "accel_bias_walk": "m/s2/sqrt(s)", "gyro_bias_sigma": "rad/s, at turn-on", "accel_bias_sigma": "m/s2, at turn-on",
+    "gyro_scale_sigma": "1", "accel_scale_sigma": "1",
+}  # fmt: skip
 Noise = create_model(  # type: ignore[call-overload]
-    "Noise", __base__=_Section, **{f.name: (_figure(f.name), None) for f in fields(ImuNoise)}
+    "Noise",
+    __base__=_Section,
+    **{f.name: (_figure(f.name), Field(None, description=NOISE_UNITS[f.name])) for f in fields(ImuNoise)},
 )
 
 
@@ -156,7 +159,7 @@ class ImuTable(_Sensor):
     @classmethod
     def _known_model(cls, model: str | None) -> str | None:
         if model is not None and find_model(model) is None:
-            raise ValueError(f"no figures of an IMU called '{model}' are known; {_nearest(model, tuple(MODELS))}")
+            raise ValueError(f"no figures of an IMU called '{model}' are known; {nearest(model, tuple(MODELS))}")
         return model
 
     @model_validator(mode="after")
@@ -189,9 +192,9 @@ class GnssTable(_Sensor):
     optional = ("sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu", "vd", "speed", "course")
 
     units: GnssUnits = GnssUnits()
-    lever_arm: Vector = (0.0, 0.0, 0.0)
-    sd: Sigmas | None = None
-    sd_v: Sigmas | None = None
+    lever_arm: Vector = Field((0.0, 0.0, 0.0), description="m from the IMU: right, forward, up")
+    sd: Sigmas | None = Field(None, description="m: east, north, up")
+    sd_v: Sigmas | None = Field(None, description="m/s: east, north, up")
 
 
 WHEELS = ("speed_fl", "speed_fr", "speed_rl", "speed_rr")
@@ -204,14 +207,14 @@ class OdometerTable(_Sensor):
     optional = ("speed", "pulses", *WHEELS)
 
     units: OdometerUnits = OdometerUnits()
-    lever_arm: Vector = (0.0, 0.0, 0.0)
-    scale_sigma: Positive = 0.02
-    metres_per_pulse: Positive | None = None  # given, the pulses are used
+    lever_arm: Vector = Field((0.0, 0.0, 0.0), description="m from the IMU: right, forward, up")
+    scale_sigma: Positive = Field(0.02, description="1-sigma of the scale, 0.02 = 2 %")
+    metres_per_pulse: Positive | None = Field(None, description="m; given, the pulses are used")
     pulses: Literal["cumulative", "per_row"] | None = None  # None: told from the counts
     use: Literal["rear", "front", "all"] | None = None  # wheels; None: the rear ones if there is no `speed`
-    speed_sigma: Positive | None = None
+    speed_sigma: Positive | None = Field(None, description="m/s, of one reading")
     signed: Annotated[bool, Strict()] | None = None  # None: told from the readings
-    delay_sigma: NotNegative = 0.0
+    delay_sigma: NotNegative = Field(0.0, description="s, of the stamps")
 
     @model_validator(mode="after")
     def _one_source(self) -> OdometerTable:
@@ -242,7 +245,7 @@ class TruthTable(_Sensor):
     units: GnssUnits = GnssUnits()
     of: Literal["imu", "gnss", "odometer"] = "imu"
     frame: Literal["geodetic", "local"] = "geodetic"
-    closed_loop_sigma: Positive | None = None
+    closed_loop_sigma: Positive | None = Field(None, description="m, from the start to the end")
 
     @model_validator(mode="after")
     def _one_kind(self) -> TruthTable:
@@ -276,11 +279,6 @@ class RecordingFile(_Section):
         if getattr(self, of) is None:
             raise ValueError(f"truth.of = '{of}', but there is no [{of}] table whose lever arm would apply")
         return self
-
-
-def _nearest(name: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"did you mean '{close[0]}'?" if close else f"known are {', '.join(known)}"
 
 
 def rotation_from_letters(axes: str) -> Array:
@@ -319,18 +317,11 @@ def read_description(path: Path) -> RecordingFile:
     RecordingError
         Naming the file and the key, and the nearest known key for an unknown one.
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise RecordingError(f"{path}: is not UTF-8 text") from None
-    except tomllib.TOMLDecodeError as error:
-        raise RecordingError(f"{path}: not valid TOML ({error})") from None
+    values, text = read_toml(path, RecordingError)
     try:
         description = RecordingFile.model_validate(values)
     except ValidationError as error:
-        raise RecordingError(f"{path}: {_sentence(error)}") from None
+        raise RecordingError(complaint(path, error, RecordingFile, text)) from None
     try:
         _ = description.imu.R_bs
     except ValueError as error:
@@ -338,18 +329,3 @@ def read_description(path: Path) -> RecordingFile:
         where = "'imu': " if axes is None else f"'imu.axes' = '{axes}' "
         raise RecordingError(f"{path}: {where}{error}") from None
     return description
-
-
-def _sentence(error: ValidationError) -> str:
-    """One complaint in plain words; an unknown key before the missing one that it may have been meant for."""
-    complaints = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-    first = complaints[0]
-    where = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
-        return f"unknown key '{where}'{suggestion(first['loc'], RecordingFile)}"
-    if first["type"] == "value_error":  # our own sentence
-        what = str(first["ctx"]["error"])
-        return f"'{where}': {what}" if where else what
-    if first["type"] == "model_type":
-        return f"'{where}' must be a table: [{where}]"
-    return explain(error, RecordingFile)

@@ -164,6 +164,8 @@ def _header(path: Path) -> tuple[int, list[str]]:
             start = raw.read(1 << 16)
     except (OSError, EOFError, zlib.error) as error:
         raise _broken_gzip(path, error) from None
+    if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise RecordingError(f"{path}: is UTF-16 text; save it as UTF-8")
     if b"\0" in start:
         raise RecordingError(f"{path}: is a binary file, not a CSV table")
     text = start.decode("utf-8-sig", errors="replace")
@@ -175,7 +177,11 @@ def _header(path: Path) -> tuple[int, list[str]]:
         if "\ufffd" in line:
             raise RecordingError(f"{path}, line {number}: is not UTF-8 text")
         if len(names) == 1 and (";" in line or "\t" in line):
-            raise RecordingError(f"{path}, line {number}: fields must be separated by commas")
+            mark = "a semicolon" if ";" in line else "a tab"
+            raise RecordingError(
+                f"{path}, line {number}: fields are separated by {mark}; they must be by commas, numbers written with "
+                "points"
+            )
         if all(_is_number(name) for name in names):
             raise RecordingError(f"{path}, line {number}: the first line must name the columns, and it holds numbers")
         return number, names

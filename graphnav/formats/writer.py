@@ -11,16 +11,12 @@ import numpy as np
 
 from graphnav.formats.clocks import clock_words
 from graphnav.formats.registry import Log
-from graphnav.formats.schema import WHEELS
+from graphnav.formats.schema import NOISE_UNITS, WHEELS
+from graphnav.progress import tell
 from graphnav.recording import ImuNoise, Odometer, Recording
 from graphnav.rotation import Array
 
 _DEG = np.pi / 180.0
-_NOISE_UNITS = {
-    "gyro_noise_density": "rad/s/sqrt(Hz)", "accel_noise_density": "m/s2/sqrt(Hz)", "gyro_bias_walk": "rad/s/sqrt(s)",
-    "accel_bias_walk": "m/s2/sqrt(s)", "gyro_bias_sigma": "rad/s, at turn-on", "accel_bias_sigma": "m/s2, at turn-on",
-    "gyro_scale_sigma": "1", "accel_scale_sigma": "1",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -133,6 +129,7 @@ def write_csv(path: Path, header: list[str], columns: list[Array]) -> None:
     with path.open("wb") as raw, gzip.GzipFile("", "wb", 4, raw, mtime=0) as file:
         file.write((",".join(header) + "\n").encode())
         for start in range(0, len(table), 2000):
+            tell(f"writing {path.name}", start / len(table))
             part = table[start : start + 2000]
             text = row * len(part) % tuple(part.ravel().tolist())
             file.write(text.replace("nan", "").encode())
@@ -199,7 +196,7 @@ def _noise(noise: ImuNoise, assumed: bool) -> list[str]:
     lines = ["", "[imu.noise]                    # 1-sigma"]
     for f in fields(noise):
         value = float(getattr(noise, f.name))
-        lines.append(f"{f.name} = {value!r}".ljust(48) + f"# {_NOISE_UNITS[f.name]}")
+        lines.append(f"{f.name} = {value!r}".ljust(48) + f"# {NOISE_UNITS[f.name]}")
     return lines
 
 

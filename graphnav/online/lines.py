@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from graphnav.config import explain
+from graphnav.complaints import complaint
 from graphnav.errors import RecordingError
 from graphnav.online.sensors import Row, rows_of
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
@@ -72,7 +72,7 @@ def setup_of(line: str) -> Recording:
     except json.JSONDecodeError as error:
         raise RecordingError(f"line 1: the setup is not JSON ({error.msg} at character {error.pos})") from None
     except ValidationError as error:
-        raise RecordingError(f"line 1: setup: {explain(error, _Setup)}") from None
+        raise RecordingError(complaint("line 1: setup", error, _Setup)) from None
     known = {f.name for f in fields(ImuNoise)}
     unknown = sorted(set(found.imu.noise) - known)
     if unknown:

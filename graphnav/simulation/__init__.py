@@ -6,12 +6,12 @@ called simulated, in the recording's name too.
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import tomllib
 from collections.abc import Sequence
 from typing import Any
 
+from graphnav.complaints import nearest
 from graphnav.errors import ConfigError
 from graphnav.simulation.result import Simulated
 from graphnav.simulation.scenarios import Scenario, scenarios
@@ -29,7 +29,7 @@ def scenario(name: str) -> Scenario:
     """
     known = scenarios()
     if name not in known:
-        raise ConfigError(f"no scenario '{name}'{_nearest(name, list(known))}")
+        raise ConfigError(f"no scenario '{name}'; {nearest(name, list(known))}")
     return known[name]
 
 
@@ -45,7 +45,7 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Simulated:
     known = defaults(one)
     for key, value in options.items():
         if key not in known:
-            raise ConfigError(f"scenario '{name}' has no option '{key}'{_nearest(key, list(known))}")
+            raise ConfigError(f"scenario '{name}' has no option '{key}'; {nearest(key, list(known))}")
         if not _alike(value, known[key]):
             raise ConfigError(f"scenario '{name}': {key} = {value!r} is not of the kind of its default {known[key]!r}")
     if not 0 <= seed < 2**32:
@@ -98,8 +98,3 @@ def catalogue() -> str:
         options = ", ".join(f"{key}={str(value).lower()}" for key, value in defaults(one).items())
         lines += [f"{name:<9} {one.about}", f"{'':<9}   --set {options}"]
     return "\n".join(lines)
-
-
-def _nearest(name: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"; did you mean '{close[0]}'?" if close else f"; known are {', '.join(known) or 'none'}"

@@ -22,6 +22,7 @@ import numpy as np
 
 from graphnav import rotation
 from graphnav.earth import E2, RATE, A, ecef_to_llh, enu_axes, gravity, llh_to_ecef
+from graphnav.progress import tell
 from graphnav.rotation import Array
 from graphnav.simulation.motion import BANK, HEADING, SLIP, SLOPE, SPEED, Path
 from graphnav.simulation.vibration import PITCH, ROLL, Shake
@@ -148,6 +149,7 @@ def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Sh
     omega_eb, arm = np.empty((count + 1, 3)), np.empty((count + 1, 3))
     gyro, accel = np.empty((count, 3)), np.empty((count, 3))
     for a in range(0, count, _CHUNK):
+        tell("driving", a / count)
         b = min(a + _CHUNK, count)
         n = b - a
         nodes = np.append((t[a:b, None] + _NODES / rate).ravel(), t[b])

@@ -1,0 +1,28 @@
+"""How far long work is. Whoever wants to know listens; work that takes long tells, from wherever it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+Progress = Callable[[str, float], None]  # a stage, and its share done, 0 to 1
+
+_LISTENER: ContextVar[Progress | None] = ContextVar("graphnav_progress", default=None)
+
+
+@contextmanager
+def listening(listener: Progress | None) -> Iterator[None]:
+    """What is told inside goes to `listener`."""
+    token = _LISTENER.set(listener)
+    try:
+        yield
+    finally:
+        _LISTENER.reset(token)
+
+
+def tell(stage: str, share: float = 0.0) -> None:
+    """Say that a stage has come to a share of its work; nothing happens where nobody listens."""
+    listener = _LISTENER.get()
+    if listener is not None:
+        listener(stage, share)

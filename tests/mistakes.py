@@ -1,0 +1,174 @@
+"""Tools to make mistakes on a real recording and to see what graphnav says; tests/mistakes_made.py lists them."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import io
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graphnav import cli
+
+ROOT = Path(__file__).resolve().parents[1]
+
+Array = np.ndarray
+Table = dict[str, Array]  # the columns of a CSV file by name
+
+
+HEAD = """\
+# What can go wrong
+
+What people get wrong, and the line that graphnav has for it. Each of these is made by the tests on the two minutes of
+Tokyo that come with the clone (`data/tokyo`), and the line is what was printed.
+
+A line that begins with *warning* or *note* is one of several: the recording can be read, and `graphnav info` lists what
+is odd in it (so do `smooth` and `compare`, and the reports). The others end the program with exit code 2. Run
+`graphnav info` before anything else, and read its warnings from the top: the first may be the cause of the others.
+"""
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """What was done, how it is done here, and what graphnav must say of it."""
+
+    what: str
+    make: Callable[[Path], None]
+    wants: tuple[str, ...]  # fragments of the line, written by hand
+    command: tuple[str, ...] = ("info", "drive")
+    error: bool = False  # else it is a warning or a note, for the recording can be used
+
+
+# ---- tools
+def table(folder: Path, name: str) -> Table:
+    """The columns of a sensor's file."""
+    with gzip.open(folder / f"{name}.csv.gz", "rt") as file:
+        header = file.readline().strip().split(",")
+        values = np.genfromtxt(file, delimiter=",")
+    return dict(zip(header, values.T, strict=True))
+
+
+def write(folder: Path, name: str, columns: Table, separator: str = ",") -> None:
+    """Write a sensor's file."""
+    rows = [
+        separator.join("" if np.isnan(x) else repr(float(x)) for x in row)
+        for row in zip(*columns.values(), strict=True)
+    ]
+    text = "\n".join([separator.join(columns), *rows]) + "\n"
+    (folder / f"{name}.csv.gz").write_bytes(gzip.compress(text.encode(), 1))
+
+
+def change(name: str, how: Callable[[Table], Table | None]) -> Callable[[Path], None]:
+    """Change the numbers of a sensor."""
+
+    def make(folder: Path) -> None:
+        columns = table(folder, name)
+        write(folder, name, how(columns) or columns)
+
+    return make
+
+
+def scaled(name: str, columns: str, factor: float) -> Callable[[Path], None]:
+    """Multiply columns."""
+    return change(name, lambda c: {k: v * factor if k in columns.split() else v for k, v in c.items()})
+
+
+def swapped(name: str, one: str, other: str) -> Callable[[Path], None]:
+    """Exchange two columns."""
+    return change(name, lambda c: {k: c[{one: other, other: one}.get(k, k)] for k in c})
+
+
+def toml(old: str, new: str) -> Callable[[Path], None]:
+    """Replace text of recording.toml."""
+
+    def make(folder: Path) -> None:
+        text = (folder / "recording.toml").read_text()
+        assert old in text, old
+        (folder / "recording.toml").write_text(text.replace(old, new, 1))
+
+    return make
+
+
+def text(name: str, how: Callable[[str], str | bytes]) -> Callable[[Path], None]:
+    """Change the text of a sensor's file, which is then no longer compressed."""
+
+    def make(folder: Path) -> None:
+        packed = folder / f"{name}.csv.gz"
+        plain = how(gzip.decompress(packed.read_bytes()).decode())
+        (folder / f"{name}.csv").write_bytes(plain.encode() if isinstance(plain, str) else plain)
+        packed.unlink()
+        toml(f'"{name}.csv.gz"', f'"{name}.csv"')(folder)
+
+    return make
+
+
+def both(*makers: Callable[[Path], None]) -> Callable[[Path], None]:
+    """Several changes."""
+
+    def make(folder: Path) -> None:
+        for one in makers:
+            one(folder)
+
+    return make
+
+
+def settings(content: str) -> Callable[[Path], None]:
+    """A settings file beside the recording."""
+    return lambda folder: (folder.parent / "settings.toml").write_text(content) and None
+
+
+def nothing(folder: Path) -> None:
+    """The mistake is in the command."""
+
+
+def made(mistake: Mistake, room: Path) -> tuple[int, list[str]]:
+    """Make the mistake in `room`; the exit code, and the lines that speak of something wrong."""
+    folder = room / "drive"
+    folder.mkdir()
+    for file in (ROOT / "data" / "tokyo").iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    mistake.make(folder)
+    code, out, err = run(mistake.command, room, full="no space" in mistake.what)
+    if code:
+        return code, err.splitlines()
+    said = [line.strip() for line in out.splitlines()]
+    return code, [line for line in said if line.startswith(("warning: ", "note: "))]
+
+
+def run(command: tuple[str, ...], room: Path, full: bool = False) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of the program in a folder, on a disk that is `full` after 20 kB."""
+    if full:  # a limit of the system's stands for the disk
+        program = [sys.executable, "-m", "graphnav", *command]
+        limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # noqa: E731
+        done = subprocess.run(program, cwd=room, preexec_fn=limit, capture_output=True, text=True, timeout=300)
+        return done.returncode, done.stdout, done.stderr
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.chdir(room), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = cli.run(list(command))
+    return code, out.getvalue(), err.getvalue()
+
+
+def said(mistake: Mistake, lines: list[str]) -> list[str]:
+    """Those of the lines that speak of the mistake: that hold all that is wanted."""
+    return [line for line in lines if all(want in line for want in mistake.wants)]
+
+
+def row(mistake: Mistake, lines: list[str]) -> str:
+    """The mistake's line of the page."""
+    (line, *_) = said(mistake, lines) or lines or [""]
+    line = line.removeprefix("graphnav: ").replace("|", "\\|").replace("<", "&lt;")
+    return f"| {mistake.what} | {line} |"
+
+
+def page(rows: dict[str, list[str]]) -> str:
+    """docs/mistakes.md."""
+    text = HEAD
+    for head, some in rows.items():
+        text += "\n".join([f"\n## {head}\n", "| what was done | what graphnav says |", "| --- | --- |", *some]) + "\n"
+    return text

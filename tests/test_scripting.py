@@ -1,0 +1,321 @@
+"""What scripts rely on: JSON alone on stdout, exit codes, quality gates, profiles, whole files whatever stops a run."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import resource
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from graphnav import cli, gates, staging
+from graphnav.config import PROFILES, Settings, read_settings, settings_from, settings_text
+from graphnav.errors import ConfigError
+from graphnav.progress import listening, tell
+from graphnav.terminal import Pace
+
+ROOT = Path(__file__).resolve().parents[1]
+TOKYO = ROOT / "data" / "tokyo"
+PROGRAM = Path(sys.executable).with_name("graphnav")
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory):
+    """A minute without fixes, filter and smoother: (folder, what --json printed, the rest)."""
+    out = tmp_path_factory.mktemp("tokyo")
+    command = [PROGRAM, "compare", TOKYO, "--without", "gnss:40-100", "--solvers", "ekf,batch", "-o", out, "--json",
+               "--require", "batch:h_rms<0.2", "--require", "span_max_h<1"]  # fmt: skip
+    run = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    return out, run
+
+
+# ---------------------------------------------------------------------------------------------------------------- JSON
+def test_json_of_compare_is_what_the_files_hold(solved):
+    out, run = solved
+    values = json.loads(run.stdout)
+    assert set(values["solvers"]) == {"ekf", "batch"}
+    for solver, summary in values["solvers"].items():
+        assert summary == json.loads((out / solver / "summary.json").read_text())
+    assert [Path(file).exists() for file in values["files"]] == [True] * len(values["files"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "keys"),
+    [
+        (["info", TOKYO], {"name", "imu", "gnss", "odometer", "findings"}),
+        (["detect", TOKYO, "-o", "out"], {"stationary", "seconds_by_detector", "files"}),
+        (["convert", TOKYO, "-o", "out"], {"rows", "assumed", "files"}),
+        (["init", TOKYO / "imu.csv.gz", TOKYO / "gnss.csv.gz", "-o", "r.toml"], {"decisions", "files"}),
+        (["simulate", "gait", "--set", "duration=20", "-o", "out"], {"scenario", "stops", "files"}),
+        (["settings", "--profile", "car"], {"profile", "gnss", "vehicle"}),
+        (["smooth", TOKYO, "--end", "60", "--solver", "ekf", "-o", "out"], {"solver", "errors", "settings", "files"}),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_json_alone_is_on_stdout(arguments, keys, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.run([*map(str, arguments), "--json"]) == 0
+    printed = capsys.readouterr()
+    assert keys <= set(json.loads(printed.out))
+    assert printed.err == ""
+
+
+@pytest.mark.parametrize("command", ["info", "detect", "convert", "simulate"])
+def test_quiet_prints_nothing(command, tmp_path, capsys):
+    subject = ["gait", "--set", "duration=20"] if command == "simulate" else [str(TOKYO)]
+    out = [] if command == "info" else ["-o", str(tmp_path / "out")]
+    assert cli.run([command, *subject, *out, "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+# --------------------------------------------------------------------------------------------------------------- gates
+def test_a_requirement_is_of_every_solver_or_of_one(solved):
+    _, run = solved
+    verdicts = {(v["require"], v["solver"]): v for v in json.loads(run.stdout)["requirements"]}
+    errors = {name: s["errors"] for name, s in json.loads(run.stdout)["solvers"].items()}
+    spans = {name: s["spans"] for name, s in json.loads(run.stdout)["solvers"].items()}
+    assert set(verdicts) == {("batch:h_rms<0.2", "batch"), ("span_max_h<1", "ekf"), ("span_max_h<1", "batch")}
+    assert verdicts["batch:h_rms<0.2", "batch"]["value"] == errors["batch"]["h_rms_m"] < 0.2
+    assert verdicts["span_max_h<1", "ekf"]["value"] == spans["ekf"][0]["max_h_m"] > 1.0
+    assert [verdicts[key]["met"] for key in sorted(verdicts)] == [True, True, False]
+    assert run.returncode == 3
+    missed = f"graphnav: not met: ekf has span_max_h_m {spans['ekf'][0]['max_h_m']:g}, required span_max_h<1\n"
+    assert run.stderr == missed
+
+
+def test_a_requirement_that_is_met_or_cannot_be_known(solved, tmp_path, capsys):
+    out, _ = solved
+    trajectory = str(out / "batch" / "trajectory.csv")
+    assert cli.run(["evaluate", trajectory, str(TOKYO), "--require", "h_rms<=0.2", "--require", "heading_rms<9"]) == 3
+    printed = capsys.readouterr()
+    assert "met: trajectory has h_rms_m" in printed.out
+    assert printed.err == "graphnav: not met: trajectory has heading_rms_deg not known, required heading_rms<9\n"
+    assert cli.run(["evaluate", trajectory, str(TOKYO), "--require", "h_rms<=0.2", "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("h_rsm<0.5", "did you mean h_rms"),
+        ("h_rms", "write NAME<NUMBER"),
+        ("h_rms=0.5", "write NAME<NUMBER"),
+        ("h_rms<half", "'half' is not a number"),
+        ("rts:h_rms<1", "no solver 'rts' runs; there are batch"),
+        ("span2_maxh<1", "did you mean span_max_h"),
+    ],
+)
+def test_a_requirement_that_says_nothing_is_refused_before_any_work(text, reason, tmp_path, capsys):
+    assert cli.run(["smooth", str(TOKYO), "-o", str(tmp_path / "o"), "--require", text]) == 2
+    printed = capsys.readouterr()
+    assert reason in printed.err
+    assert printed.err.count("\n") == 1
+    assert not (tmp_path / "o").exists()
+
+
+def test_names_of_requirements_are_those_of_the_comparison(solved):
+    out, _ = solved
+    header = (out / "comparison.csv").read_text().splitlines()[0].split(",")
+    columns = {re.sub(r"^span\d+_", "span_", name) for name in header} - {"solver"}
+    assert columns <= set(gates.names())
+
+
+@pytest.mark.parametrize(("sign", "met"), [("<", False), ("<=", True), (">", False), (">=", True)])
+def test_limits_themselves(sign, met):
+    (verdict,) = gates.judge([gates.parse_requirement(f"h_rms{sign}0.5")], [{"solver": "batch", "h_rms_m": 0.5}])
+    assert verdict.met is met
+
+
+def test_a_requirement_on_spans_is_of_each_or_of_the_one_that_is_numbered():
+    row = {"solver": "batch", "span1_max_h_m": 0.1, "span2_max_h_m": 0.9}
+
+    def met(text):
+        return all(v.met for v in gates.judge([gates.parse_requirement(text)], [row]))
+
+    assert not met("span_max_h<0.5")
+    assert met("span1_max_h<0.5")
+    assert not met("span2_max_h<0.5")
+    assert not met("span3_max_h<0.5")  # there is none
+
+
+# ----------------------------------------------------------------------------------------------- settings and profiles
+def test_a_profile_is_below_the_file_and_the_flag_above_its_profile(tmp_path):
+    file = tmp_path / "s.toml"
+    file.write_text('profile = "car+odometer"\n[vehicle]\nnhc = false\n')
+    assert read_settings(file).vehicle.odometer
+    assert not read_settings(file).vehicle.nhc
+    flagged = read_settings(file, "car")
+    assert (flagged.profile, flagged.vehicle.odometer, flagged.vehicle.nhc) == ("car", False, False)
+    assert Settings(profile="car").vehicle.nhc
+    assert not Settings(profile="foot").vehicle.nhc
+    assert Settings().profile is None
+
+
+@pytest.mark.parametrize("profile", [None, *PROFILES])
+def test_settings_as_text_are_the_same_settings(profile):
+    given = read_settings(None, profile)
+    assert settings_from(tomllib.loads(settings_text(given))) == given
+
+
+def test_a_profile_of_another_platform_is_refused_and_a_missing_odometer_is_said(tmp_path, capsys):
+    assert cli.run(["smooth", str(TOKYO), "--profile", "foot", "-o", str(tmp_path)]) == 2
+    assert 'platform = "vehicle"' in capsys.readouterr().err
+    options = ["--end", "60", "--solver", "ekf", "-o", str(tmp_path / "o")]
+    assert cli.run(["smooth", "kitti", "--profile", "car+odometer", *options]) == 0
+    assert "there is no odometer in 'kitti'" in capsys.readouterr().out
+
+
+def test_a_run_can_be_repeated_with_the_settings_in_its_summary(tmp_path):
+    options = ["--end", "60", "--solver", "ekf", "--quiet"]
+    assert cli.run(["smooth", str(TOKYO), "--profile", "car", *options, "-o", str(tmp_path / "a")]) == 0
+    again = ["--config", str(tmp_path / "a" / "summary.json")]
+    assert cli.run(["smooth", str(TOKYO), *again, *options, "-o", str(tmp_path / "b")]) == 0
+    one, other = (json.loads((tmp_path / x / "summary.json").read_text()) for x in "ab")
+    assert not any("odometer" in kind for kind in one["counts"])
+    assert one["settings"] == other["settings"]
+    assert one["final_cost"] == other["final_cost"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[keyframes]\n\nrat = 1", "line 3: unknown key 'keyframes.rat'; did you mean 'rate'?"),
+        ("[keyframes]\nrate = -1", "line 2: 'keyframes.rate' = -1: input should be greater than 0 (Hz, between"),
+        ("[vehicle]\nzero_velocity = false", "did you mean 'zero_velocity' in [standstill]?"),
+        ("[detectors.fft]\nstep = 0", "line 2: 'detectors.fft.step' = 0: input should be greater than or equal to 0.1"),
+        ('profile = "bike"', "line 1: 'profile' = 'bike': input should be 'car', 'car+odometer' or 'foot'"),
+        ("[gnss]\ngate = inf", "'gnss.gate' = inf: input should be a finite number"),
+        ("keyframes = 3", "line 1: 'keyframes' must be a table: [keyframes]"),
+        ("[keyframes]\nrate = ", "not valid TOML"),
+    ],
+)
+def test_settings_that_cannot_be_are_named_with_line_value_and_unit(text, words, tmp_path):
+    file = tmp_path / "settings.toml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(words)) as caught:
+        read_settings(file)
+    assert str(caught.value).startswith(str(file))
+
+
+# ------------------------------------------------------------------------------------------------- whole or not at all
+def test_a_staged_folder_replaces_at_the_end_or_not_at_all(tmp_path):
+    old = tmp_path / "out" / "a.txt"
+    old.parent.mkdir()
+    old.write_text("old")
+
+    def stopped(folder, error):
+        with staging.staged(folder) as part:
+            (part / "a.txt").write_text("half")
+            raise error
+
+    with pytest.raises(KeyboardInterrupt):
+        stopped(old.parent, KeyboardInterrupt())
+    assert (old.read_text(), [p.name for p in old.parent.iterdir()]) == ("old", ["a.txt"])
+    with staging.staged(old.parent) as part:
+        (part / "sub").mkdir()
+        (part / "a.txt").write_text("new")
+        (part / "sub" / "b.txt").write_text("new")
+        assert old.read_text() == "old"
+    assert (old.read_text(), (old.parent / "sub" / "b.txt").read_text()) == ("new", "new")
+    assert {p.name for p in old.parent.iterdir()} == {"a.txt", "sub"}
+    with pytest.raises(ConfigError, match=r"cannot be written \(full\); what was there before is unchanged"):
+        stopped(tmp_path / "x" / "y", OSError("full"))
+    assert not (tmp_path / "x").exists()
+
+
+def test_ctrl_c_waits_for_what_must_not_be_cut():
+    done = []
+
+    def move():
+        with staging.uninterrupted():
+            os.kill(os.getpid(), signal.SIGINT)
+            done.append("moved")
+        done.append("more")
+
+    with pytest.raises(KeyboardInterrupt):
+        move()
+    assert done == ["moved"]
+
+
+def test_a_full_disk_leaves_the_older_results_as_they_were(tmp_path):
+    """A limit on the size of files stands for the disk."""
+
+    def smooth(end, limit):
+        command = [PROGRAM, "smooth", TOKYO, "--end", str(end), "--solver", "ekf", "-o", tmp_path]
+        cap = (lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))) if limit else None
+        return subprocess.run(command, preexec_fn=cap, capture_output=True, text=True, timeout=300)
+
+    assert smooth(60, None).returncode == 0
+    before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+    run = smooth(90, 20_000)
+    assert run.returncode == 2
+    assert re.fullmatch(r"graphnav: -o .*: cannot be written \(File too large\); .*\n", run.stderr)
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+def test_ctrl_c_is_one_line_and_leaves_nothing_half_done(tmp_path):
+    """On a terminal, as soon as the bar is up."""
+    main, end = pty.openpty()
+    command = [PROGRAM, "compare", "kitti", "-o", tmp_path / "out"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=end, stdin=subprocess.DEVNULL) as run:
+        os.close(end)
+        shown = b""
+        while not shown:
+            shown = os.read(main, 4096)
+        run.send_signal(signal.SIGINT)
+        try:
+            while more := os.read(main, 4096):
+                shown += more
+        except OSError:  # the other end is closed
+            pass
+        assert run.wait(timeout=60) == 130
+        assert run.stdout.read() == b""
+    os.close(main)
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.decode())
+    assert text.rstrip().splitlines()[-1] == "graphnav: interrupted"
+    assert "Traceback" not in text
+    assert not (tmp_path / "out").exists()
+
+
+# ------------------------------------------------------------------------------------------------------------ progress
+def test_the_time_left_is_what_the_pace_says():
+    pace = Pace(("simulate",))
+    assert pace.left(10.0) is None
+    pace.reach("driving", 0.5)
+    half = pace.done
+    assert 0.4 < half < 0.5  # writing is still to come
+    assert pace.left(10.0) == pytest.approx(10.0 * (1 - half) / half)
+    pace.reach("driving", 0.1)  # a second pass
+    assert pace.done == half
+    pace.reach("writing imu.csv.gz", 1.0)
+    assert pace.left(10.0) == 0.0
+    pace.reach("something else", 0.0)
+    assert pace.done == 1.0
+
+
+def test_work_tells_whoever_listens():
+    heard = []
+    tell("nobody", 0.1)
+    with listening(lambda stage, share: heard.append((stage, share))):
+        tell("one", 0.5)
+        with listening(None):
+            tell("two")
+    tell("nobody")
+    assert heard == [("one", 0.5)]
+
+
+def test_a_run_tells_its_stages_in_order():
+    from graphnav import load, run
+
+    heard = []
+    run(load(TOKYO).crop(0.0, 60.0), solvers=("batch",), progress=lambda stage, share: heard.append(stage))
+    found = list(dict.fromkeys(heard))
+    wanted = ["detection", "alignment", "judgement", "preintegration", "filter", "smoother", "batch", "covariances"]
+    assert found == wanted
