@@ -20,6 +20,8 @@ _I3 = np.eye(3)
 _GENERATORS = np.array(
     [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float
 )
+# coefficients of (x^2)^j, j = 0..4, of sin(x)/x, (1 - cos x)/x^2 and the two that follow: (-1)^j / (2j + 1 + k)!
+_TAYLOR = np.array([[(-1.0) ** j / math.factorial(2 * j + 1 + k) for k in range(4)] for j in range(5)])
 _TINY = 1e-300  # keeps sin(x)/x = 1 at x = 0 without a case of its own
 
 
@@ -52,10 +54,12 @@ def coefficients(theta2: Array) -> tuple[Array, Array, Array, Array]:
     0.1 rad by their Taylor series (error < 1e-13), because the quotients lose digits there.
     """
     x2 = np.asarray(theta2, dtype=float)
-    a = 1.0 - x2 / 6.0 * (1.0 - x2 / 20.0 * (1.0 - x2 / 42.0 * (1.0 - x2 / 72.0)))
-    b = 0.5 * (1.0 - x2 / 12.0 * (1.0 - x2 / 30.0 * (1.0 - x2 / 56.0 * (1.0 - x2 / 90.0))))
-    c = (1.0 - x2 / 20.0 * (1.0 - x2 / 42.0 * (1.0 - x2 / 72.0 * (1.0 - x2 / 110.0)))) / 6.0
-    d = (1.0 - x2 / 30.0 * (1.0 - x2 / 56.0 * (1.0 - x2 / 90.0 * (1.0 - x2 / 132.0)))) / 24.0
+    power = np.multiply.outer(_TAYLOR[4], x2)
+    for term in (_TAYLOR[3], _TAYLOR[2], _TAYLOR[1]):  # Horner, all four at once
+        power += term.reshape(-1, *(1,) * x2.ndim)
+        power *= x2
+    power += _TAYLOR[0].reshape(-1, *(1,) * x2.ndim)
+    a, b, c, d = power
     large = x2 > 1e-2
     if np.any(large):
         y2 = np.where(large, x2, 1.0)
