@@ -38,6 +38,7 @@ from graphnav import rotation
 from graphnav.recording import Imu
 from graphnav.rotation import Array
 
+GAP = 1.5  # sample periods between rows that are a gap
 _CHUNK = 40_000  # pieces handled at once: keeps the working arrays in the processor's cache
 _CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 _WALK_POINTS = 6  # quadrature points for the effect of bias walk inside an interval
@@ -111,7 +112,7 @@ class Samples:
     bridged: Array  # (g, 2) start and end of every bridged gap, s
 
 
-def bridge_gaps(imu: Imu, factor: float = 1.5) -> Samples:
+def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
     """Put a made-up sample into every gap: the mean of its neighbours, with the noise that deserves.
 
     A row only speaks for one sample period before its stamp. What happened in a longer silence g is

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -50,8 +52,18 @@ class Problem:
     motion: Motion
     prior: InitialPrior
     constraints: tuple[Constraint, ...]
-    chains: tuple[ParameterChain, ...] = ()
     notes: tuple[str, ...] = ()
+
+    @cached_property
+    def parameters(self) -> dict[str, Parameter]:
+        """What is estimated beside the states, by name."""
+        own = (*scale_parameter(self.recording.imu.noise), *(p for rows in self.constraints for p in rows.parameters))
+        return {p.name: p for p in own}
+
+    @cached_property
+    def chains(self) -> tuple[ParameterChain, ...]:
+        """The parameters with their nodes."""
+        return _chains(self.parameters.values(), self.t)
 
     @property
     def columns(self) -> dict[str, slice]:
@@ -113,7 +125,6 @@ def pose(
         motion=Motion(intervals, frame),
         prior=prior,
         constraints=built,
-        chains=_chains((*scale_parameter(recording.imu.noise), *(p for rows in built for p in rows.parameters)), t),
         notes=(*_notes(samples, recording), *(note for rows in built for note in rows.notes)),
     )
 
@@ -140,9 +151,9 @@ def _inside(stationary: Array | None, recording: Recording) -> Array:
     return np.stack([t[first[kept]], t[last[kept]]], -1)
 
 
-def _chains(parameters: tuple[Parameter, ...], t: Array) -> tuple[ParameterChain, ...]:
+def _chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterChain, ...]:
     chains = []
-    for p in {p.name: p for p in parameters}.values():
+    for p in parameters:
         if p.begins is not None:
             nodes, mean, sigma, decay = p.begins, p.initial, p.sigma, np.zeros(len(p.begins))
         else:

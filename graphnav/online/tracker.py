@@ -23,17 +23,18 @@ from graphnav.detectors.base import merged
 from graphnav.dynamics import SCALE, Motion
 from graphnav.earth import LocalFrame
 from graphnav.online.sensors import Sensors
-from graphnav.preintegration import bridge_gaps, preintegrate
+from graphnav.preintegration import GAP, bridge_gaps, preintegrate
 from graphnav.problem import NODE_SPACING, Problem, keyframe_times, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solvers.stages import Place, Step
 from graphnav.solvers.window import Message, Smoothed, Window, turn_limit
 from graphnav.state import DIM, Parameter, States
-from graphnav.wheels import MeanSpeed
+from graphnav.wheels import Figures, MeanSpeed
 from graphnav.wheels.faults import faults
 
 CONTEXT = 30.0  # s of rows before a keyframe that its constraints may look at
+_NEAR = 2.0  # s of the same, where the IMU has no gap
 _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
 _EVERY = 2.0  # s between looks of the detectors
 _WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector sees, and the least
@@ -70,6 +71,7 @@ class Tracker:
         self.settings, self.frame = settings, frame
         self.foot = setup.platform == "foot"
         self.window = Window(message, turn_limit(setup.imu.noise))
+        self._begun = t0  # s
         self.head = t0  # time of the message before the window, or of the first keyframe as long as it is in it
         self.opened = False  # whether the first keyframe has left the window
         self.stops: Array = np.empty((0, 2))  # s, between keyframes
@@ -80,7 +82,8 @@ class Tracker:
         self._head_nodes: dict[str, float] = {}
         self._parameters: dict[str, Parameter] = {}
         self._detected = self._judged = -np.inf
-        self._speed: MeanSpeed | None = None  # of the odometer, when it was looked at last
+        self._figures: Figures | None = None  # of the odometer's readings
+        self._told = -np.inf  # s, when these were told
         self._wrong: Array = np.empty((0, 2))  # s, where its readings are wrong
 
     @property
@@ -97,21 +100,22 @@ class Tracker:
     def update(self, sensors: Sensors, new: Array, dirty: float = np.inf) -> None:
         """Add keyframes at the times `new`, after the newest, and redo those from `dirty` on."""
         clock = [time.process_time()]
-        edges = np.unique(np.concatenate([self.times, new]))
-        now = float(edges[-1])
+        now = max(self.newest, float(new[-1]) if len(new) else -np.inf)
         if not self.foot and now - self._detected >= _EVERY - SAME_TIME:
-            dirty = min(dirty, self._classify(sensors, edges, now))
+            dirty = min(dirty, self._classify(sensors, np.unique(np.concatenate([self.times, new])), now))
         if now - self._judged >= _WHEELS - SAME_TIME:
             dirty = min(dirty, self._judge_odometer(sensors, now))
         clock.append(time.process_time())
-        t = self.window.t
-        keep = int(np.searchsorted(t, dirty - SAME_TIME))
-        times = np.unique(np.concatenate([t[keep:], new]))
+        again = [stage.place.t for stage in self.window.since(dirty - SAME_TIME)]
+        times = np.unique(np.concatenate([again, new]))
         times = times[np.concatenate([[True], np.diff(times) > SAME_TIME])]
         if not len(times):
             return
-        before = self.times[: len(self.times) - len(t) + keep]
-        before = before[-_BEFORE:] if len(self.stops) and self.stops[-1, 1] > times[0] - _BEFORE else before[-1:]
+        keep = len(self.window) - len(again)
+        look = _BEFORE if len(self.stops) and self.stops[-1, 1] > times[0] - _BEFORE else 1
+        before = [stage.place.t for stage in self.window.stages[max(0, keep - look) : keep]]
+        if self.opened and len(before) < look:
+            before.insert(0, self.head)
         self.window.truncate(keep)
         del self._nodes[keep:]
         problem = self._pose(sensors, np.concatenate([before, times]))
@@ -190,10 +194,10 @@ class Tracker:
         if len(self.stops):  # a stop is posed whole, so that its place begins where it began
             here = self.stops[(self.stops[:, 0] < begin) & (self.stops[:, 1] > begin)]
             begin = min([begin, *here[:, 0].tolist()])
-        recording = sensors.recording(begin - CONTEXT, float(times[-1]) + 0.1)
+        recording = self._around(sensors, begin, float(times[-1]) + 0.1)
         start, speed = self.window.newest.state, None
-        if self._speed is not None and recording.odometer is not None:
-            speed = MeanSpeed.of(recording.odometer, self._wrong, self._speed)
+        if recording.odometer is not None:
+            speed = MeanSpeed.of(recording.odometer, self._wrong, self._figures)
         problem = pose(recording, self.settings, self.frame, start, np.ones(DIM), self.stops, times, speed)
         factor = self.settings.gnss.sd_factor or 1.0
         rows = tuple(
@@ -201,6 +205,16 @@ class Tracker:
             for c in problem.constraints
         )
         return replace(problem, constraints=rows)
+
+    def _around(self, sensors: Sensors, begin: float, end: float) -> Recording:
+        """The rows that keyframes between two times look at.
+
+        Only what gaps in the IMU hide is told by the signal of the last half minute.
+        """
+        near = sensors.recording(begin - _NEAR, end)
+        step = np.diff(near.imu.t)
+        whole = len(step) > 1 and float(step.max()) < GAP * float(np.median(step))
+        return near if whole else sensors.recording(begin - CONTEXT, end)
 
     def _push(self, problem: Problem, k: int) -> float:
         t = float(problem.t[k])
@@ -248,9 +262,10 @@ class Tracker:
     def _forget(self) -> None:
         """Stages need not know where their rows came from: that is posed again when it is asked for."""
         stages = self.window.stages
-        for k, stage in enumerate(stages):
-            if stage.place.problem is not None:
-                stages[k] = replace(stage, place=replace(stage.place, problem=None))
+        for k in range(len(stages) - 1, -1, -1):
+            if stages[k].place.problem is None:
+                break  # nor do those before it
+            stages[k] = replace(stages[k], place=replace(stages[k].place, problem=None))
 
     # ----------------------------------------------------------------------------------------- stops, bad readings
     def steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
@@ -291,11 +306,14 @@ class Tracker:
         recording = sensors.recording(-np.inf if whole else now - _WHEELS_LOOK, now)
         if recording.odometer is None:
             return np.inf
-        found, known = faults(recording.odometer, recording.imu).spans, self._wrong
+        if now - self._begun >= 2.0 * (self._told - self._begun):  # ever longer ago, as more readings tell little new
+            every = sensors.recording().odometer
+            assert every is not None
+            self._figures, self._told = Figures.of(every), now
+        found, known = faults(recording.odometer, recording.imu, self._figures).spans, self._wrong
         since = float(recording.odometer.t[0]) + (0.0 if whole else 5.0)
         old = known[(known[:, 0] < since) & (known[:, 1] > since - CONTEXT - _WHEELS_LOOK)]
         self._wrong = np.concatenate([old, found[found[:, 0] >= since]])
-        self._speed = MeanSpeed.of(recording.odometer, self._wrong)
         new = self._wrong[~np.isin(self._wrong[:, 0], known[:, 0])]
         return float(new[0, 0]) if len(new) and len(self.window) else np.inf
 

@@ -90,6 +90,13 @@ class Window:
         """Times of the keyframes in the window, s."""
         return np.array([stage.place.t for stage in self.stages])
 
+    def since(self, t: float) -> list[Stage]:
+        """The stages from a time on."""
+        first = len(self.stages)
+        while first and self.stages[first - 1].place.t >= t:
+            first -= 1
+        return self.stages[first:]
+
     def push(self, place: Place) -> float:
         """Add a keyframe, linearised at its prediction; returns by how much its measurements turned it, rad."""
         before = self.newest
@@ -102,11 +109,13 @@ class Window:
         self.stages.append(stage.moved(e))
         if columns != self._limit[0]:
             assert place.problem is not None
-            self._limit = _limits(columns, {c.parameter.name: c.parameter.unit for c in place.problem.chains})
+            self._limit = _limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})
         return float(np.linalg.norm(e[:3]))
 
     def truncate(self, keep: int) -> None:
         """Forget all but the first `keep` stages: something before what follows has changed."""
+        if keep >= len(self.stages):
+            return
         del self.stages[keep:]
         if self.stages:
             self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
