@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from graphnav import rotation
 from graphnav.rotation import Array
 
 A = 6378137.0  # semi-major axis, m
@@ -113,6 +114,24 @@ class LocalFrame:
     def omega_n(self) -> Array:
         """Earth's rotation rate in n, rad/s."""
         return self.R_ne @ np.array([0.0, 0.0, RATE])
+
+    @cached_property
+    def W(self) -> Array:
+        """[omega_n]x, rad/s."""
+        return rotation.skew(self.omega_n)
+
+    @cached_property
+    def W2(self) -> Array:
+        """Its square: minus the gradient of the centrifugal term, 1/s^2."""
+        return self.W @ self.W
+
+    @cached_property
+    def gravity_gradient(self) -> Array:
+        """Newton's, -(g/r)(I - 3 u u^T), 1/s^2: small, but it is what makes long outages honest."""
+        g = self.gravity_n(np.zeros(3))
+        size = float(np.linalg.norm(g))
+        up = -g / size
+        return np.asarray(-size / A * (np.eye(3) - 3.0 * np.outer(up, up)))
 
     def to_llh(self, p_n: Array) -> Array:
         """Positions in n (..., 3) -> (lat, lon, h)."""

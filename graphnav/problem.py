@@ -90,6 +90,7 @@ def pose(
     stationary: Array | None = None,
     times: Array | None = None,
     speed: MeanSpeed | None = None,
+    usual: Array | None = None,
 ) -> Problem:
     """Pose the estimation problem for a recording.
 
@@ -100,6 +101,7 @@ def pose(
     stationary : (M, 2) spans in which the platform stands still, s; none when None.
     times : (K,) keyframes, s, where they are given: measurements at other times are left out.
     speed : of the odometer, where it is known already.
+    usual : (M, 3) m, the unit of the slow errors of the recording's fixes, where it is known already.
     """
     classes = registered()
     stops = _inside(stationary, recording)
@@ -112,7 +114,7 @@ def pose(
     if recording.platform == "foot":
         samples = with_unresolved_motion(samples, recording.imu.noise)
     intervals = preintegrate(samples, recording.imu, t, start.ba[0], start.bg[0])
-    scene = Scene(recording, settings, frame, t, stops, intervals, speed)
+    scene = Scene(recording, settings, frame, t, stops, intervals, speed, usual)
     built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
     prior = InitialPrior(keyframe=np.zeros(1, dtype=int), mean=start, sigma=np.asarray(sigma)[None])
     return Problem(
@@ -144,7 +146,11 @@ def _inside(stationary: Array | None, recording: Recording) -> Array:
     """The parts of stationary spans that a recording covers, (M, 2), from sample to sample of the IMU."""
     if stationary is None or not len(stationary):
         return np.empty((0, 2))
-    t = np.concatenate([[recording.start], recording.imu.t])
+    begin, end = recording.start, recording.end
+    stationary = stationary[(stationary[:, 1] > begin - SAME_TIME) & (stationary[:, 0] < end + SAME_TIME)]
+    if not len(stationary):
+        return np.empty((0, 2))
+    t = np.concatenate([[begin], recording.imu.t])
     first = np.searchsorted(t, stationary[:, 0] - SAME_TIME)
     last = np.searchsorted(t, stationary[:, 1] + SAME_TIME, side="right") - 1
     kept = last > first

@@ -126,11 +126,32 @@ def right_jacobian(v: Array) -> Array:
 def right_jacobian_inverse(v: Array) -> Array:
     """Inverse of `right_jacobian`; singular at 2 pi, which `log` never returns."""
     v = np.asarray(v, dtype=float)
+    if v.size == 3:
+        return _right_jacobian_inverse_one(*v.ravel().tolist()).reshape(*v.shape, 3)
     theta2 = np.sum(v * v, axis=-1)
     a, b, _, _ = coefficients(theta2)
     small = theta2 < 1e-4
     second = np.where(small, 1.0 / 12.0 + theta2 / 720.0, (1.0 - 0.5 * a / b) / np.where(small, 1.0, theta2))
     return _polynomial(v, np.full_like(theta2, 0.5), second)
+
+
+def _right_jacobian_inverse_one(x: float, y: float, z: float) -> Array:
+    """`right_jacobian_inverse` of a single vector: I + S/2 + c (v v^T - v.v I)."""
+    n2 = x * x + y * y + z * z
+    if n2 < 1e-4:
+        c = 1.0 / 12.0 + n2 / 720.0
+    else:
+        n = math.sqrt(n2)
+        c = (1.0 - 0.5 * n / math.tan(0.5 * n)) / n2
+    one, x2, y2, z2 = 1.0 - c * n2, 0.5 * x, 0.5 * y, 0.5 * z
+    xy, xz, yz = c * x * y, c * x * z, c * y * z
+    return np.array(
+        [
+            [one + c * x * x, xy - z2, xz + y2],
+            [xy + z2, one + c * y * y, yz - x2],
+            [xz - y2, yz + x2, one + c * z * z],
+        ]
+    )
 
 
 def integrals(v: Array) -> tuple[Array, Array]:

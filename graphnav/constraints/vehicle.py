@@ -83,7 +83,7 @@ class Past:
         """u (N, 3) at a lever arm, body axes; turn rate; acceleration; and the derivatives of u and acceleration."""
         turn, late, rate, force = self.turn[rows], self.late[rows], self.rate[rows], self.force[rows]
         omega_n = self.frame.omega_n
-        W = rotation.skew(omega_n)
+        W = self.frame.W
         Rt = np.swapaxes(states.R_nb, -1, -2)
         da, dg = states.ba - self.ba[rows], states.bg - self.bg[rows]
         if SCALE in parameters:

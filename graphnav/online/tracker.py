@@ -15,7 +15,6 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints import registered
 from graphnav.constraints.base import SAME_TIME
-from graphnav.constraints.gnss import GnssPosition
 from graphnav.constraints.standstill import PLACE
 from graphnav.dense import Dense
 from graphnav.detectors import detect
@@ -198,13 +197,10 @@ class Tracker:
         start, speed = self.window.newest.state, None
         if recording.odometer is not None:
             speed = MeanSpeed.of(recording.odometer, self._wrong, self._figures)
-        problem = pose(recording, self.settings, self.frame, start, np.ones(DIM), self.stops, times, speed)
-        factor = self.settings.gnss.sd_factor or 1.0
-        rows = tuple(
-            replace(c, usual=factor * sensors.usual(times[c.keyframe])) if isinstance(c, GnssPosition) else c
-            for c in problem.constraints
-        )
-        return replace(problem, constraints=rows)
+        usual = None
+        if recording.gnss is not None:
+            usual = (self.settings.gnss.sd_factor or 1.0) * sensors.usual(recording.gnss.t)
+        return pose(recording, self.settings, self.frame, start, np.ones(DIM), self.stops, times, speed, usual)
 
     def _around(self, sensors: Sensors, begin: float, end: float) -> Recording:
         """The rows that keyframes between two times look at.

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dgeqrf, dtrtri
+from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtri
 
 from graphnav import rotation
 from graphnav.constraints.base import assemble
@@ -77,7 +77,7 @@ class Message:
     def covariance(self) -> Array:
         """(D, D)"""
         root = np.linalg.inv(self.R)
-        return root @ root.T
+        return np.asarray(root @ root.T)
 
     def moved(self, e: Array) -> Message:
         """The same about the point moved by the error state e (D,)."""
@@ -105,6 +105,19 @@ class Stage:
     def moved(self, e: Array) -> Stage:
         """The same about the point moved by the error state e."""
         return Stage(self.place, self.message.moved(e), turned(self.G, e), self.g + self.G @ e, self.lost, self.C)
+
+    @property
+    def noise(self) -> Array:
+        """(D before, D before), C in its place."""
+        out = np.zeros((len(self.G), len(self.G)))
+        out[self.lost[:, None], self.lost] = self.C
+        return out
+
+    def before(self, P: Array) -> Array:
+        """The covariance before from that of y."""
+        out = self.G @ P @ self.G.T
+        out[self.lost[:, None], self.lost] += self.C
+        return np.asarray(out)
 
 
 def turned(A: Array, e: Array) -> Array:
@@ -170,7 +183,10 @@ def predicted(before: Message, place: Place) -> tuple[States, Array, Columns, Ar
     scale = before.value(SCALE) if SCALE in before.columns else None
     ahead, F = motion.propagate(row, before.state, scale)
     frames = motion.frames(row, before.state.R_nb)[0]
-    W = np.linalg.inv(frames @ np.linalg.cholesky(motion.intervals.covariance[place.k - 1]))
+    root, info = dpotrf(motion.intervals.covariance[place.k - 1], lower=1)
+    if info:
+        raise EstimationError(f"the noise of the IMU before {place.t:.3f} s is none: check its figures")
+    W = dtrtri(root, lower=1)[0] @ np.linalg.inv(frames)
     link = np.zeros((DIM, DIM + D + 1))
     link[:, :DIM] = -W @ F[0]
     link[:, DIM : 2 * DIM] = W
@@ -210,12 +226,13 @@ def at_points(
         links = list(rows)
     parts: list[list[tuple[Array, Array, str, float]]] = [[] for _ in places]
     for constraint in problem.constraints:
-        lo, hi = np.searchsorted(constraint.keyframe, [first, first + n])
+        lo, hi = constraint.keyframe.searchsorted((first, first + n))
         if lo == hi or any(p.name not in columns for p in constraint.parameters):
             continue  # none here, or of parameters that have not begun
         at = constraint.keyframe[lo:hi] - first + skip
         given = {p.name: values[at, _shift(columns[p.name])] for p in constraint.parameters}
-        linear = constraint.linearize(states[at], given, slice(lo, hi))
+        here = states if len(at) == len(states) == 1 else states[at]
+        linear = constraint.linearize(here, given, slice(lo, hi))
         H = assemble(linear, columns, D) / linear.sigma[..., None]
         b = -linear.residual / linear.sigma
         edge = np.searchsorted(at, np.arange(n + 1) + skip)
