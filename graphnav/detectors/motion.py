@@ -7,6 +7,7 @@ epochs, and both may be late. So single epochs never count, and only motion is c
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -34,10 +35,10 @@ class Speeds:
     half: float = 0.0  # s on either side of t of which v is the mean
     silent_at_rest: bool = False  # reads zero whatever happens when it is unplugged
 
-    @property
+    @cached_property
     def speed(self) -> Array:
         """(K,) m/s, without a sign."""
-        return np.asarray(np.linalg.norm(self.v, axis=1))
+        return np.sqrt(np.einsum("kj,kj->k", self.v, self.v))
 
     def over(self, span: Array) -> float:
         """Speed in a span in which nothing changes, m/s: 0 if it may be none, NaN if the sensor did not look.
@@ -75,8 +76,7 @@ def moving(found: list[Speeds]) -> Array:
     for s in found:
         excess = s.speed - s.limit
         k = np.arange(len(excess))
-        three = excess[np.clip(k[:, None] + [-1, 0, 1], 0, len(k) - 1)]
-        fast = np.median(three, axis=1) > 0.0
+        fast = of_three(excess[np.maximum(k - 1, 0)], excess, excess[np.minimum(k + 1, len(k) - 1)]) > 0.0
         breaks = np.diff(s.t) > _LONGEST
         spans = [spans_of(fast[a:b], s.t[a:b]) for a, b in _pieces(breaks)]
         one = union([p for p in spans if len(p)]) if any(len(p) for p in spans) else NONE
@@ -84,6 +84,11 @@ def moving(found: list[Speeds]) -> Array:
             one = np.stack([one[:, 0] + s.half, one[:, 1] - s.half - s.late], -1)
             parts.append(one[one[:, 1] > one[:, 0]])
     return merged(np.concatenate(parts)) if parts else NONE
+
+
+def of_three(a: Array, b: Array, c: Array) -> Array:
+    """Median of three, element by element."""
+    return np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
 
 
 def _pieces(breaks: np.ndarray) -> list[tuple[int, int]]:

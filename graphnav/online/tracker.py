@@ -17,7 +17,7 @@ from graphnav.constraints import registered
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.standstill import PLACE
 from graphnav.dense import Dense
-from graphnav.detectors import detect
+from graphnav.detectors import detect, stops
 from graphnav.detectors.base import merged
 from graphnav.dynamics import SCALE, Motion
 from graphnav.earth import LocalFrame
@@ -101,7 +101,7 @@ class Tracker:
         clock = [time.process_time()]
         now = max(self.newest, float(new[-1]) if len(new) else -np.inf)
         if not self.foot and now - self._detected >= _EVERY - SAME_TIME:
-            dirty = min(dirty, self._classify(sensors, np.unique(np.concatenate([self.times, new])), now))
+            dirty = min(dirty, self._classify(sensors, new, now))
         if now - self._judged >= _WHEELS - SAME_TIME:
             dirty = min(dirty, self._judge_odometer(sensors, now))
         clock.append(time.process_time())
@@ -313,13 +313,17 @@ class Tracker:
         new = self._wrong[~np.isin(self._wrong[:, 0], known[:, 0])]
         return float(new[0, 0]) if len(new) and len(self.window) else np.inf
 
-    def _classify(self, sensors: Sensors, edges: Array, now: float) -> float:
+    def _classify(self, sensors: Sensors, new: Array, now: float) -> float:
         """Ask the detectors; returns the start of the first interval between keyframes that they see otherwise."""
         whole = not np.isfinite(self._detected)
-        since = float(edges[0]) if whole else now - _SEEN
+        since = min(self.head, *new.tolist()) if whole else now - _SEEN
         self._detected = now
-        found = detect(sensors.recording(-np.inf if whole else now - _LOOK, now), self.settings).stationary
-        parts = [_clipped(self.stops, -np.inf, since), _clipped(found, since, now - SURE)]
+        recording = sensors.recording(-np.inf if whole else now - _LOOK, now)
+        found = stops(recording, self.settings, since, now - SURE)
+        if not len(found) and not len(self.stops):
+            return np.inf
+        parts = [_clipped(self.stops, -np.inf, since), found]
+        edges = np.unique(np.concatenate([self.times, new]))
         spans = merged(np.concatenate(parts), gap=SAME_TIME)
         spans = spans[spans[:, 1] >= edges[0] - SAME_TIME] if len(spans) else spans
         aligned = []
