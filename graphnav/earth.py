@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from graphnav import rotation
-from graphnav.rotation import Array
+from graphnav.rotation import Array, columns
 
 A = 6378137.0  # semi-major axis, m
 F = 1.0 / 298.257223563  # flattening
@@ -29,12 +29,11 @@ _M = RATE**2 * A**2 * B / GM
 
 def llh_to_ecef(llh: Array) -> Array:
     """(lat, lon, h) in rad, rad, m -> Earth-centred Earth-fixed metres; (..., 3) -> (..., 3)."""
-    lat, lon, h = np.moveaxis(np.asarray(llh, dtype=float), -1, 0)
-    n = A / np.sqrt(1.0 - E2 * np.sin(lat) ** 2)
-    return np.stack(
-        [(n + h) * np.cos(lat) * np.cos(lon), (n + h) * np.cos(lat) * np.sin(lon), (n * (1 - E2) + h) * np.sin(lat)],
-        -1,
-    )
+    llh = np.asarray(llh, dtype=float)
+    lat, lon, h = llh[..., 0], llh[..., 1], llh[..., 2]
+    s, c = np.sin(lat), np.cos(lat)
+    n = A / np.sqrt(1.0 - E2 * s * s)
+    return columns((n + h) * c * np.cos(lon), (n + h) * c * np.sin(lon), (n * (1 - E2) + h) * s)
 
 
 def _normal(r: Array) -> tuple[Array, Array, Array]:
@@ -63,9 +62,8 @@ def enu_axes(llh: Array) -> Array:
     """R_ne: rows are the east, north and up axes in ECEF; (..., 3) -> (..., 3, 3)."""
     lat, lon = np.asarray(llh, dtype=float)[..., 0], np.asarray(llh, dtype=float)[..., 1]
     sl, cl, so, co = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
-    zero = np.zeros_like(sl)
-    rows = [[-so, co, zero], [-sl * co, -sl * so, cl], [cl * co, cl * so, sl]]
-    return np.stack([np.stack(r, -1) for r in rows], -2)
+    parts = (-so, co, 0.0 * sl, -sl * co, -sl * so, cl, cl * co, cl * so, sl)
+    return columns(*parts).reshape(*sl.shape, 3, 3)
 
 
 def gravity(lat: Array, h: Array) -> Array:

@@ -35,6 +35,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav import rotation
+from graphnav.findings import period_of
 from graphnav.recording import Imu
 from graphnav.rotation import Array
 
@@ -120,8 +121,8 @@ def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
     half its structure function, D(g)/2 = E|x(t+g) - x(t)|^2 / 2 per axis, is the variance of a guess
     from the neighbours. That error lasts the whole gap, so the equivalent white density is D(g)/2 * g.
     """
-    dt = np.diff(imu.t)
-    period = float(np.median(dt))
+    dt = imu.t[1:] - imu.t[:-1]
+    period = period_of(imu.t)
     gap = np.flatnonzero(dt > factor * period)
     zero = np.zeros(len(imu.t))
     if not len(gap):
@@ -225,10 +226,13 @@ def _pieces(samples: Samples, t: Array, extra: Array | None = None) -> _Pieces:
     inner = samples.t[(samples.t > t[0]) & (samples.t < t[-1])]
     # all but sorted already, which is what a stable sort makes use of
     edges = np.sort(np.concatenate([inner, t] if extra is None else [inner, t, extra]), kind="stable")
-    edges = edges[np.append(True, np.diff(edges) > 0)]
+    dt = edges[1:] - edges[:-1]
+    if dt.size and dt.min() <= 0.0:
+        edges = edges[np.append(True, dt > 0)]
+        dt = edges[1:] - edges[:-1]
     index = np.minimum(np.searchsorted(samples.t, edges[1:], side="left"), len(samples.t) - 1)
     starts = np.searchsorted(edges, t)
-    return _Pieces(edges, np.diff(edges), index, starts[:-1], np.diff(starts))
+    return _Pieces(edges, dt, index, starts[:-1], starts[1:] - starts[:-1])
 
 
 def _chunks(count: Array) -> Iterator[Array]:
@@ -279,14 +283,14 @@ def _means(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Array]:
     x2 = phi[:, 0] * phi[:, 0] + phi[:, 1] * phi[:, 1] + phi[:, 2] * phi[:, 2]
     a, b, c, d = (x[:, None] for x in rotation.coefficients(x2))
     turn = np.empty((L, n, 3, 3))
-    step = np.moveaxis(turn, 1, -1)
+    step = turn.transpose(0, 2, 3, 1)
     np.multiply((b * phi)[:, :, None], phi[:, None], out=step)
     cosine, sine = 1.0 - b[:, 0] * x2, a * phi
     for i, j, k in _CYCLES:
         step[:, i, i] += cosine
         step[:, j, i] += sine[:, k]
         step[:, i, j] -= sine[:, k]
-    R = np.ascontiguousarray(np.moveaxis(_products(turn), 1, -1))
+    R = np.ascontiguousarray(_products(turn).transpose(0, 2, 3, 1))
     one = _cross(phi, f)
     two = _cross(phi, one)
     V = _summed(_turned(R[:-1], (f + b * one + c * two) * h))
@@ -327,13 +331,13 @@ def _integrate(
     A, R, V, P = A[cut], R[cut], V[cut], P[cut]
     edge = _summed(dt)[cut]
     qg, qa = _white_noise(samples, imu, dt, index, edge, cut)
-    h = np.diff(edge, axis=0)[:, None]
+    h = (edge[1:] - edge[:-1])[:, None]
     # dV / d bg = -int [dV]x A, exactly for A linear in a cell: int (t - t_start) dV = h dV - int (V - V_start) dt
-    dv = np.diff(V, axis=0)
-    gain = np.diff(P, axis=0) - V[:-1] * h
+    dv = V[1:] - V[:-1]
+    gain = P[1:] - P[:-1] - V[:-1] * h
     late = h * dv - gain
     h = h[:, None]
-    slope = np.diff(A, axis=0) / np.maximum(h, 1e-12)
+    slope = (A[1:] - A[:-1]) / np.maximum(h, 1e-12)
     B = _summed(-_cross(dv, A[:-1]) - _cross(late, slope))
     PA = _summed(0.5 * h * (A[:-1] + A[1:]))  # dP / d ba
     # dP / d bg = int B, in a cell B_start h - int [(t_end - t) dV]x A
@@ -360,7 +364,7 @@ def _integrate(
 def _past(edge: Array, R: Array, V: Array, A: Array) -> tuple[Array, Array, Array, Array]:
     """What the mean velocity over an interval is made of, seen from its end; by the trapezoidal rule."""
     T = edge[-1]
-    h = np.diff(edge, axis=0)
+    h = edge[1:] - edge[:-1]
     weight = np.zeros_like(edge)
     weight[1:] += h
     weight[:-1] += h
@@ -377,7 +381,8 @@ def _past(edge: Array, R: Array, V: Array, A: Array) -> tuple[Array, Array, Arra
 
 def _last(x: Array) -> Array:
     """(n, ...) what (L, ..., n) holds at the end."""
-    return np.ascontiguousarray(np.moveaxis(x[-1], -1, 0))
+    x = x[-1]
+    return np.ascontiguousarray(x.transpose(x.ndim - 1, *range(x.ndim - 1)))
 
 
 def _summed(terms: Array) -> Array:
@@ -395,7 +400,7 @@ def _white_noise(
     samples: Samples, imu: Imu, dt: Array, index: Array, edge: Array, cut: Array
 ) -> tuple[Array, Array]:
     """Variances of the integrals of white rate and force noise over each cell between the edges."""
-    h = np.diff(edge, axis=0)
+    h = edge[1:] - edge[:-1]
     qg, qa = imu.noise.gyro_noise_density**2 * h, imu.noise.accel_noise_density**2 * h
     if samples.extra_gyro.any() or samples.extra_accel.any():
         qg += np.diff(_summed(samples.extra_gyro[index] * dt)[cut], axis=0)

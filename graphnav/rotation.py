@@ -104,7 +104,7 @@ def _exp_one(x: float, y: float, z: float) -> Array:
 def log(R: Array) -> Array:
     """Rotation vectors in [0, pi] of rotation matrices: (..., 3, 3) -> (..., 3)."""
     R = np.asarray(R, dtype=float)
-    w = 0.5 * np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
+    w = 0.5 * columns(R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1])
     c = 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0)
     s = np.sqrt(np.sum(w * w, axis=-1) + _TINY)
     v = w * (np.arctan2(s, c) / s)[..., None]

@@ -205,7 +205,7 @@ class NonHolonomic(Wheels):
         return cls(
             keyframe=rows + 1,
             past=past,
-            sigma=np.hypot(density, np.stack([right, up], -1)),
+            sigma=np.hypot(density, columns(right, up)),
             robust=s.robust,
             robust_scale=s.robust_scale,
             gate=s.gate,

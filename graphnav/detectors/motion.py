@@ -81,7 +81,7 @@ def moving(found: list[Speeds]) -> Array:
         spans = [spans_of(fast[a:b], s.t[a:b]) for a, b in _pieces(breaks)]
         one = union([p for p in spans if len(p)]) if any(len(p) for p in spans) else NONE
         if len(one):
-            one = np.stack([one[:, 0] + s.half, one[:, 1] - s.half - s.late], -1)
+            one = one + [s.half, -s.half - s.late]
             parts.append(one[one[:, 1] > one[:, 0]])
     return merged(np.concatenate(parts)) if parts else NONE
 
@@ -93,8 +93,8 @@ def of_three(a: Array, b: Array, c: Array) -> Array:
 
 def _pieces(breaks: np.ndarray) -> list[tuple[int, int]]:
     """[start, end) between the breaks."""
-    ends = np.flatnonzero(breaks) + 1
-    return list(zip(np.r_[0, ends].tolist(), np.r_[ends, len(breaks) + 1].tolist(), strict=True))
+    ends = (np.flatnonzero(breaks) + 1).tolist()
+    return list(zip([0, *ends], [*ends, len(breaks) + 1], strict=True))
 
 
 def quantum(values: Array) -> float:

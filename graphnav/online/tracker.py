@@ -222,7 +222,7 @@ class Tracker:
 
     def _steps(self, problem: Problem, t: float, nodes: dict[str, float]) -> tuple[Step, ...]:
         """Parameters that begin or move on at a keyframe; `nodes` is brought up to date."""
-        self._parameters |= {chain.parameter.name: chain.parameter for chain in problem.chains}
+        self._parameters |= problem.parameters
         steps = []
         stop = self._stop_at(t)
         for name, p in self._parameters.items():

@@ -7,6 +7,7 @@ what was counted, or the integral of the speed read, straight between the readin
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,6 +133,13 @@ class Figures:
         return float(np.sqrt(max(self.sigma**2 - rounding**2, 0.0))), rounding, 0.0
 
 
+def _from_zero(steps: NDArray[Any]) -> NDArray[Any]:
+    """Running sums, from zero."""
+    out = np.zeros(len(steps) + 1, dtype=steps.dtype)
+    np.cumsum(steps, out=out[1:])
+    return out
+
+
 @dataclass(frozen=True)
 class MeanSpeed:
     """Mean speed over windows, from sums made once: a call costs two searches per window.
@@ -154,7 +162,7 @@ class MeanSpeed:
         """Without the readings in `spans` (see `faults`) and not across gaps; `figures` where they are known already."""
         figures = figures or Figures.of(odometer)
         t, speed = odometer.t, odometer.speed
-        step = np.diff(t)
+        step = t[1:] - t[:-1]
         good = np.ones(len(t), dtype=bool)
         across = step > figures.longest
         for begin, end in np.empty((0, 2)) if spans is None else spans:
@@ -162,15 +170,15 @@ class MeanSpeed:
             across |= (t[:-1] < end) & (t[1:] > begin)
         bad = across | ~good[1:] | ~good[:-1]
         counted = odometer.way is not None
-        way = odometer.way if odometer.way is not None else np.r_[0.0, np.cumsum(0.5 * (speed[1:] + speed[:-1]) * step)]
+        way = odometer.way if odometer.way is not None else _from_zero(0.5 * (speed[1:] + speed[:-1]) * step)
         white, rounding, ends = figures.sigmas(odometer)
         return cls(
             t,
             speed,
             np.asarray(way),
             counted,
-            np.r_[0, np.cumsum(bad)],
-            np.r_[0, np.cumsum(speed[1:] != speed[:-1])],
+            _from_zero(bad.astype(np.intp)),
+            _from_zero((speed[1:] != speed[:-1]).astype(np.intp)),
             white=white,
             rounding=rounding,
             ends=ends,
