@@ -29,7 +29,7 @@ same (the tests compare them) in a fraction of the time.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -175,6 +175,23 @@ def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array) -> 
     order = np.argsort(np.concatenate([rows for rows, _ in parts]), kind="stable")
     names = Intervals.__dataclass_fields__
     return Intervals(*(np.concatenate([getattr(part, name) for _, part in parts])[order] for name in names))
+
+
+def preintegrate_unknown(
+    samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array, known: Mapping[float, Intervals]
+) -> Intervals:
+    """`preintegrate`, but for intervals that are `known` already, by the time they end at."""
+    missing = [k for k, end in enumerate(t[1:].tolist()) if end not in known or known[end].t0[0] != t[k]]
+    if len(missing) == len(t) - 1:
+        return preintegrate(samples, imu, t, ba, bg)
+    parts = {k: known[float(t[k + 1])] for k in range(len(t) - 1) if k not in missing}
+    for run in np.split(np.array(missing, dtype=int), np.flatnonzero(np.diff(missing) > 1) + 1):
+        if len(run):
+            new = preintegrate(samples, imu, t[run[0] : run[-1] + 2], ba, bg)
+            parts |= {int(k): new[i : i + 1] for i, k in enumerate(run)}
+    names = Intervals.__dataclass_fields__
+    ordered = [parts[k] for k in range(len(t) - 1)]
+    return Intervals(*(np.concatenate([getattr(part, name) for part in ordered]) for name in names))
 
 
 def prefix(samples: Samples, t0: float, t: Array, ba: Array, bg: Array) -> tuple[Array, Array, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,7 +14,7 @@ from graphnav.constraints.base import SAME_TIME, Constraint, Scene
 from graphnav.constraints.prior import InitialPrior
 from graphnav.dynamics import Motion, scale_parameter
 from graphnav.earth import LocalFrame
-from graphnav.preintegration import Intervals, Samples, bridge_gaps, preintegrate
+from graphnav.preintegration import Intervals, Samples, bridge_gaps, preintegrate, preintegrate_unknown
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.state import DIM, Parameter, States
@@ -91,6 +91,7 @@ def pose(
     times: Array | None = None,
     speed: MeanSpeed | None = None,
     usual: Array | None = None,
+    known: Mapping[float, Intervals] | None = None,
 ) -> Problem:
     """Pose the estimation problem for a recording.
 
@@ -102,6 +103,7 @@ def pose(
     times : (K,) keyframes, s, where they are given: measurements at other times are left out.
     speed : of the odometer, where it is known already.
     usual : (M, 3) m, the unit of the slow errors of the recording's fixes, where it is known already.
+    known : intervals between keyframes that were integrated before, by the time they end at.
     """
     classes = registered()
     stops = _inside(stationary, recording)
@@ -113,7 +115,7 @@ def pose(
     samples = bridge_gaps(recording.imu)
     if recording.platform == "foot":
         samples = with_unresolved_motion(samples, recording.imu.noise)
-    intervals = preintegrate(samples, recording.imu, t, start.ba[0], start.bg[0])
+    intervals = preintegrate_unknown(samples, recording.imu, t, start.ba[0], start.bg[0], known or {})
     scene = Scene(recording, settings, frame, t, stops, intervals, speed, usual)
     built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
     prior = InitialPrior(keyframe=np.zeros(1, dtype=int), mean=start, sigma=np.asarray(sigma)[None])

@@ -79,7 +79,8 @@ def peaks(amplitude: Array, frequencies: Array, low: float, high: float) -> tupl
         return np.full(shape, np.nan), np.full(shape, np.nan)
     k = i + amplitude[..., i:j].argmax(axis=-1)
     last = len(frequencies) - 1
-    at = [np.take_along_axis(amplitude, np.clip(k + d, 0, last)[..., None], -1)[..., 0] for d in (-1, 0, 1)]
+    flat, row = amplitude.reshape(-1, amplitude.shape[-1]), np.arange(k.size)
+    at = [flat[row, np.minimum(k.ravel() + d, last)].reshape(k.shape) for d in (-1, 0, 1)]  # k > 0
     # what borders on a band may be a line of the next one: only a peak is interpolated
     peak = (at[1] >= at[0]) & (at[1] >= at[2]) & (k < last)
     up = at[2] >= at[0]

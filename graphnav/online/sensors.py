@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
 
@@ -46,7 +47,7 @@ class Sensors:
         velocity and its sigmas (NaN where there is none) of a fix; speed, way counted and four wheels of an odometer.
         """
         known = values[: 6 if sensor != "odometer" else 1]
-        if not (np.isfinite(t) and np.isfinite(known).all()) or (sensor == "gnss" and min(values[3:6]) <= 0.0):
+        if not math.isfinite(t + sum(known)) or (sensor == "gnss" and min(values[3:6]) <= 0.0):
             self.counts[f"{sensor}: not a number"] += 1
             return False
         if t <= self.oldest:
@@ -83,7 +84,8 @@ class Sensors:
         return mean
 
     def _add_imu(self, t: float, values: tuple[float, ...]) -> bool:
-        if len(self.imu) and t > self.imu.newest + self.longest_gap:
+        newest = self.imu.newest
+        if t > newest + self.longest_gap and newest > -np.inf:
             # the next row tells whether this stamp was wrong or the IMU away
             before, self._suspect = self._suspect, (t, values)
             if before is None or not 0.0 < t - before[0] < self.longest_gap:
@@ -94,7 +96,7 @@ class Sensors:
         elif self._suspect is not None:
             self.counts["imu: stamp in the future"] += 1
         self._suspect = None
-        if not self.imu.add(t, values):
+        if not self.imu.add(t, values, newest):
             self.counts["imu: repeated"] += 1
             return False
         self.counts["imu"] += 1

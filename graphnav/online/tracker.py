@@ -22,7 +22,7 @@ from graphnav.detectors.base import merged
 from graphnav.dynamics import SCALE, Motion
 from graphnav.earth import LocalFrame
 from graphnav.online.sensors import Sensors
-from graphnav.preintegration import GAP, bridge_gaps, preintegrate
+from graphnav.preintegration import GAP, Intervals, bridge_gaps, preintegrate
 from graphnav.problem import NODE_SPACING, Problem, keyframe_times, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
@@ -81,6 +81,7 @@ class Tracker:
         self._head_nodes: dict[str, float] = {}
         self._parameters: dict[str, Parameter] = {}
         self._detected = self._judged = -np.inf
+        self._intervals: dict[float, Intervals] = {}  # integrated already, by the time they end at
         self._figures: Figures | None = None  # of the odometer's readings
         self._told = -np.inf  # s, when these were told
         self._wrong: Array = np.empty((0, 2))  # s, where its readings are wrong
@@ -99,6 +100,8 @@ class Tracker:
     def update(self, sensors: Sensors, new: Array, dirty: float = np.inf) -> None:
         """Add keyframes at the times `new`, after the newest, and redo those from `dirty` on."""
         clock = [time.process_time()]
+        if dirty < np.inf:
+            self._intervals = {t: iv for t, iv in self._intervals.items() if t < dirty}
         now = max(self.newest, float(new[-1]) if len(new) else -np.inf)
         if not self.foot and now - self._detected >= _EVERY - SAME_TIME:
             dirty = min(dirty, self._classify(sensors, new, now))
@@ -144,6 +147,7 @@ class Tracker:
         self._head_nodes = self._nodes[count - 1]
         self.head, self.opened = float(self.window.t[count - 1]), True
         self.settled.append(self.window.settle(count))
+        self._intervals = {t: iv for t, iv in self._intervals.items() if t > self.head - CONTEXT}
         del self._nodes[:count]
         self._forget()
 
@@ -200,7 +204,13 @@ class Tracker:
         usual = None
         if recording.gnss is not None:
             usual = (self.settings.gnss.sd_factor or 1.0) * sensors.usual(recording.gnss.t)
-        return pose(recording, self.settings, self.frame, start, np.ones(DIM), self.stops, times, speed, usual)
+        found = ((t, self._intervals.get(t)) for t in times[1:].tolist())
+        known = {t: iv for t, iv in found if iv is not None and not iv.out_of_range(start.bg)[0]}
+        problem = pose(
+            recording, self.settings, self.frame, start, np.ones(DIM), self.stops, times, speed, usual, known
+        )  # fmt: skip
+        self._intervals |= {t: problem.intervals[k : k + 1] for k, t in enumerate(times[1:].tolist())}
+        return problem
 
     def _around(self, sensors: Sensors, begin: float, end: float) -> Recording:
         """The rows that keyframes between two times look at.
