@@ -59,10 +59,11 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
     return Detections(spans, tuple(found), notes)
 
 
-def stops(recording: Recording, settings: Settings, since: float, until: float) -> Array:
+def stops(recording: Recording, settings: Settings, since: float, until: float, new: float) -> Array | None:
     """What `detect` calls stationary of a vehicle between two times, (M, 2) s, and nothing else.
 
-    So it need not look where odometer or GNSS are certain of motion, nor at spectra where nothing is still.
+    So it need not look at spectra where nothing is still. None where odometer or GNSS are certain of motion from
+    the time `new` on: then there is nothing to be said that could not be said before.
     """
     d, imu = settings.detectors, recording.imu
     period = period_of(imu.t)
@@ -71,8 +72,8 @@ def stops(recording: Recording, settings: Settings, since: float, until: float) 
     known = speeds(recording, d.fusion)
     certain = moving(known)
     left = longer_than(without(np.array([[recording.start, recording.end]]), certain), d.fusion.min_duration)
-    if not ((left[:, 0] < until) & (left[:, 1] > since)).any():
-        return NONE
+    if not ((left[:, 0] < until) & (left[:, 1] > new)).any():
+        return None
     b = blocks(imu, period)
     low = low_pass(b)
     if not len(low.t):

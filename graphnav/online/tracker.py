@@ -42,6 +42,7 @@ _STANDS = 3.0  # s, a stance as long as that is standing, and need not be over
 _WHEELS, _WHEELS_LOOK = 10.0, 40.0  # s between looks at the odometer, and what they see
 _LOOK = 30.0  # s that the detectors see
 _SEEN = 25.0  # s of these that they answer for; the first few lack what was before
+_REVIEW = 10.0  # s between looks at what was answered before, while nothing stands
 SURE = 1.0  # s before now that they answer for: the end of a stop shows only when it is over
 _PLACE_SIGMA = 1000.0  # m, of where a stop may be
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
@@ -80,10 +81,11 @@ class Tracker:
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
         self._parameters: dict[str, Parameter] = {}
-        self._detected = self._judged = -np.inf
+        self._detected = self._judged = self._reviewed = -np.inf
         self._intervals: dict[float, Intervals] = {}  # integrated already, by the time they end at
         self._figures: Figures | None = None  # of the odometer's readings
         self._told = -np.inf  # s, when these were told
+        self._lag: float | None = None  # s by which it is late, as far as the IMU can tell
         self._wrong: Array = np.empty((0, 2))  # s, where its readings are wrong
 
     @property
@@ -103,10 +105,12 @@ class Tracker:
         if dirty < np.inf:
             self._intervals = {t: iv for t, iv in self._intervals.items() if t < dirty}
         now = max(self.newest, float(new[-1]) if len(new) else -np.inf)
-        if not self.foot and now - self._detected >= _EVERY - SAME_TIME:
+        looked = not self.foot and now - self._detected >= _EVERY - SAME_TIME
+        if looked:
             dirty = min(dirty, self._classify(sensors, new, now))
-        if now - self._judged >= _WHEELS - SAME_TIME:
-            dirty = min(dirty, self._judge_odometer(sensors, now))
+        # what can wait for the next keyframe does, so that no update does everything
+        if now - self._judged >= _WHEELS - SAME_TIME and not (looked and now - self._judged < _WHEELS + _EVERY):
+            dirty, looked = min(dirty, self._judge_odometer(sensors, now)), True
         clock.append(time.process_time())
         again = [stage.place.t for stage in self.window.since(dirty - SAME_TIME)]
         times = np.unique(np.concatenate([again, new]))
@@ -130,8 +134,10 @@ class Tracker:
         self.in_force = {
             c.name: n for c in problem.constraints if (n := int(np.sum(c.keyframe == len(problem.t) - 1)))
         }  # fmt: skip
-        if self.newest - self.window.stages[0].place.t > self.settings.solver.lag * (1.0 + 1.0 / _PORTIONS):
-            self.settle(sensors, self.newest - self.settings.solver.lag)
+        lag = self.settings.solver.lag
+        over = self.newest - self.window.stages[0].place.t - lag * (1.0 + 1.0 / _PORTIONS)
+        if over > (_EVERY if looked else 0.0):
+            self.settle(sensors, self.newest - lag)
         self._forget()
         clock.append(time.process_time())
         self.seconds = dict(zip(("detectors", "posing", "solving"), np.diff(clock).tolist(), strict=True))
@@ -312,11 +318,13 @@ class Tracker:
         recording = sensors.recording(-np.inf if whole else now - _WHEELS_LOOK, now)
         if recording.odometer is None:
             return np.inf
-        if now - self._begun >= 2.0 * (self._told - self._begun):  # ever longer ago, as more readings tell little new
+        lag = self._lag
+        if now - self._begun >= 2.0 * (self._told - self._begun):  # ever more seldom, as more readings tell little new
             every = sensors.recording().odometer
             assert every is not None
-            self._figures, self._told = Figures.of(every), now
-        found, known = faults(recording.odometer, recording.imu, self._figures).spans, self._wrong
+            self._figures, self._told, lag = Figures.of(every), now, None
+        seen, known = faults(recording.odometer, recording.imu, self._figures, lag), self._wrong
+        found, self._lag = seen.spans, seen.lag
         since = float(recording.odometer.t[0]) + (0.0 if whole else 5.0)
         old = known[(known[:, 0] < since) & (known[:, 1] > since - CONTEXT - _WHEELS_LOOK)]
         self._wrong = np.concatenate([old, found[found[:, 0] >= since]])
@@ -326,11 +334,13 @@ class Tracker:
     def _classify(self, sensors: Sensors, new: Array, now: float) -> float:
         """Ask the detectors; returns the start of the first interval between keyframes that they see otherwise."""
         whole = not np.isfinite(self._detected)
-        since = min(self.head, *new.tolist()) if whole else now - _SEEN
+        since, answered = (min(self.head, *new.tolist()), -np.inf) if whole else (now - _SEEN, self._detected - SURE)
+        if now - self._reviewed >= _REVIEW - SAME_TIME:
+            self._reviewed, answered = now, since
         self._detected = now
         recording = sensors.recording(-np.inf if whole else now - _LOOK, now)
-        found = stops(recording, self.settings, since, now - SURE)
-        if not len(found) and not len(self.stops):
+        found = stops(recording, self.settings, since, now - SURE, answered)
+        if found is None or (not len(found) and not len(self.stops)):
             return np.inf
         parts = [_clipped(self.stops, -np.inf, since), found]
         edges = np.unique(np.concatenate([self.times, new]))

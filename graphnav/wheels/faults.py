@@ -52,16 +52,24 @@ class Faults:
 
     spans: Array  # (M, 2) s, [first bad reading, next good one)
     reasons: tuple[str, ...]
+    lag: float | None = None  # s by which the odometer is late, as far as the IMU can tell
 
 
-def faults(odometer: Odometer, imu: Imu | None = None, figures: Figures | None = None) -> Faults:
-    """Where readings are missing or wrong; see the module's head. Times are those of the odometer's own stamps."""
+def faults(
+    odometer: Odometer, imu: Imu | None = None, figures: Figures | None = None, lag: float | None = None
+) -> Faults:
+    """Where readings are missing or wrong; see the module's head. Times are those of the odometer's own stamps.
+
+    `figures` and `lag` (s) are what is known of the odometer already.
+    """
     figures = figures or Figures.of(odometer)
     found = [(a, b, GAP) for a, b in gaps(odometer.t, figures.longest)]
     if len(odometer.t) >= 10:
-        found += _wrong(odometer, imu, figures)
+        motion = _motion(odometer, imu, lag) if imu is not None and len(imu.t) > 10 else None
+        found += _wrong(odometer, imu, motion, figures)
+        lag = lag if motion is None else motion.lag
     found.sort()
-    return Faults(np.array([f[:2] for f in found], dtype=float).reshape(-1, 2), tuple(f[2] for f in found))
+    return Faults(np.array([f[:2] for f in found], dtype=float).reshape(-1, 2), tuple(f[2] for f in found), lag)
 
 
 @dataclass(frozen=True)
@@ -82,7 +90,7 @@ def _ahead_up(imu: Imu) -> tuple[Array, Array]:
     return ahead / max(float(np.linalg.norm(ahead)), 1e-9), up
 
 
-def _motion(odometer: Odometer, imu: Imu) -> _Motion | None:
+def _motion(odometer: Odometer, imu: Imu, known: float | None) -> _Motion | None:
     t, speed = odometer.t, odometer.speed
     dt = np.diff(imu.t, prepend=2 * imu.t[0] - imu.t[1])
     ahead, up = _ahead_up(imu)
@@ -104,7 +112,7 @@ def _motion(odometer: Odometer, imu: Imu) -> _Motion | None:
     def size(off: Array) -> float:
         return float(np.mean(np.minimum(np.abs(off), 1.0)))  # what is wrong has no more say than 1 m/s
 
-    lags = np.arange(-_LATEST / 3.0, _LATEST + 0.01, 0.05)
+    lags = np.arange(-_LATEST / 3.0, _LATEST + 0.01, 0.05) if known is None else np.array([known])
     misfits = [size(np.subtract(*missing(lag))) for lag in lags]
     lag, left = float(lags[int(np.argmin(misfits))]), min(misfits)
     # clocks far apart, wrong axes: the force explains nothing of the changes of speed
@@ -171,9 +179,10 @@ def _closest(i: NDArray[np.intp], j: NDArray[np.intp], found: list[tuple[int, in
     return out
 
 
-def _wrong(odometer: Odometer, imu: Imu | None, figures: Figures) -> list[tuple[float, float, str]]:
+def _wrong(
+    odometer: Odometer, imu: Imu | None, motion: _Motion | None, figures: Figures
+) -> list[tuple[float, float, str]]:
     t, v = odometer.t, odometer.speed
-    motion = _motion(odometer, imu) if imu is not None and len(imu.t) > 10 else None
     breaks = _breaks(odometer, motion, figures)
     equal = [(a - 1, b - 1) for a, b in runs_of(np.r_[False, v[1:] == v[:-1]])]  # first and last of equal readings
     stays = [(a, b) for a, b in equal if b - a >= 4 and t[b] - t[a] >= _STAYS]
