@@ -106,7 +106,7 @@ def pose(
     known : intervals between keyframes that were integrated before, by the time they end at.
     """
     classes = registered()
-    stops = _inside(stationary, recording)
+    stops = to_samples(stationary, recording)
     if times is None:
         wanted = [cls.epochs(recording, settings, stops) for cls in classes]
         epochs = np.concatenate([*wanted, np.empty(0)])
@@ -144,7 +144,7 @@ def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Arra
     return np.append(np.repeat(fixed[:-1], parts) + within * step, fixed[-1])
 
 
-def _inside(stationary: Array | None, recording: Recording) -> Array:
+def to_samples(stationary: Array | None, recording: Recording) -> Array:
     """The parts of stationary spans that a recording covers, (M, 2), from sample to sample of the IMU."""
     if stationary is None or not len(stationary):
         return np.empty((0, 2))

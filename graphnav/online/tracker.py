@@ -23,7 +23,7 @@ from graphnav.dynamics import SCALE, Motion
 from graphnav.earth import LocalFrame
 from graphnav.online.sensors import Sensors
 from graphnav.preintegration import GAP, Intervals, bridge_gaps, preintegrate
-from graphnav.problem import NODE_SPACING, Problem, keyframe_times, pose
+from graphnav.problem import NODE_SPACING, Problem, keyframe_times, pose, to_samples
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solvers.stages import Place, Step
@@ -290,7 +290,9 @@ class Tracker:
         recording = sensors.recording(-np.inf if whole else min(T, limit) - _WALK, limit + SURE)
         if recording.duration < _WALK_LEAST:
             return np.empty(0)
-        spans = _clipped(detect(recording, self.settings).stationary, T, limit)
+        rows = recording.imu.t  # keyframes stand where the stances will be said to begin and end
+        limit = float(rows[max(int(np.searchsorted(rows, limit + SAME_TIME)) - 1, 0)])
+        spans = _clipped(to_samples(detect(recording, self.settings).stationary, recording), T, limit)
         if not last and len(spans):
             ongoing = spans[-1, 1] >= limit - SAME_TIME
             if ongoing and limit - spans[-1, 0] < _STANDS:
