@@ -413,9 +413,7 @@ def _summed(terms: Array) -> Array:
     return out
 
 
-def _white_noise(
-    samples: Samples, imu: Imu, dt: Array, index: Array, edge: Array, cut: Array
-) -> tuple[Array, Array]:
+def _white_noise(samples: Samples, imu: Imu, dt: Array, index: Array, edge: Array, cut: Array) -> tuple[Array, Array]:
     """Variances of the integrals of white rate and force noise over each cell between the edges."""
     h = edge[1:] - edge[:-1]
     qg, qa = imu.noise.gyro_noise_density**2 * h, imu.noise.accel_noise_density**2 * h

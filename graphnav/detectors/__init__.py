@@ -19,6 +19,7 @@ from graphnav.detectors.windows import blocks, low_pass
 from graphnav.earth import gravity
 from graphnav.findings import period_of
 from graphnav.recording import Recording
+from graphnav.rotation import Array
 
 __all__ = ["Detection", "Detections", "detect", "glrt_statistic", "stops"]
 

@@ -81,7 +81,7 @@ def moving(found: list[Speeds]) -> Array:
         spans = [spans_of(fast[a:b], s.t[a:b]) for a, b in _pieces(breaks)]
         one = union([p for p in spans if len(p)]) if any(len(p) for p in spans) else NONE
         if len(one):
-            one = one + [s.half, -s.half - s.late]
+            one = one + np.array([s.half, -s.half - s.late])
             parts.append(one[one[:, 1] > one[:, 0]])
     return merged(np.concatenate(parts)) if parts else NONE
 

@@ -51,7 +51,10 @@ class Windows:
     def amplitudes(self, which: Array | None = None) -> Iterator[tuple[slice, Array]]:
         """Single-sided amplitudes (w, 3, F) of all windows or of some, chunk by chunk, in the columns' units."""
         if self.count <= _CHUNK:  # few enough to be kept
-            yield slice(0, self.count if which is None else len(which)), self._all if which is None else self._all[which]
+            yield (
+                slice(0, self.count if which is None else len(which)),
+                self._all if which is None else self._all[which],
+            )
             return
         yield from self._made(np.arange(self.count) if which is None else which)
 

@@ -16,11 +16,13 @@ from graphnav.config import Settings
 from graphnav.constraints import registered
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.standstill import PLACE
+from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.dense import Dense
 from graphnav.detectors import detect, stops
 from graphnav.detectors.base import merged
 from graphnav.dynamics import SCALE, Motion
 from graphnav.earth import LocalFrame
+from graphnav.online.evidence import Evidence
 from graphnav.online.sensors import Sensors
 from graphnav.preintegration import GAP, Intervals, bridge_gaps, preintegrate
 from graphnav.problem import NODE_SPACING, Problem, keyframe_times, pose, to_samples
@@ -76,6 +78,7 @@ class Tracker:
         self.opened = False  # whether the first keyframe has left the window
         self.stops: Array = np.empty((0, 2))  # s, between keyframes
         self.settled: list[Smoothed] = []
+        self.evidence = Evidence()
         self.in_force: dict[str, int] = {}  # rows of each constraint at the newest keyframe
         self.seconds: dict[str, float] = {}  # of process time, by what the newest update did
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
@@ -153,9 +156,15 @@ class Tracker:
         self._head_nodes = self._nodes[count - 1]
         self.head, self.opened = float(self.window.t[count - 1]), True
         self.settled.append(self.window.settle(count))
+        self.evidence.add(self.settled[-1])
         self._intervals = {t: iv for t, iv in self._intervals.items() if t > self.head - CONTEXT}
         del self._nodes[:count]
         self._forget()
+
+    def judged(self, settings: Settings, sensors: Sensors) -> None:
+        """Go on with other figures of the sensors, and go through what has not settled again."""
+        self.settings, self.window.turn = settings, turn_limit(sensors.setup.imu.noise)
+        self.update(sensors, np.empty(0), -np.inf)
 
     def live(self, sensors: Sensors) -> Live:
         """The state at the newest IMU row, by prediction from the newest keyframe."""
@@ -216,7 +225,24 @@ class Tracker:
             recording, self.settings, self.frame, start, np.ones(DIM), self.stops, times, speed, usual, known
         )  # fmt: skip
         self._intervals |= {t: problem.intervals[k : k + 1] for k, t in enumerate(times[1:].tolist())}
-        return problem
+        return self._weighed(problem)
+
+    def _weighed(self, problem: Problem) -> Problem:
+        """The problem with what is decided of each row before it enters the window: its sigma, its robust kernel.
+
+        Decided here once, with what is known when a keyframe is posed; the window then weighs the rows by their
+        kernels. Wheels: by what settled so far says of them. A fix that is suspect would be given its weight here.
+        """
+        factors = self.evidence.factors
+        if not factors:
+            return problem
+        rows = (
+            replace(c, sigma=c.sigma * factors[c.name])
+            if isinstance(c, NonHolonomic | OdometerSpeed) and c.name in factors
+            else c
+            for c in problem.constraints
+        )
+        return replace(problem, constraints=tuple(rows))
 
     def _around(self, sensors: Sensors, begin: float, end: float) -> Recording:
         """The rows that keyframes between two times look at.

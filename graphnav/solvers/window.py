@@ -20,6 +20,7 @@ from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 from graphnav.solvers.stages import (
     Columns,
+    Measured,
     Message,
     Place,
     Stage,
@@ -47,6 +48,16 @@ Renewed = Callable[[int], list[Place]]
 
 
 @dataclass(frozen=True)
+class Residual:
+    """What is left of a constraint's rows at a settled keyframe, in its sigmas, and the variance it should have."""
+
+    name: str
+    sigma: Array  # (n, m)
+    left: Array  # (n, m) predicted - measured over sigma
+    variance: Array  # (n, m) of that: 1 less what the states took up
+
+
+@dataclass(frozen=True)
 class Smoothed:
     """Some keyframes with all that the window knows: states, covariances, and the parameters there."""
 
@@ -57,6 +68,7 @@ class Smoothed:
     values: tuple[Array, ...]  # (D-15,) each
     sigma: tuple[Array, ...]  # (D-15,) each
     places: tuple[Place, ...]
+    residuals: tuple[tuple[Residual, ...], ...] = ()  # of the measurements at each
 
     def __len__(self) -> int:
         return len(self.t)
@@ -155,11 +167,12 @@ class Window:
         """Smooth the window and let its first `count` stages go."""
         gone, means = self.stages[:count], self.means()[1 : count + 1]
         columns = tuple(stage.message.columns for stage in gone)
-        rows, covariance, sigma = [], np.empty((len(gone), DIM, DIM)), []
+        rows, covariance, sigma, residuals = [], np.empty((len(gone), DIM, DIM)), [], []
         for k, (stage, e, P) in enumerate(zip(gone, means, self._covariances(count), strict=True)):
             rows.append(stage.message.state)
             covariance[k] = P[:DIM, :DIM]
             sigma.append(np.sqrt(np.maximum(np.diagonal(P)[DIM:], 0.0)))
+            residuals.append(tuple(_residual(one, stage.way + e, P) for one in stage.measured))
         values = tuple(stage.message.values + e[DIM:] for stage, e in zip(gone, means, strict=True))
         states = self.head.state[:0]
         if gone:
@@ -182,6 +195,7 @@ class Window:
             values=values,
             sigma=tuple(sigma),
             places=tuple(stage.place for stage in gone),
+            residuals=tuple(residuals),
         )
 
     def _covariances(self, count: int) -> list[Array]:
@@ -275,6 +289,11 @@ class Window:
             first = min(first, self.first_moved(_ALMOST * share) or 0) if first else 0
             self.relinearize(first, renewed(first) if renewed is not None else None)
         return _ROUNDS
+
+
+def _residual(rows: Measured, e: Array, P: Array) -> Residual:
+    left = rows.H @ e - rows.b
+    return Residual(rows.name, rows.sigma, left, 1.0 - np.einsum("nmi,nmi->nm", rows.H @ P, rows.H))
 
 
 def turn_limit(noise: ImuNoise) -> float:

@@ -159,7 +159,7 @@ class MeanSpeed:
 
     @classmethod
     def of(cls, odometer: Odometer, spans: Spans | None = None, figures: Figures | None = None) -> MeanSpeed:
-        """Without the readings in `spans` (see `faults`) and not across gaps; `figures` where they are known already."""
+        """Without the readings in `spans` (see `faults`) and not across gaps; `figures` if they are known already."""
         figures = figures or Figures.of(odometer)
         t, speed = odometer.t, odometer.speed
         step = t[1:] - t[:-1]
