@@ -107,7 +107,7 @@ def quantum(values: Array) -> float:
 def _odometer(o: Odometer, settings: FusionSettings) -> Speeds:
     # one pulse in a period may be the jitter of a wheel that stands on a tooth
     limit = max(settings.max_speed, 1.5 * quantum(o.speed))
-    return Speeds(o.t, o.speed[:, None], np.full(len(o.t), limit), settings.odometer_delay, True)
+    return Speeds(o.t, o.speed[:, None], np.full(len(o.t), limit), settings.odometer_delay)
 
 
 def _gnss(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:
