@@ -83,7 +83,9 @@ def stops(recording: Recording, settings: Settings, since: float, until: float, 
     still, _ = candidates(b, sway, s, known, certain)
     if not len(still):
         return NONE
-    idling = detect_fft(imu, period, d.fft, still, known).intervals if recording.platform == "vehicle" else NONE
+    idling = NONE
+    if recording.platform == "vehicle":
+        idling = detect_fft(imu, period, d.fft, still, known, shown=False).intervals
     spans = np.clip(fuse(b, still, idling, certain, d.fusion)[0], since, until)
     return np.asarray(spans[spans[:, 1] > spans[:, 0]])
 

@@ -14,6 +14,7 @@ import numpy as np
 from graphnav.config import FusionSettings
 from graphnav.crosschecks import local_positions
 from graphnav.detectors.base import NONE, merged, spans_of, union
+from graphnav.detectors.windows import share_of
 from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.rotation import Array
 
@@ -52,10 +53,10 @@ class Speeds:
         if there.sum() < _MEDIAN:
             return float("nan")
         v = self.v[there]
-        middle = np.median(v, axis=0)
-        wander = float(np.linalg.norm(np.median(np.abs(v - middle), axis=0))) / 0.6745
+        middle = share_of(v, 0.5)
+        wander = float(np.linalg.norm(share_of(np.abs(v - middle), 0.5))) / 0.6745
         speed = float(np.linalg.norm(middle))
-        if speed > max(float(np.median(self.limit[there])), 2.0 * wander):
+        if speed > max(float(share_of(self.limit[there], 0.5)), 2.0 * wander):
             return speed
         return float("nan") if self.silent_at_rest else 0.0
 
