@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from graphnav.online.buffers import Buffer
+from graphnav.online.buffers import SAME, Buffer
 from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.rotation import Array
 
@@ -67,6 +67,16 @@ class Sensors:
         self.counts[sensor] += 1
         return True
 
+    def add_next(self, t: float, values: tuple[float, ...], newest: float) -> bool:
+        """Take in an IMU row if nothing is odd about it; False leaves it to `add`. `newest` is the time before it."""
+        if self._suspect is not None or not newest + SAME < t <= newest + self.longest_gap or t <= self.oldest:
+            return False
+        if len(values) != _WIDTH["imu"] or not math.isfinite(sum(values)):
+            return False
+        self.imu.append(t, values)
+        self.counts["imu"] += 1
+        return True
+
     def usual(self, t: Array) -> Array:
         """(N, 3) what the fixes at some times usually state, m: the unit of their slow errors."""
         return self.gnss.rows[np.searchsorted(self.gnss.t, t - 1e-6), 13:16]
@@ -84,8 +94,7 @@ class Sensors:
         return mean
 
     def _add_imu(self, t: float, values: tuple[float, ...]) -> bool:
-        newest = self.imu.newest
-        if t > newest + self.longest_gap and newest > -np.inf:
+        if len(self.imu) and t > self.imu.newest + self.longest_gap:
             # the next row tells whether this stamp was wrong or the IMU away
             before, self._suspect = self._suspect, (t, values)
             if before is None or not 0.0 < t - before[0] < self.longest_gap:
@@ -96,7 +105,7 @@ class Sensors:
         elif self._suspect is not None:
             self.counts["imu: stamp in the future"] += 1
         self._suspect = None
-        if not self.imu.add(t, values, newest):
+        if not self.imu.add(t, values):
             self.counts["imu: repeated"] += 1
             return False
         self.counts["imu"] += 1

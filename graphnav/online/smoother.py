@@ -74,6 +74,10 @@ class Online:
         sensor, t, values = row
         sensors = self.sensors
         before = sensors.imu.newest
+        if sensor == "imu" and sensors.add_next(t, values, before):  # as all but a few do
+            if t >= self._due:
+                self._look()
+            return
         previous = sensors.odometer.newest
         if not sensors.add(sensor, t, values):
             return
@@ -94,10 +98,13 @@ class Online:
             elif sensor == "odometer" and previous < tracker.newest - SAME_TIME:
                 self._dirty = min(self._dirty, previous + 2.0 * SAME_TIME)
         if sensors.imu.newest >= self._due:
-            if self.tracker is None:
-                self._align()
-            else:
-                self._advance(self.tracker)
+            self._look()
+
+    def _look(self) -> None:
+        if self.tracker is None:
+            self._align()
+        else:
+            self._advance(self.tracker)
 
     def live(self) -> Live | None:
         """The state at the newest IMU row; None while aligning."""
