@@ -56,7 +56,7 @@ class Online:
         self.late: Counter[str] = Counter()  # rows that came after the keyframe they belong before, and were used
         self._found: Alignment | None = None  # as long as the sensors are still to be judged by more rows
         self._said: tuple[str, ...] = ()  # of the notes, those about what the sensors are judged to be
-        self._enough = 0  # fixes since the first motion that they are judged again by
+        self._judged = 0.0  # s of rows that they were judged by
         self._fixes: list[float] = []  # s, not yet in the graph
         self._began = -np.inf  # s, of what is being smoothed
         self._due = -np.inf
@@ -160,7 +160,7 @@ class Online:
         self._found = found if found.motion is not None and settings.gnss.position else None
         tracker = self._track(found, recording, settings, said)
         self._fixes = [t for t in sensors.gnss.t.tolist() if t >= recording.start - SAME_TIME]
-        self._began, self._enough = recording.start, 0
+        self._began, self._judged = recording.start, recording.duration
         sensors.oldest = recording.start
         self._advance(tracker)
 
@@ -178,23 +178,16 @@ class Online:
         return self.tracker
 
     def _judge_again(self, found: Alignment, tracker: Tracker) -> Tracker:
-        """Judge the sensors by all rows since the alignment: before the first settles, then by twice as many fixes.
-
-        Up to `judgement.FIXES`, as offline does at once. What has not settled is gone through again.
-        """
+        """Judge the sensors by all rows since the alignment, and go through what has not settled again."""
         assert self.frame is not None
-        assert found.motion is not None
-        fixes = int(np.count_nonzero(self.sensors.gnss.t > found.motion))
-        late = fixes >= FIXES or tracker.newest - self._began > _JUDGED_UNTIL
-        self._enough = min(2 * fixes, FIXES)
-        self._found = None if late else found
-        self.sensors.setup = self._setup
+        used, self.sensors.setup = self.sensors.setup, self._setup
         recording = self.sensors.recording(-np.inf, tracker.newest)
         try:
             stationary = detect(recording, self.settings).stationary
             recording, settings, said = judged(recording, self.settings, self.frame, found, stationary)
         except EstimationError as error:
             self.notes.append(f"not judged again: {error}")
+            self.sensors.setup = used
             return tracker
         if tracker.opened:
             self.sensors.setup = replace(self._setup, imu=replace(self._setup.imu, noise=recording.imu.noise))
@@ -212,14 +205,18 @@ class Online:
         self._said = said
 
     def _more_to_judge(self, found: Alignment, tracker: Tracker) -> Tracker:
-        """Judge the sensors again where there is enough to do so."""
-        if not self._enough:
-            first = tracker.newest - self._began > min(self.settings.solver.lag, _JUDGED) or tracker.opened
-            return self._judge_again(found, tracker) if first else tracker
-        t = self.sensors.gnss.t
+        """Judge the sensors again before the first state settles, and whenever there are twice as many rows as before.
+
+        Up to `judgement.FIXES` fixes in motion, which is what offline judges by.
+        """
         assert found.motion is not None
-        enough = np.count_nonzero(t > found.motion) >= self._enough or tracker.newest - self._began > _JUDGED_UNTIL
-        return self._judge_again(found, tracker) if enough else tracker
+        span = tracker.newest - self._began
+        enough = np.count_nonzero(self.sensors.gnss.t > found.motion) >= FIXES or span > _JUDGED_UNTIL
+        if not enough and span < max(min(self.settings.solver.lag, _JUDGED), 2.0 * self._judged):
+            return tracker
+        self._judged = span
+        self._found = None if enough else found
+        return self._judge_again(found, tracker)
 
     def _wait(self, now: float) -> None:
         """Keep what the next attempt may need."""
