@@ -497,14 +497,14 @@ def test_stops_are_those_of_detect_wherever_they_are_asked_for(shared_data, with
         since, until = look.end - 25.0, look.end - 1.0
         whole = np.clip(detect(look, settings).stationary, since, until)
         whole = whole[whole[:, 1] > whole[:, 0]]
-        found = stops(look, settings, since, until, since)
+        found = stops(look, settings, since, until, base.NONE, since)
         if found is None:
             silent += 1
             assert not len(whole)
         else:
             some += len(found) > 0
             np.testing.assert_allclose(found, whole)
-        newer = stops(look, settings, since, until, until - 2.0)
+        newer = stops(look, settings, since, until, base.NONE, until - 2.0)
         if newer is None:
             assert not np.any(whole[:, 1] > until - 2.0)
     assert some > 20

@@ -60,11 +60,15 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
     return Detections(spans, tuple(found), notes)
 
 
-def stops(recording: Recording, settings: Settings, since: float, until: float, new: float) -> Array | None:
+def stops(
+    recording: Recording, settings: Settings, since: float, until: float, before: Array, new: float
+) -> Array | None:
     """What `detect` calls stationary of a vehicle between two times, (M, 2) s, and nothing else.
 
     So it need not look at spectra where nothing is still. None where odometer or GNSS are certain of motion from
-    the time `new` on: then there is nothing to be said that could not be said before.
+    the time `new` on, and not certain of any in the stops (K, 2) found `before`: then there is nothing to be said that
+    was not said then. Where positions alone tell speeds, nothing is said of the seconds over which they were last
+    compared, if they show motion: a smooth drive would pass for a stop there.
     """
     d, imu = settings.detectors, recording.imu
     period = period_of(imu.t)
@@ -73,8 +77,13 @@ def stops(recording: Recording, settings: Settings, since: float, until: float, 
     known = speeds(recording, d.fusion)
     certain = moving(known)
     left = longer_than(without(np.array([[recording.start, recording.end]]), certain), d.fusion.min_duration)
-    if not ((left[:, 0] < until) & (left[:, 1] > new)).any():
+    before = np.clip(before, since, until)
+    doubted = any(((certain[:, 0] < b) & (certain[:, 1] > a)).any() for a, b in before if b > a)
+    if not doubted and not ((left[:, 0] < until) & (left[:, 1] > new)).any():
         return None
+    for one in known:
+        if one.half > 0.0 and one.speed[-1] > one.limit[-1]:
+            until = max(min(until, float(one.t[-1]) - one.half), since)
     b = blocks(imu, period)
     low = low_pass(b)
     if not len(low.t):

@@ -48,6 +48,7 @@ _REVIEW = 10.0  # s between looks at what was answered before, while nothing sta
 SURE = 1.0  # s before now that they answer for: the end of a stop shows only when it is over
 _PLACE_SIGMA = 1000.0  # m, of where a stop may be
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
+_LATEST = 0.5  # of the lag by which they may be late for it, where states still move
 
 
 @dataclass(frozen=True)
@@ -153,6 +154,9 @@ class Tracker:
         last = count == len(self.window)
         robust = {self.settings.gnss.robust, self.settings.vehicle.robust} != {"none"}
         self.window.converge(always=last or robust, renewed=lambda first: self._renewed(sensors, first))
+        overdue = self.newest - float(self.window.stages[0].place.t) - self.settings.solver.lag
+        if not last and overdue < _LATEST * self.settings.solver.lag and self.window.first_moved() is not None:
+            return  # still being linearised again: the next keyframe will do
         self._head_nodes = self._nodes[count - 1]
         self.head, self.opened = float(self.window.t[count - 1]), True
         self.settled.append(self.window.settle(count))
@@ -367,7 +371,7 @@ class Tracker:
             self._reviewed, answered = now, since
         self._detected = now
         recording = sensors.recording(-np.inf if whole else now - _LOOK, now)
-        found = stops(recording, self.settings, since, now - SURE, answered)
+        found = stops(recording, self.settings, since, now - SURE, self.stops, answered)
         if found is None or (not len(found) and not len(self.stops)):
             return np.inf
         parts = [_clipped(self.stops, -np.inf, since), found]
