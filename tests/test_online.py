@@ -20,6 +20,7 @@ from helpers import Array, truth_states
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import graphnav
 from graphnav.config import Settings, settings_from
 from graphnav.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.formats import read
@@ -570,3 +571,19 @@ def test_an_imu_is_judged_by_ever_more_rows(drive: tuple[Recording, Trajectory])
         assert getattr(used, name) / getattr(noise, name) == pytest.approx(1.0, rel=0.25)
     assert sum("noisier" in note for note in online.notes) == 1
     assert online.tracker.window.turn > turn_limit(quiet)
+
+
+def test_smooth_driving_with_positions_alone_is_no_stop() -> None:
+    """KITTI cruises where no odometer says so: never held while its fixes move by metres a second."""
+    recording = graphnav.load("kitti").crop(0.0, 170.0)
+    gnss = recording.gnss
+    speed = np.linalg.norm(np.diff(gnss.llh, axis=0) * [6.37e6, 4.2e6, 0.0], axis=1) / np.diff(gnss.t)
+    online, held = Online(without_rows(recording), QUICK), []
+    for row in rows_of(recording)[1]:
+        online.add(row)
+        tracker = online.tracker
+        if row[0] == "gnss" and tracker is not None and "zero_velocity" in tracker.in_force:
+            held.append(tracker.newest)
+    assert all(speed[min(max(np.searchsorted(gnss.t, t), 1), len(speed)) - 1] < 2.0 for t in held)
+    error = online.frame.from_llh(gnss.llh[-1]) - online.live().state.p[0]
+    assert np.linalg.norm(error[:2]) < 3.0
