@@ -578,12 +578,14 @@ def test_smooth_driving_with_positions_alone_is_no_stop() -> None:
     recording = graphnav.load("kitti").crop(0.0, 170.0)
     gnss = recording.gnss
     speed = np.linalg.norm(np.diff(gnss.llh, axis=0) * [6.37e6, 4.2e6, 0.0], axis=1) / np.diff(gnss.t)
-    online, held = Online(without_rows(recording), QUICK), []
+    # what the IMU is judged to be here makes smooth roads look still
+    online, held = Online(without_rows(recording), Settings()), []
     for row in rows_of(recording)[1]:
         online.add(row)
-        tracker = online.tracker
-        if row[0] == "gnss" and tracker is not None and "zero_velocity" in tracker.in_force:
-            held.append(tracker.newest)
-    assert all(speed[min(max(np.searchsorted(gnss.t, t), 1), len(speed)) - 1] < 2.0 for t in held)
+        if row[0] == "gnss" and online.tracker is not None:
+            held += online.tracker.stops.tolist()
+    for begin, end in held:
+        inside = (gnss.t[:-1] >= begin - 0.5) & (gnss.t[1:] <= end + 0.5)
+        assert np.all(speed[inside] < 2.0)
     error = online.frame.from_llh(gnss.llh[-1]) - online.live().state.p[0]
     assert np.linalg.norm(error[:2]) < 3.0
