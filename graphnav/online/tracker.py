@@ -31,8 +31,7 @@ from graphnav.rotation import Array
 from graphnav.solvers.stages import Place, Step
 from graphnav.solvers.window import Message, Smoothed, Window, turn_limit
 from graphnav.state import DIM, Parameter, States
-from graphnav.wheels import Figures, MeanSpeed
-from graphnav.wheels.faults import faults
+from graphnav.wheels import Figures, MeanSpeed, faults
 
 CONTEXT = 30.0  # s of rows before a keyframe that its constraints may look at
 _NEAR = 2.0  # s of the same, where the IMU has no gap
