@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphnav import earth, rotation
+from graphnav import rotation
 from graphnav.earth import LocalFrame
 from graphnav.preintegration import Intervals
 from graphnav.recording import ImuNoise
@@ -52,17 +52,13 @@ class Motion:
         T = intervals.T[:, None]
         h = T[..., None]
         omega = frame.omega_n
-        W = rotation.skew(omega)
-        self.W, self.W2 = W, W @ W
+        W = self.W = frame.W
+        self.W2 = frame.W2
         E = rotation.exp(omega * T)
         gamma1, gamma2 = rotation.integrals(omega * T)
         self.back = np.swapaxes(E, -1, -2)
         self.force = np.concatenate([gamma2 * h * h, gamma1 * h], axis=1)  # iint E, int E: (n, 6, 3)
-        # Newtonian gradient of gravity, -(g/r)(I - 3 u u^T): small, but it is what makes long outages honest
-        g = frame.gravity_n(np.zeros(3))
-        size = float(np.linalg.norm(g))
-        up = -g / size
-        gradient = -size / earth.A * (_I3 - 3.0 * np.outer(up, up))
+        gradient = frame.gravity_gradient
         n = len(intervals)
         self.post = np.zeros((n, 6, 6))  # from (E p, E u) to (p, v)
         self.post[:, :3, :3] = self.post[:, 3:, 3:] = self.back
@@ -78,7 +74,9 @@ class Motion:
         coast[:, 3:, :3] += h * (gradient + self.W2)
         self.inner = self.post @ coast
         # d(dP, dV) / d(ba, bg), (n, 6, 6)
-        self.bias = np.block([[intervals.p_ba, intervals.p_bg], [intervals.v_ba, intervals.v_bg]])
+        self.bias = np.empty((n, 6, 6))
+        self.bias[:, :3, :3], self.bias[:, :3, 3:] = intervals.p_ba, intervals.p_bg
+        self.bias[:, 3:, :3], self.bias[:, 3:, 3:] = intervals.v_ba, intervals.v_bg
         self.step = np.concatenate([intervals.dP, intervals.dV], axis=-1)
         self.expected = np.concatenate([intervals.ba, intervals.bg], axis=-1)
         self.mean = np.concatenate([intervals.force, intervals.rate], axis=-1)

@@ -13,7 +13,8 @@ from functools import cached_property
 
 import numpy as np
 
-from graphnav.rotation import Array
+from graphnav import rotation
+from graphnav.rotation import Array, columns
 
 A = 6378137.0  # semi-major axis, m
 F = 1.0 / 298.257223563  # flattening
@@ -28,12 +29,11 @@ _M = RATE**2 * A**2 * B / GM
 
 def llh_to_ecef(llh: Array) -> Array:
     """(lat, lon, h) in rad, rad, m -> Earth-centred Earth-fixed metres; (..., 3) -> (..., 3)."""
-    lat, lon, h = np.moveaxis(np.asarray(llh, dtype=float), -1, 0)
-    n = A / np.sqrt(1.0 - E2 * np.sin(lat) ** 2)
-    return np.stack(
-        [(n + h) * np.cos(lat) * np.cos(lon), (n + h) * np.cos(lat) * np.sin(lon), (n * (1 - E2) + h) * np.sin(lat)],
-        -1,
-    )
+    llh = np.asarray(llh, dtype=float)
+    lat, lon, h = llh[..., 0], llh[..., 1], llh[..., 2]
+    s, c = np.sin(lat), np.cos(lat)
+    n = A / np.sqrt(1.0 - E2 * s * s)
+    return columns((n + h) * c * np.cos(lon), (n + h) * c * np.sin(lon), (n * (1 - E2) + h) * s)
 
 
 def _normal(r: Array) -> tuple[Array, Array, Array]:
@@ -62,9 +62,8 @@ def enu_axes(llh: Array) -> Array:
     """R_ne: rows are the east, north and up axes in ECEF; (..., 3) -> (..., 3, 3)."""
     lat, lon = np.asarray(llh, dtype=float)[..., 0], np.asarray(llh, dtype=float)[..., 1]
     sl, cl, so, co = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
-    zero = np.zeros_like(sl)
-    rows = [[-so, co, zero], [-sl * co, -sl * so, cl], [cl * co, cl * so, sl]]
-    return np.stack([np.stack(r, -1) for r in rows], -2)
+    parts = (-so, co, 0.0 * sl, -sl * co, -sl * so, cl, cl * co, cl * so, sl)
+    return columns(*parts).reshape(*sl.shape, 3, 3)
 
 
 def gravity(lat: Array, h: Array) -> Array:
@@ -113,6 +112,24 @@ class LocalFrame:
     def omega_n(self) -> Array:
         """Earth's rotation rate in n, rad/s."""
         return self.R_ne @ np.array([0.0, 0.0, RATE])
+
+    @cached_property
+    def W(self) -> Array:
+        """[omega_n]x, rad/s."""
+        return rotation.skew(self.omega_n)
+
+    @cached_property
+    def W2(self) -> Array:
+        """Its square: minus the gradient of the centrifugal term, 1/s^2."""
+        return self.W @ self.W
+
+    @cached_property
+    def gravity_gradient(self) -> Array:
+        """Newton's, -(g/r)(I - 3 u u^T), 1/s^2: small, but it is what makes long outages honest."""
+        g = self.gravity_n(np.zeros(3))
+        size = float(np.linalg.norm(g))
+        up = -g / size
+        return np.asarray(-size / A * (np.eye(3) - 3.0 * np.outer(up, up)))
 
     def to_llh(self, p_n: Array) -> Array:
         """Positions in n (..., 3) -> (lat, lon, h)."""

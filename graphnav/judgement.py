@@ -48,7 +48,7 @@ _OUTLIER = 6.0  # whitened norm of a fix that no Gaussian would have
 _CLEARLY = 1.3  # ratio of two figures of noise that makes a difference
 _MOST = 0.98  # the largest share called slow
 _TRIMMED = 0.01
-_BLOCK = 10.0  # s
+BLOCK = 10.0  # s
 _FEWEST = 30  # fixes or intervals that say anything
 _FIGURES = {
     "gyro_noise_density": slice(0, 3),
@@ -148,7 +148,7 @@ def judge_wheels(problem: Problem, smoothed: Smoothed) -> tuple[Problem, tuple[s
     """The problem with the sigmas of wheel constraints raised where their residuals ask for it, and sentences.
 
     What matters is what errors add up to: camber, wind and load push a vehicle aside for many seconds. So the sums
-    of whitened residuals over `_BLOCK` s are judged, against what white noise of the sigmas used would sum up to.
+    of whitened residuals over `BLOCK` s are judged, against what white noise of the sigmas used would sum up to.
     """
     raised: dict[str, Constraint] = {}
     notes = []
@@ -160,21 +160,26 @@ def judge_wheels(problem: Problem, smoothed: Smoothed) -> tuple[Problem, tuple[s
         H = assemble(linear, problem.columns, smoothed.P.shape[-1])
         left = linear.sigma**2 - np.einsum("nij,njk,nik->ni", H, smoothed.P[at], H, optimize=True)
         usable = np.all(left > 0.2 * linear.sigma**2, axis=1)
-        block = np.unique(np.floor(problem.t[at[usable]] / _BLOCK), return_inverse=True)[1]
+        block = np.unique(np.floor(problem.t[at[usable]] / BLOCK), return_inverse=True)[1]
         factor = np.ones(len(rows.axes))
         for axis, name in enumerate(rows.axes):
             weight = 1.0 / linear.sigma[usable, axis] ** 2
             total = np.bincount(block, weight * linear.residual[usable, axis])
             variance = np.bincount(block, weight**2 * left[usable, axis])
-            if len(total) < _FEWEST:
-                continue
-            f = _trimmed(total**2 / variance)
-            if np.log(f) > _SIGNIFICANT * _scatter(len(total)):
-                factor[axis] = min(np.sqrt(f), MOST_RAISED)
+            factor[axis] = raised_by(total**2 / variance)
+            if factor[axis] > 1.0:
                 notes.append(f"{rows.name}, {name}: its sigma was multiplied by {factor[axis]:.1f}, as residuals ask")
         if np.any(factor > 1.0):
             raised[rows.name] = replace(rows, sigma=rows.sigma * factor)
     return replace(problem, constraints=tuple(raised.get(c.name, c) for c in problem.constraints)), tuple(notes)
+
+
+def raised_by(squared: Array) -> float:
+    """Factor on a sigma that squared sums over blocks, against their variances, ask for; 1 where none is clear."""
+    if len(squared) < _FEWEST:
+        return 1.0
+    f = _trimmed(squared)
+    return min(float(np.sqrt(f)), MOST_RAISED) if np.log(f) > _SIGNIFICANT * _scatter(len(squared)) else 1.0
 
 
 @dataclass(frozen=True)

@@ -28,17 +28,22 @@ same (the tests compare them) in a fraction of the time.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from graphnav import rotation
+from graphnav.findings import period_of
 from graphnav.recording import Imu
 from graphnav.rotation import Array
 
+GAP = 1.5  # sample periods between rows that are a gap
 _CHUNK = 40_000  # pieces handled at once: keeps the working arrays in the processor's cache
+_CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 _WALK_POINTS = 6  # quadrature points for the effect of bias walk inside an interval
+_FEW = 16  # intervals at once, below which calls cost more than numbers
 _CELL, _MANY = 4, 64  # Jacobians and noise of intervals of many pieces are summed over cells of a few; means never
 
 
@@ -108,7 +113,7 @@ class Samples:
     bridged: Array  # (g, 2) start and end of every bridged gap, s
 
 
-def bridge_gaps(imu: Imu, factor: float = 1.5) -> Samples:
+def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
     """Put a made-up sample into every gap: the mean of its neighbours, with the noise that deserves.
 
     A row only speaks for one sample period before its stamp. What happened in a longer silence g is
@@ -116,8 +121,8 @@ def bridge_gaps(imu: Imu, factor: float = 1.5) -> Samples:
     half its structure function, D(g)/2 = E|x(t+g) - x(t)|^2 / 2 per axis, is the variance of a guess
     from the neighbours. That error lasts the whole gap, so the equivalent white density is D(g)/2 * g.
     """
-    dt = np.diff(imu.t)
-    period = float(np.median(dt))
+    dt = imu.t[1:] - imu.t[:-1]
+    period = period_of(imu.t)
     gap = np.flatnonzero(dt > factor * period)
     zero = np.zeros(len(imu.t))
     if not len(gap):
@@ -165,9 +170,28 @@ def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array) -> 
     for rows in _chunks(pieces.count):
         dt, index = pieces.padded(rows)
         parts.append((rows, _integrate(samples, imu, t, rows, dt, index, ba[rows], bg[rows])))
+    if n == 1:
+        return parts[0][1]
     order = np.argsort(np.concatenate([rows for rows, _ in parts]), kind="stable")
     names = Intervals.__dataclass_fields__
     return Intervals(*(np.concatenate([getattr(part, name) for _, part in parts])[order] for name in names))
+
+
+def preintegrate_unknown(
+    samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array, known: Mapping[float, Intervals]
+) -> Intervals:
+    """`preintegrate`, but for intervals that are `known` already, by the time they end at."""
+    missing = [k for k, end in enumerate(t[1:].tolist()) if end not in known or known[end].t0[0] != t[k]]
+    if len(missing) == len(t) - 1:
+        return preintegrate(samples, imu, t, ba, bg)
+    parts = {k: known[float(t[k + 1])] for k in range(len(t) - 1) if k not in missing}
+    for run in np.split(np.array(missing, dtype=int), np.flatnonzero(np.diff(missing) > 1) + 1):
+        if len(run):
+            new = preintegrate(samples, imu, t[run[0] : run[-1] + 2], ba, bg)
+            parts |= {int(k): new[i : i + 1] for i, k in enumerate(run)}
+    names = Intervals.__dataclass_fields__
+    ordered = [parts[k] for k in range(len(t) - 1)]
+    return Intervals(*(np.concatenate([getattr(part, name) for part in ordered]) for name in names))
 
 
 def prefix(samples: Samples, t0: float, t: Array, ba: Array, bg: Array) -> tuple[Array, Array, Array]:
@@ -219,10 +243,13 @@ def _pieces(samples: Samples, t: Array, extra: Array | None = None) -> _Pieces:
     inner = samples.t[(samples.t > t[0]) & (samples.t < t[-1])]
     # all but sorted already, which is what a stable sort makes use of
     edges = np.sort(np.concatenate([inner, t] if extra is None else [inner, t, extra]), kind="stable")
-    edges = edges[np.append(True, np.diff(edges) > 0)]
+    dt = edges[1:] - edges[:-1]
+    if dt.size and dt.min() <= 0.0:
+        edges = edges[np.append(True, dt > 0)]
+        dt = edges[1:] - edges[:-1]
     index = np.minimum(np.searchsorted(samples.t, edges[1:], side="left"), len(samples.t) - 1)
     starts = np.searchsorted(edges, t)
-    return _Pieces(edges, np.diff(edges), index, starts[:-1], np.diff(starts))
+    return _Pieces(edges, dt, index, starts[:-1], starts[1:] - starts[:-1])
 
 
 def _chunks(count: Array) -> Iterator[Array]:
@@ -252,9 +279,12 @@ def _less(x: Array, index: Array, bias: Array) -> Array:
 
 def _cross(a: Array, b: Array) -> Array:
     """[a]x b for vectors a (L, 3, n) and vectors or matrices b (L, 3, n) or (L, 3, 3, n)."""
-    ax, ay, az = np.moveaxis(a if b.ndim == 3 else a[:, :, None], 1, 0)
-    bx, by, bz = np.moveaxis(b, 1, 0)
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
+    a = a if b.ndim == 3 else a[:, :, None]
+    out = np.empty_like(b)
+    for i, j, k in _CYCLES:
+        np.multiply(a[:, j], b[:, k], out=out[:, i])
+        out[:, i] -= a[:, k] * b[:, j]
+    return out
 
 
 def _turned(R: Array, x: Array) -> Array:
@@ -270,23 +300,39 @@ def _means(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Array]:
     x2 = phi[:, 0] * phi[:, 0] + phi[:, 1] * phi[:, 1] + phi[:, 2] * phi[:, 2]
     a, b, c, d = (x[:, None] for x in rotation.coefficients(x2))
     turn = np.empty((L, n, 3, 3))
-    step = np.moveaxis(turn, 1, -1)
+    step = turn.transpose(0, 2, 3, 1)
     np.multiply((b * phi)[:, :, None], phi[:, None], out=step)
     cosine, sine = 1.0 - b[:, 0] * x2, a * phi
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    for i, j, k in _CYCLES:
         step[:, i, i] += cosine
         step[:, j, i] += sine[:, k]
         step[:, i, j] -= sine[:, k]
-    product = np.empty((L + 1, n, 3, 3))
-    product[0] = np.eye(3)
-    for k in range(L):
-        np.matmul(product[k], turn[k], out=product[k + 1])
-    R = np.ascontiguousarray(np.moveaxis(product, 1, -1))
+    R = np.ascontiguousarray(_products(turn).transpose(0, 2, 3, 1))
     one = _cross(phi, f)
     two = _cross(phi, one)
     V = _summed(_turned(R[:-1], (f + b * one + c * two) * h))
     P = _summed(V[:-1] * h + _turned(R[:-1], (0.5 * f + c * one + d * two) * (h * h)))
     return R, V, P
+
+
+def _products(turn: Array) -> Array:
+    """Running products of rotations (L, n, 3, 3) along the first axis, from one: one more than there are factors."""
+    L, n = turn.shape[:2]
+    out = np.empty((L + 1, n, 3, 3))
+    out[0] = np.eye(3)
+    size = 1 if n > _FEW else max(1, math.isqrt(L))
+    blocks = L // size
+    if size > 1:  # of few intervals the calls are what costs: runs of pieces side by side, then run after run
+        within = turn[: blocks * size].reshape(blocks, size, n, 3, 3).copy()
+        for k in range(1, size):
+            np.matmul(within[:, k - 1], within[:, k], out=within[:, k])
+        whole = out[1 : blocks * size + 1].reshape(blocks, size, n, 3, 3)
+        whole[0] = within[0]
+        for k in range(1, blocks):
+            np.matmul(whole[k - 1, -1], within[k], out=whole[k])
+    for k in range(blocks * size if size > 1 else 0, L):
+        np.matmul(out[k], turn[k], out=out[k + 1])
+    return out
 
 
 def _integrate(
@@ -300,14 +346,15 @@ def _integrate(
     # the rest in cells of a few pieces, within which A is a straight line
     cut = np.append(np.arange(0, L, _CELL if L >= _MANY else 1), L)
     A, R, V, P = A[cut], R[cut], V[cut], P[cut]
-    edge, qg, qa = (_summed(x)[cut] for x in (dt, *_white_noise(samples, imu, dt, index)))
-    h = np.diff(edge, axis=0)[:, None]
+    edge = _summed(dt)[cut]
+    qg, qa = _white_noise(samples, imu, dt, index, edge, cut)
+    h = (edge[1:] - edge[:-1])[:, None]
     # dV / d bg = -int [dV]x A, exactly for A linear in a cell: int (t - t_start) dV = h dV - int (V - V_start) dt
-    dv = np.diff(V, axis=0)
-    gain = np.diff(P, axis=0) - V[:-1] * h
+    dv = V[1:] - V[:-1]
+    gain = P[1:] - P[:-1] - V[:-1] * h
     late = h * dv - gain
     h = h[:, None]
-    slope = np.diff(A, axis=0) / np.maximum(h, 1e-12)
+    slope = (A[1:] - A[:-1]) / np.maximum(h, 1e-12)
     B = _summed(-_cross(dv, A[:-1]) - _cross(late, slope))
     PA = _summed(0.5 * h * (A[:-1] + A[1:]))  # dP / d ba
     # dP / d bg = int B, in a cell B_start h - int [(t_end - t) dV]x A
@@ -315,7 +362,7 @@ def _integrate(
     left = T - edge  # time left at each edge
     a_edge = V[-1] - V
     b_edge = P[-1] - P - V * left[:, None]
-    Q = _white(np.diff(qg, axis=0), np.diff(qa, axis=0), left, a_edge, b_edge)
+    Q = _white(qg, qa, left, a_edge, b_edge)
     Q += _walk(imu, edge, left, A, B, PA, PB, a_edge, b_edge)
 
     dR, v_ba, v_bg, p_ba, p_bg = (_last(x) for x in (R, A, B, PA, PB))
@@ -334,7 +381,7 @@ def _integrate(
 def _past(edge: Array, R: Array, V: Array, A: Array) -> tuple[Array, Array, Array, Array]:
     """What the mean velocity over an interval is made of, seen from its end; by the trapezoidal rule."""
     T = edge[-1]
-    h = np.diff(edge, axis=0)
+    h = edge[1:] - edge[:-1]
     weight = np.zeros_like(edge)
     weight[1:] += h
     weight[:-1] += h
@@ -351,7 +398,8 @@ def _past(edge: Array, R: Array, V: Array, A: Array) -> tuple[Array, Array, Arra
 
 def _last(x: Array) -> Array:
     """(n, ...) what (L, ..., n) holds at the end."""
-    return np.ascontiguousarray(np.moveaxis(x[-1], -1, 0))
+    x = x[-1]
+    return np.ascontiguousarray(x.transpose(x.ndim - 1, *range(x.ndim - 1)))
 
 
 def _summed(terms: Array) -> Array:
@@ -365,34 +413,40 @@ def _summed(terms: Array) -> Array:
     return out
 
 
-def _white_noise(samples: Samples, imu: Imu, dt: Array, index: Array) -> tuple[Array, Array]:
-    """Variances (L, n) of the integrals of white rate and force noise over each piece."""
-    qg, qa = imu.noise.gyro_noise_density**2 * dt, imu.noise.accel_noise_density**2 * dt
+def _white_noise(samples: Samples, imu: Imu, dt: Array, index: Array, edge: Array, cut: Array) -> tuple[Array, Array]:
+    """Variances of the integrals of white rate and force noise over each cell between the edges."""
+    h = edge[1:] - edge[:-1]
+    qg, qa = imu.noise.gyro_noise_density**2 * h, imu.noise.accel_noise_density**2 * h
     if samples.extra_gyro.any() or samples.extra_accel.any():
-        qg, qa = qg + samples.extra_gyro[index] * dt, qa + samples.extra_accel[index] * dt
+        qg += np.diff(_summed(samples.extra_gyro[index] * dt)[cut], axis=0)
+        qa += np.diff(_summed(samples.extra_accel[index] * dt)[cut], axis=0)
     return qg, qa
 
 
 def _white(qg: Array, qa: Array, left: Array, a_edge: Array, b_edge: Array) -> Array:
     """Covariance (n, 15, 15), start frame, of white noise with variances qg, qa (L, n) in each cell."""
-    a, b = 0.5 * (a_edge[:-1] + a_edge[1:]), 0.5 * (b_edge[:-1] + b_edge[1:])
+    ab = np.concatenate([a_edge, b_edge], axis=1)
+    ab = 0.5 * (ab[:-1] + ab[1:])
     s, dt = 0.5 * (left[:-1] + left[1:]), left[:-1] - left[1:]
+    weighted = qg[:, None] * ab
+    moment = weighted.sum(0).T
+    products = np.einsum("lin,ljn->nij", weighted, ab)  # sum q [a; b] [a; b]^T
     eye = np.eye(3)
     Q = np.zeros((qg.shape[1], 15, 15))
     theta, p, v = slice(0, 3), slice(3, 6), slice(6, 9)
+    a, b = slice(0, 3), slice(3, 6)
 
-    def outer(x: Array, y: Array) -> Array:
-        """sum q ([x]x [y]x^T) = sum q (x.y I - y x^T)"""
-        xy = np.einsum("lin,ljn->nij", qg[:, None] * y, x)
-        return np.trace(xy, axis1=-2, axis2=-1)[:, None, None] * eye - xy
+    def outer(x: slice, y: slice, own: Array) -> Array:
+        """sum qg ([x]x [y]x^T) = sum qg (x.y I - y x^T), and a variance on the diagonal"""
+        yx = products[:, y, x]
+        return (np.trace(yx, axis1=-2, axis2=-1) + own)[:, None, None] * eye - yx
 
     Q[:, theta, theta] = qg.sum(0)[:, None, None] * eye
-    Q[:, theta, v] = rotation.skew(np.sum(qg[:, None] * a, axis=0).T)
-    Q[:, theta, p] = rotation.skew(np.sum(qg[:, None] * b, axis=0).T)
-    Q[:, v, v] = outer(a, a) + qa.sum(0)[:, None, None] * eye
-    Q[:, v, p] = outer(a, b) + (qa * s).sum(0)[:, None, None] * eye
+    Q[:, theta, v], Q[:, theta, p] = rotation.skew(moment[:, a]), rotation.skew(moment[:, b])
+    Q[:, v, v] = outer(a, a, qa.sum(0))
+    Q[:, v, p] = outer(a, b, (qa * s).sum(0))
     # force noise inside a cell also moves the position: dt^2/12 keeps one-cell intervals regular
-    Q[:, p, p] = outer(b, b) + (qa * (s * s + dt * dt / 12.0)).sum(0)[:, None, None] * eye
+    Q[:, p, p] = outer(b, b, (qa * (s * s + dt * dt / 12.0)).sum(0))
     for x, y in ((theta, v), (theta, p), (v, p)):
         Q[:, y, x] = np.swapaxes(Q[:, x, y], -1, -2)
     return Q
@@ -402,27 +456,23 @@ def _walk(imu: Imu, edge: Array, left: Array, A: Array, B: Array, PA: Array, PB:
     """Covariance (n, 15, 15), start frame, of bias walk inside the interval, by midpoint quadrature."""
     n = edge.shape[1]
     T = edge[-1]
-    target = T[:, None] * (np.arange(_WALK_POINTS) + 0.5) / _WALK_POINTS
-    at = np.empty((n, _WALK_POINTS), dtype=int)
-    for j in range(_WALK_POINTS):  # the edge nearest to each quadrature point
-        at[:, j] = np.argmin(np.abs(edge - target[:, j]), axis=0)
+    target = T * ((np.arange(_WALK_POINTS) + 0.5) / _WALK_POINTS)[:, None]
+    at = np.abs(edge[:, None] - target).argmin(axis=0).T  # the edge nearest to each quadrature point
     row = np.arange(n)[:, None]
     s = left[at, row][..., None, None]
-    gyro = np.zeros((n, _WALK_POINTS, 15, 3))
-    accel = np.zeros((n, _WALK_POINTS, 15, 3))
+    # of a change of the gyro's bias, of one of the accelerometer's
+    M = np.zeros((n, _WALK_POINTS, 15, 6))
     eye = np.eye(3)
     A_t, B_t, PA_t, PB_t = (x[at, :, :, row] for x in (A, B, PA, PB))
     A_T, B_T, PA_T, PB_T = (_last(x)[:, None] for x in (A, B, PA, PB))
-    gyro[..., 0:3, :] = A_T - A_t
-    gyro[..., 3:6, :] = PB_T - PB_t - B_t * s + rotation.skew(b[at, :, row]) @ A_t
-    gyro[..., 6:9, :] = B_T - B_t + rotation.skew(a[at, :, row]) @ A_t
-    gyro[..., 12:15, :] = eye
-    accel[..., 3:6, :] = PA_T - PA_t - A_t * s
-    accel[..., 6:9, :] = A_T - A_t
-    accel[..., 9:12, :] = eye
-    q = (T / _WALK_POINTS)[:, None, None]
-    Q = np.zeros((n, 15, 15))
-    for M, walk in ((gyro, imu.noise.gyro_bias_walk), (accel, imu.noise.accel_bias_walk)):
-        flat = np.swapaxes(M, 1, 2).reshape(n, 15, -1)
-        Q += walk**2 * q * (flat @ np.swapaxes(flat, -1, -2))
-    return Q
+    turned = A_T - A_t
+    M[..., 0:3, :3] = turned
+    M[..., 3:6, :3] = PB_T - PB_t - B_t * s + rotation.skew(b[at, :, row]) @ A_t
+    M[..., 6:9, :3] = B_T - B_t + rotation.skew(a[at, :, row]) @ A_t
+    M[..., 12:15, :3] = eye
+    M[..., 3:6, 3:] = PA_T - PA_t - A_t * s
+    M[..., 6:9, 3:] = turned
+    M[..., 9:12, 3:] = eye
+    M *= np.repeat([imu.noise.gyro_bias_walk, imu.noise.accel_bias_walk], 3)
+    flat = np.swapaxes(M, 1, 2).reshape(n, 15, -1)
+    return np.asarray((T / _WALK_POINTS)[:, None, None] * (flat @ np.swapaxes(flat, -1, -2)))

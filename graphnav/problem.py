@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -13,7 +15,7 @@ from graphnav.constraints.base import SAME_TIME, Constraint, Scene
 from graphnav.constraints.prior import InitialPrior
 from graphnav.dynamics import Motion, scale_parameter
 from graphnav.earth import LocalFrame
-from graphnav.preintegration import Intervals, Samples, bridge_gaps, preintegrate
+from graphnav.preintegration import Intervals, Samples, bridge_gaps, preintegrate, preintegrate_unknown
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.state import DIM, Parameter, States
@@ -51,8 +53,18 @@ class Problem:
     motion: Motion
     prior: InitialPrior
     constraints: tuple[Constraint, ...]
-    chains: tuple[ParameterChain, ...] = ()
     notes: tuple[str, ...] = ()
+
+    @cached_property
+    def parameters(self) -> dict[str, Parameter]:
+        """What is estimated beside the states, by name."""
+        own = (*scale_parameter(self.recording.imu.noise), *(p for rows in self.constraints for p in rows.parameters))
+        return {p.name: p for p in own}
+
+    @cached_property
+    def chains(self) -> tuple[ParameterChain, ...]:
+        """The parameters with their nodes."""
+        return _chains(self.parameters.values(), self.t)
 
     @property
     def columns(self) -> dict[str, slice]:
@@ -79,6 +91,8 @@ def pose(
     stationary: Array | None = None,
     times: Array | None = None,
     speed: MeanSpeed | None = None,
+    usual: Array | None = None,
+    known: Mapping[float, Intervals] | None = None,
 ) -> Problem:
     """Pose the estimation problem for a recording.
 
@@ -89,9 +103,11 @@ def pose(
     stationary : (M, 2) spans in which the platform stands still, s; none when None.
     times : (K,) keyframes, s, where they are given: measurements at other times are left out.
     speed : of the odometer, where it is known already.
+    usual : (M, 3) m, the unit of the slow errors of the recording's fixes, where it is known already.
+    known : intervals between keyframes that were integrated before, by the time they end at.
     """
     classes = registered()
-    stops = _inside(stationary, recording)
+    stops = to_samples(stationary, recording)
     if times is None:
         wanted = [cls.epochs(recording, settings, stops) for cls in classes]
         epochs = np.concatenate([*wanted, np.empty(0)])
@@ -103,8 +119,8 @@ def pose(
         samples, said = with_whole_peaks(samples, recording.imu.R_bs)
         samples = with_unresolved_motion(samples, recording.imu.noise)
         samples = with_coning(samples) if settings.imu.coning else samples
-    intervals = preintegrate(samples, recording.imu, t, start.ba[0], start.bg[0])
-    scene = Scene(recording, settings, frame, t, stops, intervals, speed)
+    intervals = preintegrate_unknown(samples, recording.imu, t, start.ba[0], start.bg[0], known or {})
+    scene = Scene(recording, settings, frame, t, stops, intervals, speed, usual)
     built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
     prior = InitialPrior(keyframe=np.zeros(1, dtype=int), mean=start, sigma=np.asarray(sigma)[None])
     return Problem(
@@ -117,7 +133,6 @@ def pose(
         motion=Motion(intervals, frame),
         prior=prior,
         constraints=built,
-        chains=_chains((*scale_parameter(recording.imu.noise), *(p for rows in built for p in rows.parameters)), t),
         notes=(*_notes(samples, recording), *said, *(note for rows in built for note in rows.notes)),
     )
 
@@ -133,20 +148,24 @@ def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Arra
     return np.append(np.repeat(fixed[:-1], parts) + within * step, fixed[-1])
 
 
-def _inside(stationary: Array | None, recording: Recording) -> Array:
+def to_samples(stationary: Array | None, recording: Recording) -> Array:
     """The parts of stationary spans that a recording covers, (M, 2), from sample to sample of the IMU."""
     if stationary is None or not len(stationary):
         return np.empty((0, 2))
-    t = np.concatenate([[recording.start], recording.imu.t])
+    begin, end = recording.start, recording.end
+    stationary = stationary[(stationary[:, 1] > begin - SAME_TIME) & (stationary[:, 0] < end + SAME_TIME)]
+    if not len(stationary):
+        return np.empty((0, 2))
+    t = np.concatenate([[begin], recording.imu.t])
     first = np.searchsorted(t, stationary[:, 0] - SAME_TIME)
     last = np.searchsorted(t, stationary[:, 1] + SAME_TIME, side="right") - 1
     kept = last > first
     return np.stack([t[first[kept]], t[last[kept]]], -1)
 
 
-def _chains(parameters: tuple[Parameter, ...], t: Array) -> tuple[ParameterChain, ...]:
+def _chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterChain, ...]:
     chains = []
-    for p in {p.name: p for p in parameters}.values():
+    for p in parameters:
         if p.begins is not None:
             nodes, mean, sigma, decay = p.begins, p.initial, p.sigma, np.zeros(len(p.begins))
         else:

@@ -20,6 +20,8 @@ _I3 = np.eye(3)
 _GENERATORS = np.array(
     [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float
 )
+# coefficients of (x^2)^j, j = 0..4, of sin(x)/x, (1 - cos x)/x^2 and the two that follow: (-1)^j / (2j + 1 + k)!
+_TAYLOR = np.array([[(-1.0) ** j / math.factorial(2 * j + 1 + k) for k in range(4)] for j in range(5)])
 _TINY = 1e-300  # keeps sin(x)/x = 1 at x = 0 without a case of its own
 
 
@@ -52,10 +54,12 @@ def coefficients(theta2: Array) -> tuple[Array, Array, Array, Array]:
     0.1 rad by their Taylor series (error < 1e-13), because the quotients lose digits there.
     """
     x2 = np.asarray(theta2, dtype=float)
-    a = 1.0 - x2 / 6.0 * (1.0 - x2 / 20.0 * (1.0 - x2 / 42.0 * (1.0 - x2 / 72.0)))
-    b = 0.5 * (1.0 - x2 / 12.0 * (1.0 - x2 / 30.0 * (1.0 - x2 / 56.0 * (1.0 - x2 / 90.0))))
-    c = (1.0 - x2 / 20.0 * (1.0 - x2 / 42.0 * (1.0 - x2 / 72.0 * (1.0 - x2 / 110.0)))) / 6.0
-    d = (1.0 - x2 / 30.0 * (1.0 - x2 / 56.0 * (1.0 - x2 / 90.0 * (1.0 - x2 / 132.0)))) / 24.0
+    power = np.multiply.outer(_TAYLOR[4], x2)
+    for term in (_TAYLOR[3], _TAYLOR[2], _TAYLOR[1]):  # Horner, all four at once
+        power += term.reshape(-1, *(1,) * x2.ndim)
+        power *= x2
+    power += _TAYLOR[0].reshape(-1, *(1,) * x2.ndim)
+    a, b, c, d = power
     large = x2 > 1e-2
     if np.any(large):
         y2 = np.where(large, x2, 1.0)
@@ -100,7 +104,7 @@ def _exp_one(x: float, y: float, z: float) -> Array:
 def log(R: Array) -> Array:
     """Rotation vectors in [0, pi] of rotation matrices: (..., 3, 3) -> (..., 3)."""
     R = np.asarray(R, dtype=float)
-    w = 0.5 * np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
+    w = 0.5 * columns(R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1])
     c = 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0)
     s = np.sqrt(np.sum(w * w, axis=-1) + _TINY)
     v = w * (np.arctan2(s, c) / s)[..., None]
@@ -122,11 +126,32 @@ def right_jacobian(v: Array) -> Array:
 def right_jacobian_inverse(v: Array) -> Array:
     """Inverse of `right_jacobian`; singular at 2 pi, which `log` never returns."""
     v = np.asarray(v, dtype=float)
+    if v.size == 3:
+        return _right_jacobian_inverse_one(*v.ravel().tolist()).reshape(*v.shape, 3)
     theta2 = np.sum(v * v, axis=-1)
     a, b, _, _ = coefficients(theta2)
     small = theta2 < 1e-4
     second = np.where(small, 1.0 / 12.0 + theta2 / 720.0, (1.0 - 0.5 * a / b) / np.where(small, 1.0, theta2))
     return _polynomial(v, np.full_like(theta2, 0.5), second)
+
+
+def _right_jacobian_inverse_one(x: float, y: float, z: float) -> Array:
+    """`right_jacobian_inverse` of a single vector: I + S/2 + c (v v^T - v.v I)."""
+    n2 = x * x + y * y + z * z
+    if n2 < 1e-4:
+        c = 1.0 / 12.0 + n2 / 720.0
+    else:
+        n = math.sqrt(n2)
+        c = (1.0 - 0.5 * n / math.tan(0.5 * n)) / n2
+    one, x2, y2, z2 = 1.0 - c * n2, 0.5 * x, 0.5 * y, 0.5 * z
+    xy, xz, yz = c * x * y, c * x * z, c * y * z
+    return np.array(
+        [
+            [one + c * x * x, xy - z2, xz + y2],
+            [xy + z2, one + c * y * y, yz - x2],
+            [xz - y2, yz + x2, one + c * z * z],
+        ]
+    )
 
 
 def integrals(v: Array) -> tuple[Array, Array]:

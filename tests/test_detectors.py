@@ -13,8 +13,8 @@ import pytest
 from scipy import signal
 
 from graphnav import cli
-from graphnav.config import FftSettings, FusionSettings
-from graphnav.detectors import base, detect, fft, glrt, motion, spectrum, thresholds, windows
+from graphnav.config import FftSettings, FusionSettings, Settings
+from graphnav.detectors import base, detect, fft, glrt, motion, spectrum, stops, thresholds, windows
 from graphnav.formats import read
 from graphnav.formats.writing import write_folder
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
@@ -480,3 +480,40 @@ def test_an_unknown_setting_is_named(tmp_path, capsys):
     config.write_text("[detectors.fft]\nwindows = 3.0\n")
     assert cli.run(["detect", "kitti", "-o", str(tmp_path / "out"), "--config", str(config)]) == 2
     assert "did you mean 'window'" in capsys.readouterr().err
+
+
+# ---- while the drive happens
+
+
+@pytest.mark.parametrize("without", [(), ("gnss",), ("odometer",)])
+def test_stops_are_those_of_detect_wherever_they_are_asked_for(shared_data, without):
+    """Looks at half a minute of Tokyo; silent only where no stop is, or none that the last look did not know."""
+    recording = load(str(shared_data / "tokyo_20201105"))
+    recording = functools.reduce(lambda r, source: r.without(source), without, recording)
+    settings = Settings()
+    silent = some = 0
+    for now in np.arange(95.0, 700.0, 7.0):
+        look = recording.crop(now - 30.0, now)
+        since, until = look.end - 25.0, look.end - 1.0
+        whole = np.clip(detect(look, settings).stationary, since, until)
+        whole = whole[whole[:, 1] > whole[:, 0]]
+        found = stops(look, settings, since, until, base.NONE, since)
+        if found is None:
+            silent += 1
+            assert not len(whole)
+        else:
+            some += len(found) > 0
+            np.testing.assert_allclose(found, whole)
+        newer = stops(look, settings, since, until, base.NONE, until - 2.0)
+        if newer is None:
+            assert not np.any(whole[:, 1] > until - 2.0)
+    assert some > 20
+    assert silent > 0 or "odometer" in without
+
+
+def test_a_share_is_a_quantile():
+    rng = np.random.default_rng(4)
+    for shape in ((7,), (100, 3), (1, 2)):
+        x = rng.standard_normal(shape)
+        for share in (0.0, 0.3, 0.5, 0.95, 1.0):
+            np.testing.assert_allclose(windows.share_of(x, share), np.quantile(x, share, axis=0), atol=1e-14)

@@ -361,3 +361,29 @@ def test_real_walks(shared_data: Path, walk: str, horizontal: float, up: float) 
         if recording.truth is not None and recording.truth.xyz is not None:
             assert found.stride == pytest.approx(1.0, abs=0.004), solver
     assert solutions["batch"].stopped.startswith("converged")
+
+
+def test_missing_rows_do_not_make_two_stances_of_one() -> None:
+    """Standing in many pieces, between lost packets, is one deep lull and no reason to leave out the walk's."""
+    walk = made("normal")
+    imu = walk.recording.imu
+    true = np.array(walk.facts["stances"])
+    short = true[(true[:, 1] - true[:, 0]) < 2.0]
+    stand = 30.0  # s of standing before it, as the first rows are
+    n, rate = int(stand * 200.0), 200.0
+    still = slice(0, 100)
+    rng = np.random.default_rng(2)
+    gyro = imu.gyro[still].mean(axis=0) + 1e-3 * rng.standard_normal((n, 3))
+    accel = imu.accel[still].mean(axis=0) + 1e-2 * rng.standard_normal((n, 3))
+    t = imu.t[0] - (n - np.arange(n)) / rate
+    kept = np.arange(n) % 60 > 4  # five rows of sixty are lost
+    longer = replace(
+        imu,
+        t=np.concatenate([t[kept], imu.t]),
+        gyro=np.concatenate([gyro[kept], imu.gyro]),
+        accel=np.concatenate([accel[kept], imu.accel]),
+    )
+    spans = detect(replace(walk.recording, imu=longer)).stationary
+    hit = [bool(np.any((spans[:, 0] < b) & (spans[:, 1] > a))) for a, b in short]
+    assert len(spans) > 60  # the pieces
+    assert all(hit)

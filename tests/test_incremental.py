@@ -232,3 +232,55 @@ def test_real_program_run(shared_data: Path, name: str) -> None:
     a, b = found["incremental"], found["batch"]
     assert np.abs(a.states.p - b.states.p).max() < 0.01
     assert any("ms (median)" in note for note in a.notes)
+
+
+def test_spans_that_are_kept_smooth_back_as_stage_by_stage(posed: Problem) -> None:
+    """Covariances of what settles, with spans from before, after a change within them, and without any."""
+    steps = node_steps(posed)
+    window = Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3)
+
+    def plain(count: int) -> list[Array]:
+        P, out = window.newest.covariance, []
+        for k in range(len(window) - 1, -1, -1):
+            if k < count:
+                out.append(P)
+            P = window.stages[k].before(P)
+        return out[::-1]
+
+    fill(window, posed, 0, 70, steps)
+    for first, last, count in ((70, 90, 10), (90, 95, 7), (95, 130, 30)):
+        expected = plain(count)
+        for P, own in zip(expected, window._covariances(count), strict=True):
+            np.testing.assert_allclose(own, P, rtol=1e-6, atol=1e-9 * np.abs(P).max())
+        window.settle(count)
+        if first == 90:
+            window.relinearize(40)
+        fill(window, posed, first, last, steps)
+    assert window._spans
+
+
+def test_residuals_of_what_settled_are_those_at_the_solution(posed: Problem) -> None:
+    """Whitened, and with the variance that is left of them: against the rows taken at the settled states."""
+    solver = Incremental(Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3), lag=30.0)
+    steps = node_steps(posed)
+    for k in range(len(posed.t)):
+        solver.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=k > 0))
+    solver.finish()
+    rows = next(c for c in posed.constraints if c.name == "odometer")
+    seen = 0
+    for part in solver.settled:
+        for i, k in enumerate(np.searchsorted(posed.t, part.t)):
+            at = np.flatnonzero(rows.keyframe == k)
+            mine = [r for r in part.residuals[i] if r.name == "odometer"]
+            assert len(mine) == len(at)
+            if not len(at) or not part.columns[i]:
+                continue
+            seen += 1
+            given = {
+                p.name: part.values[i][None, part.columns[i][p.name].start - DIM : part.columns[i][p.name].stop - DIM]
+                for p in rows.parameters
+            }
+            linear = rows.linearize(part.states[i : i + 1], given, at)
+            np.testing.assert_allclose(mine[0].left, linear.residual / linear.sigma, atol=0.02)
+            assert np.all((mine[0].variance > 0.0) & (mine[0].variance <= 1.0))
+    assert seen > 100

@@ -20,16 +20,19 @@ from helpers import Array, truth_states
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import graphnav
 from graphnav.config import Settings, settings_from
 from graphnav.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.formats import read
 from graphnav.online import Online, Row, Session, rows_of, without_rows
 from graphnav.online.buffers import Buffer
+from graphnav.online.evidence import Evidence
 from graphnav.online.lines import END, head_of, line_of, lines_of, row_of, setup_of
 from graphnav.online.view import view
 from graphnav.pipeline import run
 from graphnav.recording import Recording
 from graphnav.solution import to_trajectory
+from graphnav.solvers.window import Residual, Smoothed, turn_limit
 from graphnav.trajectory import Trajectory
 
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "online.py"
@@ -520,3 +523,69 @@ def test_a_real_walk_settles_step_by_step(shared_data: Path) -> None:
     assert np.abs(away).max() < 0.03
     np.testing.assert_allclose(track.sd_p[-1], np.sqrt(np.diag(P[-1]))[3:6], rtol=0.15)
     assert np.quantile(behind, 0.9) < 2.5
+
+
+def test_a_walk_with_lost_packets_settles_on_the_batch_solution(shared_data: Path) -> None:
+    """Ten seconds of standing in pieces, and stances that begin and end between samples."""
+    walk = read(shared_data / "xio_loops" / "short.toml")
+    _, track = played(walk, rows_of(walk)[1], Settings())
+    best = run(walk, solvers=("batch",))["batch"]
+    t, states, P = best.at(track.t)
+    away = best.frame.from_llh(track.llh[np.isin(track.t, t)]) - states.p
+    assert np.abs(away).max() < 0.03
+    np.testing.assert_allclose(track.sd_p[-1], np.sqrt(np.diag(P[-1]))[3:6], rtol=0.15)
+
+
+# ----------------------------------------------------------------------------------------------- judged as it goes
+def settled_with(factor: float, seed: int) -> Smoothed:
+    """An hour of residuals of forward speed that scatter `factor` times as much as stated."""
+    t = np.arange(3600.0)
+    left = factor * np.random.default_rng(seed).standard_normal(3600)
+    rows = tuple((Residual("odometer", np.full((1, 1), 0.01), np.full((1, 1), x), np.ones((1, 1))),) for x in left)
+    none = (np.empty(0),) * 3600
+    return Smoothed(t, None, np.empty(0), ({},) * 3600, none, none, (None,) * 3600, rows)
+
+
+@pytest.mark.parametrize(("factor", "lowest", "highest"), [(1.0, 1.0, 1.0), (3.0, 2.7, 3.3)])
+def test_wheels_are_judged_by_what_has_settled(factor: float, lowest: float, highest: float) -> None:
+    evidence = Evidence()
+    evidence.add(settled_with(factor, 1))
+    found = evidence.factors.get("odometer", np.ones(1))
+    assert lowest <= found[0] <= highest
+    # what comes after was whitened with the raised sigma, and the factor stays what it was
+    evidence.add(settled_with(factor / found[0], 2))
+    assert lowest <= evidence.factors.get("odometer", np.ones(1))[0] <= highest
+
+
+def test_an_imu_is_judged_by_ever_more_rows(drive: tuple[Recording, Trajectory]) -> None:
+    """Half the noise is stated; what a minute cannot say, ten can, and the last word is that of all of them."""
+    path = oracle.vehicle_path(420.0, 50.0, seed=11)
+    recording, _ = oracle.drive(path, seed=2, odometer_rate=None)
+    noise = recording.imu.noise
+    figures = ("gyro_noise_density", "accel_noise_density")
+    quiet = replace(noise, **{name: getattr(noise, name) / 3.0 for name in figures})
+    recording = replace(recording, imu=replace(recording.imu, noise=quiet))
+    online, _ = played(recording, rows_of(recording)[1], settings_from({"solver": {"lag": 60.0}}))
+    used = online.sensors.setup.imu.noise
+    for name in figures:
+        assert getattr(used, name) / getattr(noise, name) == pytest.approx(1.0, rel=0.25)
+    assert sum("noisier" in note for note in online.notes) == 1
+    assert online.tracker.window.turn > turn_limit(quiet)
+
+
+def test_smooth_driving_with_positions_alone_is_no_stop() -> None:
+    """KITTI cruises where no odometer says so: never held while its fixes move by metres a second."""
+    recording = graphnav.load("kitti").crop(0.0, 170.0)
+    gnss = recording.gnss
+    speed = np.linalg.norm(np.diff(gnss.llh, axis=0) * [6.37e6, 4.2e6, 0.0], axis=1) / np.diff(gnss.t)
+    # what the IMU is judged to be here makes smooth roads look still
+    online, held = Online(without_rows(recording), Settings()), []
+    for row in rows_of(recording)[1]:
+        online.add(row)
+        if row[0] == "gnss" and online.tracker is not None:
+            held += online.tracker.stops.tolist()
+    for begin, end in held:
+        inside = (gnss.t[:-1] >= begin - 0.5) & (gnss.t[1:] <= end + 0.5)
+        assert np.all(speed[inside] < 2.0)
+    error = online.frame.from_llh(gnss.llh[-1]) - online.live().state.p[0]
+    assert np.linalg.norm(error[:2]) < 3.0

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
 from helpers import Array, difference, random_imu
 
 from graphnav import rotation as ro
-from graphnav.preintegration import Intervals, Samples, bridge_gaps, prefix, preintegrate
+from graphnav.preintegration import Intervals, Samples, bridge_gaps, prefix, preintegrate, preintegrate_unknown
 from graphnav.recording import Imu, ImuNoise
 
 BA, BG = np.array([0.08, -0.05, 0.03]), np.array([0.012, -0.02, 0.007])
@@ -271,3 +273,28 @@ def test_without_a_gap_nothing_is_made_up(imu: Imu, samples: Samples) -> None:
     assert samples.start == pytest.approx(0.0, abs=1e-12)
     assert not samples.extra_gyro.any()
     assert not samples.extra_accel.any()
+
+
+def test_what_is_known_is_not_integrated_again(samples: Samples, imu: Imu) -> None:
+    """Intervals known already are taken as they are; the rest is as if all had been integrated."""
+    whole = preintegrate(samples, imu, TIMES, BA, BG)
+    marked = replace(whole[2:3], dP=whole.dP[2:3] + 1.0)
+    known = {float(TIMES[3]): marked, float(TIMES[5]): whole[3:4]}  # the second began elsewhere: not this interval
+    found = preintegrate_unknown(samples, imu, TIMES, BA, BG, known)
+    for name in Intervals.__dataclass_fields__:
+        expected = getattr(whole, name).copy()
+        if name == "dP":
+            expected[2] += 1.0
+        np.testing.assert_allclose(getattr(found, name), expected, rtol=1e-9, atol=1e-14, err_msg=name)
+
+
+def test_a_few_intervals_are_integrated_as_many_are() -> None:
+    """Running products over runs of pieces side by side, and one after the other."""
+    imu = random_imu(np.random.default_rng(5), 30.0, 200.0)
+    samples = bridge_gaps(imu)
+    t = np.linspace(0.0, 30.0, 31)
+    many = preintegrate(samples, imu, t, BA, BG)
+    for k in (0, 17, 29):
+        one = preintegrate(samples, imu, t[k : k + 2], BA, BG)
+        for name in Intervals.__dataclass_fields__:
+            np.testing.assert_allclose(getattr(one, name)[0], getattr(many, name)[k], rtol=1e-9, atol=1e-13)

@@ -156,3 +156,11 @@ def test_rph_jacobian_numerically() -> None:
 def test_wrap() -> None:
     np.testing.assert_allclose(ro.wrap(DEG * np.array([-180.0, 180.0, 190.0, 540.0, -10.0, 359.0])) / DEG,
                                [-180.0, -180.0, -170.0, -180.0, -10.0, -1.0], atol=1e-12)  # fmt: skip
+
+
+def test_a_single_vector_is_as_one_of_many() -> None:
+    """What filters ask for one at a time has code of its own."""
+    for size in (1e-7, 1e-3, 0.3, 3.0):
+        v = size * np.random.default_rng(3).standard_normal((2, 3)) / np.sqrt(3.0)
+        for function in (ro.exp, ro.right_jacobian_inverse, ro.skew):
+            np.testing.assert_allclose(function(v[0]), function(v)[0], atol=1e-14)

@@ -44,6 +44,7 @@ class Scene:
     stationary: Array  # (M, 2) spans in which the platform stands still, s
     intervals: Intervals  # (K-1) between the keyframes
     speed: MeanSpeed | None = None  # of the odometer, where it is known already
+    usual: Array | None = None  # (M, 3) m, sigma that the fixes usually state, where it is known already
 
     def keyframe_at(self, t: Array) -> Array:
         """Index of the keyframe at each time, -1 where there is none."""

@@ -119,7 +119,7 @@ class GnssPosition(Constraint):
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
             sigma=np.sqrt(1.0 - share) * stated,
             stated=stated,
-            usual=_usual(gnss.t, every)[used],
+            usual=(_usual(gnss.t, every) if scene.usual is None else scene.usual)[used],
             lever_arm=gnss.lever_arm,
             gyro=around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
             omega_n=scene.frame.omega_n,

@@ -36,10 +36,10 @@ from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
 from graphnav.dynamics import SCALE, scale_parameter
 from graphnav.earth import LocalFrame
 from graphnav.preintegration import Intervals
-from graphnav.recording import Recording
+from graphnav.recording import Imu, Odometer, Recording
 from graphnav.rotation import Array, columns, mv
 from graphnav.state import Parameter, States
-from graphnav.wheels import MeanSpeed, faults
+from graphnav.wheels import Figures, MeanSpeed, faults
 
 MOUNTING = "mounting"
 AXLE = "axle"
@@ -83,7 +83,7 @@ class Past:
         """u (N, 3) at a lever arm, body axes; turn rate; acceleration; and the derivatives of u and acceleration."""
         turn, late, rate, force = self.turn[rows], self.late[rows], self.rate[rows], self.force[rows]
         omega_n = self.frame.omega_n
-        W = rotation.skew(omega_n)
+        W = self.frame.W
         Rt = np.swapaxes(states.R_nb, -1, -2)
         da, dg = states.ba - self.ba[rows], states.bg - self.bg[rows]
         if SCALE in parameters:
@@ -205,7 +205,7 @@ class NonHolonomic(Wheels):
         return cls(
             keyframe=rows + 1,
             past=past,
-            sigma=np.hypot(density, np.stack([right, up], -1)),
+            sigma=np.hypot(density, columns(right, up)),
             robust=s.robust,
             robust_scale=s.robust_scale,
             gate=s.gate,
@@ -239,6 +239,11 @@ class NonHolonomic(Wheels):
         return Linearized(residual, jacobians, self.sigma[rows])
 
 
+def _speed_of(odometer: Odometer, imu: Imu) -> MeanSpeed:
+    figures = Figures.of(odometer)
+    return MeanSpeed.of(odometer, faults(odometer, imu, figures).spans, figures)
+
+
 @dataclass(frozen=True)
 class OdometerSpeed(Wheels):
     """The vehicle moved as fast as its odometer read."""
@@ -259,7 +264,7 @@ class OdometerSpeed(Wheels):
         s, odometer = scene.settings.vehicle, scene.recording.odometer
         if scene.recording.platform != "vehicle" or odometer is None or not s.odometer:
             return None
-        speed = scene.speed or MeanSpeed.of(odometer, faults(odometer, scene.recording.imu).spans)
+        speed = scene.speed or _speed_of(odometer, scene.recording.imu)
         rows = moving_rows(scene)
         begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
         reach = _REACH * odometer.delay_sigma

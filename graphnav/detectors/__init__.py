@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.detectors.base import NONE, Detection, Detections, inside, spans_of
+from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, spans_of, without
 from graphnav.detectors.fft import detect_fft
 from graphnav.detectors.fusion import candidates, fuse
 from graphnav.detectors.glrt import detect_windows, glrt_statistic
@@ -19,8 +19,9 @@ from graphnav.detectors.windows import blocks, low_pass
 from graphnav.earth import gravity
 from graphnav.findings import period_of
 from graphnav.recording import Recording
+from graphnav.rotation import Array
 
-__all__ = ["Detection", "Detections", "detect", "glrt_statistic"]
+__all__ = ["Detection", "Detections", "detect", "glrt_statistic", "stops"]
 
 _SHORTEST = 3.0  # s, of a recording in which anything can be told
 _CLEARLY = 10.0  # times its threshold a statistic is where the vehicle clearly moves
@@ -57,6 +58,45 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
         Detection("fused", sway.t, sway.statistic, sway.threshold, mask, spans, notes, {"disturbed": disturbed})
     )
     return Detections(spans, tuple(found), notes)
+
+
+def stops(
+    recording: Recording, settings: Settings, since: float, until: float, before: Array, new: float
+) -> Array | None:
+    """What `detect` calls stationary of a vehicle between two times, (M, 2) s, and nothing else.
+
+    So it need not look at spectra where nothing is still. None where odometer or GNSS are certain of motion from
+    the time `new` on, and not certain of any in the stops (K, 2) found `before`: then there is nothing to be said that
+    was not said then. Where positions alone tell speeds, nothing is said of the seconds over which they were last
+    compared, if they show motion: a smooth drive would pass for a stop there.
+    """
+    d, imu = settings.detectors, recording.imu
+    period = period_of(imu.t)
+    if not recording.duration >= _SHORTEST or not period > 0.0:
+        return NONE
+    known = speeds(recording, d.fusion)
+    certain = moving(known)
+    left = longer_than(without(np.array([[recording.start, recording.end]]), certain), d.fusion.min_duration)
+    before = np.clip(before, since, until)
+    doubted = any(((certain[:, 0] < b) & (certain[:, 1] > a)).any() for a, b in before if b > a)
+    if not doubted and not ((left[:, 0] < until) & (left[:, 1] > new)).any():
+        return None
+    for one in known:
+        if one.half > 0.0 and one.speed[-1] > one.limit[-1]:
+            until = max(min(until, float(one.t[-1]) - one.half), since)
+    b = blocks(imu, period)
+    low = low_pass(b)
+    if not len(low.t):
+        return NONE
+    sway, s = detect_sway(low, imu.noise, d.sway, certain)
+    still, _ = candidates(b, sway, s, known, certain)
+    if not len(still):
+        return NONE
+    idling = NONE
+    if recording.platform == "vehicle":
+        idling = detect_fft(imu, period, d.fft, still, known, shown=False).intervals
+    spans = np.clip(fuse(b, still, idling, certain, d.fusion)[0], since, until)
+    return np.asarray(spans[spans[:, 1] > spans[:, 0]])
 
 
 def _gravity(recording: Recording) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from graphnav.rotation import Array
+from graphnav.rotation import Array, columns
 
 Mask = NDArray[np.bool_]
 
@@ -58,19 +58,26 @@ def intervals_text(detections: Sequence[Detection]) -> str:
 
 def spans_of(mask: Mask, t: Array, half: float = 0.0) -> Array:
     """(M, 2) spans covered by the runs of True, each row of t standing for `half` seconds on either side of it."""
-    edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
+    padded = np.zeros(len(mask) + 2, dtype=bool)
+    padded[1:-1] = mask
+    edges = np.flatnonzero(padded[1:] != padded[:-1])
     first, last = edges[::2], edges[1::2] - 1
-    return merged(np.stack([t[first] - half, t[last] + half], -1)) if len(first) else NONE
+    return merged(columns(t[first] - half, t[last] + half)) if len(first) else NONE
 
 
 def merged(spans: Array, gap: float = 0.0) -> Array:
     """Spans in order, those that overlap or lie at most `gap` seconds apart as one."""
     if not len(spans):
         return NONE
+    if len(spans) == 1:
+        return spans.copy()
     spans = spans[np.argsort(spans[:, 0])]
     reach = np.maximum.accumulate(spans[:, 1])
-    new = np.r_[True, spans[1:, 0] > reach[:-1] + gap]
-    return np.stack([spans[new, 0], np.r_[reach[np.flatnonzero(new)[1:] - 1], reach[-1]]], -1)
+    new = np.flatnonzero(spans[1:, 0] > reach[:-1] + gap) + 1
+    out = np.empty((len(new) + 1, 2))
+    out[0, 0], out[-1, 1] = spans[0, 0], reach[-1]
+    out[1:, 0], out[:-1, 1] = spans[new, 0], reach[new - 1]
+    return out
 
 
 def without(spans: Array, taken: Array) -> Array:

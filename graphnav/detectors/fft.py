@@ -40,13 +40,16 @@ CONDITIONS = (
 )  # fmt: skip
 
 
-def detect_fft(imu: Imu, period: float, settings: FftSettings, still: Array, speeds: Sequence[Speeds]) -> Detection:
+def detect_fft(
+    imu: Imu, period: float, settings: FftSettings, still: Array, speeds: Sequence[Speeds], shown: bool = True
+) -> Detection:
     """Windows ruled by the idle line.
 
     Parameters
     ----------
     still : spans (M, 2), s, in which another detector finds the vehicle still: where the line is looked for.
     speeds : of odometer and GNSS, for the speed condition.
+    shown : whether its peaks are wanted where they decide nothing.
     """
     rate = 1.0 / period
     length, step = round(settings.window * rate), max(1, round(settings.step * rate))
@@ -65,6 +68,8 @@ def detect_fft(imu: Imu, period: float, settings: FftSettings, still: Array, spe
     notes: list[str] = []
     if settings.find_line and line is None:
         notes.append(_no_line(int(inner.sum()), settings))
+        if not shown:
+            return Detection("fft", t, np.full(w.count, np.nan), 1.0, t < t, NONE, tuple(notes))
     factor = 1.0 if line is None else line.frequency / LINE_OF_THE_PAPER
     bands, clipped = _bands(settings, factor, w.frequencies)
     if clipped:

@@ -20,7 +20,7 @@ from graphnav.detectors.base import NONE, Detection, longer_than, merged, within
 from graphnav.detectors.chain import Link, at_rest_until, link, moving_by_chain
 from graphnav.detectors.motion import Speeds
 from graphnav.detectors.sway import Scale
-from graphnav.detectors.windows import Blocks, kernel, smooth
+from graphnav.detectors.windows import Blocks, kernel, share_of, smooth
 from graphnav.rotation import Array
 
 _LOOK = 3.0  # s about an end in which the edge is sought
@@ -66,9 +66,9 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
         normal = np.abs(t - middle) <= max(0.25, 2.0 * b.period)
         if not normal.any():
             return middle
-    off = ((rows - np.median(rows[normal], axis=0)) ** 2).sum(axis=1) / 6.0
+    off = ((rows - share_of(rows[normal], 0.5)) ** 2).sum(axis=1) / 6.0
     # what is normal inside must not end the stop: twice its upper quantile, at least the detector's own limit
-    limit = max(threshold, 2.0 * float(np.quantile(off[normal], 0.95)))
+    limit = max(threshold, 2.0 * float(share_of(off[normal], 0.95)))
     begin = int(np.argmax(normal))
     beyond = np.flatnonzero(off[begin:] > limit)
     # a gap in the recording ends every interval

@@ -7,12 +7,14 @@ epochs, and both may be late. So single epochs never count, and only motion is c
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from graphnav.config import FusionSettings
 from graphnav.crosschecks import local_positions
 from graphnav.detectors.base import NONE, merged, spans_of, union
+from graphnav.detectors.windows import share_of
 from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.rotation import Array
 
@@ -34,10 +36,10 @@ class Speeds:
     half: float = 0.0  # s on either side of t of which v is the mean
     silent_at_rest: bool = False  # reads zero whatever happens when it is unplugged
 
-    @property
+    @cached_property
     def speed(self) -> Array:
         """(K,) m/s, without a sign."""
-        return np.asarray(np.linalg.norm(self.v, axis=1))
+        return np.sqrt(np.einsum("kj,kj->k", self.v, self.v))
 
     def over(self, span: Array) -> float:
         """Speed in a span in which nothing changes, m/s: 0 if it may be none, NaN if the sensor did not look.
@@ -51,10 +53,10 @@ class Speeds:
         if there.sum() < _MEDIAN:
             return float("nan")
         v = self.v[there]
-        middle = np.median(v, axis=0)
-        wander = float(np.linalg.norm(np.median(np.abs(v - middle), axis=0))) / 0.6745
+        middle = share_of(v, 0.5)
+        wander = float(np.linalg.norm(share_of(np.abs(v - middle), 0.5))) / 0.6745
         speed = float(np.linalg.norm(middle))
-        if speed > max(float(np.median(self.limit[there])), 2.0 * wander):
+        if speed > max(float(share_of(self.limit[there], 0.5)), 2.0 * wander):
             return speed
         return float("nan") if self.silent_at_rest else 0.0
 
@@ -75,21 +77,25 @@ def moving(found: list[Speeds]) -> Array:
     for s in found:
         excess = s.speed - s.limit
         k = np.arange(len(excess))
-        three = excess[np.clip(k[:, None] + [-1, 0, 1], 0, len(k) - 1)]
-        fast = np.median(three, axis=1) > 0.0
+        fast = of_three(excess[np.maximum(k - 1, 0)], excess, excess[np.minimum(k + 1, len(k) - 1)]) > 0.0
         breaks = np.diff(s.t) > _LONGEST
         spans = [spans_of(fast[a:b], s.t[a:b]) for a, b in _pieces(breaks)]
         one = union([p for p in spans if len(p)]) if any(len(p) for p in spans) else NONE
         if len(one):
-            one = np.stack([one[:, 0] + s.half, one[:, 1] - s.half - s.late], -1)
+            one = one + np.array([s.half, -s.half - s.late])
             parts.append(one[one[:, 1] > one[:, 0]])
     return merged(np.concatenate(parts)) if parts else NONE
 
 
+def of_three(a: Array, b: Array, c: Array) -> Array:
+    """Median of three, element by element."""
+    return np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
+
+
 def _pieces(breaks: np.ndarray) -> list[tuple[int, int]]:
     """[start, end) between the breaks."""
-    ends = np.flatnonzero(breaks) + 1
-    return list(zip(np.r_[0, ends].tolist(), np.r_[ends, len(breaks) + 1].tolist(), strict=True))
+    ends = (np.flatnonzero(breaks) + 1).tolist()
+    return list(zip([0, *ends], [*ends, len(breaks) + 1], strict=True))
 
 
 def quantum(values: Array) -> float:
@@ -102,7 +108,7 @@ def quantum(values: Array) -> float:
 def _odometer(o: Odometer, settings: FusionSettings) -> Speeds:
     # one pulse in a period may be the jitter of a wheel that stands on a tooth
     limit = max(settings.max_speed, 1.5 * quantum(o.speed))
-    return Speeds(o.t, o.speed[:, None], np.full(len(o.t), limit), settings.odometer_delay, True)
+    return Speeds(o.t, o.speed[:, None], np.full(len(o.t), limit), settings.odometer_delay)
 
 
 def _gnss(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.fft
@@ -49,7 +50,19 @@ class Windows:
 
     def amplitudes(self, which: Array | None = None) -> Iterator[tuple[slice, Array]]:
         """Single-sided amplitudes (w, 3, F) of all windows or of some, chunk by chunk, in the columns' units."""
-        number = np.arange(self.count) if which is None else which
+        if self.count <= _CHUNK:  # few enough to be kept
+            yield (
+                slice(0, self.count if which is None else len(which)),
+                self._all if which is None else self._all[which],
+            )
+            return
+        yield from self._made(np.arange(self.count) if which is None else which)
+
+    @cached_property
+    def _all(self) -> Array:
+        return next(self._made(np.arange(self.count)))[1]
+
+    def _made(self, number: Array) -> Iterator[tuple[slice, Array]]:
         n = self.length
         ramp = np.linspace(-1.0, 1.0, n)
         hann = np.hanning(n + 1)[:-1]
@@ -79,7 +92,8 @@ def peaks(amplitude: Array, frequencies: Array, low: float, high: float) -> tupl
         return np.full(shape, np.nan), np.full(shape, np.nan)
     k = i + amplitude[..., i:j].argmax(axis=-1)
     last = len(frequencies) - 1
-    at = [np.take_along_axis(amplitude, np.clip(k + d, 0, last)[..., None], -1)[..., 0] for d in (-1, 0, 1)]
+    flat, row = amplitude.reshape(-1, amplitude.shape[-1]), np.arange(k.size)
+    at = [flat[row, np.minimum(k.ravel() + d, last)].reshape(k.shape) for d in (-1, 0, 1)]  # k > 0
     # what borders on a band may be a line of the next one: only a peak is interpolated
     peak = (at[1] >= at[0]) & (at[1] >= at[2]) & (k < last)
     up = at[2] >= at[0]

@@ -65,7 +65,7 @@ def detect_stances(imu: Imu, period: float, settings: StanceSettings) -> Detecti
         spans[0, 0] = imu.t[0] - period
     if len(spans) and spans[-1, 1] > imu.t[-1] - half - period:
         spans[-1, 1] = imu.t[-1]
-    kept = spans[_as_deep_as_others(spans, t, e)]
+    kept = spans[_as_deep_as_others(spans, t, e, settings.threshold)]
     notes = (
         () if len(kept) == len(spans)
         else (f"{len(spans) - len(kept)} short lulls that do not reach as deep as the stances were left out",)
@@ -88,14 +88,24 @@ def _quietest(imu: Imu, period: float) -> tuple[Array, float]:
     return means[k, :3], float(np.linalg.norm(means[k, 3:]))
 
 
-def _as_deep_as_others(spans: Array, t: Array, e: Array) -> Array:
-    """(M,) bool, which spans reach about as low as the others do."""
+def _as_deep_as_others(spans: Array, t: Array, e: Array, threshold: float) -> Array:
+    """(M,) bool, which spans reach about as low as the others do.
+
+    Rows that are missing do not make two stances of one: standing would be many, and those of the walk the odd ones.
+    """
     if len(spans) < _ENOUGH:
         return np.ones(len(spans), dtype=bool)
-    depth = np.array([np.log(np.nanmin(e[slice(*np.searchsorted(t, span))])) for span in spans])
+    first, last = np.searchsorted(t, spans[:, 0]), np.searchsorted(t, spans[:, 1], side="right")
+    moved = np.concatenate([[0], np.cumsum(np.nan_to_num(e) >= threshold)])
+    one = np.cumsum(np.concatenate([[False], moved[first[1:]] > moved[last[:-1] - 1]]))  # which stance each is part of
+    lowest = np.array([np.log(np.nanmin(e[a:b])) for a, b in zip(first, last, strict=True)])
+    depth = np.full(one[-1] + 1, np.inf)
+    np.minimum.at(depth, one, lowest)
+    if len(depth) < _ENOUGH:
+        return np.ones(len(spans), dtype=bool)
     middle = float(np.median(depth))
     spread = max(1.4826 * float(np.median(np.abs(depth - middle))), _LEAST_SPREAD)
-    return np.asarray(depth < middle + _SPREADS * spread)
+    return np.asarray(depth < middle + _SPREADS * spread)[one]
 
 
 def _without_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fastest: float) -> Array:

@@ -130,6 +130,14 @@ def low_pass(b: Blocks) -> LowPassed:
     return LowPassed(t, rows, gain, step * b.period, whole)
 
 
+def share_of(x: Array, share: float) -> Array:
+    """`np.quantile` down the first axis, several times quicker for a few hundred rows."""
+    x = np.sort(x, axis=0)
+    at = share * (len(x) - 1)
+    k = int(at)
+    return np.asarray(x[k] + (at - k) * (x[min(k + 1, len(x) - 1)] - x[k]))
+
+
 def smooth(rows: Array, h: Array) -> Array:
     """Every row low-passed by h, (K - len(h) + 1, c): for a short stretch."""
     return np.asarray(sliding_window_view(rows, len(h), axis=0) @ h)

@@ -34,12 +34,22 @@ class Buffer:
         """Newest time, minus infinity without any."""
         return float(self._data[self._end - 1, 0]) if self._end > self._begin else -np.inf
 
+    def append(self, t: float, values: tuple[float, ...]) -> None:
+        """Put a row that is newer than all others at the end."""
+        if self._end == len(self._data):
+            self._make_room()
+        self._data[self._end] = (t, *values)
+        self._end += 1
+
     def add(self, t: float, values: tuple[float, ...]) -> bool:
         """Put a row in its place; False if there is one at that time already, which stays."""
+        if t > self.newest + SAME:
+            self.append(t, values)
+            return True
         if self._end == len(self._data):
             self._make_room()
         at = self._end
-        if t <= self.newest + SAME:
+        if at > self._begin:
             at = self._begin + int(np.searchsorted(self.t, t))
             near = self._data[max(at - 1, self._begin) : min(at + 1, self._end), 0]
             if np.abs(near - t).min() <= SAME:

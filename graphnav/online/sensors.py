@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from graphnav.online.buffers import Buffer
+from graphnav.online.buffers import SAME, Buffer
 from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.rotation import Array
 
@@ -46,7 +47,7 @@ class Sensors:
         velocity and its sigmas (NaN where there is none) of a fix; speed, way counted and four wheels of an odometer.
         """
         known = values[: 6 if sensor != "odometer" else 1]
-        if not (np.isfinite(t) and np.isfinite(known).all()) or (sensor == "gnss" and min(values[3:6]) <= 0.0):
+        if not math.isfinite(t + sum(known)) or (sensor == "gnss" and min(values[3:6]) <= 0.0):
             self.counts[f"{sensor}: not a number"] += 1
             return False
         if t <= self.oldest:
@@ -64,6 +65,16 @@ class Sensors:
             self.counts[f"{sensor}: repeated"] += 1
             return False
         self.counts[sensor] += 1
+        return True
+
+    def add_next(self, t: float, values: tuple[float, ...], newest: float) -> bool:
+        """Take in an IMU row if nothing is odd about it; False leaves it to `add`. `newest` is the time before it."""
+        if self._suspect is not None or not newest + SAME < t <= newest + self.longest_gap or t <= self.oldest:
+            return False
+        if len(values) != _WIDTH["imu"] or not math.isfinite(sum(values)):
+            return False
+        self.imu.append(t, values)
+        self.counts["imu"] += 1
         return True
 
     def usual(self, t: Array) -> Array:

@@ -17,6 +17,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
+from graphnav.judgement import FIXES
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import CONTEXT, SURE, Live, Tracker
 from graphnav.pipeline import judged, origin
@@ -33,6 +34,7 @@ _STEP = 0.5  # s between looks at a walk
 _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that level a vehicle without GNSS
 _JUDGED = 120.0  # s of rows by which the sensors are judged again
+_JUDGED_UNTIL = 900.0  # s of rows, where fixes are so rare that these are still too few
 _PATIENCE = 300.0  # s of rows kept while there is no motion to align with
 
 
@@ -52,8 +54,11 @@ class Online:
         self.tracker: Tracker | None = None
         self.notes: list[str] = []
         self.late: Counter[str] = Counter()  # rows that came after the keyframe they belong before, and were used
-        self._found: Alignment | None = None  # until the sensors are judged again
+        self._found: Alignment | None = None  # as long as the sensors are still to be judged by more rows
+        self._said: tuple[str, ...] = ()  # of the notes, those about what the sensors are judged to be
+        self._judged = 0.0  # s of rows that they were judged by
         self._fixes: list[float] = []  # s, not yet in the graph
+        self._began = -np.inf  # s, of what is being smoothed
         self._due = -np.inf
         self._dirty = np.inf
         self._settled: list[Trajectory] = []
@@ -69,6 +74,10 @@ class Online:
         sensor, t, values = row
         sensors = self.sensors
         before = sensors.imu.newest
+        if sensor == "imu" and sensors.add_next(t, values, before):  # as all but a few do
+            if t >= self._due:
+                self._look()
+            return
         previous = sensors.odometer.newest
         if not sensors.add(sensor, t, values):
             return
@@ -89,10 +98,13 @@ class Online:
             elif sensor == "odometer" and previous < tracker.newest - SAME_TIME:
                 self._dirty = min(self._dirty, previous + 2.0 * SAME_TIME)
         if sensors.imu.newest >= self._due:
-            if self.tracker is None:
-                self._align()
-            else:
-                self._advance(self.tracker)
+            self._look()
+
+    def _look(self) -> None:
+        if self.tracker is None:
+            self._align()
+        else:
+            self._advance(self.tracker)
 
     def live(self) -> Live | None:
         """The state at the newest IMU row; None while aligning."""
@@ -145,9 +157,10 @@ class Online:
             self.notes.append(f"not aligned at {now:.1f} s: {error}")
             self._wait(now)
             return
-        self._found = found
+        self._found = found if found.motion is not None and settings.gnss.position else None
         tracker = self._track(found, recording, settings, said)
         self._fixes = [t for t in sensors.gnss.t.tolist() if t >= recording.start - SAME_TIME]
+        self._began, self._judged = recording.start, recording.duration
         sensors.oldest = recording.start
         self._advance(tracker)
 
@@ -156,30 +169,54 @@ class Online:
         assert self.frame is not None
         self.sensors.setup = replace(self._setup, imu=replace(self._setup.imu, noise=recording.imu.noise))
         stated = with_known_heading(found, self.settings)
-        self.notes += [note for note in (*stated.notes, *said) if note not in self.notes]
+        self.notes += [note for note in stated.notes if note not in self.notes]
+        self._say(said)
         message = first_message(stated.state, stated.sigma)
         self.tracker = Tracker(settings, self.frame, message, recording.start, recording)
         if found is not stated:
             self.tracker.window.head = message.moved(found.state.minus(stated.state)[0])
         return self.tracker
 
-    def _judge_again(self, tracker: Tracker) -> Tracker:
-        """Judge the sensors by all rows before the first of them settles, and go through them again if need be."""
-        found, self._found = self._found, None
-        assert found is not None
+    def _judge_again(self, found: Alignment, tracker: Tracker) -> Tracker:
+        """Judge the sensors by all rows since the alignment, and go through what has not settled again."""
         assert self.frame is not None
-        self.sensors.setup = self._setup
+        used, self.sensors.setup = self.sensors.setup, self._setup
         recording = self.sensors.recording(-np.inf, tracker.newest)
         try:
             stationary = detect(recording, self.settings).stationary
             recording, settings, said = judged(recording, self.settings, self.frame, found, stationary)
         except EstimationError as error:
             self.notes.append(f"not judged again: {error}")
+            self.sensors.setup = used
+            return tracker
+        if tracker.opened:
+            self.sensors.setup = replace(self._setup, imu=replace(self._setup.imu, noise=recording.imu.noise))
+            self._say(said)
+            tracker.judged(settings, self.sensors)
             return tracker
         times = tracker.window.t
         again = self._track(found, recording, settings, said)
         again.update(self.sensors, times)
         return again
+
+    def _say(self, said: tuple[str, ...]) -> None:
+        """Note what the sensors are judged to be, in place of what was thought before."""
+        self.notes = [note for note in self.notes if note not in self._said] + list(said)
+        self._said = said
+
+    def _more_to_judge(self, found: Alignment, tracker: Tracker) -> Tracker:
+        """Judge the sensors again before the first state settles, and whenever there are twice as many rows as before.
+
+        Up to `judgement.FIXES` fixes in motion, which is what offline judges by.
+        """
+        assert found.motion is not None
+        span = tracker.newest - self._began
+        enough = np.count_nonzero(self.sensors.gnss.t > found.motion) >= FIXES or span > _JUDGED_UNTIL
+        if not enough and span < max(min(self.settings.solver.lag, _JUDGED), 2.0 * self._judged):
+            return tracker
+        self._judged = span
+        self._found = None if enough else found
+        return self._judge_again(found, tracker)
 
     def _wait(self, now: float) -> None:
         """Keep what the next attempt may need."""
@@ -197,7 +234,7 @@ class Online:
             self._advance(self.tracker, last=True)
             self.tracker.settle(sensors)
             self._collect(self.tracker)
-        self.tracker = None
+        self.tracker = self._found = None
         sensors.setup = self._setup  # the IMU is judged anew as well
         sensors.drop_before(np.inf)
         for row in after:
@@ -244,8 +281,8 @@ class Online:
             dirty, self._dirty = self._dirty, np.inf
             self._fixes = [t for t in self._fixes if t > limit and t > T + SAME_TIME]
             tracker.update(sensors, np.array(times), dirty)
-            if self._found is not None and tracker.newest - tracker.head > min(self.settings.solver.lag, _JUDGED):
-                tracker = self._judge_again(tracker) if not tracker.opened else tracker
+            if self._found is not None and not last:
+                tracker = self._more_to_judge(self._found, tracker)
             self._collect(tracker)
         T = tracker.newest
         self._due = min([T + period, *(t for t in self._fixes if t > T)]) + AFTER
@@ -274,4 +311,5 @@ class Online:
         begin = tracker.head
         if len(tracker.stops):
             begin = min(begin, max(float(tracker.stops[0, 0]), begin - 10.0 * CONTEXT))
-        self.sensors.drop_before(begin - CONTEXT - 5.0)
+        if self._found is None:  # else they are still to be judged by
+            self.sensors.drop_before(begin - CONTEXT - 5.0)

@@ -15,25 +15,26 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints import registered
 from graphnav.constraints.base import SAME_TIME
-from graphnav.constraints.gnss import GnssPosition
 from graphnav.constraints.standstill import PLACE
+from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.dense import Dense
-from graphnav.detectors import detect
+from graphnav.detectors import detect, stops
 from graphnav.detectors.base import merged
 from graphnav.dynamics import SCALE, Motion
 from graphnav.earth import LocalFrame
+from graphnav.online.evidence import Evidence
 from graphnav.online.sensors import Sensors
-from graphnav.preintegration import bridge_gaps, preintegrate
-from graphnav.problem import NODE_SPACING, Problem, keyframe_times, pose
+from graphnav.preintegration import GAP, Intervals, bridge_gaps, preintegrate
+from graphnav.problem import NODE_SPACING, Problem, keyframe_times, pose, to_samples
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solvers.stages import Place, Step
 from graphnav.solvers.window import Message, Smoothed, Window, turn_limit
 from graphnav.state import DIM, Parameter, States
-from graphnav.wheels import MeanSpeed
-from graphnav.wheels.faults import faults
+from graphnav.wheels import Figures, MeanSpeed, faults
 
 CONTEXT = 30.0  # s of rows before a keyframe that its constraints may look at
+_NEAR = 2.0  # s of the same, where the IMU has no gap
 _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
 _EVERY = 2.0  # s between looks of the detectors
 _WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector sees, and the least
@@ -42,9 +43,11 @@ _STANDS = 3.0  # s, a stance as long as that is standing, and need not be over
 _WHEELS, _WHEELS_LOOK = 10.0, 40.0  # s between looks at the odometer, and what they see
 _LOOK = 30.0  # s that the detectors see
 _SEEN = 25.0  # s of these that they answer for; the first few lack what was before
+_REVIEW = 10.0  # s between looks at what was answered before, while nothing stands
 SURE = 1.0  # s before now that they answer for: the end of a stop shows only when it is over
 _PLACE_SIGMA = 1000.0  # m, of where a stop may be
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
+_LATEST = 0.5  # of the lag by which they may be late for it, where states still move
 
 
 @dataclass(frozen=True)
@@ -70,17 +73,22 @@ class Tracker:
         self.settings, self.frame = settings, frame
         self.foot = setup.platform == "foot"
         self.window = Window(message, turn_limit(setup.imu.noise))
+        self._begun = t0  # s
         self.head = t0  # time of the message before the window, or of the first keyframe as long as it is in it
         self.opened = False  # whether the first keyframe has left the window
         self.stops: Array = np.empty((0, 2))  # s, between keyframes
         self.settled: list[Smoothed] = []
+        self.evidence = Evidence()
         self.in_force: dict[str, int] = {}  # rows of each constraint at the newest keyframe
         self.seconds: dict[str, float] = {}  # of process time, by what the newest update did
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
         self._parameters: dict[str, Parameter] = {}
-        self._detected = self._judged = -np.inf
-        self._speed: MeanSpeed | None = None  # of the odometer, when it was looked at last
+        self._detected = self._judged = self._reviewed = -np.inf
+        self._intervals: dict[float, Intervals] = {}  # integrated already, by the time they end at
+        self._figures: Figures | None = None  # of the odometer's readings
+        self._told = -np.inf  # s, when these were told
+        self._lag: float | None = None  # s by which it is late, as far as the IMU can tell
         self._wrong: Array = np.empty((0, 2))  # s, where its readings are wrong
 
     @property
@@ -97,21 +105,26 @@ class Tracker:
     def update(self, sensors: Sensors, new: Array, dirty: float = np.inf) -> None:
         """Add keyframes at the times `new`, after the newest, and redo those from `dirty` on."""
         clock = [time.process_time()]
-        edges = np.unique(np.concatenate([self.times, new]))
-        now = float(edges[-1])
-        if not self.foot and now - self._detected >= _EVERY - SAME_TIME:
-            dirty = min(dirty, self._classify(sensors, edges, now))
-        if now - self._judged >= _WHEELS - SAME_TIME:
-            dirty = min(dirty, self._judge_odometer(sensors, now))
+        if dirty < np.inf:
+            self._intervals = {t: iv for t, iv in self._intervals.items() if t < dirty}
+        now = max(self.newest, float(new[-1]) if len(new) else -np.inf)
+        looked = not self.foot and now - self._detected >= _EVERY - SAME_TIME
+        if looked:
+            dirty = min(dirty, self._classify(sensors, new, now))
+        # what can wait for the next keyframe does, so that no update does everything
+        if now - self._judged >= _WHEELS - SAME_TIME and not (looked and now - self._judged < _WHEELS + _EVERY):
+            dirty, looked = min(dirty, self._judge_odometer(sensors, now)), True
         clock.append(time.process_time())
-        t = self.window.t
-        keep = int(np.searchsorted(t, dirty - SAME_TIME))
-        times = np.unique(np.concatenate([t[keep:], new]))
+        again = [stage.place.t for stage in self.window.since(dirty - SAME_TIME)]
+        times = np.unique(np.concatenate([again, new]))
         times = times[np.concatenate([[True], np.diff(times) > SAME_TIME])]
         if not len(times):
             return
-        before = self.times[: len(self.times) - len(t) + keep]
-        before = before[-_BEFORE:] if len(self.stops) and self.stops[-1, 1] > times[0] - _BEFORE else before[-1:]
+        keep = len(self.window) - len(again)
+        look = _BEFORE if len(self.stops) and self.stops[-1, 1] > times[0] - _BEFORE else 1
+        before = [stage.place.t for stage in self.window.stages[max(0, keep - look) : keep]]
+        if self.opened and len(before) < look:
+            before.insert(0, self.head)
         self.window.truncate(keep)
         del self._nodes[keep:]
         problem = self._pose(sensors, np.concatenate([before, times]))
@@ -124,8 +137,10 @@ class Tracker:
         self.in_force = {
             c.name: n for c in problem.constraints if (n := int(np.sum(c.keyframe == len(problem.t) - 1)))
         }  # fmt: skip
-        if self.newest - self.window.stages[0].place.t > self.settings.solver.lag * (1.0 + 1.0 / _PORTIONS):
-            self.settle(sensors, self.newest - self.settings.solver.lag)
+        lag = self.settings.solver.lag
+        over = self.newest - self.window.stages[0].place.t - lag * (1.0 + 1.0 / _PORTIONS)
+        if over > (_EVERY if looked else 0.0):
+            self.settle(sensors, self.newest - lag)
         self._forget()
         clock.append(time.process_time())
         self.seconds = dict(zip(("detectors", "posing", "solving"), np.diff(clock).tolist(), strict=True))
@@ -138,11 +153,21 @@ class Tracker:
         last = count == len(self.window)
         robust = {self.settings.gnss.robust, self.settings.vehicle.robust} != {"none"}
         self.window.converge(always=last or robust, renewed=lambda first: self._renewed(sensors, first))
+        overdue = self.newest - float(self.window.stages[0].place.t) - self.settings.solver.lag
+        if not last and overdue < _LATEST * self.settings.solver.lag and self.window.first_moved() is not None:
+            return  # still being linearised again: the next keyframe will do
         self._head_nodes = self._nodes[count - 1]
         self.head, self.opened = float(self.window.t[count - 1]), True
         self.settled.append(self.window.settle(count))
+        self.evidence.add(self.settled[-1])
+        self._intervals = {t: iv for t, iv in self._intervals.items() if t > self.head - CONTEXT}
         del self._nodes[:count]
         self._forget()
+
+    def judged(self, settings: Settings, sensors: Sensors) -> None:
+        """Go on with other figures of the sensors, and go through what has not settled again."""
+        self.settings, self.window.turn = settings, turn_limit(sensors.setup.imu.noise)
+        self.update(sensors, np.empty(0), -np.inf)
 
     def live(self, sensors: Sensors) -> Live:
         """The state at the newest IMU row, by prediction from the newest keyframe."""
@@ -190,17 +215,47 @@ class Tracker:
         if len(self.stops):  # a stop is posed whole, so that its place begins where it began
             here = self.stops[(self.stops[:, 0] < begin) & (self.stops[:, 1] > begin)]
             begin = min([begin, *here[:, 0].tolist()])
-        recording = sensors.recording(begin - CONTEXT, float(times[-1]) + 0.1)
+        recording = self._around(sensors, begin, float(times[-1]) + 0.1)
         start, speed = self.window.newest.state, None
-        if self._speed is not None and recording.odometer is not None:
-            speed = MeanSpeed.of(recording.odometer, self._wrong, self._speed)
-        problem = pose(recording, self.settings, self.frame, start, np.ones(DIM), self.stops, times, speed)
-        factor = self.settings.gnss.sd_factor or 1.0
-        rows = tuple(
-            replace(c, usual=factor * sensors.usual(times[c.keyframe])) if isinstance(c, GnssPosition) else c
+        if recording.odometer is not None:
+            speed = MeanSpeed.of(recording.odometer, self._wrong, self._figures)
+        usual = None
+        if recording.gnss is not None:
+            usual = (self.settings.gnss.sd_factor or 1.0) * sensors.usual(recording.gnss.t)
+        found = ((t, self._intervals.get(t)) for t in times[1:].tolist())
+        known = {t: iv for t, iv in found if iv is not None and not iv.out_of_range(start.bg)[0]}
+        problem = pose(
+            recording, self.settings, self.frame, start, np.ones(DIM), self.stops, times, speed, usual, known
+        )  # fmt: skip
+        self._intervals |= {t: problem.intervals[k : k + 1] for k, t in enumerate(times[1:].tolist())}
+        return self._weighed(problem)
+
+    def _weighed(self, problem: Problem) -> Problem:
+        """The problem with what is decided of each row before it enters the window: its sigma, its robust kernel.
+
+        Decided here once, with what is known when a keyframe is posed; the window then weighs the rows by their
+        kernels. Wheels: by what settled so far says of them. A fix that is suspect would be given its weight here.
+        """
+        factors = self.evidence.factors
+        if not factors:
+            return problem
+        rows = (
+            replace(c, sigma=c.sigma * factors[c.name])
+            if isinstance(c, NonHolonomic | OdometerSpeed) and c.name in factors
+            else c
             for c in problem.constraints
         )
-        return replace(problem, constraints=rows)
+        return replace(problem, constraints=tuple(rows))
+
+    def _around(self, sensors: Sensors, begin: float, end: float) -> Recording:
+        """The rows that keyframes between two times look at.
+
+        Only what gaps in the IMU hide is told by the signal of the last half minute.
+        """
+        near = sensors.recording(begin - _NEAR, end)
+        step = np.diff(near.imu.t)
+        whole = len(step) > 1 and float(step.max()) < GAP * float(np.median(step))
+        return near if whole else sensors.recording(begin - CONTEXT, end)
 
     def _push(self, problem: Problem, k: int) -> float:
         t = float(problem.t[k])
@@ -212,7 +267,7 @@ class Tracker:
 
     def _steps(self, problem: Problem, t: float, nodes: dict[str, float]) -> tuple[Step, ...]:
         """Parameters that begin or move on at a keyframe; `nodes` is brought up to date."""
-        self._parameters |= {chain.parameter.name: chain.parameter for chain in problem.chains}
+        self._parameters |= problem.parameters
         steps = []
         stop = self._stop_at(t)
         for name, p in self._parameters.items():
@@ -248,9 +303,10 @@ class Tracker:
     def _forget(self) -> None:
         """Stages need not know where their rows came from: that is posed again when it is asked for."""
         stages = self.window.stages
-        for k, stage in enumerate(stages):
-            if stage.place.problem is not None:
-                stages[k] = replace(stage, place=replace(stage.place, problem=None))
+        for k in range(len(stages) - 1, -1, -1):
+            if stages[k].place.problem is None:
+                break  # nor do those before it
+            stages[k] = replace(stages[k], place=replace(stages[k].place, problem=None))
 
     # ----------------------------------------------------------------------------------------- stops, bad readings
     def steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
@@ -263,7 +319,9 @@ class Tracker:
         recording = sensors.recording(-np.inf if whole else min(T, limit) - _WALK, limit + SURE)
         if recording.duration < _WALK_LEAST:
             return np.empty(0)
-        spans = _clipped(detect(recording, self.settings).stationary, T, limit)
+        rows = recording.imu.t  # keyframes stand where the stances will be said to begin and end
+        limit = float(rows[max(int(np.searchsorted(rows, limit + SAME_TIME)) - 1, 0)])
+        spans = _clipped(to_samples(detect(recording, self.settings).stationary, recording), T, limit)
         if not last and len(spans):
             ongoing = spans[-1, 1] >= limit - SAME_TIME
             if ongoing and limit - spans[-1, 0] < _STANDS:
@@ -291,21 +349,32 @@ class Tracker:
         recording = sensors.recording(-np.inf if whole else now - _WHEELS_LOOK, now)
         if recording.odometer is None:
             return np.inf
-        found, known = faults(recording.odometer, recording.imu).spans, self._wrong
+        lag = self._lag
+        if now - self._begun >= 2.0 * (self._told - self._begun):  # ever more seldom, as more readings tell little new
+            every = sensors.recording().odometer
+            assert every is not None
+            self._figures, self._told, lag = Figures.of(every), now, None
+        seen, known = faults(recording.odometer, recording.imu, self._figures, lag), self._wrong
+        found, self._lag = seen.spans, seen.lag
         since = float(recording.odometer.t[0]) + (0.0 if whole else 5.0)
         old = known[(known[:, 0] < since) & (known[:, 1] > since - CONTEXT - _WHEELS_LOOK)]
         self._wrong = np.concatenate([old, found[found[:, 0] >= since]])
-        self._speed = MeanSpeed.of(recording.odometer, self._wrong)
         new = self._wrong[~np.isin(self._wrong[:, 0], known[:, 0])]
         return float(new[0, 0]) if len(new) and len(self.window) else np.inf
 
-    def _classify(self, sensors: Sensors, edges: Array, now: float) -> float:
+    def _classify(self, sensors: Sensors, new: Array, now: float) -> float:
         """Ask the detectors; returns the start of the first interval between keyframes that they see otherwise."""
         whole = not np.isfinite(self._detected)
-        since = float(edges[0]) if whole else now - _SEEN
+        since, answered = (min(self.head, *new.tolist()), -np.inf) if whole else (now - _SEEN, self._detected - SURE)
+        if now - self._reviewed >= _REVIEW - SAME_TIME:
+            self._reviewed, answered = now, since
         self._detected = now
-        found = detect(sensors.recording(-np.inf if whole else now - _LOOK, now), self.settings).stationary
-        parts = [_clipped(self.stops, -np.inf, since), _clipped(found, since, now - SURE)]
+        recording = sensors.recording(-np.inf if whole else now - _LOOK, now)
+        found = stops(recording, self.settings, since, now - SURE, self.stops, answered)
+        if found is None or (not len(found) and not len(self.stops)):
+            return np.inf
+        parts = [_clipped(self.stops, -np.inf, since), found]
+        edges = np.unique(np.concatenate([self.times, new]))
         spans = merged(np.concatenate(parts), gap=SAME_TIME)
         spans = spans[spans[:, 1] >= edges[0] - SAME_TIME] if len(spans) else spans
         aligned = []

@@ -135,8 +135,8 @@ def isam2(problem: Problem, progress: Progress | None = None) -> Replayed:
             b = link[:, -1] + A @ d
             tree.push_about(link[:, DIM:-1], b, k, before, {k - 1: A, k: link[:, DIM : 2 * DIM]})
             now = Message(state, values, columns, np.empty(0), np.empty(0))
-        for H, b, *_ in measured(place, now.state, now.values, now.columns).measured:
-            for row, right in zip(H, b, strict=True):
+        for one in measured(place, now.state, now.values, now.columns).measured:
+            for row, right in zip(one.H, one.b, strict=True):
                 tree.push_about(row, right, k, now, {k: row[:, :DIM]})
         tree.update()
         live.append(tree.points[k].plus(tree.delta(k)[None]))

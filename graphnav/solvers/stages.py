@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dgeqrf, dtrtri
+from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtri
 
 from graphnav import rotation
 from graphnav.constraints.base import assemble, weighted_sigma
@@ -77,7 +77,7 @@ class Message:
     def covariance(self) -> Array:
         """(D, D)"""
         root = np.linalg.inv(self.R)
-        return root @ root.T
+        return np.asarray(root @ root.T)
 
     def moved(self, e: Array) -> Message:
         """The same about the point moved by the error state e (D,)."""
@@ -92,6 +92,18 @@ class Message:
 
 
 @dataclass(frozen=True)
+class Measured:
+    """Rows of one constraint at one keyframe, whitened: H y = b, with the kernel that weighs them and its scale."""
+
+    name: str
+    H: Array  # (n, m, D)
+    b: Array  # (n, m)
+    sigma: Array  # (n, m) that they were whitened with
+    kernel: str
+    scale: float
+
+
+@dataclass(frozen=True)
 class Stage:
     """A keyframe in the window. Smoothing back, y_before = g + G y + noise of covariance C in the rows `lost`."""
 
@@ -101,10 +113,26 @@ class Stage:
     g: Array  # (D before,)
     lost: Array  # rows that were eliminated
     C: Array  # (lost, lost)
+    measured: tuple[Measured, ...] = ()  # about a point that the stage has moved from by `way`
+    way: Array | float = 0.0
 
     def moved(self, e: Array) -> Stage:
         """The same about the point moved by the error state e."""
-        return Stage(self.place, self.message.moved(e), turned(self.G, e), self.g + self.G @ e, self.lost, self.C)
+        message, G, g = self.message.moved(e), turned(self.G, e), self.g + self.G @ e
+        return Stage(self.place, message, G, g, self.lost, self.C, self.measured, self.way + e)
+
+    @property
+    def noise(self) -> Array:
+        """(D before, D before), C in its place."""
+        out = np.zeros((len(self.G), len(self.G)))
+        out[self.lost[:, None], self.lost] = self.C
+        return out
+
+    def before(self, P: Array) -> Array:
+        """The covariance before from that of y."""
+        out = self.G @ P @ self.G.T
+        out[self.lost[:, None], self.lost] += self.C
+        return np.asarray(out)
 
 
 def turned(A: Array, e: Array) -> Array:
@@ -119,15 +147,16 @@ class Linear:
     """Whitened rows of one stage: link (15, 15 + D + 1) over [x_before, y, b], or None; measurements by constraint."""
 
     link: Array | None
-    measured: tuple[tuple[Array, Array, str, float], ...]  # H (n, m, D), b (n, m), kernel and its scale
+    measured: tuple[Measured, ...]
 
     def stacked(self, y: Array, passes: int) -> Array:
         """(rows, D + 1) of the measurements, weighted for the error state y once `passes` is not 0."""
         parts = []
-        for H, b, kernel, scale in self.measured:
-            if kernel != "none" and passes:
+        for one in self.measured:
+            H, b = one.H, one.b
+            if one.kernel != "none" and passes:
                 left = b - mv(H, np.broadcast_to(y, (len(b), len(y))))
-                weight = np.sqrt(weight_and_cost(kernel, np.linalg.norm(left, axis=-1), scale)[0])
+                weight = np.sqrt(weight_and_cost(one.kernel, np.linalg.norm(left, axis=-1), one.scale)[0])
                 H, b = H * weight[:, None, None], b * weight[:, None]
             parts.append(np.concatenate([H, b[..., None]], axis=-1).reshape(-1, H.shape[-1] + 1))
         return np.concatenate(parts) if parts else np.zeros((0, len(y) + 1))
@@ -135,7 +164,7 @@ class Linear:
     @property
     def robust(self) -> bool:
         """Whether any kernel bends."""
-        return any(kernel != "none" for _, _, kernel, _ in self.measured)
+        return any(one.kernel != "none" for one in self.measured)
 
 
 def extended(columns: Columns, steps: Sequence[Step]) -> Columns:
@@ -170,7 +199,10 @@ def predicted(before: Message, place: Place) -> tuple[States, Array, Columns, Ar
     scale = before.value(SCALE) if SCALE in before.columns else None
     ahead, F = motion.propagate(row, before.state, scale)
     frames = motion.frames(row, before.state.R_nb)[0]
-    W = np.linalg.inv(frames @ np.linalg.cholesky(motion.intervals.covariance[place.k - 1]))
+    root, info = dpotrf(motion.intervals.covariance[place.k - 1], lower=1)
+    if info:
+        raise EstimationError(f"the noise of the IMU before {place.t:.3f} s is none: check its figures")
+    W = dtrtri(root, lower=1)[0] @ np.linalg.inv(frames)
     link = np.zeros((DIM, DIM + D + 1))
     link[:, :DIM] = -W @ F[0]
     link[:, DIM : 2 * DIM] = W
@@ -208,21 +240,23 @@ def at_points(
             here = columns[SCALE]
             rows[:, :, DIM + here.start : DIM + here.stop] = W @ Js
         links = list(rows)
-    parts: list[list[tuple[Array, Array, str, float]]] = [[] for _ in places]
+    parts: list[list[Measured]] = [[] for _ in places]
     for constraint in problem.constraints:
-        lo, hi = np.searchsorted(constraint.keyframe, [first, first + n])
+        lo, hi = constraint.keyframe.searchsorted((first, first + n))
         if lo == hi or any(p.name not in columns for p in constraint.parameters):
             continue  # none here, or of parameters that have not begun
         at = constraint.keyframe[lo:hi] - first + skip
         given = {p.name: values[at, _shift(columns[p.name])] for p in constraint.parameters}
-        linear = constraint.linearize(states[at], given, slice(lo, hi))
+        where = states if len(at) == len(states) == 1 else states[at]
+        linear = constraint.linearize(where, given, slice(lo, hi))
         sigma = weighted_sigma(constraint, linear.sigma, slice(lo, hi))
         H = assemble(linear, columns, D) / sigma[..., None]
         b = -linear.residual / sigma
         edge = np.searchsorted(at, np.arange(n + 1) + skip)
         for i in np.flatnonzero(np.diff(edge)):
             own = slice(edge[i], edge[i + 1])
-            parts[i].append((H[own], b[own], constraint.robust, constraint.robust_scale))
+            c = constraint
+            parts[i].append(Measured(c.name, H[own], b[own], sigma[own], c.robust, c.robust_scale))
     return [Linear(link, tuple(part)) for link, part in zip(links, parts, strict=True)]
 
 
@@ -303,7 +337,7 @@ def eliminate(
         shift = state.minus(before.state)[0]
         G[:DIM] = turned(G[:DIM], shift)
         g[:DIM] += shift
-    return Stage(place, message, G, g, lost, root @ root.T)
+    return Stage(place, message, G, g, lost, root @ root.T, linear.measured)
 
 
 def _shift(columns: slice) -> slice:

@@ -20,6 +20,7 @@ from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 from graphnav.solvers.stages import (
     Columns,
+    Measured,
     Message,
     Place,
     Stage,
@@ -38,11 +39,22 @@ _SHARE = (
 _G = 9.8  # m/s^2
 _DELAY = 0.02  # s, of a delay: 1 mm where speed is known to 5 cm/s
 _ROUNDS = 5
+_SPAN = 16  # stages that are smoothed back over at once
 _ALMOST = 0.3
 _LIMITS = {"rad": 1e-2, "s": _DELAY}
 
 
 Renewed = Callable[[int], list[Place]]
+
+
+@dataclass(frozen=True)
+class Residual:
+    """What is left of a constraint's rows at a settled keyframe, in its sigmas, and the variance it should have."""
+
+    name: str
+    sigma: Array  # (n, m)
+    left: Array  # (n, m) predicted - measured over sigma
+    variance: Array  # (n, m) of that: 1 less what the states took up
 
 
 @dataclass(frozen=True)
@@ -56,9 +68,21 @@ class Smoothed:
     values: tuple[Array, ...]  # (D-15,) each
     sigma: tuple[Array, ...]  # (D-15,) each
     places: tuple[Place, ...]
+    residuals: tuple[tuple[Residual, ...], ...] = ()  # of the measurements at each
 
     def __len__(self) -> int:
         return len(self.t)
+
+
+@dataclass(frozen=True)
+class _Span:
+    """Some stages as one, smoothing back: y_first = F y_last + noise of covariance C. Indices count from the first."""
+
+    first: int
+    last: int
+    stage: Stage  # the last: when it has been replaced, so may have been those before it
+    F: Array
+    C: Array
 
 
 class Window:
@@ -76,6 +100,9 @@ class Window:
         self.stages: list[Stage] = []
         self.relinearized = 0  # stages made anew
         self._limit = _limits(prior.columns, {})
+        self._gone = 0  # stages that have left
+        self._spans: list[_Span] = []
+        self._means: list[Array] | None = None
 
     def __len__(self) -> int:
         return len(self.stages)
@@ -90,6 +117,13 @@ class Window:
         """Times of the keyframes in the window, s."""
         return np.array([stage.place.t for stage in self.stages])
 
+    def since(self, t: float) -> list[Stage]:
+        """The stages from a time on."""
+        first = len(self.stages)
+        while first and self.stages[first - 1].place.t >= t:
+            first -= 1
+        return self.stages[first:]
+
     def push(self, place: Place) -> float:
         """Add a keyframe, linearised at its prediction; returns by how much its measurements turned it, rad."""
         before = self.newest
@@ -100,14 +134,18 @@ class Window:
         stage = eliminate(before, place, linear, state, values, columns)
         e = stage.message.estimate
         self.stages.append(stage.moved(e))
+        self._means = None
         if columns != self._limit[0]:
             assert place.problem is not None
-            self._limit = _limits(columns, {c.parameter.name: c.parameter.unit for c in place.problem.chains})
+            self._limit = _limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})
         return float(np.linalg.norm(e[:3]))
 
     def truncate(self, keep: int) -> None:
         """Forget all but the first `keep` stages: something before what follows has changed."""
+        if keep >= len(self.stages):
+            return
         del self.stages[keep:]
+        self._means = None
         if self.stages:
             self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
         else:
@@ -115,57 +153,100 @@ class Window:
 
     def means(self) -> list[Array]:
         """Smoothed error states, one of the message before the window and one of each stage."""
-        e = self.newest.estimate
-        out = [e]
-        for stage in reversed(self.stages):
-            e = stage.g + stage.G @ e
-            out.append(e)
-        return out[::-1]
+        if self._means is None:
+            e = self.newest.estimate
+            out = [e]
+            for stage in reversed(self.stages):
+                e = stage.G @ e
+                e += stage.g
+                out.append(e)
+            self._means = out[::-1]
+        return self._means
 
     def settle(self, count: int) -> Smoothed:
         """Smooth the window and let its first `count` stages go."""
-        means = self.means()
-        P = self.newest.covariance
-        covariances = []
-        for k in range(len(self.stages) - 1, -1, -1):
-            stage = self.stages[k]
-            if k < count:
-                covariances.append(P)
-            if k:
-                P = stage.G @ P @ stage.G.T
-                P[np.ix_(stage.lost, stage.lost)] += stage.C
-        gone, rows = self.stages[:count], []
-        sigma = []
-        for stage, e, P in zip(gone, means[1 : count + 1], reversed(covariances), strict=True):
-            J = np.eye(DIM)
-            J[:3, :3] = rotation.right_jacobian(e[None, :3])[0]
-            rows.append((stage.message.state.plus(e[None, :DIM]), J @ P[:DIM, :DIM] @ J.T))
+        gone, means = self.stages[:count], self.means()[1 : count + 1]
+        columns = tuple(stage.message.columns for stage in gone)
+        rows, covariance, sigma, residuals = [], np.empty((len(gone), DIM, DIM)), [], []
+        for k, (stage, e, P) in enumerate(zip(gone, means, self._covariances(count), strict=True)):
+            rows.append(stage.message.state)
+            covariance[k] = P[:DIM, :DIM]
             sigma.append(np.sqrt(np.maximum(np.diagonal(P)[DIM:], 0.0)))
+            residuals.append(tuple(_residual(one, stage.way + e, P) for one in stage.measured))
+        values = tuple(stage.message.values + e[DIM:] for stage, e in zip(gone, means, strict=True))
+        states = self.head.state[:0]
         if gone:
+            moved = np.array([e[:DIM] for e in means])
+            states = States.stack(rows).plus(moved)
+            J = rotation.right_jacobian(moved[:, :3])
+            covariance[:, :3] = J @ covariance[:, :3]
+            covariance[:, :, :3] = covariance[:, :, :3] @ np.swapaxes(J, -1, -2)
             self.head = gone[-1].message
             del self.stages[:count]
+            self._gone += count
+            self._means = None
             if not self.stages:
                 self.head = self.head.moved(self.head.estimate)
         return Smoothed(
             t=np.array([stage.place.t for stage in gone]),
-            states=States.stack([state for state, _ in rows]) if rows else self.head.state[:0],
-            covariance=np.array([P for _, P in rows]).reshape(-1, DIM, DIM),
-            columns=tuple(stage.message.columns for stage in gone),
-            values=tuple(s.message.values + e[DIM:] for s, e in zip(gone, means[1 : count + 1], strict=True)),
+            states=states,
+            covariance=covariance,
+            columns=columns,
+            values=values,
             sigma=tuple(sigma),
             places=tuple(stage.place for stage in gone),
+            residuals=tuple(residuals),
         )
+
+    def _covariances(self, count: int) -> list[Array]:
+        """(D, D) of the first `count` stages."""
+        out: list[Array] = []
+        P, at = self.newest.covariance, len(self.stages) - 1
+        for span in reversed(self._bridged(count)):
+            while at > span.last - self._gone:
+                P = self.stages[at].before(P)
+                at -= 1
+            P = span.F @ P @ span.F.T + span.C
+            at = span.first - self._gone
+        while at >= 0:
+            if at < count:
+                out.append(P)
+            if at:
+                P = self.stages[at].before(P)
+            at -= 1
+        return out[::-1]
+
+    def _bridged(self, count: int) -> list[_Span]:
+        """What leads from the newest stages back to the last of the first `count`, most of it as it was last time."""
+        first, newest = self._gone + count - 1, self._gone + len(self.stages) - 1
+        spans = [
+            span
+            for span in self._spans
+            if first <= span.first and span.last <= newest and self.stages[span.last - self._gone] is span.stage
+        ]
+        begin = spans[-1].last if spans else first
+        for k in range(begin, newest - _SPAN + 1, _SPAN):
+            run = self.stages[k - self._gone + 1 : k - self._gone + _SPAN + 1]
+            F, C = run[-1].G, run[-1].noise
+            for stage in run[-2::-1]:
+                F, C = stage.G @ F, stage.before(C)
+            spans.append(_Span(k, k + _SPAN, run[-1], F, C))
+        self._spans = spans
+        return spans
 
     # ------------------------------------------------------------------------------------------ linearising again
     def first_moved(self, share: float = 1.0) -> int | None:
         """The first stage whose point is further than its limit from the smoothed state; None if there is none."""
-        _, limit = self._limit
-        for k, e in enumerate(self.means()[1:]):
-            if np.dot(e[:3], e[:3]) > (share * self.turn) ** 2 or np.any(
-                np.abs(e[DIM:]) > share * limit[: len(e) - DIM]
-            ):
-                return k
-        return None
+        means = self.means()[1:]
+        if not means:
+            return None
+        limit = self._limit[1]
+        e = np.zeros((len(means), max(len(x) for x in means)))
+        for row, x in zip(e, means, strict=True):
+            row[: len(x)] = x
+        far = np.einsum("ki,ki->k", e[:, :3], e[:, :3]) > (share * self.turn) ** 2
+        far |= np.any(np.abs(e[:, DIM:]) > share * limit[: e.shape[1] - DIM], axis=1)
+        return int(np.argmax(far)) if far.any() else None
 
     def relinearize(self, first: int, places: Sequence[Place] | None = None) -> None:
         """Make the stages from `first` on anew about the smoothed states.
@@ -188,6 +269,7 @@ class Window:
         ]
         self.stages[first:] = remade(before, points, places or [stage.place for stage in old])
         self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
+        self._means = None
         self.relinearized += len(old)
 
     def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> int:
@@ -207,6 +289,11 @@ class Window:
             first = min(first, self.first_moved(_ALMOST * share) or 0) if first else 0
             self.relinearize(first, renewed(first) if renewed is not None else None)
         return _ROUNDS
+
+
+def _residual(rows: Measured, e: Array, P: Array) -> Residual:
+    left = rows.H @ e - rows.b
+    return Residual(rows.name, rows.sigma, left, 1.0 - np.einsum("nmi,nmi->nm", rows.H @ P, rows.H))
 
 
 def turn_limit(noise: ImuNoise) -> float:

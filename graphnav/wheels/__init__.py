@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from graphnav.wheels.faults import Faults, faults
-from graphnav.wheels.mean import MeanSpeed, counts, gaps, longest_step, quantum, reading_sigma
+from graphnav.wheels.mean import Figures, MeanSpeed, counts, gaps, longest_step, quantum, reading_sigma
 
-__all__ = ["Faults", "MeanSpeed", "counts", "faults", "gaps", "longest_step", "quantum", "reading_sigma"]
+__all__ = ["Faults", "Figures", "MeanSpeed", "counts", "faults", "gaps", "longest_step", "quantum", "reading_sigma"]

@@ -23,7 +23,7 @@ from scipy.ndimage import median_filter
 from graphnav.findings import period_of, runs_of
 from graphnav.recording import Imu, Odometer
 from graphnav.rotation import Array
-from graphnav.wheels.mean import gaps, longest_step, quantum, reading_sigma
+from graphnav.wheels.mean import Figures, gaps
 
 GAP, STUCK, FROZEN, WILD = "no readings", "stuck at zero", "frozen", "against the motion"
 
@@ -52,15 +52,24 @@ class Faults:
 
     spans: Array  # (M, 2) s, [first bad reading, next good one)
     reasons: tuple[str, ...]
+    lag: float | None = None  # s by which the odometer is late, as far as the IMU can tell
 
 
-def faults(odometer: Odometer, imu: Imu | None = None) -> Faults:
-    """Where readings are missing or wrong; see the module's head. Times are those of the odometer's own stamps."""
-    found = [(a, b, GAP) for a, b in gaps(odometer.t)]
+def faults(
+    odometer: Odometer, imu: Imu | None = None, figures: Figures | None = None, lag: float | None = None
+) -> Faults:
+    """Where readings are missing or wrong; see the module's head. Times are those of the odometer's own stamps.
+
+    `figures` and `lag` (s) are what is known of the odometer already.
+    """
+    figures = figures or Figures.of(odometer)
+    found = [(a, b, GAP) for a, b in gaps(odometer.t, figures.longest)]
     if len(odometer.t) >= 10:
-        found += _wrong(odometer, imu)
+        motion = _motion(odometer, imu, lag) if imu is not None and len(imu.t) > 10 else None
+        found += _wrong(odometer, imu, motion, figures)
+        lag = lag if motion is None else motion.lag
     found.sort()
-    return Faults(np.array([f[:2] for f in found], dtype=float).reshape(-1, 2), tuple(f[2] for f in found))
+    return Faults(np.array([f[:2] for f in found], dtype=float).reshape(-1, 2), tuple(f[2] for f in found), lag)
 
 
 @dataclass(frozen=True)
@@ -81,7 +90,7 @@ def _ahead_up(imu: Imu) -> tuple[Array, Array]:
     return ahead / max(float(np.linalg.norm(ahead)), 1e-9), up
 
 
-def _motion(odometer: Odometer, imu: Imu) -> _Motion | None:
+def _motion(odometer: Odometer, imu: Imu, known: float | None) -> _Motion | None:
     t, speed = odometer.t, odometer.speed
     dt = np.diff(imu.t, prepend=2 * imu.t[0] - imu.t[1])
     ahead, up = _ahead_up(imu)
@@ -103,7 +112,7 @@ def _motion(odometer: Odometer, imu: Imu) -> _Motion | None:
     def size(off: Array) -> float:
         return float(np.mean(np.minimum(np.abs(off), 1.0)))  # what is wrong has no more say than 1 m/s
 
-    lags = np.arange(-_LATEST / 3.0, _LATEST + 0.01, 0.05)
+    lags = np.arange(-_LATEST / 3.0, _LATEST + 0.01, 0.05) if known is None else np.array([known])
     misfits = [size(np.subtract(*missing(lag))) for lag in lags]
     lag, left = float(lags[int(np.argmin(misfits))]), min(misfits)
     # clocks far apart, wrong axes: the force explains nothing of the changes of speed
@@ -122,12 +131,12 @@ def _motion(odometer: Odometer, imu: Imu) -> _Motion | None:
     return _Motion(np.interp(at, imu.t, gained) + np.interp(at, ends, drift) + 1e6 * hole, inside, lag)
 
 
-def _breaks(odometer: Odometer, motion: _Motion | None) -> list[tuple[int, int]]:
+def _breaks(odometer: Odometer, motion: _Motion | None, figures: Figures) -> list[tuple[int, int]]:
     """Pairs of readings between which x changes by more than it can, the closest pairs that show it, in order."""
     t, v = odometer.t, odometer.speed
-    error = quantum(v) + 6.0 * reading_sigma(odometer)
+    error = figures.step + 6.0 * figures.sigma
     period = period_of(t)
-    part = np.r_[0, np.cumsum(np.diff(t) > longest_step(t))]
+    part = np.r_[0, np.cumsum(np.diff(t) > figures.longest)]
     found: list[tuple[int, int]] = []
     for window in _WINDOWS:
         i = np.arange(len(t) - 1)
@@ -170,16 +179,17 @@ def _closest(i: NDArray[np.intp], j: NDArray[np.intp], found: list[tuple[int, in
     return out
 
 
-def _wrong(odometer: Odometer, imu: Imu | None) -> list[tuple[float, float, str]]:
+def _wrong(
+    odometer: Odometer, imu: Imu | None, motion: _Motion | None, figures: Figures
+) -> list[tuple[float, float, str]]:
     t, v = odometer.t, odometer.speed
-    motion = _motion(odometer, imu) if imu is not None and len(imu.t) > 10 else None
-    breaks = _breaks(odometer, motion)
+    breaks = _breaks(odometer, motion, figures)
     equal = [(a - 1, b - 1) for a, b in runs_of(np.r_[False, v[1:] == v[:-1]])]  # first and last of equal readings
     stays = [(a, b) for a, b in equal if b - a >= 4 and t[b] - t[a] >= _STAYS]
     bad: list[tuple[int, int, str]] = []  # first bad reading, first good one
     bad += _islands(t, v, motion, breaks, stays, _SPIKE)
     bad += _stuck(t, v, motion, breaks, stays)
-    bad += _noiseless(odometer, equal, stays)
+    bad += _noiseless(v, figures, equal, stays)
     if motion is not None and imu is not None:
         bad += _moves(odometer, imu, motion.lag, stays)
     bad += _islands(t, v, motion, breaks, stays, _ISLAND)
@@ -240,11 +250,10 @@ def _stuck(
 
 
 def _noiseless(
-    odometer: Odometer, equal: list[tuple[int, int]], stays: list[tuple[int, int]]
+    v: Array, figures: Figures, equal: list[tuple[int, int]], stays: list[tuple[int, int]]
 ) -> list[tuple[int, int, str]]:
     """Readings that stay the same while moving, of a sensor whose noise is above its step: it never is so still."""
-    v = odometer.speed
-    if reading_sigma(odometer) < 2.0 * quantum(v):
+    if figures.sigma < 2.0 * figures.step:
         return []
     repeats = np.array([b - a for a, b in equal if v[a] != 0.0])
     single: int = max(int((v != 0.0).sum()) - int(np.sum(repeats + 1)), 0)

@@ -7,6 +7,7 @@ what was counted, or the integral of the speed read, straight between the readin
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,16 +49,16 @@ def quantum(speed: Array) -> float:
     return 0.0
 
 
-def reading_sigma(odometer: Odometer) -> float:
+def reading_sigma(odometer: Odometer, step: float | None = None) -> float:
     """1-sigma of one reading by its own figures, m/s: as stated, else its scatter, at least that of its step.
 
     The scatter is that of third differences while moving, which leave nothing of a motion that is smooth over four
-    readings: the variance of a third difference is 20 times that of a reading.
+    readings: the variance of a third difference is 20 times that of a reading. `step` is the quantum, if known.
     """
     if odometer.speed_sigma is not None:
         return odometer.speed_sigma
     t, speed = odometer.t, odometer.speed
-    rounding = _STEP * quantum(speed)
+    rounding = _STEP * (quantum(speed) if step is None else step)
     if len(t) < 10:
         return rounding
     steps = np.diff(t)
@@ -68,14 +69,14 @@ def reading_sigma(odometer: Odometer) -> float:
     return max(scatter, rounding)
 
 
-def counts(odometer: Odometer) -> float:
+def counts(odometer: Odometer, step: float | None = None) -> float:
     """Metres per pulse where the speeds are pulses counted from row to row, else 0.
 
     The rounding errors of such readings telescope: the mean of n of them is wrong by 1/n of what one is wrong by, and
     by 1/sqrt(n) were they new with every reading. Third differences tell, as in `reading_sigma`.
     """
     t, speed = odometer.t, odometer.speed
-    step = quantum(speed)
+    step = quantum(speed) if step is None else step
     if odometer.way is not None or step == 0.0:
         return odometer.pulse
     even = np.r_[True, np.diff(t) < 1.5 * period_of(t)] & (speed != 0.0)
@@ -101,21 +102,42 @@ def longest_step(t: Array) -> float:
     return 3.5 * max(period_of(t), float(np.percentile(np.diff(t), 95.0))) if len(t) > 1 else 0.0
 
 
-def gaps(t: Array) -> Spans:
-    """Spans without readings, from where the first one is missing."""
-    k = np.flatnonzero(np.diff(t) > longest_step(t))
+def gaps(t: Array, longest: float | None = None) -> Spans:
+    """Spans without readings, from where the first one is missing; `longest` as `longest_step` says, if known."""
+    k = np.flatnonzero(np.diff(t) > (longest_step(t) if longest is None else longest))
     return np.stack([t[k] + period_of(t), t[k + 1]], -1).reshape(-1, 2)
 
 
-def _sigmas(odometer: Odometer) -> tuple[float, float, float]:
-    """`white`, `rounding` and `ends` of a `MeanSpeed`."""
-    pulse = counts(odometer)
-    if odometer.speed_sigma is not None:
-        return float(odometer.speed_sigma), 0.0, 0.0
-    if pulse:  # each end of a count is wrong by up to one pulse, evenly: a difference of two
-        return 0.0, 0.0, float(np.sqrt(2.0) * _STEP * pulse)
-    sigma, rounding = reading_sigma(odometer), _STEP * quantum(odometer.speed)
-    return float(np.sqrt(max(sigma**2 - rounding**2, 0.0))), rounding, 0.0
+@dataclass(frozen=True)
+class Figures:
+    """What many readings tell of each of them."""
+
+    step: float  # m/s, `quantum`
+    sigma: float  # m/s, `reading_sigma`
+    pulse: float  # m, `counts`
+    longest: float  # s, `longest_step`
+
+    @classmethod
+    def of(cls, odometer: Odometer) -> Figures:
+        """As these readings tell."""
+        step = quantum(odometer.speed)
+        return cls(step, reading_sigma(odometer, step), counts(odometer, step), longest_step(odometer.t))
+
+    def sigmas(self, odometer: Odometer) -> tuple[float, float, float]:
+        """`white`, `rounding` and `ends` of a `MeanSpeed`."""
+        if odometer.speed_sigma is not None:
+            return float(odometer.speed_sigma), 0.0, 0.0
+        if self.pulse:  # each end of a count is wrong by up to one pulse, evenly: a difference of two
+            return 0.0, 0.0, float(np.sqrt(2.0) * _STEP * self.pulse)
+        rounding = _STEP * self.step
+        return float(np.sqrt(max(self.sigma**2 - rounding**2, 0.0))), rounding, 0.0
+
+
+def _from_zero(steps: NDArray[Any]) -> NDArray[Any]:
+    """Running sums, from zero."""
+    out = np.zeros(len(steps) + 1, dtype=steps.dtype)
+    np.cumsum(steps, out=out[1:])
+    return out
 
 
 @dataclass(frozen=True)
@@ -136,26 +158,27 @@ class MeanSpeed:
     ends: float  # m, the error of a way that is counted
 
     @classmethod
-    def of(cls, odometer: Odometer, spans: Spans | None = None, like: MeanSpeed | None = None) -> MeanSpeed:
-        """Without the readings in `spans` (see `faults`) and not across gaps; with the sigmas of `like`, if given."""
+    def of(cls, odometer: Odometer, spans: Spans | None = None, figures: Figures | None = None) -> MeanSpeed:
+        """Without the readings in `spans` (see `faults`) and not across gaps; `figures` if they are known already."""
+        figures = figures or Figures.of(odometer)
         t, speed = odometer.t, odometer.speed
-        step = np.diff(t)
+        step = t[1:] - t[:-1]
         good = np.ones(len(t), dtype=bool)
-        across = step > longest_step(t)
+        across = step > figures.longest
         for begin, end in np.empty((0, 2)) if spans is None else spans:
             good &= (t < begin) | (t >= end)
             across |= (t[:-1] < end) & (t[1:] > begin)
         bad = across | ~good[1:] | ~good[:-1]
         counted = odometer.way is not None
-        way = odometer.way if odometer.way is not None else np.r_[0.0, np.cumsum(0.5 * (speed[1:] + speed[:-1]) * step)]
-        white, rounding, ends = _sigmas(odometer) if like is None else (like.white, like.rounding, like.ends)
+        way = odometer.way if odometer.way is not None else _from_zero(0.5 * (speed[1:] + speed[:-1]) * step)
+        white, rounding, ends = figures.sigmas(odometer)
         return cls(
             t,
             speed,
             np.asarray(way),
             counted,
-            np.r_[0, np.cumsum(bad)],
-            np.r_[0, np.cumsum(speed[1:] != speed[:-1])],
+            _from_zero(bad.astype(np.intp)),
+            _from_zero((speed[1:] != speed[:-1]).astype(np.intp)),
             white=white,
             rounding=rounding,
             ends=ends,
