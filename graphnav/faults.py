@@ -86,6 +86,11 @@ def without(problem: Problem, faults: Iterable[Fault]) -> Problem:
     return weighted(problem, weights)
 
 
+def all_used(problem: Problem) -> Problem:
+    """The problem with nothing left out."""
+    return weighted(problem, {c.name: np.ones(len(c)) for c in problem.constraints if c.weight is not None})
+
+
 def widened(problem: Problem) -> Problem:
     """The problem with as much again left out on either side of every fault, at most `_EDGE`.
 
@@ -101,6 +106,11 @@ def widened(problem: Problem) -> Problem:
 def count(problem: Problem) -> int:
     """How many rows are left out."""
     return sum(int(np.sum(c.weight == 0.0)) for c in problem.constraints if c.weight is not None)
+
+
+def share(problem: Problem) -> float:
+    """The largest share of a kind that is left out."""
+    return max((float(np.mean(c.weight == 0.0)) for c in problem.constraints if c.weight is not None), default=0.0)
 
 
 def readmitted(problem: Problem, smoothed: Smoothed) -> Problem:

@@ -28,6 +28,7 @@ from graphnav.solvers.isam import isam2
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
 _FAR = 0.5  # rad between the stated and the found start attitude
+_MOST = 0.5  # share of the fixes of a kind that can be wrong
 _SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
 
 
@@ -135,7 +136,11 @@ def _solve(
 
     def watched(problem: Problem) -> tuple[Problem, Filtered]:
         forward = ekf(problem, progress, aligned.until, watch=True)
-        return faults.weighted(problem, forward.weights), forward
+        found = faults.weighted(problem, forward.weights)
+        if faults.share(found) > _MOST:
+            found = faults.all_used(problem)
+            forward = ekf(found, progress, aligned.until)
+        return found, forward
 
     problem, said = posed()
     done = time.perf_counter()

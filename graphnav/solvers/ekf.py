@@ -196,7 +196,7 @@ def _forward(
                     back = verdicts.settle(rows.name, fault, hi)
                     break
         if back is not None:  # once more from before the fault, without it
-            bank = banks.get(back) or Bank(watched, problem.t, D)
+            bank = banks.get(back) or bank.forgetful() if bank else None
             banks = {key: old for key, old in banks.items() if key < back}
             state, values, P = (states[back - 1], all_values[back - 1], all_P[back - 1]) if back else begun
             k = back
@@ -263,13 +263,17 @@ def _update(
     if rows.gate is not None and nis > rows.gate**2:
         weight = 0.0
     record.set(slice(lo, hi), r.reshape(n, -1), np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1), nis / n, weight)
+    if bank is not None:
+        bank.seen(rows.name, lo, nis)
     if weight == 0.0:
         return state, values, P, None
     IKH = -K @ H
     IKH.flat[:: len(P) + 1] += 1.0
     P = IKH @ P @ IKH.T + (K * (sigma * sigma)) @ K.T
     P = 0.5 * (P + P.T)  # rounding's asymmetry would grow, past what a stop leaves between its place and the state
-    fault = None if bank is None else bank.updated(rows.name, K, G, solved[:, D + 1 :], r)
+    fault = None
+    if bank is not None:
+        fault = bank.updated(rows.name, K, G, solved[:, D + 1 :], r, float(np.linalg.norm(state.v)))
     return at.plus(d[None, :DIM]), at_values + d[DIM:], P, fault
 
 

@@ -21,14 +21,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, gammaincinv
 
 from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.rotation import Array
 
 _PATIENCE = 60.0  # s
-LARGE = 3.0  # stated sigmas: less is no fault, however certain; a filter's model has errors too
+_EVERY = 8  # fixes between two looks at what is usual
+LARGE = 3.0  # sigmas that are stated or that clocks can be off: less is no fault, however certain
+_CLOCKS = 0.05  # s, by which the stamps of IMU and receiver may disagree
+_BRAKING = 3.0  # m/s^2, of a usual manoeuvre
 FALSE_ALARM = 1e-7  # per test: one drive in a hundred of an hour, if errors were Gaussian
 LONGEST = 600.0  # s, about, of the oldest onset: what inertial sensors knew ten minutes ago says little
 
@@ -36,14 +39,16 @@ LONGEST = 600.0  # s, about, of the oldest onset: what inertial sensors knew ten
 class _Slots:
     """The tests of one constraint: slot l has columns 3 l to 3 l + 2 of those it has in the bank."""
 
-    def __init__(self, columns: slice, L: int, m: int, stated: Array) -> None:
+    def __init__(self, columns: slice, L: int, m: int, stated: Array, N: int, moves: bool) -> None:
         self.columns, self.L, self.m = columns, L, m
         self.threshold = float(chdtri(m, FALSE_ALARM))
+        self.moves = moves  # a position, which is off by what the vehicle moves while clocks are
         self.stated = stated  # (m,) typical sigma of a whole error
         self.first = np.full(L, -1)  # row at which each slot began, -1 before
         self.inputs = np.zeros((m, L * m))  # what a unit error is to each column: the identity since its slot began
         self.score, self.info = np.zeros((L, m)), np.tile(np.eye(m), (L, 1, 1))
         self.seen = 0
+        self.usual = _Usual(m, N)
 
     def copy(self) -> _Slots:
         other = object.__new__(_Slots)
@@ -60,6 +65,22 @@ class _Slots:
         self.first[slot], self.score[slot], self.info[slot] = row, 0.0, 0.0
         self.inputs[:, own] = np.eye(self.m)
         return slice(self.columns.start + own.start, self.columns.start + own.stop)
+
+
+class _Usual:
+    """By how much the innovations of a kind are usually larger than the filter says; all copies of a bank share it.
+
+    What half of all fixes do, those not used included, is no fault: the filter has lost its way.
+    """
+
+    def __init__(self, m: int, N: int) -> None:
+        self.median = 2.0 * float(gammaincinv(0.5 * m, 0.5))
+        self.nis, self.factor = np.zeros(N), 1.0
+
+    def add(self, row: int, nis: float) -> None:
+        self.nis[row] = nis
+        if row % _EVERY == 0:
+            self.factor = max(1.0, float(np.median(self.nis[: row + 1])) / self.median)
 
 
 class Bank:
@@ -81,7 +102,9 @@ class Bank:
             period = float(np.median(np.diff(times))) if len(times) > 1 else LONGEST
             L = 1 + int(np.clip(np.log2(LONGEST / max(period, 1e-3)), 0, 12))
             stated = rows.stated if isinstance(rows, GnssPosition) else rows.sigma
-            self._slots[rows.name] = _Slots(slice(end, end + L * m), L, m, np.median(stated, axis=0))
+            columns = slice(end, end + L * m)
+            moves = isinstance(rows, GnssPosition)
+            self._slots[rows.name] = _Slots(columns, L, m, np.median(stated, axis=0), len(rows), moves)
             end += L * m
         self.X = np.zeros((width, end))
 
@@ -89,6 +112,14 @@ class Bank:
         """The same, on its own."""
         other = object.__new__(Bank)
         other.X, other._slots = self.X.copy(), {name: slots.copy() for name, slots in self._slots.items()}
+        return other
+
+    def forgetful(self) -> Bank:
+        """The same without any onset."""
+        other = self.copy()
+        other.X[:] = 0.0
+        for slots in other._slots.values():
+            slots.first[:], slots.score[:], slots.info[:], slots.inputs[:] = -1, 0.0, np.eye(slots.m), 0.0
         return other
 
     def predicted(self, F: Array) -> None:
@@ -105,7 +136,12 @@ class Bank:
         G.reshape(-1, slots.m, G.shape[1])[:, :, slots.columns] += slots.inputs
         return G
 
-    def updated(self, name: str, K: Array, G: Array, weighted: Array, r: Array) -> int | None:
+    def seen(self, name: str, row: int, nis: float) -> None:
+        """The filter has seen an innovation of so many squared sigmas, used or not."""
+        if slots := self._slots.get(name):
+            slots.usual.add(row, nis)
+
+    def updated(self, name: str, K: Array, G: Array, weighted: Array, r: Array, speed: float) -> int | None:
         """The filter has used an innovation; the first row of a fault, or None.
 
         Parameters
@@ -113,6 +149,7 @@ class Bank:
         K : (D, n m) gain.
         G : (n m, C) its signature, and `weighted` S^-1 G.
         r : (n m,) residual, -nu.
+        speed : m/s, of the vehicle.
         """
         self.X += K @ G
         slots = self._slots.get(name)
@@ -123,9 +160,11 @@ class Bank:
         G3, S3 = (x[:, slots.columns].reshape(-1, L, m).swapaxes(0, 1) for x in (G, weighted))
         slots.info += G3.swapaxes(1, 2) @ S3
         b = np.linalg.solve(slots.info, slots.score[..., None])[..., 0]
-        T = np.where(np.sum((b / slots.stated) ** 2, axis=1) > LARGE**2, np.sum(slots.score * b, axis=1), 0.0)
+        T = np.sum(slots.score * b, axis=1)
+        allowed = slots.stated**2 + (_CLOCKS * speed if slots.moves else _CLOCKS * _BRAKING) ** 2
+        T = np.where(np.sum(b**2 / allowed, axis=1) > LARGE**2, T / slots.threshold, 0.0)
         worst = int(np.argmax(T))
-        return int(slots.first[worst]) if T[worst] > slots.threshold else None
+        return int(slots.first[worst]) if T[worst] > slots.usual.factor else None
 
 
 class Verdicts:
