@@ -96,11 +96,12 @@ def widened(problem: Problem) -> Problem:
 
     A fault that grows is found late, and what the filter used of it before would hide it from a smoother.
     """
-    wider = []
-    for fault in spans(problem):
-        more = min(fault.t_end - fault.t_start, _EDGE)
-        wider.append(replace(fault, t_start=fault.t_start - more, t_end=fault.t_end + more))
-    return without(problem, wider)
+    return without(problem, [_wider(fault) for fault in spans(problem)])
+
+
+def _wider(fault: Fault) -> Fault:
+    more = min(fault.t_end - fault.t_start, _EDGE)
+    return replace(fault, t_start=fault.t_start - more, t_end=fault.t_end + more)
 
 
 def count(problem: Problem) -> int:
@@ -114,42 +115,45 @@ def share(problem: Problem) -> float:
 
 
 def readmitted(problem: Problem, smoothed: Smoothed) -> Problem:
-    """The problem with those fixes back in use that agree with a smoothed solution made without them."""
-    back = {}
+    """The problem with better edges of its faults, by a smoothed solution of the `widened` one.
+
+    Towards every fault, and on into it, fixes are used as far as no window of them disagrees with its prediction.
+    """
+    better = {}
     for rows in problem.constraints:
-        if rows.watched and rows.weight is not None and np.any(rows.weight == 0.0):
-            weight = rows.weight.copy()
-            weight[_consistent(problem, rows, smoothed)] = 1.0
-            back[rows.name] = weight
-    return weighted(problem, back)
+        if not rows.watched or rows.weight is None or not np.any(rows.weight == 0.0):
+            continue
+        weight, t = rows.weight.copy(), problem.t[rows.keyframe]
+        agree, doubted = np.zeros(len(rows), dtype=bool), rows.weight == 0.0
+        for fault in (fault for fault in spans(problem) if fault.kind == rows.name):
+            wide, own = _wider(fault), (t >= fault.t_start - SAME_TIME) & (t <= fault.t_end + SAME_TIME)
+            left, right = (t >= wide.t_start) & (t <= fault.t_end), (t >= fault.t_start) & (t <= wide.t_end)
+            for side, step in ((left, 1), (right, -1)):
+                inwards = np.flatnonzero(side & (own | (rows.weight > 0.0)))[::step]
+                doubted[inwards] = True
+                agree[inwards[: _agreeing(problem, rows, smoothed, inwards)]] = True
+        weight[doubted] = agree[doubted]
+        better[rows.name] = weight
+    return weighted(problem, better)
 
 
-def _consistent(problem: Problem, rows: Constraint, smoothed: Smoothed) -> Array:
-    """Unused rows at the ends of faults that agree with what they were predicted to be."""
-    assert rows.weight is not None
-    lost = np.flatnonzero(rows.weight == 0.0)
-    at = rows.keyframe[lost]
-    linear = _linear(problem, rows, smoothed, lost)
+def _agreeing(problem: Problem, rows: Constraint, smoothed: Smoothed, which: Array) -> int:
+    """How many rows from the first of `which` on agree with what they were predicted to be."""
+    linear = _linear(problem, rows, smoothed, which)
     H, m = assemble(linear, problem.columns, smoothed.P.shape[-1]), linear.residual.shape[1]
-    HPH = H @ smoothed.P[at] @ np.swapaxes(H, -1, -2)
+    HPH = H @ smoothed.P[rows.keyframe[which]] @ np.swapaxes(H, -1, -2)
     R = linear.sigma[..., None] ** 2 * np.eye(m)
-    limit = float(chdtri(m, _DISAGREES))
-    agree = np.zeros(len(lost), dtype=bool)
-    for run in np.split(np.arange(len(lost)), np.flatnonzero(np.diff(lost) > 1) + 1):
-        earliest, latest, n = len(run), 0, 1  # end of the window that ends first, start of that which starts last
-        sums = [np.cumsum(np.concatenate([np.zeros((1, *x.shape[1:])), x[run]]), axis=0)
-                for x in (linear.residual, R, HPH)]  # fmt: skip
-        while n <= len(run):
-            first = np.arange(len(run) - n + 1)
-            mean, noise, drift = ((s[first + n] - s[first]) / n for s in sums)
-            T = np.sum(mean * np.linalg.solve(noise / n + drift, mean[..., None])[..., 0], axis=1)
-            disagree = first[limit < T]
-            if len(disagree):
-                earliest, latest = min(earliest, int(disagree[0]) + n - 1), max(latest, int(disagree[-1]) + 1)
-            n *= 2
-        agree[run[:earliest]] = True
-        agree[run[latest:]] = True
-    return lost[agree]
+    limit, end, n = float(chdtri(m, _DISAGREES)), len(which), 1
+    sums = [np.cumsum(np.concatenate([np.zeros((1, *x.shape[1:])), x]), axis=0) for x in (linear.residual, R, HPH)]
+    while n <= end:
+        first = np.arange(end - n + 1)
+        mean, noise, drift = ((s[first + n] - s[first]) / n for s in sums)
+        T = np.sum(mean * np.linalg.solve(noise / n + drift, mean[..., None])[..., 0], axis=1)
+        disagree = first[limit < T]
+        if len(disagree):
+            end = int(disagree[0]) + n - 1
+        n *= 2
+    return end
 
 
 def _linear(problem: Problem, rows: Constraint, smoothed: Smoothed, which: Array) -> Linearized:

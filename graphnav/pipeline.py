@@ -28,6 +28,7 @@ from graphnav.solvers.isam import isam2
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
 _FAR = 0.5  # rad between the stated and the found start attitude
+_REVIEWS = 2  # of where faults begin and end
 _MOST = 0.5  # share of the fixes of a kind that can be wrong
 _SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
 
@@ -157,17 +158,25 @@ def _solve(
         "alignment": after - detected,
         "judgement": done - after,
     }
-    began, dirty = time.perf_counter(), faults.count(problem) > 0
-    if dirty:
-        problem = faults.widened(problem)
-        forward = ekf(problem, progress, aligned.until)
-    smoothed = backward(problem, forward, progress)
-    problem, raised = judgement.judge_wheels(problem, smoothed)
-    if dirty:
-        problem, forward = watched(faults.readmitted(problem, smoothed))
-    elif raised:
-        forward = ekf(problem, progress, aligned.until)
-    if dirty or raised:
+    began = time.perf_counter()
+    raised: tuple[str, ...] = ()
+    for again in range(_REVIEWS):
+        before = faults.count(problem)
+        if before:
+            apart = faults.widened(problem)
+            smoothed = backward(apart, ekf(apart, progress, aligned.until), progress)
+            problem = faults.readmitted(problem, smoothed)
+        else:
+            smoothed = backward(problem, forward, progress)
+        if not again:
+            problem, raised = judgement.judge_wheels(problem, smoothed)
+        if before:
+            problem, forward = watched(problem)
+        elif raised:
+            forward = ekf(problem, progress, aligned.until)
+        if faults.count(problem) == before:
+            break
+    if before or raised:
         smoothed, said = backward(problem, forward, progress), (*said, *raised)
     wrong = faults.spans(problem, smoothed)
     said = (*said, *faults.notes(wrong, problem))

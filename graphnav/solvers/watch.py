@@ -186,23 +186,24 @@ class Verdicts:
 
     def settle(self, name: str, fault: int, end: int) -> int:
         """Take from use what a fault in rows `fault` to `end` gives reason to; the keyframe to go on from."""
-        at, back = self._keyframe[name], fault
+        at, used = self._keyframe[name], self.used[name]
+        used[fault:end] = 0.0
         if self._trial is not None and self._trial[0] == name:
             _, begin, until, were = self._trial
-            self._trial = None
-            if fault < until:
-                for other, used in were.items():
-                    self.used[other][:] = used
-                back = _begin(were[name], _begin(were[name], begin, 1.0), 0.0)
-        used = self.used[name]
-        used[fault:end] = 0.0
+            if end > until:
+                self._trial = None
+            elif np.mean(used[begin:until] == 0.0) > 0.5:
+                self._trial = None
+                for other, was in were.items():
+                    self.used[other][:] = was
+                return int(at[_begin(used, _begin(used, begin, 1.0), 0.0)])
         begin = _begin(used, end, 0.0)
         before = _begin(used, begin, 1.0)  # of what was used between two faults
         lasted = self._t[at[end - 1]] - self._t[at[begin]]
         if lasted > LONGEST and (name, begin) not in self.anew:
             used[begin:end] = 1.0
             self.anew.add((name, begin))
-            return int(at[min(back, begin)])
+            return int(at[begin])
         if (name, begin) not in self._tried and lasted > _PATIENCE and before > 0 and begin - before < end - begin:
             self._tried.add((name, begin))
             self._trial = name, begin, end, {other: u.copy() for other, u in self.used.items()}
@@ -211,7 +212,7 @@ class Verdicts:
             for other, keyframe in self._keyframe.items():
                 self.used[other][(keyframe >= first) & (keyframe < at[begin])] = 0.0
             return first
-        return int(at[back])
+        return int(at[fault])
 
 
 def _begin(used: Array, end: int, value: float) -> int:
