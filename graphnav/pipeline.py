@@ -143,44 +143,51 @@ def _solve(
             forward = ekf(found, progress, aligned.until)
         return found, forward
 
+    def reviewed(problem: Problem) -> tuple[Problem, Filtered, Smoothed, tuple[str, ...]]:
+        problem, forward = watched(problem)
+        raised: tuple[str, ...] = ()
+        for again in range(_REVIEWS):
+            before = faults.count(problem)
+            if before:
+                apart = faults.widened(problem)
+                smoothed = backward(apart, ekf(apart, progress, aligned.until), progress)
+                problem = faults.readmitted(problem, smoothed)
+            else:
+                smoothed = backward(problem, forward, progress)
+            if not again:
+                problem, raised = judgement.judge_wheels(problem, smoothed)
+            if before:
+                problem, forward = watched(problem)
+            elif raised:
+                forward = ekf(problem, progress, aligned.until)
+            if faults.count(problem) == before:
+                break
+        if before or raised:
+            smoothed = backward(problem, forward, progress)
+        return problem, forward, smoothed, raised
+
     problem, said = posed()
     done = time.perf_counter()
-    problem, forward = watched(problem)
+    problem, forward, smoothed, raised = reviewed(problem)
     if faults.count(problem):
         # what faults did to the states around them may have passed for noise of the IMU
-        other, says = posed(faults.spans(problem))
+        wrong = faults.spans(problem)
+        other, says = posed(wrong)
         if judgement.calmer(other.recording.imu.noise, problem.recording.imu.noise):
-            other, ahead = watched(other)
-            if faults.count(other) <= faults.count(problem):
-                problem, forward, said = other, ahead, says
+            problem, said = faults.without(other, wrong), says
+            forward = ekf(problem, progress, aligned.until)
+            problem, raised = judgement.judge_wheels(problem, backward(problem, forward, progress))
+            forward = ekf(problem, progress, aligned.until) if raised else forward
+            smoothed = backward(problem, forward, progress)
+    said = (*said, *raised)
     timings = {
         "detection": detected - began,
         "alignment": after - detected,
         "judgement": done - after,
+        "smoother": time.perf_counter() - done,
     }
-    began = time.perf_counter()
-    raised: tuple[str, ...] = ()
-    for again in range(_REVIEWS):
-        before = faults.count(problem)
-        if before:
-            apart = faults.widened(problem)
-            smoothed = backward(apart, ekf(apart, progress, aligned.until), progress)
-            problem = faults.readmitted(problem, smoothed)
-        else:
-            smoothed = backward(problem, forward, progress)
-        if not again:
-            problem, raised = judgement.judge_wheels(problem, smoothed)
-        if before:
-            problem, forward = watched(problem)
-        elif raised:
-            forward = ekf(problem, progress, aligned.until)
-        if faults.count(problem) == before:
-            break
-    if before or raised:
-        smoothed, said = backward(problem, forward, progress), (*said, *raised)
     wrong = faults.spans(problem, smoothed)
     said = (*said, *faults.notes(wrong, problem))
-    timings["smoother"] = time.perf_counter() - began
     start = smoothed
     if astray:
         prior = InitialPrior(keyframe=problem.prior.keyframe, mean=stated.state, sigma=stated.sigma[None])

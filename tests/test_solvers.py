@@ -30,7 +30,12 @@ from graphnav.trajectory import Trajectory
 
 KERNELS = ("none", "huber", "cauchy", "geman-mcclure", "tukey", "welsch")
 NO_WHEELS = {"nhc": False, "odometer": False}
-WHITE = {"time_offset_sigma": 0.0, "sd_factor": 1.0, "slow_share": 0.0}  # fixes are what they are simulated as
+WHITE = {
+    "faults": False,
+    "time_offset_sigma": 0.0,
+    "sd_factor": 1.0,
+    "slow_share": 0.0,
+}  # fixes are what they are simulated as
 
 
 # ----------------------------------------------------------------------------------------------- linear problems

@@ -118,7 +118,8 @@ def incremental(
     records = {}
     for rows in problem.constraints:
         r = residual_record(problem, rows, states, chains)
-        records[rows.name] = replace(r, weight=weight_and_cost(rows.robust, np.sqrt(r.nis), rows.robust_scale)[0])
+        robust, _ = weight_and_cost(rows.robust, np.sqrt(r.nis), rows.robust_scale)
+        records[rows.name] = replace(r, weight=robust * r.weight)
     settled = Solution(
         solver="incremental",
         frame=problem.frame,

@@ -1,0 +1,232 @@
+"""Fixes that are wrong: found over time, left out by every solver alike, and taken back where they are right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import oracle
+import pytest
+
+from graphnav import faults
+from graphnav.alignment import align
+from graphnav.config import Settings, settings_from
+from graphnav.detectors import detect
+from graphnav.earth import LocalFrame
+from graphnav.pipeline import origin, run
+from graphnav.problem import Problem, pose
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+from graphnav.scoring import errors
+from graphnav.solution import Solution
+from graphnav.solvers.batch import batch
+from graphnav.solvers.ekf import backward, ekf
+from graphnav.solvers.watch import Bank, Verdicts
+from graphnav.trajectory import Trajectory
+
+OFF = settings_from({"gnss": {"faults": False}})
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[Recording, Trajectory]:
+    return oracle.drive(oracle.vehicle_path(duration=420, seed=11), seed=3)
+
+
+@pytest.fixture(scope="module")
+def posed(drive: tuple[Recording, Trajectory]) -> Problem:
+    """The problem of the drive, its fixes taken as they are stated."""
+    recording = drive[0]
+    settings = settings_from({"gnss": {"slow_share": 0.0, "sd_factor": 1.0, "time_offset_sigma": 0.0}})
+    frame = LocalFrame(origin(recording))
+    found = align(recording, settings, frame, lambda p, s: batch(p, s, wanted=(0,), reintegrate=False))
+    stationary = detect(recording, settings).stationary
+    return pose(recording, settings, frame, found.state, found.sigma, stationary)
+
+
+def moved(recording: Recording, rows: Array, by: Array) -> Recording:
+    """The recording with some fixes moved, m in east, north and up."""
+    gnss, frame = recording.gnss, LocalFrame(origin(recording))
+    assert gnss is not None
+    p = frame.from_llh(gnss.llh)
+    p[rows] += by
+    return replace(recording, gnss=replace(gnss, llh=frame.to_llh(p)))
+
+
+def horizontal(solution: Solution, truth: Trajectory) -> Array:
+    """(N,) m of error."""
+    return np.linalg.norm(errors(solution.trajectory(), truth).p[:, :2], axis=1)
+
+
+def left_out(solution: Solution, recording: Recording) -> Array:
+    """Mask of the fixes in `excluded`."""
+    assert recording.gnss is not None
+    t, out = recording.gnss.t, np.zeros(len(recording.gnss.t), dtype=bool)
+    for fault in solution.excluded:
+        if fault.kind == "gnss_position":
+            out |= (t >= fault.t_start - 1e-6) & (t <= fault.t_end + 1e-6)
+    return out
+
+
+# ---------------------------------------------------------------------------------------------------------- the tests
+
+
+def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    """G of an error since row 63, against two filters whose fixes differ by it."""
+    seen: dict[int, Array] = {}
+    updated = Bank.updated
+
+    def spy(self: Bank, name: str, K: Array, G: Array, weighted: Array, r: Array, speed: float) -> int | None:
+        row = self._slots[name].seen - 1 if name == "gnss_position" else -1
+        if 63 <= row < 160:
+            seen[row] = G[:, 6 * 3 : 6 * 3 + 3].copy()  # slot 6 begins at its 64th fix
+        updated(self, name, K, G, weighted, r, speed)
+        return None
+
+    rows = next(c for c in posed.constraints if c.name == "gnss_position")
+    monkeypatch.setattr(Bank, "updated", spy)
+    plain = ekf(posed, watch=True).solution.records[rows.name].residual
+    delta = 1e-3
+    for axis in range(3):
+        p = rows.p_n.copy()
+        p[63:, axis] += delta
+        shifted = replace(rows, p_n=p)
+        other = replace(posed, constraints=tuple(shifted if c is rows else c for c in posed.constraints))
+        change = (ekf(other).solution.records[rows.name].residual - plain) / delta
+        # innovations are the negative of residuals, in axes of the fix
+        C = rows.R_ln[63:160]
+        expected = -np.einsum("nij,nj->ni", np.stack([seen[k] for k in range(63, 160)]) @ C, np.eye(3)[[axis] * 97])
+        assert np.allclose(change[63:160], expected, atol=0.02), axis
+
+
+def test_filter_and_its_tests_are_the_filter_where_nothing_is_wrong(posed: Problem) -> None:
+    watched, plain = ekf(posed, watch=True), ekf(posed)
+    assert all(np.all(w == 1.0) for w in watched.weights.values())
+    assert np.array_equal(watched.solution.states.p, plain.solution.states.p)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_clean_drive_keeps_every_fix(seed: int) -> None:
+    recording, _ = oracle.drive(oracle.vehicle_path(duration=200, seed=20 + seed), seed=seed)
+    with_tests, without = run(recording), run(recording, OFF)
+    for name, solution in with_tests.items():
+        assert not solution.excluded
+        assert np.array_equal(solution.states.p, without[name].states.p), name
+
+
+# ---------------------------------------------------------------------------------------------------------- whole runs
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_gross_outliers_and_a_burst(drive: tuple[Recording, Trajectory], seed: int) -> None:
+    """Every tenth fix 5 to 200 m off, and 30 s that are 10 m off alike."""
+    recording, truth = drive
+    assert recording.gnss is not None
+    rng, t = np.random.default_rng([7, seed]), recording.gnss.t - recording.start
+    bad, begin = rng.random(len(t)) < 0.1, rng.uniform(60, 350)
+    u = rng.standard_normal((len(t), 3))
+    by = u / np.linalg.norm(u, axis=1, keepdims=True) * rng.uniform(5, 200, (len(t), 1))
+    burst = (t >= begin) & (t < begin + 30)
+    by[burst], bad = [8.0, -6.0, 0.0], bad | burst
+    wrong = moved(recording, bad, by[bad])
+    found = run(wrong)
+    given_up = left_out(found["batch"], wrong)
+    assert np.mean(given_up[bad]) == 1.0  # recall
+    assert np.mean(bad[given_up]) > 0.8  # precision
+    kept = replace(
+        recording, gnss=replace(recording.gnss, **{k: getattr(recording.gnss, k)[~bad] for k in ("t", "llh", "sd")})
+    )
+    by_hand = run(kept, OFF)
+    for name in ("rts", "batch"):
+        mine, theirs = (np.sqrt(np.mean(horizontal(s[name], truth) ** 2)) for s in (found, by_hand))
+        assert mine < 1.2 * theirs, (name, mine, theirs)
+    assert horizontal(run(wrong, OFF)["rts"], truth).max() > 5.0  # or the test would show nothing
+
+
+def test_error_that_grows(drive: tuple[Recording, Trajectory]) -> None:
+    """0.2 m/s for two minutes: no single fix stands out until it ends."""
+    recording, truth = drive
+    assert recording.gnss is not None
+    t = recording.gnss.t - recording.start
+    bad = (t >= 200.0) & (t < 320.0)
+    grown = 0.2 * (t[bad] - 200.0)
+    wrong = moved(recording, bad, np.stack([0.6 * grown, 0.8 * grown, 0.0 * grown], -1))
+    found, by_hand = run(wrong), run(recording.without("gnss", (199.9, 319.9)), OFF)
+    plain = run(wrong, OFF)
+    worst = {name: horizontal(s, truth).max() for name, s in found.items()}
+    for name in ("rts", "batch"):
+        assert worst[name] < 2.0 * horizontal(by_hand[name], truth).max(), (name, worst)
+    assert horizontal(plain["batch"], truth).max() > 5.0
+    given_up = left_out(found["ekf"], wrong)
+    assert np.mean(given_up[bad]) > 0.8
+    assert np.sum(given_up & ~bad) <= 5
+    (fault,) = [f for f in found["batch"].excluded if f.t_end - f.t_start > 60.0]
+    assert "m from where everything else puts it" in fault.reason
+    assert any("are wrong and left out" in note for note in found["batch"].notes)
+
+
+def test_every_solver_leaves_out_the_same(drive: tuple[Recording, Trajectory]) -> None:
+    recording, _ = drive
+    wrong = moved(recording.crop(0.0, 200.0), np.arange(100, 110), np.array([30.0, 0.0, 0.0]))
+    found = run(wrong, solvers=("ekf", "rts", "batch", "incremental"))
+    for name, solution in found.items():
+        assert np.all(solution.records["gnss_position"].weight[100:110] == 0.0), name
+    apart = np.linalg.norm(found["incremental"].states.p - found["batch"].states.p, axis=1)
+    assert apart.max() < 0.01
+
+
+def test_more_wrong_than_right_is_not_believed(drive: tuple[Recording, Trajectory]) -> None:
+    """Where the fixes contradict a filter's figures everywhere, the filter is not right and they are used."""
+    recording, _ = drive
+    recording = recording.crop(0.0, 200.0)
+    assert recording.gnss is not None
+    rng = np.random.default_rng(5)
+    wrong = moved(recording, np.arange(len(recording.gnss.t)), rng.normal(0.0, 20.0, (len(recording.gnss.t), 3)))
+    found = run(wrong, Settings(), ("ekf",))["ekf"]
+    assert np.mean(left_out(found, wrong)) < 0.5
+
+
+# ---------------------------------------------------------------------------------------------------------- parts
+
+
+def test_edges_are_found_from_both_sides(posed: Problem) -> None:
+    """A filter that refused too much and too little: 100 to 120 are wrong, 105 to 140 were left out."""
+    rows = next(c for c in posed.constraints if c.name == "gnss_position")
+    p = rows.p_n.copy()
+    p[100:121] += [3.0, 0.0, 0.0]
+    weight = np.ones(len(rows))
+    weight[105:141] = 0.0
+    wrong = replace(rows, p_n=p, weight=weight)
+    problem = replace(posed, constraints=tuple(wrong if c is rows else c for c in posed.constraints))
+    wide = faults.widened(problem)
+    better = faults.readmitted(problem, backward(wide, ekf(wide)))
+    found = next(c for c in better.constraints if c.name == "gnss_position").weight
+    assert found is not None
+    assert np.array_equal(np.flatnonzero(found == 0.0), np.arange(100, 121))
+
+
+def test_a_filter_astray_gives_up_what_led_it_there(posed: Problem) -> None:
+    rows = next(c for c in posed.constraints if c.name == "gnss_position")
+    verdicts = Verdicts([rows], posed.t)
+    used = verdicts.used[rows.name]
+    verdicts.settle(rows.name, 100, 110)  # a fault
+    assert not used[100:110].any()
+    for k in range(115, 180):  # five fixes used, and all after them refused
+        at = verdicts.settle(rows.name, k, k + 1)
+        if at != rows.keyframe[k]:
+            break
+    assert at == rows.keyframe[100]  # from before the first fault
+    assert not used[100:115].any()
+    assert used[115 : k + 1].all()
+
+
+def test_spans_and_back(posed: Problem) -> None:
+    rows = next(c for c in posed.constraints if c.name == "gnss_position")
+    weight = np.ones(len(rows))
+    weight[[3, 4, 5, 9]] = 0.0
+    problem = faults.weighted(posed, {rows.name: weight})
+    found = faults.spans(problem)
+    assert [(f.count, f.kind) for f in found] == [(3, rows.name), (1, rows.name)]
+    again = faults.without(posed, found)
+    assert np.array_equal(next(c for c in again.constraints if c.name == rows.name).weight, weight)
+    assert faults.count(again) == 4
+    assert faults.count(faults.all_used(again)) == 0
