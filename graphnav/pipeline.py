@@ -128,12 +128,17 @@ def _solve(
     found_heading = aligned.motion is not None  # without motion heading zero is only a convention
     astray = found_heading and bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
 
+    spent: list[float] = []
+
     def posed(wrong: tuple[faults.Fault, ...] = ()) -> tuple[Problem, tuple[str, ...]]:
         tell("judgement")
         sensed, how, said = judged(recording, settings, frame, aligned, stationary, wrong)
         begin = aligned if astray else stated
         tell("preintegration")
-        return pose(sensed, how, frame, begin.state, begin.sigma, stationary), said
+        started = time.perf_counter()
+        problem = pose(sensed, how, frame, begin.state, begin.sigma, stationary)
+        spent.append(time.perf_counter() - started)
+        return problem, said
 
     def watched(problem: Problem) -> tuple[Problem, Filtered]:
         forward = ekf(problem, progress, aligned.until, watch=True)
@@ -183,8 +188,9 @@ def _solve(
     timings = {
         "detection": detected - began,
         "alignment": after - detected,
-        "judgement": done - after,
-        "smoother": time.perf_counter() - done,
+        "judgement": done - after - spent[0],
+        "preintegration": sum(spent),
+        "smoother": time.perf_counter() - done - sum(spent[1:]),
     }
     wrong = faults.spans(problem, smoothed)
     said = (*said, *faults.notes(wrong, problem))

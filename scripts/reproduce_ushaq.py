@@ -22,13 +22,14 @@ import numpy as np
 
 from graphnav.config import Settings, settings_from
 from graphnav.errors import EstimationError
-from graphnav.pipeline import SOLVERS, run
+from graphnav.pipeline import run
 from graphnav.simulation import Simulated, simulate
 from graphnav.simulation.scenarios.ushaq import FAULTS
 from graphnav.solution import Solution
 
 Array = np.ndarray
 BACK = 50.0  # m, below which a solution has recovered
+SOLVERS = ("ekf", "rts", "incremental", "batch")
 AFTER = 300.0  # s after a fault that still count as its consequence
 # name: (options of the scenario, whether GNSS is used, whether stops are)
 SCHEMES: dict[str, tuple[dict[str, Any], bool, bool]] = {
@@ -51,10 +52,11 @@ PAPER = {
     "growing": "havoc, recovers only with GNSS (Fig. 11-12)",
     "growing/ZUPT, 20 min": "stays within bounds (Fig. 16-18)",
 }
+PLAIN = {"faults": False, "slow_share": 0.0, "sd_factor": 1.0, "time_offset_sigma": 0.0}
 VARIANTS: dict[str, dict[str, Any]] = {
-    "plain": {"slow_share": 0.0, "sd_factor": 1.0, "time_offset_sigma": 0.0},
-    "gate": {"slow_share": 0.0, "sd_factor": 1.0, "time_offset_sigma": 0.0, "gate": 5.0},
-    "kernel": {"slow_share": 0.0, "sd_factor": 1.0, "time_offset_sigma": 0.0, "robust": "tukey", "robust_scale": 5.0},
+    "plain": PLAIN,
+    "gate": {**PLAIN, "gate": 5.0},
+    "kernel": {**PLAIN, "robust": "tukey", "robust_scale": 5.0},
     "default": {},
 }
 COLUMNS = ("inside, RMS m", "max m", "outside, RMS m", "max m", "inside, RMS m/s", "max m/s", "outside, RMS m/s",
