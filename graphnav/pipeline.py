@@ -190,7 +190,7 @@ def _solve(
         "alignment": after - detected,
         "judgement": done - after - spent[0],
         "preintegration": sum(spent),
-        "smoother": time.perf_counter() - done - sum(spent[1:]),
+        "smoother": time.perf_counter() - done - sum(spent[1:]) - forward.solution.timings["filter"],
     }
     wrong = faults.spans(problem, smoothed)
     said = (*said, *faults.notes(wrong, problem))
