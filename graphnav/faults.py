@@ -26,7 +26,7 @@ from graphnav.solution import Fault
 from graphnav.solvers.ekf import Smoothed
 from graphnav.state import DIM
 
-_EDGE = 60.0  # s
+_EDGE = 60.0  # s; farther from a fault a smoother without GNSS could not tell right from wrong
 _DISAGREES = 1e-3  # chance of T by which a window next to a fault is taken for a part of it
 
 

@@ -143,8 +143,9 @@ def _solve(
     def watched(problem: Problem) -> tuple[Problem, Filtered]:
         forward = ekf(problem, progress, aligned.until, watch=True)
         found = faults.weighted(problem, forward.weights)
-        if faults.share(found) > _MOST:
+        if too_many := faults.share(found) > _MOST:
             found = faults.all_used(problem)
+        if too_many or forward.anew:
             forward = ekf(found, progress, aligned.until)
         return found, forward
 

@@ -64,6 +64,7 @@ class Forward:
     F: Array  # (K-1, D, D)
     records: dict[str, _Innovations]
     weights: dict[str, Array]  # (N,) of the rows of watched constraints: 0 where a fault was found
+    anew: bool  # it began anew somewhere, which no other solver can: its estimates are not to be used
     about: Smoothed | None  # points at which the first keyframes were linearised; their P is of errors about these
 
 
@@ -209,7 +210,8 @@ def _forward(
             progress("filter", k / K)
         k += 1
     weights = {rows.name: records[rows.name].used for rows in watched}
-    return Forward(states, all_values, all_vp, all_P, predicted, all_Pp, all_F, records, weights, about)
+    anew = bool(verdicts.anew)
+    return Forward(states, all_values, all_vp, all_P, predicted, all_Pp, all_F, records, weights, anew, about)
 
 
 def _update(
