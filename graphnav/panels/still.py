@@ -1,4 +1,4 @@
-"""A `Drawing` as a matplotlib figure, to write in any format.
+"""A `Drawing` as a matplotlib figure, to write in any format, and as an SVG element of a page.
 
 Lines are placed straight on a `matplotlib.figure.Figure`, as what a drawing says is in points already. Nothing here
 touches pyplot, and matplotlib is imported at the first figure.
@@ -6,11 +6,14 @@ touches pyplot, and matplotlib is imported at the first figure.
 
 from __future__ import annotations
 
+import io
+import re
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graphnav.panels.colours import colour
+from graphnav.panels.colours import PALETTE, colour
 from graphnav.panels.drawing import LEFT, Drawing, Item, Panel
 from graphnav.panels.thinning import BINS
 from graphnav.rotation import Array
@@ -20,13 +23,35 @@ if TYPE_CHECKING:
 
 FONT = 10.0
 _LEGEND_ROW = 15.0
+_NAMES = {pair[0]: name for name, pair in PALETTE.items()}  # of light pages' colours, each its own
 
 
-def figure(drawing: Drawing) -> Figure:
-    """The drawing on a matplotlib figure with its legend on top."""
+def svg(drawing: Drawing, words: str) -> str:
+    """The drawing without its legend, as an element of a page that has `css_colours`.
+
+    It follows the reader's light or dark colours and the page's font; `words` say what it shows to those who
+    cannot see it.
+    """
+    import matplotlib
+
+    out = io.StringIO()
+    # the page has many drawings, and the names in each must be its own
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": words}):
+        figure(drawing, legend=False).savefig(out, format="svg", transparent=True)
+    body = out.getvalue()
+    body = body[body.index("</defs>") + len("</defs>") :]  # the head has a date, and a style for the whole page
+    body = re.sub(r' style="[^"]*"', lambda m: re.sub(r"#[0-9a-f]{6}", lambda c: f"var(--{_NAMES[c[0]]})", m[0]), body)
+    body = re.sub(r' d="[^"]*"', lambda m: re.sub(r"(\.\d\d)\d+", r"\1", m[0].replace(" \n", "")), body)
+    body = re.sub(r'font-family: [^;]*; | transform="rotate\(-0 [^"]*"| id="[a-z0-9]+_\d+"|\n *', "", body)
+    head = f'viewBox="0 0 {drawing.width:g} {drawing.height:g}" role="img" aria-label="{escape(words)}"'
+    return f'<svg {head} stroke-linejoin="round">{body}'
+
+
+def figure(drawing: Drawing, legend: bool = True) -> Figure:
+    """The drawing on a matplotlib figure, its legend on top."""
     from matplotlib.figure import Figure
 
-    rows = _legend_rows(drawing)
+    rows = _legend_rows(drawing) if legend else []
     height = drawing.height + _LEGEND_ROW * len(rows)
     out = Figure(figsize=(drawing.width / 72.0, height / 72.0), dpi=100)
     for panel in drawing.panels:
