@@ -141,7 +141,9 @@ def checked(path):
     assert parser.references
     assert all(r[1:] in parser.ids for r in parser.references if r.startswith("#"))
     assert all(r.startswith(("#", "data:")) for r in parser.references)
-    assert not re.search(r"url\(|@import", re.sub(r'id="plotly-library">[^<]*<', "<", html))
+    own = re.sub(r'id="plotly-library">[^<]*<', "<", html)
+    assert not re.search(r"url\((?!#)|@import", own)
+    assert set(re.findall(r"url\(#([^)]*)\)", own)) <= set(parser.ids)
     # two elements of the library and its use, and the data of every picture
     assert parser.tags.count("script") == (len(parser.figures) + 2 if "plotly-library" in parser.ids else 0)
     assert set(re.findall(r"var\(--([\w-]+)\)", html)) <= set(re.findall(r"--([\w-]+):", html))
