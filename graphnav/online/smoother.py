@@ -18,8 +18,9 @@ from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.judgement import FIXES
+from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sensors import Row, Sensors
-from graphnav.online.tracker import CONTEXT, SURE, Live, Tracker
+from graphnav.online.tracker import Live, Tracker
 from graphnav.pipeline import judged, origin
 from graphnav.recording import Recording
 from graphnav.solution import to_trajectory
@@ -59,7 +60,8 @@ class Online:
         self._judged = 0.0  # s of rows that they were judged by
         self._fixes: list[float] = []  # s, not yet in the graph
         self._began = -np.inf  # s, of what is being smoothed
-        self._due = -np.inf
+        self._due = -np.inf  # s, of IMU time at which the next keyframes can be made
+        self._awake = -np.inf  # s, at which there is anything to do
         self._dirty = np.inf
         self._settled: list[Trajectory] = []
         self._last_settled = -np.inf
@@ -75,7 +77,7 @@ class Online:
         sensors = self.sensors
         before = sensors.imu.newest
         if sensor == "imu" and sensors.add_next(t, values, before):  # as all but a few do
-            if t >= self._due:
+            if t >= self._awake:
                 self._look()
             return
         previous = sensors.odometer.newest
@@ -87,6 +89,9 @@ class Online:
                 self._restart(before)
         tracker = self.tracker
         if tracker is not None:
+            self._awake = -np.inf
+            if sensor == "imu" and t < before:
+                tracker.came_late(t)
             if sensor == "gnss" and t > tracker.newest + SAME_TIME:
                 self._fixes = sorted([*self._fixes, t])
                 self._due = min(self._due, t + AFTER)
@@ -101,10 +106,24 @@ class Online:
             self._look()
 
     def _look(self) -> None:
-        if self.tracker is None:
+        """Do what there is to do; without keyframes to make one thing at a row, so that none waits for long."""
+        now, tracker = self.sensors.imu.newest, self.tracker
+        if tracker is None:
             self._align()
+            self._awake = self._due if self.tracker is None else now
+        elif now >= self._due:
+            self._advance(tracker)
+            self._awake = now
+        elif tracker.spare(self.sensors, expected := self._expected(tracker)):
+            self._collect(tracker)
         else:
-            self._advance(self.tracker)
+            self._awake = expected if now < expected else self._due
+
+    def _expected(self, tracker: Tracker) -> float:
+        """When the next keyframe will stand, as far as is known, s."""
+        T, period = tracker.newest, 1.0 / self.settings.keyframes.rate
+        fix = min((t for t in self._fixes if t > T + SAME_TIME), default=np.inf)
+        return fix if fix - T <= period * (1.0 + 1e-6) else T + period
 
     def live(self) -> Live | None:
         """The state at the newest IMU row; None while aligning."""
@@ -244,6 +263,7 @@ class Online:
                 getattr(sensors, name).add(float(row[0]), tuple(row[1:]))
         sensors.oldest = before
         self._fixes, self._dirty, self._due = [], np.inf, sensors.imu.newest + _TRY
+        self._awake = self._due
 
     # --------------------------------------------------------------------------------------------------- running
     def _advance(self, tracker: Tracker, last: bool = False) -> None:

@@ -18,11 +18,12 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.standstill import PLACE
 from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.dense import Dense
-from graphnav.detectors import detect, stops
+from graphnav.detectors import detect
 from graphnav.detectors.base import merged
 from graphnav.dynamics import SCALE, Motion
 from graphnav.earth import LocalFrame
 from graphnav.online.evidence import Evidence
+from graphnav.online.looks import CONTEXT, SURE, Readings, Stops, clipped
 from graphnav.online.sensors import Sensors
 from graphnav.preintegration import GAP, Intervals, bridge_gaps, preintegrate
 from graphnav.problem import NODE_SPACING, Problem, keyframe_times, pose, to_samples
@@ -31,20 +32,13 @@ from graphnav.rotation import Array
 from graphnav.solvers.stages import Place, Step
 from graphnav.solvers.window import Message, Smoothed, Window, turn_limit
 from graphnav.state import DIM, Parameter, States
-from graphnav.wheels import Figures, MeanSpeed, faults
+from graphnav.wheels import MeanSpeed
 
-CONTEXT = 30.0  # s of rows before a keyframe that its constraints may look at
-_NEAR = 2.0  # s of the same, where the IMU has no gap
+_NEAR = 2.0  # s of rows before a keyframe that its constraints look at where the IMU has no gap; else `CONTEXT`
 _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
-_EVERY = 2.0  # s between looks of the detectors
 _WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector sees, and the least
 _SHORTEST = 0.05  # s between looks at a walk that are worth keyframes
 _STANDS = 3.0  # s, a stance as long as that is standing, and need not be over
-_WHEELS, _WHEELS_LOOK = 10.0, 40.0  # s between looks at the odometer, and what they see
-_LOOK = 30.0  # s that the detectors see
-_SEEN = 25.0  # s of these that they answer for; the first few lack what was before
-_REVIEW = 10.0  # s between looks at what was answered before, while nothing stands
-SURE = 1.0  # s before now that they answer for: the end of a stop shows only when it is over
 _PLACE_SIGMA = 1000.0  # m, of where a stop may be
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
 _LATEST = 0.5  # of the lag by which they may be late for it, where states still move
@@ -73,10 +67,10 @@ class Tracker:
         self.settings, self.frame = settings, frame
         self.foot = setup.platform == "foot"
         self.window = Window(message, turn_limit(setup.imu.noise))
-        self._begun = t0  # s
         self.head = t0  # time of the message before the window, or of the first keyframe as long as it is in it
         self.opened = False  # whether the first keyframe has left the window
-        self.stops: Array = np.empty((0, 2))  # s, between keyframes
+        self._standing = Stops()
+        self._readings = Readings(t0)
         self.settled: list[Smoothed] = []
         self.evidence = Evidence()
         self.in_force: dict[str, int] = {}  # rows of each constraint at the newest keyframe
@@ -84,12 +78,10 @@ class Tracker:
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
         self._parameters: dict[str, Parameter] = {}
-        self._detected = self._judged = self._reviewed = -np.inf
         self._intervals: dict[float, Intervals] = {}  # integrated already, by the time they end at
-        self._figures: Figures | None = None  # of the odometer's readings
-        self._told = -np.inf  # s, when these were told
-        self._lag: float | None = None  # s by which it is late, as far as the IMU can tell
-        self._wrong: Array = np.empty((0, 2))  # s, where its readings are wrong
+        self._dirty = np.inf  # s, from where on keyframes are to be redone with the next
+        self._tried = -np.inf  # s, the newest keyframe when some were to settle last
+        self._turned = False  # whether something has moved so far that it may have to be linearised again
 
     @property
     def newest(self) -> float:
@@ -97,23 +89,40 @@ class Tracker:
         return self.window.stages[-1].place.t if self.window.stages else self.head
 
     @property
+    def stops(self) -> Array:
+        """Spans (M, 2) between keyframes in which the vehicle stands, or the foot, s."""
+        return self._standing.spans
+
+    @property
     def times(self) -> Array:
         """Times of all keyframes that an interval in the window touches, s."""
         t = self.window.t
         return np.concatenate([[self.head], t]) if self.opened else t
+
+    @property
+    def _oldest(self) -> float:
+        """Time of the oldest keyframe in the window, s."""
+        return self.window.stages[0].place.t if self.window.stages else self.newest
+
+    def came_late(self, t: float) -> None:
+        """A row of the IMU came after newer ones: what was integrated beyond it is void."""
+        self._intervals = {end: iv for end, iv in self._intervals.items() if end < t}
 
     def update(self, sensors: Sensors, new: Array, dirty: float = np.inf) -> None:
         """Add keyframes at the times `new`, after the newest, and redo those from `dirty` on."""
         clock = [time.process_time()]
         if dirty < np.inf:
             self._intervals = {t: iv for t, iv in self._intervals.items() if t < dirty}
+        if self._turned:
+            self._converge(sensors)
         now = max(self.newest, float(new[-1]) if len(new) else -np.inf)
-        looked = not self.foot and now - self._detected >= _EVERY - SAME_TIME
-        if looked:
-            dirty = min(dirty, self._classify(sensors, new, now))
-        # what can wait for the next keyframe does, so that no update does everything
-        if now - self._judged >= _WHEELS - SAME_TIME and not (looked and now - self._judged < _WHEELS + _EVERY):
-            dirty, looked = min(dirty, self._judge_odometer(sensors, now)), True
+        if not self.foot:
+            if self._standing.due(now):
+                self._standing.look(sensors, self.settings, now, min([self.head, *new.tolist()]))
+            dirty = min(dirty, self._standing.take(np.unique(np.concatenate([self.times, new]))))
+            if not self._readings.looked:
+                self._readings.look(sensors, now)
+        dirty, self._dirty = min(dirty, self._dirty), np.inf
         clock.append(time.process_time())
         again = [stage.place.t for stage in self.window.since(dirty - SAME_TIME)]
         times = np.unique(np.concatenate([again, new]))
@@ -132,18 +141,55 @@ class Tracker:
         turn = 0.0
         for k in range(len(before), len(problem.t)):
             turn = max(turn, self._push(problem, k))
-        if turn > self.window.turn:
-            self.window.converge(renewed=lambda first: self._renewed(sensors, first))
+        self._turned = turn > self.window.turn
         self.in_force = {
             c.name: n for c in problem.constraints if (n := int(np.sum(c.keyframe == len(problem.t) - 1)))
         }  # fmt: skip
-        lag = self.settings.solver.lag
-        over = self.newest - self.window.stages[0].place.t - lag * (1.0 + 1.0 / _PORTIONS)
-        if over > (_EVERY if looked else 0.0):
-            self.settle(sensors, self.newest - lag)
         self._forget()
         clock.append(time.process_time())
-        self.seconds = dict(zip(("detectors", "posing", "solving"), np.diff(clock).tolist(), strict=True))
+        self.seconds = dict(zip(("looking", "posing", "solving"), np.diff(clock).tolist(), strict=True))
+
+    def spare(self, sensors: Sensors, expected: float = np.inf) -> bool:
+        """Do one thing that need not wait for the next keyframe, or should not delay it; False if there is none.
+
+        What comes out depends on the rows that have come when it is called, so it is called at certain rows.
+
+        Parameters
+        ----------
+        expected : s, when the next keyframe should be: once the IMU is there, its interval can be integrated.
+        """
+        lag, now = self.settings.solver.lag, sensors.imu.newest
+        if self._turned:
+            self._converge(sensors)
+        elif self._tried < self.newest and self.newest - self._oldest > lag * (1.0 + 1.0 / _PORTIONS):
+            self._tried = self.newest
+            self.settle(sensors, self.newest - lag)
+        elif self.foot:
+            return False
+        elif self._readings.due(self.newest):
+            self._dirty = min(self._dirty, self._readings.look(sensors, self.newest))
+        elif now < expected or expected <= self.newest:
+            return False
+        elif expected not in self._intervals:
+            self._integrate(sensors, expected)
+        elif self._standing.due(expected):
+            self._standing.look(sensors, self.settings, expected, self.head)
+        else:
+            return False
+        return True
+
+    def _integrate(self, sensors: Sensors, expected: float) -> None:
+        """The interval up to a keyframe that is expected."""
+        T, start = self.newest, self.window.newest.state
+        imu = self._around(sensors, T, sensors.imu.newest).imu
+        self._intervals[expected] = preintegrate(
+            bridge_gaps(imu), imu, np.array([T, expected]), start.ba[0], start.bg[0]
+        )  # fmt: skip
+
+    def _converge(self, sensors: Sensors) -> None:
+        self._turned = False
+        self.window.converge(renewed=lambda first: self._renewed(sensors, first))
+        self._forget()
 
     def settle(self, sensors: Sensors, until: float = np.inf) -> None:
         """Settle the keyframes before a time."""
@@ -218,7 +264,7 @@ class Tracker:
         recording = self._around(sensors, begin, float(times[-1]) + 0.1)
         start, speed = self.window.newest.state, None
         if recording.odometer is not None:
-            speed = MeanSpeed.of(recording.odometer, self._wrong, self._figures)
+            speed = MeanSpeed.of(recording.odometer, self._readings.wrong, self._readings.figures)
         usual = None
         if recording.gnss is not None:
             usual = (self.settings.gnss.sd_factor or 1.0) * sensors.usual(recording.gnss.t)
@@ -308,20 +354,20 @@ class Tracker:
                 break  # nor do those before it
             stages[k] = replace(stages[k], place=replace(stages[k].place, problem=None))
 
-    # ----------------------------------------------------------------------------------------- stops, bad readings
+    # ----------------------------------------------------------------------------------------- stops
     def steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
         """Keyframes of a walk, step by step: up to the newest stance that has begun or ended, whose spans are kept.
 
         Only whole stances and swings say what phase a moment of them is in.
         """
         T = self.newest
-        whole = not np.isfinite(self._detected)
+        whole = not np.isfinite(self._standing.looked)
         recording = sensors.recording(-np.inf if whole else min(T, limit) - _WALK, limit + SURE)
         if recording.duration < _WALK_LEAST:
             return np.empty(0)
         rows = recording.imu.t  # keyframes stand where the stances will be said to begin and end
         limit = float(rows[max(int(np.searchsorted(rows, limit + SAME_TIME)) - 1, 0)])
-        spans = _clipped(to_samples(detect(recording, self.settings).stationary, recording), T, limit)
+        spans = clipped(to_samples(detect(recording, self.settings).stationary, recording), T, limit)
         if not last and len(spans):
             ongoing = spans[-1, 1] >= limit - SAME_TIME
             if ongoing and limit - spans[-1, 0] < _STANDS:
@@ -332,69 +378,13 @@ class Tracker:
             return np.empty(0)
         if limit - T <= _SHORTEST:
             return np.empty(0)
-        self._detected = limit
-        self.stops = merged(np.concatenate([self.stops, spans]), gap=SAME_TIME)
-        self.stops = self.stops[self.stops[:, 1] > self.head - CONTEXT]
+        self._standing.looked = limit
+        known = merged(np.concatenate([self.stops, spans]), gap=SAME_TIME)
+        self._standing.spans = known[known[:, 1] > self.head - CONTEXT]
         # a swing is one because of the stance before it
         begin = max([T - _WALK, *self.stops[self.stops[:, 0] <= T, 0].tolist()]) if len(self.stops) else T
         part = sensors.recording(min(begin, T), limit)
-        around = _clipped(self.stops, part.start, limit)
+        around = clipped(self.stops, part.start, limit)
         epochs = [cls.epochs(part, self.settings, around) for cls in registered()]
         times = keyframe_times(T, limit, np.concatenate([*epochs, np.empty(0)]), self.settings.keyframes.rate)
         return times if not len(self.window) and not self.opened else times[1:]
-
-    def _judge_odometer(self, sensors: Sensors, now: float) -> float:
-        """Look for wrong readings of the odometer; returns the start of the first that was not known."""
-        whole, self._judged = not np.isfinite(self._judged), now
-        recording = sensors.recording(-np.inf if whole else now - _WHEELS_LOOK, now)
-        if recording.odometer is None:
-            return np.inf
-        lag = self._lag
-        if now - self._begun >= 2.0 * (self._told - self._begun):  # ever more seldom, as more readings tell little new
-            every = sensors.recording().odometer
-            assert every is not None
-            self._figures, self._told, lag = Figures.of(every), now, None
-        seen, known = faults(recording.odometer, recording.imu, self._figures, lag), self._wrong
-        found, self._lag = seen.spans, seen.lag
-        since = float(recording.odometer.t[0]) + (0.0 if whole else 5.0)
-        old = known[(known[:, 0] < since) & (known[:, 1] > since - CONTEXT - _WHEELS_LOOK)]
-        self._wrong = np.concatenate([old, found[found[:, 0] >= since]])
-        new = self._wrong[~np.isin(self._wrong[:, 0], known[:, 0])]
-        return float(new[0, 0]) if len(new) and len(self.window) else np.inf
-
-    def _classify(self, sensors: Sensors, new: Array, now: float) -> float:
-        """Ask the detectors; returns the start of the first interval between keyframes that they see otherwise."""
-        whole = not np.isfinite(self._detected)
-        since, answered = (min(self.head, *new.tolist()), -np.inf) if whole else (now - _SEEN, self._detected - SURE)
-        if now - self._reviewed >= _REVIEW - SAME_TIME:
-            self._reviewed, answered = now, since
-        self._detected = now
-        recording = sensors.recording(-np.inf if whole else now - _LOOK, now)
-        found = stops(recording, self.settings, since, now - SURE, self.stops, answered)
-        if found is None or (not len(found) and not len(self.stops)):
-            return np.inf
-        parts = [_clipped(self.stops, -np.inf, since), found]
-        edges = np.unique(np.concatenate([self.times, new]))
-        spans = merged(np.concatenate(parts), gap=SAME_TIME)
-        spans = spans[spans[:, 1] >= edges[0] - SAME_TIME] if len(spans) else spans
-        aligned = []
-        for begin, end in spans:
-            inside = edges[(edges >= begin - SAME_TIME) & (edges <= end + SAME_TIME)]
-            if len(inside):
-                first = begin if begin < edges[0] else float(inside[0])
-                if inside[-1] > first:
-                    aligned.append((first, float(inside[-1])))
-        before, self.stops = self.stops, np.array(aligned).reshape(-1, 2)
-        middle = 0.5 * (edges[1:] + edges[:-1])
-        changed = np.flatnonzero(_within(middle, before) != _within(middle, self.stops))
-        return float(edges[changed[0]]) if len(changed) else np.inf
-
-
-def _clipped(spans: Array, begin: float, end: float) -> Array:
-    cut = np.clip(spans, begin, end)
-    return cut[cut[:, 1] > cut[:, 0]]
-
-
-def _within(t: Array, spans: Array) -> Array:
-    """Which times lie in the spans (M, 2)."""
-    return np.asarray(((t[:, None] >= spans[:, 0]) & (t[:, None] <= spans[:, 1])).any(axis=1))

@@ -1,0 +1,123 @@
+"""What is looked for beside the keyframes as a drive goes on: where the vehicle stands, where its odometer is wrong.
+
+Looks are made now and then (the rows they see overlap), between one keyframe and the next where there is time, and
+take effect at the next keyframe.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME
+from graphnav.detectors import stops
+from graphnav.detectors.base import merged
+from graphnav.online.sensors import Sensors
+from graphnav.rotation import Array
+from graphnav.wheels import Figures, faults
+
+CONTEXT = 30.0  # s of rows before a keyframe that its constraints may look at
+SURE = 1.0  # s before now that the detectors answer for: the end of a stop shows only when it is over
+_EVERY = 2.0  # s between looks of the detectors
+_LOOK = 30.0  # s that they see
+_SEEN = 25.0  # s of these that they answer for; the first few lack what was before
+_REVIEW = 10.0  # s between looks at what was answered before, while nothing stands
+_WHEELS, _WHEELS_LOOK = 10.0, 40.0  # s between looks at the odometer, and what they see
+
+
+class Stops:
+    """Where the vehicle stands, as far as the detectors can tell by now."""
+
+    def __init__(self) -> None:
+        self.spans: Array = np.empty((0, 2))  # s, between keyframes
+        self.looked = -np.inf  # s, up to where
+        self._reviewed = -np.inf
+        self._seen: tuple[float, Array | None] | None = None  # since when, and what; not yet in `spans`
+
+    def due(self, now: float) -> bool:
+        """Whether it is time to look again."""
+        return self._seen is None and now - self.looked >= _EVERY - SAME_TIME
+
+    def look(self, sensors: Sensors, settings: Settings, now: float, head: float) -> None:
+        """Ask the detectors; the first time about everything since `head`."""
+        whole = not np.isfinite(self.looked)
+        since, answered = (head, -np.inf) if whole else (now - _SEEN, self.looked - SURE)
+        if now - self._reviewed >= _REVIEW - SAME_TIME:
+            self._reviewed, answered = now, since
+        self.looked = now
+        recording = sensors.recording(-np.inf if whole else now - _LOOK, now)
+        self._seen = since, stops(recording, settings, since, now - SURE, self.spans, answered)
+
+    def take(self, edges: Array) -> float:
+        """Take over what was seen, cut to keyframes; the start of the first interval between `edges` that changes."""
+        (since, found), self._seen = self._seen or (0.0, None), None
+        if found is None or (not len(found) and not len(self.spans)):
+            return np.inf
+        spans = merged(np.concatenate([clipped(self.spans, -np.inf, since), found]), gap=SAME_TIME)
+        spans = spans[spans[:, 1] >= edges[0] - SAME_TIME] if len(spans) else spans
+        aligned = []
+        for begin, end in spans:
+            inside = edges[(edges >= begin - SAME_TIME) & (edges <= end + SAME_TIME)]
+            if len(inside):
+                first = begin if begin < edges[0] else float(inside[0])
+                if inside[-1] > first:
+                    aligned.append((first, float(inside[-1])))
+        before, self.spans = self.spans, np.array(aligned).reshape(-1, 2)
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        changed = np.flatnonzero(_within(middle, before) != _within(middle, self.spans))
+        return float(edges[changed[0]]) if len(changed) else np.inf
+
+
+class Readings:
+    """What an odometer's readings are worth, and where they are wrong, as far as can be told by now.
+
+    Parameters
+    ----------
+    begun : s, since when there are any.
+    """
+
+    def __init__(self, begun: float) -> None:
+        self.wrong: Array = np.empty((0, 2))  # s
+        self.figures: Figures | None = None
+        self._begun = begun
+        self._looked = self._told = -np.inf  # s, when last, and when for the figures
+        self._lag: float | None = None  # s by which it is late, as far as the IMU can tell
+
+    @property
+    def looked(self) -> bool:
+        """Whether ever."""
+        return bool(np.isfinite(self._looked))
+
+    def due(self, now: float) -> bool:
+        """Whether it is time to look again."""
+        return now - self._looked >= _WHEELS - SAME_TIME
+
+    def look(self, sensors: Sensors, now: float) -> float:
+        """Look for wrong readings; returns the start of the first that was not known."""
+        whole, self._looked = not self.looked, now
+        recording = sensors.recording(-np.inf if whole else now - _WHEELS_LOOK, now)
+        if recording.odometer is None:
+            return np.inf
+        lag = self._lag
+        if now - self._begun >= 2.0 * (self._told - self._begun):  # ever more seldom, as more readings tell little new
+            every = sensors.recording().odometer
+            assert every is not None
+            self.figures, self._told, lag = Figures.of(every), now, None
+        seen, known = faults(recording.odometer, recording.imu, self.figures, lag), self.wrong
+        found, self._lag = seen.spans, seen.lag
+        since = float(recording.odometer.t[0]) + (0.0 if whole else 5.0)
+        old = known[(known[:, 0] < since) & (known[:, 1] > since - CONTEXT - _WHEELS_LOOK)]
+        self.wrong = np.concatenate([old, found[found[:, 0] >= since]])
+        new = self.wrong[~np.isin(self.wrong[:, 0], known[:, 0])]
+        return float(new[0, 0]) if len(new) else np.inf
+
+
+def clipped(spans: Array, begin: float, end: float) -> Array:
+    """The parts of spans between two times."""
+    cut = np.clip(spans, begin, end)
+    return np.asarray(cut[cut[:, 1] > cut[:, 0]])
+
+
+def _within(t: Array, spans: Array) -> Array:
+    """Which times lie in the spans (M, 2)."""
+    return np.asarray(((t[:, None] >= spans[:, 0]) & (t[:, None] <= spans[:, 1])).any(axis=1))
