@@ -23,6 +23,8 @@ transition matrix F = d(end)/d(start) below.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from graphnav import rotation
@@ -80,6 +82,22 @@ class Motion:
         self.step = np.concatenate([intervals.dP, intervals.dV], axis=-1)
         self.expected = np.concatenate([intervals.ba, intervals.bg], axis=-1)
         self.mean = np.concatenate([intervals.force, intervals.rate], axis=-1)
+
+    def prepared(self) -> Motion:
+        """The same, with all that is made when it is asked for first made already."""
+        _ = self.whitener
+        return self
+
+    @cached_property
+    def whitener(self) -> Array:
+        """(n, 15, 15) W with W^T W the inverse of `Intervals.covariance`.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If a covariance is singular.
+        """
+        return np.linalg.inv(np.linalg.cholesky(self.intervals.covariance))
 
     def propagate(self, rows: slice, start: States, scale: Array | None = None) -> tuple[States, Array]:
         """The states at the ends of intervals `rows` and F (n, 15, 15) there, from the states at their starts.
@@ -155,15 +173,15 @@ class Motion:
         Jj[:] = np.eye(DIM)
         Jj[:, :3, :3] = inverse
         value = self._body(r, start.R_nb)
-        both, Jj = self._body_rows(both, start.R_nb), self._body_rows(Jj, start.R_nb)
+        both, Jj = self.body_rows(both, start.R_nb), self.body_rows(Jj, start.R_nb)
         # the frame of p and v turns with the start's attitude
         both[:, 3:6, :3] += rotation.skew(value[:, 3:6])
         both[:, 6:9, :3] += rotation.skew(value[:, 6:9])
         return value, both[:, :, :DIM], Jj, both[:, :, DIM:]
 
-    def _body_rows(self, J: Array, R_nb: Array) -> Array:
+    def body_rows(self, J: Array, R_nb: Array, rows: slice = slice(None)) -> Array:
         """Turn the p and v rows of (n, 15, k) back into the start's body axes: inverse of `frames`."""
-        Et = np.swapaxes(self.back, -1, -2)
+        Et = np.swapaxes(self.back[rows], -1, -2)
         Rt = np.swapaxes(R_nb, -1, -2) @ Et
         out = J.copy()
         out[:, 3:6] = Rt @ J[:, 3:6]
@@ -171,7 +189,7 @@ class Motion:
         return out
 
     def _body(self, r: Array, R_nb: Array) -> Array:
-        return self._body_rows(r[..., None], R_nb)[..., 0]
+        return self.body_rows(r[..., None], R_nb)[..., 0]
 
 
 _I6 = np.eye(6)

@@ -92,7 +92,7 @@ def pose(
     times: Array | None = None,
     speed: MeanSpeed | None = None,
     usual: Array | None = None,
-    known: Mapping[float, Intervals] | None = None,
+    known: Mapping[float, Motion] | None = None,
 ) -> Problem:
     """Pose the estimation problem for a recording.
 
@@ -104,7 +104,7 @@ def pose(
     times : (K,) keyframes, s, where they are given: measurements at other times are left out.
     speed : of the odometer, where it is known already.
     usual : (M, 3) m, the unit of the slow errors of the recording's fixes, where it is known already.
-    known : intervals between keyframes that were integrated before, by the time they end at.
+    known : what intervals between keyframes say that were integrated before, by the time they end at.
     """
     classes = registered()
     stops = to_samples(stationary, recording)
@@ -119,7 +119,12 @@ def pose(
         samples, said = with_whole_peaks(samples, recording.imu.R_bs)
         samples = with_unresolved_motion(samples, recording.imu.noise)
         samples = with_coning(samples) if settings.imu.coning else samples
-    intervals = preintegrate_unknown(samples, recording.imu, t, start.ba[0], start.bg[0], known or {})
+    motion = known.get(float(t[1])) if known and len(t) == 2 else None
+    if motion is None or motion.intervals.t0[0] != t[0]:
+        before = {end: one.intervals for end, one in (known or {}).items()}
+        intervals = preintegrate_unknown(samples, recording.imu, t, start.ba[0], start.bg[0], before)
+        motion = Motion(intervals, frame)
+    intervals = motion.intervals
     scene = Scene(recording, settings, frame, t, stops, intervals, speed, usual)
     built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
     prior = InitialPrior(keyframe=np.zeros(1, dtype=int), mean=start, sigma=np.asarray(sigma)[None])
@@ -130,7 +135,7 @@ def pose(
         t=t,
         samples=samples,
         intervals=intervals,
-        motion=Motion(intervals, frame),
+        motion=motion,
         prior=prior,
         constraints=built,
         notes=(*_notes(samples, recording), *said, *(note for rows in built for note in rows.notes)),

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -45,6 +46,11 @@ class Scene:
     intervals: Intervals  # (K-1) between the keyframes
     speed: MeanSpeed | None = None  # of the odometer, where it is known already
     usual: Array | None = None  # (M, 3) m, sigma that the fixes usually state, where it is known already
+
+    @cached_property
+    def made(self) -> dict[str, Any]:
+        """What several constraints need and one of them has made."""
+        return {}
 
     def keyframe_at(self, t: Array) -> Array:
         """Index of the keyframe at each time, -1 where there is none."""

@@ -26,6 +26,7 @@ lateral force tyres leave their linear range; in quick yaw the axle's place matt
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -69,6 +70,11 @@ class Past:
     bg: Array
     rate: Array  # (N, 3) mean rate and force, less those biases
     force: Array
+
+    @cached_property
+    def asked(self) -> dict[str, Any]:
+        """What was asked for one state last, and the answer."""
+        return {}
 
     @classmethod
     def of(cls, intervals: Intervals, rows: Array, frame: LocalFrame) -> Past:
@@ -138,6 +144,26 @@ class Wheels(Constraint):
     ) -> tuple[Array, dict[str, Array], Array, Array, dict[str, Array]]:
         """u_v, its derivatives, turn rate and acceleration (body axes), and the latter's derivatives."""
         assert self.past is not None
+        # both constraints on one keyframe ask the same, one after the other
+        asked = self.past.asked
+        values = [parameters[name] for name in (SCALE, MOUNTING, AXLE) if name in parameters]
+        known = isinstance(rows, slice) and asked.get("states") is states and asked["rows"] == rows
+        if (
+            known
+            and len(values) == len(asked["values"])
+            and all(map(np.array_equal, values, asked["values"]))
+            and asked["lever"] is self.lever_arm
+        ):
+            return asked["found"]  # type: ignore[no-any-return]
+        found = self._found(states, parameters, rows)
+        if len(states) == 1 and isinstance(rows, slice):
+            asked |= {"states": states, "rows": rows, "values": values, "lever": self.lever_arm, "found": found}
+        return found
+
+    def _found(
+        self, states: States, parameters: dict[str, Array], rows: slice | Array
+    ) -> tuple[Array, dict[str, Array], Array, Array, dict[str, Array]]:
+        assert self.past is not None
         lever = self.lever_arm + (parameters[AXLE] * _E_Y if AXLE in parameters else np.zeros((len(states), 3)))
         u, omega, acceleration, J, Ja = self.past.velocity(states, parameters, rows, lever)
         mounting = parameters.get(MOUNTING, np.zeros((len(states), 2)))
@@ -152,6 +178,21 @@ class Wheels(Constraint):
 
 def moving_rows(scene: Scene) -> Array:
     """Indices of the intervals in which the vehicle does not stand, long enough to mean something."""
+    if "moving" not in scene.made:
+        scene.made["moving"] = _moving_rows(scene)
+    return np.asarray(scene.made["moving"])
+
+
+def shared_past(scene: Scene) -> Past:
+    """Of the intervals `moving_rows`."""
+    if "past" not in scene.made:
+        scene.made["past"] = Past.of(scene.intervals, moving_rows(scene), scene.frame)
+    past = scene.made["past"]
+    assert isinstance(past, Past)
+    return past
+
+
+def _moving_rows(scene: Scene) -> Array:
     t0, t1 = scene.intervals.t0, scene.intervals.t1
     usable = t1 - t0 >= _SHORTEST
     for begin, end in scene.stationary:
@@ -197,7 +238,7 @@ class NonHolonomic(Wheels):
                 Parameter(BODY, np.zeros(2), np.full(2, s.body_sigma), "rad s^2/m, of lateral and forward acceleration")
             )
         shared["parameters"] = tuple(shared["parameters"])
-        past = Past.of(scene.intervals, rows, scene.frame)
+        past = shared_past(scene)
         density = np.asarray(s.nhc_density) / np.sqrt(scene.intervals.T[rows])[:, None]
         beyond = np.maximum(np.abs(past.force[:, 0]) - _LINEAR, 0.0)
         right = np.hypot(_BEYOND * beyond, _AXLE_LEFT * past.rate[:, 2])
@@ -265,11 +306,13 @@ class OdometerSpeed(Wheels):
         if scene.recording.platform != "vehicle" or odometer is None or not s.odometer:
             return None
         speed = scene.speed or _speed_of(odometer, scene.recording.imu)
-        rows = moving_rows(scene)
+        rows, past = moving_rows(scene), shared_past(scene)
         begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
         reach = _REACH * odometer.delay_sigma
         good = np.all([np.isfinite(speed(begin, end, d)[0]) for d in {-reach, 0.0, reach}], axis=0)
-        rows, begin, end = rows[good], begin[good], end[good]
+        if not good.all():
+            rows, begin, end = rows[good], begin[good], end[good]
+            past = Past.of(scene.intervals, rows, scene.frame)
         shared = shared_parameters(scene)
         walk = s.scale_walk / np.sqrt(60.0)
         shared["parameters"].append(
@@ -281,7 +324,7 @@ class OdometerSpeed(Wheels):
         sigma = np.hypot(speed.sigma(begin, end), s.odometer_density / np.sqrt(end - begin))
         return cls(
             keyframe=rows + 1,
-            past=Past.of(scene.intervals, rows, scene.frame),
+            past=past,
             begin=begin,
             end=end,
             speed=speed,

@@ -49,10 +49,16 @@ class Stops:
         self._seen = since, stops(recording, settings, since, now - SURE, self.spans, answered)
 
     def take(self, edges: Array) -> float:
-        """Take over what was seen, cut to keyframes; the start of the first interval between `edges` that changes."""
-        (since, found), self._seen = self._seen or (0.0, None), None
+        """Take over what was seen, cut to keyframes; the start of the first interval between `edges` that changes.
+
+        `edges` are the keyframes, in any order.
+        """
+        if self._seen is None:
+            return np.inf
+        (since, found), self._seen = self._seen, None
         if found is None or (not len(found) and not len(self.spans)):
             return np.inf
+        edges = np.unique(edges)
         spans = merged(np.concatenate([clipped(self.spans, -np.inf, since), found]), gap=SAME_TIME)
         spans = spans[spans[:, 1] >= edges[0] - SAME_TIME] if len(spans) else spans
         aligned = []

@@ -22,10 +22,11 @@ from graphnav.detectors import detect
 from graphnav.detectors.base import merged
 from graphnav.dynamics import SCALE, Motion
 from graphnav.earth import LocalFrame
+from graphnav.findings import period_of
 from graphnav.online.evidence import Evidence
 from graphnav.online.looks import CONTEXT, SURE, Readings, Stops, clipped
 from graphnav.online.sensors import Sensors
-from graphnav.preintegration import GAP, Intervals, bridge_gaps, preintegrate
+from graphnav.preintegration import GAP, bridge_gaps, preintegrate
 from graphnav.problem import NODE_SPACING, Problem, keyframe_times, pose, to_samples
 from graphnav.recording import Recording
 from graphnav.rotation import Array
@@ -78,7 +79,7 @@ class Tracker:
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
         self._parameters: dict[str, Parameter] = {}
-        self._intervals: dict[float, Intervals] = {}  # integrated already, by the time they end at
+        self._motions: dict[float, Motion] = {}  # of intervals integrated already, by the time they end at
         self._dirty = np.inf  # s, from where on keyframes are to be redone with the next
         self._tried = -np.inf  # s, the newest keyframe when some were to settle last
         self._turned = False  # whether something has moved so far that it may have to be linearised again
@@ -106,20 +107,20 @@ class Tracker:
 
     def came_late(self, t: float) -> None:
         """A row of the IMU came after newer ones: what was integrated beyond it is void."""
-        self._intervals = {end: iv for end, iv in self._intervals.items() if end < t}
+        self._motions = {end: one for end, one in self._motions.items() if end < t}
 
     def update(self, sensors: Sensors, new: Array, dirty: float = np.inf) -> None:
         """Add keyframes at the times `new`, after the newest, and redo those from `dirty` on."""
         clock = [time.process_time()]
         if dirty < np.inf:
-            self._intervals = {t: iv for t, iv in self._intervals.items() if t < dirty}
+            self._motions = {t: one for t, one in self._motions.items() if t < dirty}
         if self._turned:
             self._converge(sensors)
         now = max(self.newest, float(new[-1]) if len(new) else -np.inf)
         if not self.foot:
             if self._standing.due(now):
                 self._standing.look(sensors, self.settings, now, min([self.head, *new.tolist()]))
-            dirty = min(dirty, self._standing.take(np.unique(np.concatenate([self.times, new]))))
+            dirty = min(dirty, self._standing.take(np.concatenate([self.times, new])))
             if not self._readings.looked:
                 self._readings.look(sensors, now)
         dirty, self._dirty = min(dirty, self._dirty), np.inf
@@ -138,13 +139,12 @@ class Tracker:
         del self._nodes[keep:]
         problem = self._pose(sensors, np.concatenate([before, times]))
         clock.append(time.process_time())
+        self._parameters |= problem.parameters
         turn = 0.0
         for k in range(len(before), len(problem.t)):
             turn = max(turn, self._push(problem, k))
         self._turned = turn > self.window.turn
-        self.in_force = {
-            c.name: n for c in problem.constraints if (n := int(np.sum(c.keyframe == len(problem.t) - 1)))
-        }  # fmt: skip
+        self.in_force = {rows.name: len(rows.b) for rows in self.window.stages[-1].measured}
         self._forget()
         clock.append(time.process_time())
         self.seconds = dict(zip(("looking", "posing", "solving"), np.diff(clock).tolist(), strict=True))
@@ -170,7 +170,7 @@ class Tracker:
             self._dirty = min(self._dirty, self._readings.look(sensors, self.newest))
         elif now < expected or expected <= self.newest:
             return False
-        elif expected not in self._intervals:
+        elif expected not in self._motions:
             self._integrate(sensors, expected)
         elif self._standing.due(expected):
             self._standing.look(sensors, self.settings, expected, self.head)
@@ -182,9 +182,9 @@ class Tracker:
         """The interval up to a keyframe that is expected."""
         T, start = self.newest, self.window.newest.state
         imu = self._around(sensors, T, sensors.imu.newest).imu
-        self._intervals[expected] = preintegrate(
-            bridge_gaps(imu), imu, np.array([T, expected]), start.ba[0], start.bg[0]
-        )  # fmt: skip
+        ends = np.array([T, expected])
+        motion = Motion(preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0]), self.frame)
+        self._motions[expected] = motion.prepared()
 
     def _converge(self, sensors: Sensors) -> None:
         self._turned = False
@@ -206,7 +206,7 @@ class Tracker:
         self.head, self.opened = float(self.window.t[count - 1]), True
         self.settled.append(self.window.settle(count))
         self.evidence.add(self.settled[-1])
-        self._intervals = {t: iv for t, iv in self._intervals.items() if t > self.head - CONTEXT}
+        self._motions = {t: one for t, one in self._motions.items() if t > self.head - CONTEXT}
         del self._nodes[:count]
         self._forget()
 
@@ -257,9 +257,10 @@ class Tracker:
 
     # ------------------------------------------------------------------------------------------------- keyframes
     def _pose(self, sensors: Sensors, times: Array) -> Problem:
-        begin = float(times[0])
-        if len(self.stops):  # a stop is posed whole, so that its place begins where it began
-            here = self.stops[(self.stops[:, 0] < begin) & (self.stops[:, 1] > begin)]
+        begin, stops = float(times[0]), self.stops
+        if len(stops):  # a stop is posed whole, so that its place begins where it began
+            stops = stops if self.foot else stops[stops[:, 1] > begin]
+            here = stops[(stops[:, 0] < begin) & (stops[:, 1] > begin)]
             begin = min([begin, *here[:, 0].tolist()])
         recording = self._around(sensors, begin, float(times[-1]) + 0.1)
         start, speed = self.window.newest.state, None
@@ -268,12 +269,14 @@ class Tracker:
         usual = None
         if recording.gnss is not None:
             usual = (self.settings.gnss.sd_factor or 1.0) * sensors.usual(recording.gnss.t)
-        found = ((t, self._intervals.get(t)) for t in times[1:].tolist())
-        known = {t: iv for t, iv in found if iv is not None and not iv.out_of_range(start.bg)[0]}
+        found = ((t, self._motions.get(t)) for t in times[1:].tolist())
+        known = {t: one for t, one in found if one is not None and not one.intervals.out_of_range(start.bg)[0]}
         problem = pose(
-            recording, self.settings, self.frame, start, np.ones(DIM), self.stops, times, speed, usual, known
+            recording, self.settings, self.frame, start, np.ones(DIM), stops, times, speed, usual, known
         )  # fmt: skip
-        self._intervals |= {t: problem.intervals[k : k + 1] for k, t in enumerate(times[1:].tolist())}
+        for k, t in enumerate(times[1:].tolist()):
+            if t not in known:
+                self._motions[t] = Motion(problem.intervals[k : k + 1], self.frame)
         return self._weighed(problem)
 
     def _weighed(self, problem: Problem) -> Problem:
@@ -299,8 +302,8 @@ class Tracker:
         Only what gaps in the IMU hide is told by the signal of the last half minute.
         """
         near = sensors.recording(begin - _NEAR, end)
-        step = np.diff(near.imu.t)
-        whole = len(step) > 1 and float(step.max()) < GAP * float(np.median(step))
+        t = near.imu.t
+        whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < GAP * period_of(t)
         return near if whole else sensors.recording(begin - CONTEXT, end)
 
     def _push(self, problem: Problem, k: int) -> float:
@@ -313,9 +316,8 @@ class Tracker:
 
     def _steps(self, problem: Problem, t: float, nodes: dict[str, float]) -> tuple[Step, ...]:
         """Parameters that begin or move on at a keyframe; `nodes` is brought up to date."""
-        self._parameters |= problem.parameters
         steps = []
-        stop = self._stop_at(t)
+        stop = self._stop_at(t) if PLACE in self._parameters else None
         for name, p in self._parameters.items():
             if name == PLACE:
                 if stop is not None and nodes.get(name) != stop:
@@ -325,7 +327,7 @@ class Tracker:
             elif name not in nodes:
                 steps.append(Step(name, np.atleast_2d(p.initial)[0], np.atleast_2d(p.sigma)[0]))
                 nodes[name] = t
-            elif not p.constant and t - nodes[name] >= NODE_SPACING - SAME_TIME:
+            elif t - nodes[name] >= NODE_SPACING - SAME_TIME and not p.constant:
                 ahead, added = p.step(np.array([t - nodes[name]]))
                 steps.append(Step(name, p.initial, added[0], float(ahead[0]), p.initial))
                 nodes[name] = t

@@ -83,7 +83,7 @@ class Layout:
         self.keys = range(len(self.width))
         self.order = [key for k in range(K) for key in (k, *after.get(k, ()))]
         # the root of an interval's information does not depend on the states
-        self.whitener = np.linalg.inv(np.linalg.cholesky(problem.intervals.covariance))
+        self.whitener = problem.motion.whitener
 
     def unpack(self, vectors: list[Array]) -> Step:
         """Steps per state and parameter from one vector per key."""

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtri
+from scipy.linalg.lapack import dgeqrf, dtrtri, dtrtrs
 
 from graphnav import rotation
 from graphnav.constraints.base import assemble, weighted_sigma
@@ -30,6 +30,7 @@ from graphnav.solvers.robust import weight_and_cost
 from graphnav.state import DIM, States
 
 Columns = dict[str, slice]
+_I = np.eye(DIM)
 _PASSES = 4  # of re-weighting where a kernel is robust
 
 
@@ -71,7 +72,10 @@ class Message:
     @property
     def estimate(self) -> Array:
         """(D,) the error state that it makes most likely."""
-        return np.linalg.solve(self.R, self.z)
+        found, info = dtrtrs(self.R, self.z)
+        if info:
+            raise EstimationError("the smoother's information broke down: check sigmas and units")
+        return np.asarray(found)
 
     @property
     def covariance(self) -> Array:
@@ -198,18 +202,17 @@ def predicted(before: Message, place: Place) -> tuple[States, Array, Columns, Ar
     motion, row = place.problem.motion, slice(place.k - 1, place.k)
     scale = before.value(SCALE) if SCALE in before.columns else None
     ahead, F = motion.propagate(row, before.state, scale)
-    frames = motion.frames(row, before.state.R_nb)[0]
-    root, info = dpotrf(motion.intervals.covariance[place.k - 1], lower=1)
-    if info:
-        raise EstimationError(f"the noise of the IMU before {place.t:.3f} s is none: check its figures")
-    W = dtrtri(root, lower=1)[0] @ np.linalg.inv(frames)
-    link = np.zeros((DIM, DIM + D + 1))
-    link[:, :DIM] = -W @ F[0]
-    link[:, DIM : 2 * DIM] = W
+    try:
+        W = motion.whitener[row]
+    except np.linalg.LinAlgError:
+        raise EstimationError(f"the noise of the IMU before {place.t:.3f} s is none: check its figures") from None
+    link = np.zeros((1, DIM, DIM + D + 1))
+    link[:, :, :DIM] = -F
+    link[:, :, DIM : 2 * DIM] = _I
     if scale is not None:
         at = columns[SCALE]
-        link[:, DIM + at.start : DIM + at.stop] = -W @ motion.scale_columns(row, F)[0]
-    return ahead, values, columns, link
+        link[:, :, DIM + at.start : DIM + at.stop] = -motion.scale_columns(row, F)
+    return ahead, values, columns, (W @ motion.body_rows(link, before.state.R_nb, row))[0]
 
 
 def measured(place: Place, state: States, values: Array, columns: Columns) -> Linear:
@@ -231,9 +234,9 @@ def at_points(
     links: list[Array | None] = [None] * n
     if linked:
         scale = values[0, _shift(columns[SCALE])] if SCALE in columns else None
-        intervals = problem.intervals[slice(first - 1, first - 1 + n)]
-        r, Ji, Jj, Js = Motion(intervals, problem.frame).linearize(states, scale)
-        W = np.linalg.inv(np.linalg.cholesky(intervals.covariance))
+        motion = Motion(problem.intervals[slice(first - 1, first - 1 + n)], problem.frame)
+        r, Ji, Jj, Js = motion.linearize(states, scale)
+        W = motion.whitener
         rows = np.zeros((n, DIM, DIM + D + 1))
         rows[:, :, :DIM], rows[:, :, DIM : 2 * DIM], rows[:, :, -1] = W @ Ji, W @ Jj, -mv(W, r)
         if scale is not None:
