@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import socket
 import subprocess
@@ -568,12 +569,23 @@ def test_an_imu_is_judged_by_ever_more_rows(drive: tuple[Recording, Trajectory])
     figures = ("gyro_noise_density", "accel_noise_density")
     quiet = replace(noise, **{name: getattr(noise, name) / 3.0 for name in figures})
     recording = replace(recording, imu=replace(recording.imu, noise=quiet))
-    online, _ = played(recording, rows_of(recording)[1], settings_from({"solver": {"lag": 60.0}}))
+    rows, how = rows_of(recording)[1], settings_from({"solver": {"lag": 60.0}})
+    online, track = played(recording, rows, how)
     used = online.sensors.setup.imu.noise
     for name in figures:
         assert getattr(used, name) / getattr(noise, name) == pytest.approx(1.0, rel=0.25)
     assert sum("noisier" in note for note in online.notes) == 1
     assert online.tracker.window.turn > turn_limit(quiet)
+    # ended and resumed while it is being judged, and while what has not settled is gone through again
+    other, parts, resumed = Online(without_rows(recording), how), [], 0
+    for k, row in enumerate(rows):
+        other.add(row)
+        if other._again is not None or (other._judgement is not None and k % 100 == 0):
+            other, resumed = pickle.loads(pickle.dumps(other)), resumed + 1
+        parts += other.settled()
+    other.finish()
+    assert resumed > 20
+    np.testing.assert_array_equal(joined([*parts, *other.settled()]).llh, track.llh)
 
 
 def test_smooth_driving_with_positions_alone_is_no_stop() -> None:

@@ -48,6 +48,11 @@ class Stops:
         recording = sensors.recording(-np.inf if whole else now - _LOOK, now)
         self._seen = since, stops(recording, settings, since, now - SURE, self.spans, answered)
 
+    def replace(self, spans: Array, edges: Array) -> None:
+        """Know other spans, cut to keyframes `edges`."""
+        self.spans, self._seen = np.empty((0, 2)), (-np.inf, spans)
+        self.take(edges)
+
     def take(self, edges: Array) -> float:
         """Take over what was seen, cut to keyframes; the start of the first interval between `edges` that changes.
 

@@ -18,6 +18,7 @@ from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.judgement import FIXES
+from graphnav.online.judging import Again, Judgement
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import Live, Tracker
@@ -35,6 +36,7 @@ _STEP = 0.5  # s between looks at a walk
 _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that level a vehicle without GNSS
 _JUDGED = 120.0  # s of rows by which the sensors are judged again
+_THINKING, _LONGEST_THOUGHT = 1.0 / 16.0, 10.0  # of the lag, and s: what judging may take
 _JUDGED_UNTIL = 900.0  # s of rows, where fixes are so rare that these are still too few
 _PATIENCE = 300.0  # s of rows kept while there is no motion to align with
 
@@ -55,6 +57,8 @@ class Online:
         self.tracker: Tracker | None = None
         self.notes: list[str] = []
         self.late: Counter[str] = Counter()  # rows that came after the keyframe they belong before, and were used
+        self._judgement: Judgement | None = None  # being made
+        self._again: Again | None = None  # going through what has not settled with it
         self._found: Alignment | None = None  # as long as the sensors are still to be judged by more rows
         self._said: tuple[str, ...] = ()  # of the notes, those about what the sensors are judged to be
         self._judged = 0.0  # s of rows that they were judged by
@@ -114,9 +118,15 @@ class Online:
         elif now >= self._due:
             self._advance(tracker)
             self._awake = now
+        elif self._again is not None:
+            self._go_through(self._again, tracker)
+        elif self._judgement is not None and tracker.newest >= self._judgement.due:
+            self._use(self._judgement, tracker)
         elif tracker.spare(self.sensors, expected := self._expected(tracker)):
             self._collect(tracker)
         else:
+            if self._found is not None and self._judgement is None:
+                self._judge_again(self._found, tracker)
             self._awake = expected if now < expected else self._due
 
     def _expected(self, tracker: Tracker) -> float:
@@ -142,6 +152,7 @@ class Online:
             except EstimationError as error:
                 self.notes.append(str(error))
         if self.tracker is not None:
+            self._judged_at_last()
             self._advance(self.tracker, last=True)
             self.tracker.settle(self.sensors)
             self._collect(self.tracker)
@@ -176,66 +187,80 @@ class Online:
             self.notes.append(f"not aligned at {now:.1f} s: {error}")
             self._wait(now)
             return
-        self._found = found if found.motion is not None and settings.gnss.position else None
-        tracker = self._track(found, recording, settings, said)
+        more = found.motion is not None and settings.gnss.position and recording.platform != "foot"
+        self._found = found if more else None
+        self.tracker, sensors.setup = self._track(found, recording, settings)
+        self._say(said)
         self._fixes = [t for t in sensors.gnss.t.tolist() if t >= recording.start - SAME_TIME]
         self._began, self._judged = recording.start, recording.duration
         sensors.oldest = recording.start
-        self._advance(tracker)
+        self._advance(self.tracker)
 
-    def _track(self, found: Alignment, recording: Recording, settings: Settings, said: tuple[str, ...]) -> Tracker:
-        """Begin at the first row of the buffer, with what the sensors were judged to be."""
+    def _track(self, found: Alignment, recording: Recording, settings: Settings) -> tuple[Tracker, Recording]:
+        """Begin at the first row of a recording, with what the sensors were judged to be; and their setup."""
         assert self.frame is not None
-        self.sensors.setup = replace(self._setup, imu=replace(self._setup.imu, noise=recording.imu.noise))
+        setup = replace(self._setup, imu=replace(self._setup.imu, noise=recording.imu.noise))
         stated = with_known_heading(found, self.settings)
         self.notes += [note for note in stated.notes if note not in self.notes]
-        self._say(said)
         message = first_message(stated.state, stated.sigma)
-        self.tracker = Tracker(settings, self.frame, message, recording.start, recording)
+        tracker = Tracker(settings, self.frame, message, recording.start, recording)
         if found is not stated:
-            self.tracker.window.head = message.moved(found.state.minus(stated.state)[0])
-        return self.tracker
-
-    def _judge_again(self, found: Alignment, tracker: Tracker) -> Tracker:
-        """Judge the sensors by all rows since the alignment, and go through what has not settled again."""
-        assert self.frame is not None
-        used, self.sensors.setup = self.sensors.setup, self._setup
-        recording = self.sensors.recording(-np.inf, tracker.newest)
-        try:
-            stationary = detect(recording, self.settings).stationary
-            recording, settings, said = judged(recording, self.settings, self.frame, found, stationary)
-        except EstimationError as error:
-            self.notes.append(f"not judged again: {error}")
-            self.sensors.setup = used
-            return tracker
-        if tracker.opened:
-            self.sensors.setup = replace(self._setup, imu=replace(self._setup.imu, noise=recording.imu.noise))
-            self._say(said)
-            tracker.judged(settings, self.sensors)
-            return tracker
-        times = tracker.window.t
-        again = self._track(found, recording, settings, said)
-        again.update(self.sensors, times)
-        return again
+            tracker.window.head = message.moved(found.state.minus(stated.state)[0])
+        return tracker, setup
 
     def _say(self, said: tuple[str, ...]) -> None:
         """Note what the sensors are judged to be, in place of what was thought before."""
         self.notes = [note for note in self.notes if note not in self._said] + list(said)
         self._said = said
 
-    def _more_to_judge(self, found: Alignment, tracker: Tracker) -> Tracker:
-        """Judge the sensors again before the first state settles, and whenever there are twice as many rows as before.
+    def _judge_again(self, found: Alignment, tracker: Tracker) -> None:
+        """Have the sensors judged again before the first state settles, and whenever there are twice as many rows.
 
         Up to `judgement.FIXES` fixes in motion, which is what offline judges by.
         """
         assert found.motion is not None
-        span = tracker.newest - self._began
+        assert self.frame is not None
+        span, lag = tracker.newest - self._began, self.settings.solver.lag
         enough = np.count_nonzero(self.sensors.gnss.t > found.motion) >= FIXES or span > _JUDGED_UNTIL
-        if not enough and span < max(min(self.settings.solver.lag, _JUDGED), 2.0 * self._judged):
-            return tracker
+        if not enough and span < max(min(lag, _JUDGED), 2.0 * self._judged):
+            return
         self._judged = span
         self._found = None if enough else found
-        return self._judge_again(found, tracker)
+        used, self.sensors.setup = self.sensors.setup, self._setup
+        recording = self.sensors.recording(-np.inf, tracker.newest)
+        self.sensors.setup = used
+        due = tracker.newest + min(_THINKING * lag, _LONGEST_THOUGHT)
+        self._judgement = Judgement(recording, self.settings, self.frame, found, due)
+
+    def _use(self, judgement: Judgement, tracker: Tracker) -> None:
+        """Begin to go through what has not settled with what the sensors were judged to be."""
+        self._judgement = None
+        try:
+            recording, settings, said, stationary = judgement.answer()
+        except EstimationError as error:
+            self.notes.append(f"not judged again: {error}")
+            return
+        self._say(said)
+        if tracker.opened:
+            setup = replace(self._setup, imu=replace(self._setup.imu, noise=recording.imu.noise))
+            self._again = Again(tracker.afresh(settings, setup), setup)
+        else:
+            again, setup = self._track(judgement.found, recording, settings)
+            again.knows(tracker, stationary, judgement.until)
+            self._again = Again(again, setup)
+
+    def _go_through(self, again: Again, tracker: Tracker) -> None:
+        """Some of it; what has caught up takes over."""
+        if again.step(self.sensors, tracker):
+            self.tracker, self._again = again.tracker, None
+            self.sensors.setup = again.setup
+
+    def _judged_at_last(self) -> None:
+        """Nothing more will come: do not wait for what is being judged."""
+        if self._judgement is not None and self.tracker is not None:
+            self._use(self._judgement, self.tracker)
+        while self._again is not None and self.tracker is not None:
+            self._go_through(self._again, self.tracker)
 
     def _wait(self, now: float) -> None:
         """Keep what the next attempt may need."""
@@ -250,10 +275,11 @@ class Online:
         later = {name: getattr(sensors, name).rows.copy() for name in ("gnss", "odometer")}
         if self.tracker is not None:
             sensors.imu.drop_after(before)
+            self._judged_at_last()
             self._advance(self.tracker, last=True)
             self.tracker.settle(sensors)
             self._collect(self.tracker)
-        self.tracker = self._found = None
+        self.tracker = self._found = self._judgement = self._again = None
         sensors.setup = self._setup  # the IMU is judged anew as well
         sensors.drop_before(np.inf)
         for row in after:
@@ -300,9 +326,9 @@ class Online:
         if (times and enough) or (last and self._dirty < np.inf):
             dirty, self._dirty = self._dirty, np.inf
             self._fixes = [t for t in self._fixes if t > limit and t > T + SAME_TIME]
-            tracker.update(sensors, np.array(times), dirty)
-            if self._found is not None and not last:
-                tracker = self._more_to_judge(self._found, tracker)
+            redone = tracker.update(sensors, np.array(times), dirty)
+            if self._again is not None and redone < np.inf:
+                self._again.tracker.back_to(redone, tracker)
             self._collect(tracker)
         T = tracker.newest
         self._due = min([T + period, *(t for t in self._fixes if t > T)]) + AFTER
@@ -331,5 +357,5 @@ class Online:
         begin = tracker.head
         if len(tracker.stops):
             begin = min(begin, max(float(tracker.stops[0, 0]), begin - 10.0 * CONTEXT))
-        if self._found is None:  # else they are still to be judged by
+        if self._found is None and self._judgement is None:  # else they are still to be judged by
             self.sensors.drop_before(begin - CONTEXT - 5.0)

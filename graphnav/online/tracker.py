@@ -7,6 +7,7 @@ recognised a second or two after it began) takes back the keyframes from there o
 
 from __future__ import annotations
 
+import copy
 import time
 from dataclasses import dataclass, replace
 
@@ -75,7 +76,7 @@ class Tracker:
         self.settled: list[Smoothed] = []
         self.evidence = Evidence()
         self.in_force: dict[str, int] = {}  # rows of each constraint at the newest keyframe
-        self.seconds: dict[str, float] = {}  # of process time, by what the newest update did
+        self.seconds: dict[str, float] = {}  # of its thread, by what the newest update did
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
         self._parameters: dict[str, Parameter] = {}
@@ -109,9 +110,12 @@ class Tracker:
         """A row of the IMU came after newer ones: what was integrated beyond it is void."""
         self._motions = {end: one for end, one in self._motions.items() if end < t}
 
-    def update(self, sensors: Sensors, new: Array, dirty: float = np.inf) -> None:
-        """Add keyframes at the times `new`, after the newest, and redo those from `dirty` on."""
-        clock = [time.process_time()]
+    def update(self, sensors: Sensors, new: Array, dirty: float = np.inf) -> float:
+        """Add keyframes at the times `new`, after the newest, and redo those from `dirty` on.
+
+        Returns the first that was redone, s.
+        """
+        clock = [time.thread_time()]
         if dirty < np.inf:
             self._motions = {t: one for t, one in self._motions.items() if t < dirty}
         if self._turned:
@@ -124,21 +128,20 @@ class Tracker:
             if not self._readings.looked:
                 self._readings.look(sensors, now)
         dirty, self._dirty = min(dirty, self._dirty), np.inf
-        clock.append(time.process_time())
+        clock.append(time.thread_time())
         again = [stage.place.t for stage in self.window.since(dirty - SAME_TIME)]
         times = np.unique(np.concatenate([again, new]))
         times = times[np.concatenate([[True], np.diff(times) > SAME_TIME])]
         if not len(times):
-            return
+            return np.inf
         keep = len(self.window) - len(again)
         look = _BEFORE if len(self.stops) and self.stops[-1, 1] > times[0] - _BEFORE else 1
         before = [stage.place.t for stage in self.window.stages[max(0, keep - look) : keep]]
         if self.opened and len(before) < look:
             before.insert(0, self.head)
-        self.window.truncate(keep)
-        del self._nodes[keep:]
+        self._keep(keep)
         problem = self._pose(sensors, np.concatenate([before, times]))
-        clock.append(time.process_time())
+        clock.append(time.thread_time())
         self._parameters |= problem.parameters
         turn = 0.0
         for k in range(len(before), len(problem.t)):
@@ -146,8 +149,9 @@ class Tracker:
         self._turned = turn > self.window.turn
         self.in_force = {rows.name: len(rows.b) for rows in self.window.stages[-1].measured}
         self._forget()
-        clock.append(time.process_time())
+        clock.append(time.thread_time())
         self.seconds = dict(zip(("looking", "posing", "solving"), np.diff(clock).tolist(), strict=True))
+        return again[0] if again else np.inf
 
     def spare(self, sensors: Sensors, expected: float = np.inf) -> bool:
         """Do one thing that need not wait for the next keyframe, or should not delay it; False if there is none.
@@ -210,10 +214,30 @@ class Tracker:
         del self._nodes[:count]
         self._forget()
 
-    def judged(self, settings: Settings, sensors: Sensors) -> None:
-        """Go on with other figures of the sensors, and go through what has not settled again."""
-        self.settings, self.window.turn = settings, turn_limit(sensors.setup.imu.noise)
-        self.update(sensors, np.empty(0), -np.inf)
+    def afresh(self, settings: Settings, setup: Recording) -> Tracker:
+        """One with other figures of the sensors that has settled what this one has, and has no keyframes since."""
+        other, head = copy.copy(self), self.window.head
+        other.settings, other._parameters = settings, {}
+        other.window = Window(head.moved(head.estimate), turn_limit(setup.imu.noise))
+        other._nodes, other._motions, other.settled = [], {}, []
+        other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)
+        return other
+
+    def knows(self, other: Tracker, stationary: Array, until: float) -> None:
+        """Take over what another has seen, but for the stops up to a time, which have been looked for anew."""
+        self._standing, self._readings = copy.copy(other._standing), copy.copy(other._readings)
+        before, after = clipped(stationary, self.head, until - SURE), clipped(other.stops, until - SURE, np.inf)
+        self._standing.replace(merged(np.concatenate([before, after]), gap=SAME_TIME), other.times)
+
+    def back_to(self, t: float, other: Tracker) -> None:
+        """Forget the keyframes from a time on, where another has redone them and sees stops otherwise."""
+        self._keep(len(self.window) - len(self.window.since(t - SAME_TIME)))
+        self._motions = {end: one for end, one in self._motions.items() if end < t}
+        self._standing = copy.copy(other._standing)
+
+    def _keep(self, count: int) -> None:
+        self.window.truncate(count)
+        del self._nodes[count:]
 
     def live(self, sensors: Sensors) -> Live:
         """The state at the newest IMU row, by prediction from the newest keyframe."""
