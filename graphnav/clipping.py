@@ -22,6 +22,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from graphnav.preintegration import Samples
+from graphnav.recording import Imu
 from graphnav.rotation import Array
 
 _NEAR = 0.95  # of the highest reading: a range that ends lower than that for some peaks is none
@@ -41,12 +42,15 @@ class Peak:
     values: Array
 
 
-def cut_peaks(t: Array, x: Array, least: float) -> list[Peak]:
-    """The peaks above `least` of one axis (N,), read at times (N,) s, that were cut off."""
+def cut_peaks(t: Array, x: Array, least: float, highest: Array | None = None) -> list[Peak]:
+    """The peaks above `least` of one axis (N,), read at times (N,) s, that were cut off.
+
+    `highest` (2,) is what the sensor is known to have read at other times, up and down.
+    """
     found = []
-    for sign in (1.0, -1.0):
+    for sign, most in zip((1.0, -1.0), np.zeros(2) if highest is None else highest, strict=True):
         y = sign * x
-        limit = max(_NEAR * float(y.max(initial=0.0)), least)
+        limit = max(_NEAR * max(float(y.max(initial=0.0)), float(most)), least)
         high = np.flatnonzero(np.diff(np.r_[False, y >= limit, False].astype(int)))
         for begin, end in zip(high[::2], high[1::2], strict=True):
             top = y[begin:end].max()
@@ -65,15 +69,42 @@ def cut_peaks(t: Array, x: Array, least: float) -> list[Peak]:
     return found
 
 
-def with_whole_peaks(samples: Samples, R_bs: Array) -> tuple[Samples, tuple[str, ...]]:
-    """The samples with cut peaks put back, and sentences that say so. R_bs: body from the sensors' own axes."""
+def highest(imu: Imu) -> Array:
+    """(2, 3, 2) the highest readings of gyro and accelerometer by their own axes, up and down."""
+    both = (imu.gyro @ imu.R_bs, imu.accel @ imu.R_bs)
+    return np.array([np.stack([x.max(axis=0, initial=0.0), (-x).max(axis=0, initial=0.0)], -1) for x in both])
+
+
+def first_not_cut(samples: Samples, R_bs: Array, before: Array, now: Array) -> float:
+    """When the first peak was, s, that seemed cut as long as readings were no higher than `before`, but is not.
+
+    Infinite if there is none; `before` and `now` are as `highest` says.
+    """
+    first = np.inf
+    for k, name in enumerate(_LEAST):
+        x = getattr(samples, name) @ R_bs
+        for axis in range(3):
+            old, new = (cut_peaks(samples.t, x[:, axis], _LEAST[name], most[k, axis]) for most in (before, now))
+            still = {p.first for p in new}
+            first = min([first, *(float(samples.t[p.first]) for p in old if p.first not in still)])
+    return first
+
+
+def with_whole_peaks(samples: Samples, R_bs: Array, known: Array | None = None) -> tuple[Samples, tuple[str, ...]]:
+    """The samples with cut peaks put back, and sentences that say so.
+
+    Parameters
+    ----------
+    R_bs : body from the sensors' own axes.
+    known : as `highest` says, what they have read at other times.
+    """
     notes = []
     out = samples
-    for name, what, unit in (("gyro", "gyro", "rad/s"), ("accel", "accelerometer", "m/s^2")):
+    for k, (name, what, unit) in enumerate((("gyro", "gyro", "rad/s"), ("accel", "accelerometer", "m/s^2"))):
         x, cut = getattr(samples, name) @ R_bs, False
         extra = getattr(samples, f"extra_{name}").copy()
         for axis in range(3):
-            peaks = cut_peaks(samples.t, x[:, axis], _LEAST[name])
+            peaks = cut_peaks(samples.t, x[:, axis], _LEAST[name], None if known is None else known[k, axis])
             if not peaks:
                 continue
             cut = True

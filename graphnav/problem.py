@@ -93,6 +93,7 @@ def pose(
     speed: MeanSpeed | None = None,
     usual: Array | None = None,
     known: Mapping[float, Motion] | None = None,
+    highest: Array | None = None,
 ) -> Problem:
     """Pose the estimation problem for a recording.
 
@@ -105,6 +106,7 @@ def pose(
     speed : of the odometer, where it is known already.
     usual : (M, 3) m, the unit of the slow errors of the recording's fixes, where it is known already.
     known : what intervals between keyframes say that were integrated before, by the time they end at.
+    highest : what the IMU has read at other times, as `graphnav.clipping.highest` says.
     """
     classes = registered()
     stops = to_samples(stationary, recording)
@@ -116,7 +118,7 @@ def pose(
     samples = bridge_gaps(recording.imu)
     said: tuple[str, ...] = ()
     if recording.platform == "foot":
-        samples, said = with_whole_peaks(samples, recording.imu.R_bs)
+        samples, said = with_whole_peaks(samples, recording.imu.R_bs, highest)
         samples = with_unresolved_motion(samples, recording.imu.noise)
         samples = with_coning(samples) if settings.imu.coning else samples
     motion = known.get(float(t[1])) if known and len(t) == 2 else None

@@ -527,16 +527,16 @@ def test_a_real_walk_settles_step_by_step(shared_data: Path) -> None:
 
 
 def test_a_walk_with_lost_packets_settles_on_the_batch_solution(shared_data: Path) -> None:
-    """Ten seconds of standing in pieces, and stances that begin and end between samples.
+    """Fifteen seconds of standing in pieces, a first step that has the highest readings so far, and gaps.
 
-    Online a stance's edges and what standing wanders by are told from less; that is within the walk's own sigma.
+    What is left is the noise of bridged gaps, told from half a minute here and from the whole walk there.
     """
     walk = read(shared_data / "xio_loops" / "short.toml")
     _, track = played(walk, rows_of(walk)[1], Settings())
     best = run(walk, solvers=("batch",))["batch"]
     t, states, P = best.at(track.t)
     away = best.frame.from_llh(track.llh[np.isin(track.t, t)]) - states.p
-    assert np.all(np.abs(away).max(axis=0) < track.sd_p.max(axis=0))
+    assert np.abs(away).max() < 0.02
     np.testing.assert_allclose(track.sd_p[-1], np.sqrt(np.diag(P[-1]))[3:6], rtol=0.15)
 
 

@@ -53,6 +53,14 @@ class Stops:
         self.spans, self._seen = np.empty((0, 2)), (-np.inf, spans)
         self.take(edges)
 
+    def add(self, spans: Array) -> None:
+        """Know more spans, between keyframes already."""
+        self.spans = merged(np.concatenate([self.spans, spans]), gap=SAME_TIME)
+
+    def forget(self, t: float) -> None:
+        """Those that ended before a time do not matter any more."""
+        self.spans = self.spans[self.spans[:, 1] > t]
+
     def take(self, edges: Array) -> float:
         """Take over what was seen, cut to keyframes; the start of the first interval between `edges` that changes.
 

@@ -14,12 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints import registered
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.standstill import PLACE
 from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.dense import Dense
-from graphnav.detectors import detect
 from graphnav.detectors.base import merged
 from graphnav.dynamics import SCALE, Motion
 from graphnav.earth import LocalFrame
@@ -27,8 +25,9 @@ from graphnav.findings import period_of
 from graphnav.online.evidence import Evidence
 from graphnav.online.looks import CONTEXT, SURE, Readings, Stops, clipped
 from graphnav.online.sensors import Sensors
+from graphnav.online.steps import Steps
 from graphnav.preintegration import GAP, bridge_gaps, preintegrate
-from graphnav.problem import NODE_SPACING, Problem, keyframe_times, pose, to_samples
+from graphnav.problem import NODE_SPACING, Problem, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solvers.stages import Place, Step
@@ -38,9 +37,6 @@ from graphnav.wheels import MeanSpeed
 
 _NEAR = 2.0  # s of rows before a keyframe that its constraints look at where the IMU has no gap; else `CONTEXT`
 _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
-_WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector sees, and the least
-_SHORTEST = 0.05  # s between looks at a walk that are worth keyframes
-_STANDS = 3.0  # s, a stance as long as that is standing, and need not be over
 _PLACE_SIGMA = 1000.0  # m, of where a stop may be
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
 _LATEST = 0.5  # of the lag by which they may be late for it, where states still move
@@ -73,6 +69,7 @@ class Tracker:
         self.opened = False  # whether the first keyframe has left the window
         self._standing = Stops()
         self._readings = Readings(t0)
+        self._steps = Steps()
         self.settled: list[Smoothed] = []
         self.evidence = Evidence()
         self.in_force: dict[str, int] = {}  # rows of each constraint at the newest keyframe
@@ -152,6 +149,18 @@ class Tracker:
         clock.append(time.thread_time())
         self.seconds = dict(zip(("looking", "posing", "solving"), np.diff(clock).tolist(), strict=True))
         return again[0] if again else np.inf
+
+    def steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
+        """Keyframes of a walk that can be made by now, and what they change of those before."""
+        times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
+        if (stood := self._steps.over) is not None:  # how much a foot sways is told from all of its standing
+            self._keep(len(self.window) - len(self.window.since(stood + SAME_TIME)))
+            times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
+        self._standing.forget(self.head - CONTEXT)
+        dirty = self._steps.changed(sensors, self.head)
+        self.came_late(dirty)
+        self._dirty = min(self._dirty, dirty)
+        return times[1:] if len(self.window) or self.opened else times
 
     def spare(self, sensors: Sensors, expected: float = np.inf) -> bool:
         """Do one thing that need not wait for the next keyframe, or should not delay it; False if there is none.
@@ -296,7 +305,8 @@ class Tracker:
         found = ((t, self._motions.get(t)) for t in times[1:].tolist())
         known = {t: one for t, one in found if one is not None and not one.intervals.out_of_range(start.bg)[0]}
         problem = pose(
-            recording, self.settings, self.frame, start, np.ones(DIM), stops, times, speed, usual, known
+            recording, self.settings, self.frame, start, np.ones(DIM), stops, times, speed, usual, known,
+            self._steps.highest,
         )  # fmt: skip
         for k, t in enumerate(times[1:].tolist()):
             if t not in known:
@@ -334,11 +344,11 @@ class Tracker:
         t = float(problem.t[k])
         first = not self.window.stages and not self.opened
         nodes = dict(self._nodes[-1] if self._nodes else self._head_nodes)
-        turn = self.window.push(Place(t, problem, k, self._steps(problem, t, nodes), linked=not first))
+        turn = self.window.push(Place(t, problem, k, self._moves(problem, t, nodes), linked=not first))
         self._nodes.append(nodes)
         return turn
 
-    def _steps(self, problem: Problem, t: float, nodes: dict[str, float]) -> tuple[Step, ...]:
+    def _moves(self, problem: Problem, t: float, nodes: dict[str, float]) -> tuple[Step, ...]:
         """Parameters that begin or move on at a keyframe; `nodes` is brought up to date."""
         steps = []
         stop = self._stop_at(t) if PLACE in self._parameters else None
@@ -379,38 +389,3 @@ class Tracker:
             if stages[k].place.problem is None:
                 break  # nor do those before it
             stages[k] = replace(stages[k], place=replace(stages[k].place, problem=None))
-
-    # ----------------------------------------------------------------------------------------- stops
-    def steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
-        """Keyframes of a walk, step by step: up to the newest stance that has begun or ended, whose spans are kept.
-
-        Only whole stances and swings say what phase a moment of them is in.
-        """
-        T = self.newest
-        whole = not np.isfinite(self._standing.looked)
-        recording = sensors.recording(-np.inf if whole else min(T, limit) - _WALK, limit + SURE)
-        if recording.duration < _WALK_LEAST:
-            return np.empty(0)
-        rows = recording.imu.t  # keyframes stand where the stances will be said to begin and end
-        limit = float(rows[max(int(np.searchsorted(rows, limit + SAME_TIME)) - 1, 0)])
-        spans = clipped(to_samples(detect(recording, self.settings).stationary, recording), T, limit)
-        if not last and len(spans):
-            ongoing = spans[-1, 1] >= limit - SAME_TIME
-            if ongoing and limit - spans[-1, 0] < _STANDS:
-                limit, spans = float(spans[-1, 0]), spans[:-1]
-            elif not ongoing:
-                limit = float(spans[-1, 1])
-        elif not last and limit - T < _STANDS:
-            return np.empty(0)
-        if limit - T <= _SHORTEST:
-            return np.empty(0)
-        self._standing.looked = limit
-        known = merged(np.concatenate([self.stops, spans]), gap=SAME_TIME)
-        self._standing.spans = known[known[:, 1] > self.head - CONTEXT]
-        # a swing is one because of the stance before it
-        begin = max([T - _WALK, *self.stops[self.stops[:, 0] <= T, 0].tolist()]) if len(self.stops) else T
-        part = sensors.recording(min(begin, T), limit)
-        around = clipped(self.stops, part.start, limit)
-        epochs = [cls.epochs(part, self.settings, around) for cls in registered()]
-        times = keyframe_times(T, limit, np.concatenate([*epochs, np.empty(0)]), self.settings.keyframes.rate)
-        return times if not len(self.window) and not self.opened else times[1:]

@@ -1,0 +1,80 @@
+"""Keyframes of a walk as it goes on, step by step, and what a step tells of those before it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.clipping import first_not_cut, highest
+from graphnav.config import Settings
+from graphnav.constraints import registered
+from graphnav.constraints.base import SAME_TIME
+from graphnav.detectors import detect
+from graphnav.online.looks import SURE, Stops, clipped
+from graphnav.online.sensors import Sensors
+from graphnav.preintegration import bridge_gaps
+from graphnav.problem import keyframe_times, to_samples
+from graphnav.rotation import Array
+
+_WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector sees, and the least
+_SHORTEST = 0.05  # s between looks at a walk that are worth keyframes
+_STANDS = 3.0  # s, a stance as long as that is standing, and need not be over
+
+
+class Steps:
+    """Up to where a walk has been cut into steps, and what its IMU has read at most."""
+
+    def __init__(self) -> None:
+        self.highest: Array | None = None  # as `graphnav.clipping.highest` says
+        self._seen = -np.inf  # s, up to where that is known
+        self._pieces: float | None = None  # s, begin of a standing that goes on, of which keyframes were made
+        self.over: float | None = None  # s, begin of one that is over by now: its keyframes are to be made anew
+
+    def until(self, sensors: Sensors, settings: Settings, standing: Stops, T: float, limit: float, last: bool) -> Array:
+        """Keyframes after T, that at T first: up to the newest stance that has begun or ended, whose spans are kept.
+
+        Only whole stances and swings say what phase a moment of them is in.
+        """
+        none, self.over = np.empty(0), None
+        whole = not np.isfinite(standing.looked)
+        recording = sensors.recording(-np.inf if whole else min(T, limit) - _WALK, limit + SURE)
+        if recording.duration < _WALK_LEAST:
+            return none
+        rows = recording.imu.t  # keyframes stand where the stances will be said to begin and end
+        limit = float(rows[max(int(np.searchsorted(rows, limit + SAME_TIME)) - 1, 0)])
+        spans = clipped(to_samples(detect(recording, settings).stationary, recording), T, limit)
+        ongoing = bool(len(spans)) and spans[-1, 1] >= limit - SAME_TIME
+        if not last and len(spans):
+            if ongoing and limit - spans[-1, 0] < _STANDS:
+                limit, spans, ongoing = float(spans[-1, 0]), spans[:-1], False
+            elif not ongoing:
+                limit = float(spans[-1, 1])
+        elif not last and limit - T < _STANDS:
+            return none
+        if limit - T <= _SHORTEST:
+            return none
+        standing.looked = limit
+        standing.add(spans)
+        # a swing is one because of the stance before it
+        before = standing.spans[standing.spans[:, 0] <= T]
+        begin = max([T - _WALK, *before[:, 0].tolist()]) if len(before) else T
+        pieces, self._pieces = self._pieces, float(standing.spans[-1, 0]) if ongoing and not last else None
+        self.over = pieces if pieces != self._pieces else None
+        part = sensors.recording(min(begin, T), limit)
+        around = clipped(standing.spans, part.start, limit)
+        epochs = [cls.epochs(part, settings, around) for cls in registered()]
+        return keyframe_times(T, limit, np.concatenate([*epochs, none]), settings.keyframes.rate)
+
+    def changed(self, sensors: Sensors, head: float) -> float:
+        """From when on intervals after `head` would be integrated otherwise by now, s.
+
+        A peak is cut where the IMU's range ends, which nothing shows before it has read more.
+        """
+        now, fresh = self.highest, sensors.recording(np.nextafter(self._seen, np.inf)).imu
+        if len(fresh.t):
+            read, self._seen = highest(fresh), float(fresh.t[-1])
+            now = read if now is None else np.maximum(now, read)
+        before, self.highest = self.highest, now
+        if before is None or now is None or not np.any(now > before):
+            return np.inf
+        imu = sensors.recording(head).imu
+        return first_not_cut(bridge_gaps(imu), imu.R_bs, before, now) if len(imu.t) > 2 else np.inf
