@@ -24,7 +24,7 @@ from graphnav.pipeline import judged
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 
-_PORTION = 6  # keyframes gone through again at a row
+_PORTION = 4  # keyframes gone through again at a row
 
 Answer = tuple[Recording, Settings, tuple[str, ...], Array]  # recording, settings, notes, stops
 

@@ -34,6 +34,11 @@ class Stops:
         self._reviewed = -np.inf
         self._seen: tuple[float, Array | None] | None = None  # since when, and what; not yet in `spans`
 
+    @property
+    def news(self) -> bool:
+        """Whether something was seen that is not taken over yet."""
+        return self._seen is not None
+
     def due(self, now: float) -> bool:
         """Whether it is time to look again."""
         return self._seen is None and now - self.looked >= _EVERY - SAME_TIME
@@ -66,8 +71,7 @@ class Stops:
 
         `edges` are the keyframes, in any order.
         """
-        if self._seen is None:
-            return np.inf
+        assert self._seen is not None
         (since, found), self._seen = self._seen, None
         if found is None or (not len(found) and not len(self.spans)):
             return np.inf

@@ -121,16 +121,17 @@ class Tracker:
         if not self.foot:
             if self._standing.due(now):
                 self._standing.look(sensors, self.settings, now, min([self.head, *new.tolist()]))
-            dirty = min(dirty, self._standing.take(np.concatenate([self.times, new])))
+            if self._standing.news:
+                dirty = min(dirty, self._standing.take(np.concatenate([self.times, new])))
             if not self._readings.looked:
                 self._readings.look(sensors, now)
         dirty, self._dirty = min(dirty, self._dirty), np.inf
         clock.append(time.thread_time())
         again = [stage.place.t for stage in self.window.since(dirty - SAME_TIME)]
+        if not again and not len(new):
+            return np.inf
         times = np.unique(np.concatenate([again, new]))
         times = times[np.concatenate([[True], np.diff(times) > SAME_TIME])]
-        if not len(times):
-            return np.inf
         keep = len(self.window) - len(again)
         look = _BEFORE if len(self.stops) and self.stops[-1, 1] > times[0] - _BEFORE else 1
         before = [stage.place.t for stage in self.window.stages[max(0, keep - look) : keep]]
@@ -147,7 +148,8 @@ class Tracker:
         self.in_force = {rows.name: len(rows.b) for rows in self.window.stages[-1].measured}
         self._forget()
         clock.append(time.thread_time())
-        self.seconds = dict(zip(("looking", "posing", "solving"), np.diff(clock).tolist(), strict=True))
+        if len(new):
+            self.seconds = dict(zip(("looking", "posing", "solving"), np.diff(clock).tolist(), strict=True))
         return again[0] if again else np.inf
 
     def steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
@@ -187,6 +189,8 @@ class Tracker:
             self._integrate(sensors, expected)
         elif self._standing.due(expected):
             self._standing.look(sensors, self.settings, expected, self.head)
+        elif self._standing.news or self._dirty < np.inf:
+            self.update(sensors, np.empty(0))
         else:
             return False
         return True
