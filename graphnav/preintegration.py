@@ -29,22 +29,22 @@ same (the tests compare them) in a fraction of the time.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from graphnav import rotation
-from graphnav.findings import period_of
 from graphnav.recording import Imu
 from graphnav.rotation import Array
+from graphnav.samples import GAP, MANY, Samples, bridge_gaps, chunks, pieces_of
 
-GAP = 1.5  # sample periods between rows that are a gap
-_CHUNK = 40_000  # pieces handled at once: keeps the working arrays in the processor's cache
+__all__ = ["GAP", "Intervals", "Samples", "bridge_gaps", "prefix", "preintegrate", "preintegrate_unknown", "within"]
+
 _CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 _WALK_POINTS = 6  # quadrature points for the effect of bias walk inside an interval
 _FEW = 16  # intervals at once, below which calls cost more than numbers
-_CELL, _MANY = 4, 64  # Jacobians and noise of intervals of many pieces are summed over cells of a few; means never
+_CELL = 4  # Jacobians and noise of intervals of `MANY` pieces are summed over cells of so many; means never
 
 
 @dataclass(frozen=True)
@@ -96,63 +96,6 @@ class Intervals:
         return np.linalg.norm(bg - self.bg, axis=-1) * self.T > angle
 
 
-@dataclass(frozen=True)
-class Samples:
-    """IMU samples as pieces of constant rate and force, with gaps made explicit.
-
-    `extra_gyro`, `extra_accel` are white densities squared ((rad/s)^2/Hz, (m/s^2)^2/Hz) on top of the
-    sensor's own: where a gap is bridged, and what `graphnav.unresolved` adds for a foot.
-    """
-
-    t: Array  # (N,) end of each sample's period
-    gyro: Array  # (N, 3)
-    accel: Array  # (N, 3)
-    extra_gyro: Array  # (N,)
-    extra_accel: Array  # (N,)
-    start: float  # start of the first period
-    bridged: Array  # (g, 2) start and end of every bridged gap, s
-
-
-def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
-    """Put a made-up sample into every gap: the mean of its neighbours, with the noise that deserves.
-
-    A row only speaks for one sample period before its stamp. What happened in a longer silence g is
-    unknown by as much as the signal itself usually changes over g, which the recording shows:
-    half its structure function, D(g)/2 = E|x(t+g) - x(t)|^2 / 2 per axis, is the variance of a guess
-    from the neighbours. That error lasts the whole gap, so the equivalent white density is D(g)/2 * g.
-    """
-    dt = imu.t[1:] - imu.t[:-1]
-    period = period_of(imu.t)
-    gap = np.flatnonzero(dt > factor * period)
-    zero = np.zeros(len(imu.t))
-    if not len(gap):
-        return Samples(imu.t, imu.gyro, imu.accel, zero, zero, float(imu.t[0] - period), np.empty((0, 2)))
-    t_fill = imu.t[gap + 1] - period
-    length = t_fill - imu.t[gap]
-    at = gap + 1  # the made-up sample stands before the row that ends the gap
-    fill = {name: 0.5 * (getattr(imu, name)[gap] + getattr(imu, name)[gap + 1]) for name in ("gyro", "accel")}
-    extra = {name: _structure(getattr(imu, name), length / period) * length for name in ("gyro", "accel")}
-    return Samples(
-        t=np.insert(imu.t, at, t_fill),
-        gyro=np.insert(imu.gyro, at, fill["gyro"], axis=0),
-        accel=np.insert(imu.accel, at, fill["accel"], axis=0),
-        extra_gyro=np.insert(zero, at, extra["gyro"]),
-        extra_accel=np.insert(zero, at, extra["accel"]),
-        start=float(imu.t[0] - period),
-        bridged=np.stack([imu.t[gap], t_fill], -1),
-    )
-
-
-def _structure(x: Array, lags: Array) -> Array:
-    """Half the mean squared change per axis over each lag (in samples)."""
-    steps = np.maximum(1, np.rint(lags)).astype(int)
-    values = {}
-    for n in np.unique(np.minimum(steps, len(x) - 1)):
-        change = x[n:] - x[:-n]
-        values[n] = 0.5 * float(np.mean(change * change))
-    return np.array([values[min(n, len(x) - 1)] for n in steps])
-
-
 def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array) -> Intervals:
     """All intervals between consecutive keyframe times.
 
@@ -165,9 +108,9 @@ def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array) -> 
     """
     n = len(t) - 1
     ba, bg = np.broadcast_to(ba, (n, 3)), np.broadcast_to(bg, (n, 3))
-    pieces = _pieces(samples, t)
+    pieces = pieces_of(samples, t)
     parts: list[tuple[Array, Intervals]] = []
-    for rows in _chunks(pieces.count):
+    for rows in chunks(pieces.count):
         dt, index = pieces.padded(rows)
         parts.append((rows, _integrate(samples, imu, t, rows, dt, index, ba[rows], bg[rows])))
     if n == 1:
@@ -205,11 +148,11 @@ def within(samples: Samples, keyframes: Array, t: Array, ba: Array, bg: Array) -
     `ba`, `bg` are (K-1, 3), the biases of each interval; t (M,) ascending, after the first keyframe and not
     after the last.
     """
-    pieces = _pieces(samples, keyframes, t)
+    pieces = pieces_of(samples, keyframes, t)
     edge = np.searchsorted(pieces.edges, t)
     interval = np.searchsorted(keyframes, t, side="left") - 1
     dR, dV, dP = np.empty((len(t), 3, 3)), np.empty((len(t), 3)), np.empty((len(t), 3))
-    for rows in _chunks(pieces.count):
+    for rows in chunks(pieces.count):
         dt, index = pieces.padded(rows)
         R, V, P = _means(_less(samples.gyro, index, bg[rows]), _less(samples.accel, index, ba[rows]), dt)
         place = np.full(len(pieces.count), -1)
@@ -218,55 +161,6 @@ def within(samples: Samples, keyframes: Array, t: Array, ba: Array, bg: Array) -
         row, column = place[interval[here]], edge[here] - pieces.first[interval[here]]
         dR[here], dV[here], dP[here] = R[column, :, :, row], V[column, :, row], P[column, :, row]
     return dR, dV, dP
-
-
-@dataclass(frozen=True)
-class _Pieces:
-    """Sample periods split at keyframes: interval i owns pieces first[i] .. first[i] + count[i]."""
-
-    edges: Array  # (pieces + 1,) s
-    dt: Array
-    index: Array  # the sample each piece belongs to
-    first: Array
-    count: Array
-
-    def padded(self, rows: Array) -> tuple[Array, Array]:
-        """(L, n) lengths and sample indices of some intervals, padded with pieces of no length."""
-        piece = np.arange(int(self.count[rows].max()))[:, None]
-        inside = piece < self.count[rows]
-        at = np.minimum(self.first[rows] + piece, len(self.dt) - 1)
-        return np.where(inside, self.dt[at], 0.0), self.index[at]
-
-
-def _pieces(samples: Samples, t: Array, extra: Array | None = None) -> _Pieces:
-    """Pieces between keyframes t, split at the `extra` times too."""
-    inner = samples.t[(samples.t > t[0]) & (samples.t < t[-1])]
-    # all but sorted already, which is what a stable sort makes use of
-    edges = np.sort(np.concatenate([inner, t] if extra is None else [inner, t, extra]), kind="stable")
-    dt = edges[1:] - edges[:-1]
-    if dt.size and dt.min() <= 0.0:
-        edges = edges[np.append(True, dt > 0)]
-        dt = edges[1:] - edges[:-1]
-    index = np.minimum(np.searchsorted(samples.t, edges[1:], side="left"), len(samples.t) - 1)
-    starts = np.searchsorted(edges, t)
-    return _Pieces(edges, dt, index, starts[:-1], starts[1:] - starts[:-1])
-
-
-def _chunks(count: Array) -> Iterator[Array]:
-    """Intervals of similar length together, so that little is padded."""
-    order = np.argsort(count, kind="stable")
-    start = 0
-    while start < len(order):
-        # the longest of the chunk decides its width; lengths are ascending, so look ahead by bisection
-        lo, hi = start + 1, len(order)
-        while lo < hi:
-            mid = (lo + hi + 1) // 2
-            fits = (mid - start) * count[order[mid - 1]] <= _CHUNK
-            alike = count[order[mid - 1]] <= 2 * count[order[start]] + 16
-            alike &= (count[order[mid - 1]] >= _MANY) == (count[order[start]] >= _MANY)
-            lo, hi = (mid, hi) if fits and alike else (lo, mid - 1)
-        yield order[start:lo]
-        start = lo
 
 
 def _less(x: Array, index: Array, bias: Array) -> Array:
@@ -344,7 +238,7 @@ def _integrate(
     T = dt.sum(0)
     A = _summed((-0.5 * dt)[:, None, None] * (R[:-1] + R[1:]))
     # the rest in cells of a few pieces, within which A is a straight line
-    cut = np.append(np.arange(0, L, _CELL if L >= _MANY else 1), L)
+    cut = np.append(np.arange(0, L, _CELL if L >= MANY else 1), L)
     A, R, V, P = A[cut], R[cut], V[cut], P[cut]
     edge = _summed(dt)[cut]
     qg, qa = _white_noise(samples, imu, dt, index, edge, cut)

@@ -15,7 +15,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "graphnav"
 ROOMS = [
     "errors", "complaints", "progress", "rotation", "earth", "state", "config", "recording", "trajectory",
     "formats", "draft", "allan", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding",
-    "checks_stated", "checks", "detectors",
+    "checks_stated", "checks", "detectors", "samples",
     "preintegration", "unresolved", "clipping", "dynamics", "constraints", "problem", "solution", "alignment",
     "dense", "solvers", "faults", "judgement", "pipeline", "lever_arm",
     "interpolation", "metrics", "gates", "scoring", "strides", "evaluation", "exporters", "online",

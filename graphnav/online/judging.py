@@ -15,6 +15,7 @@ import numpy as np
 
 from graphnav.alignment import Alignment
 from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
@@ -96,9 +97,12 @@ class Again:
     def step(self, sensors: Sensors, other: Tracker) -> bool:
         """Go through a few more keyframes of the other; True once it has caught up."""
         t, done = other.window.t, len(self.tracker.window)
+        end = min(done + _PORTION, len(t))
+        while end < len(t) and np.any(np.abs(other.stops[:, 0] - t[end - 1]) < SAME_TIME):
+            end += 1  # where a stop begins shows only in what follows
         used, sensors.setup = sensors.setup, self.setup
         try:
-            self.tracker.update(sensors, t[done : done + _PORTION])
+            self.tracker.update(sensors, t[done:end])
         finally:
             sensors.setup = used
         return len(self.tracker.window) >= len(t)

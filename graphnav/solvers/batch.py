@@ -22,8 +22,8 @@ from graphnav.dense import dense
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
-from graphnav.solvers.ekf import Progress, residual_record
 from graphnav.solvers.graph import Eliminated, LinearGraph
+from graphnav.solvers.passes import Progress, residual_record
 from graphnav.solvers.robust import weight_and_cost
 from graphnav.solvers.rows import Layout, Point, Rows, Values, column_norms, cost, promised, whitened
 from graphnav.state import DIM, States

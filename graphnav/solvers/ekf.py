@@ -1,4 +1,4 @@
-"""Error-state extended Kalman filter and its Rauch-Tung-Striebel smoother.
+"""Error-state extended Kalman filter.
 
 The filter holds one state and the covariance P of its error state, widened by the parameters that the
 constraints ask for. From keyframe to keyframe it predicts with a whole preintegrated interval,
@@ -10,9 +10,6 @@ and updates with the rows of every constraint there, nu = -r,
     S = H P H^T + R     K = P H^T S^-1     d = K nu     x <- x [+] d     P <- (I-KH) P (I-KH)^T + K R K^T
 
 (closed loop: the error state is moved into x at once; Joseph's form keeps P symmetric and positive).
-Backwards, with C = P_k F^T P^-_{k+1}^-1 (Rauch, Tung, Striebel 1965),
-
-    x^s_k = x_k [+] C (x^s_{k+1} [-] x^-_{k+1})     P^s_k = P_k + C (P^s_{k+1} - P^-_{k+1}) C^T
 
 The opening, the part that the alignment has seen, is run through twice. Before a vehicle moves nothing tells its
 heading, the filter's wanders by degrees until the first motion puts it right, and Jacobians taken along the way
@@ -28,8 +25,6 @@ Later keyframes are linearised where the filter is.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg.lapack import dposv
@@ -42,37 +37,26 @@ from graphnav.dynamics import SCALE
 from graphnav.errors import EstimationError
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array
-from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.solution import Solution
+from graphnav.solvers.passes import (
+    Filtered,
+    Forward,
+    Innovations,
+    Progress,
+    Smoothed,
+    parameters_of,
+    residual_record,
+    scale_of,
+    shift,
+)
+from graphnav.solvers.rts import backward, rts
 from graphnav.solvers.watch import Bank, Verdicts
 from graphnav.state import BLOCKS, DIM, States
 
-Progress = Callable[[str, float], None]
+__all__ = ["Filtered", "Progress", "Smoothed", "backward", "ekf", "residual_record", "rts"]
+
 _NOTHING = np.empty((1, 0))
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
-
-
-@dataclass(frozen=True)
-class Forward:
-    """A forward pass over the first K keyframes, with what the backward pass needs."""
-
-    states: list[States]  # K filtered states of one row each
-    values: Array  # (K, D-15) parameter values
-    values_predicted: Array  # (K, D-15)
-    P: Array  # (K, D, D) filtered
-    predicted: list[States]  # K predicted states
-    P_predicted: Array  # (K, D, D)
-    F: Array  # (K-1, D, D)
-    records: dict[str, _Innovations]
-    weights: dict[str, Array]  # (N,) of the rows of watched constraints: 0 where a fault was found
-    anew: bool  # it began anew somewhere, which no other solver can: its estimates are not to be used
-    about: Smoothed | None  # points at which the first keyframes were linearised; their P is of errors about these
-
-
-@dataclass(frozen=True)
-class Filtered(Forward):
-    """A forward pass over the whole problem."""
-
-    solution: Solution
 
 
 def ekf(
@@ -104,14 +88,14 @@ def ekf(
         t=problem.t,
         states=filtered,
         covariance=P,
-        parameters=_parameters(problem, one.values, one.P),
+        parameters=parameters_of(problem, one.values, one.P),
         records={name: r.record(problem) for name, r in one.records.items()},
         counts={"imu": K - 1, **{rows.name: len(rows) for rows in problem.constraints}},
         iterations=1,
         stopped="one pass forward over all keyframes",
         timings={"filter": seconds},
         notes=problem.notes,
-        between=(dense(problem, filtered, P, _scale(problem, one.values), smooth=False),),
+        between=(dense(problem, filtered, P, scale_of(problem, one.values), smooth=False),),
     )
     return Filtered(**vars(one), solution=solution)
 
@@ -130,7 +114,7 @@ def _forward(
     assert state is not None
     values = np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)])
     P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
-    records = {rows.name: _Innovations(rows) for rows in problem.constraints}
+    records = {rows.name: Innovations(rows) for rows in problem.constraints}
     first = {rows.name: np.searchsorted(rows.keyframe, np.arange(K + 1)) for rows in problem.constraints}
     watched = [c for c in problem.constraints if watch and c.watched and isinstance(c, GnssPosition | GnssVelocity)]
     bank = Bank(watched, problem.t, D) if watched else None
@@ -155,7 +139,7 @@ def _forward(
         if k:
             step = slice(k - 1, k)
             at, at_values = (state, values) if about is None or k >= n else about.at(k - 1)
-            scale = None if scale_at is None else at_values[_shift(scale_at)]
+            scale = None if scale_at is None else at_values[shift(scale_at)]
             ahead, F15 = problem.motion.propagate(step, at, scale)
             F = all_F[k - 1]
             F[:] = identity
@@ -165,8 +149,8 @@ def _forward(
             at_values = at_values.copy()
             for column, chain, j in steps.get(k, ()):
                 F[column, column] *= chain.decay[j]
-                at_values[_shift(column)] -= chain.mean[j - 1]
-                at_values[_shift(column)] = chain.mean[j] + chain.decay[j] * at_values[_shift(column)]
+                at_values[shift(column)] -= chain.mean[j - 1]
+                at_values[shift(column)] = chain.mean[j] + chain.decay[j] * at_values[shift(column)]
                 added[column] = chain.sigma[j] ** 2
             P = F @ P @ F.T
             P[:DIM, :DIM] += problem.motion.noise(step, at.R_nb)[0]
@@ -222,7 +206,7 @@ def _update(
     values: Array,
     P: Array,
     columns: dict[str, slice],
-    record: _Innovations,
+    record: Innovations,
     about: Smoothed | None,
     k: int,
     bank: Bank | None,
@@ -235,7 +219,7 @@ def _update(
     weight, G = float(np.min(record.used[lo:hi])), _NOTHING
     for left in range(rows.passes - 1 if about is None else 0, -1, -1):
         here = at if n == 1 else at[np.zeros(n, dtype=int)]
-        given = {p.name: at_values[None, _shift(columns[p.name])] for p in rows.parameters}
+        given = {p.name: at_values[None, shift(columns[p.name])] for p in rows.parameters}
         if n > 1:
             given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
         linear = rows.linearize(here, given, slice(lo, hi))
@@ -291,154 +275,10 @@ def _about_own(P: Array, e: Array) -> Array:
     return P
 
 
-@dataclass(frozen=True)
-class Smoothed:
-    """A backward pass: states, parameter values and their joint covariance at every keyframe."""
-
-    states: States
-    values: Array  # (K, D-15)
-    P: Array  # (K, D, D)
-
-    def at(self, k: int) -> tuple[States, Array]:
-        """State (one row) and parameter values of a keyframe."""
-        return self.states[k : k + 1], self.values[k]
-
-    def nodes(self, problem: Problem) -> dict[str, Array]:
-        """(n, k) per parameter: the value of each node after the last keyframe that it governs."""
-        return {
-            c.parameter.name: self.values[_last(c), _shift(problem.columns[c.parameter.name])] for c in problem.chains
-        }
-
-    def offset(self, k: int, state: States, values: Array) -> Array:
-        """The error state (D,) that leads from here to another state."""
-        return np.concatenate([state.minus(self.states[k : k + 1])[0], values - self.values[k]])
-
-
-def backward(problem: Problem, forward: Forward, progress: Progress | None = None) -> Smoothed:
-    """Smooth a forward pass."""
-    K, D = forward.P.shape[:2]
-    about = forward.about
-    n = 0 if about is None else len(about.values)
-    state, values, P = forward.states[-1], forward.values[-1], forward.P[-1]
-    states: list[States] = [state]
-    all_P, all_values = np.empty((K, D, D)), np.empty((K, D - DIM))
-    all_P[-1], all_values[-1] = P, values
-    for k in range(K - 2, -1, -1):
-        Pp = forward.P_predicted[k + 1]
-        _, gain, info = dposv(Pp, forward.F[k] @ forward.P[k])
-        if info:
-            raise EstimationError(f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas")
-        C = gain.T
-        moved = np.concatenate([state.minus(forward.predicted[k + 1])[0], values - forward.values_predicted[k + 1]])
-        at, at_values, e = forward.states[k], forward.values[k], np.zeros(D)
-        if about is not None and k + 1 < n:
-            # both ends are steps from points, and only such steps add up
-            before = about.offset(k + 1, forward.predicted[k + 1], forward.values_predicted[k + 1])
-            moved, e = about.offset(k + 1, state, values) - before, about.offset(k, at, at_values)
-            at, at_values = about.at(k)
-        d = e + C @ moved
-        state, values = at.plus(d[None, :DIM]), at_values + d[DIM:]
-        P = forward.P[k] + C @ (P - Pp) @ C.T
-        P = 0.5 * (P + P.T)
-        states.append(state)
-        all_P[k], all_values[k] = P, values
-        if progress is not None and k % 256 == 0:
-            progress("smoother", 1.0 - k / K)
-    return Smoothed(States.stack(states[::-1]), all_values, all_P)
-
-
-def rts(problem: Problem, forward: Filtered, found: Smoothed | None = None) -> Solution:
-    """The smoothed solution; residuals are its own. `found` is the backward pass where it was done before."""
-    began = time.perf_counter()
-    found = found or backward(problem, forward)
-    smoothed, all_values, all_P = found.states, found.values, found.P
-    chains = {c.parameter.name: all_values[:, _shift(problem.columns[c.parameter.name])] for c in problem.chains}
-    records = {rows.name: residual_record(problem, rows, smoothed, chains) for rows in problem.constraints}
-    seconds = time.perf_counter() - began
-    return Solution(
-        solver="rts",
-        frame=problem.frame,
-        t=problem.t,
-        states=smoothed,
-        covariance=all_P[:, :DIM, :DIM],
-        parameters=_parameters(problem, all_values, all_P),
-        records=records,
-        counts=forward.solution.counts,
-        iterations=1,
-        stopped="one pass forward and one back",
-        timings={**forward.solution.timings, "smoother": seconds},
-        notes=problem.notes,
-        between=(dense(problem, smoothed, all_P[:, :DIM, :DIM], _scale(problem, all_values), smooth=True),),
-    )
-
-
-def residual_record(
-    problem: Problem, rows: Constraint, states: States, values: dict[str, Array], weight: Array | None = None
-) -> ConstraintRecord:
-    """What is left of a constraint at the solution; `values` holds (K, k) per parameter."""
-    at = rows.keyframe
-    linear = rows.linearize(states[at], {p.name: values[p.name][at] for p in rows.parameters}, slice(None))
-    nis = np.sum((linear.residual / linear.sigma) ** 2, axis=-1)
-    weight = np.ones(len(rows)) if weight is None else weight
-    if rows.weight is not None:
-        weight = weight * rows.weight
-    return ConstraintRecord("residual", problem.t[at], linear.residual, linear.sigma, nis, weight, rows.axes, rows.unit)
-
-
-class _Innovations:
-    """Collects one constraint's innovations as the filter goes."""
-
-    def __init__(self, rows: Constraint) -> None:
-        self.rows = rows
-        shape = (len(rows), len(rows.axes))
-        self.residual, self.sigma = np.zeros(shape), np.ones(shape)
-        self.nis, self.weight = np.zeros(len(rows)), np.ones(len(rows))
-        self.used = np.ones(len(rows)) if rows.weight is None else rows.weight.copy()
-
-    def set(self, at: slice, residual: Array, sigma: Array, nis: float, weight: float) -> None:
-        self.residual[at], self.sigma[at], self.nis[at], self.weight[at] = residual, sigma, nis, weight
-
-    def record(self, problem: Problem) -> ConstraintRecord:
-        t = problem.t[self.rows.keyframe]
-        return ConstraintRecord(
-            "innovation", t, self.residual, self.sigma, self.nis, self.weight, self.rows.axes, self.rows.unit
-        )
-
-
 def _node_steps(problem: Problem) -> dict[int, list[tuple[slice, ParameterChain, int]]]:
     """At keyframes where a parameter moves on to its next node: its columns, its chain and that node."""
     out: dict[int, list[tuple[slice, ParameterChain, int]]] = {}
     for chain in problem.chains:
         for k in np.flatnonzero(np.diff(chain.node)) + 1:
             out.setdefault(int(k), []).append((problem.columns[chain.parameter.name], chain, int(chain.node[k])))
-    return out
-
-
-def _scale(problem: Problem, values: Array) -> Array | None:
-    """(K, 6) scale errors of the IMU at each keyframe."""
-    at = problem.columns.get(SCALE)
-    return None if at is None else values[:, _shift(at)]
-
-
-def _shift(columns: slice) -> slice:
-    return slice(columns.start - DIM, columns.stop - DIM)
-
-
-def _last(chain: ParameterChain) -> Array:
-    """(n,) the last keyframe that each node governs."""
-    return np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
-
-
-def _parameters(problem: Problem, values: Array, P: Array) -> dict[str, ParameterEstimate]:
-    """At each node: the value after the last keyframe that it governs."""
-    out = {}
-    for chain in problem.chains:
-        if chain.parameter.begins is not None:
-            continue  # a place of a stop is no calibration
-        at = problem.columns[chain.parameter.name]
-        last = _last(chain)
-        sigma = np.sqrt(np.maximum(np.diagonal(P[last][:, at, at], axis1=-2, axis2=-1), 0.0))
-        out[chain.parameter.name] = ParameterEstimate(
-            chain.t, values[last][:, _shift(at)], sigma, chain.parameter.sigma, chain.parameter.unit
-        )
     return out

@@ -17,7 +17,7 @@ from graphnav.dynamics import SCALE
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
-from graphnav.solvers.ekf import Progress, residual_record
+from graphnav.solvers.passes import Progress, residual_record
 from graphnav.solvers.robust import weight_and_cost
 from graphnav.solvers.stages import Place, Step
 from graphnav.solvers.window import Smoothed, Window, first_message, turn_limit

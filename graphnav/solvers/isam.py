@@ -19,8 +19,8 @@ from graphnav.dense import dense
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import Progress
 from graphnav.solvers.incremental import Replayed, node_steps, said
+from graphnav.solvers.passes import Progress
 from graphnav.solvers.rows import Layout
 from graphnav.solvers.stages import Message, Place, Step, measured, predicted
 from graphnav.state import DIM, States

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dgeqrf, dtrtri, dtrtrs
+from scipy.linalg.lapack import dgeqrf, dgesv, dtrtri
 
 from graphnav import rotation
 from graphnav.constraints.base import assemble, weighted_sigma
@@ -72,7 +72,7 @@ class Message:
     @property
     def estimate(self) -> Array:
         """(D,) the error state that it makes most likely."""
-        found, info = dtrtrs(self.R, self.z)
+        found, info = dgesv(self.R, self.z)[2:]  # not triangular any more once its point has turned
         if info:
             raise EstimationError("the smoother's information broke down: check sigmas and units")
         return np.asarray(found)

@@ -1,0 +1,130 @@
+"""What a pass over all keyframes leaves behind, forward or back, and what is said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.constraints.base import Constraint
+from graphnav.dynamics import SCALE
+from graphnav.problem import ParameterChain, Problem
+from graphnav.rotation import Array
+from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.state import DIM, States
+
+Progress = Callable[[str, float], None]
+
+
+class Innovations:
+    """Collects one constraint's innovations as the filter goes."""
+
+    def __init__(self, rows: Constraint) -> None:
+        self.rows = rows
+        shape = (len(rows), len(rows.axes))
+        self.residual, self.sigma = np.zeros(shape), np.ones(shape)
+        self.nis, self.weight = np.zeros(len(rows)), np.ones(len(rows))
+        self.used = np.ones(len(rows)) if rows.weight is None else rows.weight.copy()
+
+    def set(self, at: slice, residual: Array, sigma: Array, nis: float, weight: float) -> None:
+        """Of the rows `at`."""
+        self.residual[at], self.sigma[at], self.nis[at], self.weight[at] = residual, sigma, nis, weight
+
+    def record(self, problem: Problem) -> ConstraintRecord:
+        """All of them."""
+        t = problem.t[self.rows.keyframe]
+        return ConstraintRecord(
+            "innovation", t, self.residual, self.sigma, self.nis, self.weight, self.rows.axes, self.rows.unit
+        )
+
+
+@dataclass(frozen=True)
+class Forward:
+    """A forward pass over the first K keyframes, with what the backward pass needs."""
+
+    states: list[States]  # K filtered states of one row each
+    values: Array  # (K, D-15) parameter values
+    values_predicted: Array  # (K, D-15)
+    P: Array  # (K, D, D) filtered
+    predicted: list[States]  # K predicted states
+    P_predicted: Array  # (K, D, D)
+    F: Array  # (K-1, D, D)
+    records: dict[str, Innovations]
+    weights: dict[str, Array]  # (N,) of the rows of watched constraints: 0 where a fault was found
+    anew: bool  # it began anew somewhere, which no other solver can: its estimates are not to be used
+    about: Smoothed | None  # points at which the first keyframes were linearised; their P is of errors about these
+
+
+@dataclass(frozen=True)
+class Filtered(Forward):
+    """A forward pass over the whole problem."""
+
+    solution: Solution
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """A backward pass: states, parameter values and their joint covariance at every keyframe."""
+
+    states: States
+    values: Array  # (K, D-15)
+    P: Array  # (K, D, D)
+
+    def at(self, k: int) -> tuple[States, Array]:
+        """State (one row) and parameter values of a keyframe."""
+        return self.states[k : k + 1], self.values[k]
+
+    def nodes(self, problem: Problem) -> dict[str, Array]:
+        """(n, k) per parameter: the value of each node after the last keyframe that it governs."""
+        return {
+            c.parameter.name: self.values[last_of(c), shift(problem.columns[c.parameter.name])] for c in problem.chains
+        }
+
+    def offset(self, k: int, state: States, values: Array) -> Array:
+        """The error state (D,) that leads from here to another state."""
+        return np.concatenate([state.minus(self.states[k : k + 1])[0], values - self.values[k]])
+
+
+def residual_record(
+    problem: Problem, rows: Constraint, states: States, values: dict[str, Array], weight: Array | None = None
+) -> ConstraintRecord:
+    """What is left of a constraint at the solution; `values` holds (K, k) per parameter."""
+    at = rows.keyframe
+    linear = rows.linearize(states[at], {p.name: values[p.name][at] for p in rows.parameters}, slice(None))
+    nis = np.sum((linear.residual / linear.sigma) ** 2, axis=-1)
+    weight = np.ones(len(rows)) if weight is None else weight
+    if rows.weight is not None:
+        weight = weight * rows.weight
+    return ConstraintRecord("residual", problem.t[at], linear.residual, linear.sigma, nis, weight, rows.axes, rows.unit)
+
+
+def scale_of(problem: Problem, values: Array) -> Array | None:
+    """(K, 6) scale errors of the IMU at each keyframe."""
+    at = problem.columns.get(SCALE)
+    return None if at is None else values[:, shift(at)]
+
+
+def shift(columns: slice) -> slice:
+    """Where columns of an error state stand among the parameters' values."""
+    return slice(columns.start - DIM, columns.stop - DIM)
+
+
+def last_of(chain: ParameterChain) -> Array:
+    """(n,) the last keyframe that each node governs."""
+    return np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
+
+
+def parameters_of(problem: Problem, values: Array, P: Array) -> dict[str, ParameterEstimate]:
+    """At each node: the value after the last keyframe that it governs."""
+    out = {}
+    for chain in problem.chains:
+        if chain.parameter.begins is not None:
+            continue  # a place of a stop is no calibration
+        at = problem.columns[chain.parameter.name]
+        last = last_of(chain)
+        sigma = np.sqrt(np.maximum(np.diagonal(P[last][:, at, at], axis1=-2, axis2=-1), 0.0))
+        out[chain.parameter.name] = ParameterEstimate(
+            chain.t, values[last][:, shift(at)], sigma, chain.parameter.sigma, chain.parameter.unit
+        )
+    return out
