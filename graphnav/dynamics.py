@@ -23,7 +23,7 @@ transition matrix F = d(end)/d(start) below.
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -38,6 +38,7 @@ SCALE = "imu_scale"
 _I3 = np.eye(3)
 
 
+@cache
 def scale_parameter(noise: ImuNoise) -> tuple[Parameter, ...]:
     """The six scale errors (gyro x y z, accelerometer x y z), where the noise figures leave them open."""
     if noise.gyro_scale_sigma <= 0 and noise.accel_scale_sigma <= 0:

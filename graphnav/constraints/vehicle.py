@@ -202,6 +202,13 @@ def _moving_rows(scene: Scene) -> Array:
 
 def shared_parameters(scene: Scene) -> dict[str, Any]:
     """Lever arm of the point that does not slip, and the parameters both constraints depend on."""
+    if "wheels" not in scene.made:
+        scene.made["wheels"] = _shared_parameters(scene)
+    lever, parameters = scene.made["wheels"]
+    return {"lever_arm": lever, "parameters": list(parameters)}
+
+
+def _shared_parameters(scene: Scene) -> tuple[Array, list[Parameter]]:
     s, odometer = scene.settings.vehicle, scene.recording.odometer
     parameters = list(scale_parameter(scene.recording.imu.noise))
     lever = np.zeros(3) if odometer is None else odometer.lever_arm
@@ -213,7 +220,7 @@ def shared_parameters(scene: Scene) -> dict[str, Any]:
     sigma_axle = s.axle_sigma if stated else s.unstated_axle_sigma
     if sigma_axle > 0:
         parameters.append(Parameter(AXLE, np.zeros(1), np.full(1, sigma_axle), "m"))
-    return {"lever_arm": lever, "parameters": parameters}
+    return lever, parameters
 
 
 @dataclass(frozen=True)

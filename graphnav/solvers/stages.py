@@ -83,11 +83,11 @@ class Message:
         root = np.linalg.inv(self.R)
         return np.asarray(root @ root.T)
 
-    def moved(self, e: Array) -> Message:
-        """The same about the point moved by the error state e (D,)."""
-        return Message(
-            self.state.plus(e[None, :DIM]), self.values + e[DIM:], self.columns, turned(self.R, e), self.z - self.R @ e
-        )
+    def moved(self, e: Array, J: Array | None = None) -> Message:
+        """The same about the point moved by the error state e (D,); J is Jr^-1 of its turn, if known."""
+        J = rotation.right_jacobian_inverse(e[None, :3])[0] if J is None else J
+        state, values = self.state.plus(e[None, :DIM]), self.values + e[DIM:]
+        return Message(state, values, self.columns, turned(self.R, J), self.z - self.R @ e)
 
     def value(self, name: str) -> Array:
         """A parameter at the point."""
@@ -122,7 +122,8 @@ class Stage:
 
     def moved(self, e: Array) -> Stage:
         """The same about the point moved by the error state e."""
-        message, G, g = self.message.moved(e), turned(self.G, e), self.g + self.G @ e
+        J = rotation.right_jacobian_inverse(e[None, :3])[0]
+        message, G, g = self.message.moved(e, J), turned(self.G, J), self.g + self.G @ e
         return Stage(self.place, message, G, g, self.lost, self.C, self.measured, self.way + e)
 
     @property
@@ -139,10 +140,10 @@ class Stage:
         return np.asarray(out)
 
 
-def turned(A: Array, e: Array) -> Array:
-    """Columns about a point turned by e: log(Exp(e) Exp(d)) = e + Jr^-1(e) d."""
+def turned(A: Array, J: Array) -> Array:
+    """Columns about a point turned by e, of which J is Jr^-1: log(Exp(e) Exp(d)) = e + Jr^-1(e) d."""
     out = A.copy()
-    out[:, :3] = A[:, :3] @ rotation.right_jacobian_inverse(e[None, :3])[0]
+    out[:, :3] = A[:, :3] @ J
     return out
 
 
@@ -338,7 +339,7 @@ def eliminate(
     G[lost], g[lost] = -root @ R[:E, E : E + D], root @ R[:E, -1]
     if not place.linked and np.any(state.minus(before.state)):
         shift = state.minus(before.state)[0]
-        G[:DIM] = turned(G[:DIM], shift)
+        G[:DIM] = turned(G[:DIM], rotation.right_jacobian_inverse(shift[None, :3])[0])
         g[:DIM] += shift
     return Stage(place, message, G, g, lost, root @ root.T, linear.measured)
 
