@@ -19,6 +19,7 @@ from graphnav.solvers.window import Residual, Smoothed
 
 _WHEELS = (NonHolonomic.name, OdometerSpeed.name)
 _KEPT = 1000  # blocks: about three hours
+_CLEARLY = 0.1  # of a factor
 _MORE = 1.2  # times the blocks of the last judgement, for the next
 
 
@@ -44,6 +45,7 @@ class Evidence:
 
     def __init__(self) -> None:
         self.factors: dict[str, Array] = {}  # (m,) by constraint
+        self.revised = False  # whether they have become clearly others
         self._blocks: dict[str, _Blocks] = {name: _Blocks() for name in _WHEELS}
 
     def add(self, part: Smoothed) -> None:
@@ -57,6 +59,8 @@ class Evidence:
                 blocks.judged = len(blocks.squared)
                 found = np.array([raised_by(axis) for axis in np.array(blocks.squared).T])
                 if np.any(found > 1.0) or name in self.factors:
+                    before = self.factors.get(name, 1.0)
+                    self.revised |= bool(np.any(np.abs(found - before) > _CLEARLY * np.maximum(found, before)))
                     self.factors[name] = found
 
     def _add(self, blocks: _Blocks, number: float, rows: Residual) -> None:

@@ -22,6 +22,7 @@ _EVERY = 2.0  # s between looks of the detectors
 _LOOK = 30.0  # s that they see
 _SEEN = 25.0  # s of these that they answer for; the first few lack what was before
 _REVIEW = 10.0  # s between looks at what was answered before, while nothing stands
+_CLEARLY = 0.1  # of a figure
 _WHEELS, _WHEELS_LOOK = 10.0, 40.0  # s between looks at the odometer, and what they see
 
 
@@ -92,18 +93,14 @@ class Stops:
 
 
 class Readings:
-    """What an odometer's readings are worth, and where they are wrong, as far as can be told by now.
+    """What an odometer's readings are worth, and where they are wrong, as far as can be told by now."""
 
-    Parameters
-    ----------
-    begun : s, since when there are any.
-    """
-
-    def __init__(self, begun: float) -> None:
+    def __init__(self) -> None:
         self.wrong: Array = np.empty((0, 2))  # s
         self.figures: Figures | None = None
-        self._begun = begun
-        self._looked = self._told = -np.inf  # s, when last, and when for the figures
+        self.revised = False  # whether the figures have become clearly others
+        self._looked = -np.inf  # s
+        self._moving, self._told, self._counted = 0, 0, -np.inf  # readings in motion, by when told, and up to when
         self._lag: float | None = None  # s by which it is late, as far as the IMU can tell
 
     @property
@@ -121,11 +118,15 @@ class Readings:
         recording = sensors.recording(-np.inf if whole else now - _WHEELS_LOOK, now)
         if recording.odometer is None:
             return np.inf
-        lag = self._lag
-        if now - self._begun >= 2.0 * (self._told - self._begun):  # ever more seldom, as more readings tell little new
+        lag, o = self._lag, recording.odometer
+        self._moving += int(np.count_nonzero(o.speed[o.t > self._counted]))
+        self._counted = float(o.t[-1])
+        # ever more seldom, as more readings tell little new; while it stands they tell nothing
+        if self.figures is None or self._moving >= 2 * max(self._told, 1):
             every = sensors.recording().odometer
             assert every is not None
-            self.figures, self._told, lag = Figures.of(every), now, None
+            before, self.figures, self._told, lag = self.figures, Figures.of(every), self._moving, None
+            self.revised |= before is not None and _other(before.sigmas(o), self.figures.sigmas(o))
         seen, known = faults(recording.odometer, recording.imu, self.figures, lag), self.wrong
         found, self._lag = seen.spans, seen.lag
         since = float(recording.odometer.t[0]) + (0.0 if whole else 5.0)
@@ -133,6 +134,11 @@ class Readings:
         self.wrong = np.concatenate([old, found[found[:, 0] >= since]])
         new = self.wrong[~np.isin(self.wrong[:, 0], known[:, 0])]
         return float(new[0, 0]) if len(new) else np.inf
+
+
+def _other(before: tuple[float, ...], now: tuple[float, ...]) -> bool:
+    """Whether sigmas are clearly others."""
+    return any(abs(a - b) > _CLEARLY * max(a, b) for a, b in zip(before, now, strict=True))
 
 
 def clipped(spans: Array, begin: float, end: float) -> Array:

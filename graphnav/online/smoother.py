@@ -124,6 +124,8 @@ class Online:
             self._use(self._judgement, tracker)
         elif tracker.spare(self.sensors, expected := self._expected(tracker)):
             self._collect(tracker)
+        elif tracker.stale:
+            self._again = Again(tracker.afresh(tracker.settings, self.sensors.setup), self.sensors.setup)
         else:
             if self._found is not None and self._judgement is None:
                 self._judge_again(self._found, tracker)

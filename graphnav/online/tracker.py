@@ -68,7 +68,7 @@ class Tracker:
         self.head = t0  # time of the message before the window, or of the first keyframe as long as it is in it
         self.opened = False  # whether the first keyframe has left the window
         self._standing = Stops()
-        self._readings = Readings(t0)
+        self._readings = Readings()
         self._steps = Steps()
         self.settled: list[Smoothed] = []
         self.evidence = Evidence()
@@ -234,7 +234,13 @@ class Tracker:
         other.window = Window(head.moved(head.estimate), turn_limit(setup.imu.noise))
         other._nodes, other._motions, other.settled = [], {}, []
         other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)
+        other._readings.revised = other.evidence.revised = False
         return other
+
+    @property
+    def stale(self) -> bool:
+        """Whether what has not settled was posed with figures of the wheels that are known better by now."""
+        return self._readings.revised or self.evidence.revised
 
     def knows(self, other: Tracker, stationary: Array, until: float) -> None:
         """Take over what another has seen, but for the stops up to a time, which have been looked for anew."""
