@@ -206,15 +206,15 @@ def test_edges_are_found_from_both_sides(posed: Problem) -> None:
 
 def test_a_filter_astray_gives_up_what_led_it_there(posed: Problem) -> None:
     rows = next(c for c in posed.constraints if c.name == "gnss_position")
-    verdicts = Verdicts([rows], posed.t)
-    used = verdicts.used[rows.name]
-    verdicts.settle(rows.name, 100, 110)  # a fault
+    t, used = posed.t[rows.keyframe], np.ones(len(rows))
+    verdicts = Verdicts({rows.name: t}, {rows.name: used})
+    verdicts.settle(rows.name, t[100], t[109])  # a fault
     assert not used[100:110].any()
     for k in range(115, 180):  # five fixes used, and all after them refused
-        at = verdicts.settle(rows.name, k, k + 1)
-        if at != rows.keyframe[k]:
+        at = verdicts.settle(rows.name, t[k], t[k])
+        if at != t[k]:
             break
-    assert at == rows.keyframe[100]  # from before the first fault
+    assert at == t[100]  # from before the first fault
     assert not used[100:115].any()
     assert used[115 : k + 1].all()
 

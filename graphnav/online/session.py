@@ -104,6 +104,9 @@ class Session:
             "late_and_used": dict(online.late),
             "bad_lines": self.bad,
             "first_bad_lines": self.complaints,
+            "excluded": [
+                {"kind": f.kind, "from_s": f.t_start, "to_s": f.t_end, "count": f.count} for f in online.excluded
+            ],
             "notes": online.notes,
             "lag_s": self.settings.solver.lag,
         }

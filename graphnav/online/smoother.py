@@ -14,7 +14,6 @@ import numpy as np
 from graphnav.alignment import Alignment, align, ready, with_known_heading
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
-from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.judgement import FIXES
@@ -22,10 +21,11 @@ from graphnav.online.judging import Again, Judgement
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import Live, Tracker
-from graphnav.pipeline import judged, origin
+from graphnav.pipeline import origin
 from graphnav.recording import Recording
-from graphnav.solution import to_trajectory
+from graphnav.solution import Fault, to_trajectory
 from graphnav.solvers.batch import batch
+from graphnav.solvers.watch import LONGEST
 from graphnav.solvers.window import first_message
 from graphnav.trajectory import Trajectory
 
@@ -59,6 +59,7 @@ class Online:
         self.late: Counter[str] = Counter()  # rows that came after the keyframe they belong before, and were used
         self._judgement: Judgement | None = None  # being made
         self._again: Again | None = None  # going through what has not settled with it
+        self._tentative = False  # nothing is to settle before the sensors have been judged once
         self._found: Alignment | None = None  # as long as the sensors are still to be judged by more rows
         self._said: tuple[str, ...] = ()  # of the notes, those about what the sensors are judged to be
         self._judged = 0.0  # s of rows that they were judged by
@@ -69,6 +70,12 @@ class Online:
         self._dirty = np.inf
         self._settled: list[Trajectory] = []
         self._last_settled = -np.inf
+        self._faults: tuple[Fault, ...] = ()  # found before the newest alignment
+
+    @property
+    def excluded(self) -> tuple[Fault, ...]:
+        """Spans of fixes found to be wrong, which were not used."""
+        return self._faults + (self.tracker.verdicts.faults() if self.tracker is not None else ())
 
     @property
     def status(self) -> str:
@@ -90,7 +97,7 @@ class Online:
         if sensor == "imu":
             newest = sensors.imu.newest
             if newest - before > self.settings.keyframes.bridge and len(sensors.imu) > 1 and np.isfinite(before):
-                self._restart(before)
+                self._restart(before, f"the IMU was silent from {before:.3f} to {newest:.3f} s")
         tracker = self.tracker
         if tracker is not None:
             self._awake = -np.inf
@@ -122,6 +129,8 @@ class Online:
             self._go_through(self._again, tracker)
         elif self._judgement is not None and tracker.newest >= self._judgement.due:
             self._use(self._judgement, tracker)
+        elif self._tentative:
+            self._awake = self._due
         elif tracker.spare(self.sensors, expected := self._expected(tracker)):
             self._collect(tracker)
         elif tracker.stale:
@@ -181,18 +190,16 @@ class Online:
         try:
             found = align(recording, self.settings, frame, lambda problem, start: batch(
                 problem, start, wanted=(0,), reintegrate=False))  # fmt: skip
-            stationary = detect(recording, self.settings).stationary
-            recording, settings, said = judged(recording, self.settings, frame, found, stationary)
         except EstimationError as error:
             if last:
                 raise
             self.notes.append(f"not aligned at {now:.1f} s: {error}")
             self._wait(now)
             return
-        more = found.motion is not None and settings.gnss.position and recording.platform != "foot"
-        self._found = found if more else None
-        self.tracker, sensors.setup = self._track(found, recording, settings)
-        self._say(said)
+        self.tracker, sensors.setup = self._track(found, recording, self.settings)
+        if found.motion is not None and self.settings.gnss.position and recording.platform != "foot":
+            self._found, self._tentative = found, True
+            self._have_judged(recording, found, now)
         self._fixes = [t for t in sensors.gnss.t.tolist() if t >= recording.start - SAME_TIME]
         self._began, self._judged = recording.start, recording.duration
         sensors.oldest = recording.start
@@ -222,16 +229,20 @@ class Online:
         """
         assert found.motion is not None
         assert self.frame is not None
-        span, lag = tracker.newest - self._began, self.settings.solver.lag
+        span = tracker.newest - self._began
         enough = np.count_nonzero(self.sensors.gnss.t > found.motion) >= FIXES or span > _JUDGED_UNTIL
-        if not enough and span < max(min(lag, _JUDGED), 2.0 * self._judged):
+        if not enough and span < max(min(self.settings.solver.lag, _JUDGED), 2.0 * self._judged):
             return
         self._judged = span
         self._found = None if enough else found
         used, self.sensors.setup = self.sensors.setup, self._setup
         recording = self.sensors.recording(-np.inf, tracker.newest)
         self.sensors.setup = used
-        due = tracker.newest + min(_THINKING * lag, _LONGEST_THOUGHT)
+        self._have_judged(recording, found, tracker.newest)
+
+    def _have_judged(self, recording: Recording, found: Alignment, now: float) -> None:
+        assert self.frame is not None
+        due = now + min(_THINKING * self.settings.solver.lag, _LONGEST_THOUGHT)
         self._judgement = Judgement(recording, self.settings, self.frame, found, due)
 
     def _use(self, judgement: Judgement, tracker: Tracker) -> None:
@@ -241,6 +252,7 @@ class Online:
             recording, settings, said, stationary = judgement.answer()
         except EstimationError as error:
             self.notes.append(f"not judged again: {error}")
+            self._tentative = False
             return
         self._say(said)
         if tracker.opened:
@@ -254,7 +266,7 @@ class Online:
     def _go_through(self, again: Again, tracker: Tracker) -> None:
         """Some of it; what has caught up takes over."""
         if again.step(self.sensors, tracker):
-            self.tracker, self._again = again.tracker, None
+            self.tracker, self._again, self._tentative = again.tracker, None, False
             self.sensors.setup = again.setup
 
     def _judged_at_last(self) -> None:
@@ -269,10 +281,10 @@ class Online:
         if now - float(self.sensors.imu.t[0]) > _PATIENCE:
             self.sensors.drop_before(now - 0.5 * _PATIENCE)
 
-    def _restart(self, before: float) -> None:
-        """The IMU was away for too long: what was before settles as it is, and an alignment begins anew."""
+    def _restart(self, before: float, why: str) -> None:
+        """What was up to a time (s) settles as it is, and an alignment begins anew."""
         sensors = self.sensors
-        self.notes.append(f"the IMU was silent from {before:.3f} to {sensors.imu.newest:.3f} s: aligning anew")
+        self.notes.append(f"{why}: aligning anew")
         after = sensors.imu.rows[sensors.imu.t > before].copy()
         later = {name: getattr(sensors, name).rows.copy() for name in ("gnss", "odometer")}
         if self.tracker is not None:
@@ -281,7 +293,9 @@ class Online:
             self._advance(self.tracker, last=True)
             self.tracker.settle(sensors)
             self._collect(self.tracker)
+            self._faults += self.tracker.verdicts.faults()
         self.tracker = self._found = self._judgement = self._again = None
+        self._tentative = False
         sensors.setup = self._setup  # the IMU is judged anew as well
         sensors.drop_before(np.inf)
         for row in after:
@@ -332,6 +346,10 @@ class Online:
             if self._again is not None and redone < np.inf:
                 self._again.tracker.back_to(redone, tracker)
             self._collect(tracker)
+            if tracker.verdicts.anew and not last:
+                said = f"for {LONGEST:.0f} s fixes contradicted all else, until {tracker.newest:.3f} s"
+                self._restart(tracker.newest, said)
+                return
         T = tracker.newest
         self._due = min([T + period, *(t for t in self._fixes if t > T)]) + AFTER
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
+from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.constraints.standstill import PLACE
 from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.dense import Dense
@@ -31,6 +32,7 @@ from graphnav.problem import NODE_SPACING, Problem, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solvers.stages import Place, Step
+from graphnav.solvers.watch import Verdicts, Watch
 from graphnav.solvers.window import Message, Smoothed, Window, turn_limit
 from graphnav.state import DIM, Parameter, States
 from graphnav.wheels import MeanSpeed
@@ -40,6 +42,7 @@ _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is see
 _PLACE_SIGMA = 1000.0  # m, of where a stop may be
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
 _LATEST = 0.5  # of the lag by which they may be late for it, where states still move
+_FIXES = 5  # that tell how often they come
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,7 @@ class Tracker:
         self._steps = Steps()
         self.settled: list[Smoothed] = []
         self.evidence = Evidence()
+        self.verdicts = Verdicts({}, {})  # which fixes are used
         self.in_force: dict[str, int] = {}  # rows of each constraint at the newest keyframe
         self.seconds: dict[str, float] = {}  # of its thread, by what the newest update did
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
@@ -141,16 +145,39 @@ class Tracker:
         problem = self._pose(sensors, np.concatenate([before, times]))
         clock.append(time.thread_time())
         self._parameters |= problem.parameters
-        turn = 0.0
-        for k in range(len(before), len(problem.t)):
-            turn = max(turn, self._push(problem, k))
-        self._turned = turn > self.window.turn
-        self.in_force = {rows.name: len(rows.b) for rows in self.window.stages[-1].measured}
+        self._watch(problem, sensors)
+        back = self._add(problem, len(before))
+        self.in_force = {rows.name: len(rows.b) for rows in self.window.stages[-1].measured if rows.H.any()}
         self._forget()
         clock.append(time.thread_time())
         if len(new):
             self.seconds = dict(zip(("looking", "posing", "solving"), np.diff(clock).tolist(), strict=True))
-        return again[0] if again else np.inf
+        redone = again[0] if again else np.inf
+        if back is None:
+            return redone
+        rest = times[times > self.newest + SAME_TIME]
+        return min(redone, back, self.update(sensors, rest, back))
+
+    def _add(self, posed: Problem, first: int) -> float | None:
+        """Add the keyframes of a problem from one on; the time before them to go on from, if a fault is found."""
+        problem, k, turn = self._weighed(posed), first, 0.0
+        while k < len(problem.t):
+            turn = max(turn, self._push(problem, k))
+            fault = self.window.stages[-1].fault
+            if fault is not None:
+                again = self.verdicts.settle(*fault, now=float(problem.t[k]))
+                if again < problem.t[first] - SAME_TIME:
+                    if again <= self.head + SAME_TIME:
+                        self.window.forget_tests()
+                    return again
+                problem = self._weighed(posed)
+                back = int(problem.t.searchsorted(again - SAME_TIME))
+                self._keep(len(self.window) - (k - back + 1))
+                k = back
+                continue
+            k += 1
+        self._turned = turn > self.window.turn
+        return None
 
     def steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
         """Keyframes of a walk that can be made by now, and what they change of those before."""
@@ -230,7 +257,7 @@ class Tracker:
     def afresh(self, settings: Settings, setup: Recording) -> Tracker:
         """One with other figures of the sensors that has settled what this one has, and has no keyframes since."""
         other, head = copy.copy(self), self.window.head
-        other.settings, other._parameters = settings, {}
+        other.settings, other._parameters, other.verdicts = settings, {}, copy.deepcopy(self.verdicts)
         other.window = Window(head.moved(head.estimate), turn_limit(setup.imu.noise))
         other._nodes, other._motions, other.settled = [], {}, []
         other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)
@@ -321,23 +348,31 @@ class Tracker:
         for k, t in enumerate(times[1:].tolist()):
             if t not in known:
                 self._motions[t] = Motion(problem.intervals[k : k + 1], self.frame)
-        return self._weighed(problem)
+        return problem
+
+    def _watch(self, problem: Problem, sensors: Sensors) -> None:
+        """Have the fixes watched for errors that last, as soon as some tell how often they come."""
+        if self.window.newest.tests is not None or not self.settings.gnss.faults or len(sensors.gnss) < _FIXES:
+            return
+        watched = [c for c in problem.constraints if c.watched and isinstance(c, GnssPosition | GnssVelocity)]
+        if watched:
+            period = float(np.median(np.diff(sensors.gnss.t)))
+            self.window.watch(Watch(watched, period, len(self.window.newest.z)))
 
     def _weighed(self, problem: Problem) -> Problem:
-        """The problem with what is decided of each row before it enters the window: its sigma, its robust kernel.
+        """The problem with what is decided of each row before it enters the window.
 
-        Decided here once, with what is known when a keyframe is posed; the window then weighs the rows by their
-        kernels. Wheels: by what settled so far says of them. A fix that is suspect would be given its weight here.
+        Fixes: not used where a fault was found. Wheels: their sigma by what settled so far says of them.
         """
-        factors = self.evidence.factors
-        if not factors:
-            return problem
-        rows = (
-            replace(c, sigma=c.sigma * factors[c.name])
-            if isinstance(c, NonHolonomic | OdometerSpeed) and c.name in factors
-            else c
-            for c in problem.constraints
-        )
+        factors, rows = self.evidence.factors, []
+        for c in problem.constraints:
+            if isinstance(c, NonHolonomic | OdometerSpeed) and c.name in factors:
+                c = replace(c, sigma=c.sigma * factors[c.name])
+            elif c.watched and self.settings.gnss.faults:
+                weight = self.verdicts.weights(c.name, problem.t[c.keyframe])
+                if not weight.all():
+                    c = replace(c, weight=weight)
+            rows.append(c)
         return replace(problem, constraints=tuple(rows))
 
     def _around(self, sensors: Sensors, begin: float, end: float) -> Recording:
@@ -386,7 +421,7 @@ class Tracker:
         """The places of the stages from `first` on, posed again."""
         skip = len(self.times) - len(self.window)  # 1 once there is a keyframe before the first stage
         begin = max(0, first + skip - _BEFORE)
-        problem = self._pose(sensors, self.times[begin:])
+        problem = self._weighed(self._pose(sensors, self.times[begin:]))
         return [
             replace(stage.place, problem=problem, k=first + skip - begin + i)
             for i, stage in enumerate(self.window.stages[first:])

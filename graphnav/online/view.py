@@ -48,11 +48,12 @@ def view(session: Session, silent: float = 0.0) -> list[tuple[str, str]]:
             ("window", f"{len(tracker.window)} keyframes, {tracker.newest - tracker.head:.0f} s"),
             ("update", ", ".join(f"{name} {1e3 * s:.1f} ms" for name, s in tracker.seconds.items())),
         ]
-    late = sum(online.late.values())
+    late, wrong = sum(online.late.values()), sum(fault.count for fault in online.excluded)
     odd = {k: n for k, n in sensors.counts.items() if ":" in k}
     lines.append(("settled", f"{session.rows_settled} keyframes"))
-    if late or odd or session.bad:
+    if late or wrong or odd or session.bad:
         said = [f"{late} late rows used"] * bool(late) + [f"{n} {k}" for k, n in sorted(odd.items())]
+        said += [f"{wrong} wrong fixes left out"] * bool(wrong)
         said += [f"{session.bad} bad lines ({session.complaints[0]})"] if session.complaints else []
         lines.append(("odd", ", ".join(said)))
     if online.notes:

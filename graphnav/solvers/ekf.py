@@ -119,9 +119,9 @@ def _forward(
     watched = [c for c in problem.constraints if watch and c.watched and isinstance(c, GnssPosition | GnssVelocity)]
     bank = Bank(watched, problem.t, D) if watched else None
     banks: dict[int, Bank] = {}  # as they were before the latest keyframes with fixes
-    verdicts = Verdicts(watched, problem.t)
-    for kind in watched:
-        records[kind.name].used = verdicts.used[kind.name]
+    verdicts = Verdicts(
+        {c.name: problem.t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
+    )
     begun = (state, values, P)
 
     all_P, all_Pp, all_F = np.empty((K, D, D)), np.empty((K, D, D)), np.empty((K - 1, D, D))
@@ -164,7 +164,7 @@ def _forward(
                 ahead, at_values = ahead.plus(e[None, :DIM]), at_values + e[DIM:]
             state, values = ahead, at_values
         for kind in watched:
-            if (kind.name, first[kind.name][k]) in verdicts.anew:
+            if (kind.name, problem.t[k]) in verdicts.anew:
                 block = BLOCKS["p" if isinstance(kind, GnssPosition) else "v"]
                 P[block, block] += 1e6 * np.eye(3)
         predicted[k] = state
@@ -178,7 +178,8 @@ def _forward(
                 at_point = about if k < n else None
                 state, values, P, fault = _update(rows, lo, hi, *x, columns, record, at_point, k, bank)
                 if fault is not None:
-                    back = verdicts.settle(rows.name, fault, hi)
+                    again = verdicts.settle(rows.name, fault, float(problem.t[k]))
+                    back = int(np.searchsorted(problem.t, again))
                     break
         if back is not None:  # once more from before the fault, without it
             bank = banks.get(back) or bank.forgetful() if bank else None
@@ -210,8 +211,8 @@ def _update(
     about: Smoothed | None,
     k: int,
     bank: Bank | None,
-) -> tuple[States, Array, Array, int | None]:
-    """One measurement update with rows lo..hi of a constraint at keyframe k; the first row of a fault comes last."""
+) -> tuple[States, Array, Array, float | None]:
+    """One measurement update with rows lo..hi of a constraint at keyframe k; when a fault began comes last."""
     n = hi - lo
     at, at_values = (state, values) if about is None else about.at(k)
     D = len(P)
@@ -231,7 +232,7 @@ def _update(
         S = H @ PHt
         S.flat[:: len(r) + 1] += sigma * sigma
         if bank is not None and weight > 0.0 and not left:
-            G = bank.signature(rows.name, lo, H)
+            G = bank.signature(rows.name, k, H)
         # LAPACK called directly: for matrices this small the checks around it would cost more than the work
         right = np.empty((len(r), D + 1 + G.shape[1]))
         right[:, 0], right[:, 1 : D + 1], right[:, D + 1 :] = r, PHt.T, G
@@ -250,7 +251,7 @@ def _update(
         weight = 0.0
     record.set(slice(lo, hi), r.reshape(n, -1), np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1), nis / n, weight)
     if bank is not None:
-        bank.seen(rows.name, lo, nis)
+        bank.seen(rows.name, k, nis)
     if weight == 0.0:
         return state, values, P, None
     IKH = -K @ H

@@ -10,6 +10,9 @@ with QR (Bierman 1977, ch. VI; Dellaert and Kaess 2006) what only they touch: x_
     [ 0           H_k ]
 
 For a chain this is the elimination that GTSAM does in the same order, on matrices that are dense anyway.
+
+A message may have tests beside it (`graphnav.solvers.watch`) that look for errors of fixes that last: more columns on
+the right, which go through the same QR.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dgeqrf, dgesv, dtrtri
+from scipy.linalg.lapack import dgeqrf, dgesv, dtrtri, dtrtrs
 
 from graphnav import rotation
 from graphnav.constraints.base import assemble, weighted_sigma
@@ -27,6 +30,7 @@ from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array, mv
 from graphnav.solvers.robust import weight_and_cost
+from graphnav.solvers.watch import Watch
 from graphnav.state import DIM, States
 
 Columns = dict[str, slice]
@@ -68,6 +72,7 @@ class Message:
     columns: Columns
     R: Array  # (D, D)
     z: Array  # (D,)
+    tests: Watch | None = None
 
     @property
     def estimate(self) -> Array:
@@ -87,7 +92,7 @@ class Message:
         """The same about the point moved by the error state e (D,); J is Jr^-1 of its turn, if known."""
         J = rotation.right_jacobian_inverse(e[None, :3])[0] if J is None else J
         state, values = self.state.plus(e[None, :DIM]), self.values + e[DIM:]
-        return Message(state, values, self.columns, turned(self.R, J), self.z - self.R @ e)
+        return Message(state, values, self.columns, turned(self.R, J), self.z - self.R @ e, self.tests)
 
     def value(self, name: str) -> Array:
         """A parameter at the point."""
@@ -106,6 +111,15 @@ class Measured:
     kernel: str
     scale: float
 
+    def weighted(self, y: Array, passes: int) -> tuple[Array, Array, Array]:
+        """H, b and sigma, by the kernel's weights for the error state y once `passes` is not 0."""
+        if self.kernel == "none" or not passes:
+            return self.H, self.b, self.sigma
+        left = self.b - mv(self.H, np.broadcast_to(y, (len(self.b), len(y))))
+        weight = np.sqrt(weight_and_cost(self.kernel, np.linalg.norm(left, axis=-1), self.scale)[0])[:, None]
+        with np.errstate(divide="ignore"):
+            return self.H * weight[..., None], self.b * weight, self.sigma / weight
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -119,12 +133,13 @@ class Stage:
     C: Array  # (lost, lost)
     measured: tuple[Measured, ...] = ()  # about a point that the stage has moved from by `way`
     way: Array | float = 0.0
+    fault: tuple[str, float] | None = None  # whose fixes are wrong, and since when (s)
 
     def moved(self, e: Array) -> Stage:
         """The same about the point moved by the error state e."""
         J = rotation.right_jacobian_inverse(e[None, :3])[0]
         message, G, g = self.message.moved(e, J), turned(self.G, J), self.g + self.G @ e
-        return Stage(self.place, message, G, g, self.lost, self.C, self.measured, self.way + e)
+        return Stage(self.place, message, G, g, self.lost, self.C, self.measured, self.way + e, self.fault)
 
     @property
     def noise(self) -> Array:
@@ -154,16 +169,13 @@ class Linear:
     link: Array | None
     measured: tuple[Measured, ...]
 
-    def stacked(self, y: Array, passes: int) -> Array:
-        """(rows, D + 1) of the measurements, weighted for the error state y once `passes` is not 0."""
+    def stacked(self, y: Array, passes: int, tests: Watch | None = None) -> Array:
+        """(rows, D + 1) of the measurements without tests, weighted for the error state y once `passes` is not 0."""
         parts = []
         for one in self.measured:
-            H, b = one.H, one.b
-            if one.kernel != "none" and passes:
-                left = b - mv(H, np.broadcast_to(y, (len(b), len(y))))
-                weight = np.sqrt(weight_and_cost(one.kernel, np.linalg.norm(left, axis=-1), one.scale)[0])
-                H, b = H * weight[:, None, None], b * weight[:, None]
-            parts.append(np.concatenate([H, b[..., None]], axis=-1).reshape(-1, H.shape[-1] + 1))
+            if tests is None or one.name not in tests:
+                H, b, _ = one.weighted(y, passes)
+                parts.append(np.concatenate([H, b[..., None]], axis=-1).reshape(-1, H.shape[-1] + 1))
         return np.concatenate(parts) if parts else np.zeros((0, len(y) + 1))
 
     @property
@@ -292,9 +304,13 @@ def eliminate(
     # where each column of the message goes: to the eliminated ones in front, or to its own place behind them
     to = np.arange(E, E + D0)
     to[lost] = np.arange(E)
-    steps = sum(len(s.mean) for s in place.steps)
-    head = np.zeros((D0 + steps + (0 if linear.link is None else DIM), E + D + 1))
+    steps, tests = sum(len(s.mean) for s in place.steps), before.tests
+    C = 0 if tests is None else tests.X.shape[1]
+    wide = np.zeros((D0 + steps + (0 if linear.link is None else DIM), E + D + 1 + C))
+    head = wide[:, : E + D + 1]
     head[:D0, to], head[:D0, -1] = before.R, before.z
+    if tests is not None:
+        wide[:D0, E + D + 1 :] = before.R @ tests.X
     if not place.linked:  # one and the same state, but about its new point
         shift = state.minus(before.state)[0]
         if np.any(shift):
@@ -320,13 +336,16 @@ def eliminate(
         row += k
     if linear.link is not None:
         head[row:, :DIM], head[row:, E:] = linear.link[:, :DIM], linear.link[:, DIM:]
-    y, first = np.zeros(D), 1 if weighted else 0
+    y, first, fault = np.zeros(D), 1 if weighted else 0, None
     for passes in range(first, first + 1 if weighted or not linear.robust else _PASSES):
-        tail = linear.stacked(y, passes)
-        A = np.zeros((len(head) + len(tail), E + D + 1), order="F")
-        A[: len(head)], A[len(head) :, E:] = head, tail
+        tail = linear.stacked(y, passes, tests)
+        A = np.zeros((len(head) + len(tail), E + D + 1 + C), order="F")
+        A[: len(head)], A[len(head) :, E : E + D + 1] = wide, tail
         R = np.triu(dgeqrf(A, overwrite_a=1)[0][: E + D])
-        message = Message(state, values, columns, R[E:, E : E + D], R[E:, -1])
+        top, beside = R[E:, E:], None
+        if tests is not None:
+            top, beside, fault = _tested(top, tests.copy(), linear.measured, y, passes, place.t, state)
+        message = Message(state, values, columns, top[:, :D], top[:, D], beside)
         if linear.robust:
             y = message.estimate
     root, info = dtrtri(R[:E, :E]) if E else (np.zeros((0, 0)), 0)
@@ -336,12 +355,35 @@ def eliminate(
     kept = np.arange(D0)
     G[kept, kept] = 1.0
     g[DIM:] = values[: D0 - DIM] - before.values
-    G[lost], g[lost] = -root @ R[:E, E : E + D], root @ R[:E, -1]
+    G[lost], g[lost] = -root @ R[:E, E : E + D], root @ R[:E, E + D]
     if not place.linked and np.any(state.minus(before.state)):
         shift = state.minus(before.state)[0]
         G[:DIM] = turned(G[:DIM], rotation.right_jacobian_inverse(shift[None, :3])[0])
         g[:DIM] += shift
-    return Stage(place, message, G, g, lost, root @ root.T, linear.measured)
+    return Stage(place, message, G, g, lost, root @ root.T, linear.measured, fault=fault)
+
+
+def _tested(
+    top: Array, tests: Watch, rows: Sequence[Measured], y: Array, passes: int, t: float, state: States
+) -> tuple[Array, Watch, tuple[str, float] | None]:
+    """Add the measurements that have tests to the rows [R z Z] of a message, Z = R X (D, C)."""
+    fault, D, speed = None, len(top), float(np.linalg.norm(state.v))
+    for one in rows:
+        if one.name not in tests or not one.H.any():  # none of those that are left out
+            continue
+        H, b, sigma = one.weighted(y, passes)
+        own, columns, errors = tests.begin(one.name, t, sigma)
+        A = np.zeros((D + errors.shape[0], top.shape[1]), order="F")
+        A[:D], A[D:, :D], A[D:, D] = top, H.reshape(-1, D), b.ravel()
+        with_tests = A[:, D + 1 :]
+        with_tests[:D, own], with_tests[D:, columns] = 0.0, errors
+        R = np.triu(dgeqrf(A, overwrite_a=1)[0])
+        top, left = R[:D], R[D:, D:]
+        since = tests.found(one.name, t, left[:, 0], left[:, 1:][:, columns], speed)
+        if since is not None and fault is None:
+            fault = one.name, since
+    tests.X = dtrtrs(top[:, :D], top[:, D + 1 :])[0]
+    return top, tests, fault
 
 
 def _shift(columns: slice) -> slice:

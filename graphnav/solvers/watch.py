@@ -18,16 +18,19 @@ old, more or less: slot l of the bank begins anew at every odd multiple of 2^l.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from array import array
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from scipy.special import chdtri, gammaincinv
 
-from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.rotation import Array
+from graphnav.solution import Fault
 
 _PATIENCE = 60.0  # s
+_CHANCE = 3  # fixes that agree after a fault, below which the next that does not says that they did by chance
 _EVERY = 8  # fixes between two looks at what is usual
 LARGE = 3.0  # sigmas that are stated or that clocks can be off: less is no fault, however certain
 _CLOCKS = 0.05  # s, by which the stamps of IMU and receiver may disagree
@@ -39,16 +42,16 @@ LONGEST = 600.0  # s, about, of the oldest onset: what inertial sensors knew ten
 class _Slots:
     """The tests of one constraint: slot l has columns 3 l to 3 l + 2 of those it has in the bank."""
 
-    def __init__(self, columns: slice, L: int, m: int, stated: Array, N: int, moves: bool) -> None:
+    def __init__(self, columns: slice, L: int, m: int, stated: Array, moves: bool) -> None:
         self.columns, self.L, self.m = columns, L, m
         self.threshold = float(chdtri(m, FALSE_ALARM))
         self.moves = moves  # a position, which is off by what the vehicle moves while clocks are
         self.stated = stated  # (m,) typical sigma of a whole error
-        self.first = np.full(L, -1)  # row at which each slot began, -1 before
+        self.first = np.full(L, -1.0)  # when each slot began, -1 before
         self.inputs = np.zeros((m, L * m))  # what a unit error is to each column: the identity since its slot began
         self.score, self.info = np.zeros((L, m)), np.tile(np.eye(m), (L, 1, 1))
         self.seen = 0
-        self.usual = _Usual(m, N)
+        self.usual = _Usual(m)
 
     def copy(self) -> _Slots:
         other = object.__new__(_Slots)
@@ -57,14 +60,53 @@ class _Slots:
         other.score, other.info = self.score.copy(), self.info.copy()
         return other
 
-    def begin(self, row: int) -> slice:
+    def forget(self) -> None:
+        """Begin none again until its turn."""
+        self.first[:], self.score[:], self.info[:], self.inputs[:] = -1.0, 0.0, np.eye(self.m), 0.0
+
+    def begin(self, t: float) -> slice:
         """Begin the slot whose turn it is; its columns in the bank."""
         self.seen += 1
         slot = min((self.seen & -self.seen).bit_length() - 1, self.L - 1)
         own = slice(slot * self.m, (slot + 1) * self.m)
-        self.first[slot], self.score[slot], self.info[slot] = row, 0.0, 0.0
+        self.first[slot], self.score[slot], self.info[slot] = t, 0.0, 0.0
         self.inputs[:, own] = np.eye(self.m)
         return slice(self.columns.start + own.start, self.columns.start + own.stop)
+
+    def found(self, score: Array, G: Array, weighted: Array, speed: float) -> float | None:
+        """When a fault began that a fix adds enough to be sure of, or None.
+
+        Parameters
+        ----------
+        score : (L m,) G^T S^-1 nu.
+        G : (n m, L m) signature, and `weighted` S^-1 G.
+        """
+        L, m = self.L, self.m
+        self.score += score.reshape(L, m)
+        G3, S3 = (x.reshape(-1, L, m).swapaxes(0, 1) for x in (G, weighted))
+        self.info += G3.swapaxes(1, 2) @ S3
+        b = np.linalg.solve(self.info, self.score[..., None])[..., 0]
+        T = np.sum(self.score * b, axis=1)
+        allowed = self.stated**2 + (_CLOCKS * speed if self.moves else _CLOCKS * _BRAKING) ** 2
+        T = np.where(np.sum(b**2 / allowed, axis=1) > LARGE**2, T / self.threshold, 0.0)
+        worst = int(np.argmax(T))
+        return float(self.first[worst]) if T[worst] > self.usual.factor else None
+
+
+def _slots(constraints: Iterable[GnssPosition | GnssVelocity], t: Array | None, period: float) -> dict[str, _Slots]:
+    """Slots of each constraint, their columns behind each other; t (K,) of the keyframes, s, tells the period."""
+    out: dict[str, _Slots] = {}
+    end = 0
+    for rows in constraints:
+        m = len(rows.axes)
+        if t is not None and len(rows) > 1:
+            period = float(np.median(np.diff(t[rows.keyframe])))
+        L = 1 + int(np.clip(np.log2(LONGEST / max(period, 1e-3)), 0, 12))
+        stated = rows.stated if isinstance(rows, GnssPosition) else rows.sigma
+        columns = slice(end, end + L * m)
+        out[rows.name] = _Slots(columns, L, m, np.median(stated, axis=0), isinstance(rows, GnssPosition))
+        end += L * m
+    return out
 
 
 class _Usual:
@@ -73,14 +115,19 @@ class _Usual:
     What half of all fixes do, those not used included, is no fault: the filter has lost its way.
     """
 
-    def __init__(self, m: int, N: int) -> None:
+    def __init__(self, m: int) -> None:
         self.median = 2.0 * float(gammaincinv(0.5 * m, 0.5))
-        self.nis, self.factor = np.zeros(N), 1.0
+        self.t, self.nis, self.factor = array("d"), array("d"), 1.0
 
-    def add(self, row: int, nis: float) -> None:
-        self.nis[row] = nis
-        if row % _EVERY == 0:
-            self.factor = max(1.0, float(np.median(self.nis[: row + 1])) / self.median)
+    def add(self, t: float, nis: float) -> None:
+        k = bisect_left(self.t, t)
+        if k < len(self.t) and self.t[k] == t:
+            self.nis[k] = nis
+        else:
+            self.t.insert(k, t)
+            self.nis.insert(k, nis)
+        if k % _EVERY == 0:
+            self.factor = max(1.0, float(np.median(np.frombuffer(self.nis)[: k + 1])) / self.median)
 
 
 class Bank:
@@ -94,24 +141,17 @@ class Bank:
     """
 
     def __init__(self, constraints: Iterable[GnssPosition | GnssVelocity], t: Array, width: int) -> None:
-        self._slots: dict[str, _Slots] = {}
-        end = 0
-        for rows in constraints:
-            m = len(rows.axes)
-            times = t[rows.keyframe]
-            period = float(np.median(np.diff(times))) if len(times) > 1 else LONGEST
-            L = 1 + int(np.clip(np.log2(LONGEST / max(period, 1e-3)), 0, 12))
-            stated = rows.stated if isinstance(rows, GnssPosition) else rows.sigma
-            columns = slice(end, end + L * m)
-            moves = isinstance(rows, GnssPosition)
-            self._slots[rows.name] = _Slots(columns, L, m, np.median(stated, axis=0), len(rows), moves)
-            end += L * m
-        self.X = np.zeros((width, end))
+        self._slots, self._t = _slots(constraints, t, LONGEST), t
+        self.X = np.zeros((width, sum(s.L * s.m for s in self._slots.values())))
 
     def copy(self) -> Bank:
         """The same, on its own."""
         other = object.__new__(Bank)
-        other.X, other._slots = self.X.copy(), {name: slots.copy() for name, slots in self._slots.items()}
+        other._t, other.X, other._slots = (
+            self._t,
+            self.X.copy(),
+            {name: slots.copy() for name, slots in self._slots.items()},
+        )
         return other
 
     def forgetful(self) -> Bank:
@@ -119,30 +159,30 @@ class Bank:
         other = self.copy()
         other.X[:] = 0.0
         for slots in other._slots.values():
-            slots.first[:], slots.score[:], slots.info[:], slots.inputs[:] = -1, 0.0, np.eye(slots.m), 0.0
+            slots.forget()
         return other
 
     def predicted(self, F: Array) -> None:
         """The filter has gone on to the next keyframe."""
         self.X = F @ self.X
 
-    def signature(self, name: str, row: int, H: Array) -> Array:
-        """(n m, C) mean of an innovation for unit errors since each onset; a fix of a watched kind is itself one."""
+    def signature(self, name: str, k: int, H: Array) -> Array:
+        """(n m, C) mean of an innovation at keyframe k for unit errors since each onset; a fix itself is one."""
         slots = self._slots.get(name)
         if slots is None:
             return -(H @ self.X)
-        self.X[:, slots.begin(row)] = 0.0
+        self.X[:, slots.begin(float(self._t[k]))] = 0.0
         G = -(H @ self.X)
         G.reshape(-1, slots.m, G.shape[1])[:, :, slots.columns] += slots.inputs
         return G
 
-    def seen(self, name: str, row: int, nis: float) -> None:
+    def seen(self, name: str, k: int, nis: float) -> None:
         """The filter has seen an innovation of so many squared sigmas, used or not."""
         if slots := self._slots.get(name):
-            slots.usual.add(row, nis)
+            slots.usual.add(float(self._t[k]), nis)
 
-    def updated(self, name: str, K: Array, G: Array, weighted: Array, r: Array, speed: float) -> int | None:
-        """The filter has used an innovation; the first row of a fault, or None.
+    def updated(self, name: str, K: Array, G: Array, weighted: Array, r: Array, speed: float) -> float | None:
+        """The filter has used an innovation; when a fault began, or None.
 
         Parameters
         ----------
@@ -155,16 +195,55 @@ class Bank:
         slots = self._slots.get(name)
         if slots is None:
             return None
-        L, m = slots.L, slots.m
-        slots.score -= (r @ weighted[:, slots.columns]).reshape(L, m)
-        G3, S3 = (x[:, slots.columns].reshape(-1, L, m).swapaxes(0, 1) for x in (G, weighted))
-        slots.info += G3.swapaxes(1, 2) @ S3
-        b = np.linalg.solve(slots.info, slots.score[..., None])[..., 0]
-        T = np.sum(slots.score * b, axis=1)
-        allowed = slots.stated**2 + (_CLOCKS * speed if slots.moves else _CLOCKS * _BRAKING) ** 2
-        T = np.where(np.sum(b**2 / allowed, axis=1) > LARGE**2, T / slots.threshold, 0.0)
-        worst = int(np.argmax(T))
-        return int(slots.first[worst]) if T[worst] > slots.usual.factor else None
+        G, weighted = G[:, slots.columns], weighted[:, slots.columns]
+        return slots.found(-(r @ weighted), G, weighted, speed)
+
+
+class Watch:
+    """The same tests beside a square-root message R y = z, which is then R y = z - R X b for errors b since each onset.
+
+    With columns B = 1 / sigma for them at a fix, the QR that takes in its rows leaves behind, below those of the
+    message, rho - Gamma b ~ N(0, 1): rho^T rho is its NIS, and Gamma^T rho and Gamma^T Gamma add to score and info.
+
+    Parameters
+    ----------
+    constraints : those whose rows are tested.
+    period : s, between fixes.
+    width : of the error state.
+    """
+
+    def __init__(self, constraints: Iterable[GnssPosition | GnssVelocity], period: float, width: int) -> None:
+        self._slots = _slots(constraints, None, period)
+        self.X = np.zeros((width, sum(s.L * s.m for s in self._slots.values())))
+
+    def copy(self) -> Watch:
+        """The same, on its own."""
+        other = object.__new__(Watch)
+        other.X, other._slots = self.X, {name: slots.copy() for name, slots in self._slots.items()}
+        return other
+
+    def forgetful(self) -> Watch:
+        """The same without any onset."""
+        other = self.copy()
+        other.X = np.zeros_like(self.X)
+        for slots in other._slots.values():
+            slots.forget()
+        return other
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._slots
+
+    def begin(self, name: str, t: float, sigma: Array) -> tuple[slice, slice, Array]:
+        """Begin an onset with fixes of these sigmas (n, m): its columns, those of the kind, and B (n m, L m) there."""
+        slots = self._slots[name]
+        own = slots.begin(t)
+        return own, slots.columns, (slots.inputs / sigma[..., None]).reshape(sigma.size, -1)
+
+    def found(self, name: str, t: float, rho: Array, Gamma: Array, speed: float) -> float | None:
+        """When a fault began, or None, by what a fix has left behind: rho (n m,) and Gamma (n m, L m) of its kind."""
+        slots = self._slots[name]
+        slots.usual.add(t, float(rho @ rho))
+        return slots.found(rho @ Gamma, Gamma, Gamma, speed)
 
 
 class Verdicts:
@@ -174,20 +253,48 @@ class Verdicts:
     lost its way with those: it drifts while fixes are refused, and a fault that grows meets it again. So what it used
     since, of any kind, is given up instead, and the fixes are taken back; this in turn is undone if they are refused
     even so. After `LONGEST` of a fault the filter begins anew where the fixes are.
+
+    The first fix that is used after a long fault meets a filter that knows little, and agrees easily; from then on the
+    filter is sure of it. If one of the next does not agree, it was chance, and the fault goes on.
     """
 
-    def __init__(self, watched: Sequence[Constraint], t: Array) -> None:
-        self.used = {c.name: np.ones(len(c)) if c.weight is None else c.weight.copy() for c in watched}
-        self.anew: set[tuple[str, int]] = set()  # rows at which the filter begins anew
-        self._keyframe = {c.name: c.keyframe for c in watched}
-        self._t = t
-        self._tried: set[tuple[str, int]] = set()
+    def __init__(self, times: Mapping[str, Array], used: Mapping[str, Array]) -> None:
+        self.times, self.used = dict(times), dict(used)  # (N,) each; `used` is changed in place
+        self.anew: set[tuple[str, float]] = set()  # kinds and times at which the filter begins anew
+        self._tried: set[tuple[str, float]] = set()
         self._trial: tuple[str, int, int, dict[str, Array]] | None = None  # fixes taken back, and what was used before
 
-    def settle(self, name: str, fault: int, end: int) -> int:
-        """Take from use what a fault in rows `fault` to `end` gives reason to; the keyframe to go on from."""
-        at, used = self._keyframe[name], self.used[name]
+    def faults(self) -> tuple[Fault, ...]:
+        """Spans of fixes that are not used."""
+        out = []
+        for name, t in self.times.items():
+            lost = np.flatnonzero(self.used[name] == 0.0)
+            for run in np.split(lost, np.flatnonzero(np.diff(lost) > 1) + 1) if len(lost) else []:
+                out.append(Fault(name, float(t[run[0]]), float(t[run[-1]]), len(run)))
+        return tuple(sorted(out, key=lambda fault: fault.t_start))
+
+    def weights(self, name: str, t: Array) -> Array:
+        """(n,) of fixes at the times t: 0 for what is not used. Fixes that were not known yet are."""
+        known = self.times.get(name, np.empty(0))
+        new = t[~np.isin(t, known)] if len(known) and t[0] <= known[-1] else t
+        if len(new):
+            at = known.searchsorted(new)
+            if len(at) and at[0] < len(known):
+                self._trial = None  # its rows have moved
+            self.times[name] = np.insert(known, at, new)
+            self.used[name] = np.insert(self.used.get(name, np.empty(0)), at, 1.0)
+        return self.used[name][self.times[name].searchsorted(t)]
+
+    def settle(self, name: str, since: float, now: float) -> float:
+        """Take from use what a fault of fixes `since` (s) up to `now` gives reason to; the time to go on from."""
+        t, used = self.times[name], self.used[name]
+        fault, end = int(np.searchsorted(t, since)), int(np.searchsorted(t, now, side="right"))
         used[fault:end] = 0.0
+        begin = _begin(used, end, 0.0)
+        before = _begin(used, begin, 1.0)  # of what was used between two faults
+        if begin - before < min(_CHANCE, before - _begin(used, before, 0.0)):
+            used[before:begin] = 0.0
+            fault = min(fault, before)
         if self._trial is not None and self._trial[0] == name:
             _, begin, until, were = self._trial
             if end > until:
@@ -195,24 +302,24 @@ class Verdicts:
             elif np.mean(used[begin:until] == 0.0) > 0.5:
                 self._trial = None
                 for other, was in were.items():
-                    self.used[other][:] = was
-                return int(at[_begin(used, _begin(used, begin, 1.0), 0.0)])
+                    self.used[other][: len(was)] = was
+                return float(t[_begin(used, _begin(used, begin, 1.0), 0.0)])
         begin = _begin(used, end, 0.0)
         before = _begin(used, begin, 1.0)  # of what was used between two faults
-        lasted = self._t[at[end - 1]] - self._t[at[begin]]
-        if lasted > LONGEST and (name, begin) not in self.anew:
+        lasted = t[end - 1] - t[begin]
+        if lasted > LONGEST and (name, t[begin]) not in self.anew:
             used[begin:end] = 1.0
-            self.anew.add((name, begin))
-            return int(at[begin])
-        if (name, begin) not in self._tried and lasted > _PATIENCE and before > 0 and begin - before < end - begin:
-            self._tried.add((name, begin))
+            self.anew.add((name, float(t[begin])))
+            return float(t[begin])
+        if (name, t[begin]) not in self._tried and lasted > _PATIENCE and before > 0 and begin - before < end - begin:
+            self._tried.add((name, float(t[begin])))
             self._trial = name, begin, end, {other: u.copy() for other, u in self.used.items()}
             used[begin:end] = 1.0
-            first = int(at[_begin(used, before, 0.0)])
-            for other, keyframe in self._keyframe.items():
-                self.used[other][(keyframe >= first) & (keyframe < at[begin])] = 0.0
+            first = float(t[_begin(used, before, 0.0)])
+            for other, at in self.times.items():
+                self.used[other][(at >= first) & (at < t[begin])] = 0.0
             return first
-        return int(at[fault])
+        return float(t[fault])
 
 
 def _begin(used: Array, end: int, value: float) -> int:

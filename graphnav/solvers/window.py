@@ -11,7 +11,7 @@ does the same from its own time on. With a lag longer than the drive this is the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from graphnav.solvers.stages import (
     predicted,
     width,
 )
+from graphnav.solvers.watch import Watch
 from graphnav.state import DIM, States
 
 _SHARE = (
@@ -139,6 +140,19 @@ class Window:
             assert place.problem is not None
             self._limit = _limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})
         return float(np.linalg.norm(e[:3]))
+
+    def watch(self, tests: Watch) -> None:
+        """Have the fixes from the next keyframe on tested."""
+        if self.stages:
+            newest = self.stages[-1]
+            self.stages[-1] = replace(newest, message=replace(newest.message, tests=tests))
+        else:
+            self.head = replace(self.head, tests=tests)
+
+    def forget_tests(self) -> None:
+        """What the tests know of fixes before the window is not true any more."""
+        if self.head.tests is not None:
+            self.head = replace(self.head, tests=self.head.tests.forgetful())
 
     def truncate(self, keep: int) -> None:
         """Forget all but the first `keep` stages: something before what follows has changed."""
@@ -267,7 +281,12 @@ class Window:
             Point(states[k : k + 1], m.values + e[DIM:], m.columns)
             for k, (m, e) in enumerate(zip(around, moves, strict=True))
         ]
-        self.stages[first:] = remade(before, points, places or [stage.place for stage in old])
+        again = remade(replace(before, tests=None), points, places or [stage.place for stage in old])
+        # what an error of the fixes does to the estimate is the same to first order
+        self.stages[first:] = [
+            replace(stage, message=replace(stage.message, tests=was.message.tests))
+            for stage, was in zip(again, old, strict=True)
+        ]
         self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
         self._means = None
         self.relinearized += len(old)

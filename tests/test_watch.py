@@ -1,0 +1,109 @@
+"""Faults of fixes found as the drive happens: the tests beside the newest message of the window."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_faults import drive, moved, posed
+
+from graphnav.config import settings_from
+from graphnav.online import Online, rows_of, without_rows
+from graphnav.problem import Problem
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+from graphnav.solvers import watch
+from graphnav.solvers.ekf import ekf
+from graphnav.solvers.incremental import node_steps
+from graphnav.solvers.stages import Place
+from graphnav.solvers.watch import Bank
+from graphnav.solvers.window import Window, first_message
+from graphnav.state import DIM
+from graphnav.trajectory import Trajectory
+
+__all__ = ["drive", "posed"]  # fixtures
+
+
+def likelihoods(slots: watch._Slots) -> Array:
+    """(L,) T of every onset."""
+    b = np.linalg.solve(slots.info, slots.score[..., None])[..., 0]
+    return np.where(slots.first < 0.0, np.nan, np.sum(slots.score * b, axis=1))
+
+
+def test_tests_beside_a_message_are_those_of_the_filter(posed: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two derivations of one thing: a recursion beside a covariance, and columns of a QR."""
+    rows = next(c for c in posed.constraints if c.name == "gnss_position")
+    problem = replace(posed, constraints=(rows,))
+    kept: list[Bank] = []
+    updated = Bank.updated
+    monkeypatch.setattr(Bank, "updated", lambda self, *a: (kept.append(self), updated(self, *a))[1])
+    ekf(problem, watch=True)
+    mean = problem.prior.mean
+    assert mean is not None
+    message = first_message(mean, problem.prior.sigma[0])
+    window = Window(replace(message, tests=watch.Watch([rows], 1.0, DIM)), np.inf)
+    plain, steps = Window(message, np.inf), node_steps(problem)
+    for k in range(len(problem.t)):
+        for one in (window, plain):
+            one.push(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
+    tests = window.newest.tests
+    assert tests is not None
+    mine, theirs = (likelihoods(x._slots[rows.name]) for x in (tests, kept[-1]))
+    assert np.isfinite(theirs).sum() >= 8
+    np.testing.assert_allclose(mine, theirs, rtol=0.02, atol=0.02)
+    # and they do nothing to the estimate
+    np.testing.assert_allclose(window.newest.state.p, plain.newest.state.p, atol=1e-7)
+    np.testing.assert_allclose(window.newest.covariance, plain.newest.covariance, rtol=1e-6, atol=1e-9)
+
+
+def settled(recording: Recording, **settings: dict[str, object]) -> tuple[Online, Array, Array]:
+    """The smoother that runs as it drives, and the times and places (local frame, m) that it settled."""
+    online = Online(without_rows(recording), settings_from(settings))
+    parts = []
+    for row in rows_of(recording)[1]:
+        online.add(row)
+        parts += online.settled()
+    online.finish()
+    parts += online.settled()
+    assert online.frame is not None
+    return online, np.concatenate([p.t for p in parts]), online.frame.from_llh(np.concatenate([p.llh for p in parts]))
+
+
+def horizontal(drive: tuple[Recording, Trajectory], t: Array, p: Array, online: Online) -> Array:
+    """(N,) horizontal, m."""
+    assert online.frame is not None
+    truth = online.frame.from_llh(drive[1].llh)
+    return np.hypot(*(p[:, k] - np.interp(t, drive[1].t, truth[:, k]) for k in (0, 1)))
+
+
+def test_as_it_drives_a_burst_and_gross_errors_do_no_harm(drive: tuple[Recording, Trajectory]) -> None:
+    rng = np.random.default_rng(0)
+    recording, N = drive[0], len(drive[0].gnss.t)
+    gross = np.sort(rng.choice(N, N // 10, replace=False))
+    burst = np.arange(150, 180)
+    by = np.concatenate([rng.uniform(5, 200, (len(gross), 1)) * [0.6, 0.8, 0.0], np.tile([6.0, 8.0, 0.0], (30, 1))])
+    wrong, first = np.unique(np.concatenate([gross, burst]), return_index=True)
+    dirty = moved(recording, wrong, by[first])
+    clean, t, p = settled(recording)
+    assert clean.excluded == ()
+    usual = np.sqrt(np.mean(horizontal(drive, t, p, clean) ** 2))
+    online, t, p = settled(dirty)
+    assert np.sqrt(np.mean(horizontal(drive, t, p, online) ** 2)) < 1.2 * usual
+    found = np.zeros(N, dtype=bool)
+    for fault in online.excluded:
+        found |= (recording.gnss.t >= fault.t_start) & (recording.gnss.t <= fault.t_end)
+    assert found[wrong].mean() > 0.95
+    assert wrong.size / found.sum() > 0.9
+
+
+def test_as_it_drives_an_error_that_grows_is_found(drive: tuple[Recording, Trajectory]) -> None:
+    rows = np.arange(200, 300)
+    dirty = moved(drive[0], rows, np.column_stack([0.3 * np.arange(100.0), np.zeros((100, 2))]))
+    online, t, p = settled(dirty)
+    (fault,) = online.excluded
+    assert fault.t_end == pytest.approx(299.0)
+    assert fault.t_start < 210.0
+    believing, _, q = settled(dirty, gnss={"faults": False})
+    assert believing.excluded == ()
+    assert horizontal(drive, t, p, online).max() < 0.1 * horizontal(drive, t, q, believing).max()
