@@ -8,7 +8,8 @@ that, tau' from its middle, it has the slope s = 2 c tau'. So
     q = s tau^2 / (2 tau' b p)
 
 is 1 for a peak and several where the sides would meet far above. With whole rows counted, q of a parabola is 2.25 at
-most (three rows).
+most (three rows). Ranges end softly, too: a peak that bends over the last few per cent is within 1 % of its height for
+a row or two only. So where one peak shows that an axis ends, all its peaks are asked again with b = 3 %.
 
 Within a cut peak the cubic goes on that leaves from either side with the slope it has there. How much is added is a
 guess, of which the half is taken for its 1-sigma: white noise of that effect over the peak.
@@ -27,6 +28,7 @@ from graphnav.rotation import Array
 
 _NEAR = 0.95  # of the highest reading: a range that ends lower than that for some peaks is none
 _BAND = 0.01  # b
+_SOFT_BAND = 0.03  # b, of an axis that is known to end: it does so softly
 _TOO_FLAT = 2.5  # q
 _FEWEST = 3  # rows of a flat top
 _LEAST = {"gyro": 4.0, "accel": 19.0}  # rad/s, m/s^2: no range ends lower (250 deg/s, 2 g)
@@ -47,14 +49,23 @@ def cut_peaks(t: Array, x: Array, least: float, highest: Array | None = None) ->
 
     `highest` (2,) is what the sensor is known to have read at other times, up and down.
     """
+    most = np.zeros(2) if highest is None else highest
+    if not (sure := _flat(t, x, least, _BAND, most)):
+        return []
+    soft = _flat(t, x, least, _SOFT_BAND, most)
+    return soft + [p for p in sure if all(p.last <= q.first or q.last <= p.first for q in soft)]
+
+
+def _flat(t: Array, x: Array, least: float, band: float, highest: Array) -> list[Peak]:
+    """The peaks that are within `band` of their height for longer than their sides allow."""
     found = []
-    for sign, most in zip((1.0, -1.0), np.zeros(2) if highest is None else highest, strict=True):
+    for sign, most in zip((1.0, -1.0), highest, strict=True):
         y = sign * x
         limit = max(_NEAR * max(float(y.max(initial=0.0)), float(most)), least)
         high = np.flatnonzero(np.diff(np.r_[False, y >= limit, False].astype(int)))
         for begin, end in zip(high[::2], high[1::2], strict=True):
             top = y[begin:end].max()
-            rows = begin + np.flatnonzero(y[begin:end] >= (1.0 - _BAND) * top)
+            rows = begin + np.flatnonzero(y[begin:end] >= (1.0 - band) * top)
             first, last = int(rows[0]), int(rows[-1]) + 1
             if last - first < _FEWEST or first < 2 or last + 2 > len(y):
                 continue
@@ -62,7 +73,7 @@ def cut_peaks(t: Array, x: Array, least: float, highest: Array | None = None) ->
             down = (y[last] - y[last + 1]) / (t[last + 1] - t[last])
             step = (t[last] - t[first - 1]) / (last + 1 - first)
             half = 0.5 * (last - first) * step
-            if min(up, down) * half**2 < _TOO_FLAT * 2.0 * (half + 1.5 * step) * _BAND * top:
+            if min(up, down) * half**2 < _TOO_FLAT * 2.0 * (half + 1.5 * step) * band * top:
                 continue
             curve = CubicHermiteSpline(t[[first - 1, last]], y[[first - 1, last]], [up, -down])
             found.append(Peak(first, last, sign * np.maximum(curve(t[first:last]), y[first:last])))

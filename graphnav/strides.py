@@ -39,13 +39,28 @@ class WalkErrors:
     nees_up: float
 
 
+def floor_sigma(recording: Recording, solution: Solution) -> float:
+    """1-sigma of a coordinate of a dense truth, m: how its heights scatter from stance to stance on a flat floor.
+
+    The first and the last are left out, in which the foot stands as it does in none between them.
+    """
+    truth = recording.truth
+    assert truth is not None
+    assert truth.xyz is not None
+    middle = [(a + 0.3 * (b - a), b - 0.3 * (b - a)) for a, b in solution.stationary[1:-1]]
+    inside = [(truth.t >= a) & (truth.t <= b) & np.isfinite(truth.xyz[:, 2]) for a, b in middle]
+    return float(np.std([truth.xyz[rows, 2].mean() for rows in inside if rows.any()]))
+
+
 def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0.0) -> WalkErrors:
     """Errors of a walk against the recording's truth.
+
+    Of a dense truth the NEES is of the point that it is of: with a lever arm fitted.
 
     Parameters
     ----------
     truth_sigma : m, of a coordinate of the truth, added to the solution's own in the NEES: its noise, and how far its
-        point lies from the IMU where that is not known.
+        points lie from the IMU where that is not fitted.
 
     Raises
     ------
@@ -67,9 +82,11 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     _, states, covariance = solution.at(t)
     p, P = states.p, covariance[:, 3:6, 3:6]
     flat = np.column_stack([X[:, :2], np.zeros(len(X))])
+    of_point, arm = _of_point(states, flat)
     # about the start
-    at_start = p[0, :2] if X.shape[1] == 2 else p[t <= t[0] + _STANDS, :2].mean(axis=0)
-    a, b = X[:, :2] - first[:2], p[:, :2] - at_start
+    q = p if X.shape[1] == 2 else p + states.R_nb @ arm
+    at_start = q[0] if X.shape[1] == 2 else q[t <= t[0] + _STANDS].mean(axis=0)
+    a, b = X[:, :2] - first[:2], (q - at_start)[:, :2]
     anchored = _turned(a, float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))))
     e = b - anchored
     R = truth_sigma**2
@@ -77,14 +94,15 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     up = nees_up = stride = np.nan
     if X.shape[1] == 3:
         height = p[:, 2] - X[:, 2] - np.mean((p[:, 2] - X[:, 2])[t <= t[0] + _STANDS])
-        up, nees_up = float(np.sqrt(np.mean(height**2))), float(np.mean(height**2 / (P[:, 2, 2] + R)))
+        up, e_up = float(np.sqrt(np.mean(height**2))), (q - at_start)[:, 2] - (X[:, 2] - first[2])
+        nees_up = float(np.mean(e_up**2 / (P[:, 2, 2] + R)))
     else:
         true, mine = (np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1) for x in (X, p))
         stride = float(np.median((mine / true)[true > _A_STRIDE]))
     # points are measured where a foot stands; a dense truth has it in the air as well
     standing = _in_stance(solution, t) if X.shape[1] == 3 else np.ones(len(t), dtype=bool)
     horizontal, in_stance = _shape(p, flat), _shape(p[standing], flat[standing])
-    return WalkErrors(horizontal, in_stance, _of_point(states, flat), up, stride, float(np.mean(nees_h)), nees_up)
+    return WalkErrors(horizontal, in_stance, of_point, up, stride, float(np.mean(nees_h)), nees_up)
 
 
 def _of_loop(solution: Solution, sigma: float) -> WalkErrors:
@@ -109,8 +127,8 @@ def _shape(p: Array, flat: Array) -> float:
     return float(np.sqrt(np.mean(np.sum((p[:, :2] - _turned(flat[:, :2], yaw) - offset[:2]) ** 2, axis=1))))
 
 
-def _of_point(states: States, flat: Array) -> float:
-    """Horizontal rms after fitting yaw, offset and a lever arm in the body, by turns, m."""
+def _of_point(states: States, flat: Array) -> tuple[float, Array]:
+    """Horizontal rms after fitting yaw, offset and a lever arm in the body, by turns, and that arm (3,), m."""
     arm = np.zeros(3)
     level = states.R_nb[:, :2]
     for _ in range(_TURNS):
@@ -118,7 +136,7 @@ def _of_point(states: States, flat: Array) -> float:
         yaw, offset = fit_yaw(flat, p)
         e = p[:, :2] - (_turned(flat[:, :2], yaw) + offset[:2])
         arm = arm - np.linalg.lstsq((level - level.mean(axis=0)).reshape(-1, 3), e.ravel(), rcond=1e-3)[0]
-    return float(np.sqrt(np.mean(np.sum(e**2, axis=1))))
+    return float(np.sqrt(np.mean(np.sum(e**2, axis=1)))), arm
 
 
 def _turned(x: Array, yaw: float) -> Array:

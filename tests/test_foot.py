@@ -16,6 +16,7 @@ from graphnav.constraints.base import Scene
 from graphnav.constraints.foot import FOOT_AXIS, PIVOT, TRAVEL, FootLateral, Stance
 from graphnav.constraints.standstill import ZeroRate, _swaying
 from graphnav.detectors import detect
+from graphnav.detectors.base import Detection
 from graphnav.earth import LocalFrame
 from graphnav.formats import read
 from graphnav.interpolation import interpolate
@@ -26,7 +27,7 @@ from graphnav.recording import Imu, Recording, Truth
 from graphnav.simulation import Simulated, simulate
 from graphnav.solution import Solution
 from graphnav.state import States
-from graphnav.strides import walk_errors
+from graphnav.strides import floor_sigma, walk_errors
 from graphnav.workflow import Request, run_request
 
 PACES = ("slow", "normal", "fast")
@@ -344,6 +345,30 @@ def test_strides_and_shape_of_a_walk() -> None:
     assert xy is not None
     assert long.horizontal == pytest.approx(0.02 * np.sqrt(np.mean(np.sum((xy - xy.mean(0)) ** 2, axis=1))), rel=1e-6)
     assert long.nees_h == pytest.approx(0.5 * np.mean(np.sum((0.02 * xy) ** 2, axis=1)) / 0.01, rel=1e-6)
+
+
+def test_a_dense_truth_of_another_point_on_the_foot() -> None:
+    """Its lever arm is fitted, and what it says of its own noise is how high it finds a flat floor."""
+    t = np.arange(0.0, 40.0, 0.05)
+    p = np.column_stack([3.0 * np.sin(0.2 * t), 2.0 * np.sin(0.31 * t), np.zeros(len(t))])
+    pitch = 0.6 * np.sin(2.0 * np.pi * t)
+    R = ro.from_rph(np.column_stack([0.2 * np.sin(3.0 * t), pitch, 0.7 * t]))
+    spans = np.column_stack([np.arange(0.0, 40.0), np.arange(0.0, 40.0) + 0.5])
+    off = np.random.default_rng(3).normal(0.0, 0.01, len(spans))
+    xyz = p + R @ np.array([0.02, 0.03, 0.05])
+    xyz[:, 2] = off[np.floor(t).astype(int)]
+    n = len(t)
+    states = States(R, p, np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)))
+    P = np.tile(1e-4 * np.eye(15), (n, 1, 1))
+    standing = Detection("fused", t, np.zeros(n), 1.0, np.ones(n, dtype=bool), spans)
+    solution = Solution("made", LocalFrame(np.zeros(3)), t, states, P, detections=(standing,))
+    solution = replace(solution, between=(_Rows(t, states, P),))
+    recording = replace(line_walk(0.0)[0], truth=Truth(t, xyz=xyz))
+    assert floor_sigma(recording, solution) == pytest.approx(np.std(off[1:-1]), rel=1e-6)
+    found = walk_errors(recording, solution)
+    assert found.horizontal > 0.01
+    assert found.of_point < 1e-3
+    assert found.nees_h < 0.01
 
 
 # --------------------------------------------------------------------------------------------------------- real walks

@@ -90,7 +90,8 @@ def test_the_shoe_stays_on_the_floor_and_does_not_slide(pace: str) -> None:
     heights, speeds = sole_points(walk, t)
     low, contacts = heights.min(axis=0), spans(walk, "contacts")
     touching = within(t, contacts + np.array([0.03, -0.03]))
-    assert np.abs(low[touching]).max() < 0.007
+    sole = Sole()  # carried by all its points at once it stands highest; and a strike shakes it
+    assert np.abs(low[touching]).max() < sole.softness * np.log(len(sole.points)) + 0.002
     assert low.min() > -0.015  # the shoe gives way at the strike
     swings = np.column_stack([contacts[:-1, 1], contacts[1:, 0]])
     middle = within(t, np.column_stack([swings @ [0.75, 0.25], swings @ [0.3, 0.7]]))

@@ -16,7 +16,8 @@ What is left is a share of the turn rate (the pivot is not a point, the sole giv
 
     sigma^2 = (still^2 + (rolling |omega|)^2) max(1, tau / T)
 
-The second factor is for errors that last: over a time tau they are one error, not one per interval of length T.
+The second factor is for errors that last: over a time tau they are one error, not one per interval of length T. What
+the pivot does not explain lasts for a stance, so tau is as long as one: its rows together weigh like one.
 
 In swing the foot hardly goes sideways. `FootLateral` says of the mean over each interval
 
