@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from graphnav.complaints import complaint, read_toml
 from graphnav.errors import ConfigError
 
-Kernel = Literal["none", "huber", "cauchy", "geman-mcclure", "tukey", "welsch"]
+SWITCH = ("off", "on", "automatic")
+KERNELS = ("huber", "cauchy", "geman-mcclure", "tukey", "welsch", "gnc")
+_BY_NAME = {"none": "off", None: "off", False: "off", True: "automatic"}  # as earlier versions wrote them
 Profile = Literal["car", "car+odometer", "foot"]
 
 # What is made of the platform, below whatever the settings say themselves.
@@ -25,6 +27,67 @@ PROFILES: dict[str, dict[str, dict[str, Any]]] = {
 
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def _switch(value: Any) -> Any:
+    value = _BY_NAME.get(value, value) if isinstance(value, str | bool) else value
+    if value not in SWITCH:
+        raise ValueError(f'\'{value}\' must be "off", "on" or "automatic"')
+    return value
+
+
+def _kernel(value: Any) -> Any:
+    value = _BY_NAME.get(value, value) if isinstance(value, str | bool) else value
+    if value not in (*SWITCH, *KERNELS):
+        raise ValueError(f"'{value}' must be one of {', '.join((*SWITCH, *KERNELS))}")
+    return value
+
+
+def _gate(value: Any) -> Any:
+    if value is None or isinstance(value, str | bool):
+        value = _BY_NAME.get(value, value)
+    number = isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < float("inf")
+    if not number and value not in SWITCH:
+        raise ValueError(f'\'{value}\' must be "off", "on", "automatic" or a number above 0')
+    return float(value) if number else value
+
+
+Switch = Annotated[Literal["off", "on", "automatic"], BeforeValidator(_switch)]
+Kernel = Annotated[str, BeforeValidator(_kernel)]
+Gate = Annotated[float | str, BeforeValidator(_gate)]
+
+
+class _Outliers(_Section):
+    """What every solver does with rows that are far off."""
+
+    usual_kernel: ClassVar[str] = "none"  # "automatic"
+    usual_gate: ClassVar[float | None] = None
+
+    robust: Kernel = Field(
+        "automatic", description=f"robust kernel in every solver: off, on (cauchy), automatic, {', '.join(KERNELS)}"
+    )
+    robust_scale: float = Field(3.0, gt=0, description="whitened norm of a whole measurement at which the kernel bends")
+    gate: Gate = Field(
+        "automatic",
+        description="whitened norm of an innovation above which no solver uses it: off, on (6), automatic, a number",
+    )
+
+    @property
+    def kernel(self) -> str:
+        """The kernel to use, "none" for none."""
+        return {"off": "none", "on": "cauchy", "automatic": self.usual_kernel}.get(self.robust, self.robust)
+
+    @property
+    def limit(self) -> float | None:
+        """The gate to use."""
+        if isinstance(self.gate, str):
+            return {"off": None, "on": 6.0, "automatic": self.usual_gate}[self.gate]
+        return self.gate
+
+    @property
+    def outliers(self) -> dict[str, Any]:
+        """What a constraint is told of it."""
+        return {"robust": self.kernel, "robust_scale": self.robust_scale, "gate": self.limit}
 
 
 class KeyframeSettings(_Section):
@@ -63,15 +126,18 @@ class ImuSettings(_Section):
     )
 
 
-class GnssSettings(_Section):
+class GnssSettings(_Outliers):
     """How fixes are used."""
 
     position: bool = Field(True, description="use the positions")
     velocity: bool = Field(True, description="use the velocities where there are any")
-    faults: bool = Field(True, description="find fixes, and spans of fixes, that are wrong, and leave them out")
-    robust: Kernel = Field("none", description="robust kernel of the smoother")
-    robust_scale: float = Field(3.0, gt=0, description="whitened norm of a whole fix at which the kernel bends")
-    gate: float | None = Field(None, gt=0, description="whitened norm above which the filter rejects a fix")
+    faults: Switch = Field(
+        "automatic",
+        description="find fixes, and spans of fixes, that are wrong, and leave them out: off, on, automatic",
+    )
+    adaptive: Switch = Field(
+        "automatic", description="raise the sigmas of fixes where they are noisier than stated: off, on, automatic"
+    )
     lever_arm_sigma: float | None = Field(
         None, gt=0, description="m, 1-sigma of the stated lever arm; given, the lever arm is estimated"
     )
@@ -97,7 +163,7 @@ class StandstillSettings(_Section):
     held_position: bool = Field(True, description="one place for a whole stop")
 
 
-class VehicleSettings(_Section):
+class VehicleSettings(_Outliers):
     """What is used of a vehicle's wheels."""
 
     nhc: bool = Field(True, description="no speed sideways and up where the wheels do not slip")
@@ -121,13 +187,13 @@ class VehicleSettings(_Section):
         0.006, ge=0, description="rad per m/s^2, 1-sigma of side slip and squat; 0 = none, not estimated"
     )
     scale_walk: float = Field(1e-4, ge=0, description="1 in a minute, how the odometer's scale wanders: tyres, load")
-    robust: Kernel = Field("none", description="robust kernel of the smoother")
-    robust_scale: float = Field(3.0, gt=0, description="whitened norm of a row at which the kernel bends")
-    gate: float | None = Field(None, gt=0, description="whitened norm above which the filter rejects a row")
 
 
-class FootSettings(_Section):
+class FootSettings(_Outliers):
     """What is used of a foot's way over the floor and through the air."""
+
+    usual_kernel: ClassVar[str] = "cauchy"
+    usual_gate: ClassVar[float | None] = 6.0
 
     rate: float = Field(20.0, gt=0, le=200, description="Hz, keyframes within a stance and within a swing")
     stance: bool = Field(True, description="where the shoe touches the floor it does not move")
@@ -144,9 +210,6 @@ class FootSettings(_Section):
     closed_loop: float | None = Field(
         None, gt=0, description="m, 1-sigma; given, the end is the start (only without GNSS)"
     )
-    robust: Kernel = Field("cauchy", description="robust kernel of the smoother")
-    robust_scale: float = Field(3.0, gt=0, description="whitened norm of a row at which the kernel bends")
-    gate: float | None = Field(6.0, gt=0, description="whitened norm above which the filter rejects a row")
 
 
 class StanceSettings(_Section):

@@ -23,6 +23,7 @@ from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, assembl
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import Fault
+from graphnav.solvers import adaptive
 from graphnav.solvers.ekf import Smoothed
 from graphnav.state import DIM
 
@@ -30,13 +31,16 @@ _EDGE = 60.0  # s; farther from a fault a smoother without GNSS could not tell r
 _DISAGREES = 1e-3  # chance of T by which a window next to a fault is taken for a part of it
 
 
-def spans(problem: Problem, smoothed: Smoothed | None = None) -> tuple[Fault, ...]:
-    """The rows of weight 0, by constraint and in order of time; with a smoothed solution, what is wrong with them."""
+def spans(problem: Problem, smoothed: Smoothed | None = None, noisy: bool = False) -> tuple[Fault, ...]:
+    """The rows of weight 0, by constraint and in order of time; with a smoothed solution, what is wrong with them.
+
+    With `noisy` all whose weight is less than 1.
+    """
     out = []
     for rows in problem.constraints:
         if rows.weight is None:
             continue
-        lost = np.flatnonzero(rows.weight == 0.0)
+        lost = np.flatnonzero(rows.weight < 1.0 if noisy else rows.weight == 0.0)
         if not len(lost):
             continue
         t = problem.t[rows.keyframe]
@@ -63,6 +67,13 @@ def notes(faults: tuple[Fault, ...], problem: Problem) -> tuple[str, ...]:
             out.append(
                 f"{rows.name}: {sum(f.count for f in own)} of {len(rows)} are wrong and left out, in {len(own)} spans; "
                 f"the longest, from {begin:.1f} s for {longest.t_end - longest.t_start:.1f} s, is {longest.reason}"
+            )
+        noisy = np.empty(0) if rows.weight is None else rows.weight[(rows.weight > 0.0) & (rows.weight < 1.0)]
+        if len(noisy):
+            usual, most = np.median(noisy) ** -0.5, np.min(noisy) ** -0.5
+            out.append(
+                f"{rows.name}: {len(noisy)} of {len(rows)} scatter {usual:.0f} times as much as they state (median; "
+                f"{most:.0f} at most) and have less say for it"
             )
     return tuple(out)
 
@@ -91,6 +102,12 @@ def all_used(problem: Problem) -> Problem:
     return weighted(problem, {c.name: np.ones(len(c)) for c in problem.constraints if c.weight is not None})
 
 
+def bent(problem: Problem) -> Problem:
+    """The problem with Cauchy's kernel on its watched rows: what most of them contradict is not left to tests."""
+    rows = (replace(c, robust="cauchy") if c.watched else c for c in problem.constraints)
+    return replace(problem, constraints=tuple(rows))
+
+
 def widened(problem: Problem) -> Problem:
     """The problem with as much again left out on either side of every fault, at most `_EDGE`.
 
@@ -105,8 +122,8 @@ def _wider(fault: Fault) -> Fault:
 
 
 def count(problem: Problem) -> int:
-    """How many rows are left out."""
-    return sum(int(np.sum(c.weight == 0.0)) for c in problem.constraints if c.weight is not None)
+    """How many rows are left out, or have less say."""
+    return sum(int(np.sum(c.weight < 1.0)) for c in problem.constraints if c.weight is not None)
 
 
 def share(problem: Problem) -> float:
@@ -117,32 +134,52 @@ def share(problem: Problem) -> float:
 def readmitted(problem: Problem, smoothed: Smoothed) -> Problem:
     """The problem with better edges of its faults, by a smoothed solution of the `widened` one.
 
-    Towards every fault, and on into it, fixes are used as far as no window of them disagrees with its prediction.
+    Towards every fault, and on into it, fixes are used as far as no window of them disagrees with its prediction. Where
+    fixes are to be noisier than stated they have the noise that is seen from both sides.
     """
     better = {}
     for rows in problem.constraints:
-        if not rows.watched or rows.weight is None or not np.any(rows.weight == 0.0):
+        if rows.weight is None or not np.any(rows.weight < 1.0):
             continue
-        weight, t = rows.weight.copy(), problem.t[rows.keyframe]
+        f = _noise(problem, rows, smoothed)
+        weight, t = np.where(rows.weight > 0.0, 1.0 / f, 0.0), problem.t[rows.keyframe]
         agree, doubted = np.zeros(len(rows), dtype=bool), rows.weight == 0.0
+        if not rows.watched:  # left out by a gate
+            better[rows.name] = weight
+            continue
         for fault in (fault for fault in spans(problem) if fault.kind == rows.name):
             wide, own = _wider(fault), (t >= fault.t_start - SAME_TIME) & (t <= fault.t_end + SAME_TIME)
             left, right = (t >= wide.t_start) & (t <= fault.t_end), (t >= fault.t_start) & (t <= wide.t_end)
             for side, step in ((left, 1), (right, -1)):
                 inwards = np.flatnonzero(side & (own | (rows.weight > 0.0)))[::step]
                 doubted[inwards] = True
-                agree[inwards[: _agreeing(problem, rows, smoothed, inwards)]] = True
-        weight[doubted] = agree[doubted]
+                agree[inwards[: _agreeing(problem, rows, smoothed, inwards, f)]] = True
+        weight[doubted] = np.where(agree, 1.0 / f, 0.0)[doubted]
         better[rows.name] = weight
     return weighted(problem, better)
 
 
-def _agreeing(problem: Problem, rows: Constraint, smoothed: Smoothed, which: Array) -> int:
-    """How many rows from the first of `which` on agree with what they were predicted to be."""
+def _noise(problem: Problem, rows: Constraint, smoothed: Smoothed) -> Array:
+    """(N,) factors on the variances of fixes, 1 where they are as stated."""
+    if rows.adaptive == "off":
+        return np.ones(len(rows))
+    linear, HPH = _predicted(problem, rows, smoothed, np.arange(len(rows)))
+    predicted = np.diagonal(HPH, axis1=-2, axis2=-1)
+    return adaptive.factors(linear.residual, linear.sigma, predicted, always=rows.adaptive == "on")
+
+
+def _predicted(problem: Problem, rows: Constraint, smoothed: Smoothed, which: Array) -> tuple[Linearized, Array]:
+    """Some rows at a smoothed solution, and its part (n, m, m) in the covariance of their residuals."""
     linear = _linear(problem, rows, smoothed, which)
-    H, m = assemble(linear, problem.columns, smoothed.P.shape[-1]), linear.residual.shape[1]
-    HPH = H @ smoothed.P[rows.keyframe[which]] @ np.swapaxes(H, -1, -2)
-    R = linear.sigma[..., None] ** 2 * np.eye(m)
+    H = assemble(linear, problem.columns, smoothed.P.shape[-1])
+    return linear, H @ smoothed.P[rows.keyframe[which]] @ np.swapaxes(H, -1, -2)
+
+
+def _agreeing(problem: Problem, rows: Constraint, smoothed: Smoothed, which: Array, f: Array) -> int:
+    """How many rows from the first of `which` on agree with what they were predicted to be, f (N,) times as noisy."""
+    linear, HPH = _predicted(problem, rows, smoothed, which)
+    m = linear.residual.shape[1]
+    R = (f[which, None] * linear.sigma**2)[..., None] * np.eye(m)
     limit, end, n = float(chdtri(m, _DISAGREES)), len(which), 1
     sums = [np.cumsum(np.concatenate([np.zeros((1, *x.shape[1:])), x]), axis=0) for x in (linear.residual, R, HPH)]
     while n <= end:

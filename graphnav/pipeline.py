@@ -143,8 +143,10 @@ def _solve(
     def watched(problem: Problem) -> tuple[Problem, Filtered]:
         forward = ekf(problem, progress, aligned.until, watch=True)
         found = faults.weighted(problem, forward.weights)
-        if too_many := faults.share(found) > _MOST:
+        if too_many := settings.gnss.faults != "on" and faults.share(found) > _MOST:
             found = faults.all_used(problem)
+            if settings.gnss.robust == "automatic":
+                found = faults.bent(found)
         if too_many or forward.anew:
             forward = ekf(found, progress, aligned.until)
         return found, forward
@@ -177,10 +179,11 @@ def _solve(
     problem, forward, smoothed, raised = reviewed(problem)
     if faults.count(problem):
         # what faults did to the states around them may have passed for noise of the IMU
-        wrong = faults.spans(problem)
+        wrong = faults.spans(problem, noisy=True)
         other, says = posed(wrong)
         if judgement.calmer(other.recording.imu.noise, problem.recording.imu.noise):
-            problem, said = faults.without(other, wrong), says
+            weights = {c.name: c.weight for c in problem.constraints if c.weight is not None}
+            problem, said = faults.weighted(other, weights), says
             forward = ekf(problem, progress, aligned.until)
             problem, raised = judgement.judge_wheels(problem, backward(problem, forward, progress))
             forward = ekf(problem, progress, aligned.until) if raised else forward
@@ -238,7 +241,9 @@ def judged(
     if aligned.motion is None or not gnss.position:
         return recording, settings, ()
     free = settings.without_wheels()  # wheels are judged by what comes of this, so they have no say in it
-    plain = free.model_copy(update={"gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0})})
+    plain = free.model_copy(
+        update={"gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0, "adaptive": "off"})}
+    )
     part = judgement.stretch(recording, aligned.motion)
     noise = stated
     weight: dict[str, np.ndarray] = {}

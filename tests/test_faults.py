@@ -13,18 +13,21 @@ from graphnav.alignment import align
 from graphnav.config import Settings, settings_from
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
+from graphnav.errors import ConfigError
 from graphnav.pipeline import origin, run
 from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.scoring import errors
 from graphnav.solution import Solution
+from graphnav.solvers import adaptive
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import backward, ekf
+from graphnav.solvers.rows import Layout, Point, whitened
 from graphnav.solvers.watch import Bank, Verdicts
 from graphnav.trajectory import Trajectory
 
-OFF = settings_from({"gnss": {"faults": False}})
+OFF = settings_from({"gnss": {"faults": "off", "adaptive": "off"}})
 
 
 @pytest.fixture(scope="module")
@@ -230,3 +233,145 @@ def test_spans_and_back(posed: Problem) -> None:
     assert np.array_equal(next(c for c in again.constraints if c.name == rows.name).weight, weight)
     assert faults.count(again) == 4
     assert faults.count(faults.all_used(again)) == 0
+
+
+# ---------------------------------------------------------------------------------------------------------- noise
+
+
+def scattered(recording: Recording, bad: Array, times: float, seed: int) -> Recording:
+    """Fixes with errors so many times as large as they state."""
+    assert recording.gnss is not None
+    rng = np.random.default_rng(seed)
+    return moved(recording, bad, rng.standard_normal((int(bad.sum()), 3)) * recording.gnss.sd[bad] * times)
+
+
+@pytest.mark.parametrize("times", [5.0, 50.0])
+def test_noise_is_weighed_down_and_not_left_out(drive: tuple[Recording, Trajectory], times: float) -> None:
+    """Two minutes of fixes that scatter more than they state: every solver gives them what they are worth."""
+    recording, truth = drive
+    assert recording.gnss is not None
+    t = recording.gnss.t - recording.start
+    bad = (t >= 200.0) & (t < 320.0)
+    wrong = scattered(recording, bad, times, 3)
+    sd = np.where(bad[:, None], times * recording.gnss.sd, recording.gnss.sd)
+    assert wrong.gnss is not None
+    solvers = ("ekf", "rts", "incremental", "batch")
+    found, known = run(wrong, solvers=solvers), run(replace(wrong, gnss=replace(wrong.gnss, sd=sd)), OFF, solvers)
+    left = run(recording.without("gnss", (199.9, 319.9)), OFF, ("ekf",))["ekf"]
+    for name in solvers:
+        mine, best = (float(np.sqrt(np.mean(horizontal(s[name], truth) ** 2))) for s in (found, known))
+        assert mine < 1.5 * best, (name, mine, best)  # it takes a while until noise is seen to be noise
+        weight = found[name].records["gnss_position"].weight
+        assert 1 / 1.5 < np.median(weight[bad]) ** -0.5 / times < 1.5, name
+        assert np.array_equal(weight, found["ekf"].records["gnss_position"].weight), name
+        assert np.median(weight[~bad]) == 1.0
+    assert np.mean(left_out(found["ekf"], wrong)) < 0.1
+    assert horizontal(found["ekf"], truth).max() < horizontal(left, truth).max()
+
+
+def test_noise_factors_are_one_without_noise_and_right_with() -> None:
+    rng = np.random.default_rng(4)
+    r, sigma, predicted = rng.standard_normal((20000, 3)), np.ones((20000, 3)), np.zeros((20000, 3))
+    assert np.all(adaptive.factors(r, sigma, predicted) == 1.0)
+    r[5000:6000] *= 10.0
+    f = adaptive.factors(r, sigma, predicted)
+    assert np.sqrt(np.median(f[5000:6000])) == pytest.approx(10.0, rel=0.1)
+    assert np.all(f[:4960] == 1.0)
+    assert np.all(f[6040:] == 1.0)
+
+
+def test_a_common_error_is_no_noise() -> None:
+    """Neither one that is constant nor one that grows, nor single outliers: those are for the tests of faults."""
+    rng = np.random.default_rng(5)
+    sigma, predicted = np.ones((2000, 3)), np.zeros((2000, 3))
+    for wrong in (np.full(500, 30.0), 0.5 * np.arange(500.0)):
+        r = rng.standard_normal((2000, 3))
+        r[700:1200] += wrong[:, None]
+        assert np.all(adaptive.factors(r, sigma, predicted) == 1.0)
+    r = rng.standard_normal((2000, 3))
+    r[rng.random(2000) < 0.1] *= 100.0
+    assert np.all(adaptive.factors(r, sigma, predicted) == 1.0)
+
+
+def test_filter_adapts_as_seen_from_both_sides_but_later(posed: Problem) -> None:
+    rows = next(c for c in posed.constraints if c.name == "gnss_position")
+    rng, p = np.random.default_rng(6), rows.p_n.copy()
+    p[150:300] += 20.0 * rows.stated[150:300] * rng.standard_normal((150, 3))
+    noisy = replace(rows, p_n=p)
+    problem = replace(posed, constraints=tuple(noisy if c is rows else c for c in posed.constraints))
+    weight = ekf(problem, watch=True).weights[rows.name]
+    assert np.all(weight[:145] == 1.0)
+    assert np.median(weight[170:300]) ** -0.5 == pytest.approx(20.0, rel=0.3)
+    assert np.all(weight[320:] == 1.0)
+
+
+# ---------------------------------------------------------------------------------------------------------- switches
+
+
+def test_kernel_is_of_whole_measurements(posed: Problem) -> None:
+    """A fix with 2 sigma on each of three axes is beyond a scale of 3, one with 2 sigma on one is not."""
+    rows = next(c for c in posed.constraints if c.name == "gnss_position")
+    layout = Layout(posed)
+    point = Point(backward(posed, ekf(posed)).states, {c.parameter.name: c.mean for c in posed.chains})
+    linear = rows.linearize(point.states[rows.keyframe], {}, slice(None))
+    p = rows.p_n + np.einsum("nji,nj->ni", rows.R_ln, linear.residual)  # nothing left
+    for axes, weighed in ((3, True), (1, False)):
+        q = p.copy()
+        q[100] -= rows.R_ln[100].T @ (np.arange(3) < axes) * 2.0 * rows.stated[100]
+        bent = replace(rows, p_n=q, robust="gnc", robust_scale=3.0)
+        problem = replace(posed, constraints=tuple(bent if c is rows else c for c in posed.constraints))
+        at = 1 + [c.name for c in problem.constraints].index(rows.name) + 1  # behind intervals and prior
+        blocks, _ = whitened(problem, point, layout)[at]
+        assert bool(np.abs(blocks[0][1][100]).max() == 0.0) is weighed
+
+
+def test_graduation_where_bursts_are_many(drive: tuple[Recording, Trajectory]) -> None:
+    """Thirty per cent of the fixes are off by 10 m, 20 s at a time and all alike, and nobody watches for faults."""
+    recording, truth = drive[0].crop(0.0, 240.0), drive[1]
+    assert recording.gnss is not None
+    t = recording.gnss.t - recording.start
+    bad = (t > 60.0) & ((t - 60.0) % 60.0 < 20.0)
+    wrong = moved(recording, bad, np.array([8.0, -6.0, 0.0]))
+    worst = {}
+    for kernel in ("off", "huber", "gnc"):
+        settings = settings_from({"gnss": {"faults": "off", "adaptive": "off", "robust": kernel}})
+        worst[kernel] = horizontal(run(wrong, settings, ("batch",))["batch"], truth).max()
+    assert worst["off"] > 5.0
+    assert worst["huber"] > 1.0
+    assert worst["gnc"] < 0.15
+
+
+def test_what_a_gate_refuses_no_solver_uses(drive: tuple[Recording, Trajectory]) -> None:
+    recording, _ = drive
+    wrong = moved(recording.crop(0.0, 200.0), np.array([120]), np.array([30.0, 0.0, 0.0]))
+    settings = settings_from({"gnss": {"faults": "off", "adaptive": "off", "gate": "on"}})
+    for name, solution in run(wrong, settings, ("ekf", "rts", "batch", "incremental")).items():
+        assert solution.records["gnss_position"].weight[120] == 0.0, name
+        assert np.sum(solution.records["gnss_position"].weight == 0.0) == 1, name
+
+
+@pytest.mark.parametrize(
+    ("given", "is_now"),
+    [
+        ({"faults": True, "robust": "none", "gate": None}, ("automatic", "off", "off")),
+        ({"faults": False, "robust": "tukey", "gate": 5}, ("off", "tukey", 5.0)),
+        ({}, ("automatic", "automatic", "automatic")),
+    ],
+)
+def test_settings_of_earlier_versions(given: dict[str, object], is_now: tuple[object, ...]) -> None:
+    gnss = settings_from({"gnss": given}).gnss
+    assert (gnss.faults, gnss.robust, gnss.gate) == is_now
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("faults", "yes", "'gnss.faults': 'yes' must be"),
+        ("adaptive", 3, "'gnss.adaptive': '3' must be"),
+        ("robust", "geman", "'gnss.robust': 'geman' must be one of off, on, automatic, huber"),
+        ("gate", -1.0, "'gnss.gate': '-1.0' must be .* a number above 0"),
+    ],
+)
+def test_a_switch_that_is_none_of_its_words(key: str, value: object, says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        settings_from({"gnss": {key: value}})

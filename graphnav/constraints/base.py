@@ -4,7 +4,7 @@ A constraint is N rows of m numbers, each row tied to one keyframe. `linearize` 
 parameter values of some rows, the residual (predicted minus measured), its derivative with respect to
 the error-state blocks and parameters it depends on, and the measurement's sigma. It knows nothing of
 filters or graphs, and no weights, gates or robust kernels: those belong to the solvers, which read
-`robust`, `robust_scale`, `gate`, `watched` and `weight`.
+`robust`, `robust_scale`, `gate`, `watched`, `adaptive` and `weight`.
 """
 
 from __future__ import annotations
@@ -76,8 +76,10 @@ class Constraint(ABC):
     parameters: tuple[Parameter, ...] = ()
     robust: str = "none"
     robust_scale: float = 3.0
+    graduation: float = np.inf  # mu of graduated non-convexity; infinite at its end
     gate: float | None = None
     watched: bool = False  # for errors that last
+    adaptive: str = "off"  # whether its sigmas are raised where it is noisier than they say
     weight: Array | None = None  # (N,) of each row's information, 0 = not used; all 1 when None
     notes: tuple[str, ...] = ()  # sentences that whoever reads the result must know
 

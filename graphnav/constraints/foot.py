@@ -97,9 +97,7 @@ class Stance(Constraint):
                 Parameter(PIVOT, np.zeros(3), np.full(3, s.pivot_sigma), "m"),
                 Parameter(TRAVEL, np.zeros(2), np.full(2, s.travel_sigma), "m"),
             ),
-            robust=s.robust,
-            robust_scale=s.robust_scale,
-            gate=s.gate,
+            **s.outliers,
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -151,9 +149,7 @@ class FootLateral(Constraint):
                 *scale_parameter(scene.recording.imu.noise),
                 Parameter(FOOT_AXIS, np.zeros(2), np.full(2, np.radians(s.axis_sigma)), "rad"),
             ),
-            robust=s.robust,
-            robust_scale=s.robust_scale,
-            gate=s.gate,
+            **s.outliers,
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:

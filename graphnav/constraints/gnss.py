@@ -63,10 +63,9 @@ def _common(scene: Scene, offset: str) -> dict[str, Any]:
         parameters.append(Parameter(offset, np.zeros(1), np.full(1, settings.time_offset_sigma), "s"))
     return {
         "parameters": tuple(parameters),
-        "robust": settings.robust,
-        "robust_scale": settings.robust_scale,
-        "gate": settings.gate,
-        "watched": settings.faults,
+        "watched": settings.faults != "off",
+        "adaptive": settings.adaptive,
+        **settings.outliers,
     }
 
 

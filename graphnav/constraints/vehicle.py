@@ -254,9 +254,7 @@ class NonHolonomic(Wheels):
             keyframe=rows + 1,
             past=past,
             sigma=np.hypot(density, columns(right, up)),
-            robust=s.robust,
-            robust_scale=s.robust_scale,
-            gate=s.gate,
+            **s.outliers,
             **shared,
         )
 
@@ -338,9 +336,7 @@ class OdometerSpeed(Wheels):
             signed=odometer.signed,
             sigma=sigma[:, None],
             reach=reach,
-            robust=s.robust,
-            robust_scale=s.robust_scale,
-            gate=s.gate,
+            **s.outliers,
             **shared,
         )
 

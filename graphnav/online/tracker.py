@@ -241,7 +241,7 @@ class Tracker:
         if not count:
             return
         last = count == len(self.window)
-        robust = {self.settings.gnss.robust, self.settings.vehicle.robust} != {"none"}
+        robust = {self.settings.gnss.kernel, self.settings.vehicle.kernel} != {"none"}
         self.window.converge(always=last or robust, renewed=lambda first: self._renewed(sensors, first))
         overdue = self.newest - float(self.window.stages[0].place.t) - self.settings.solver.lag
         if not last and overdue < _LATEST * self.settings.solver.lag and self.window.first_moved() is not None:
@@ -352,7 +352,7 @@ class Tracker:
 
     def _watch(self, problem: Problem, sensors: Sensors) -> None:
         """Have the fixes watched for errors that last, as soon as some tell how often they come."""
-        if self.window.newest.tests is not None or not self.settings.gnss.faults or len(sensors.gnss) < _FIXES:
+        if self.window.newest.tests is not None or self.settings.gnss.faults == "off" or len(sensors.gnss) < _FIXES:
             return
         watched = [c for c in problem.constraints if c.watched and isinstance(c, GnssPosition | GnssVelocity)]
         if watched:
@@ -368,7 +368,7 @@ class Tracker:
         for c in problem.constraints:
             if isinstance(c, NonHolonomic | OdometerSpeed) and c.name in factors:
                 c = replace(c, sigma=c.sigma * factors[c.name])
-            elif c.watched and self.settings.gnss.faults:
+            elif c.watched and self.settings.gnss.faults != "off":
                 weight = self.verdicts.weights(c.name, problem.t[c.keyframe])
                 if not weight.all():
                     c = replace(c, weight=weight)

@@ -14,6 +14,7 @@ then within sqrt(2 tolerance) sigma in every direction at once.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,11 +25,12 @@ from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
 from graphnav.solvers.graph import Eliminated, LinearGraph
 from graphnav.solvers.passes import Progress, residual_record
-from graphnav.solvers.robust import weight_and_cost
+from graphnav.solvers.robust import REDESCENDING, weight_and_cost
 from graphnav.solvers.rows import Layout, Point, Rows, Values, column_norms, cost, promised, whitened
 from graphnav.state import DIM, States
 
-_REDESCENDING = ("geman-mcclure", "tukey", "welsch")
+_GRADUATION = 1.4  # by which mu grows from step to step
+_SHARP = 100.0  # mu from which on the kernel bends within half a per cent of its scale
 _MIN_DAMPING, _MAX_DAMPING = 1e-4, 1e8
 
 
@@ -48,16 +50,19 @@ def batch(
     began = time.perf_counter()
     values = {c.parameter.name: c.mean for c in problem.chains} | (values or {})
     point, notes = Point(start, values), []
-    if any(c.robust in _REDESCENDING for c in problem.constraints):
+    if any(c.robust in REDESCENDING and c.robust != "gnc" for c in problem.constraints):
         # such a kernel gives up on whatever is far from the start; Cauchy's never quite does, and leads there
-        gentle = [replace(c, robust="cauchy") if c.robust in _REDESCENDING else c for c in problem.constraints]
-        point = _minimise(replace(problem, constraints=tuple(gentle)), point, progress, reintegrate).point
+        rows = (replace(c, robust="cauchy") if c.robust in REDESCENDING else c for c in problem.constraints)
+        point = _minimise(replace(problem, constraints=tuple(rows)), point, progress, reintegrate).point
+    for gentle in _graduated(problem, point):
+        point = _minimise(gentle, point, progress, reintegrate, 1).point
     found = _minimise(problem, point, progress, reintegrate)
     problem, point, layout = found.problem, found.point, found.layout
     solved = time.perf_counter()
     if progress is not None:
         progress("covariances", 0.0)
     keys = set(layout.keys) if wanted is None else {*wanted, *layout.keys[layout.K :]}
+    assert found.eliminated is not None
     marginal = found.eliminated.covariances(keys)
     unknown = np.full((DIM, DIM), np.nan)
     covariance = np.stack([marginal.get(k, unknown) for k in range(layout.K)])
@@ -93,15 +98,34 @@ class _Minimum:
     problem: Problem  # with intervals integrated about the final biases
     point: Point
     layout: Layout
-    eliminated: Eliminated  # undamped, at the point
+    eliminated: Eliminated | None  # undamped, at the point; None where the iterations were limited
     cost: float
     iterations: int
     stopped: str
     notes: tuple[str, ...]
 
 
-def _minimise(problem: Problem, point: Point, progress: Progress | None, reintegrate: bool) -> _Minimum:
+def _graduated(problem: Problem, point: Point) -> Iterator[Problem]:
+    """The problem with its "gnc" kernels convex at first and then ever less so, for a step each."""
+    mu = {}
+    at_keyframes = point.at_keyframes(problem)
+    for c in problem.constraints:
+        if c.robust == "gnc":
+            s2 = residual_record(problem, c, point.states, at_keyframes).nis * (1.0 if c.weight is None else c.weight)
+            if np.max(s2) > c.robust_scale**2:
+                mu[c.name] = 1.0 / (2.0 * float(np.max(s2)) / c.robust_scale**2 - 1.0)
+    while mu and min(mu.values()) < _SHARP:
+        rows = (replace(c, graduation=mu.get(c.name, np.inf)) for c in problem.constraints)
+        yield replace(problem, constraints=tuple(rows))
+        mu = {name: _GRADUATION * x for name, x in mu.items()}
+
+
+def _minimise(
+    problem: Problem, point: Point, progress: Progress | None, reintegrate: bool, iterations: int | None = None
+) -> _Minimum:
     settings = problem.settings.solver
+    if iterations is not None:
+        settings = settings.model_copy(update={"max_iterations": iterations})
     renewed = refused = 0
     if reintegrate:
         problem, renewed = _renew(problem, point)
@@ -158,7 +182,7 @@ def _minimise(problem: Problem, point: Point, progress: Progress | None, reinteg
                 layout = Layout(problem)
                 now = cost(problem, point, layout)
                 renewed += again
-    if eliminated is None:
+    if eliminated is None and iterations is None:
         eliminated = _eliminate(whitened(problem, point, layout), layout, 0.0)
     notes = []
     if refused:

@@ -38,6 +38,7 @@ from graphnav.errors import EstimationError
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array
 from graphnav.solution import Solution
+from graphnav.solvers.adaptive import Noise
 from graphnav.solvers.passes import (
     Filtered,
     Forward,
@@ -49,6 +50,7 @@ from graphnav.solvers.passes import (
     scale_of,
     shift,
 )
+from graphnav.solvers.robust import PASSES, softened, weight_and_cost
 from graphnav.solvers.rts import backward, rts
 from graphnav.solvers.watch import Bank, Verdicts
 from graphnav.state import BLOCKS, DIM, States
@@ -68,7 +70,8 @@ def ekf(
     ----------
     opening : s, the end of what the alignment has seen of the recording; up to there the filter runs twice. Estimates
         after it depend on nothing later than themselves.
-    watch : look for errors that last in the rows that are to be watched, and go back to before them.
+    watch : look for errors that last in the rows that are to be watched, and go back to before them; and for noise
+        in those whose sigmas are to be adapted.
     """
     began = time.perf_counter()
     K, about = len(problem.t), None
@@ -116,7 +119,9 @@ def _forward(
     P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
     records = {rows.name: Innovations(rows) for rows in problem.constraints}
     first = {rows.name: np.searchsorted(rows.keyframe, np.arange(K + 1)) for rows in problem.constraints}
-    watched = [c for c in problem.constraints if watch and c.watched and isinstance(c, GnssPosition | GnssVelocity)]
+    fixes = [c for c in problem.constraints if watch and isinstance(c, GnssPosition | GnssVelocity)]
+    watched = [c for c in fixes if c.watched]
+    noise = Noise([c for c in fixes if c.adaptive != "off" and c.weight is None])  # weights know what follows as well
     bank = Bank(watched, problem.t, D) if watched else None
     banks: dict[int, Bank] = {}  # as they were before the latest keyframes with fixes
     verdicts = Verdicts(
@@ -176,7 +181,7 @@ def _forward(
             if hi > lo:
                 x, record = (state, values, P), records[rows.name]
                 at_point = about if k < n else None
-                state, values, P, fault = _update(rows, lo, hi, *x, columns, record, at_point, k, bank)
+                state, values, P, fault = _update(rows, lo, hi, *x, columns, record, at_point, k, bank, noise)
                 if fault is not None:
                     again = verdicts.settle(rows.name, fault, float(problem.t[k]))
                     back = int(np.searchsorted(problem.t, again))
@@ -194,7 +199,7 @@ def _forward(
         if progress is not None and k % 256 == 0:
             progress("filter", k / K)
         k += 1
-    weights = {rows.name: records[rows.name].used for rows in watched}
+    weights = {c.name: records[c.name].decided * noise.weight(c.name) for c in fixes}
     anew = bool(verdicts.anew)
     return Forward(states, all_values, all_vp, all_P, predicted, all_Pp, all_F, records, weights, anew, about)
 
@@ -211,6 +216,7 @@ def _update(
     about: Smoothed | None,
     k: int,
     bank: Bank | None,
+    noise: Noise,
 ) -> tuple[States, Array, Array, float | None]:
     """One measurement update with rows lo..hi of a constraint at keyframe k; when a fault began comes last."""
     n = hi - lo
@@ -229,27 +235,27 @@ def _update(
         if 0.0 < weight < 1.0:
             sigma = sigma / np.sqrt(weight)
         PHt = P @ H.T
-        S = H @ PHt
-        S.flat[:: len(r) + 1] += sigma * sigma
+        HPHt = H @ PHt
+        if not left:
+            sigma = noise.raised(rows.name, lo, r, HPHt.diagonal(), sigma)
         if bank is not None and weight > 0.0 and not left:
             G = bank.signature(rows.name, k, H)
         # LAPACK called directly: for matrices this small the checks around it would cost more than the work
         right = np.empty((len(r), D + 1 + G.shape[1]))
         right[:, 0], right[:, 1 : D + 1], right[:, D + 1 :] = r, PHt.T, G
-        _, solved, info = dposv(S, right)
-        if info:
-            raise EstimationError(
-                f"the filter's covariance broke down at '{rows.name}' row {lo}: check sigmas and units"
-            )
+        S, solved = _solve(HPHt, sigma, right, rows, lo)
+        nis, bent = float(r @ solved[:, 0]), 1.0
+        if rows.robust != "none" and rows.gate is None and not left:  # a gate stands in place of a kernel
+            sigma, solved, bent = _robust(HPHt, sigma, right, solved, rows, lo, hi)
         K = solved[:, 1 : D + 1].T
         d = e - K @ r
         if left:  # again about where this leads (Jazwinski 1970, theorem 8.2)
             at, at_values = at.plus(d[None, :DIM]), at_values + d[DIM:]
             e = np.concatenate([state.minus(at)[0], values - at_values])
-    nis = float(r @ solved[:, 0])
-    if rows.gate is not None and nis > rows.gate**2:
-        weight = 0.0
-    record.set(slice(lo, hi), r.reshape(n, -1), np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1), nis / n, weight)
+    refused = rows.gate is not None and nis > rows.gate**2
+    weight = 0.0 if refused else weight * bent
+    spread = np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1)
+    record.set(slice(lo, hi), r.reshape(n, -1), spread, nis / n, weight, refused)
     if bank is not None:
         bank.seen(rows.name, k, nis)
     if weight == 0.0:
@@ -262,6 +268,33 @@ def _update(
     if bank is not None:
         fault = bank.updated(rows.name, K, G, solved[:, D + 1 :], r, float(np.linalg.norm(state.v)))
     return at.plus(d[None, :DIM]), at_values + d[DIM:], P, fault
+
+
+def _solve(HPHt: Array, sigma: Array, right: Array, rows: Constraint, lo: int) -> tuple[Array, Array]:
+    """S = H P H^T + R and S^-1 times the right sides."""
+    S = HPHt.copy()
+    S.flat[:: len(S) + 1] += sigma * sigma
+    _, solved, info = dposv(S, right)
+    if info:
+        raise EstimationError(f"the filter's covariance broke down at '{rows.name}' row {lo}: check sigmas and units")
+    return S, solved
+
+
+def _robust(
+    HPHt: Array, sigma: Array, right: Array, solved: Array, rows: Constraint, lo: int, hi: int
+) -> tuple[Array, Array, float]:
+    """Sigmas with a kernel's weights in them, S^-1 times the right sides with these, and the least weight.
+
+    As the incremental smoother does with a new keyframe: none at first, then by what the update leaves, a few times.
+    """
+    stated, weight = sigma, np.ones(hi - lo)
+    for _ in range(PASSES - 1):
+        left = (right[:, 0] - HPHt @ solved[:, 0]) / stated
+        s = np.linalg.norm(left.reshape(hi - lo, -1), axis=1)
+        weight = np.maximum(weight_and_cost(softened(rows.robust), s, rows.robust_scale)[0], 1e-12)
+        sigma = stated / np.repeat(np.sqrt(weight), len(stated) // (hi - lo))
+        _, solved = _solve(HPHt, sigma, right, rows, lo)
+    return sigma, solved, float(np.min(weight))
 
 
 def _about_own(P: Array, e: Array) -> Array:

@@ -26,10 +26,17 @@ class Innovations:
         self.residual, self.sigma = np.zeros(shape), np.ones(shape)
         self.nis, self.weight = np.zeros(len(rows)), np.ones(len(rows))
         self.used = np.ones(len(rows)) if rows.weight is None else rows.weight.copy()
+        self.refused = np.zeros(len(rows), dtype=bool)
 
-    def set(self, at: slice, residual: Array, sigma: Array, nis: float, weight: float) -> None:
+    def set(self, at: slice, residual: Array, sigma: Array, nis: float, weight: float, refused: bool) -> None:
         """Of the rows `at`."""
         self.residual[at], self.sigma[at], self.nis[at], self.weight[at] = residual, sigma, nis, weight
+        self.refused[at] = refused
+
+    @property
+    def decided(self) -> Array:
+        """(N,) weights without what a gate refused."""
+        return np.where(self.refused, 0.0, self.used)
 
     def record(self, problem: Problem) -> ConstraintRecord:
         """All of them."""
@@ -51,7 +58,7 @@ class Forward:
     P_predicted: Array  # (K, D, D)
     F: Array  # (K-1, D, D)
     records: dict[str, Innovations]
-    weights: dict[str, Array]  # (N,) of the rows of watched constraints: 0 where a fault was found
+    weights: dict[str, Array]  # (N,) of fixes: 0 where a fault was found, less than 1 where noisy
     anew: bool  # it began anew somewhere, which no other solver can: its estimates are not to be used
     about: Smoothed | None  # points at which the first keyframes were linearised; their P is of errors about these
 

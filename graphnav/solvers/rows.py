@@ -128,7 +128,7 @@ def whitened(problem: Problem, point: Point, layout: Layout) -> Rows:
     for rows in (problem.prior, *problem.constraints):
         linear = rows.linearize(x[rows.keyframe], _of_rows(rows, at_keyframes), slice(None))
         sigma = weighted_sigma(rows, linear.sigma)
-        weight, _ = weight_and_cost(rows.robust, norms(linear.residual, sigma), rows.robust_scale)
+        weight, _ = weight_and_cost(rows.robust, norms(linear.residual, sigma), rows.robust_scale, rows.graduation)
         scale = np.sqrt(weight)[:, None] / sigma
         weighted = {p.name: scale[..., None] * linear.jacobians[p.name] for p in rows.parameters}
         blocks = [(rows.keyframe, scale[..., None] * assemble(linear))]
@@ -145,7 +145,7 @@ def cost(problem: Problem, point: Point, layout: Layout) -> float:
     for rows in (problem.prior, *problem.constraints):
         linear = rows.linearize(x[rows.keyframe], _of_rows(rows, at_keyframes), slice(None))
         s = norms(linear.residual, weighted_sigma(rows, linear.sigma))
-        total += float(np.sum(weight_and_cost(rows.robust, s, rows.robust_scale)[1]))
+        total += float(np.sum(weight_and_cost(rows.robust, s, rows.robust_scale, rows.graduation)[1]))
     for chain in problem.chains:
         for _, b in _chain_rows(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name]):
             total += 0.5 * float(np.sum(b * b))

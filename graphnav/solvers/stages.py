@@ -29,13 +29,12 @@ from graphnav.dynamics import SCALE, Motion
 from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array, mv
-from graphnav.solvers.robust import weight_and_cost
+from graphnav.solvers.robust import PASSES, softened, weight_and_cost
 from graphnav.solvers.watch import Watch
 from graphnav.state import DIM, States
 
 Columns = dict[str, slice]
 _I = np.eye(DIM)
-_PASSES = 4  # of re-weighting where a kernel is robust
 
 
 @dataclass(frozen=True)
@@ -272,7 +271,8 @@ def at_points(
         for i in np.flatnonzero(np.diff(edge)):
             own = slice(edge[i], edge[i + 1])
             c = constraint
-            parts[i].append(Measured(c.name, H[own], b[own], sigma[own], c.robust, c.robust_scale))
+            kernel = softened(c.robust) if c.robust == "gnc" else c.robust
+            parts[i].append(Measured(c.name, H[own], b[own], sigma[own], kernel, c.robust_scale))
     return [Linear(link, tuple(part)) for link, part in zip(links, parts, strict=True)]
 
 
@@ -337,7 +337,7 @@ def eliminate(
     if linear.link is not None:
         head[row:, :DIM], head[row:, E:] = linear.link[:, :DIM], linear.link[:, DIM:]
     y, first, fault = np.zeros(D), 1 if weighted else 0, None
-    for passes in range(first, first + 1 if weighted or not linear.robust else _PASSES):
+    for passes in range(first, first + 1 if weighted or not linear.robust else PASSES):
         tail = linear.stacked(y, passes, tests)
         A = np.zeros((len(head) + len(tail), E + D + 1 + C), order="F")
         A[: len(head)], A[len(head) :, E : E + D + 1] = wide, tail

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from graphnav.errors import ConfigError
-from graphnav.simulation.aiding import Fault, GnssModel, Span
+from graphnav.simulation.aiding import Fault, GnssModel, OdometerModel, Span
 from graphnav.simulation.inertial import ImuModel, accelerometer, gyroscope
 from graphnav.simulation.kinematics import Mount
 from graphnav.simulation.motion import Manoeuvre, drive
@@ -29,6 +29,7 @@ def run(
     growth: float = 1.0,
     growth_in_velocity: bool = False,
     stops_every: float = 0.0,
+    odometer: bool = False,
     exact: bool = False,
     rate: float = 100.0,
 ) -> Simulated:
@@ -37,6 +38,7 @@ def run(
     `fault` is what GNSS does in 18-25 and 43-47 min: "none", "noise" (errors 100 times larger), "growing" (a
     position error that grows by `growth` m/s to the north-east, in the velocities too if `growth_in_velocity`) or
     "outage". `stops_every` min the vehicle stops for a minute, from the 20th on while it drives; 0 is never.
+    `odometer` adds wheel speeds, which the paper has not.
     """
     outages: tuple[Span, ...] = ()
     faults: tuple[Fault, ...] = ()
@@ -67,6 +69,7 @@ def run(
         origin=(33.7, 73.1, 20.0), imu=IMU.at(rate), mount=Mount((0.0, 1.2, 0.5)), shake=shake, exact=exact,
         gnss=GnssModel(white=(25.0, 25.0, 25.0), velocity=(0.1, 0.1, 0.1), outages=outages, faults=faults,
                        lever_arm=(0.0, -0.3, 1.0)),
+        odometer=OdometerModel(rate=10.0) if odometer else None,
         facts={"fault": fault, "fault_spans": [list(span) for span in FAULTS] if fault != "none" else []},
     )  # fmt: skip
 
