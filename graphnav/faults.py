@@ -102,12 +102,6 @@ def all_used(problem: Problem) -> Problem:
     return weighted(problem, {c.name: np.ones(len(c)) for c in problem.constraints if c.weight is not None})
 
 
-def bent(problem: Problem) -> Problem:
-    """The problem with Cauchy's kernel on its watched rows: what most of them contradict is not left to tests."""
-    rows = (replace(c, robust="cauchy") if c.watched else c for c in problem.constraints)
-    return replace(problem, constraints=tuple(rows))
-
-
 def widened(problem: Problem) -> Problem:
     """The problem with as much again left out on either side of every fault, at most `_EDGE`.
 

@@ -145,8 +145,6 @@ def _solve(
         found = faults.weighted(problem, forward.weights)
         if too_many := settings.gnss.faults != "on" and faults.share(found) > _MOST:
             found = faults.all_used(problem)
-            if settings.gnss.robust == "automatic":
-                found = faults.bent(found)
         if too_many or forward.anew:
             forward = ekf(found, progress, aligned.until)
         return found, forward
