@@ -77,6 +77,7 @@ class Constraint(ABC):
     robust: str = "none"
     robust_scale: float = 3.0
     gate: float | None = None
+    filtered: bool = False  # the filter uses the kernel too
     watched: bool = False  # for errors that last
     weight: Array | None = None  # (N,) of each row's information, 0 = not used; all 1 when None
     notes: tuple[str, ...] = ()  # sentences that whoever reads the result must know

@@ -49,6 +49,7 @@ from graphnav.solvers.passes import (
     scale_of,
     shift,
 )
+from graphnav.solvers.robust import weight_and_cost
 from graphnav.solvers.rts import backward, rts
 from graphnav.solvers.watch import Bank, Verdicts
 from graphnav.state import BLOCKS, DIM, States
@@ -247,6 +248,13 @@ def _update(
             at, at_values = at.plus(d[None, :DIM]), at_values + d[DIM:]
             e = np.concatenate([state.minus(at)[0], values - at_values])
     nis = float(r @ solved[:, 0])
+    if rows.filtered and weight > 0.0:
+        kept = float(weight_and_cost(rows.robust, np.sqrt([nis]), rows.robust_scale)[0][0])
+        S.flat[:: len(r) + 1] += sigma * sigma * (1.0 / kept - 1.0)
+        sigma, weight = sigma / np.sqrt(kept), weight * kept
+        _, solved, _ = dposv(S, right)
+        K = solved[:, 1 : D + 1].T
+        d = e - K @ r
     if rows.gate is not None and nis > rows.gate**2:
         weight = 0.0
     record.set(slice(lo, hi), r.reshape(n, -1), np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1), nis / n, weight)
