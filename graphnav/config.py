@@ -82,7 +82,9 @@ class GnssSettings(_Section):
         (100.0, 3600.0), description="s, correlation times of the two halves of that slow part"
     )
     fast_time: float | None = Field(
-        None, ge=0, description="s, for which the rest of its error stays alike (multipath); found from the data if unset"
+        None,
+        ge=0,
+        description="s, for which the rest of its error stays alike (multipath); found from the data if unset",
     )
     sd_factor: float | None = Field(
         None, gt=0, description="factor on the stated position sigmas; found from the data if unset, never below 1"

@@ -96,8 +96,14 @@ class FixQuality:
         """What was found, in words."""
         if self.fast_time > 0.0:
             up = self.sd_factor if self.up_factor is None else self.up_factor
-            larger = f", and {self.sd_factor:.1f} times (up {up:.1f}) as large as stated" if max(self.sd_factor, up) > 1 else ""
-            return (f"errors of the fixes last (multipath), {self.fast_time:.2g} s{larger}: they are weighed accordingly",)
+            larger = (
+                f", and {self.sd_factor:.1f} times (up {up:.1f}) as large as stated"
+                if max(self.sd_factor, up) > 1
+                else ""
+            )
+            return (
+                f"errors of the fixes last (multipath), {self.fast_time:.2g} s{larger}: they are weighed accordingly",
+            )
         if self.sd_factor > 1.0:
             return (f"the fixes scatter {self.sd_factor:.1f} times as much as they state: their sigmas were raised",)
         if self.slow_share > 0.0:
@@ -180,7 +186,11 @@ def judge_lasting(problem: Problem, smoothed: Smoothed) -> FixQuality:
     fast = scale**2 * nu / (nu + 3.0)
     total = fast + _SLOW
     return FixQuality(
-        float(np.sqrt(total[0])), _SLOW / float(total[0]), float(time), float(np.sqrt(total[2])), float(np.sqrt(nu + 3.0))
+        float(np.sqrt(total[0])),
+        _SLOW / float(total[0]),
+        float(time),
+        float(np.sqrt(total[2])),
+        float(np.sqrt(nu + 3.0)),
     )
 
 
@@ -208,9 +218,14 @@ def _student(z: Array) -> tuple[Array, float]:
     return found
 
 
-def contradiction(problem: Problem, smoothed: Smoothed) -> float:
-    """How clearly wheels contradict a smoothed solution: logarithms of the factors their sigmas ask for, added up."""
-    return sum(max(0.0, float(np.log(_trimmed(x)))) for *_, x in _wheel_sums(problem, smoothed) if len(x) >= _FEWEST)
+def contradiction(problem: Problem, smoothed: Smoothed) -> tuple[float, float]:
+    """How much wheels contradict a smoothed solution, and how much of that may be chance.
+
+    Logarithms of the variance factors that their sums of residuals ask for, added up.
+    """
+    seen = [x for *_, x in _wheel_sums(problem, smoothed) if len(x) >= _FEWEST]
+    asked = sum(max(0.0, float(np.log(_trimmed(x)))) for x in seen)
+    return asked, sum(_SIGNIFICANT * _scatter(len(x)) for x in seen)
 
 
 def _wheel_sums(problem: Problem, smoothed: Smoothed) -> Iterator[tuple[Constraint, int, Array]]:

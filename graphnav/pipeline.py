@@ -238,7 +238,9 @@ def judged(
     if aligned.motion is None or not gnss.position:
         return recording, settings, ()
     free = settings.without_wheels()  # wheels are judged by what comes of this, so they have no say in it
-    plain = free.model_copy(update={"gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0, "fast_time": 0.0})})
+    plain = free.model_copy(
+        update={"gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0, "fast_time": 0.0})}
+    )
     part = judgement.stretch(recording, aligned.motion)
     noise = stated
     weight: dict[str, np.ndarray] = {}
@@ -290,21 +292,23 @@ def judged(
         raised, part, weight = noise, judgement.stretch(recording, aligned.motion, judgement.LONG), {}
         try:
             problem, _, back = smoothed(fixes.applied(settings))
-            against = judgement.contradiction(problem, back)
-            noise = stated
-            problem, _, back = smoothed(lasting.applied(settings))
-            lasting = judgement.judge_lasting(problem, back)
-            if not settings.imu.as_stated:
-                problem, _, back = smoothed(lasting.applied(free))
-                weight = judgement.outliers(problem, back)
-                improve(lasting.applied(free))
-                weight = {}
-            if larger or judgement.contradiction(*smoothed(lasting.applied(settings))[::2]) < against:
-                fixes = lasting
-            else:
-                noise = raised
+            against, chance = judgement.contradiction(problem, back)
+            if larger or against > chance:
+                noise = stated
+                problem, _, back = smoothed(lasting.applied(settings))
+                lasting = judgement.judge_lasting(problem, back)
+                if not settings.imu.as_stated:
+                    problem, _, back = smoothed(lasting.applied(free))
+                    weight = judgement.outliers(problem, back)
+                    improve(lasting.applied(free))
+                    weight = {}
+                problem, _, back = smoothed(lasting.applied(settings))
+                agreed = judgement.contradiction(problem, back)[0] < against - chance
+                if larger or (agreed and judgement.calmer(noise, raised)):
+                    fixes, raised = lasting, noise
         except EstimationError:
-            noise = raised
+            pass  # as it was judged before
+        noise = raised
     recording = replace(recording, imu=replace(recording.imu, noise=noise))
     notes = judgement.imu_notes(stated, noise)
     if fixes is None:

@@ -16,10 +16,11 @@ changes over minutes (multipath, satellites coming and going) and one over hours
 coordinates). Together they have the share `slow_share` of the variance, half each, since nothing in a drive tells
 them apart; the rest is white.
 
-Or it is not: reflections from houses last for seconds, and are often far larger than any sigma says. Where the data show
-that (`fast_time`), n fixes in a row have an error in common. Over times longer than that such noise is worth white noise
-of n times the variance, n = coth(dt / 2 T) for a Gauss-Markov process of correlation time T sampled every dt: the ratio
-of their spectra at zero frequency. A kernel then weighs the fix by what its own sigma says, and n fixes as one,
+Or it is not: reflections from houses last for seconds, and are often far larger than any sigma says. Where the data
+show that (`fast_time`), n fixes in a row have an error in common. Over times longer than that such noise is worth
+white noise of n times the variance, n = coth(dt / 2 T) for a Gauss-Markov process of correlation time T sampled every
+dt: the ratio of their spectra at zero frequency. A kernel then weighs the fix by what its own sigma says, and n fixes
+as one,
 
     cost = rho_k(s) / n,    which is rho of s / sqrt(n) with the scale k / sqrt(n).
 """
