@@ -228,7 +228,7 @@ def contradiction(problem: Problem, smoothed: Smoothed) -> tuple[float, float]:
     return asked, sum(_SIGNIFICANT * _scatter(len(x)) for x in seen)
 
 
-def _wheel_sums(problem: Problem, smoothed: Smoothed) -> Iterator[tuple[Constraint, int, Array]]:
+def _wheel_sums(problem: Problem, smoothed: Smoothed) -> Iterator[tuple[NonHolonomic | OdometerSpeed, int, Array]]:
     """Constraint, axis and squared sums over blocks against their variances."""
     for rows in problem.constraints:
         if not isinstance(rows, NonHolonomic | OdometerSpeed) or len(rows) < _FEWEST:
@@ -252,7 +252,7 @@ def judge_wheels(problem: Problem, smoothed: Smoothed) -> tuple[Problem, tuple[s
     What matters is what errors add up to: camber, wind and load push a vehicle aside for many seconds. So the sums
     of whitened residuals over `BLOCK` s are judged, against what white noise of the sigmas used would sum up to.
     """
-    raised: dict[str, Constraint] = {}
+    raised: dict[str, NonHolonomic | OdometerSpeed] = {}
     notes = []
     for rows, axis, squared in _wheel_sums(problem, smoothed):
         factor = np.ones(len(rows.axes))
