@@ -147,9 +147,15 @@ class GnssSettings(_Outliers):
     slow_times: tuple[float, float] = Field(
         (100.0, 3600.0), description="s, correlation times of the two halves of that slow part"
     )
+    fast_time: float | None = Field(
+        None,
+        ge=0,
+        description="s, for which the rest of its error stays alike (multipath); found from the data if unset",
+    )
     sd_factor: float | None = Field(
         None, gt=0, description="factor on the stated position sigmas; found from the data if unset, never below 1"
     )
+    up_factor: float | None = Field(None, gt=0, description="the same for heights; as sd_factor if unset")
     time_offset_sigma: float = Field(
         0.02, ge=0, description="s, 1-sigma of what the stamps of the fixes may be off; 0 = exact, not estimated"
     )

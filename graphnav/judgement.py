@@ -23,14 +23,15 @@ because noise that one lacks looks like noise of its neighbours; none is set bel
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtr, chdtri, gammaincinv
+from scipy.special import chdtr, chdtri, gammaincinv, gammaln
 
 from graphnav.config import Settings
 from graphnav.constraints.base import Constraint, assemble
-from graphnav.constraints.gnss import GnssPosition, GnssVelocity
+from graphnav.constraints.gnss import GnssPosition, GnssVelocity, period
 from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.problem import Problem
 from graphnav.recording import ImuNoise, Recording
@@ -41,13 +42,16 @@ from graphnav.solvers.ekf import Filtered, Smoothed, residual_record
 from graphnav.state import DIM, States
 
 FIXES = 600  # fixes the judgement is made on, from the first motion
+LONG = 600.0  # s, at least, where their errors may last
 ROUNDS = 4
 MOST_RAISED = 10.0  # an IMU ten times worse than stated is not the explanation: the fixes are, and are judged next
 _SIGNIFICANT = 3.0  # standard deviations of the estimate of a factor that it must differ from 1
 _OUTLIER = 6.0  # whitened norm of a fix that no Gaussian would have
-_CLEARLY = 1.3  # ratio of two figures of noise that makes a difference
+CLEARLY = 1.3  # ratio of two figures of noise that makes a difference
 _MOST = 0.98  # the largest share called slow
 _TRIMMED = 0.01
+_SLOW = 0.5  # share of the stated variance that is slow where nothing tells
+_TAILS = (3.0, 5.0, 9.0, 20.0, 100.0)  # degrees of freedom that are tried
 BLOCK = 10.0  # s
 _FEWEST = 30  # fixes or intervals that say anything
 _FIGURES = {
@@ -66,10 +70,13 @@ _WORDS = {
 
 @dataclass(frozen=True)
 class FixQuality:
-    """Factor on the stated position sigmas, and share of the variance that is slow."""
+    """Factor on the stated position sigmas, share of the variance that is slow, and for how long the rest lasts."""
 
     sd_factor: float = 1.0
     slow_share: float = 0.0
+    fast_time: float = 0.0  # s
+    up_factor: float | None = None  # that of heights; `sd_factor` when None
+    robust_scale: float | None = None  # of Cauchy's kernel, what tails there are ask for
 
     def applied(self, settings: Settings) -> Settings:
         """Settings with what the user left open filled in."""
@@ -77,12 +84,26 @@ class FixQuality:
         found = {
             "sd_factor": self.sd_factor if gnss.sd_factor is None else gnss.sd_factor,
             "slow_share": self.slow_share if gnss.slow_share is None else gnss.slow_share,
+            "up_factor": gnss.up_factor or (self.up_factor if gnss.sd_factor is None else None),
+            "fast_time": self.fast_time if gnss.fast_time is None else gnss.fast_time,
         }
+        if self.robust_scale is not None and "robust_scale" not in gnss.model_fields_set:
+            found["robust_scale"] = self.robust_scale
         return settings.model_copy(update={"gnss": gnss.model_copy(update=found)})
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What was found, in words."""
+        if self.fast_time > 0.0:
+            up = self.sd_factor if self.up_factor is None else self.up_factor
+            larger = (
+                f", and {self.sd_factor:.1f} times (up {up:.1f}) as large as stated"
+                if max(self.sd_factor, up) > 1
+                else ""
+            )
+            return (
+                f"errors of the fixes last (multipath), {self.fast_time:.2g} s{larger}: they are weighed accordingly",
+            )
         if self.sd_factor > 1.0:
             return (f"the fixes scatter {self.sd_factor:.1f} times as much as they state: their sigmas were raised",)
         if self.slow_share > 0.0:
@@ -91,14 +112,17 @@ class FixQuality:
         return ()
 
 
-def stretch(recording: Recording, begin: float) -> Recording:
-    """The part of a recording to judge on: from its start to `FIXES` fixes after `begin` (s, its clock)."""
+def stretch(recording: Recording, begin: float, least: float = 0.0) -> Recording:
+    """The part of a recording to judge on: from its start to `FIXES` fixes after `begin` (s, its clock).
+
+    For a time of `least` s after that in any case, where there is so much.
+    """
     gnss = recording.gnss
     assert gnss is not None
     later = gnss.t[gnss.t > begin]
     if len(later) <= FIXES:
         return recording
-    return recording.crop(0.0, float(later[FIXES]) - recording.start)
+    return recording.crop(0.0, max(float(later[FIXES]), begin + least) - recording.start)
 
 
 def suspicious(problem: Problem, smoothed: Smoothed) -> bool:
@@ -144,14 +168,68 @@ def judge_fixes(problem: Problem, smoothed: Smoothed) -> FixQuality | None:
     return FixQuality(slow_share=min(1.0 - f, _MOST))
 
 
-def judge_wheels(problem: Problem, smoothed: Smoothed) -> tuple[Problem, tuple[str, ...]]:
-    """The problem with the sigmas of wheel constraints raised where their residuals ask for it, and sentences.
+def judge_lasting(problem: Problem, smoothed: Smoothed) -> FixQuality:
+    """Judge fixes whose errors last, by a smoothed solution that weighs them as such.
 
-    What matters is what errors add up to: camber, wind and load push a vehicle aside for many seconds. So the sums
-    of whitened residuals over `BLOCK` s are judged, against what white noise of the sigmas used would sum up to.
+    For how long, the autocorrelation of residuals tells. Each is taken for no more than `_CLIPPED` times the usual, so
+    that one stretch does not decide.
     """
-    raised: dict[str, Constraint] = {}
-    notes = []
+    rows = _fixes(problem)
+    assert rows is not None
+    gnss = problem.settings.gnss
+    factor = gnss.sd_factor or 1.0
+    z = _record(problem, rows, smoothed).residual / rows.stated * [factor, factor, gnss.up_factor or factor]
+    scale, nu = _student(z)
+    psi = z / scale / (1.0 + np.sum((z / scale) ** 2, axis=1, keepdims=True) / nu)
+    alike = z.size / _independent(psi)
+    time = 0.5 * period(problem.t[rows.keyframe]) / np.arctanh(1.0 / alike) if alike > 1.0 else 0.0
+    fast = scale**2 * nu / (nu + 3.0)
+    total = fast + _SLOW
+    return FixQuality(
+        float(np.sqrt(total[0])),
+        _SLOW / float(total[0]),
+        float(time),
+        float(np.sqrt(total[2])),
+        float(np.sqrt(nu + 3.0)),
+    )
+
+
+def _student(z: Array) -> tuple[Array, float]:
+    """Scale (3,) of rows z (N, 3), one for both horizontal axes, and degrees of freedom of Student's t, most likely.
+
+    Their variance is not below what is left of the stated one: a sigma is meant to hold for the whole error.
+
+    By expectation and maximisation (Lange, Little and Taylor 1989, "Robust statistical modeling using the t
+    distribution") for some degrees of freedom each.
+    """
+    best, found = -np.inf, (np.ones(3), np.inf)
+    for nu in _TAILS:
+        scale = np.median(np.abs(z), axis=0) / np.sqrt(_median(1))
+        for _ in range(30):
+            weight = (nu + 3.0) / (nu + np.sum((z / scale) ** 2, axis=1, keepdims=True))
+            variance = np.mean(weight * z * z, axis=0)
+            variance[:2] = np.mean(variance[:2])
+            scale = np.sqrt(np.maximum(variance, _SLOW * (nu + 3.0) / nu))
+        s = np.sum((z / scale) ** 2, axis=1)
+        likelihood = gammaln(0.5 * (nu + 3.0)) - gammaln(0.5 * nu) - 1.5 * np.log(nu) - np.sum(np.log(scale))
+        likelihood -= 0.5 * (nu + 3.0) * float(np.mean(np.log1p(s / nu)))
+        if likelihood > best:
+            best, found = likelihood, (scale, nu)
+    return found
+
+
+def contradiction(problem: Problem, smoothed: Smoothed) -> tuple[float, float]:
+    """How much wheels contradict a smoothed solution, and how much of that may be chance.
+
+    Logarithms of the variance factors that their sums of residuals ask for, added up.
+    """
+    seen = [x for *_, x in _wheel_sums(problem, smoothed) if len(x) >= _FEWEST]
+    asked = sum(max(0.0, float(np.log(_trimmed(x)))) for x in seen)
+    return asked, sum(_SIGNIFICANT * _scatter(len(x)) for x in seen)
+
+
+def _wheel_sums(problem: Problem, smoothed: Smoothed) -> Iterator[tuple[NonHolonomic | OdometerSpeed, int, Array]]:
+    """Constraint, axis and squared sums over blocks against their variances."""
     for rows in problem.constraints:
         if not isinstance(rows, NonHolonomic | OdometerSpeed) or len(rows) < _FEWEST:
             continue
@@ -161,16 +239,29 @@ def judge_wheels(problem: Problem, smoothed: Smoothed) -> tuple[Problem, tuple[s
         left = linear.sigma**2 - np.einsum("nij,njk,nik->ni", H, smoothed.P[at], H, optimize=True)
         usable = np.all(left > 0.2 * linear.sigma**2, axis=1)
         block = np.unique(np.floor(problem.t[at[usable]] / BLOCK), return_inverse=True)[1]
-        factor = np.ones(len(rows.axes))
-        for axis, name in enumerate(rows.axes):
+        for axis in range(len(rows.axes)):
             weight = 1.0 / linear.sigma[usable, axis] ** 2
             total = np.bincount(block, weight * linear.residual[usable, axis])
             variance = np.bincount(block, weight**2 * left[usable, axis])
-            factor[axis] = raised_by(total**2 / variance)
-            if factor[axis] > 1.0:
-                notes.append(f"{rows.name}, {name}: its sigma was multiplied by {factor[axis]:.1f}, as residuals ask")
-        if np.any(factor > 1.0):
-            raised[rows.name] = replace(rows, sigma=rows.sigma * factor)
+            yield rows, axis, total**2 / variance
+
+
+def judge_wheels(problem: Problem, smoothed: Smoothed) -> tuple[Problem, tuple[str, ...]]:
+    """The problem with the sigmas of wheel constraints raised where their residuals ask for it, and sentences.
+
+    What matters is what errors add up to: camber, wind and load push a vehicle aside for many seconds. So the sums
+    of whitened residuals over `BLOCK` s are judged, against what white noise of the sigmas used would sum up to.
+    """
+    raised: dict[str, NonHolonomic | OdometerSpeed] = {}
+    notes = []
+    for rows, axis, squared in _wheel_sums(problem, smoothed):
+        factor = np.ones(len(rows.axes))
+        factor[axis] = raised_by(squared)
+        if factor[axis] > 1.0:
+            name = rows.axes[axis]
+            notes.append(f"{rows.name}, {name}: its sigma was multiplied by {factor[axis]:.1f}, as residuals ask")
+            before = raised.get(rows.name, rows)
+            raised[rows.name] = replace(before, sigma=before.sigma * factor)
     return replace(problem, constraints=tuple(raised.get(c.name, c) for c in problem.constraints)), tuple(notes)
 
 
@@ -238,7 +329,7 @@ def noisiest(noise: ImuNoise) -> ImuNoise:
 def calmer(noise: ImuNoise, than: ImuNoise) -> bool:
     """Whether an IMU is clearly less noisy by some figure, and by none clearly more."""
     ratio = [getattr(noise, name) / getattr(than, name) for name in _FIGURES]
-    return min(ratio) < 1.0 / _CLEARLY and max(ratio) < _CLEARLY
+    return min(ratio) < 1.0 / CLEARLY and max(ratio) < CLEARLY
 
 
 def imu_notes(stated: ImuNoise, used: ImuNoise) -> tuple[str, ...]:

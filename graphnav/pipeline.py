@@ -240,7 +240,9 @@ def judged(
         return recording, settings, ()
     free = settings.without_wheels()  # wheels are judged by what comes of this, so they have no say in it
     plain = free.model_copy(
-        update={"gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0, "adaptive": "off"})}
+        update={
+            "gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0, "fast_time": 0.0, "adaptive": "off"})
+        }
     )
     part = judgement.stretch(recording, aligned.motion)
     noise = stated
@@ -269,18 +271,47 @@ def judged(
         weight = judgement.outliers(problem, back)
         problem, forward, back = smoothed(plain)
     fixes = judgement.judge_fixes(problem, back)
-    if not settings.imu.as_stated and judgement.judge_imu(problem, forward, back).clear:
-        # fixes that wander would pass for noise of the IMU: it is judged with their wandering in the problem
-        basis = plain if fixes is None else fixes.applied(free)
+    lasting = None if fixes is None else judgement.judge_lasting(problem, back)
+
+    def improve(basis: Settings) -> None:
+        """Raise the noise figures of the IMU as it asks for, in rounds."""
+        nonlocal noise
         for _ in range(judgement.ROUNDS):
             imu = judgement.judge_imu(*smoothed(basis))
             better = imu.applied(noise, stated)
             if (noise == stated and not imu.clear) or imu.settled or better == noise:
                 break
             noise = better
+
+    if not settings.imu.as_stated and judgement.judge_imu(problem, forward, back).clear:
+        # fixes that wander would pass for noise of the IMU: it is judged with their wandering in the problem
+        improve(plain if fixes is None else fixes.applied(free))
         if noise != stated:
             problem, _, back = smoothed(plain)
             fixes = judgement.judge_fixes(problem, back)
+    larger = fixes is not None and fixes.sd_factor > judgement.CLEARLY
+    if fixes is not None and lasting is not None and lasting.fast_time > 0.0 and (larger or noise != stated):
+        # the IMU may be that bad, or errors of the fixes last for seconds: wheels, without a say so far, are witnesses
+        raised, part, weight = noise, judgement.stretch(recording, aligned.motion, judgement.LONG), {}
+        try:
+            problem, _, back = smoothed(fixes.applied(settings))
+            against, chance = judgement.contradiction(problem, back)
+            if larger or against > chance:
+                noise = stated
+                problem, _, back = smoothed(lasting.applied(settings))
+                lasting = judgement.judge_lasting(problem, back)
+                if not settings.imu.as_stated:
+                    problem, _, back = smoothed(lasting.applied(free))
+                    weight = judgement.outliers(problem, back)
+                    improve(lasting.applied(free))
+                    weight = {}
+                problem, _, back = smoothed(lasting.applied(settings))
+                agreed = judgement.contradiction(problem, back)[0] < against - chance
+                if larger or (agreed and judgement.calmer(noise, raised)):
+                    fixes, raised = lasting, noise
+        except EstimationError:
+            pass  # as it was judged before
+        noise = raised
     recording = replace(recording, imu=replace(recording.imu, noise=noise))
     notes = judgement.imu_notes(stated, noise)
     if fixes is None:

@@ -15,6 +15,14 @@ them are not worth a thousand. It is the sum of two Gauss-Markov processes in un
 changes over minutes (multipath, satellites coming and going) and one over hours (orbits, atmosphere, the base's
 coordinates). Together they have the share `slow_share` of the variance, half each, since nothing in a drive tells
 them apart; the rest is white.
+
+Or it is not: reflections from houses last for seconds, and are often far larger than any sigma says. Where the data
+show that (`fast_time`), n fixes in a row have an error in common. Over times longer than that such noise is worth
+white noise of n times the variance, n = coth(dt / 2 T) for a Gauss-Markov process of correlation time T sampled every
+dt: the ratio of their spectra at zero frequency. A kernel then weighs the fix by what its own sigma says, and n fixes
+as one,
+
+    cost = rho_k(s) / n,    which is rho of s / sqrt(n) with the scale k / sqrt(n).
 """
 
 from __future__ import annotations
@@ -103,10 +111,16 @@ class GnssPosition(Constraint):
             return None
         llh = gnss.llh[used]
         s = scene.settings.gnss
-        every = (s.sd_factor or 1.0) * gnss.sd
+        factor = s.sd_factor or 1.0
+        every = np.array([factor, factor, s.up_factor or factor]) * gnss.sd
         stated = every[used]
         common = _common(scene, TIME_OFFSET)
         share = s.slow_share or 0.0
+        alike = as_one(s.fast_time or 0.0, gnss.t)
+        if alike > 1.0:
+            common["robust_scale"] = s.robust_scale / np.sqrt(alike)
+            if s.robust == "automatic":
+                common["robust"] = "cauchy"
         if share > 0:
             sigma = np.full(3, np.sqrt(0.5 * share))
             for name, time in zip(SLOW_ERRORS, s.slow_times, strict=True):
@@ -116,7 +130,7 @@ class GnssPosition(Constraint):
             keyframe=keyframe[used],
             p_n=scene.frame.from_llh(llh),
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
-            sigma=np.sqrt(1.0 - share) * stated,
+            sigma=np.sqrt((1.0 - share) * alike) * stated,
             stated=stated,
             usual=(_usual(gnss.t, every) if scene.usual is None else scene.usual)[used],
             lever_arm=gnss.lever_arm,
@@ -210,13 +224,22 @@ class GnssVelocity(Constraint):
         return Linearized(residual, jacobians, self.sigma[rows])
 
 
+def period(t: Array) -> float:
+    """Usual time between fixes, s."""
+    return max(float(np.median(np.diff(t))), 1e-3) if len(t) > 1 else 1.0
+
+
+def as_one(correlation_time: float, t: Array) -> float:
+    """How many fixes at times t are worth one, of errors with that correlation time (s)."""
+    return 1.0 / float(np.tanh(0.5 * period(t) / correlation_time)) if correlation_time > 0.0 else 1.0
+
+
 def _usual(t: Array, sigma: Array) -> Array:
     """Running median of sigmas over a minute.
 
     A slow error times a sigma that jumps from fix to fix would jump with it, and so give itself away.
     """
-    period = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
-    size = 2 * int(np.clip(_MINUTE / max(period, 1e-3) / 2, 0, (len(t) - 1) // 2)) + 1
+    size = 2 * int(np.clip(_MINUTE / period(t) / 2, 0, (len(t) - 1) // 2)) + 1
     return median_filter(sigma, size=(size, 1), mode="nearest")
 
 
