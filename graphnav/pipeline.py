@@ -129,10 +129,11 @@ def _solve(
     astray = found_heading and bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
 
     spent: list[float] = []
+    overruled = settings.gnss.faults == "off"  # most fixes contradict the filter, or nobody asks whether they do
 
     def posed(wrong: tuple[faults.Fault, ...] = ()) -> tuple[Problem, tuple[str, ...]]:
         tell("judgement")
-        sensed, how, said = judged(recording, settings, frame, aligned, stationary, wrong)
+        sensed, how, said = judged(recording, settings, frame, aligned, stationary, wrong, overruled)
         begin = aligned if astray else stated
         tell("preintegration")
         started = time.perf_counter()
@@ -141,10 +142,11 @@ def _solve(
         return problem, said
 
     def watched(problem: Problem) -> tuple[Problem, Filtered]:
+        nonlocal overruled
         forward = ekf(problem, progress, aligned.until, watch=True)
         found = faults.weighted(problem, forward.weights)
         if too_many := settings.gnss.faults != "on" and faults.share(found) > _MOST:
-            found = faults.all_used(problem)
+            found, overruled = faults.all_used(problem), True
         if too_many or forward.anew:
             forward = ekf(found, progress, aligned.until)
         return found, forward
@@ -172,9 +174,16 @@ def _solve(
             smoothed = backward(problem, forward, progress)
         return problem, forward, smoothed, raised
 
+    asked = overruled
     problem, said = posed()
     done = time.perf_counter()
     problem, forward, smoothed, raised = reviewed(problem)
+    if overruled and not asked:
+        # when most are wrong it is their sigmas that are
+        other, says = posed()
+        if says != said:
+            said = says
+            problem, forward, smoothed, raised = reviewed(other)
     if faults.count(problem):
         # what faults did to the states around them may have passed for noise of the IMU
         wrong = faults.spans(problem, noisy=True)
@@ -233,8 +242,15 @@ def judged(
     aligned: Alignment,
     stationary: np.ndarray,
     wrong: tuple[faults.Fault, ...] = (),
+    witnesses: bool = False,
 ) -> tuple[Recording, Settings, tuple[str, ...]]:
-    """Recording and settings with the figures of IMU and fixes judged by the first part of the drive."""
+    """Recording and settings with the figures of IMU and fixes judged by the first part of the drive.
+
+    Parameters
+    ----------
+    wrong : spans of fixes to judge without.
+    witnesses : whether wheels may say that it is not the IMU that is noisy, but errors of the fixes that last.
+    """
     gnss, stated = settings.gnss, recording.imu.noise
     if aligned.motion is None or not gnss.position:
         return recording, settings, ()
@@ -290,7 +306,12 @@ def judged(
             problem, _, back = smoothed(plain)
             fixes = judgement.judge_fixes(problem, back)
     larger = fixes is not None and fixes.sd_factor > judgement.CLEARLY
-    if fixes is not None and lasting is not None and lasting.fast_time > 0.0 and (larger or noise != stated):
+    if (
+        fixes is not None
+        and lasting is not None
+        and lasting.fast_time > 0.0
+        and (larger or (witnesses and noise != stated))
+    ):
         # the IMU may be that bad, or errors of the fixes last for seconds: wheels, without a say so far, are witnesses
         raised, part, weight = noise, judgement.stretch(recording, aligned.motion, judgement.LONG), {}
         try:

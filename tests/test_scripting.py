@@ -191,7 +191,7 @@ def test_a_run_can_be_repeated_with_the_settings_in_its_summary(tmp_path):
         ("[vehicle]\nzero_velocity = false", "did you mean 'zero_velocity' in [standstill]?"),
         ("[detectors.fft]\nstep = 0", "line 2: 'detectors.fft.step' = 0: input should be greater than or equal to 0.1"),
         ('profile = "bike"', "line 1: 'profile' = 'bike': input should be 'car', 'car+odometer' or 'foot'"),
-        ("[gnss]\ngate = inf", "'gnss.gate' = inf: input should be a finite number"),
+        ("[gnss]\ngate = inf", '\'gnss.gate\': \'inf\' must be "off", "on", "automatic" or a number above 0'),
         ("keyframes = 3", "line 1: 'keyframes' must be a table: [keyframes]"),
         ("[keyframes]\nrate = ", "not valid TOML"),
     ],

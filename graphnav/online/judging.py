@@ -36,13 +36,20 @@ class Judgement:
     Parameters
     ----------
     due : s, when the answer is to be used.
+    overruled : most fixes contradict the smoother.
     """
 
     def __init__(
-        self, recording: Recording, settings: Settings, frame: LocalFrame, found: Alignment, due: float
+        self,
+        recording: Recording,
+        settings: Settings,
+        frame: LocalFrame,
+        found: Alignment,
+        due: float,
+        overruled: bool = False,
     ) -> None:
         self.found, self.due, self.until = found, due, recording.end
-        self._asked = recording, settings, frame
+        self._asked = recording, settings, frame, overruled
         self._begin()
 
     def answer(self) -> Answer:
@@ -65,10 +72,11 @@ class Judgement:
         self._thread.start()
 
     def _work(self) -> None:
-        recording, settings, frame = self._asked
+        recording, settings, frame, overruled = self._asked
         try:
             stationary = detect(recording, settings).stationary
-            self._answer = *judged(recording, settings, frame, self.found, stationary), stationary
+            how = judged(recording, settings, frame, self.found, stationary, witnesses=overruled)
+            self._answer = *how, stationary
         except (EstimationError, np.linalg.LinAlgError) as error:
             self._answer = EstimationError(str(error))
         except BaseException as error:  # said by whoever asks

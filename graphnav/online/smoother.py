@@ -243,7 +243,10 @@ class Online:
     def _have_judged(self, recording: Recording, found: Alignment, now: float) -> None:
         assert self.frame is not None
         due = now + min(_THINKING * self.settings.solver.lag, _LONGEST_THOUGHT)
-        self._judgement = Judgement(recording, self.settings, self.frame, found, due)
+        overruled = self.settings.gnss.faults == "off" or (
+            self.tracker is not None and self.tracker.verdicts.refused > 0.5
+        )
+        self._judgement = Judgement(recording, self.settings, self.frame, found, due, overruled)
 
     def _use(self, judgement: Judgement, tracker: Tracker) -> None:
         """Begin to go through what has not settled with what the sensors were judged to be."""
