@@ -25,12 +25,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtr, chdtri, gammaincinv, gammaln
 
 from graphnav.config import Settings
-from graphnav.constraints.base import Constraint, assemble
+from graphnav.constraints.base import Constraint, assemble, weighted_sigma
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity, period
 from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.problem import Problem
@@ -41,6 +42,8 @@ from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import Filtered, Smoothed, residual_record
 from graphnav.state import DIM, States
 
+Speed = NonHolonomic | OdometerSpeed | GnssVelocity
+_WHEELS = (NonHolonomic, OdometerSpeed)
 FIXES = 600  # fixes the judgement is made on, from the first motion
 LONG = 600.0  # s, at least, where their errors may last
 ROUNDS = 4
@@ -223,38 +226,41 @@ def contradiction(problem: Problem, smoothed: Smoothed) -> tuple[float, float]:
 
     Logarithms of the variance factors that their sums of residuals ask for, added up.
     """
-    seen = [x for *_, x in _wheel_sums(problem, smoothed) if len(x) >= _FEWEST]
+    seen = [x for *_, x in _sums(problem, smoothed, _WHEELS) if len(x) >= _FEWEST]
     asked = sum(max(0.0, float(np.log(_trimmed(x)))) for x in seen)
     return asked, sum(_SIGNIFICANT * _scatter(len(x)) for x in seen)
 
 
-def _wheel_sums(problem: Problem, smoothed: Smoothed) -> Iterator[tuple[NonHolonomic | OdometerSpeed, int, Array]]:
+def _sums(problem: Problem, smoothed: Smoothed, kinds: tuple[type[Any], ...]) -> Iterator[tuple[Speed, int, Array]]:
     """Constraint, axis and squared sums over blocks against their variances."""
     for rows in problem.constraints:
-        if not isinstance(rows, NonHolonomic | OdometerSpeed) or len(rows) < _FEWEST:
+        if not isinstance(rows, kinds) or len(rows) < _FEWEST:
             continue
         at = rows.keyframe
         linear = rows.linearize(smoothed.states[at], _values_at(problem, smoothed, rows), slice(None))
         H = assemble(linear, problem.columns, smoothed.P.shape[-1])
-        left = linear.sigma**2 - np.einsum("nij,njk,nik->ni", H, smoothed.P[at], H, optimize=True)
-        usable = np.all(left > 0.2 * linear.sigma**2, axis=1)
+        used = np.ones(len(rows), dtype=bool) if rows.weight is None else rows.weight > 0.0
+        sigma = weighted_sigma(rows, linear.sigma)
+        left = sigma**2 - np.einsum("nij,njk,nik->ni", H, smoothed.P[at], H, optimize=True)
+        usable = used & np.all(left > 0.2 * sigma**2, axis=1)
         block = np.unique(np.floor(problem.t[at[usable]] / BLOCK), return_inverse=True)[1]
         for axis in range(len(rows.axes)):
-            weight = 1.0 / linear.sigma[usable, axis] ** 2
+            weight = 1.0 / sigma[usable, axis] ** 2
             total = np.bincount(block, weight * linear.residual[usable, axis])
             variance = np.bincount(block, weight**2 * left[usable, axis])
             yield rows, axis, total**2 / variance
 
 
-def judge_wheels(problem: Problem, smoothed: Smoothed) -> tuple[Problem, tuple[str, ...]]:
-    """The problem with the sigmas of wheel constraints raised where their residuals ask for it, and sentences.
+def judge_speeds(problem: Problem, smoothed: Smoothed) -> tuple[Problem, tuple[str, ...]]:
+    """The problem with the sigmas of wheels and of the receiver's velocities raised as residuals ask, and sentences.
 
-    What matters is what errors add up to: camber, wind and load push a vehicle aside for many seconds. So the sums
-    of whitened residuals over `BLOCK` s are judged, against what white noise of the sigmas used would sum up to.
+    What matters is what errors add up to: camber, wind and load push a vehicle aside for many seconds, and reflections
+    last. So the sums of whitened residuals over `BLOCK` s are judged, against what white noise of the sigmas used would
+    sum up to.
     """
-    raised: dict[str, NonHolonomic | OdometerSpeed] = {}
+    raised: dict[str, Speed] = {}
     notes = []
-    for rows, axis, squared in _wheel_sums(problem, smoothed):
+    for rows, axis, squared in _sums(problem, smoothed, (*_WHEELS, GnssVelocity)):
         factor = np.ones(len(rows.axes))
         factor[axis] = raised_by(squared)
         if factor[axis] > 1.0:

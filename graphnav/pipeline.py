@@ -163,7 +163,7 @@ def _solve(
             else:
                 smoothed = backward(problem, forward, progress)
             if not again:
-                problem, raised = judgement.judge_wheels(problem, smoothed)
+                problem, raised = judgement.judge_speeds(problem, smoothed)
             if before:
                 problem, forward = watched(problem)
             elif raised:
@@ -192,7 +192,7 @@ def _solve(
             weights = {c.name: c.weight for c in problem.constraints if c.weight is not None}
             problem, said = faults.weighted(other, weights), says
             forward = ekf(problem, progress, aligned.until)
-            problem, raised = judgement.judge_wheels(problem, backward(problem, forward, progress))
+            problem, raised = judgement.judge_speeds(problem, backward(problem, forward, progress))
             forward = ekf(problem, progress, aligned.until) if raised else forward
             smoothed = backward(problem, forward, progress)
     said = (*said, *raised)

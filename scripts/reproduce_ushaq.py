@@ -61,7 +61,7 @@ PAPER = {
     "growing/ZUPT, 20 min": "stays within bounds (Fig. 16-18)",
 }
 PLAIN = {"faults": "off", "adaptive": "off", "robust": "off", "gate": "off",
-         "slow_share": 0.0, "sd_factor": 1.0, "time_offset_sigma": 0.0}  # fmt: skip
+         "slow_share": 0.0, "sd_factor": 1.0, "fast_time": 0.0, "time_offset_sigma": 0.0}  # fmt: skip
 VARIANTS: dict[str, dict[str, Any]] = {
     "plain": PLAIN,
     "gate": {**PLAIN, "gate": 5.0},

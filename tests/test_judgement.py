@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -66,6 +67,20 @@ def test_fixes_that_scatter_more_than_they_state(path: oracle.ExactPath) -> None
     recording, _ = oracle.drive(path, seed=3)
     (said,) = (note for note in notes(stating(recording, fixes=3.0)) if "scatter" in note)
     assert 2.4 < float(said.split("scatter ")[1].split()[0]) < 4.0
+
+
+@pytest.mark.parametrize(("times", "seed"), [(1.0, 0), (1.0, 1), (1.0, 2), (3.0, 0), (3.0, 1)])
+def test_velocities_have_a_factor_of_their_own(path: oracle.ExactPath, times: float, seed: int) -> None:
+    recording, _ = oracle.drive(path, seed=seed, gnss_velocity_sd=(0.1 * times,) * 3)
+    assert recording.gnss is not None
+    assert recording.gnss.sd_v is not None
+    stated = replace(recording, gnss=replace(recording.gnss, sd_v=recording.gnss.sd_v / times))
+    said = " ".join(notes(stated, settings_from({"gnss": {"adaptive": "off"}})))
+    found = [float(x) for x in re.findall(r"gnss_velocity, \w+: its sigma was multiplied by ([\d.]+)", said)]
+    assert len(found) == (0 if times == 1.0 else 3)
+    assert all(0.8 * times < factor < 1.2 * times for factor in found)
+    # where the filter has met the noise already it is not met twice
+    assert "gnss_velocity, " not in " ".join(notes(stated))
 
 
 def test_an_imu_noisier_than_stated(path: oracle.ExactPath) -> None:
