@@ -287,7 +287,7 @@ def judged(
         weight = judgement.outliers(problem, back)
         problem, forward, back = smoothed(plain)
     fixes = judgement.judge_fixes(problem, back)
-    lasting = None if fixes is None else judgement.judge_lasting(problem, back)
+    lasting = None if fixes is None or gnss.fast_time == 0.0 else judgement.judge_lasting(problem, back)
 
     def improve(basis: Settings) -> None:
         """Raise the noise figures of the IMU as it asks for, in rounds."""
