@@ -22,9 +22,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from graphnav.preintegration import Samples
 from graphnav.recording import Imu
 from graphnav.rotation import Array
+from graphnav.samples import Samples
 
 _NEAR = 0.95  # of the highest reading: a range that ends lower than that for some peaks is none
 _BAND = 0.01  # b

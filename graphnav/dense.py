@@ -14,9 +14,10 @@ import numpy as np
 
 from graphnav.dynamics import Motion
 from graphnav.earth import LocalFrame
-from graphnav.preintegration import Intervals, Samples, within
+from graphnav.preintegration import Intervals, within
 from graphnav.problem import Problem
 from graphnav.rotation import Array
+from graphnav.samples import Samples
 from graphnav.state import States
 
 

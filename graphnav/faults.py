@@ -24,7 +24,7 @@ from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import Fault
 from graphnav.solvers import adaptive
-from graphnav.solvers.ekf import Smoothed
+from graphnav.solvers.passes import Smoothed
 from graphnav.state import DIM
 
 _EDGE = 60.0  # s; farther from a fault a smoother without GNSS could not tell right from wrong

@@ -10,20 +10,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphnav import judgement
 from graphnav.alignment import align
 from graphnav.config import Settings
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.findings import Finding
-from graphnav.pipeline import judged, origin
+from graphnav.judgement import judged
+from graphnav.judgement.fixes import stretch
+from graphnav.pipeline import origin
 from graphnav.problem import pose
 from graphnav.progress import tell
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import backward, ekf, rts
+from graphnav.solvers.ekf import ekf
+from graphnav.solvers.rts import backward, rts
 
 _UNKNOWN = 2.0  # m, 1-sigma before the drive
 _SURE = 8.0  # sigmas: 4, and twice that because errors of fixes are alike for minutes
@@ -77,7 +79,7 @@ def find_antenna(recording: Recording) -> Antenna:
         raise EstimationError(f"'{recording.name}': without motion nothing tells where the antenna is")
     tell("judgement")
     fit, settings, _ = judged(recording, settings, frame, aligned, still)
-    part = judgement.stretch(recording, aligned.motion)
+    part = stretch(recording, aligned.motion)
     part = replace(part, imu=replace(part.imu, noise=fit.imu.noise))
     gnss = settings.gnss.model_copy(update={"lever_arm_sigma": _UNKNOWN})
     problem = pose(part, settings.model_copy(update={"gnss": gnss}), frame, aligned.state, aligned.sigma, still)

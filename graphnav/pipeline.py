@@ -9,21 +9,24 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from graphnav import faults, judgement
-from graphnav.alignment import Alignment, align, with_known_heading
+from graphnav import faults
+from graphnav.alignment import align, with_known_heading
 from graphnav.config import Settings
 from graphnav.constraints.prior import InitialPrior
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import ConfigError, EstimationError
+from graphnav.judgement import calmer, judge_speeds, judged
 from graphnav.problem import Problem, pose
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
 from graphnav.solution import Solution, joined
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import Filtered, Smoothed, backward, ekf, rts
+from graphnav.solvers.ekf import ekf
 from graphnav.solvers.incremental import incremental
 from graphnav.solvers.isam import isam2
+from graphnav.solvers.passes import Filtered, Smoothed
+from graphnav.solvers.rts import backward, rts
 
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
@@ -163,7 +166,7 @@ def _solve(
             else:
                 smoothed = backward(problem, forward, progress)
             if not again:
-                problem, raised = judgement.judge_speeds(problem, smoothed)
+                problem, raised = judge_speeds(problem, smoothed)
             if before:
                 problem, forward = watched(problem)
             elif raised:
@@ -188,11 +191,11 @@ def _solve(
         # what faults did to the states around them may have passed for noise of the IMU
         wrong = faults.spans(problem, noisy=True)
         other, says = posed(wrong)
-        if judgement.calmer(other.recording.imu.noise, problem.recording.imu.noise):
+        if calmer(other.recording.imu.noise, problem.recording.imu.noise):
             weights = {c.name: c.weight for c in problem.constraints if c.weight is not None}
             problem, said = faults.weighted(other, weights), says
             forward = ekf(problem, progress, aligned.until)
-            problem, raised = judgement.judge_speeds(problem, backward(problem, forward, progress))
+            problem, raised = judge_speeds(problem, backward(problem, forward, progress))
             forward = ekf(problem, progress, aligned.until) if raised else forward
             smoothed = backward(problem, forward, progress)
     said = (*said, *raised)
@@ -233,111 +236,6 @@ def _solve(
         )
         for name in solvers
     }
-
-
-def judged(
-    recording: Recording,
-    settings: Settings,
-    frame: LocalFrame,
-    aligned: Alignment,
-    stationary: np.ndarray,
-    wrong: tuple[faults.Fault, ...] = (),
-    witnesses: bool = False,
-) -> tuple[Recording, Settings, tuple[str, ...]]:
-    """Recording and settings with the figures of IMU and fixes judged by the first part of the drive.
-
-    Parameters
-    ----------
-    wrong : spans of fixes to judge without.
-    witnesses : whether wheels may say that it is not the IMU that is noisy, but errors of the fixes that last.
-    """
-    gnss, stated = settings.gnss, recording.imu.noise
-    if aligned.motion is None or not gnss.position:
-        return recording, settings, ()
-    free = settings.without_wheels()  # wheels are judged by what comes of this, so they have no say in it
-    plain = free.model_copy(
-        update={
-            "gnss": gnss.model_copy(update={"sd_factor": 1.0, "slow_share": 0.0, "fast_time": 0.0, "adaptive": "off"})
-        }
-    )
-    part = judgement.stretch(recording, aligned.motion)
-    noise = stated
-    weight: dict[str, np.ndarray] = {}
-
-    def posed(how: Settings) -> Problem:
-        noisy = replace(part, imu=replace(part.imu, noise=noise))
-        problem = faults.weighted(pose(noisy, how, frame, aligned.state, aligned.sigma, stationary), weight)
-        return faults.without(problem, wrong)
-
-    def smoothed(how: Settings) -> tuple[Problem, Filtered, Smoothed]:
-        problem = posed(how)
-        forward = ekf(problem, opening=aligned.until)
-        return problem, forward, backward(problem, forward)
-
-    try:
-        problem, forward, back = smoothed(plain)
-        suspicious = judgement.suspicious(problem, back)
-    except EstimationError:
-        suspicious = True
-    if suspicious:
-        noise = judgement.noisiest(stated)
-        weight = ekf(posed(plain), opening=aligned.until, watch=True).weights
-        noise = stated
-        problem, forward, back = smoothed(plain)
-        weight = judgement.outliers(problem, back)
-        problem, forward, back = smoothed(plain)
-    fixes = judgement.judge_fixes(problem, back)
-    lasting = None if fixes is None or gnss.fast_time == 0.0 else judgement.judge_lasting(problem, back)
-
-    def improve(basis: Settings) -> None:
-        """Raise the noise figures of the IMU as it asks for, in rounds."""
-        nonlocal noise
-        for _ in range(judgement.ROUNDS):
-            imu = judgement.judge_imu(*smoothed(basis))
-            better = imu.applied(noise, stated)
-            if (noise == stated and not imu.clear) or imu.settled or better == noise:
-                break
-            noise = better
-
-    if not settings.imu.as_stated and judgement.judge_imu(problem, forward, back).clear:
-        # fixes that wander would pass for noise of the IMU: it is judged with their wandering in the problem
-        improve(plain if fixes is None else fixes.applied(free))
-        if noise != stated:
-            problem, _, back = smoothed(plain)
-            fixes = judgement.judge_fixes(problem, back)
-    larger = fixes is not None and fixes.sd_factor > judgement.CLEARLY
-    if (
-        fixes is not None
-        and lasting is not None
-        and lasting.fast_time > 0.0
-        and (larger or (witnesses and noise != stated))
-    ):
-        # the IMU may be that bad, or errors of the fixes last for seconds: wheels, without a say so far, are witnesses
-        raised, part, weight = noise, judgement.stretch(recording, aligned.motion, judgement.LONG), {}
-        try:
-            problem, _, back = smoothed(fixes.applied(settings))
-            against, chance = judgement.contradiction(problem, back)
-            if larger or against > chance:
-                noise = stated
-                problem, _, back = smoothed(lasting.applied(settings))
-                lasting = judgement.judge_lasting(problem, back)
-                if not settings.imu.as_stated:
-                    problem, _, back = smoothed(lasting.applied(free))
-                    weight = judgement.outliers(problem, back)
-                    improve(lasting.applied(free))
-                    weight = {}
-                problem, _, back = smoothed(lasting.applied(settings))
-                agreed = judgement.contradiction(problem, back)[0] < against - chance
-                if larger or (agreed and judgement.calmer(noise, raised)):
-                    fixes, raised = lasting, noise
-        except EstimationError:
-            pass  # as it was judged before
-        noise = raised
-    recording = replace(recording, imu=replace(recording.imu, noise=noise))
-    notes = judgement.imu_notes(stated, noise)
-    if fixes is None:
-        return recording, settings, notes
-    return recording, fixes.applied(settings), (*notes, *fixes.notes)
 
 
 def fitting(recording: Recording, settings: Settings) -> list[str]:

@@ -37,9 +37,7 @@ import numpy as np
 from graphnav import rotation
 from graphnav.recording import Imu
 from graphnav.rotation import Array
-from graphnav.samples import GAP, MANY, Samples, bridge_gaps, chunks, pieces_of
-
-__all__ = ["GAP", "Intervals", "Samples", "bridge_gaps", "prefix", "preintegrate", "preintegrate_unknown", "within"]
+from graphnav.samples import MANY, Samples, chunks, pieces_of
 
 _CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 _WALK_POINTS = 6  # quadrature points for the effect of bias walk inside an interval

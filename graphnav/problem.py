@@ -15,9 +15,10 @@ from graphnav.constraints.base import SAME_TIME, Constraint, Scene
 from graphnav.constraints.prior import InitialPrior
 from graphnav.dynamics import Motion, scale_parameter
 from graphnav.earth import LocalFrame
-from graphnav.preintegration import Intervals, Samples, bridge_gaps, preintegrate, preintegrate_unknown
+from graphnav.preintegration import Intervals, preintegrate, preintegrate_unknown
 from graphnav.recording import Recording
 from graphnav.rotation import Array
+from graphnav.samples import Samples, bridge_gaps
 from graphnav.state import DIM, Parameter, States
 from graphnav.unresolved import with_coning, with_unresolved_motion
 from graphnav.wheels import MeanSpeed

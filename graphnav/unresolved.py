@@ -17,9 +17,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.preintegration import Samples
 from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
+from graphnav.samples import Samples
 
 
 def with_unresolved_motion(samples: Samples, noise: ImuNoise) -> Samples:

@@ -29,8 +29,9 @@ from graphnav.alignment import align
 from graphnav.config import Settings
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
+from graphnav.judgement import judged
 from graphnav.online import Online, Row, rows_of, without_rows
-from graphnav.pipeline import judged, origin
+from graphnav.pipeline import origin
 from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.solvers.batch import batch

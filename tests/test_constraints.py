@@ -17,9 +17,10 @@ from graphnav.constraints.base import Constraint, Scene, assemble
 from graphnav.constraints.gnss import LEVER_ARM, GnssPosition
 from graphnav.constraints.prior import InitialPrior
 from graphnav.earth import LocalFrame
-from graphnav.preintegration import bridge_gaps, preintegrate
+from graphnav.preintegration import preintegrate
 from graphnav.problem import Problem, keyframe_times, pose
 from graphnav.recording import Recording
+from graphnav.samples import bridge_gaps
 from graphnav.solvers.ekf import ekf
 from graphnav.solvers.graph import LinearGraph
 from graphnav.state import BLOCKS, DIM, States

@@ -13,7 +13,8 @@ import pytest
 from scipy import signal
 
 from graphnav import cli
-from graphnav.config import FftSettings, FusionSettings, Settings
+from graphnav.config import Settings
+from graphnav.config.detectors import FftSettings, FusionSettings
 from graphnav.detectors import base, detect, fft, glrt, motion, spectrum, stops, thresholds, windows
 from graphnav.formats import read
 from graphnav.formats.writing import write_folder

@@ -23,7 +23,8 @@ from graphnav.detectors.windows import low_pass
 from graphnav.earth import LocalFrame
 from graphnav.formats import read
 from graphnav.pipeline import SOLVERS
-from graphnav.preintegration import bridge_gaps, preintegrate
+from graphnav.preintegration import preintegrate
+from graphnav.samples import bridge_gaps
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "data").rglob("*.md"))]

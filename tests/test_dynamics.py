@@ -10,8 +10,9 @@ from helpers import FRAME, STEPS, Array, difference, random_imu, random_states
 
 from graphnav import rotation as ro
 from graphnav.dynamics import SCALE, Motion, scale_parameter
-from graphnav.preintegration import bridge_gaps, preintegrate
+from graphnav.preintegration import preintegrate
 from graphnav.recording import ImuNoise
+from graphnav.samples import bridge_gaps
 from graphnav.state import DIM, States
 
 N = 6

@@ -22,8 +22,9 @@ from graphnav.scoring import errors
 from graphnav.solution import Solution
 from graphnav.solvers import adaptive
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import backward, ekf
+from graphnav.solvers.ekf import ekf
 from graphnav.solvers.rows import Layout, Point, whitened
+from graphnav.solvers.rts import backward
 from graphnav.solvers.watch import Bank, Verdicts
 from graphnav.trajectory import Trajectory
 

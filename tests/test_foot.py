@@ -21,9 +21,10 @@ from graphnav.earth import LocalFrame
 from graphnav.formats import read
 from graphnav.interpolation import interpolate
 from graphnav.pipeline import run
-from graphnav.preintegration import bridge_gaps, preintegrate
+from graphnav.preintegration import preintegrate
 from graphnav.problem import keyframe_times
 from graphnav.recording import Imu, Recording, Truth
+from graphnav.samples import bridge_gaps
 from graphnav.simulation import Simulated, simulate
 from graphnav.solution import Solution
 from graphnav.state import States

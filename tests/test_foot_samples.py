@@ -11,8 +11,9 @@ import pytest
 from graphnav import rotation as ro
 from graphnav.clipping import cut_peaks, with_whole_peaks
 from graphnav.detectors import detect
-from graphnav.preintegration import Samples, bridge_gaps, preintegrate
+from graphnav.preintegration import preintegrate
 from graphnav.recording import ImuNoise
+from graphnav.samples import Samples, bridge_gaps
 from graphnav.simulation import Simulated, simulate
 from graphnav.unresolved import with_coning, with_unresolved_motion
 

@@ -14,8 +14,9 @@ from graphnav.config import settings_from
 from graphnav.dynamics import Motion
 from graphnav.earth import LocalFrame
 from graphnav.pipeline import run
-from graphnav.preintegration import bridge_gaps, prefix, preintegrate
+from graphnav.preintegration import prefix, preintegrate
 from graphnav.recording import Recording
+from graphnav.samples import bridge_gaps
 from graphnav.state import States
 from graphnav.trajectory import Trajectory
 

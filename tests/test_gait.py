@@ -20,8 +20,9 @@ from graphnav.dynamics import Motion as Mechanisation
 from graphnav.earth import LocalFrame, gravity
 from graphnav.errors import ConfigError
 from graphnav.formats import read
-from graphnav.preintegration import bridge_gaps, preintegrate
+from graphnav.preintegration import preintegrate
 from graphnav.recording import Imu
+from graphnav.samples import bridge_gaps
 from graphnav.simulation import Simulated, simulate
 from graphnav.simulation.footsteps import rectangle, way
 from graphnav.simulation.gait import Sole

@@ -19,9 +19,10 @@ from graphnav.recording import Recording
 from graphnav.rotation import exp, right_jacobian_inverse
 from graphnav.solution import Solution
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import backward, ekf
+from graphnav.solvers.ekf import ekf
 from graphnav.solvers.incremental import Incremental, incremental, node_steps
 from graphnav.solvers.isam import isam2
+from graphnav.solvers.rts import backward
 from graphnav.solvers.stages import Message, Place, Step, turned
 from graphnav.solvers.window import Window, first_message
 from graphnav.state import DIM

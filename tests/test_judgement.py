@@ -13,7 +13,8 @@ import pytest
 from graphnav import load
 from graphnav.config import Settings, settings_from
 from graphnav.evaluation import evaluate_recording
-from graphnav.judgement import _trimmed, imu_notes
+from graphnav.judgement.chance import trimmed
+from graphnav.judgement.imu import imu_notes
 from graphnav.pipeline import run
 from graphnav.recording import Recording
 from graphnav.rotation import Array
@@ -118,9 +119,9 @@ def test_sigma_holds_when_fixes_are_wrong_alike(path: oracle.ExactPath) -> None:
 
 def test_trimmed_mean_is_one_for_a_normal_and_sees_bursts() -> None:
     z = np.random.default_rng(0).normal(size=(100_000, 3))
-    assert abs(_trimmed(z * z) - 1.0) < 0.01
+    assert abs(trimmed(z * z) - 1.0) < 0.01
     z[::20] *= 5.0  # a twentieth of the time five times noisier: variance 2.2
-    assert 1.5 < _trimmed(z * z) < 2.2
+    assert 1.5 < trimmed(z * z) < 2.2
 
 
 def test_notes_say_only_what_was_raised() -> None:

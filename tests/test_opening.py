@@ -15,7 +15,8 @@ from graphnav.config import settings_from
 from graphnav.earth import LocalFrame
 from graphnav.problem import Problem, pose
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import ekf, rts
+from graphnav.solvers.ekf import ekf
+from graphnav.solvers.rts import rts
 
 
 @dataclass(frozen=True)

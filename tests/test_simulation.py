@@ -22,8 +22,9 @@ from graphnav.earth import RATE, LocalFrame, gravity, llh_to_ecef
 from graphnav.errors import ConfigError
 from graphnav.formats import read
 from graphnav.formats.writing import write_folder
-from graphnav.preintegration import bridge_gaps, preintegrate
+from graphnav.preintegration import preintegrate
 from graphnav.recording import Imu, Odometer
+from graphnav.samples import bridge_gaps
 from graphnav.simulation import Simulated, options_from, scenarios, simulate
 from graphnav.simulation.aiding import Fault, GnssModel, OdometerModel
 from graphnav.simulation.inertial import EG370N, MIMU, Triad, accelerometer, gyroscope

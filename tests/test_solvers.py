@@ -23,8 +23,9 @@ from graphnav.recording import Gnss, Recording
 from graphnav.rotation import exp
 from graphnav.solution import Solution
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import ekf, rts
+from graphnav.solvers.ekf import ekf
 from graphnav.solvers.robust import weight_and_cost
+from graphnav.solvers.rts import rts
 from graphnav.state import DIM
 from graphnav.trajectory import Trajectory
 

@@ -18,9 +18,10 @@ from graphnav.constraints.vehicle import AXLE, MOUNTING, ODOMETER_DELAY, ODOMETE
 from graphnav.earth import LocalFrame
 from graphnav.formats import read
 from graphnav.pipeline import run
-from graphnav.preintegration import bridge_gaps, preintegrate
+from graphnav.preintegration import preintegrate
 from graphnav.problem import keyframe_times
 from graphnav.recording import Recording
+from graphnav.samples import bridge_gaps
 from graphnav.simulation import simulate
 from graphnav.solution import Solution
 from graphnav.state import States

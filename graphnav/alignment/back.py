@@ -8,9 +8,10 @@ from graphnav import rotation
 from graphnav.alignment.first import Alignment
 from graphnav.config import Settings
 from graphnav.earth import LocalFrame
-from graphnav.preintegration import bridge_gaps, prefix
+from graphnav.preintegration import prefix
 from graphnav.recording import Imu, Recording
 from graphnav.rotation import Array
+from graphnav.samples import bridge_gaps
 from graphnav.solution import Solution
 from graphnav.state import States
 

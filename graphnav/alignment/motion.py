@@ -14,10 +14,11 @@ from graphnav.alignment.first import Alignment, level, some
 from graphnav.config import Settings
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
-from graphnav.preintegration import bridge_gaps, prefix
+from graphnav.preintegration import prefix
 from graphnav.problem import Problem, pose
 from graphnav.recording import Gnss, Imu, Recording
 from graphnav.rotation import Array
+from graphnav.samples import bridge_gaps
 from graphnav.solution import Solution
 from graphnav.state import States
 

@@ -9,8 +9,9 @@ from graphnav.alignment.first import Alignment, level
 from graphnav.config import Settings
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
-from graphnav.preintegration import bridge_gaps, prefix
+from graphnav.preintegration import prefix
 from graphnav.recording import Recording
+from graphnav.samples import bridge_gaps
 from graphnav.state import States
 
 _AT_ONCE = 0.05  # s from the start within which a foot that stands is found

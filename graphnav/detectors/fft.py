@@ -19,7 +19,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from graphnav.config import FftSettings
+from graphnav.config.detectors import FftSettings
 from graphnav.detectors.base import NONE, Detection, Mask, spans_of, within
 from graphnav.detectors.motion import Speeds
 from graphnav.detectors.spectrum import IdleLine, Windows, idle_line, peaks

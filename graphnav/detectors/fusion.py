@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from graphnav.config import FusionSettings
+from graphnav.config.detectors import FusionSettings
 from graphnav.detectors.base import NONE, Detection, longer_than, merged, within, without
 from graphnav.detectors.chain import Link, at_rest_until, link, moving_by_chain
 from graphnav.detectors.motion import Speeds

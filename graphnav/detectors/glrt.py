@@ -18,7 +18,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from graphnav.config import GlrtSettings
+from graphnav.config.detectors import GlrtSettings
 from graphnav.detectors.base import Detection, spans_of, within
 from graphnav.detectors.windows import Blocks, running, unbroken, window_times
 from graphnav.recording import ImuNoise

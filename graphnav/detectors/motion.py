@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from graphnav.config import FusionSettings
+from graphnav.config.detectors import FusionSettings
 from graphnav.crosschecks import local_positions
 from graphnav.detectors.base import NONE, merged, spans_of, union
 from graphnav.detectors.windows import share_of

@@ -27,7 +27,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav import rotation
-from graphnav.config import StanceSettings
+from graphnav.config.detectors import StanceSettings
 from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, merged, spans_of
 from graphnav.detectors.glrt import glrt_statistic
 from graphnav.detectors.windows import running, unbroken

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav.config import SwaySettings
+from graphnav.config.detectors import SwaySettings
 from graphnav.detectors.base import NONE, Detection, longer_than, spans_of, within
 from graphnav.detectors.glrt import log_statistic
 from graphnav.detectors.thresholds import valley

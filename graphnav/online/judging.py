@@ -19,9 +19,9 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
+from graphnav.judgement import judged
 from graphnav.online.sensors import Sensors
 from graphnav.online.tracker import Tracker
-from graphnav.pipeline import judged
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 

@@ -11,9 +11,9 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.detectors import detect
 from graphnav.online.looks import SURE, Stops, clipped
 from graphnav.online.sensors import Sensors
-from graphnav.preintegration import bridge_gaps
 from graphnav.problem import keyframe_times, to_samples
 from graphnav.rotation import Array
+from graphnav.samples import bridge_gaps
 
 _WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector sees, and the least
 _SHORTEST = 0.05  # s between looks at a walk that are worth keyframes

@@ -27,10 +27,11 @@ from graphnav.online.evidence import Evidence
 from graphnav.online.looks import CONTEXT, SURE, Readings, Stops, clipped
 from graphnav.online.sensors import Sensors
 from graphnav.online.steps import Steps
-from graphnav.preintegration import GAP, bridge_gaps, preintegrate
+from graphnav.preintegration import preintegrate
 from graphnav.problem import NODE_SPACING, Problem, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
+from graphnav.samples import GAP, bridge_gaps
 from graphnav.solvers.stages import Place, Step
 from graphnav.solvers.watch import Verdicts, Watch
 from graphnav.solvers.window import Message, Smoothed, Window, turn_limit

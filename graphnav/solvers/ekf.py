@@ -46,16 +46,13 @@ from graphnav.solvers.passes import (
     Progress,
     Smoothed,
     parameters_of,
-    residual_record,
     scale_of,
     shift,
 )
 from graphnav.solvers.robust import PASSES, softened, weight_and_cost
-from graphnav.solvers.rts import backward, rts
+from graphnav.solvers.rts import backward
 from graphnav.solvers.watch import Bank, Verdicts
 from graphnav.state import BLOCKS, DIM, States
-
-__all__ = ["Filtered", "Progress", "Smoothed", "backward", "ekf", "residual_record", "rts"]
 
 _NOTHING = np.empty((1, 0))
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were

@@ -1,0 +1,73 @@
+"""Settings of the detectors."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from graphnav.config.section import Section
+
+
+class StanceSettings(Section):
+    """Where a foot is on the floor."""
+
+    window: float = Field(0.05, gt=0, le=1, description="s, length of a window")
+    threshold: float = Field(1.5, gt=0, description="rad/s, of the statistic, between stance and swing")
+    force_per_rate: float = Field(5.7, gt=0, description="m/s^2 of force that weigh as much as 1 rad/s")
+    shortest: float = Field(0.06, ge=0, description="s, the shortest stance")
+    bridge: float = Field(0.03, ge=0, description="s, the longest disturbance within a stance")
+
+
+class SwaySettings(Section):
+    """The stillness detector: the GLRT below the engine's frequencies."""
+
+    window: float = Field(2.0, gt=0.3, le=30, description="s, length of a window")
+    threshold: float = Field(3.0, gt=0, description="of the statistic; 1 is the sensor's noise and a body that sways")
+    from_data: bool = Field(True, description="move the threshold into the valley between still and moving windows")
+    force: float = Field(0.005, gt=0, description="m/s^2, 1-sigma per axis that a standing vehicle sways with")
+    rate: float = Field(2.5e-4, gt=0, description="rad/s, 1-sigma per axis that a standing vehicle sways with")
+
+
+class GlrtSettings(Section):
+    """The GLRT and its relatives."""
+
+    window: float = Field(1.0, gt=0, le=30, description="s, length of a window")
+    threshold: float | None = Field(None, gt=0, description="of the GLRT; found from the recording if unset")
+
+
+class FftSettings(Section):
+    """The detector of an engine's idle line; the paper's values (Li 2024, section 4.2)."""
+
+    window: float = Field(3.0, ge=1, le=30, description="s, length of a window")
+    step: float = Field(1.0, ge=0.1, le=30, description="s between the starts of windows")
+    bands: tuple[float, float, float] = Field(
+        (10.0, 20.0, 30.0), description="Hz, upper ends of the bands of Peak-0, Peak-1 and Peak-2"
+    )
+    force_limit: float = Field(15.0, gt=0, description="mg, above which no peak of the force may rise")
+    rate_limit: float = Field(0.7, gt=0, description="deg/s, above which no peak of the pitch rate may rise")
+    force_ratio: float = Field(1.5, gt=0, description="that times Peak-1 and Peak-2 must exceed Peak-0 of the force")
+    rate_ratio: float = Field(7.0, gt=0, description="times Peak-0 that Peak-1 of the pitch rate must reach")
+    max_speed: float = Field(0.5, gt=0, description="m/s, of a known speed above which nothing is stationary")
+    find_line: bool = Field(True, description="find the idle line from 8 to 50 Hz and move the bands with it")
+
+
+class FusionSettings(Section):
+    """From the detectors' answers to stationary intervals."""
+
+    min_duration: float = Field(1.0, gt=0, description="s, the shortest interval")
+    margin: float = Field(0.1, ge=0, description="s, taken off both ends of every interval")
+    bridge: float = Field(
+        30.0, ge=0, description="s, the longest disturbance that is bridged where the force integrates to no motion"
+    )
+    bridge_speed: float = Field(0.1, gt=0, description="m/s, of that integral above which the vehicle did move")
+    max_speed: float = Field(0.15, gt=0, description="m/s, of a measured speed that is not yet motion")
+    odometer_delay: float = Field(0.7, ge=0, description="s, by which an odometer may be late")
+
+
+class DetectorSettings(Section):
+    """Where the vehicle stands."""
+
+    sway: SwaySettings = SwaySettings()
+    glrt: GlrtSettings = GlrtSettings()
+    fft: FftSettings = FftSettings()
+    fusion: FusionSettings = FusionSettings()
+    stance: StanceSettings = StanceSettings()

@@ -1,0 +1,93 @@
+"""Settings from files, and as a file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+
+from graphnav.complaints import complaint, read_toml
+from graphnav.config.settings import PROFILES, Profile, Settings
+from graphnav.errors import ConfigError
+
+
+def settings_from(values: Mapping[str, Any], source: str = "settings", text: str = "") -> Settings:
+    """Validate a nested mapping, that of the file whose `text` is given.
+
+    Raises
+    ------
+    ConfigError
+        Naming the source, the line, the key, the value and its unit, and the nearest known key for an unknown one.
+    """
+    try:
+        return Settings.model_validate(dict(values))
+    except ValidationError as error:
+        raise ConfigError(complaint(source, error, Settings, text)) from None
+
+
+def read_settings(path: str | Path | None = None, profile: str | None = None) -> Settings:
+    """Settings from a file over those of a profile over the defaults.
+
+    Parameters
+    ----------
+    path
+        TOML, or the summary.json of a run, whose settings are then used again; None: no file.
+    profile
+        One of `PROFILES`; it goes before the file's own.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read or holds something that is not a setting, or there is no such profile.
+    """
+    values: Mapping[str, Any] = {}
+    text = ""
+    if path is not None and Path(path).suffix == ".json":
+        values = _settings_of_run(Path(path))
+    elif path is not None:
+        values, text = read_toml(Path(path), ConfigError)
+    if profile is not None:
+        if profile not in PROFILES:
+            raise ConfigError(f"--profile {profile}: no such profile; known: {', '.join(get_args(Profile))}")
+        values = {**values, "profile": profile}
+    return settings_from(values, "settings" if path is None else str(path), text)
+
+
+def _settings_of_run(path: Path) -> Mapping[str, Any]:
+    """What a summary.json keeps."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))["settings"]
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, KeyError, TypeError):
+        raise ConfigError(f"{path}: holds no settings; name a settings file (TOML) or a summary.json") from None
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{path}: holds no settings; name a settings file (TOML) or a summary.json")
+    return values
+
+
+def settings_text(settings: Settings) -> str:
+    """A file that `read_settings` reads: every key with its unit and sentence, those that are unset as comments."""
+    lines: list[str] = []
+
+    def table(section: BaseModel, at: str) -> None:
+        nested = {}
+        for name, field in type(section).model_fields.items():
+            value = getattr(section, name)
+            if isinstance(value, BaseModel):
+                nested[name] = value
+                continue
+            # JSON's numbers, texts and lists are TOML's as well
+            said = f"# {name} =" if value is None else f"{name} = {json.dumps(value)}"
+            lines.append(f"{said:<30} # {field.description}")
+        for name, inner in nested.items():
+            place = f"{at}.{name}" if at else name
+            if any(not isinstance(getattr(inner, key), BaseModel) for key in type(inner).model_fields):
+                lines.extend(["", f"[{place}]"])
+            table(inner, place)
+
+    table(settings, "")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,105 @@
+"""All settings, each with its unit and a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from graphnav.config.detectors import DetectorSettings
+from graphnav.config.gnss import GnssSettings
+from graphnav.config.motion import FootSettings, StandstillSettings, VehicleSettings
+from graphnav.config.section import Section
+
+Profile = Literal["car", "car+odometer", "foot"]
+
+# What is made of the platform, below whatever the settings say themselves.
+PROFILES: dict[str, dict[str, dict[str, Any]]] = {
+    "car": {"vehicle": {"nhc": True, "odometer": False}},
+    "car+odometer": {"vehicle": {"nhc": True, "odometer": True}},
+    "foot": {"vehicle": {"nhc": False, "odometer": False}, "foot": {"stance": True}},
+}
+
+
+class KeyframeSettings(Section):
+    """Where states are placed."""
+
+    rate: float = Field(1.0, gt=0, le=200, description="Hz, between the measurements; every fix has its own")
+    bridge: float = Field(
+        2.0, gt=0, description="s, the longest IMU gap that is bridged as an interval; a longer one cuts the graph"
+    )
+
+
+class AlignmentSettings(Section):
+    """The first attitude."""
+
+    window: float = Field(30.0, gt=1, description="s of motion used to find the first attitude")
+    prior_inflation: float = Field(
+        5.0, ge=1, description="how many times wider than its own sigma the alignment enters as a prior"
+    )
+    heading: float | None = Field(None, ge=-360, le=360, description="deg, a start heading that is known")
+    heading_sigma: float = Field(10.0, gt=0, description="deg, 1-sigma of the known start heading")
+    gyro_bias: tuple[float, float, float] | None = Field(
+        None,
+        description="rad/s, body axes (right, forward, up): what an earlier recording found, where no fixes tell it",
+    )
+    gyro_bias_sigma: float = Field(5e-4, gt=0, description="rad/s, 1-sigma of that bias")
+
+
+class ImuSettings(Section):
+    """How the IMU's figures are used."""
+
+    as_stated: bool = Field(
+        False, description="take the noise figures as stated, even where the drive shows them to be too small"
+    )
+    coning: bool = Field(
+        True, description="of a foot: rows are plain means; false for a unit that makes up for coning and sculling"
+    )
+
+
+class SolverSettings(Section):
+    """The outer loop of the batch solver, and how long the incremental one waits."""
+
+    lag: float = Field(
+        120.0, ge=1, description="s of future that a state has seen when the incremental solver lets it settle"
+    )
+    max_iterations: int = Field(30, ge=1, description="Levenberg-Marquardt iterations")
+    tolerance: float = Field(
+        1e-3, gt=0, description="stop when the next step could lower the cost by less than this (cost is in sigma^2/2)"
+    )
+
+
+class Settings(Section):
+    """Everything that can be set; `Settings()` is the default, `Settings(profile="car")` one of `PROFILES`.
+
+    Without a profile everything is used that the recording's platform and sensors allow.
+    """
+
+    profile: Profile | None = Field(None, description="what the recording is of: car, car+odometer or foot")
+    keyframes: KeyframeSettings = KeyframeSettings()
+    alignment: AlignmentSettings = AlignmentSettings()
+    imu: ImuSettings = ImuSettings()
+    gnss: GnssSettings = GnssSettings()
+    detectors: DetectorSettings = DetectorSettings()
+    standstill: StandstillSettings = StandstillSettings()
+    vehicle: VehicleSettings = VehicleSettings()
+    foot: FootSettings = FootSettings()
+    solver: SolverSettings = SolverSettings()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_profile(cls, values: Any) -> Any:
+        """The profile's values where none are given."""
+        chosen = PROFILES.get(str(values.get("profile"))) if isinstance(values, Mapping) else None
+        if chosen is None:
+            return values
+        merged = dict(values)
+        for name, table in chosen.items():
+            given = merged.get(name, {})
+            merged[name] = {**table, **given} if isinstance(given, Mapping) else given
+        return merged
+
+    def without_wheels(self) -> Settings:
+        """The same with nothing assumed of wheels."""
+        return self.model_copy(update={"vehicle": self.vehicle.model_copy(update={"nhc": False, "odometer": False})})

@@ -1,0 +1,160 @@
+"""The order in which fixes and IMU are judged: the first part of a drive, smoothed again with what was found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from graphnav import faults
+from graphnav.alignment import Alignment
+from graphnav.config import Settings
+from graphnav.earth import LocalFrame
+from graphnav.errors import EstimationError
+from graphnav.judgement.chance import CLEARLY
+from graphnav.judgement.fixes import LONG, FixQuality, judge_fixes, judge_lasting, outliers, stretch, suspicious
+from graphnav.judgement.imu import calmer, imu_notes, judge_imu, noisiest
+from graphnav.judgement.speeds import contradiction
+from graphnav.problem import Problem, pose
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+from graphnav.solvers.ekf import ekf
+from graphnav.solvers.passes import Filtered, Smoothed
+from graphnav.solvers.rts import backward
+
+_ROUNDS = 4  # of raising the IMU's figures
+
+
+def judged(
+    recording: Recording,
+    settings: Settings,
+    frame: LocalFrame,
+    aligned: Alignment,
+    stationary: Array,
+    wrong: tuple[faults.Fault, ...] = (),
+    witnesses: bool = False,
+) -> tuple[Recording, Settings, tuple[str, ...]]:
+    """Recording and settings with the figures of IMU and fixes judged by the first part of the drive, and sentences.
+
+    Parameters
+    ----------
+    stationary : (N, 2) s, intervals at rest.
+    wrong : spans of fixes to judge without.
+    witnesses : whether wheels may say that it is not the IMU that is noisy, but errors of the fixes that last.
+
+    Raises
+    ------
+    EstimationError
+        If that part does not determine a trajectory.
+    """
+    if aligned.motion is None or not settings.gnss.position:
+        return recording, settings, ()
+    rounds = _Rounds(recording, settings, frame, aligned, stationary, wrong)
+    fixes = rounds.first()
+    if fixes is not None:
+        fixes = rounds.lasting(fixes, witnesses)
+        settings = fixes.applied(settings)
+    noise = rounds.noise
+    notes = imu_notes(recording.imu.noise, noise) + (() if fixes is None else fixes.notes)
+    return replace(recording, imu=replace(recording.imu, noise=noise)), settings, notes
+
+
+class _Rounds:
+    """What is known of the figures so far: `noise` of the IMU, and weights of fixes that are outliers."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        settings: Settings,
+        frame: LocalFrame,
+        aligned: Alignment,
+        stationary: Array,
+        wrong: tuple[faults.Fault, ...],
+    ) -> None:
+        assert aligned.motion is not None
+        self._recording, self._settings, self._frame = recording, settings, frame
+        self._aligned, self._stationary, self._wrong = aligned, stationary, wrong
+        self._moved = aligned.motion
+        self._part = stretch(recording, self._moved)
+        self._stated = self.noise = recording.imu.noise
+        self._weight: dict[str, Array] = {}
+        self._free = settings.without_wheels()  # wheels are judged by what comes of this: they have no say in it
+        as_stated = {"sd_factor": 1.0, "slow_share": 0.0, "fast_time": 0.0, "adaptive": "off"}
+        self._plain = self._free.model_copy(update={"gnss": settings.gnss.model_copy(update=as_stated)})
+        self._first: FixQuality | None = None  # of errors that last, where they were looked for
+
+    def first(self) -> FixQuality | None:
+        """Judge fixes, and the IMU where it is noisier than stated; None where there are too few fixes."""
+        gnss, plain = self._settings.gnss, self._plain
+        try:
+            problem, forward, back = self._smoothed(plain)
+            doubtful = suspicious(problem, back)
+        except EstimationError:
+            doubtful = True
+        if doubtful:
+            self.noise = noisiest(self._stated)
+            self._weight = ekf(self._posed(plain), opening=self._aligned.until, watch=True).weights
+            self.noise = self._stated
+            problem, forward, back = self._smoothed(plain)
+            self._weight = outliers(problem, back)
+            problem, forward, back = self._smoothed(plain)
+        fixes = judge_fixes(problem, back)
+        if fixes is not None and gnss.fast_time != 0.0:
+            self._first = judge_lasting(problem, back)
+        if not self._settings.imu.as_stated and judge_imu(problem, forward, back).clear:
+            # fixes that wander would pass for noise of the IMU: it is judged with their wandering in the problem
+            self._improve(plain if fixes is None else fixes.applied(self._free))
+            if self.noise != self._stated:
+                problem, _, back = self._smoothed(plain)
+                fixes = judge_fixes(problem, back)
+        return fixes
+
+    def lasting(self, fixes: FixQuality, witnesses: bool) -> FixQuality:
+        """The fixes as they are, or as errors that last explain better.
+
+        The IMU may be as bad as it was found, or errors of the fixes last for seconds: wheels, without a say so far,
+        are witnesses.
+        """
+        found, raised = self._first, self.noise
+        larger = fixes.sd_factor > CLEARLY
+        if found is None or found.fast_time == 0.0 or not (larger or (witnesses and raised != self._stated)):
+            return fixes
+        self._part, self._weight = stretch(self._recording, self._moved, LONG), {}
+        try:
+            against, chance = contradiction(*self._both(fixes.applied(self._settings)))
+            if larger or against > chance:
+                self.noise = self._stated
+                found = judge_lasting(*self._both(found.applied(self._settings)))
+                if not self._settings.imu.as_stated:
+                    basis = found.applied(self._free)
+                    self._weight = outliers(*self._both(basis))
+                    self._improve(basis)
+                    self._weight = {}
+                left = contradiction(*self._both(found.applied(self._settings)))[0]
+                if larger or (left < against - chance and calmer(self.noise, raised)):
+                    fixes, raised = found, self.noise
+        except EstimationError:
+            pass  # as it was judged before
+        self.noise = raised
+        return fixes
+
+    def _improve(self, basis: Settings) -> None:
+        """Raise the noise figures of the IMU as it asks for."""
+        for _ in range(_ROUNDS):
+            imu = judge_imu(*self._smoothed(basis))
+            better = imu.applied(self.noise, self._stated)
+            if (self.noise == self._stated and not imu.clear) or imu.settled or better == self.noise:
+                break
+            self.noise = better
+
+    def _posed(self, how: Settings) -> Problem:
+        noisy = replace(self._part, imu=replace(self._part.imu, noise=self.noise))
+        problem = pose(noisy, how, self._frame, self._aligned.state, self._aligned.sigma, self._stationary)
+        return faults.without(faults.weighted(problem, self._weight), self._wrong)
+
+    def _smoothed(self, how: Settings) -> tuple[Problem, Filtered, Smoothed]:
+        problem = self._posed(how)
+        forward = ekf(problem, opening=self._aligned.until)
+        return problem, forward, backward(problem, forward)
+
+    def _both(self, how: Settings) -> tuple[Problem, Smoothed]:
+        problem, _, back = self._smoothed(how)
+        return problem, back
