@@ -103,13 +103,13 @@ class Motion:
     def propagate(self, rows: slice, start: States, scale: Array | None = None) -> tuple[States, Array]:
         """The states at the ends of intervals `rows` and F (n, 15, 15) there, from the states at their starts.
 
-        `scale` is (6,) or None.
+        `scale` is (6,), (n, 6) or None.
         """
         iv, R = self.intervals, start.R_nb
         n = len(R)
         delta = np.concatenate([start.ba, start.bg], -1) - self.expected[rows]
         if scale is not None:
-            delta += scale[[3, 4, 5, 0, 1, 2]] * self.mean[rows]
+            delta += scale[..., [3, 4, 5, 0, 1, 2]] * self.mean[rows]
         turn = mv(iv.theta_bg[rows], delta[:, 3:])
         dR = iv.dR[rows] @ rotation.exp(turn)
         moved = self.step[rows] + mv(self.bias[rows], delta)  # dP, dV

@@ -16,23 +16,19 @@ from graphnav.constraints.prior import InitialPrior
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import ConfigError, EstimationError
-from graphnav.judgement import calmer, judge_speeds, judged
-from graphnav.problem import Problem, pose
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
+from graphnav.review import Review
 from graphnav.solution import Solution, joined
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf
 from graphnav.solvers.incremental import incremental
 from graphnav.solvers.isam import isam2
-from graphnav.solvers.passes import Filtered, Smoothed
 from graphnav.solvers.rts import backward, rts
 
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
 _FAR = 0.5  # rad between the stated and the found start attitude
-_REVIEWS = 2  # of where faults begin and end
-_MOST = 0.5  # share of the fixes of a kind that can be wrong
 _SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
 
 
@@ -131,83 +127,11 @@ def _solve(
     found_heading = aligned.motion is not None  # without motion heading zero is only a convention
     astray = found_heading and bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
 
-    spent: list[float] = []
-    overruled = settings.gnss.faults == "off"  # most fixes contradict the filter, or nobody asks whether they do
-
-    def posed(wrong: tuple[faults.Fault, ...] = ()) -> tuple[Problem, tuple[str, ...]]:
-        tell("judgement")
-        sensed, how, said = judged(recording, settings, frame, aligned, stationary, wrong, overruled)
-        begin = aligned if astray else stated
-        tell("preintegration")
-        started = time.perf_counter()
-        problem = pose(sensed, how, frame, begin.state, begin.sigma, stationary)
-        spent.append(time.perf_counter() - started)
-        return problem, said
-
-    def watched(problem: Problem) -> tuple[Problem, Filtered]:
-        nonlocal overruled
-        forward = ekf(problem, progress, aligned.until, watch=True)
-        found = faults.weighted(problem, forward.weights)
-        if too_many := settings.gnss.faults != "on" and faults.share(found) > _MOST:
-            found, overruled = faults.all_used(problem), True
-        if too_many or forward.anew:
-            forward = ekf(found, progress, aligned.until)
-        return found, forward
-
-    def reviewed(problem: Problem) -> tuple[Problem, Filtered, Smoothed, tuple[str, ...]]:
-        problem, forward = watched(problem)
-        raised: tuple[str, ...] = ()
-        for again in range(_REVIEWS):
-            before = faults.count(problem)
-            if before:
-                apart = faults.widened(problem)
-                smoothed = backward(apart, ekf(apart, progress, aligned.until), progress)
-                problem = faults.readmitted(problem, smoothed)
-            else:
-                smoothed = backward(problem, forward, progress)
-            if not again:
-                problem, raised = judge_speeds(problem, smoothed)
-            if before:
-                problem, forward = watched(problem)
-            elif raised:
-                forward = ekf(problem, progress, aligned.until)
-            if faults.count(problem) == before:
-                break
-        if before or raised:
-            smoothed = backward(problem, forward, progress)
-        return problem, forward, smoothed, raised
-
-    asked = overruled
-    problem, said = posed()
-    done = time.perf_counter()
-    problem, forward, smoothed, raised = reviewed(problem)
-    if overruled and not asked:
-        # when most are wrong it is their sigmas that are
-        other, says = posed()
-        if says != said:
-            said = says
-            problem, forward, smoothed, raised = reviewed(other)
-    if faults.count(problem):
-        # what faults did to the states around them may have passed for noise of the IMU
-        wrong = faults.spans(problem, noisy=True)
-        other, says = posed(wrong)
-        if calmer(other.recording.imu.noise, problem.recording.imu.noise):
-            weights = {c.name: c.weight for c in problem.constraints if c.weight is not None}
-            problem, said = faults.weighted(other, weights), says
-            forward = ekf(problem, progress, aligned.until)
-            problem, raised = judge_speeds(problem, backward(problem, forward, progress))
-            forward = ekf(problem, progress, aligned.until) if raised else forward
-            smoothed = backward(problem, forward, progress)
-    said = (*said, *raised)
-    timings = {
-        "detection": detected - began,
-        "alignment": after - detected,
-        "judgement": done - after - spent[0],
-        "preintegration": sum(spent),
-        "smoother": time.perf_counter() - done - sum(spent[1:]) - forward.solution.timings["filter"],
-    }
+    review = Review(recording, settings, frame, aligned, aligned if astray else stated, stationary, progress)
+    problem, forward, smoothed = review.problem, review.forward, review.smoothed
+    timings = {"detection": detected - began, "alignment": after - detected, **review.timings}
     wrong = faults.spans(problem, smoothed)
-    said = (*said, *faults.notes(wrong, problem))
+    said = (*review.notes, *faults.notes(wrong, problem))
     start = smoothed
     if astray:
         prior = InitialPrior(keyframe=problem.prior.keyframe, mean=stated.state, sigma=stated.sigma[None])

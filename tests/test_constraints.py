@@ -198,13 +198,13 @@ def test_the_filter_itself_does_that_update(recording: Recording, copies: int) -
     forward = ekf(problem)
     (lever,) = (c.parameter for c in problem.chains if c.parameter.name == LEVER_ARM)
     at = problem.columns[LEVER_ARM]
-    P, state = forward.P_predicted[k], forward.predicted[k]
+    P, state = forward.P_predicted[k], forward.predicted.states[k : k + 1]
     given = {p.name: np.tile(p.initial, (copies, 1)) for p in rows.parameters}
     linear = rows.linearize(state[np.zeros(copies, int)], given, slice(None))
     H = np.concatenate(assemble(linear, problem.columns, len(P)))
     gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(linear.sigma.ravel() ** 2))
     d = -gain @ linear.residual.ravel()
-    np.testing.assert_allclose(forward.states[k].minus(state.plus(d[None, :DIM])), 0.0, atol=1e-9)
+    np.testing.assert_allclose(forward.states[k : k + 1].minus(state.plus(d[None, :DIM])), 0.0, atol=1e-9)
     np.testing.assert_allclose(forward.values[k][at.start - DIM : at.stop - DIM], lever.initial + d[at], atol=1e-9)
     expected = P - gain @ H @ P
     sd = np.sqrt(np.diag(expected))

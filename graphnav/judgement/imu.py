@@ -20,8 +20,8 @@ import numpy as np
 from graphnav.judgement.chance import CLEARLY, FEWEST, MOST_RAISED, SIGNIFICANT, independent, scatter, trimmed
 from graphnav.problem import Problem
 from graphnav.recording import ImuNoise
-from graphnav.solvers.passes import Filtered, Smoothed
-from graphnav.state import DIM, States
+from graphnav.solvers.passes import Forward, Smoothed
+from graphnav.state import DIM
 
 _FIGURES = {
     "gyro_noise_density": slice(0, 3),
@@ -59,15 +59,15 @@ class ImuQuality:
         return replace(noise, **found)
 
 
-def judge_imu(problem: Problem, forward: Filtered, smoothed: Smoothed) -> ImuQuality:
+def judge_imu(problem: Problem, forward: Forward, smoothed: Smoothed) -> ImuQuality:
     """Judge the IMU's noise figures by what the smoother says the noise of every interval was."""
-    predicted = States.stack(forward.predicted)
-    moved = np.concatenate([smoothed.states.minus(predicted), smoothed.values - forward.values_predicted], axis=1)[1:]
+    ahead = forward.predicted
+    moved = np.concatenate([smoothed.states.minus(ahead.states), smoothed.values - ahead.values], axis=1)[1:]
     before, after = forward.P_predicted[1:], smoothed.P[1:]
     inverse = np.linalg.inv(before)
     pull = (inverse @ moved[..., None])[:, :DIM]
     gained = (inverse @ (before - after) @ inverse)[:, :DIM, :DIM]
-    frames = problem.motion.frames(slice(None), States.stack(forward.states[:-1]).R_nb)
+    frames = problem.motion.frames(slice(None), forward.states.R_nb[:-1])
     Q = problem.intervals.covariance
     QL = Q @ np.swapaxes(frames, -1, -2)
     noise = (QL @ pull)[..., 0]

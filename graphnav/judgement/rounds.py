@@ -16,9 +16,10 @@ from graphnav.judgement.speeds import contradiction
 from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
-from graphnav.solvers.ekf import ekf
-from graphnav.solvers.passes import Filtered, Smoothed
+from graphnav.solvers.ekf import ekf, refilter
+from graphnav.solvers.passes import Forward, Smoothed, points_of, values_of
 from graphnav.solvers.rts import backward
+from graphnav.state import States
 
 _ROUNDS = 4  # of raising the IMU's figures
 
@@ -79,6 +80,7 @@ class _Rounds:
         self._free = settings.without_wheels()  # wheels are judged by what comes of this: they have no say in it
         as_stated = {"sd_factor": 1.0, "slow_share": 0.0, "fast_time": 0.0, "adaptive": "off"}
         self._plain = self._free.model_copy(update={"gnss": settings.gnss.model_copy(update=as_stated)})
+        self._near: tuple[States, dict[str, Array]] | None = None  # the latest smoothed states and parameter values
         self._first: FixQuality | None = None  # of errors that last, where they were looked for
 
     def first(self) -> FixQuality | None:
@@ -92,7 +94,7 @@ class _Rounds:
         if doubtful:
             self.noise = noisiest(self._stated)
             self._weight = ekf(self._posed(plain), opening=self._aligned.until, watch=True).weights
-            self.noise = self._stated
+            self.noise, self._near = self._stated, None  # outliers may have led it anywhere
             problem, forward, back = self._smoothed(plain)
             self._weight = outliers(problem, back)
             problem, forward, back = self._smoothed(plain)
@@ -150,10 +152,16 @@ class _Rounds:
         problem = pose(noisy, how, self._frame, self._aligned.state, self._aligned.sigma, self._stationary)
         return faults.without(faults.weighted(problem, self._weight), self._wrong)
 
-    def _smoothed(self, how: Settings) -> tuple[Problem, Filtered, Smoothed]:
+    def _smoothed(self, how: Settings) -> tuple[Problem, Forward, Smoothed]:
         problem = self._posed(how)
-        forward = ekf(problem, opening=self._aligned.until)
-        return problem, forward, backward(problem, forward)
+        forward: Forward
+        if self._near is None or len(self._near[0]) != len(problem.t):
+            forward = ekf(problem, opening=self._aligned.until)
+        else:
+            forward = refilter(problem, points_of(problem, *self._near))
+        back = backward(problem, forward)
+        self._near = back.states, values_of(problem, back)
+        return problem, forward, back
 
     def _both(self, how: Settings) -> tuple[Problem, Smoothed]:
         problem, _, back = self._smoothed(how)

@@ -14,28 +14,26 @@ and updates with the rows of every constraint there, nu = -r,
 The opening, the part that the alignment has seen, is run through twice. Before a vehicle moves nothing tells its
 heading, the filter's wanders by degrees until the first motion puts it right, and Jacobians taken along the way
 contradict those taken afterwards: heading, tilt and accelerometer bias get correlations that were never measured.
-So the opening is filtered and smoothed, and filtered again from the same prior, linearised at points X that the first
-pass left (Bell 1994: one step of the iterated smoother, over these keyframes only),
+So the opening is filtered and smoothed, and filtered again from the same prior, linearised at the points that the first
+pass left (`graphnav.solvers.points`). Later keyframes are linearised where the filter is.
 
-    x_k = X_k [+] e_k     e_{k+1} <- f(X_k) [-] X_{k+1} + F e_k     nu = -(r(X) + H e)
-
-Later keyframes are linearised where the filter is.
+Where only figures or weights have changed since the drive was filtered, `refilter` is linearised at given points
+throughout.
 """
 
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from graphnav import rotation
-from graphnav.constraints.base import Constraint, assemble
+from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.dense import dense
-from graphnav.dynamics import SCALE
 from graphnav.errors import EstimationError
-from graphnav.problem import ParameterChain, Problem
+from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import Solution
 from graphnav.solvers.adaptive import Noise
@@ -43,12 +41,14 @@ from graphnav.solvers.passes import (
     Filtered,
     Forward,
     Innovations,
+    Points,
     Progress,
-    Smoothed,
+    joined,
+    moved,
     parameters_of,
     scale_of,
-    shift,
 )
+from graphnav.solvers.points import AtEstimate, AtPoints, Estimate, about_own
 from graphnav.solvers.robust import PASSES, softened, weight_and_cost
 from graphnav.solvers.rts import backward
 from graphnav.solvers.watch import Bank, Verdicts
@@ -77,11 +77,11 @@ def ekf(
         about = backward(problem, first)
     one = _forward(problem, K, about, progress, watch)
     seconds = time.perf_counter() - began
-    filtered, P = States.stack(one.states), one.P[:, :DIM, :DIM]
+    filtered, P = one.states, one.P[:, :DIM, :DIM]
     if about is not None:
         n = len(about.values) - 1
         P = P.copy()
-        P[:n] = _about_own(P[:n], filtered[:n].minus(about.states[:n]))
+        P[:n] = about_own(P[:n], one.errors[:n])
     solution = Solution(
         solver="ekf",
         frame=problem.frame,
@@ -100,22 +100,37 @@ def ekf(
     return Filtered(**vars(one), solution=solution)
 
 
+def refilter(problem: Problem, about: Points, progress: Progress | None = None, watch: bool = False) -> Forward:
+    """Run the filter over all keyframes, linearised at given points; several times as fast as `ekf`.
+
+    Parameters
+    ----------
+    about : of all keyframes, near enough for what is left to be linear: an earlier pass.
+    watch : as for `ekf`.
+    """
+    return _forward(problem, len(problem.t), about, progress, watch)
+
+
 def _forward(
     problem: Problem,
     K: int,
-    about: Smoothed | None = None,
+    about: Points | None = None,
     progress: Progress | None = None,
     watch: bool = False,
 ) -> Forward:
-    """Filter the first K keyframes, of which the first few are linearised at given points."""
-    columns, n = problem.columns, 0 if about is None else len(about.values)
-    D = DIM + sum(s.stop - s.start for s in columns.values())
+    """Filter the first K keyframes, of which the first n are linearised at given points."""
+    n = 0 if about is None else len(about.values)
+    own = AtEstimate(problem)
+    given = None if about is None else AtPoints(problem, about)
     state = problem.prior.mean
     assert state is not None
-    values = np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)])
+    x: Any = Estimate(state, np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)]))
+    if about is not None:
+        x = own.minus(x, _one(about, 0))
     P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
+    D = len(P)
     records = {rows.name: Innovations(rows) for rows in problem.constraints}
-    first = {rows.name: np.searchsorted(rows.keyframe, np.arange(K + 1)) for rows in problem.constraints}
+    first = {rows.name: np.searchsorted(rows.keyframe, np.arange(K + 1)).tolist() for rows in problem.constraints}
     fixes = [c for c in problem.constraints if watch and isinstance(c, GnssPosition | GnssVelocity)]
     watched = [c for c in fixes if c.watched]
     noise = Noise([c for c in fixes if c.adaptive != "off" and c.weight is None])  # weights know what follows as well
@@ -124,61 +139,36 @@ def _forward(
     verdicts = Verdicts(
         {c.name: problem.t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
     )
-    begun = (state, values, P)
-
+    begun = (x, P)
     all_P, all_Pp, all_F = np.empty((K, D, D)), np.empty((K, D, D)), np.empty((K - 1, D, D))
-    all_values, all_vp = np.empty((K, D - DIM)), np.empty((K, D - DIM))
-    states, predicted = [state] * K, [state] * K
-    identity = np.eye(D)
-    scale_at = columns.get(SCALE)
-    steps, added = _node_steps(problem), np.zeros(D)
+    found: list[Any] = [None] * K  # estimates, or errors where points are given
+    ahead = found.copy()
     k = 0
     while k < K:
+        where: AtEstimate | AtPoints = given if given is not None and k < n else own
         if bank is not None and any(first[rows.name][k] < first[rows.name][k + 1] for rows in watched):
             banks[k] = bank.copy()
             if len(banks) > _REMEMBERED:
                 del banks[next(iter(banks))]
         if k:
-            step = slice(k - 1, k)
-            at, at_values = (state, values) if about is None or k >= n else about.at(k - 1)
-            scale = None if scale_at is None else at_values[shift(scale_at)]
-            ahead, F15 = problem.motion.propagate(step, at, scale)
-            F = all_F[k - 1]
-            F[:] = identity
-            F[:DIM, :DIM] = F15[0]
-            if scale_at is not None:
-                F[:DIM, scale_at] = problem.motion.scale_columns(step, F15)[0]
-            at_values = at_values.copy()
-            for column, chain, j in steps.get(k, ()):
-                F[column, column] *= chain.decay[j]
-                at_values[shift(column)] -= chain.mean[j - 1]
-                at_values[shift(column)] = chain.mean[j] + chain.decay[j] * at_values[shift(column)]
-                added[column] = chain.sigma[j] ** 2
+            x, F, Q, added = where.step(k, x)
+            all_F[k - 1] = F
             P = F @ P @ F.T
-            P[:DIM, :DIM] += problem.motion.noise(step, at.R_nb)[0]
+            P[:DIM, :DIM] += Q
             if bank is not None:
                 bank.predicted(F)
-            if k in steps:
+            if added is not None:
                 P.flat[:: D + 1] += added
-                added[:] = 0.0
-            if about is not None and k < n:
-                e = F @ about.offset(k - 1, state, values)
-                ahead, at_values = ahead.plus(e[None, :DIM]), at_values + e[DIM:]
-            state, values = ahead, at_values
         for kind in watched:
             if (kind.name, problem.t[k]) in verdicts.anew:
                 block = BLOCKS["p" if isinstance(kind, GnssPosition) else "v"]
                 P[block, block] += 1e6 * np.eye(3)
-        predicted[k] = state
-        all_vp[k] = values
-        all_Pp[k] = P
+        ahead[k], all_Pp[k] = x, P
         back: int | None = None
         for rows in problem.constraints:
             lo, hi = first[rows.name][k], first[rows.name][k + 1]
             if hi > lo:
-                x, record = (state, values, P), records[rows.name]
-                at_point = about if k < n else None
-                state, values, P, fault = _update(rows, lo, hi, *x, columns, record, at_point, k, bank, noise)
+                x, P, fault = _update(rows, lo, hi, x, P, where, records[rows.name], k, bank, noise)
                 if fault is not None:
                     again = verdicts.settle(rows.name, fault, float(problem.t[k]))
                     back = int(np.searchsorted(problem.t, again))
@@ -186,49 +176,68 @@ def _forward(
         if back is not None:  # once more from before the fault, without it
             bank = banks.get(back) or bank.forgetful() if bank else None
             banks = {key: old for key, old in banks.items() if key < back}
-            state, values, P = (states[back - 1], all_values[back - 1], all_P[back - 1]) if back else begun
             k = back
+            x, P = (found[k - 1], all_P[k - 1]) if k else begun
+            if about is not None and k == n:
+                x = own.plus(_one(about, k - 1), x)
             continue
-        if about is not None and k == n - 1:
-            P = _about_own(P, about.offset(k, state, values)[:3])  # from here on linearised where the filter is
-        states[k] = state
-        all_P[k], all_values[k] = P, values
+        found[k], all_P[k] = x, P
         if progress is not None and k % 256 == 0:
             progress("filter", k / K)
         k += 1
+        if about is not None and k == n:  # from here on linearised where the filter is
+            all_P[k - 1] = P = about_own(P, x[:3])
+            x = own.plus(_one(about, k - 1), x)
     weights = {c.name: records[c.name].decided * noise.weight(c.name) for c in fixes}
-    anew = bool(verdicts.anew)
-    return Forward(states, all_values, all_vp, all_P, predicted, all_Pp, all_F, records, weights, anew, about)
+    errors, errors_ahead = np.array(found[:n]).reshape(n, D), np.array(ahead[:n]).reshape(n, D)
+    filtered, predicted = _points(about, errors, found[n:]), _points(about, errors_ahead, ahead[n:])
+    return Forward(
+        filtered.states,
+        filtered.values,
+        all_P,
+        predicted,
+        all_Pp,
+        all_F,
+        records,
+        weights,
+        bool(verdicts.anew),
+        about,
+        errors,
+        errors_ahead,
+    )
+
+
+def _one(points: Points, k: int) -> Estimate:
+    return Estimate(points.states[k : k + 1], points.values[k])
+
+
+def _points(about: Points | None, errors: Array, own: list[Estimate]) -> Points:
+    """Errors about given points, and the estimates that follow, as points."""
+    parts = [] if about is None else [moved(about, errors)]
+    if own:
+        parts.append(Points(States.stack([one.state for one in own]), np.array([one.values for one in own])))
+    return joined(parts)
 
 
 def _update(
     rows: Constraint,
     lo: int,
     hi: int,
-    state: States,
-    values: Array,
+    x: Any,
     P: Array,
-    columns: dict[str, slice],
+    where: Any,
     record: Innovations,
-    about: Smoothed | None,
     k: int,
     bank: Bank | None,
     noise: Noise,
-) -> tuple[States, Array, Array, float | None]:
+) -> tuple[Any, Array, float | None]:
     """One measurement update with rows lo..hi of a constraint at keyframe k; when a fault began comes last."""
     n = hi - lo
-    at, at_values = (state, values) if about is None else about.at(k)
-    D = len(P)
-    e = np.zeros(D) if about is None else about.offset(k, state, values)
-    weight, G = float(np.min(record.used[lo:hi])), _NOTHING
-    for left in range(rows.passes - 1 if about is None else 0, -1, -1):
-        here = at if n == 1 else at[np.zeros(n, dtype=int)]
-        given = {p.name: at_values[None, shift(columns[p.name])] for p in rows.parameters}
-        if n > 1:
-            given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
-        linear = rows.linearize(here, given, slice(lo, hi))
-        H = assemble(linear, columns, D).reshape(-1, D)
-        r, sigma = linear.residual.ravel() + H @ e, linear.sigma.ravel()
+    weight, G = float(min(record.used[lo:hi])), _NOTHING
+    at, e = where.about(x, len(P))
+    for left in range(where.passes(rows) - 1, -1, -1):
+        r, H, sigma = where.rows(rows, lo, hi, k, at)
+        r = r + H @ e
         if 0.0 < weight < 1.0:
             sigma = sigma / np.sqrt(weight)
         PHt = P @ H.T
@@ -238,17 +247,17 @@ def _update(
         if bank is not None and weight > 0.0 and not left:
             G = bank.signature(rows.name, k, H)
         # LAPACK called directly: for matrices this small the checks around it would cost more than the work
-        right = np.empty((len(r), D + 1 + G.shape[1]))
-        right[:, 0], right[:, 1 : D + 1], right[:, D + 1 :] = r, PHt.T, G
+        right = np.empty((len(r), len(P) + 1 + G.shape[1]))
+        right[:, 0], right[:, 1 : len(P) + 1], right[:, len(P) + 1 :] = r, PHt.T, G
         S, solved = _solve(HPHt, sigma, right, rows, lo)
         nis, bent = float(r @ solved[:, 0]), 1.0
         if rows.robust != "none" and rows.gate is None and not left:  # a gate stands in place of a kernel
             sigma, solved, bent = _robust(HPHt, sigma, right, solved, rows, lo, hi)
-        K = solved[:, 1 : D + 1].T
+        K = solved[:, 1 : len(P) + 1].T
         d = e - K @ r
         if left:  # again about where this leads (Jazwinski 1970, theorem 8.2)
-            at, at_values = at.plus(d[None, :DIM]), at_values + d[DIM:]
-            e = np.concatenate([state.minus(at)[0], values - at_values])
+            at = where.plus(at, d)
+            e = where.minus(x, at)
     refused = rows.gate is not None and nis > rows.gate**2
     weight = 0.0 if refused else weight * bent
     spread = np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1)
@@ -256,15 +265,15 @@ def _update(
     if bank is not None:
         bank.seen(rows.name, k, nis)
     if weight == 0.0:
-        return state, values, P, None
+        return x, P, None
     IKH = -K @ H
     IKH.flat[:: len(P) + 1] += 1.0
     P = IKH @ P @ IKH.T + (K * (sigma * sigma)) @ K.T
     P = 0.5 * (P + P.T)  # rounding's asymmetry would grow, past what a stop leaves between its place and the state
     fault = None
     if bank is not None:
-        fault = bank.updated(rows.name, K, G, solved[:, D + 1 :], r, float(np.linalg.norm(state.v)))
-    return at.plus(d[None, :DIM]), at_values + d[DIM:], P, fault
+        fault = bank.updated(rows.name, K, G, solved[:, len(IKH) + 1 :], r, where.speed(k, x))
+    return where.plus(at, d), P, fault
 
 
 def _solve(HPHt: Array, sigma: Array, right: Array, rows: Constraint, lo: int) -> tuple[Array, Array]:
@@ -292,24 +301,3 @@ def _robust(
         sigma = stated / np.repeat(np.sqrt(weight), len(stated) // (hi - lo))
         _, solved = _solve(HPHt, sigma, right, rows, lo)
     return sigma, solved, float(np.min(weight))
-
-
-def _about_own(P: Array, e: Array) -> Array:
-    """Covariances (..., D, D) of errors about points turned into those about states e away from them.
-
-    Exp(e + x) = Exp(e) Exp(J_r(e) x) to first order in x.
-    """
-    J = rotation.right_jacobian(e[..., :3])
-    P = P.copy()
-    P[..., :3, :] = J @ P[..., :3, :]
-    P[..., :3] = P[..., :3] @ np.swapaxes(J, -1, -2)
-    return P
-
-
-def _node_steps(problem: Problem) -> dict[int, list[tuple[slice, ParameterChain, int]]]:
-    """At keyframes where a parameter moves on to its next node: its columns, its chain and that node."""
-    out: dict[int, list[tuple[slice, ParameterChain, int]]] = {}
-    for chain in problem.chains:
-        for k in np.flatnonzero(np.diff(chain.node)) + 1:
-            out.setdefault(int(k), []).append((problem.columns[chain.parameter.name], chain, int(chain.node[k])))
-    return out

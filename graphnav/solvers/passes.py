@@ -47,20 +47,40 @@ class Innovations:
 
 
 @dataclass(frozen=True)
-class Forward:
+class Points:
+    """Where the rows of the first K keyframes are linearised."""
+
+    states: States
+    values: Array  # (K, D-15) of the parameters
+
+
+@dataclass(frozen=True)
+class Smoothed(Points):
+    """A backward pass: states, parameter values and their joint covariance at every keyframe."""
+
+    P: Array  # (K, D, D)
+
+    def nodes(self, problem: Problem) -> dict[str, Array]:
+        """(n, k) per parameter: the value of each node after the last keyframe that it governs."""
+        return {
+            c.parameter.name: self.values[last_of(c), shift(problem.columns[c.parameter.name])] for c in problem.chains
+        }
+
+
+@dataclass(frozen=True)
+class Forward(Points):
     """A forward pass over the first K keyframes, with what the backward pass needs."""
 
-    states: list[States]  # K filtered states of one row each
-    values: Array  # (K, D-15) parameter values
-    values_predicted: Array  # (K, D-15)
     P: Array  # (K, D, D) filtered
-    predicted: list[States]  # K predicted states
+    predicted: Points
     P_predicted: Array  # (K, D, D)
     F: Array  # (K-1, D, D)
     records: dict[str, Innovations]
     weights: dict[str, Array]  # (N,) of fixes: 0 where a fault was found, less than 1 where noisy
     anew: bool  # it began anew somewhere, which no other solver can: its estimates are not to be used
-    about: Smoothed | None  # points at which the first keyframes were linearised; their P is of errors about these
+    about: Points | None  # where the first n keyframes were linearised; up to the last of them P is of errors about
+    errors: Array  # (n, D) these points, and the filtered
+    errors_predicted: Array  # (n, D) and the predicted state is these errors away from them
 
 
 @dataclass(frozen=True)
@@ -70,27 +90,20 @@ class Filtered(Forward):
     solution: Solution
 
 
-@dataclass(frozen=True)
-class Smoothed:
-    """A backward pass: states, parameter values and their joint covariance at every keyframe."""
+def moved(points: Points, errors: Array) -> Points:
+    """Points moved by error states (K, D)."""
+    return Points(points.states.plus(errors[:, :DIM]), points.values + errors[:, DIM:])
 
-    states: States
-    values: Array  # (K, D-15)
-    P: Array  # (K, D, D)
 
-    def at(self, k: int) -> tuple[States, Array]:
-        """State (one row) and parameter values of a keyframe."""
-        return self.states[k : k + 1], self.values[k]
+def joined(parts: list[Points]) -> Points:
+    """One after the other."""
+    return Points(States.stack([part.states for part in parts]), np.concatenate([part.values for part in parts]))
 
-    def nodes(self, problem: Problem) -> dict[str, Array]:
-        """(n, k) per parameter: the value of each node after the last keyframe that it governs."""
-        return {
-            c.parameter.name: self.values[last_of(c), shift(problem.columns[c.parameter.name])] for c in problem.chains
-        }
 
-    def offset(self, k: int, state: States, values: Array) -> Array:
-        """The error state (D,) that leads from here to another state."""
-        return np.concatenate([state.minus(self.states[k : k + 1])[0], values - self.values[k]])
+def points_of(problem: Problem, states: States, known: dict[str, Array]) -> Points:
+    """Points of all keyframes: states, and values (K, k) of parameters, expected ones where they are not known."""
+    values = [known.get(c.parameter.name, c.mean[c.node]) for c in problem.chains]
+    return Points(states, np.concatenate([np.empty((len(states), 0)), *values], axis=1))
 
 
 def residual_record(
@@ -104,6 +117,11 @@ def residual_record(
     if rows.weight is not None:
         weight = weight * rows.weight
     return ConstraintRecord("residual", problem.t[at], linear.residual, linear.sigma, nis, weight, rows.axes, rows.unit)
+
+
+def values_of(problem: Problem, points: Points) -> dict[str, Array]:
+    """(K, k) per parameter."""
+    return {name: points.values[:, shift(at)] for name, at in problem.columns.items()}
 
 
 def scale_of(problem: Problem, values: Array) -> Array | None:

@@ -19,8 +19,10 @@ from graphnav.solution import Solution
 from graphnav.solvers.passes import (
     Filtered,
     Forward,
+    Points,
     Progress,
     Smoothed,
+    moved,
     parameters_of,
     residual_record,
     scale_of,
@@ -32,33 +34,38 @@ from graphnav.state import DIM, States
 def backward(problem: Problem, forward: Forward, progress: Progress | None = None) -> Smoothed:
     """Smooth a forward pass."""
     K, D = forward.P.shape[:2]
-    about = forward.about
+    about, before = forward.about, forward.predicted
     n = 0 if about is None else len(about.values)
-    state, values, P = forward.states[-1], forward.values[-1], forward.P[-1]
-    states: list[States] = [state]
-    all_P, all_values = np.empty((K, D, D)), np.empty((K, D - DIM))
-    all_P[-1], all_values[-1] = P, values
-    for k in range(K - 2, -1, -1):
-        Pp = forward.P_predicted[k + 1]
-        _, gain, info = dposv(Pp, forward.F[k] @ forward.P[k])
-        if info:
-            raise EstimationError(f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas")
-        C = gain.T
-        moved = np.concatenate([state.minus(forward.predicted[k + 1])[0], values - forward.values_predicted[k + 1]])
-        at, at_values, e = forward.states[k], forward.values[k], np.zeros(D)
-        if about is not None and k + 1 < n:
-            # both ends are steps from points, and only such steps add up
-            before = about.offset(k + 1, forward.predicted[k + 1], forward.values_predicted[k + 1])
-            moved, e = about.offset(k + 1, state, values) - before, about.offset(k, at, at_values)
-            at, at_values = about.at(k)
-        d = e + C @ moved
-        state, values = at.plus(d[None, :DIM]), at_values + d[DIM:]
-        P = forward.P[k] + C @ (P - Pp) @ C.T
-        P = 0.5 * (P + P.T)
-        states.append(state)
-        all_P[k], all_values[k] = P, values
+    states: list[States] = []
+    all_P, all_values, errors = np.empty((K, D, D)), np.empty((K, D - DIM)), np.zeros((n, D))
+    state, values, P = forward.states[K - 1 : K], forward.values[-1], forward.P[-1]
+    for k in range(K - 1, -1, -1):
+        if k < K - 1:
+            Pp, at = forward.P_predicted[k + 1], slice(k, k + 1)
+            _, gain, info = dposv(Pp, forward.F[k] @ forward.P[k])
+            if info:
+                raise EstimationError(f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas")
+            C = gain.T
+            if k + 1 < n:  # both ends are steps from points, and only such steps add up
+                errors[k] = forward.errors[k] + C @ (errors[k + 1] - forward.errors_predicted[k + 1])
+            else:
+                ahead = slice(k + 1, k + 2)
+                d = C @ np.concatenate([state.minus(before.states[ahead])[0], values - before.values[k + 1]])
+                state, values = forward.states[at].plus(d[None, :DIM]), forward.values[k] + d[DIM:]
+            P = forward.P[k] + C @ (P - Pp) @ C.T
+            P = 0.5 * (P + P.T)
+        if k >= n - 1:
+            states.append(state)
+            all_values[k] = values
+        if about is not None and k == n - 1:
+            errors[k] = np.concatenate([state.minus(about.states[k : k + 1])[0], values - about.values[k]])
+        all_P[k] = P
         if progress is not None and k % 256 == 0:
             progress("smoother", 1.0 - k / K)
+    if about is not None and n > 1:
+        first = moved(Points(about.states[: n - 1], about.values[: n - 1]), errors[:-1])
+        states.append(first.states)
+        all_values[: n - 1] = first.values
     return Smoothed(States.stack(states[::-1]), all_values, all_P)
 
 

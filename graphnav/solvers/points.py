@@ -1,0 +1,192 @@
+"""Where a filter takes its Jacobians: at its own estimate, or at points that are given.
+
+A filter goes from keyframe to keyframe with an estimate x and the covariance of its error, and asks one of these for
+the step to a keyframe and for the rows there. `AtEstimate` linearises where the filter is: x is a state and parameter
+values. `AtPoints` has linearised everything at once, at the points X of an earlier pass: x is the error state e with
+X_k [+] e_k the estimate, and (Bell 1994: one step of the iterated smoother)
+
+    e_{k+1} <- f(X_k) [-] X_{k+1} + F e_k     nu = -(r(X) + H e)
+
+A pass at given points takes a fifth of the time, and is the better one wherever the filter has gone astray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from graphnav import rotation
+from graphnav.constraints.base import Constraint, assemble
+from graphnav.dynamics import SCALE
+from graphnav.problem import ParameterChain, Problem
+from graphnav.rotation import Array
+from graphnav.solvers.passes import Points, shift
+from graphnav.state import DIM, States
+
+Rows = tuple[Array, Array, Array]  # residuals (n m,), Jacobian (n m, D) and sigmas (n m,)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A state of one row and parameter values (D-15,)."""
+
+    state: States
+    values: Array
+
+
+class AtEstimate:
+    """Steps and rows linearised where the filter is."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem, self._columns, self._scale = problem, problem.columns, problem.columns.get(SCALE)
+        self._width = DIM + sum(s.stop - s.start for s in self._columns.values())
+        self._steps = _node_steps(problem)
+
+    def step(self, k: int, x: Estimate) -> tuple[Estimate, Array, Array, Array | None]:
+        """The estimate at keyframe k from that at the one before, F (D, D), Q (15, 15), and more variance (D,)."""
+        motion, at, scale = self._problem.motion, slice(k - 1, k), self._scale
+        ahead, F15 = motion.propagate(at, x.state, None if scale is None else x.values[None, shift(scale)])
+        F = np.eye(self._width)
+        F[:DIM, :DIM] = F15[0]
+        if scale is not None:
+            F[:DIM, scale] = motion.scale_columns(at, F15)[0]
+        values, added = x.values, None
+        if k in self._steps:
+            values, added = values.copy(), np.zeros(self._width)
+            for column, chain, j in self._steps[k]:
+                F[column, column] *= chain.decay[j]
+                own = shift(column)
+                values[own] = chain.mean[j] + chain.decay[j] * (values[own] - chain.mean[j - 1])
+                added[column] = chain.sigma[j] ** 2
+        return Estimate(ahead, values), F, motion.noise(at, x.state.R_nb)[0], added
+
+    def rows(self, rows: Constraint, lo: int, hi: int, k: int, at: Estimate) -> Rows:
+        """Rows lo..hi of a constraint at keyframe k, linearised at an estimate."""
+        n = hi - lo
+        here = at.state if n == 1 else at.state[np.zeros(n, dtype=int)]
+        given = {p.name: at.values[None, shift(self._columns[p.name])] for p in rows.parameters}
+        if n > 1:
+            given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
+        linear = rows.linearize(here, given, slice(lo, hi))
+        H = assemble(linear, self._columns, self._width).reshape(-1, self._width)
+        return linear.residual.ravel(), H, linear.sigma.ravel()
+
+    @staticmethod
+    def about(x: Estimate, D: int) -> tuple[Estimate, Array]:
+        """What the rows of an update are linearised about, and the error state (D,) from there to x."""
+        return x, np.zeros(D)
+
+    @staticmethod
+    def passes(rows: Constraint) -> int:
+        """How often the rows of an update are linearised."""
+        return rows.passes
+
+    @staticmethod
+    def plus(at: Estimate, d: Array) -> Estimate:
+        """`at` moved by an error state."""
+        return Estimate(at.state.plus(d[None, :DIM]), at.values + d[DIM:])
+
+    @staticmethod
+    def minus(x: Estimate, at: Estimate) -> Array:
+        """The error state (D,) that leads from `at` to x."""
+        return np.concatenate([x.state.minus(at.state)[0], x.values - at.values])
+
+    @staticmethod
+    def speed(k: int, x: Estimate) -> float:
+        """m/s."""
+        return float(np.linalg.norm(x.state.v))
+
+
+class AtPoints:
+    """Steps and rows of the first n keyframes, all linearised at n points."""
+
+    def __init__(self, problem: Problem, points: Points) -> None:
+        self.points = points
+        n, columns, motion = len(points.values), problem.columns, problem.motion
+        D = DIM + points.values.shape[1]
+        begin, end, at = points.states[: n - 1], points.states[1:n], slice(0, n - 1)
+        scale = columns.get(SCALE)
+        ahead, F15 = motion.propagate(at, begin, None if scale is None else points.values[: n - 1, shift(scale)])
+        self.F = np.zeros((n - 1, D, D))
+        self.F[:] = np.eye(D)
+        self.F[:, :DIM, :DIM] = F15
+        if scale is not None:
+            self.F[:, :DIM, scale] = motion.scale_columns(at, F15)
+        self._Q = motion.noise(at, begin.R_nb)
+        values = points.values[: n - 1].copy()
+        self._added: dict[int, Array] = {}
+        for k, steps in _node_steps(problem).items():
+            if k >= n:
+                continue
+            added = self._added.setdefault(k, np.zeros(D))
+            for column, chain, j in steps:
+                self.F[k - 1, column, column] *= chain.decay[j]
+                own = shift(column)
+                values[k - 1, own] = chain.mean[j] + chain.decay[j] * (values[k - 1, own] - chain.mean[j - 1])
+                added[column] = chain.sigma[j] ** 2
+        self._gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
+        # Exp(gap) Exp(F e) = Exp(gap + J_r^-1(gap) F e)
+        turned = rotation.right_jacobian_inverse(self._gap[:, :3])
+        self.F[:, :3] = turned @ self.F[:, :3]
+        self._Q[:, :3] = turned @ self._Q[:, :3]
+        self._Q[:, :, :3] = self._Q[:, :, :3] @ np.swapaxes(turned, -1, -2)
+        self._speed = np.linalg.norm(points.states.v, axis=1)
+        self._rows: dict[str, Any] = {}
+        for rows in problem.constraints:
+            at_k = rows.keyframe[: int(np.searchsorted(rows.keyframe, n))]
+            if len(at_k):
+                given = {p.name: points.values[at_k, shift(columns[p.name])] for p in rows.parameters}
+                linear = rows.linearize(points.states[at_k], given, slice(0, len(at_k)))
+                self._rows[rows.name] = linear.residual, assemble(linear, columns, D), linear.sigma
+
+    def step(self, k: int, x: Array) -> tuple[Array, Array, Array, Array | None]:
+        """As `AtEstimate.step`, of error states (D,)."""
+        F = self.F[k - 1]
+        return self._gap[k - 1] + F @ x, F, self._Q[k - 1], self._added.get(k)
+
+    def rows(self, rows: Constraint, lo: int, hi: int, k: int, at: None) -> Rows:
+        """As `AtEstimate.rows`, linearised at the points."""
+        r, H, sigma = self._rows[rows.name]
+        return r[lo:hi].ravel(), H[lo:hi].reshape(-1, H.shape[2]), sigma[lo:hi].ravel()
+
+    @staticmethod
+    def about(x: Array, D: int) -> tuple[None, Array]:
+        """The points, which all error states are from."""
+        return None, x
+
+    @staticmethod
+    def passes(rows: Constraint) -> int:
+        """The points stay."""
+        return 1
+
+    @staticmethod
+    def plus(at: None, d: Array) -> Array:
+        """The points moved by an error state."""
+        return d
+
+    def speed(self, k: int, x: Array) -> float:
+        """m/s."""
+        return float(self._speed[k])
+
+
+def about_own(P: Array, e: Array) -> Array:
+    """Covariances (..., D, D) of errors about points turned into those about states e away from them.
+
+    Exp(e + x) = Exp(e) Exp(J_r(e) x) to first order in x.
+    """
+    J = rotation.right_jacobian(e[..., :3])
+    P = P.copy()
+    P[..., :3, :] = J @ P[..., :3, :]
+    P[..., :3] = P[..., :3] @ np.swapaxes(J, -1, -2)
+    return P
+
+
+def _node_steps(problem: Problem) -> dict[int, list[tuple[slice, ParameterChain, int]]]:
+    """At keyframes where a parameter moves on to its next node: its columns, its chain and that node."""
+    out: dict[int, list[tuple[slice, ParameterChain, int]]] = {}
+    for chain in problem.chains:
+        for k in np.flatnonzero(np.diff(chain.node)) + 1:
+            out.setdefault(int(k), []).append((problem.columns[chain.parameter.name], chain, int(chain.node[k])))
+    return out
