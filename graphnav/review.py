@@ -19,6 +19,7 @@ from graphnav.progress import Progress, tell
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solvers.ekf import ekf, refilter
+from graphnav.solvers.near import near
 from graphnav.solvers.passes import Filtered, Forward, Points, Smoothed, points_of, values_of
 from graphnav.solvers.rts import backward
 
@@ -100,7 +101,7 @@ class Review:
             if not before:
                 break
             apart = faults.widened(self.problem)
-            self.smoothed = self._smoothed(apart, refilter(apart, self._forward, self._progress))
+            _, self.smoothed = near(apart, self._forward, self._aligned.until, self._progress)
             self.problem = faults.readmitted(self.problem, self.smoothed)
             self._raise()
             self._watch(self.smoothed)
@@ -138,7 +139,7 @@ class Review:
             return
         other = faults.weighted(other, weights)
         about = points_of(other, self.smoothed.states, values_of(self.problem, self.smoothed))
-        smoothed = self._smoothed(other, refilter(other, about, self._progress))
+        _, smoothed = near(other, about, self._aligned.until, self._progress)
         self.problem, self._raised = judge_speeds(other, smoothed)
         self.notes, self._forward = says, self._filtered(self.problem)
         self.smoothed = self._smoothed(self.problem, self._forward)

@@ -16,7 +16,8 @@ from graphnav.judgement.speeds import contradiction
 from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
-from graphnav.solvers.ekf import ekf, refilter
+from graphnav.solvers.ekf import ekf
+from graphnav.solvers.near import near
 from graphnav.solvers.passes import Forward, Smoothed, points_of, values_of
 from graphnav.solvers.rts import backward
 from graphnav.state import States
@@ -154,12 +155,11 @@ class _Rounds:
 
     def _smoothed(self, how: Settings) -> tuple[Problem, Forward, Smoothed]:
         problem = self._posed(how)
-        forward: Forward
         if self._near is None or len(self._near[0]) != len(problem.t):
-            forward = ekf(problem, opening=self._aligned.until)
+            forward: Forward = ekf(problem, opening=self._aligned.until)
+            back = backward(problem, forward)
         else:
-            forward = refilter(problem, points_of(problem, *self._near))
-        back = backward(problem, forward)
+            forward, back = near(problem, points_of(problem, *self._near), self._aligned.until)
         self._near = back.states, values_of(problem, back)
         return problem, forward, back
 
