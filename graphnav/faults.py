@@ -21,6 +21,7 @@ from scipy.special import chdtri
 
 from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, assemble
 from graphnav.problem import Problem
+from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import Fault
 from graphnav.solvers import adaptive
@@ -95,6 +96,29 @@ def without(problem: Problem, faults: Iterable[Fault]) -> Problem:
             for fault in own:
                 weights[rows.name][(t >= fault.t_start - SAME_TIME) & (t <= fault.t_end + SAME_TIME)] = 0.0
     return weighted(problem, weights)
+
+
+def doubted(recording: Recording, problem: Problem) -> Recording:
+    """The recording with fixes as a problem weighs them: without those left out, the sigmas of others larger."""
+    gnss = recording.gnss
+    assert gnss is not None
+    weight = {"gnss_position": np.ones(len(gnss.t)), "gnss_velocity": np.ones(len(gnss.t))}
+    for rows in problem.constraints:
+        if rows.name in weight and rows.weight is not None:
+            t = problem.t[rows.keyframe]
+            at = np.clip(np.searchsorted(gnss.t, t - SAME_TIME), 0, len(gnss.t) - 1)
+            same = np.abs(gnss.t[at] - t) <= SAME_TIME
+            weight[rows.name][at[same]] = rows.weight[same]
+    p, v = weight["gnss_position"][:, None], weight["gnss_velocity"][:, None]
+    with np.errstate(divide="ignore"):
+        gnss = replace(
+            gnss,
+            llh=np.where(p > 0.0, gnss.llh, np.nan),
+            sd=gnss.sd / np.sqrt(p),
+            v=None if gnss.v is None else np.where(v > 0.0, gnss.v, np.nan),
+            sd_v=None if gnss.sd_v is None else gnss.sd_v / np.sqrt(v),
+        )
+    return replace(recording, gnss=gnss)
 
 
 def all_used(problem: Problem) -> Problem:

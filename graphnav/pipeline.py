@@ -114,7 +114,6 @@ def _solve(
     began = time.perf_counter()
     tell("detection")
     found = detect(recording, settings)
-    stationary = found.stationary
     detected = time.perf_counter()
     tell("alignment")
     aligned = align(
@@ -127,8 +126,8 @@ def _solve(
     found_heading = aligned.motion is not None  # without motion heading zero is only a convention
     astray = found_heading and bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
 
-    review = Review(recording, settings, frame, aligned, aligned if astray else stated, stationary, progress)
-    problem, forward, smoothed = review.problem, review.forward, review.smoothed
+    review = Review(recording, settings, frame, aligned, aligned if astray else stated, found, progress)
+    problem, forward, smoothed, found = review.problem, review.forward, review.smoothed, review.detections
     timings = {"detection": detected - began, "alignment": after - detected, **review.timings}
     wrong = faults.spans(problem, smoothed)
     said = (*review.notes, *faults.notes(wrong, problem))

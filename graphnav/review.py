@@ -9,9 +9,13 @@ from __future__ import annotations
 
 import time
 
+import numpy as np
+
 from graphnav import faults
 from graphnav.alignment import Alignment
 from graphnav.config import Settings
+from graphnav.constraints.gnss import GnssPosition, GnssVelocity
+from graphnav.detectors import Detections, detect
 from graphnav.earth import LocalFrame
 from graphnav.judgement import calmer, judge_speeds, judged
 from graphnav.problem import Problem, pose
@@ -34,7 +38,7 @@ class Review:
     ----------
     aligned : what was found of the start.
     begin : what the problem begins with; the same, but for a heading that is stated.
-    stationary : (M, 2) s, spans at rest.
+    detections : where the platform stands, by all fixes.
 
     Raises
     ------
@@ -49,10 +53,10 @@ class Review:
         frame: LocalFrame,
         aligned: Alignment,
         begin: Alignment,
-        stationary: Array,
+        detections: Detections,
         progress: Progress | None,
     ) -> None:
-        self._recording, self._settings, self._frame, self._stationary = recording, settings, frame, stationary
+        self._recording, self._settings, self._frame, self.detections = recording, settings, frame, detections
         self._aligned, self._begin, self._progress = aligned, begin, progress
         self.timings = {"judgement": 0.0, "preintegration": 0.0, "smoother": 0.0}
         # most fixes contradict the filter, or nobody asks whether they do
@@ -69,6 +73,7 @@ class Review:
                 self._review()
         if faults.count(self.problem):
             self._calm()
+            self._stand()
         if not isinstance(self._forward, Filtered):
             self._forward = ekf(self.problem, progress, aligned.until)
             self.smoothed = self._smoothed(self.problem, self._forward)
@@ -79,7 +84,7 @@ class Review:
 
     def _posed(self, wrong: tuple[faults.Fault, ...] = ()) -> tuple[Problem, tuple[str, ...]]:
         """The problem with its figures judged, without spans of wrong fixes, and what is to be said of it."""
-        frame, aligned, stationary, began = self._frame, self._aligned, self._stationary, time.perf_counter()
+        frame, aligned, stationary, began = self._frame, self._aligned, self.detections.stationary, time.perf_counter()
         tell("judgement")
         recording, how, said = judged(
             self._recording, self._settings, frame, aligned, stationary, wrong, self._overruled
@@ -131,6 +136,27 @@ class Review:
             forward = self._filtered(self.problem, about)
         self._forward = forward
 
+    def _stand(self) -> None:
+        """Look for stops again without the wrong fixes: they may have spoken of motion where there was none."""
+        found = detect(faults.doubted(self._recording, self.problem), self._settings)
+        if not _differ(found.stationary, self.detections.stationary):
+            return
+        self.detections = found
+        old, begin = self.problem, self._begin
+        weights = {
+            c.name: c.weight
+            for c in old.constraints
+            if isinstance(c, GnssPosition | GnssVelocity) and c.weight is not None
+        }
+        self.problem = faults.weighted(
+            pose(old.recording, old.settings, self._frame, begin.state, begin.sigma, found.stationary), weights
+        )
+        self._forward, self._raised = self._filtered(self.problem), ()
+        self.smoothed = self._smoothed(self.problem, self._forward)
+        if self._raise():
+            self._forward = self._filtered(self.problem)
+            self.smoothed = self._smoothed(self.problem, self._forward)
+
     def _calm(self) -> None:
         """Judge the IMU once more: what faults did to the states around them may have passed for its noise."""
         weights = {c.name: c.weight for c in self.problem.constraints if c.weight is not None}
@@ -151,3 +177,10 @@ class Review:
 
     def _smoothed(self, problem: Problem, forward: Forward) -> Smoothed:
         return backward(problem, forward, self._progress)
+
+
+def _differ(a: Array, b: Array) -> bool:
+    """Whether one has a stop that the other has nothing of."""
+    return any(
+        not np.any((other[:, 0] < end) & (other[:, 1] > begin)) for one, other in ((a, b), (b, a)) for begin, end in one
+    )

@@ -23,6 +23,8 @@ from graphnav.rotation import Array
 WINDOW = 32  # fixes, most of which are loud where there is noise
 _NEAR = 17  # fixes whose median is the factor
 _FALSE_ALARM = 1e-7  # per window
+_UNUSUAL = 1e-3  # chance of an excess that is not the usual
+_APART = 4.0  # ratio of medians of nine that is no chance: three of its standard deviations
 
 
 def _loud_above(m: int) -> float:
@@ -62,6 +64,19 @@ def _excess(r: Array, sigma: Array, predicted: Array) -> Array:
     return np.asarray(np.sum((r / sigma) ** 2, axis=1) / _median(m) - np.mean(predicted / sigma**2, axis=1))
 
 
+def _usual(excess: Array, m: int) -> Array:
+    """(N,) what is usual around each fix: by those on both sides, or where these clearly differ by its own side.
+
+    That is the calmer side, unless its own excess is more than that side explains.
+    """
+    side, off = _NEAR // 2 + 1, _NEAR // 4
+    both = median_filter(excess, _NEAR, mode="nearest")
+    before, after = (np.maximum(1.0, median_filter(excess, side, mode="nearest", origin=at)) for at in (off, -off))
+    calm, loud = np.minimum(before, after), np.maximum(before, after)
+    own = np.where(excess <= calm * float(chdtri(m, _UNUSUAL)) / _median(m), calm, loud)
+    return np.where(loud > _APART * calm, own, both)
+
+
 def factors(r: Array, sigma: Array, predicted: Array, always: bool = False) -> Array:
     """(N,) factors on the variances of fixes, seen from both sides.
 
@@ -72,7 +87,7 @@ def factors(r: Array, sigma: Array, predicted: Array, always: bool = False) -> A
     """
     if len(r) < WINDOW:
         return np.ones(len(r))
-    f = np.maximum(1.0, median_filter(_excess(r, sigma, predicted), _NEAR, mode="nearest"))
+    f = np.maximum(1.0, _usual(_excess(r, sigma, predicted), r.shape[1]))
     if always:
         return f
     loud = _loud(r, sigma**2 + predicted, _loud_above(r.shape[1])).astype(float)
