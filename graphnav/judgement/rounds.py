@@ -96,7 +96,7 @@ class _Rounds:
         if fixes is not None and fixes.types:
             problem, forward, back, fixes = self._by_type(problem, forward, back, fixes)
         elif self._part is not part:  # types do not differ: what is judged on is as long as ever
-            self._part = part
+            self._part, self._near = part, None
             problem, forward, back = self._checked()
             fixes = judge_fixes(problem, back, together=True)
         plain, together = self._plain, fixes is not None and not fixes.types
@@ -110,7 +110,7 @@ class _Rounds:
                 fixes = judge_fixes(problem, back, together)
         return fixes
 
-    def _checked(self) -> tuple[Problem, Filtered, Smoothed]:
+    def _checked(self) -> tuple[Problem, Forward, Smoothed]:
         """The part smoothed with all errors as white, outliers weighed as such."""
         plain, self._weight = self._plain, {}
         try:
@@ -128,8 +128,8 @@ class _Rounds:
         return problem, forward, back
 
     def _by_type(
-        self, problem: Problem, forward: Filtered, back: Smoothed, fixes: FixQuality
-    ) -> tuple[Problem, Filtered, Smoothed, FixQuality]:
+        self, problem: Problem, forward: Forward, back: Smoothed, fixes: FixQuality
+    ) -> tuple[Problem, Forward, Smoothed, FixQuality]:
         """The part smoothed with a factor for each type, and what it says of them, in rounds.
 
         What is far better than the rest is seen for what it is only once the rest has less weight.
