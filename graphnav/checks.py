@@ -32,6 +32,7 @@ from graphnav.checks_imu import (
     saturation,
 )
 from graphnav.checks_stated import (
+    fix_types,
     lever_arms,
     rounded_positions,
     stated_noise,
@@ -81,6 +82,8 @@ _UNITS = {"hz": "Hz", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s2"}
 
 
 def _show(name: str, value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(_show(*one) for one in value.items())
     words = name.split("_")
     unit = _UNITS.get(words[-1], "") if len(words) > 1 else ""
     number = f"{value:.6g}" if isinstance(value, float) else str(value)
@@ -118,6 +121,7 @@ def inspect(recording: Recording) -> Inspection:
         facts["gnss"] = _gnss_facts(recording, track)
         findings += gnss_coverage(recording)
         findings += rounded_positions(recording.gnss)
+        findings += fix_types(recording.gnss)
         wrong = list(velocities(recording.gnss))
         findings += wrong or gnss_jumps(recording, track)  # against wrong velocities every position jumps
     if vehicle and overlap and track is not None and recording.gnss is not None:
@@ -161,6 +165,8 @@ def _gnss_facts(recording: Recording, track: Track | None) -> dict[str, Any]:
     assert gnss is not None
     facts: dict[str, Any] = {"rows": 1} if len(gnss.t) == 1 else _sensor_facts(gnss.t)
     facts["velocities"] = 0 if gnss.v is None else int((~np.isnan(gnss.v[:, 0])).sum())
+    if gnss.types:
+        facts["types"] = gnss.types
     if track is not None:
         dt = np.diff(track.t)
         near = dt < 5 * max(1.0, track.period)

@@ -8,6 +8,7 @@ import numpy as np
 
 from graphnav import crosschecks
 from graphnav.crosschecks import Track
+from graphnav.draft.guesses import fix_numbers
 from graphnav.earth import LocalFrame
 from graphnav.findings import Finding
 from graphnav.recording import Gnss, ImuNoise, Recording, Truth
@@ -73,6 +74,15 @@ def rounded_positions(gnss: Gnss) -> Iterator[Finding]:
                     "log more digits, or state a larger sd",
                 )
             return
+
+
+def fix_types(gnss: Gnss) -> Iterator[Finding]:
+    """Types in the numbers of GGA's quality, which differ."""
+    if gnss.type is not None and (guess := fix_numbers(gnss.type, gnss.sd[:, 0])).value == "nmea":
+        sentence = (
+            f'types of the fixes look like GGA\'s qualities: {guess.why}; say units = {{ type = "nmea" }} in [gnss]'
+        )
+        yield Finding("warning", sentence)
 
 
 def velocities(gnss: Gnss) -> Iterator[Finding]:

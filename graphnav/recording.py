@@ -43,6 +43,10 @@ class Imu:
     noise_assumed: bool = False  # True when the recording states no noise figures
 
 
+# Types of fixes by RTKLIB's quality numbers (SOLQ_FIX to SOLQ_PPP of rtklib.h); 0 where a fix says nothing
+FIX_TYPES = {0: "unknown", 1: "fixed", 2: "float", 3: "sbas", 4: "differential", 5: "single", 6: "ppp"}
+
+
 @dataclass(frozen=True)
 class Gnss:
     """Position and optional velocity of the antenna; NaN where an epoch has none."""
@@ -53,6 +57,26 @@ class Gnss:
     v: Array | None = None  # (M, 3) m/s, local ENU
     sd_v: Array | None = None  # (M, 3) m/s
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
+    type: NDArray[np.intp] | None = None  # (M,) of FIX_TYPES; None: no fix says of what type it is
+
+    @property
+    def types(self) -> dict[str, int]:
+        """How many fixes there are of each type, by its name; empty where none says."""
+        if self.type is None:
+            return {}
+        return {name: n for k, name in FIX_TYPES.items() if (n := int(np.count_nonzero(self.type == k)))}
+
+
+def fix_types(said: Array, numbers: dict[int, int] | None = None) -> NDArray[np.intp] | None:
+    """Types (N,) of what a log says, by its own numbers -> those of `FIX_TYPES`; None if it says nothing anywhere.
+
+    Without `numbers` they are those of `FIX_TYPES`. Blanks (NaN) and numbers that mean none are 0.
+    """
+    numbers = {k: k for k in FIX_TYPES} if numbers is None else numbers
+    found = np.zeros(len(said), dtype=np.intp)
+    for theirs, ours in numbers.items():
+        found[said == theirs] = ours
+    return found if found.any() else None
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ class Trajectory:
     gyro_bias: Array | None = None  # (K, 3) rad/s, RFU
     accel_bias: Array | None = None  # (K, 3) m/s^2, RFU
     covariance: Array | None = None  # (K, 9, 9)
+    fix_type: Array | None = None  # (K,) where it is of a receiver: its numbers, NaN where unknown
     frame: str = "geodetic"  # "local": llh then holds metres x, y, z of unknown origin and yaw
     name: str = ""
     notes: tuple[str, ...] = field(default=())

@@ -188,6 +188,17 @@ MISTAKES: dict[str, list[Mistake]] = {
         ),
         Mistake("gravity taken out, as phones do", change("imu", _no_gravity), ("gravity seems to have been removed",)),
         Mistake("wheel speed in km/h", scaled("odometer", "speed_mps", 3.6), ("in km/h", 'speed = "km/h"')),
+        Mistake(
+            "GGA's quality taken for the type of a fix",
+            change("gnss", lambda c: {**c, "type": np.full(len(c["t_s"]), 4.0)}),
+            ("GGA's qualities", 'type = "nmea"'),
+        ),
+        Mistake(
+            "a quality that is no type of fix",
+            change("gnss", lambda c: {**c, "type": np.full(len(c["t_s"]), 9.0)}),
+            ("line 2, column 'type'", "9 is no type of fix", "1 fixed", "5 single"),
+            error=True,
+        ),
         Mistake("GNSS velocity in km/h", scaled("gnss", "ve_mps vn_mps vu_mps", 3.6), ("km/h", 'speed = "km/h"')),
         Mistake(
             "latitude and longitude in radians",

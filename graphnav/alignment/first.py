@@ -42,4 +42,6 @@ def some(gnss: Gnss, rows: Array) -> Gnss:
     pick = {"t": gnss.t[rows], "llh": gnss.llh[rows], "sd": gnss.sd[rows]}
     if gnss.v is not None and gnss.sd_v is not None:
         pick |= {"v": gnss.v[rows], "sd_v": gnss.sd_v[rows]}
+    if gnss.type is not None:
+        pick["type"] = gnss.type[rows]
     return replace(gnss, **pick)

@@ -80,8 +80,7 @@ def settings_text(settings: Settings) -> str:
             if isinstance(value, BaseModel):
                 nested[name] = value
                 continue
-            # JSON's numbers, texts and lists are TOML's as well
-            said = f"# {name} =" if value is None else f"{name} = {json.dumps(value)}"
+            said = f"# {name} =" if value is None else f"{name} = {_toml(value)}"
             lines.append(f"{said:<30} # {field.description}")
         for name, inner in nested.items():
             place = f"{at}.{name}" if at else name
@@ -91,3 +90,10 @@ def settings_text(settings: Settings) -> str:
 
     table(settings, "")
     return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    """A value of a setting; JSON's numbers, texts and lists are TOML's as well."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_toml(one)}" for key, one in value.items()) + " }"
+    return json.dumps(value)

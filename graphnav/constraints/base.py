@@ -75,7 +75,7 @@ class Constraint(ABC):
     keyframe: Array  # (N,) int, ascending
     parameters: tuple[Parameter, ...] = ()
     robust: str = "none"
-    robust_scale: float = 3.0
+    robust_scale: float | Array = 3.0  # or (N,)
     graduation: float = np.inf  # mu of graduated non-convexity; infinite at its end
     gate: float | None = None
     watched: bool = False  # for errors that last
@@ -85,6 +85,10 @@ class Constraint(ABC):
 
     def __len__(self) -> int:
         return len(self.keyframe)
+
+    def scale_of(self, rows: slice | Array) -> float | Array:
+        """Scale of the kernel for some rows."""
+        return self.robust_scale[rows] if isinstance(self.robust_scale, np.ndarray) else self.robust_scale
 
     @classmethod
     @abstractmethod

@@ -23,10 +23,14 @@ dt: the ratio of their spectra at zero frequency. A kernel then weighs the fix b
 as one,
 
     cost = rho_k(s) / n,    which is rho of s / sqrt(n) with the scale k / sqrt(n).
+
+Where fixes are of several types and the data tell them apart, all this is of each type: sigmas, shares, how long errors
+last, and slow processes, for what fixed and single-point fixes are wrong by has nothing to do with each other.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -35,14 +39,16 @@ from scipy.ndimage import median_filter
 
 from graphnav import earth, rotation
 from graphnav.config import Settings
+from graphnav.config.gnss import GnssSettings, of_type
 from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
-from graphnav.recording import Imu, Recording
+from graphnav.recording import FIX_TYPES, Gnss, Imu, Recording
 from graphnav.rotation import Array, mv
 from graphnav.state import Parameter, States
 
 LEVER_ARM = "gnss_lever_arm"
 TIME_OFFSET = "gnss_time_offset"
 SLOW_ERRORS = ("gnss_error_of_minutes", "gnss_error_of_hours")
+_NO_KERNEL = 1e6  # a scale beyond which no fix is
 VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
 _I3 = np.eye(3)
 _MINUTE = 60.0  # s
@@ -69,11 +75,14 @@ def _common(scene: Scene, offset: str) -> dict[str, Any]:
         parameters.append(Parameter(LEVER_ARM, gnss.lever_arm, np.full(3, settings.lever_arm_sigma), "m"))
     if settings.time_offset_sigma > 0:
         parameters.append(Parameter(offset, np.zeros(1), np.full(1, settings.time_offset_sigma), "s"))
+    said = settings.outliers
+    if isinstance(said["robust_scale"], Mapping):  # of positions, by type
+        said["robust_scale"] = GnssSettings().robust_scale
     return {
         "parameters": tuple(parameters),
         "watched": settings.faults != "off",
         "adaptive": settings.adaptive,
-        **settings.outliers,
+        **said,
     }
 
 
@@ -93,6 +102,7 @@ class GnssPosition(Constraint):
     omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
     stated: Array = field(default_factory=lambda: _empty(0, 3))  # sigma of the whole error
     usual: Array = field(default_factory=lambda: _empty(0, 3))  # the same, smoothed: the unit of slow errors
+    type: Array | None = None  # (N,) of graphnav.recording.FIX_TYPES
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -111,28 +121,43 @@ class GnssPosition(Constraint):
             return None
         llh = gnss.llh[used]
         s = scene.settings.gnss
-        factor = s.sd_factor or 1.0
-        every = np.array([factor, factor, s.up_factor or factor]) * gnss.sd
-        stated = every[used]
         common = _common(scene, TIME_OFFSET)
-        share = s.slow_share or 0.0
-        alike = as_one(s.fast_time or 0.0, gnss.t)
-        if alike > 1.0:
-            common["robust_scale"] = s.robust_scale / np.sqrt(alike)
-            if s.robust == "automatic":
-                common["robust"] = "cauchy"
-        if share > 0:
-            sigma = np.full(3, np.sqrt(0.5 * share))
-            for name, time in zip(SLOW_ERRORS, s.slow_times, strict=True):
-                slow = Parameter(name, np.zeros(3), sigma, "sd", correlation_time=time)
-                common["parameters"] = (*common["parameters"], slow)
+        rows: dict[str, Any] = {}
+        kinds = _groups(s, gnss)
+        for kind, own in kinds:
+            name = FIX_TYPES[kind or 0]
+            factor, share = of_type(s.sd_factor, name, 1.0), of_type(s.slow_share, name, 0.0)
+            every = np.array([factor, factor, of_type(s.up_factor, name, factor)]) * gnss.sd[own]
+            alike = as_one(of_type(s.fast_time, name, 0.0), gnss.t[own])
+            scale = of_type(s.robust_scale, name, _NO_KERNEL) / np.sqrt(alike)
+            parts = {
+                "sigma": np.sqrt((1.0 - share) * alike) * every,
+                "stated": every,
+                "usual": _usual(gnss.t[own], every) if scene.usual is None else scene.usual,
+                "scale": np.full(len(every), scale),
+            }
+            for key, part in parts.items():
+                rows.setdefault(key, np.empty((len(gnss.t), *part.shape[1:])))[own] = part
+            if alike > 1.0:
+                common["robust_scale"] = scale
+                if s.robust == "automatic":
+                    common["robust"] = "cauchy"
+            if share > 0:
+                sigma = np.full(3, np.sqrt(0.5 * share))
+                for slow, time in zip(SLOW_ERRORS, s.slow_times, strict=True):
+                    slow = slow if kind is None else f"{slow}_{name}"
+                    process = Parameter(slow, np.zeros(3), sigma, "sd", correlation_time=time)
+                    common["parameters"] = (*common["parameters"], process)
+        if len(kinds) > 1 and common["robust"] not in ("none", "gnc"):
+            common["robust_scale"] = rows["scale"][used]
         return cls(
             keyframe=keyframe[used],
             p_n=scene.frame.from_llh(llh),
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
-            sigma=np.sqrt((1.0 - share) * alike) * stated,
-            stated=stated,
-            usual=(_usual(gnss.t, every) if scene.usual is None else scene.usual)[used],
+            sigma=rows["sigma"][used],
+            stated=rows["stated"][used],
+            usual=rows["usual"][used],
+            type=None if gnss.type is None else gnss.type[used],
             lever_arm=gnss.lever_arm,
             gyro=around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
             omega_n=scene.frame.omega_n,
@@ -155,11 +180,19 @@ class GnssPosition(Constraint):
                 if block != LEVER_ARM or LEVER_ARM in parameters:
                     jacobians[block] = jacobians.get(block, 0.0) + C @ moved[block] * offset[..., None]
             jacobians[TIME_OFFSET] = mv(C, velocity)[..., None]
-        for name in SLOW_ERRORS:
-            if name in parameters:
-                residual = residual + self.usual[rows] * parameters[name]
-                jacobians[name] = self.usual[rows][..., None] * _I3
+        for name in parameters:
+            if name.startswith(SLOW_ERRORS):
+                size = self.usual[rows] * self._of(name, rows)
+                residual = residual + size * parameters[name]
+                jacobians[name] = size[..., None] * _I3
         return Linearized(residual, jacobians, self.sigma[rows])
+
+    def _of(self, name: str, rows: slice | Array) -> float | Array:
+        """Whose a slow process is: 1 where it is the error of a fix, 0 where the fix is of another type."""
+        if self.type is None or name in SLOW_ERRORS:
+            return 1.0
+        kind = next(k for k, kind in FIX_TYPES.items() if name.endswith(kind))
+        return np.asarray(self.type[rows] == kind, dtype=float)[..., None]
 
 
 @dataclass(frozen=True)
@@ -222,6 +255,15 @@ class GnssVelocity(Constraint):
             jacobians["theta"] = jacobians["theta"] - CR @ rotation.skew(force) * offset[..., None]
             jacobians |= {"ba": -CR * offset[..., None], VELOCITY_TIME_OFFSET: change[..., None]}
         return Linearized(residual, jacobians, self.sigma[rows])
+
+
+def _groups(settings: GnssSettings, gnss: Gnss) -> list[tuple[int | None, Array | slice]]:
+    """Fixes that are treated alike: a type and its rows, or None and all rows where settings know no types."""
+    tables = (settings.sd_factor, settings.slow_share, settings.fast_time, settings.up_factor, settings.robust_scale)
+    if not any(isinstance(value, Mapping) for value in tables):
+        return [(None, slice(None))]
+    kinds = np.zeros(len(gnss.t), dtype=int) if gnss.type is None else gnss.type
+    return [(int(kind), kinds == kind) for kind in np.unique(kinds)]
 
 
 def period(t: Array) -> float:

@@ -159,11 +159,21 @@ class _Writer:
         values = source.values
         late = agreement.late_velocity
         dropped = ("ve", "vn", "vu", "vd", "speed", "course") if late else ()
+        numbers = None
+        if "type" in values:
+            sd = values.get("sd_e")
+            numbers = guesses.fix_numbers(values["type"], sd)
+            theirs = source.columns.names["type"]
+            if numbers.value is None and theirs != "type":
+                dropped = (*dropped, "type")
+                self.decisions.append(f"types of fixes: column '{theirs}' is left alone: {numbers.why}")
         self._file(source, dropped)
         if source.log is None:
             if "h" not in values:
                 raise RecordingError(f"{source.path}: no column of heights beside {source.columns.names['lat']}")
             units = {"t": source.t_unit}
+            if numbers is not None and numbers.value is not None:
+                units["type"] = numbers
             if source.radians:
                 units["angle"] = Guess("rad", "lat and lon are all small enough")
             if {"speed", "course"} <= values.keys() and "ve" not in values and not late:
@@ -228,7 +238,7 @@ class _Writer:
             self.lines.append(f"columns = {{ {pairs} }}")
 
     def _units(self, units: dict[str, Guess]) -> None:
-        default = {"t": "s", "gyro": "rad/s", "accel": "m/s2", "angle": "deg", "speed": "m/s"}
+        default = {"type": "rtklib", "t": "s", "gyro": "rad/s", "accel": "m/s2", "angle": "deg", "speed": "m/s"}
         self.decisions += [f"{key} in {guess.value}: {guess.why}" for key, guess in units.items()]
         other = {key: guess for key, guess in units.items() if guess.value != default[key]}
         if other:

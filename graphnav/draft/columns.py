@@ -48,6 +48,10 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
         r"course(?:_over_ground)?|cog", r"(?:.*_)?(?:bearing|track|course|head_mot|motion_heading|heading_of_motion)",
         r"heading",
     ),
+    "type": (
+        r"type", r"q", r"(?:.*_)?(?:fix|gps|gnss|gga|nmea|sol|solution|rtk)_?(?:q|qual\w*|type|status|flag)",
+        r"quality|q_?flag",
+    ),
 }  # fmt: skip
 
 UNITS = {

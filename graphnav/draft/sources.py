@@ -22,7 +22,7 @@ _WANTED = {
     "imu": ("t", "gx", "gy", "gz", "ax", "ay", "az"),
     "gyro": ("t", "gx", "gy", "gz"),
     "accel": ("t", "ax", "ay", "az"),
-    "gnss": ("t", "lat", "lon", "h", "sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "vd", "speed", "course"),
+    "gnss": ("t", "lat", "lon", "h", "sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "vd", "speed", "course", "type"),
     "odometer": ("t", "speed", *WHEELS),
 }
 _NEEDED = {"gnss": 4, "odometer": 2}  # of those, how many must be there in a row
@@ -151,10 +151,20 @@ def _look(path: Path) -> dict[str, Source]:
     return {role: _read(path, columns, role) for role in roles}
 
 
+def _numbers(path: Path, name: str) -> bool:
+    """Whether a column holds numbers and blanks alone."""
+    try:
+        return len(read_table(path, (name,))) > 0
+    except RecordingError:
+        return False
+
+
 def _read(path: Path, columns: matching.Columns, role: str) -> Source:
     """The columns of one sensor, rows that hold all it needs, in order of time."""
     wanted = _WANTED[role]
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in wanted}
+    if "type" in names and not _numbers(path, names["type"]):
+        del names["type"]
     table = read_table(path, tuple(names), (), names)
     needed = [n for n in wanted[: _NEEDED.get(role, len(wanted))] if n in names]
     whole = np.isfinite(table.stack(*needed)).all(-1)

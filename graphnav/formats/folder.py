@@ -18,6 +18,7 @@ from graphnav.formats.repair import (
     DEFAULT_SD,
     DEFAULT_SD_V,
     Remarks,
+    fixes_by_type,
     geodetic,
     horizontal_velocity,
     sigmas,
@@ -143,7 +144,8 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
         remarks.add(sentence)
     elif there:
         remarks.add(f"GNSS velocities need ve, vn and vu; only {', '.join(there)} is there, so none are used")
-    return Gnss(rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm))
+    kinds = fixes_by_type(rows, d.units.type) if "type" in rows else None
+    return Gnss(rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds)
 
 
 def _odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odometer:

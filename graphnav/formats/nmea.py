@@ -16,8 +16,8 @@ from graphnav.errors import RecordingError
 from graphnav.formats import ubx
 from graphnav.formats.clocks import of_week, utc_to_gps
 from graphnav.formats.registry import Log, extra, first_bytes, log_format
-from graphnav.formats.repair import DEFAULT_SD, DEFAULT_SD_V, Remarks, horizontal_velocity
-from graphnav.recording import Gnss
+from graphnav.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES, Remarks, horizontal_velocity
+from graphnav.recording import Gnss, fix_types
 from graphnav.rotation import Array
 
 KNOTS = 1852 / 3600  # m/s
@@ -94,7 +94,9 @@ def load(path: Path) -> Log:
     order = order[np.concatenate([[True], np.diff(t[order]) > 0]) & np.isfinite(llh[order]).all(-1)]
     if len(order) < len(t):
         remarks.add(f"{len(t) - len(order)} fixes without a height or with the time of another were left out")
-    gnss = Gnss(t[order], llh[order], sd[order], None if v is None else v[order], None if sd_v is None else sd_v[order])
+    kinds = fix_types(np.array([e.gga.quality for e in fixes])[order], NMEA_TYPES)
+    v, sd_v = (None if x is None else x[order] for x in (v, sd_v))
+    gnss = Gnss(t[order], llh[order], sd[order], v, sd_v, type=kinds)
     remarks.add("GNSS: position of the antenna; its lever arm is not in the log and taken as zero")
     return Log(path.stem, gnss=gnss, gps_zero=zero, remarks=tuple(remarks))
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphnav.errors import RecordingError
 from graphnav.formats.schema import TIME, Keep
 from graphnav.formats.table import Mask, Table
+from graphnav.recording import FIX_TYPES, fix_types
 from graphnav.rotation import Array
 
 _LABEL = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"}
@@ -19,6 +21,11 @@ _RADIANS = (1.58, 3.15)  # |lat|, |lon| that angles in radians cannot exceed
 DEFAULT_SD = (3.3, 3.3, 6.6)  # m
 # The same section's 0.2 m/s (95 %, one axis) is for the open sky; twice its sigma for a vehicle among buildings.
 DEFAULT_SD_V = (0.2, 0.2, 0.4)  # m/s
+
+
+# GGA's quality (NMEA 0183; 9 as NovAtel's OEM7 writes it) -> RTKLIB's number. 3, a military fix, is none of these; 6,
+# 7 and 8 are no fixes, but estimated, told or simulated.
+NMEA_TYPES = {0: 0, 1: 5, 2: 4, 3: 0, 4: 1, 5: 2, 9: 3}
 
 
 class Remarks(list[str]):
@@ -188,6 +195,24 @@ def sigmas(
     if stated is None and (n := (blank.any(-1) & used).sum()):
         remarks.add(f"{assumed} where the file's own are blank ({n} of {len(rows)} rows)")
     return np.where(blank, fallback, sd)
+
+
+def fixes_by_type(rows: Table, numbers: str) -> NDArray[np.intp] | None:
+    """Types (N,) of the fixes of a table with a column of them, in the numbers of "rtklib" or "nmea".
+
+    Raises
+    ------
+    RecordingError
+        For a number that is no type, naming the line and the numbers there are.
+    """
+    said, known = rows["type"], NMEA_TYPES if numbers == "nmea" else {k: k for k in FIX_TYPES}
+    bad = np.flatnonzero(~np.isnan(said) & ~np.isin(said, list(known)))
+    if len(bad):
+        there = ", ".join(f"{k} {FIX_TYPES[ours]}" for k, ours in known.items() if ours)
+        hint = "" if numbers == "nmea" else '; if they are GGA\'s, say units = { type = "nmea" }'
+        where = rows.where(bad[0], "type")
+        raise RecordingError(f"{where}: {said[bad[0]]:g} is no type of fix: {there}, blank where unknown{hint}")
+    return fix_types(said, known)
 
 
 # 1-sigma of a vertical velocity that is taken as zero because a receiver gives only speed and course: a slope of 10 %

@@ -7,7 +7,7 @@ those of the headers. Read by rosbags, without ROS.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,12 @@ from graphnav.formats.clocks import unix_to_gps
 from graphnav.formats.registry import Log, extra, log_format
 from graphnav.formats.repair import DEFAULT_SD, DEFAULT_SD_V, Remarks
 from graphnav.formats.schema import rotation_from_letters
-from graphnav.recording import Gnss, Imu, ImuNoise, Odometer
+from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, fix_types
 from graphnav.rotation import Array
 
 _IMU, _FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
 _TWISTS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped", "nav_msgs/msg/Odometry")
+_STATUS = {0: 5, 1: 3, 2: 4}  # of a NavSatFix: unaugmented, of satellites, of a base (carrier phases or not)
 _UNIX = 1e9  # s; stamps above are dates
 _SIDEWAYS = 0.2  # a body moves ahead; a velocity whose second component is larger than this is in east-north-up
 
@@ -155,7 +156,9 @@ def _gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
     if not known.all():
         remarks.add(f"{topic.name}: {np.sum(~known)} fixes without a covariance get sigmas of 3.3, 3.3, 6.6 m")
     remarks.add(f"GNSS: {topic.name}; heights above the ellipsoid; the antenna's lever arm is taken as zero")
-    return Gnss(t, np.column_stack([np.radians(rows[:, :2]), rows[:, 2]]), sd)
+    # many drivers write 0 whatever the fix is: where no other status is to be seen, it says nothing
+    kinds = fix_types(rows[:, 6], _STATUS) if rows[:, 6].any() else None
+    return Gnss(t, np.column_stack([np.radians(rows[:, :2]), rows[:, 2]]), sd, type=kinds)
 
 
 def _twist(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> tuple[Gnss | None, Odometer | None]:
@@ -180,7 +183,7 @@ def _twist(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> tuple[Gnss | N
         f"velocity: {topic.name}, taken as east-north-up because it points sideways as well; at {np.sum(same)} of "
         f"{len(gnss.t)} fixes, sigmas of 0.2, 0.2, 0.4 m/s"
     )
-    return Gnss(gnss.t, gnss.llh, gnss.sd, v, sd_v), None
+    return replace(gnss, v=v, sd_v=sd_v), None
 
 
 FORMAT = log_format("ros", "ROS 1 or ROS 2 bags and MCAP files", recognises, load)

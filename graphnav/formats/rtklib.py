@@ -15,7 +15,7 @@ from graphnav.formats.registry import Log, first_bytes, log_format
 from graphnav.formats.repair import Remarks
 from graphnav.formats.text import text_lines
 from graphnav.formats.trajectories import read_trajectory
-from graphnav.recording import Gnss
+from graphnav.recording import Gnss, fix_types
 
 _JST = 9 * 3600.0  # s ahead of UTC
 # 1-sigma of a receiver's own single-point velocity where the file states none (see folder.DEFAULT_SD_V)
@@ -60,9 +60,10 @@ def load(path: Path) -> Log:
     if v is not None and sd_v is None:
         sd_v = np.tile(_SD_V, (len(t), 1))
         remarks.add("velocity sigmas of 0.2, 0.2, 0.4 m/s are assumed: the file states none")
+    kinds = None if track.fix_type is None else fix_types(track.fix_type)
     remarks.add("GNSS: position of the antenna; its lever arm is not in the file and taken as zero")
     remarks.add("clock: seconds of the GPS week of the first row")
-    return Log(path.stem, gnss=Gnss(t, track.llh, sd, v, sd_v), gps_zero=zero, remarks=tuple(remarks))
+    return Log(path.stem, gnss=Gnss(t, track.llh, sd, v, sd_v, type=kinds), gps_zero=zero, remarks=tuple(remarks))
 
 
 def _week_of(path: Path, fields: list[str]) -> float:

@@ -114,6 +114,12 @@ class GnssUnits(_Section):
     speed: SpeedUnit = "m/s"
 
 
+class FixUnits(GnssUnits):
+    """Units of gnss.csv; `type` is whose numbers the types of the fixes are."""
+
+    type: Literal["rtklib", "nmea"] = "rtklib"
+
+
 class OdometerUnits(_Section):
     """Units of odometer.csv."""
 
@@ -189,9 +195,9 @@ class GnssTable(_Sensor):
     """[gnss]"""
 
     required = ("t", "lat", "lon", "h")
-    optional = ("sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu", "vd", "speed", "course")
+    optional = ("sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu", "vd", "speed", "course", "type")
 
-    units: GnssUnits = GnssUnits()
+    units: FixUnits = FixUnits()
     lever_arm: Vector = Field((0.0, 0.0, 0.0), description="m from the IMU: right, forward, up")
     sd: Sigmas | None = Field(None, description="m: east, north, up")
     sd_v: Sigmas | None = Field(None, description="m/s: east, north, up")

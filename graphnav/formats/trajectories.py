@@ -220,6 +220,7 @@ def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Traject
     return _build(
         path, rows, t, position, notes,
         sd_p=take("sde", "sdn", "sdu"), v=take("ve", "vn", "vu"), sd_v=take("sdve", "sdvn", "sdvu"),
+        fix_type=None if "Q" not in at else table[:, at["Q"]],
     )  # fmt: skip
 
 

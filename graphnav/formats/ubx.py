@@ -17,7 +17,7 @@ from graphnav.errors import RecordingError
 from graphnav.formats.clocks import WEEK, utc_to_gps
 from graphnav.formats.registry import Log, extra, first_bytes, log_format
 from graphnav.formats.repair import Remarks
-from graphnav.recording import Gnss, Imu, Odometer
+from graphnav.recording import Gnss, Imu, Odometer, fix_types
 from graphnav.rotation import Array
 
 _SYNC = b"\xb5\x62"
@@ -161,7 +161,15 @@ def _gnss(fixes: list[Any], content: _Content, remarks: Remarks) -> Gnss:
     if any(m.fixType == 4 for m in fixes):
         remarks.add("some fixes are of GNSS and dead reckoning combined: they already have the receiver's IMU in them")
     remarks.add("GNSS: position of the antenna; its lever arm is not in the log and taken as zero")
-    return Gnss(t[order], llh[order], sd[order], v[order], sd_v[order])
+    kinds = np.array([_type(m) for m in fixes])[order]
+    return Gnss(t[order], llh[order], sd[order], v[order], sd_v[order], type=fix_types(kinds))
+
+
+def _type(message: Any) -> int:
+    """Of FIX_TYPES: by the carrier phases, then by the corrections; one that leans on an IMU is of neither kind."""
+    if message.carrSoln in (1, 2):
+        return 1 if message.carrSoln == 2 else 2
+    return 0 if message.fixType == 4 else 4 if message.diffSoln else 5
 
 
 def _sensors(path: Path, content: _Content, remarks: Remarks) -> tuple[Imu | None, Odometer | None]:

@@ -88,6 +88,8 @@ def _gnss(log: Log) -> _File | None:
         if gnss.sd_v is not None:
             columns += [*gnss.sd_v.T]
             header += ["sd_ve", "sd_vn", "sd_vu"]
+    if gnss.type is not None:
+        columns, header = [*columns, np.where(gnss.type > 0, gnss.type, np.nan)], [*header, "type"]
     return _File("gnss.csv.gz", header, columns)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from graphnav import faults
 from graphnav.alignment import Alignment
 from graphnav.config import Settings
@@ -13,6 +15,7 @@ from graphnav.judgement.chance import CLEARLY
 from graphnav.judgement.fixes import LONG, FixQuality, judge_fixes, judge_lasting, outliers, stretch, suspicious
 from graphnav.judgement.imu import calmer, imu_notes, judge_imu, noisiest
 from graphnav.judgement.speeds import contradiction
+from graphnav.judgement.types import reaching
 from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
@@ -86,7 +89,30 @@ class _Rounds:
 
     def first(self) -> FixQuality | None:
         """Judge fixes, and the IMU where it is noisier than stated; None where there are too few fixes."""
-        gnss, plain = self._settings.gnss, self._plain
+        gnss, part = self._settings.gnss, self._part
+        self._part = reaching(self._recording, self._moved, part)
+        problem, forward, back = self._checked()
+        fixes = judge_fixes(problem, back)
+        if fixes is not None and fixes.types:
+            problem, forward, back, fixes = self._by_type(problem, forward, back, fixes)
+        elif self._part is not part:  # types do not differ: what is judged on is as long as ever
+            self._part, self._near = part, None
+            problem, forward, back = self._checked()
+            fixes = judge_fixes(problem, back, together=True)
+        plain, together = self._plain, fixes is not None and not fixes.types
+        if fixes is not None and gnss.fast_time != 0.0:
+            self._first = judge_lasting(problem, back, fixes)
+        if not self._settings.imu.as_stated and judge_imu(problem, forward, back).clear:
+            # fixes that wander would pass for noise of the IMU: it is judged with their wandering in the problem
+            self._improve(plain if fixes is None else fixes.applied(self._free))
+            if self.noise != self._stated:
+                problem, _, back = self._smoothed(plain)
+                fixes = judge_fixes(problem, back, together)
+        return fixes
+
+    def _checked(self) -> tuple[Problem, Forward, Smoothed]:
+        """The part smoothed with all errors as white, outliers weighed as such."""
+        plain, self._weight = self._plain, {}
         try:
             problem, forward, back = self._smoothed(plain)
             doubtful = suspicious(problem, back)
@@ -99,16 +125,28 @@ class _Rounds:
             problem, forward, back = self._smoothed(plain)
             self._weight = outliers(problem, back)
             problem, forward, back = self._smoothed(plain)
-        fixes = judge_fixes(problem, back)
-        if fixes is not None and gnss.fast_time != 0.0:
-            self._first = judge_lasting(problem, back)
-        if not self._settings.imu.as_stated and judge_imu(problem, forward, back).clear:
-            # fixes that wander would pass for noise of the IMU: it is judged with their wandering in the problem
-            self._improve(plain if fixes is None else fixes.applied(self._free))
-            if self.noise != self._stated:
-                problem, _, back = self._smoothed(plain)
-                fixes = judge_fixes(problem, back)
-        return fixes
+        return problem, forward, back
+
+    def _by_type(
+        self, problem: Problem, forward: Forward, back: Smoothed, fixes: FixQuality
+    ) -> tuple[Problem, Forward, Smoothed, FixQuality]:
+        """The part smoothed with a factor for each type, and what it says of them, in rounds.
+
+        What is far better than the rest is seen for what it is only once the rest has less weight.
+        """
+        for _ in range(_ROUNDS):
+            factors = {name: one.sd_factor for name, one in fixes.types.items()}
+            self._plain = self._plain.model_copy(
+                update={"gnss": self._plain.gnss.model_copy(update={"sd_factor": factors})}
+            )
+            problem, forward, back = self._checked()
+            found = judge_fixes(problem, back)
+            if found is None or not found.types:
+                break
+            before, fixes = fixes, found
+            if all(abs(np.log(one.sd_factor / before.types[n].sd_factor)) < 0.1 for n, one in fixes.types.items()):
+                break
+        return problem, forward, back, fixes
 
     def lasting(self, fixes: FixQuality, witnesses: bool) -> FixQuality:
         """The fixes as they are, or as errors that last explain better.
@@ -117,15 +155,16 @@ class _Rounds:
         are witnesses.
         """
         found, raised = self._first, self.noise
-        larger = fixes.sd_factor > CLEARLY
-        if found is None or found.fast_time == 0.0 or not (larger or (witnesses and raised != self._stated)):
+        larger = fixes.worst > CLEARLY
+        if found is None or not found.lasts or not (larger or (witnesses and raised != self._stated)):
             return fixes
-        self._part, self._weight = stretch(self._recording, self._moved, LONG), {}
+        part = stretch(self._recording, self._moved, LONG)
+        self._part, self._weight = reaching(self._recording, self._moved, part) if fixes.types else part, {}
         try:
             against, chance = contradiction(*self._both(fixes.applied(self._settings)))
             if larger or against > chance:
                 self.noise = self._stated
-                found = judge_lasting(*self._both(found.applied(self._settings)))
+                found = judge_lasting(*self._both(found.applied(self._settings)), fixes)
                 if not self._settings.imu.as_stated:
                     basis = found.applied(self._free)
                     self._weight = outliers(*self._both(basis))

@@ -147,7 +147,7 @@ def without_rows(recording: Recording) -> Recording:
     return replace(
         recording,
         imu=replace(recording.imu, t=none, gyro=rows, accel=rows),
-        gnss=gnss and replace(gnss, t=none, llh=rows, sd=rows, v=None, sd_v=None),
+        gnss=gnss and replace(gnss, t=none, llh=rows, sd=rows, v=None, sd_v=None, type=None),
         odometer=odometer and replace(odometer, t=none, speed=none, way=None, wheels=None),
         truth=None,
     )

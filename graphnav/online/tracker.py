@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.config.gnss import of_type
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.constraints.standstill import PLACE
@@ -339,7 +340,7 @@ class Tracker:
             speed = MeanSpeed.of(recording.odometer, self._readings.wrong, self._readings.figures)
         usual = None
         if recording.gnss is not None:
-            usual = (self.settings.gnss.sd_factor or 1.0) * sensors.usual(recording.gnss.t)
+            usual = of_type(self.settings.gnss.sd_factor, "unknown", 1.0) * sensors.usual(recording.gnss.t)
         found = ((t, self._motions.get(t)) for t in times[1:].tolist())
         known = {t: one for t, one in found if one is not None and not one.intervals.out_of_range(start.bg)[0]}
         problem = pose(

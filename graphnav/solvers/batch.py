@@ -107,13 +107,13 @@ class _Minimum:
 
 def _graduated(problem: Problem, point: Point) -> Iterator[Problem]:
     """The problem with its "gnc" kernels convex at first and then ever less so, for a step each."""
-    mu = {}
+    mu: dict[str, float] = {}
     at_keyframes = point.at_keyframes(problem)
     for c in problem.constraints:
         if c.robust == "gnc":
             s2 = residual_record(problem, c, point.states, at_keyframes).nis * (1.0 if c.weight is None else c.weight)
             if np.max(s2) > c.robust_scale**2:
-                mu[c.name] = 1.0 / (2.0 * float(np.max(s2)) / c.robust_scale**2 - 1.0)
+                mu[c.name] = float(1.0 / (2.0 * float(np.max(s2)) / c.robust_scale**2 - 1.0))
     while mu and min(mu.values()) < _SHARP:
         rows = (replace(c, graduation=mu.get(c.name, np.inf)) for c in problem.constraints)
         yield replace(problem, constraints=tuple(rows))

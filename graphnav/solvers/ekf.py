@@ -297,7 +297,7 @@ def _robust(
     for _ in range(PASSES - 1):
         left = (right[:, 0] - HPHt @ solved[:, 0]) / stated
         s = np.linalg.norm(left.reshape(hi - lo, -1), axis=1)
-        weight = np.maximum(weight_and_cost(softened(rows.robust), s, rows.robust_scale)[0], 1e-12)
+        weight = np.maximum(weight_and_cost(softened(rows.robust), s, rows.scale_of(slice(lo, hi)))[0], 1e-12)
         sigma = stated / np.repeat(np.sqrt(weight), len(stated) // (hi - lo))
         _, solved = _solve(HPHt, sigma, right, rows, lo)
     return sigma, solved, float(np.min(weight))

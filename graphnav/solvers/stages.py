@@ -108,7 +108,7 @@ class Measured:
     b: Array  # (n, m)
     sigma: Array  # (n, m) that they were whitened with
     kernel: str
-    scale: float
+    scale: float | Array
 
     def weighted(self, y: Array, passes: int) -> tuple[Array, Array, Array]:
         """H, b and sigma, by the kernel's weights for the error state y once `passes` is not 0."""
@@ -272,7 +272,9 @@ def at_points(
             own = slice(edge[i], edge[i + 1])
             c = constraint
             kernel = softened(c.robust) if c.robust == "gnc" else c.robust
-            parts[i].append(Measured(c.name, H[own], b[own], sigma[own], kernel, c.robust_scale))
+            parts[i].append(
+                Measured(c.name, H[own], b[own], sigma[own], kernel, c.scale_of(slice(lo + own.start, lo + own.stop)))
+            )
     return [Linear(link, tuple(part)) for link, part in zip(links, parts, strict=True)]
 
 
