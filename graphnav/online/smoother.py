@@ -17,10 +17,11 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.judgement import FIXES
+from graphnav.online.ahead import Live
 from graphnav.online.judging import Again, Judgement
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sensors import Row, Sensors
-from graphnav.online.tracker import Live, Tracker
+from graphnav.online.tracker import Tracker
 from graphnav.pipeline import origin
 from graphnav.recording import Recording
 from graphnav.solution import Fault, to_trajectory
