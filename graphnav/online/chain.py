@@ -21,6 +21,7 @@ from graphnav.online.looks import Stops
 from graphnav.online.sensors import Sensors
 from graphnav.problem import NODE_SPACING, Problem
 from graphnav.rotation import Array
+from graphnav.solvers.elimination import Predicted
 from graphnav.solvers.stages import Place, Step
 from graphnav.solvers.watch import Verdicts, Watch
 from graphnav.solvers.window import Message, Smoothed, Window
@@ -99,12 +100,15 @@ class Chain:
             rows.append(c)
         return replace(problem, constraints=tuple(rows))
 
-    def _add(self, posed: Problem, first: int) -> float | None:
-        """Add the keyframes of a problem from one on; the time before them to go on from, if a fault is found."""
+    def _add(self, posed: Problem, first: int, ahead: Predicted | None = None) -> float | None:
+        """Add the keyframes of a problem from one on; the time before them to go on from, if a fault is found.
+
+        `ahead` is what was expected of the first of them, if that still holds.
+        """
         problem, k, turn = self._weighed(posed), first, 0.0
         while k < len(problem.t):
-            turn = max(turn, self._push(problem, k))
-            fault = self.window.stages[-1].fault
+            turn = max(turn, self._push(problem, k, ahead))
+            fault, ahead = self.window.stages[-1].fault, None
             if fault is not None:
                 again = self.verdicts.settle(*fault, now=float(problem.t[k]))
                 if again < problem.t[first] - SAME_TIME:
@@ -120,15 +124,20 @@ class Chain:
         self._turned = turn > self.window.turn
         return None
 
-    def _push(self, problem: Problem, k: int) -> float:
-        t = float(problem.t[k])
-        first = not self.window.stages and not self.opened
-        nodes = dict(self._nodes[-1] if self._nodes else self._head_nodes)
-        turn = self.window.push(Place(t, problem, k, self._moves(problem, t, nodes), linked=not first))
+    def _push(self, problem: Problem, k: int, ahead: Predicted | None) -> float:
+        place, nodes = self._place(problem, k)
+        turn = self.window.push(place, ahead if ahead is not None and ahead.before is self.window.newest else None)
         self._nodes.append(nodes)
         return turn
 
-    def _moves(self, problem: Problem, t: float, nodes: dict[str, float]) -> tuple[Step, ...]:
+    def _place(self, problem: Problem, k: int) -> tuple[Place, dict[str, float]]:
+        """Keyframe `k` of a problem as the next one, and when each parameter's node began there."""
+        t = float(problem.t[k])
+        first = not self.window.stages and not self.opened
+        nodes = dict(self._nodes[-1] if self._nodes else self._head_nodes)
+        return Place(t, problem, k, self._moves(t, nodes), linked=not first), nodes
+
+    def _moves(self, t: float, nodes: dict[str, float]) -> tuple[Step, ...]:
         """Parameters that begin or move on at a keyframe; `nodes` is brought up to date."""
         steps = []
         stop = self._stop_at(t) if PLACE in self._parameters else None

@@ -102,8 +102,8 @@ class Online:
         tracker = self.tracker
         if tracker is not None:
             self._awake = -np.inf
-            if sensor == "imu" and t < before:
-                tracker.came_late(t)
+            if t < {"imu": before, "odometer": previous}.get(sensor, -np.inf):
+                tracker.came_late(sensor, t)
             if sensor == "gnss" and t > tracker.newest + SAME_TIME:
                 self._fixes = sorted([*self._fixes, t])
                 self._due = min(self._due, t + AFTER)

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import copy
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
+from graphnav.constraints.vehicle import REACH
 from graphnav.detectors.base import merged
 from graphnav.dynamics import Motion
 from graphnav.earth import LocalFrame
@@ -29,6 +30,7 @@ from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.samples import GAP, bridge_gaps
+from graphnav.solvers.elimination import Predicted
 from graphnav.solvers.stages import Place
 from graphnav.solvers.window import Message, Smoothed, Window, turn_limit
 from graphnav.state import DIM, States
@@ -38,6 +40,16 @@ _NEAR = 2.0  # s of rows before a keyframe that its constraints look at where th
 _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
 _LATEST = 0.5  # of the lag by which they may be late for it, where states still move
+
+
+@dataclass(frozen=True)
+class _Ahead:
+    """The keyframe that is expected next, posed and predicted but for its fix, and what that rests on."""
+
+    problem: Problem
+    keyframe: Predicted
+    stops: Array
+    wrong: Array  # spans of the odometer
 
 
 class Tracker(Chain):
@@ -59,11 +71,14 @@ class Tracker(Chain):
         self.seconds: dict[str, float] = {}  # of its thread, by what the newest update did
         self._motions: dict[float, Motion] = {}  # of intervals integrated already, by the time they end at
         self._dirty = np.inf  # s, from where on keyframes are to be redone with the next
+        self._ahead: _Ahead | None = None
         self._tried = -np.inf  # s, the newest keyframe when some were to settle last
 
-    def came_late(self, t: float) -> None:
-        """A row of the IMU came after newer ones: what was integrated beyond it is void."""
-        self._motions = {end: one for end, one in self._motions.items() if end < t}
+    def came_late(self, sensor: str, t: float) -> None:
+        """A row came after newer ones of its sensor: what was made of those beyond it is void."""
+        self._ahead = None
+        if sensor == "imu":
+            self._motions = {end: one for end, one in self._motions.items() if end < t}
 
     def update(self, sensors: Sensors, new: Array, dirty: float = np.inf) -> float:
         """Add keyframes at the times `new`, after the newest, and redo those from `dirty` on.
@@ -91,16 +106,16 @@ class Tracker(Chain):
         times = np.unique(np.concatenate([again, new]))
         times = times[np.concatenate([[True], np.diff(times) > SAME_TIME])]
         keep = len(self.window) - len(again)
-        look = _BEFORE if len(self.stops) and self.stops[-1, 1] > times[0] - _BEFORE else 1
-        before = [stage.place.t for stage in self.window.stages[max(0, keep - look) : keep]]
-        if self.opened and len(before) < look:
-            before.insert(0, self.head)
+        before = self._before(keep, float(times[0]))
         self._keep(keep)
-        problem = self._pose(sensors, np.concatenate([before, times]))
+        ahead, self._ahead = self._ahead if self._prepared(float(times[0])) else None, None
+        problem = self._completed(ahead, sensors, before, times)
+        if problem is None:
+            problem, ahead = self._pose(sensors, np.concatenate([before, times])), None
         clock.append(time.thread_time())
         self._parameters |= problem.parameters
         self._watch(problem, sensors)
-        back = self._add(problem, len(before))
+        back = self._add(problem, len(before), ahead and ahead.keyframe)
         self.in_force = {rows.name: len(rows.b) for rows in self.window.stages[-1].measured if rows.H.any()}
         self._forget()
         clock.append(time.thread_time())
@@ -120,7 +135,7 @@ class Tracker(Chain):
             times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
         self._standing.forget(self.head - CONTEXT)
         dirty = self._steps.changed(sensors, self.head)
-        self.came_late(dirty)
+        self.came_late("imu", dirty)
         self._dirty = min(self._dirty, dirty)
         return times[1:] if len(self.window) or self.opened else times
 
@@ -151,6 +166,8 @@ class Tracker(Chain):
             self._standing.look(sensors, self.settings, expected, self.head)
         elif self._standing.news or self._dirty < np.inf:
             self.update(sensors, np.empty(0))
+        elif not self._prepared(expected) and self._covered(sensors, expected):
+            self._prepare(sensors, expected)
         else:
             return False
         return True
@@ -162,6 +179,38 @@ class Tracker(Chain):
         ends = np.array([T, expected])
         motion = Motion(preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0]), self.frame)
         self._motions[expected] = motion.prepared()
+
+    def _covered(self, sensors: Sensors, t: float) -> bool:
+        """Whether the odometer has come as far as rows at a keyframe ask for."""
+        o = sensors.setup.odometer
+        return o is None or sensors.odometer.newest >= t + REACH * o.delay_sigma
+
+    def _prepare(self, sensors: Sensors, expected: float) -> None:
+        """Pose and predict the keyframe that is expected, but for the fix."""
+        before = self._before(len(self.window), expected)
+        problem = self._pose(sensors, np.array([*before, expected]), complete=False)
+        self._parameters |= problem.parameters
+        place, _ = self._place(self._weighed(problem), len(before))
+        self._ahead = _Ahead(problem, self.window.expect(place), self.stops, self._readings.wrong)
+
+    def _prepared(self, t: float) -> bool:
+        """Whether what was prepared for a keyframe still holds."""
+        one = self._ahead
+        return (
+            one is not None
+            and one.keyframe.place.t == t
+            and one.keyframe.before is self.window.newest
+            and one.stops is self.stops
+            and one.wrong is self._readings.wrong
+        )
+
+    def _completed(self, ahead: _Ahead | None, sensors: Sensors, before: list[float], times: Array) -> Problem | None:
+        """What was prepared for a new keyframe with its fix, if it was."""
+        if ahead is None or len(times) > 1 or len(ahead.problem.t) != len(before) + 1:
+            return None
+        recording = sensors.recording(float(ahead.problem.t[0]) - _NEAR, float(times[-1]) + 0.1)
+        problem = ahead.problem.completed(recording, self._usual(sensors, recording))
+        return problem if problem.parameters.keys() <= self._parameters.keys() else None
 
     def _converge(self, sensors: Sensors) -> None:
         self._turned = False
@@ -180,6 +229,7 @@ class Tracker(Chain):
         if not last and overdue < _LATEST * self.settings.solver.lag and self.window.first_moved() is not None:
             return  # still being linearised again: the next keyframe will do
         self.settled.append(self._leave(count))
+        self._ahead = None  # what has settled may say that sigmas are others
         self._motions = {t: one for t, one in self._motions.items() if t > self.head - CONTEXT}
         self._forget()
 
@@ -188,7 +238,7 @@ class Tracker(Chain):
         other, head = copy.copy(self), self.window.head
         other.settings, other._parameters, other.verdicts = settings, {}, copy.deepcopy(self.verdicts)
         other.window = Window(head.moved(head.estimate), turn_limit(setup.imu.noise))
-        other._nodes, other._motions, other.settled = [], {}, []
+        other._nodes, other._motions, other.settled, other._ahead = [], {}, [], None
         other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)
         other._readings.revised = other.evidence.revised = False
         return other
@@ -219,7 +269,21 @@ class Tracker(Chain):
         return since(self.window.newest, self.newest, self.frame, sensors)
 
     # ------------------------------------------------------------------------------------------------- keyframes
-    def _pose(self, sensors: Sensors, times: Array) -> Problem:
+    def _before(self, keep: int, t: float) -> list[float]:
+        """Times of the keyframes that are posed again with those from t on, of the first `keep` in the window."""
+        look = _BEFORE if len(self.stops) and self.stops[-1, 1] > t - _BEFORE else 1
+        before = [stage.place.t for stage in self.window.stages[max(0, keep - look) : keep]]
+        if self.opened and len(before) < look:
+            before.insert(0, self.head)
+        return before
+
+    def _usual(self, sensors: Sensors, recording: Recording) -> Array | None:
+        """The unit of the slow errors of a recording's fixes, m."""
+        if recording.gnss is None:
+            return None
+        return np.asarray((self.settings.gnss.sd_factor or 1.0) * sensors.usual(recording.gnss.t))
+
+    def _pose(self, sensors: Sensors, times: Array, complete: bool = True) -> Problem:
         begin, stops = float(times[0]), self.stops
         if len(stops):  # a stop is posed whole, so that its place begins where it began
             stops = stops if self.foot else stops[stops[:, 1] > begin]
@@ -229,14 +293,12 @@ class Tracker(Chain):
         start, speed = self.window.newest.state, None
         if recording.odometer is not None:
             speed = MeanSpeed.of(recording.odometer, self._readings.wrong, self._readings.figures)
-        usual = None
-        if recording.gnss is not None:
-            usual = (self.settings.gnss.sd_factor or 1.0) * sensors.usual(recording.gnss.t)
+        usual = self._usual(sensors, recording)
         found = ((t, self._motions.get(t)) for t in times[1:].tolist())
         known = {t: one for t, one in found if one is not None and not one.intervals.out_of_range(start.bg)[0]}
         problem = pose(
             recording, self.settings, self.frame, start, np.ones(DIM), stops, times, speed, usual, known,
-            self._steps.highest,
+            self._steps.highest, complete,
         )  # fmt: skip
         for k, t in enumerate(times[1:].tolist()):
             if t not in known:

@@ -18,6 +18,7 @@ import numpy as np
 from graphnav import rotation
 from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
+from graphnav.solvers.elimination import Predicted, predict, update
 from graphnav.solvers.stages import (
     Columns,
     Measured,
@@ -25,7 +26,6 @@ from graphnav.solvers.stages import (
     Place,
     Stage,
     at_points,
-    eliminate,
     extended,
     measured,
     predicted,
@@ -125,15 +125,21 @@ class Window:
             first -= 1
         return self.stages[first:]
 
-    def push(self, place: Place) -> float:
-        """Add a keyframe, linearised at its prediction; returns by how much its measurements turned it, rad."""
-        before = self.newest
-        state, values, columns, link = predicted(before, place)
-        linear = measured(place, state, values, columns)
-        if link is not None:
-            linear = type(linear)(link, linear.measured)
-        stage = eliminate(before, place, linear, state, values, columns)
-        e = stage.message.estimate
+    def expect(self, place: Place) -> Predicted:
+        """A keyframe, linearised at its prediction, with the rows of its problem that need not be waited for."""
+        state, values, columns, link = predicted(self.newest, place)
+        rows = measured(place, state, values, columns, late=False).measured
+        return predict(self.newest, place, link, rows, state, values, columns)
+
+    def push(self, place: Place, ahead: Predicted | None = None) -> float:
+        """Add a keyframe; returns by how much its measurements turned it, rad.
+
+        `ahead` is what was expected of it after the newest, if known already: only the rows that had to be waited for
+        are then made.
+        """
+        ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
+        columns = ahead.columns
+        stage, e = update(ahead, measured(place, ahead.state, ahead.values, columns, late=True).measured)
         self.stages.append(stage.moved(e))
         self._means = None
         if columns != self._limit[0]:
@@ -350,7 +356,9 @@ def remade(before: Message, points: Sequence[Point], places: Sequence[Place]) ->
             row[: len(point.values)] = point.values
         states = States.stack([point.state for point in around])
         for place, point, linear in zip(own, part, at_points(own, states, values, columns, linked), strict=True):
-            stage = eliminate(before, place, linear, point.state, point.values, point.columns, weighted=True)
+            plain, bent = (tuple(m for m in linear.measured if (m.kernel == "none") == one) for one in (True, False))
+            ahead = predict(before, place, linear.link, plain, point.state, point.values, point.columns)
+            stage, _ = update(ahead, bent, weighted=True)
             before = stage.message
             out.append(stage)
     return out
