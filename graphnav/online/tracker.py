@@ -115,7 +115,7 @@ class Tracker(Chain):
         clock.append(time.thread_time())
         self._parameters |= problem.parameters
         self._watch(problem, sensors)
-        back = self._add(problem, len(before), ahead and ahead.keyframe)
+        back = self._add(problem, len(before), None if ahead is None else ahead.keyframe)
         self.in_force = {rows.name: len(rows.b) for rows in self.window.stages[-1].measured if rows.H.any()}
         self._forget()
         clock.append(time.thread_time())
