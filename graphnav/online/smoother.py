@@ -130,14 +130,12 @@ class Online:
             self._go_through(self._again, tracker)
         elif self._judgement is not None and tracker.newest >= self._judgement.due:
             self._use(self._judgement, tracker)
-        elif self._tentative:
-            self._awake = self._due
-        elif tracker.spare(self.sensors, expected := self._expected(tracker)):
+        elif tracker.spare(self.sensors, expected := self._expected(tracker), not self._tentative):
             self._collect(tracker)
-        elif tracker.stale:
+        elif tracker.stale and not self._tentative:
             self._again = Again(tracker.afresh(tracker.settings, self.sensors.setup), self.sensors.setup)
         else:
-            if self._found is not None and self._judgement is None:
+            if self._found is not None and self._judgement is None and not self._tentative:
                 self._judge_again(self._found, tracker)
             self._awake = expected if now < expected else self._due
 

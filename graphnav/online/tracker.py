@@ -103,8 +103,10 @@ class Tracker(Chain):
         again = [stage.place.t for stage in self.window.since(dirty - SAME_TIME)]
         if not again and not len(new):
             return np.inf
-        times = np.unique(np.concatenate([again, new]))
-        times = times[np.concatenate([[True], np.diff(times) > SAME_TIME])]
+        times = new
+        if again or len(new) > 1:
+            times = np.unique(np.concatenate([again, new]))
+            times = times[np.concatenate([[True], np.diff(times) > SAME_TIME])]
         keep = len(self.window) - len(again)
         before = self._before(keep, float(times[0]))
         self._keep(keep)
@@ -139,19 +141,20 @@ class Tracker(Chain):
         self._dirty = min(self._dirty, dirty)
         return times[1:] if len(self.window) or self.opened else times
 
-    def spare(self, sensors: Sensors, expected: float = np.inf) -> bool:
+    def spare(self, sensors: Sensors, expected: float = np.inf, settling: bool = True) -> bool:
         """Do one thing that need not wait for the next keyframe, or should not delay it; False if there is none.
 
         What comes out depends on the rows that have come when it is called, so it is called at certain rows.
 
         Parameters
         ----------
-        expected : s, when the next keyframe should be: once the IMU is there, its interval can be integrated.
+        expected : s, when the next keyframe should be: once the IMU is there, it can be prepared.
+        settling : whether keyframes may settle.
         """
         lag, now = self.settings.solver.lag, sensors.imu.newest
         if self._turned:
             self._converge(sensors)
-        elif self._tried < self.newest and self.newest - self._oldest > lag * (1.0 + 1.0 / _PORTIONS):
+        elif settling and self._tried < self.newest and self.newest - self._oldest > lag * (1.0 + 1.0 / _PORTIONS):
             self._tried = self.newest
             self.settle(sensors, self.newest - lag)
         elif self.foot:

@@ -295,15 +295,17 @@ class Verdicts:
 
     def weights(self, name: str, t: Array) -> Array:
         """(n,) of fixes at the times t: 0 for what is not used. Fixes that were not known yet are."""
-        known = self.times.get(name, np.empty(0))
-        new = t[~np.isin(t, known)] if len(known) and t[0] <= known[-1] else t
-        if len(new):
-            at = known.searchsorted(new)
-            if len(at) and at[0] < len(known):
+        known, used = self.times.get(name, np.empty(0)), self.used.get(name, np.empty(0))
+        at = known.searchsorted(t)
+        new = at == len(known)
+        new[~new] = known[at[~new]] != t[~new]
+        if new.any():
+            if at[new][0] < len(known):
                 self._trial = None  # its rows have moved
-            self.times[name] = np.insert(known, at, new)
-            self.used[name] = np.insert(self.used.get(name, np.empty(0)), at, 1.0)
-        return self.used[name][self.times[name].searchsorted(t)]
+            self.times[name] = known = np.insert(known, at[new], t[new])
+            self.used[name] = used = np.insert(used, at[new], 1.0)
+            at = known.searchsorted(t)
+        return np.asarray(used[at])
 
     def settle(self, name: str, since: float, now: float) -> float:
         """Take from use what a fault of fixes `since` (s) up to `now` gives reason to; the time to go on from."""
