@@ -38,6 +38,7 @@ from graphnav.wheels import MeanSpeed
 
 _NEAR = 2.0  # s of rows before a keyframe that its constraints look at where the IMU has no gap; else `CONTEXT`
 _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
+_AT_A_ROW = 64  # keyframes that are linearised again at one row of the IMU
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
 _LATEST = 0.5  # of the lag by which they may be late for it, where states still move
 
@@ -73,6 +74,7 @@ class Tracker(Chain):
         self._dirty = np.inf  # s, from where on keyframes are to be redone with the next
         self._ahead: _Ahead | None = None
         self._tried = -np.inf  # s, the newest keyframe when some were to settle last
+        self._settling = False  # whether some are to settle once they are linearised again
 
     def came_late(self, sensor: str, t: float) -> None:
         """A row came after newer ones of its sensor: what was made of those beyond it is void."""
@@ -88,7 +90,7 @@ class Tracker(Chain):
         clock = [time.thread_time()]
         if dirty < np.inf:
             self._motions = {t: one for t, one in self._motions.items() if t < dirty}
-        if self._turned:
+        if self._turned and not self.window.revising:
             self._converge(sensors)
         now = max(self.newest, float(new[-1]) if len(new) else -np.inf)
         if not self.foot:
@@ -152,11 +154,14 @@ class Tracker(Chain):
         settling : whether keyframes may settle.
         """
         lag, now = self.settings.solver.lag, sensors.imu.newest
-        if self._turned:
-            self._converge(sensors)
+        if self._turned or self.window.revising:
+            self._turned = False
+            if not self._revise(sensors) and self._settling:
+                self._settle(self.newest - lag)
         elif settling and self._tried < self.newest and self.newest - self._oldest > lag * (1.0 + 1.0 / _PORTIONS):
-            self._tried = self.newest
-            self.settle(sensors, self.newest - lag)
+            self._tried, self._settling = self.newest, True
+            if not self._revise(sensors, always=self._robust):
+                self._settle(self.newest - lag)
         elif self.foot:
             return False
         elif self._readings.due(self.newest):
@@ -217,17 +222,32 @@ class Tracker(Chain):
 
     def _converge(self, sensors: Sensors) -> None:
         self._turned = False
-        self.window.converge(renewed=lambda first: self._renewed(sensors, first))
+        self.window.converge(renewed=lambda *which: self._renewed(sensors, *which))
         self._forget()
 
-    def settle(self, sensors: Sensors, until: float = np.inf) -> None:
-        """Settle the keyframes before a time."""
+    def _revise(self, sensors: Sensors, always: bool = False) -> bool:
+        """As much of that as there is time for at a row; False once there is nothing left to do."""
+        more = self.window.revise(_AT_A_ROW, lambda *which: self._renewed(sensors, *which), always)
+        self._forget()
+        return more
+
+    @property
+    def _robust(self) -> bool:
+        return {self.settings.gnss.kernel, self.settings.vehicle.kernel} != {"none"}
+
+    def settle(self, sensors: Sensors) -> None:
+        """Settle all keyframes: no more will come."""
+        if len(self.window):
+            self.window.converge(always=True, renewed=lambda *which: self._renewed(sensors, *which))
+            self._settle(np.inf)
+
+    def _settle(self, until: float) -> None:
+        """Settle the keyframes before a time, which have been linearised again where they moved."""
+        self._settling = False
         count = int(np.searchsorted(self.window.t, until))
         if not count:
             return
         last = count == len(self.window)
-        robust = {self.settings.gnss.kernel, self.settings.vehicle.kernel} != {"none"}
-        self.window.converge(always=last or robust, renewed=lambda first: self._renewed(sensors, first))
         overdue = self.newest - float(self.window.stages[0].place.t) - self.settings.solver.lag
         if not last and overdue < _LATEST * self.settings.solver.lag and self.window.first_moved() is not None:
             return  # still being linearised again: the next keyframe will do
@@ -242,6 +262,7 @@ class Tracker(Chain):
         other.settings, other._parameters, other.verdicts = settings, {}, copy.deepcopy(self.verdicts)
         other.window = Window(head.moved(head.estimate), turn_limit(setup.imu.noise))
         other._nodes, other._motions, other.settled, other._ahead = [], {}, [], None
+        other._settling = False
         other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)
         other._readings.revised = other.evidence.revised = False
         return other
@@ -318,12 +339,15 @@ class Tracker(Chain):
         whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < GAP * period_of(t)
         return near if whole else sensors.recording(begin - CONTEXT, end)
 
-    def _renewed(self, sensors: Sensors, first: int) -> list[Place]:
-        """The places of the stages from `first` on, posed again."""
-        skip = len(self.times) - len(self.window)  # 1 once there is a keyframe before the first stage
-        begin = max(0, first + skip - _BEFORE)
-        problem = self._weighed(self._pose(sensors, self.times[begin:]))
+    def _renewed(self, sensors: Sensors, first: int, end: int) -> list[Place]:
+        """The places of the stages from `first` to `end`, posed again with those around them, and stops as a whole."""
+        times, skip = self.times, len(self.times) - len(self.window)  # 1 once there is one before the first stage
+        begin, until = max(0, first + skip - _BEFORE), min(end + skip + _BEFORE, len(times))
+        for stop in self.stops if end < len(self.window) else ():
+            if stop[0] < times[until - 1] < stop[1]:
+                until = int(np.searchsorted(times, stop[1] + SAME_TIME))
+        problem = self._weighed(self._pose(sensors, times[begin:until]))
         return [
             replace(stage.place, problem=problem, k=first + skip - begin + i)
-            for i, stage in enumerate(self.window.stages[first:])
+            for i, stage in enumerate(self.window.stages[first:end])
         ]
