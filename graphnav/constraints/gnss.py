@@ -84,7 +84,6 @@ class GnssPosition(Constraint):
     name: ClassVar[str] = "gnss_position"
     axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
     unit: ClassVar[str] = "m"
-    looks_ahead: ClassVar[bool] = True
 
     p_n: Array = field(default_factory=lambda: _empty(0, 3))  # fixes in the navigation frame
     R_ln: Array = field(default_factory=lambda: _empty(0, 3, 3))
@@ -170,7 +169,6 @@ class GnssVelocity(Constraint):
     name: ClassVar[str] = "gnss_velocity"
     axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
     unit: ClassVar[str] = "m/s"
-    looks_ahead: ClassVar[bool] = True
 
     v_l: Array = field(default_factory=lambda: _empty(0, 3))
     R_ln: Array = field(default_factory=lambda: _empty(0, 3, 3))

@@ -132,6 +132,8 @@ def _turned(u: Array, mounting: Array) -> tuple[Array, Array, Array]:
 class Wheels(Constraint):
     """What both constraints share: where rows are, and u_v with its derivatives."""
 
+    looks_ahead: ClassVar[bool] = False
+
     past: Past | None = None
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
 
