@@ -121,7 +121,7 @@ class Chain:
                 k = back
                 continue
             k += 1
-        self._turned = turn > self.window.turn
+        self._turned |= turn > self.window.turn
         return None
 
     def _push(self, problem: Problem, k: int, ahead: Predicted | None) -> float:

@@ -90,8 +90,6 @@ class Tracker(Chain):
         clock = [time.thread_time()]
         if dirty < np.inf:
             self._motions = {t: one for t, one in self._motions.items() if t < dirty}
-        if self._turned and not self.window.revising:
-            self._converge(sensors)
         now = max(self.newest, float(new[-1]) if len(new) else -np.inf)
         if not self.foot:
             if self._standing.due(now):
@@ -220,13 +218,8 @@ class Tracker(Chain):
         problem = ahead.problem.completed(recording, self._usual(sensors, recording))
         return problem if problem.parameters.keys() <= self._parameters.keys() else None
 
-    def _converge(self, sensors: Sensors) -> None:
-        self._turned = False
-        self.window.converge(renewed=lambda *which: self._renewed(sensors, *which))
-        self._forget()
-
     def _revise(self, sensors: Sensors, always: bool = False) -> bool:
-        """As much of that as there is time for at a row; False once there is nothing left to do."""
+        """Linearise again as much as there is time for at a row; False once there is nothing left to do."""
         more = self.window.revise(_AT_A_ROW, lambda *which: self._renewed(sensors, *which), always)
         self._forget()
         return more
