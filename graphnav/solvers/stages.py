@@ -9,7 +9,8 @@ with QR (Bierman 1977, ch. VI; Dellaert and Kaess 2006) what only they touch: x_
     [ A_{k-1}     A_k ]   - QR ->  [      R'  z']     R' y_k = z'                  the next message
     [ 0           H_k ]
 
-For a chain this is the elimination that GTSAM does in the same order, on matrices that are dense anyway.
+For a chain this is the elimination that GTSAM does in the same order, on matrices that are dense anyway. Here are the
+rows and what comes of them; `graphnav.solvers.elimination` does it.
 
 A message may have tests beside it (`graphnav.solvers.watch`) that look for errors of fixes that last: more columns on
 the right, which go through the same QR.
