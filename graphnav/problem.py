@@ -77,6 +77,15 @@ class Problem:
             at += width
         return out
 
+    def completed(self, recording: Recording, usual: Array | None = None) -> Problem:
+        """With the constraints that look ahead, from a recording that reaches as far as they look.
+
+        `usual` as for `pose`.
+        """
+        scene = Scene(recording, self.settings, self.frame, self.t, np.empty((0, 2)), self.intervals, usual=usual)
+        rows = (*self.constraints, *_built(scene, True))
+        return replace(self, recording=recording, constraints=tuple(sorted(rows, key=lambda c: c.name)))
+
     def reintegrated(self, ba: Array, bg: Array) -> Problem:
         """The same problem with its intervals integrated anew about better biases, (K-1, 3) each."""
         intervals = preintegrate(self.samples, self.recording.imu, self.t, ba, bg)
@@ -95,6 +104,7 @@ def pose(
     usual: Array | None = None,
     known: Mapping[float, Motion] | None = None,
     highest: Array | None = None,
+    complete: bool = True,
 ) -> Problem:
     """Pose the estimation problem for a recording.
 
@@ -108,11 +118,11 @@ def pose(
     usual : (M, 3) m, the unit of the slow errors of the recording's fixes, where it is known already.
     known : what intervals between keyframes say that were integrated before, by the time they end at.
     highest : what the IMU has read at other times, as `graphnav.clipping.highest` says.
+    complete : False leaves out the constraints that look ahead, for `Problem.completed`.
     """
-    classes = registered()
     stops = to_samples(stationary, recording)
     if times is None:
-        wanted = [cls.epochs(recording, settings, stops) for cls in classes]
+        wanted = [cls.epochs(recording, settings, stops) for cls in registered()]
         epochs = np.concatenate([*wanted, np.empty(0)])
         times = keyframe_times(recording.start, recording.end, epochs, settings.keyframes.rate)
     t = times
@@ -129,7 +139,7 @@ def pose(
         motion = Motion(intervals, frame)
     intervals = motion.intervals
     scene = Scene(recording, settings, frame, t, stops, intervals, speed, usual)
-    built = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
+    built = _built(scene, None if complete else False)
     prior = InitialPrior(keyframe=np.zeros(1, dtype=int), mean=start, sigma=np.asarray(sigma)[None])
     return Problem(
         recording=recording,
@@ -143,6 +153,12 @@ def pose(
         constraints=built,
         notes=(*_notes(samples, recording), *said, *(note for rows in built for note in rows.notes)),
     )
+
+
+def _built(scene: Scene, ahead: bool | None) -> tuple[Constraint, ...]:
+    """The constraints of a scene: those that look ahead, those that do not, or all (None)."""
+    classes = (cls for cls in registered() if ahead is None or cls.looks_ahead == ahead)
+    return tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
 
 
 def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Array:

@@ -12,6 +12,7 @@ Error state of one keyframe, 15 numbers in this order::
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ class Parameter:
         """k"""
         return int(np.shape(self.initial)[-1])
 
-    @property
+    @cached_property
     def constant(self) -> bool:
         """One value for the whole recording."""
         return self.begins is None and self.correlation_time is None and not np.any(self.walk)

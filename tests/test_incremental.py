@@ -11,6 +11,7 @@ import pytest
 from helpers import Array, dense, errors, factors, random_states, truth_states
 
 from graphnav.config import settings_from
+from graphnav.constraints.vehicle import OdometerSpeed
 from graphnav.earth import LocalFrame
 from graphnav.formats import read
 from graphnav.pipeline import run
@@ -25,7 +26,7 @@ from graphnav.solvers.isam import isam2
 from graphnav.solvers.rts import backward
 from graphnav.solvers.stages import Message, Place, Step, turned
 from graphnav.solvers.window import Window, first_message
-from graphnav.state import DIM
+from graphnav.state import DIM, States
 from graphnav.trajectory import Trajectory
 
 EVERYTHING = 1e9  # s, a lag longer than any drive
@@ -91,16 +92,17 @@ def test_a_window_is_the_dense_least_squares_solution(drive: tuple[Recording, Tr
 
 def test_the_live_estimate_is_the_end_of_a_batch_solution_so_far(posed: Problem) -> None:
     live = incremental(posed, lag=EVERYTHING).live
+    speed = next(rows.speed for rows in posed.constraints if isinstance(rows, OdometerSpeed))
     for end in (60.0, 130.0, 200.0):  # the second in the outage
+        # what the odometer is worth is told from its readings: the same ones
         part = pose(posed.recording.crop(0.0, end), posed.settings, posed.frame, posed.prior.mean,
-                    posed.prior.sigma[0], np.array([[0.0, 8.0]]))  # fmt: skip
+                    posed.prior.sigma[0], np.array([[0.0, 8.0]]), speed=speed)  # fmt: skip
         smoothed = backward(part, ekf(part))
         so_far = batch(part, smoothed.states, smoothed.nodes(part), reintegrate=False)
         k = int(np.searchsorted(posed.t, part.t[-1] - 1e-6))
         assert posed.t[k] == pytest.approx(part.t[-1], abs=1e-6)
         assert np.abs((live.states[k : k + 1].minus(so_far.states[-1:])) / sigmas(so_far)[-1]).max() < 0.1
-        # what the odometer is worth is told from its readings, here fewer
-        np.testing.assert_allclose(sigmas(live)[k], sigmas(so_far)[-1], rtol=0.06)
+        np.testing.assert_allclose(sigmas(live)[k], sigmas(so_far)[-1], rtol=0.01)
 
 
 def test_isam2_holds_the_same_as_the_window(posed: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -258,6 +260,43 @@ def test_spans_that_are_kept_smooth_back_as_stage_by_stage(posed: Problem) -> No
             window.relinearize(40)
         fill(window, posed, first, last, steps)
     assert window._spans
+
+
+def test_linearised_again_in_portions_it_is_the_same(posed: Problem) -> None:
+    """At once and in portions; and while keyframes come and some are taken back and made again."""
+    steps = node_steps(posed)
+    whole, parts, moving = (Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3) for _ in range(3))
+
+    def revise(window: Window) -> bool:
+        return window.revise(16, lambda begin, end: [stage.place for stage in window.stages[begin:end]], always=True)
+
+    def smoothed(window: Window) -> tuple[Array, Array]:
+        settled = window.settle(len(window))
+        return settled.states.minus(reference), np.sqrt(np.diagonal(settled.covariance, axis1=1, axis2=2))
+
+    for window in (whole, parts):
+        fill(window, posed, 0, 90, steps)
+    fill(moving, posed, 0, 60, steps)
+    assert whole.converge(always=True) > 0
+    while revise(parts):
+        assert parts.revising
+    for first, last in ((60, 70), (70, 75)):
+        assert revise(moving)
+        fill(moving, posed, first, last, steps)
+    assert revise(moving)
+    moving.truncate(40)  # within what has been made
+    fill(moving, posed, 40, 90, steps)
+    assert moving.relinearized == 0
+    while revise(moving):
+        pass
+    assert not moving.revising
+    assert parts.relinearized == whole.relinearized
+    reference = States.stack([stage.message.state for stage in whole.stages])
+    (off, sd), at_once, changed = smoothed(whole), smoothed(parts), smoothed(moving)
+    np.testing.assert_allclose(at_once[0] / sd, off / sd, atol=1e-6)
+    np.testing.assert_allclose(at_once[1], sd, rtol=1e-7)
+    np.testing.assert_allclose(changed[0] / sd, off / sd, atol=0.02)
+    np.testing.assert_allclose(changed[1], sd, rtol=1e-3)
 
 
 def test_residuals_of_what_settled_are_those_at_the_solution(posed: Problem) -> None:

@@ -29,6 +29,7 @@ from graphnav.online import Online, Row, Session, rows_of, without_rows
 from graphnav.online.buffers import Buffer
 from graphnav.online.evidence import Evidence
 from graphnav.online.lines import END, head_of, line_of, lines_of, row_of, setup_of
+from graphnav.online.tracker import Tracker
 from graphnav.online.view import view
 from graphnav.pipeline import run
 from graphnav.recording import Recording
@@ -154,6 +155,48 @@ def test_late_rows_are_used_at_their_own_time(
     away = (track.llh[common] - plain[1].llh[other]) * [6.378e6, 5.5e6, 1.0]
     assert np.abs(away).max() < 0.02
     np.testing.assert_allclose(track.sd_p[common], plain[1].sd_p[other], rtol=0.15)
+
+
+def same(track: Trajectory, other: Trajectory) -> None:
+    """To the rounding of a metre of a circle of 40,000 km."""
+    np.testing.assert_array_equal(track.t, other.t)
+    np.testing.assert_allclose((track.llh - other.llh) * [6.4e6, 6.4e6, 1.0], 0.0, atol=1e-7)
+    np.testing.assert_allclose(track.sd_p, other.sd_p, rtol=1e-7)
+
+
+def test_what_is_prepared_beside_the_drive_changes_nothing(
+    drive: tuple[Recording, Trajectory],
+    rows: list[Row],
+    plain: tuple[Online, Trajectory],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Keyframes are posed and predicted before their fix counts: as if they were made at once."""
+    monkeypatch.setattr(Tracker, "_covered", lambda *_: False)
+    same(played(drive[0], rows)[1], plain[1])
+
+
+def test_keyframes_are_prepared(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    """In the outage, too; only while another tracker goes through the window is there no time for it."""
+    online, ready = Online(without_rows(drive[0]), QUICK), []
+    for row in rows:
+        before = online.tracker
+        known = before is not None and (before.newest, before._ahead is not None)
+        online.add(row)
+        if known and online.tracker is before and before.newest > known[0] and online._again is None:
+            ready.append(known[1])
+    assert len(ready) > 40
+    assert np.mean(ready) > 0.9
+
+
+def test_a_reading_that_comes_when_its_keyframe_is_prepared_counts(
+    drive: tuple[Recording, Trajectory], rows: list[Row], plain: tuple[Online, Trajectory]
+) -> None:
+    late = [k for k, (sensor, t, _) in enumerate(rows) if sensor == "odometer" and abs(t % 5.0 - 3.9) < 1e-6]
+    later = [next(i for i in range(k, len(rows)) if rows[i][1] > rows[k][1] + 0.135) for k in late]
+    order = sorted(range(len(rows)), key=lambda k: later[late.index(k)] - 0.5 if k in late else k)
+    assert len(late) >= 5
+    assert order != list(range(len(rows)))
+    same(played(drive[0], [rows[k] for k in order])[1], plain[1])
 
 
 def test_rows_older_than_the_window_are_counted(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:

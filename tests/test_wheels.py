@@ -217,6 +217,16 @@ def test_no_mean_where_readings_are_missing_or_wrong() -> None:
     assert np.allclose(gaps(t), [[40.0, 45.1]], atol=0.11)
 
 
+def test_the_sigma_of_a_mean_does_not_ask_what_comes_after_its_window() -> None:
+    t = np.arange(0.0, 10.01, 0.5)
+    window = np.array([3.0]), np.array([8.0])
+    readings = [Odometer(t[:end], speed_at(t[:end]), speed_sigma=0.1) for end in (17, len(t))]
+    ends, goes_on = (MeanSpeed.of(o).sigma(*window) for o in readings)
+    assert readings[0].t[-1] == window[1]
+    np.testing.assert_allclose(ends, 0.1 / np.sqrt(10.0))
+    np.testing.assert_array_equal(ends, goes_on)
+
+
 def test_few_readings_give_no_means() -> None:
     for n in (0, 1):
         o = Odometer(np.zeros(n), np.zeros(n))

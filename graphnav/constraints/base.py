@@ -70,6 +70,7 @@ class Constraint(ABC):
     name: ClassVar[str]
     axes: ClassVar[tuple[str, ...]]
     unit: ClassVar[str]
+    looks_ahead: ClassVar[bool] = True  # False: once the intervals and the odometer are there, rows can be built
     passes: ClassVar[int] = 1  # of a filter's update; more for rows that are far from linear over its uncertainty
 
     keyframe: Array  # (N,) int, ascending

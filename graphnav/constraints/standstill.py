@@ -112,6 +112,8 @@ def unrest(scene: Scene, rows: Array, stop: Array) -> tuple[Array, Array]:
 class _Standing(Constraint):
     """Rows at the ends of the intervals in which the platform stands."""
 
+    looks_ahead: ClassVar[bool] = False
+
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
         return stationary.ravel()

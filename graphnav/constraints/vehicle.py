@@ -47,7 +47,7 @@ AXLE = "axle"
 BODY = "slip_squat"
 ODOMETER_SCALE = "odometer_scale"
 ODOMETER_DELAY = "odometer_delay"
-_REACH = 4.0  # sigmas of the delay that rows are prepared for
+REACH = 4.0  # sigmas of the delay that rows are prepared for
 _SHORTEST = 0.02  # s; a mean over less says nothing
 _LINEAR = 3.0  # m/s^2, lateral force up to which tyres behave linearly
 _BEYOND = 0.1  # m/s of sideways speed per m/s^2 beyond that
@@ -131,6 +131,8 @@ def _turned(u: Array, mounting: Array) -> tuple[Array, Array, Array]:
 @dataclass(frozen=True)
 class Wheels(Constraint):
     """What both constraints share: where rows are, and u_v with its derivatives."""
+
+    looks_ahead: ClassVar[bool] = False
 
     past: Past | None = None
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
@@ -313,7 +315,7 @@ class OdometerSpeed(Wheels):
         speed = scene.speed or _speed_of(odometer, scene.recording.imu)
         rows, past = moving_rows(scene), shared_past(scene)
         begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
-        reach = _REACH * odometer.delay_sigma
+        reach = REACH * odometer.delay_sigma
         good = np.all([np.isfinite(speed(begin, end, d)[0]) for d in {-reach, 0.0, reach}], axis=0)
         if not good.all():
             rows, begin, end = rows[good], begin[good], end[good]

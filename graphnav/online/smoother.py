@@ -17,10 +17,11 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.judgement import FIXES
+from graphnav.online.ahead import Live
 from graphnav.online.judging import Again, Judgement
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sensors import Row, Sensors
-from graphnav.online.tracker import Live, Tracker
+from graphnav.online.tracker import Tracker
 from graphnav.pipeline import origin
 from graphnav.recording import Recording
 from graphnav.solution import Fault, to_trajectory
@@ -101,8 +102,8 @@ class Online:
         tracker = self.tracker
         if tracker is not None:
             self._awake = -np.inf
-            if sensor == "imu" and t < before:
-                tracker.came_late(t)
+            if t < {"imu": before, "odometer": previous}.get(sensor, -np.inf):
+                tracker.came_late(sensor, t)
             if sensor == "gnss" and t > tracker.newest + SAME_TIME:
                 self._fixes = sorted([*self._fixes, t])
                 self._due = min(self._due, t + AFTER)
@@ -129,14 +130,12 @@ class Online:
             self._go_through(self._again, tracker)
         elif self._judgement is not None and tracker.newest >= self._judgement.due:
             self._use(self._judgement, tracker)
-        elif self._tentative:
-            self._awake = self._due
-        elif tracker.spare(self.sensors, expected := self._expected(tracker)):
+        elif tracker.spare(self.sensors, expected := self._expected(tracker), not self._tentative):
             self._collect(tracker)
-        elif tracker.stale:
+        elif tracker.stale and not self._tentative:
             self._again = Again(tracker.afresh(tracker.settings, self.sensors.setup), self.sensors.setup)
         else:
-            if self._found is not None and self._judgement is None:
+            if self._found is not None and self._judgement is None and not self._tentative:
                 self._judge_again(self._found, tracker)
             self._awake = expected if now < expected else self._due
 

@@ -9,7 +9,8 @@ with QR (Bierman 1977, ch. VI; Dellaert and Kaess 2006) what only they touch: x_
     [ A_{k-1}     A_k ]   - QR ->  [      R'  z']     R' y_k = z'                  the next message
     [ 0           H_k ]
 
-For a chain this is the elimination that GTSAM does in the same order, on matrices that are dense anyway.
+For a chain this is the elimination that GTSAM does in the same order, on matrices that are dense anyway. Here are the
+rows and what comes of them; `graphnav.solvers.elimination` does it.
 
 A message may have tests beside it (`graphnav.solvers.watch`) that look for errors of fixes that last: more columns on
 the right, which go through the same QR.
@@ -21,15 +22,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dgeqrf, dgesv, dtrtri, dtrtrs
+from scipy.linalg.lapack import dgesv
 
 from graphnav import rotation
-from graphnav.constraints.base import assemble, weighted_sigma
+from graphnav.constraints.base import Constraint, assemble, weighted_sigma
 from graphnav.dynamics import SCALE, Motion
 from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array, mv
-from graphnav.solvers.robust import PASSES, softened, weight_and_cost
+from graphnav.solvers.robust import softened, weight_and_cost
 from graphnav.solvers.watch import Watch
 from graphnav.state import DIM, States
 
@@ -168,20 +169,6 @@ class Linear:
     link: Array | None
     measured: tuple[Measured, ...]
 
-    def stacked(self, y: Array, passes: int, tests: Watch | None = None) -> Array:
-        """(rows, D + 1) of the measurements without tests, weighted for the error state y once `passes` is not 0."""
-        parts = []
-        for one in self.measured:
-            if tests is None or one.name not in tests:
-                H, b, _ = one.weighted(y, passes)
-                parts.append(np.concatenate([H, b[..., None]], axis=-1).reshape(-1, H.shape[-1] + 1))
-        return np.concatenate(parts) if parts else np.zeros((0, len(y) + 1))
-
-    @property
-    def robust(self) -> bool:
-        """Whether any kernel bends."""
-        return any(one.kernel != "none" for one in self.measured)
-
 
 def extended(columns: Columns, steps: Sequence[Step]) -> Columns:
     """The columns with those of parameters that begin behind them."""
@@ -227,18 +214,32 @@ def predicted(before: Message, place: Place) -> tuple[States, Array, Columns, Ar
     return ahead, values, columns, (W @ motion.body_rows(link, before.state.R_nb, row))[0]
 
 
-def measured(place: Place, state: States, values: Array, columns: Columns) -> Linear:
-    """The rows of a keyframe's measurements at a point, without a link."""
-    return at_points([place], state, values[None], columns, linked=False)[0]
+def measured(place: Place, state: States, values: Array, columns: Columns, late: bool | None = None) -> Linear:
+    """The rows of a keyframe's measurements at a point, without a link; with `late` only those that `waits` says."""
+    assert place.problem is not None
+    rows = place.problem.constraints
+    if late is not None:
+        rows = tuple(c for c in rows if waits(c) == late)
+    return at_points([place], state, values[None], columns, linked=False, rows=rows)[0]
+
+
+def waits(rows: Constraint) -> bool:
+    """Whether rows enter last: those that look ahead, and those whose weights an estimate tells."""
+    return rows.looks_ahead or rows.robust != "none"
 
 
 def at_points(
-    places: Sequence[Place], states: States, values: Array, columns: Columns, linked: bool = True
+    places: Sequence[Place],
+    states: States,
+    values: Array,
+    columns: Columns,
+    linked: bool = True,
+    rows: Sequence[Constraint] | None = None,
 ) -> list[Linear]:
     """The rows of consecutive keyframes of one problem at given points, all at once.
 
     `states` and `values` (n, D-15) are at the keyframes; with `linked` there is one more of them, the first, at the
-    keyframe before.
+    keyframe before. `rows` are the constraints that are wanted, if not all.
     """
     problem, first, n = places[0].problem, places[0].k, len(places)
     assert problem is not None
@@ -249,14 +250,14 @@ def at_points(
         motion = Motion(problem.intervals[slice(first - 1, first - 1 + n)], problem.frame)
         r, Ji, Jj, Js = motion.linearize(states, scale)
         W = motion.whitener
-        rows = np.zeros((n, DIM, DIM + D + 1))
-        rows[:, :, :DIM], rows[:, :, DIM : 2 * DIM], rows[:, :, -1] = W @ Ji, W @ Jj, -mv(W, r)
+        link = np.zeros((n, DIM, DIM + D + 1))
+        link[:, :, :DIM], link[:, :, DIM : 2 * DIM], link[:, :, -1] = W @ Ji, W @ Jj, -mv(W, r)
         if scale is not None:
             here = columns[SCALE]
-            rows[:, :, DIM + here.start : DIM + here.stop] = W @ Js
-        links = list(rows)
+            link[:, :, DIM + here.start : DIM + here.stop] = W @ Js
+        links = list(link)
     parts: list[list[Measured]] = [[] for _ in places]
-    for constraint in problem.constraints:
+    for constraint in problem.constraints if rows is None else rows:
         lo, hi = constraint.keyframe.searchsorted((first, first + n))
         if lo == hi or any(p.name not in columns for p in constraint.parameters):
             continue  # none here, or of parameters that have not begun
@@ -276,116 +277,6 @@ def at_points(
                 Measured(c.name, H[own], b[own], sigma[own], kernel, c.scale_of(slice(lo + own.start, lo + own.stop)))
             )
     return [Linear(link, tuple(part)) for link, part in zip(links, parts, strict=True)]
-
-
-def eliminate(
-    before: Message,
-    place: Place,
-    linear: Linear,
-    state: States,
-    values: Array,
-    columns: Columns,
-    weighted: bool = False,
-) -> Stage:
-    """Add the rows of a keyframe, linearised at a point of its own, and eliminate what only the past touches.
-
-    Robust rows get the weights they deserve at the point if that is an estimate of all data already (`weighted`);
-    else none at first, then those of what comes of it, a few times over.
-
-    Raises
-    ------
-    EstimationError
-        If the rows do not determine what is eliminated: sigmas or units are wrong.
-    """
-    D0, D = len(before.z), width(columns)
-    gone = [before.columns[s.name] for s in place.steps if s.name in before.columns]
-    lost = np.arange(DIM if place.linked else 0)
-    if gone:
-        lost = np.concatenate([lost, *(np.arange(at.start, at.stop) for at in gone)])
-    E = len(lost)
-    # where each column of the message goes: to the eliminated ones in front, or to its own place behind them
-    to = np.arange(E, E + D0)
-    to[lost] = np.arange(E)
-    steps, tests = sum(len(s.mean) for s in place.steps), before.tests
-    C = 0 if tests is None else tests.X.shape[1]
-    wide = np.zeros((D0 + steps + (0 if linear.link is None else DIM), E + D + 1 + C))
-    head = wide[:, : E + D + 1]
-    head[:D0, to], head[:D0, -1] = before.R, before.z
-    if tests is not None:
-        wide[:D0, E + D + 1 :] = before.R @ tests.X
-    if not place.linked:  # one and the same state, but about its new point
-        shift = state.minus(before.state)[0]
-        if np.any(shift):
-            head[:D0, -1] -= before.R[:, :DIM] @ shift
-            head[:D0, E : E + 3] = head[:D0, E : E + 3] @ rotation.right_jacobian_inverse(shift[None, :3])[0]
-    moved = values[: D0 - DIM] - before.values
-    for at in gone:
-        moved[_shift(at)] = 0.0
-    if np.any(moved):  # parameters that stay are about the new point's values
-        head[:D0, -1] -= before.R[:, DIM:] @ moved
-    row = D0
-    for step in place.steps:
-        at = columns[step.name]
-        k = len(step.mean)
-        rows, diagonal, value = np.arange(row, row + k), 1.0 / step.sigma, values[_shift(at)]
-        head[rows, E + np.arange(at.start, at.stop)] = diagonal
-        off = value - step.mean
-        if step.name in before.columns and step.decay:
-            old = before.columns[step.name]
-            head[rows, to[old.start : old.stop]] = -step.decay * diagonal
-            off = off - step.decay * (before.value(step.name) - step.mean_before)
-        head[rows, -1] = -off * diagonal
-        row += k
-    if linear.link is not None:
-        head[row:, :DIM], head[row:, E:] = linear.link[:, :DIM], linear.link[:, DIM:]
-    y, first, fault = np.zeros(D), 1 if weighted else 0, None
-    for passes in range(first, first + 1 if weighted or not linear.robust else PASSES):
-        tail = linear.stacked(y, passes, tests)
-        A = np.zeros((len(head) + len(tail), E + D + 1 + C), order="F")
-        A[: len(head)], A[len(head) :, E : E + D + 1] = wide, tail
-        R = np.triu(dgeqrf(A, overwrite_a=1)[0][: E + D])
-        top, beside = R[E:, E:], None
-        if tests is not None:
-            top, beside, fault = _tested(top, tests.copy(), linear.measured, y, passes, place.t, state)
-        message = Message(state, values, columns, top[:, :D], top[:, D], beside)
-        if linear.robust:
-            y = message.estimate
-    root, info = dtrtri(R[:E, :E]) if E else (np.zeros((0, 0)), 0)
-    if info:
-        raise EstimationError(f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units")
-    G, g = np.zeros((D0, D)), np.zeros(D0)
-    kept = np.arange(D0)
-    G[kept, kept] = 1.0
-    g[DIM:] = values[: D0 - DIM] - before.values
-    G[lost], g[lost] = -root @ R[:E, E : E + D], root @ R[:E, E + D]
-    if not place.linked and np.any(state.minus(before.state)):
-        shift = state.minus(before.state)[0]
-        G[:DIM] = turned(G[:DIM], rotation.right_jacobian_inverse(shift[None, :3])[0])
-        g[:DIM] += shift
-    return Stage(place, message, G, g, lost, root @ root.T, linear.measured, fault=fault)
-
-
-def _tested(
-    top: Array, tests: Watch, rows: Sequence[Measured], y: Array, passes: int, t: float, state: States
-) -> tuple[Array, Watch, tuple[str, float] | None]:
-    """Add the measurements that have tests to the rows [R z Z] of a message, Z = R X (D, C)."""
-    fault, D, speed = None, len(top), float(np.linalg.norm(state.v))
-    for one in rows:
-        if one.name not in tests or not one.H.any():  # none of those that are left out
-            continue
-        H, b, sigma = one.weighted(y, passes)
-        own, columns, errors = tests.begin(one.name, t, sigma)
-        A = np.zeros((D + errors.shape[0], top.shape[1]), order="F")
-        A[:D], A[D:, :D], A[D:, D] = top, H.reshape(-1, D), b.ravel()
-        with_tests = A[:, D + 1 :]
-        with_tests[:D, own], with_tests[D:, columns] = 0.0, errors
-        R = np.triu(dgeqrf(A, overwrite_a=1)[0])
-        top, left = R[:D], R[D:, D:]
-        since = tests.found(one.name, t, left[:, 0], left[:, 1:][:, columns], speed)
-        if since is not None and fault is None:
-            fault = one.name, since
-    tests.X = dtrtrs(top[:, :D], top[:, D + 1 :])[0]
-    return top, tests, fault
 
 
 def _shift(columns: slice) -> slice:

@@ -23,6 +23,7 @@ from bisect import bisect_left
 from collections.abc import Iterable, Mapping
 
 import numpy as np
+from scipy.linalg.lapack import dtrtrs
 from scipy.special import chdtri, gammaincinv
 
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity
@@ -214,18 +215,32 @@ class Watch:
 
     def __init__(self, constraints: Iterable[GnssPosition | GnssVelocity], period: float, width: int) -> None:
         self._slots = _slots(constraints, None, period)
-        self.X = np.zeros((width, sum(s.L * s.m for s in self._slots.values())))
+        self._X: Array | None = np.zeros((width, sum(s.L * s.m for s in self._slots.values())))
+        self._stands: tuple[Array, Array] | None = None  # R and R X
 
     def copy(self) -> Watch:
         """The same, on its own."""
         other = object.__new__(Watch)
-        other.X, other._slots = self.X, {name: slots.copy() for name, slots in self._slots.items()}
+        other._X, other._stands = self._X, self._stands
+        other._slots = {name: slots.copy() for name, slots in self._slots.items()}
         return other
+
+    @property
+    def X(self) -> Array:
+        """(D, C) what a unit error since each onset does to the estimate."""
+        if self._X is None:
+            assert self._stands is not None
+            self._X, self._stands = dtrtrs(*self._stands)[0], None
+        return self._X
+
+    def stands(self, R: Array, Z: Array) -> None:
+        """The message has come to a triangular R (D, D), with Z = R X (D, C) beside it."""
+        self._X, self._stands = None, (R, Z)
 
     def forgetful(self) -> Watch:
         """The same without any onset."""
         other = self.copy()
-        other.X = np.zeros_like(self.X)
+        other._X, other._stands = np.zeros_like(self.X), None
         for slots in other._slots.values():
             slots.forget()
         return other
@@ -280,15 +295,17 @@ class Verdicts:
 
     def weights(self, name: str, t: Array) -> Array:
         """(n,) of fixes at the times t: 0 for what is not used. Fixes that were not known yet are."""
-        known = self.times.get(name, np.empty(0))
-        new = t[~np.isin(t, known)] if len(known) and t[0] <= known[-1] else t
-        if len(new):
-            at = known.searchsorted(new)
-            if len(at) and at[0] < len(known):
+        known, used = self.times.get(name, np.empty(0)), self.used.get(name, np.empty(0))
+        at = known.searchsorted(t)
+        new = at == len(known)
+        new[~new] = known[at[~new]] != t[~new]
+        if new.any():
+            if at[new][0] < len(known):
                 self._trial = None  # its rows have moved
-            self.times[name] = np.insert(known, at, new)
-            self.used[name] = np.insert(self.used.get(name, np.empty(0)), at, 1.0)
-        return self.used[name][self.times[name].searchsorted(t)]
+            self.times[name] = known = np.insert(known, at[new], t[new])
+            self.used[name] = used = np.insert(used, at[new], 1.0)
+            at = known.searchsorted(t)
+        return np.asarray(used[at])
 
     def settle(self, name: str, since: float, now: float) -> float:
         """Take from use what a fault of fixes `since` (s) up to `now` gives reason to; the time to go on from."""

@@ -10,7 +10,7 @@ does the same from its own time on. With a lag longer than the drive this is the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,14 +18,14 @@ import numpy as np
 from graphnav import rotation
 from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
+from graphnav.solvers.elimination import Predicted, predict, update
+from graphnav.solvers.revision import Renewed, Revision
 from graphnav.solvers.stages import (
     Columns,
     Measured,
     Message,
     Place,
     Stage,
-    at_points,
-    eliminate,
     extended,
     measured,
     predicted,
@@ -43,9 +43,6 @@ _ROUNDS = 5
 _SPAN = 16  # stages that are smoothed back over at once
 _ALMOST = 0.3
 _LIMITS = {"rad": 1e-2, "s": _DELAY}
-
-
-Renewed = Callable[[int], list[Place]]
 
 
 @dataclass(frozen=True)
@@ -104,6 +101,8 @@ class Window:
         self._gone = 0  # stages that have left
         self._spans: list[_Span] = []
         self._means: list[Array] | None = None
+        self._revision: Revision | None = None
+        self._rounds = 0  # of it
 
     def __len__(self) -> int:
         return len(self.stages)
@@ -125,15 +124,21 @@ class Window:
             first -= 1
         return self.stages[first:]
 
-    def push(self, place: Place) -> float:
-        """Add a keyframe, linearised at its prediction; returns by how much its measurements turned it, rad."""
-        before = self.newest
-        state, values, columns, link = predicted(before, place)
-        linear = measured(place, state, values, columns)
-        if link is not None:
-            linear = type(linear)(link, linear.measured)
-        stage = eliminate(before, place, linear, state, values, columns)
-        e = stage.message.estimate
+    def expect(self, place: Place) -> Predicted:
+        """A keyframe, linearised at its prediction, with the rows of its problem that need not be waited for."""
+        state, values, columns, link = predicted(self.newest, place)
+        rows = measured(place, state, values, columns, late=False).measured
+        return predict(self.newest, place, link, rows, state, values, columns)
+
+    def push(self, place: Place, ahead: Predicted | None = None) -> float:
+        """Add a keyframe; returns by how much its measurements turned it, rad.
+
+        `ahead` is what was expected of it after the newest, if known already: only the rows that had to be waited for
+        are then made.
+        """
+        ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
+        columns = ahead.columns
+        stage, e = update(ahead, measured(place, ahead.state, ahead.values, columns, late=True).measured)
         self.stages.append(stage.moved(e))
         self._means = None
         if columns != self._limit[0]:
@@ -165,6 +170,19 @@ class Window:
         else:
             self.head = self.head.moved(self.head.estimate)
 
+    def replace_from(self, first: int, before: Stage | Message, stages: Sequence[Stage]) -> None:
+        """Have other stages from one on, and what comes before them about another point."""
+        if isinstance(before, Stage):
+            tests = self.stages[first - 1].message.tests
+            self.stages[first - 1] = replace(before, message=replace(before.message, tests=tests))
+        else:
+            self.head = replace(before, tests=self.head.tests)
+        self.stages[first:] = stages
+        if stages:
+            self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
+        self._means = None
+        self.relinearized += len(stages)
+
     def means(self) -> list[Array]:
         """Smoothed error states, one of the message before the window and one of each stage."""
         if self._means is None:
@@ -180,6 +198,7 @@ class Window:
     def settle(self, count: int) -> Smoothed:
         """Smooth the window and let its first `count` stages go."""
         gone, means = self.stages[:count], self.means()[1 : count + 1]
+        self._revision, self._rounds = None, 0
         columns = tuple(stage.message.columns for stage in gone)
         rows, covariance, sigma, residuals = [], np.empty((len(gone), DIM, DIM)), [], []
         for k, (stage, e, P) in enumerate(zip(gone, means, self._covariances(count), strict=True)):
@@ -267,29 +286,7 @@ class Window:
 
         `places` are where their rows come from, if not where they came from before; all of one problem.
         """
-        means = self.means()
-        old = self.stages[first:]
-        if first:
-            self.stages[first - 1] = self.stages[first - 1].moved(means[first])
-            before = self.stages[first - 1].message
-        else:
-            before = self.head = self.head.moved(means[0])
-        around = [before, *(stage.message for stage in old)]
-        moves = [np.zeros(len(before.z)), *means[first + 1 :]]
-        states = States.stack([m.state for m in around]).plus(np.array([e[:DIM] for e in moves]))
-        points = [
-            Point(states[k : k + 1], m.values + e[DIM:], m.columns)
-            for k, (m, e) in enumerate(zip(around, moves, strict=True))
-        ]
-        again = remade(replace(before, tests=None), points, places or [stage.place for stage in old])
-        # what an error of the fixes does to the estimate is the same to first order
-        self.stages[first:] = [
-            replace(stage, message=replace(stage.message, tests=was.message.tests))
-            for stage, was in zip(again, old, strict=True)
-        ]
-        self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
-        self._means = None
-        self.relinearized += len(old)
+        Revision(self, first).step(len(self), None if places is None else lambda *_: places)
 
     def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> int:
         """Relinearise until nothing has moved; returns how often.
@@ -298,7 +295,7 @@ class Window:
         ----------
         share : of the usual limits.
         always : once at least.
-        renewed : gives the places of the stages from an index on, where they no longer know their rows.
+        renewed : gives the places of stages, from an index to another, where they no longer know their rows.
         """
         for count in range(_ROUNDS):
             first = 0 if always and not count else self.first_moved(share)
@@ -306,8 +303,29 @@ class Window:
                 return count
             # what has moved almost as far goes with it: it would be next
             first = min(first, self.first_moved(_ALMOST * share) or 0) if first else 0
-            self.relinearize(first, renewed(first) if renewed is not None else None)
+            self.relinearize(first, None if renewed is None else renewed(first, len(self)))
         return _ROUNDS
+
+    @property
+    def revising(self) -> bool:
+        """Whether `revise` is not through."""
+        return self._revision is not None or self._rounds > 0
+
+    def revise(self, count: int, renewed: Renewed, always: bool = False) -> bool:
+        """A part of what `converge` does, at most so many stages of it; False once there is nothing left to do.
+
+        Keyframes may come and go before the next part, and what has been made of them goes with them.
+        """
+        if self._revision is None:
+            first = 0 if always and not self._rounds else self.first_moved()
+            if first is None or self._rounds == _ROUNDS:
+                self._rounds = 0
+                return False
+            first = min(first, self.first_moved(_ALMOST) or 0) if first else 0
+            self._revision, self._rounds = Revision(self, first), self._rounds + 1
+        if self._revision.step(count, renewed):
+            self._revision = None
+        return True
 
 
 def _residual(rows: Measured, e: Array, P: Array) -> Residual:
@@ -326,53 +344,6 @@ def turn_limit(noise: ImuNoise) -> float:
 def first_message(state: States, sigma: Array) -> Message:
     """A prior: one state and its fifteen sigmas."""
     return Message(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM))
-
-
-@dataclass(frozen=True)
-class Point:
-    """Where rows are linearised: one state, parameter values and where they stand."""
-
-    state: States
-    values: Array
-    columns: Columns
-
-
-def remade(before: Message, points: Sequence[Point], places: Sequence[Place]) -> list[Stage]:
-    """Stages about given points; `points[0]` is that of the message before them."""
-    out: list[Stage] = []
-    for run in _runs(points, places):
-        linked, own = places[run[0]].linked, [places[k] for k in run]
-        part = [points[k + 1] for k in run]
-        around = [points[run[0]], *part] if linked else part
-        columns = part[-1].columns
-        values = np.zeros((len(around), width(columns) - DIM))
-        for row, point in zip(values, around, strict=True):
-            row[: len(point.values)] = point.values
-        states = States.stack([point.state for point in around])
-        for place, point, linear in zip(own, part, at_points(own, states, values, columns, linked), strict=True):
-            stage = eliminate(before, place, linear, point.state, point.values, point.columns, weighted=True)
-            before = stage.message
-            out.append(stage)
-    return out
-
-
-def _runs(points: Sequence[Point], places: Sequence[Place]) -> list[list[int]]:
-    """Indices of places that can be linearised together: one problem, keyframe after keyframe, the same columns."""
-    runs: list[list[int]] = []
-    for k, place in enumerate(places):
-        last = places[k - 1] if runs else None
-        alike = (
-            last is not None
-            and place.linked == last.linked
-            and place.problem is last.problem
-            and place.k == last.k + 1
-            and points[k + 1].columns == points[k].columns
-        )
-        if alike:
-            runs[-1].append(k)
-        else:
-            runs.append([k])
-    return runs
 
 
 def _limits(columns: Columns, units: dict[str, str]) -> tuple[Columns, Array]:

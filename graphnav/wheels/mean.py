@@ -223,7 +223,7 @@ class MeanSpeed:
         a, b = np.asarray(a, dtype=float) + delay, np.asarray(b, dtype=float) + delay
         if len(self.t) < 2:
             return np.full(np.shape(a), np.nan)
-        ka, kb = self._segment(a), self._segment(b)
+        ka, kb = (np.maximum(np.searchsorted(self.t, x, side="right") - 1, 0) for x in (a, b))
         readings = np.maximum(kb - ka, 1)
         different = 1 + self.changes[kb] - self.changes[ka]
         return np.sqrt(self.white**2 / readings + self.rounding**2 / different + (self.ends / (b - a)) ** 2)

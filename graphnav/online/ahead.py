@@ -1,0 +1,69 @@
+"""The state at every row of the IMU, by prediction from the newest keyframe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.constraints.base import SAME_TIME
+from graphnav.dense import Dense
+from graphnav.dynamics import SCALE, Motion
+from graphnav.earth import LocalFrame
+from graphnav.online.sensors import Sensors
+from graphnav.preintegration import preintegrate
+from graphnav.rotation import Array
+from graphnav.samples import bridge_gaps
+from graphnav.solvers.window import Message
+from graphnav.state import DIM, States
+
+
+@dataclass(frozen=True)
+class Live:
+    """The state now: one state, the covariance of its error state, and the newest keyframe it is predicted from."""
+
+    t: float
+    state: States
+    covariance: Array  # (15, 15)
+    keyframe: float  # s
+
+
+def live(newest: Message, T: float, frame: LocalFrame, sensors: Sensors) -> Live:
+    """The state at the newest IMU row, from the message `newest` of the newest keyframe at T (s)."""
+    now = sensors.imu.newest
+    state, P = newest.state, newest.covariance
+    if now > T + SAME_TIME:
+        imu = sensors.recording(T - 1.0, now).imu
+        intervals = preintegrate(bridge_gaps(imu), imu, np.array([T, now]), state.ba[0], state.bg[0])
+        motion, one = Motion(intervals, frame), slice(0, 1)
+        scale = newest.value(SCALE) if SCALE in newest.columns else None
+        ahead, F15 = motion.propagate(one, state, scale)
+        F = np.zeros((DIM, len(P)))
+        F[:, :DIM] = F15[0]
+        if scale is not None:
+            F[:, newest.columns[SCALE]] = motion.scale_columns(one, F15)[0]
+        P = F @ P @ F.T + motion.noise(one, state.R_nb)[0]
+        state = ahead
+    return Live(float(max(now, T)), state, P[:DIM, :DIM], T)
+
+
+def since(newest: Message, T: float, frame: LocalFrame, sensors: Sensors) -> tuple[Array, States, Array]:
+    """Times (M,), states and covariances (M, 15, 15) at every IMU row since the newest keyframe at T (s).
+
+    Predicted through each row; covariances lie on the straight line between those at both ends.
+    """
+    t = sensors.imu.t[sensors.imu.t > T + SAME_TIME].copy()
+    if not len(t):
+        return t, newest.state[:0], np.empty((0, DIM, DIM))
+    now = live(newest, T, frame, sensors)
+    imu, start = sensors.recording(T - 1.0, now.t).imu, newest.state
+    ba, bg = start.ba, start.bg
+    if SCALE in newest.columns:
+        scale, rows = newest.value(SCALE), imu.t > T
+        bg = bg + scale[:3] * (imu.gyro[rows].mean(axis=0) - bg)
+        ba = ba + scale[3:] * (imu.accel[rows].mean(axis=0) - ba)
+    ends, both = np.array([T, now.t]), np.stack([newest.covariance[:DIM, :DIM], now.covariance])
+    between = Dense(
+        bridge_gaps(imu), frame, ends, States.stack([start, now.state]), both, ba, bg, smooth=False
+    )  # fmt: skip
+    return t, *between(t)

@@ -1,0 +1,183 @@
+"""The chain of keyframes of a running drive: how those that are posed enter the window, and what is kept of them.
+
+A keyframe enters with the parameters that begin or move on there, and with what is decided of each of its rows by
+then: fixes found to be wrong have no weight, wheels the sigma that settled keyframes have shown. Where a fix shows that
+fixes have been wrong for some time, the keyframes since then leave again and enter without those.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME
+from graphnav.constraints.gnss import GnssPosition, GnssVelocity
+from graphnav.constraints.standstill import PLACE
+from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
+from graphnav.online.evidence import Evidence
+from graphnav.online.looks import Stops
+from graphnav.online.sensors import Sensors
+from graphnav.problem import NODE_SPACING, Problem
+from graphnav.rotation import Array
+from graphnav.solvers.elimination import Predicted
+from graphnav.solvers.stages import Place, Step
+from graphnav.solvers.watch import Verdicts, Watch
+from graphnav.solvers.window import Message, Smoothed, Window
+from graphnav.state import Parameter
+
+_PLACE_SIGMA = 1000.0  # m, of where a stop may be
+_FIXES = 5  # that tell how often they come
+
+
+class Chain:
+    """Keyframes in a window.
+
+    Parameters
+    ----------
+    message, t0 : the prior and the time it is for.
+    turn : rad, how far an attitude may move before rows are linearised anew.
+    """
+
+    def __init__(self, settings: Settings, message: Message, t0: float, turn: float) -> None:
+        self.settings = settings
+        self.window = Window(message, turn)
+        self.head = t0  # time of the message before the window, or of the first keyframe as long as it is in it
+        self.opened = False  # whether the first keyframe has left the window
+        self.evidence = Evidence()
+        self.verdicts = Verdicts({}, {})  # which fixes are used
+        self._standing = Stops()
+        self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
+        self._head_nodes: dict[str, float] = {}
+        self._parameters: dict[str, Parameter] = {}
+        self._turned = False  # whether something has moved so far that it may have to be linearised again
+
+    @property
+    def newest(self) -> float:
+        """Time of the newest keyframe, s."""
+        return self.window.stages[-1].place.t if self.window.stages else self.head
+
+    @property
+    def stops(self) -> Array:
+        """Spans (M, 2) between keyframes in which the vehicle stands, or the foot, s."""
+        return self._standing.spans
+
+    @property
+    def times(self) -> Array:
+        """Times of all keyframes that an interval in the window touches, s."""
+        t = self.window.t
+        return np.concatenate([[self.head], t]) if self.opened else t
+
+    @property
+    def _oldest(self) -> float:
+        """Time of the oldest keyframe in the window, s."""
+        return self.window.stages[0].place.t if self.window.stages else self.newest
+
+    # ------------------------------------------------------------------------------------------ entering, leaving
+    def _watch(self, problem: Problem, sensors: Sensors) -> None:
+        """Have the fixes watched for errors that last, as soon as some tell how often they come."""
+        if self.window.newest.tests is not None or self.settings.gnss.faults == "off" or len(sensors.gnss) < _FIXES:
+            return
+        watched = [c for c in problem.constraints if c.watched and isinstance(c, GnssPosition | GnssVelocity)]
+        if watched:
+            period = float(np.median(np.diff(sensors.gnss.t)))
+            self.window.watch(Watch(watched, period, len(self.window.newest.z)))
+
+    def _weighed(self, problem: Problem) -> Problem:
+        """The problem with what is decided of each row before it enters the window.
+
+        Fixes: not used where a fault was found. Wheels: their sigma by what settled so far says of them.
+        """
+        factors, rows = self.evidence.factors, []
+        for c in problem.constraints:
+            if isinstance(c, NonHolonomic | OdometerSpeed) and c.name in factors:
+                c = replace(c, sigma=c.sigma * factors[c.name])
+            elif c.watched and self.settings.gnss.faults != "off":
+                weight = self.verdicts.weights(c.name, problem.t[c.keyframe])
+                if not weight.all():
+                    c = replace(c, weight=weight)
+            rows.append(c)
+        return replace(problem, constraints=tuple(rows))
+
+    def _add(self, posed: Problem, first: int, ahead: Predicted | None = None) -> float | None:
+        """Add the keyframes of a problem from one on; the time before them to go on from, if a fault is found.
+
+        `ahead` is what was expected of the first of them, if that still holds.
+        """
+        problem, k, turn = self._weighed(posed), first, 0.0
+        while k < len(problem.t):
+            turn = max(turn, self._push(problem, k, ahead))
+            fault, ahead = self.window.stages[-1].fault, None
+            if fault is not None:
+                again = self.verdicts.settle(*fault, now=float(problem.t[k]))
+                if again < problem.t[first] - SAME_TIME:
+                    if again <= self.head + SAME_TIME:
+                        self.window.forget_tests()
+                    return again
+                problem = self._weighed(posed)
+                back = int(problem.t.searchsorted(again - SAME_TIME))
+                self._keep(len(self.window) - (k - back + 1))
+                k = back
+                continue
+            k += 1
+        self._turned |= turn > self.window.turn
+        return None
+
+    def _push(self, problem: Problem, k: int, ahead: Predicted | None) -> float:
+        place, nodes = self._place(problem, k)
+        turn = self.window.push(place, ahead if ahead is not None and ahead.before is self.window.newest else None)
+        self._nodes.append(nodes)
+        return turn
+
+    def _place(self, problem: Problem, k: int) -> tuple[Place, dict[str, float]]:
+        """Keyframe `k` of a problem as the next one, and when each parameter's node began there."""
+        t = float(problem.t[k])
+        first = not self.window.stages and not self.opened
+        nodes = dict(self._nodes[-1] if self._nodes else self._head_nodes)
+        return Place(t, problem, k, self._moves(t, nodes), linked=not first), nodes
+
+    def _moves(self, t: float, nodes: dict[str, float]) -> tuple[Step, ...]:
+        """Parameters that begin or move on at a keyframe; `nodes` is brought up to date."""
+        steps = []
+        stop = self._stop_at(t) if PLACE in self._parameters else None
+        for name, p in self._parameters.items():
+            if name == PLACE:
+                if stop is not None and nodes.get(name) != stop:
+                    place = self.window.newest.state.p[0]
+                    steps.append(Step(name, place, np.full(3, _PLACE_SIGMA)))
+                    nodes[name] = stop
+            elif name not in nodes:
+                steps.append(Step(name, np.atleast_2d(p.initial)[0], np.atleast_2d(p.sigma)[0]))
+                nodes[name] = t
+            elif t - nodes[name] >= NODE_SPACING - SAME_TIME and not p.constant:
+                ahead, added = p.step(np.array([t - nodes[name]]))
+                steps.append(Step(name, p.initial, added[0], float(ahead[0]), p.initial))
+                nodes[name] = t
+        return tuple(steps)
+
+    def _stop_at(self, t: float) -> float | None:
+        """When the stop began that lasts at a time."""
+        inside = (self.stops[:, 0] <= t + SAME_TIME) & (self.stops[:, 1] >= t - SAME_TIME)
+        return float(self.stops[inside][0, 0]) if inside.any() else None
+
+    def _keep(self, count: int) -> None:
+        self.window.truncate(count)
+        del self._nodes[count:]
+
+    def _leave(self, count: int) -> Smoothed:
+        """Let the first keyframes settle."""
+        self._head_nodes = self._nodes[count - 1]
+        self.head, self.opened = float(self.window.t[count - 1]), True
+        settled = self.window.settle(count)
+        self.evidence.add(settled)
+        del self._nodes[:count]
+        return settled
+
+    def _forget(self) -> None:
+        """Stages need not know where their rows came from: that is posed again when it is asked for."""
+        stages = self.window.stages
+        for k in range(len(stages) - 1, -1, -1):
+            if stages[k].place.problem is None:
+                break  # nor do those before it
+            stages[k] = replace(stages[k], place=replace(stages[k].place, problem=None))
