@@ -28,7 +28,7 @@ from graphnav.online.looks import CONTEXT, SURE, Readings, Stops, clipped
 from graphnav.online.sensors import Sensors
 from graphnav.online.steps import Steps
 from graphnav.preintegration import preintegrate
-from graphnav.problem import NODE_SPACING, Problem, pose
+from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.samples import GAP, bridge_gaps
@@ -407,7 +407,7 @@ class Tracker:
             elif name not in nodes:
                 steps.append(Step(name, np.atleast_2d(p.initial)[0], np.atleast_2d(p.sigma)[0]))
                 nodes[name] = t
-            elif t - nodes[name] >= NODE_SPACING - SAME_TIME and not p.constant:
+            elif t - nodes[name] >= p.spacing - SAME_TIME and not p.constant:
                 ahead, added = p.step(np.array([t - nodes[name]]))
                 steps.append(Step(name, p.initial, added[0], float(ahead[0]), p.initial))
                 nodes[name] = t
