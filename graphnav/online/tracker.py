@@ -17,14 +17,14 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.constraints.standstill import PLACE
-from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.dense import Dense
 from graphnav.detectors.base import merged
 from graphnav.dynamics import SCALE, Motion
 from graphnav.earth import LocalFrame
 from graphnav.findings import period_of
-from graphnav.online.evidence import Evidence
+from graphnav.online.evidence import SPEEDS, Evidence
 from graphnav.online.looks import CONTEXT, SURE, Readings, Stops, clipped
+from graphnav.online.noise import Noise
 from graphnav.online.sensors import Sensors
 from graphnav.online.steps import Steps
 from graphnav.preintegration import preintegrate
@@ -77,6 +77,7 @@ class Tracker:
         self.settled: list[Smoothed] = []
         self.evidence = Evidence()
         self.verdicts = Verdicts({}, {})  # which fixes are used
+        self.noise = Noise()  # of those
         self.in_force: dict[str, int] = {}  # rows of each constraint at the newest keyframe
         self.seconds: dict[str, float] = {}  # of its thread, by what the newest update did
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
@@ -164,6 +165,10 @@ class Tracker:
         problem, k, turn = self._weighed(posed), first, 0.0
         while k < len(problem.t):
             turn = max(turn, self._push(problem, k))
+            if self.noise.hear(problem, self.window.stages[-1]):
+                self._keep(len(self.window) - 1)
+                problem = self._weighed(posed)
+                turn = max(turn, self._push(problem, k))
             fault = self.window.stages[-1].fault
             if fault is not None:
                 again = self.verdicts.settle(*fault, now=float(problem.t[k]))
@@ -251,6 +256,7 @@ class Tracker:
         self.head, self.opened = float(self.window.t[count - 1]), True
         self.settled.append(self.window.settle(count))
         self.evidence.add(self.settled[-1])
+        self.noise.forget(self.head)
         self._motions = {t: one for t, one in self._motions.items() if t > self.head - CONTEXT}
         del self._nodes[:count]
         self._forget()
@@ -259,6 +265,7 @@ class Tracker:
         """One with other figures of the sensors that has settled what this one has, and has no keyframes since."""
         other, head = copy.copy(self), self.window.head
         other.settings, other._parameters, other.verdicts = settings, {}, copy.deepcopy(self.verdicts)
+        other.noise = copy.deepcopy(self.noise)
         other.window = Window(head.moved(head.estimate), turn_limit(setup.imu.noise))
         other._nodes, other._motions, other.settled = [], {}, []
         other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)
@@ -363,15 +370,19 @@ class Tracker:
     def _weighed(self, problem: Problem) -> Problem:
         """The problem with what is decided of each row before it enters the window.
 
-        Fixes: not used where a fault was found. Wheels: their sigma by what settled so far says of them.
+        Fixes: not used where a fault was found, and by how noisy they are. Speeds: their sigma by what settled so far
+        says of them.
         """
         factors, rows = self.evidence.factors, []
         for c in problem.constraints:
-            if isinstance(c, NonHolonomic | OdometerSpeed) and c.name in factors:
+            if isinstance(c, SPEEDS) and c.name in factors:
                 c = replace(c, sigma=c.sigma * factors[c.name])
-            elif c.watched and self.settings.gnss.faults != "off":
-                weight = self.verdicts.weights(c.name, problem.t[c.keyframe])
-                if not weight.all():
+            if c.watched or c.adaptive != "off":
+                t = problem.t[c.keyframe]
+                weight = self.noise.weights(c, t)
+                if c.watched:
+                    weight = weight * self.verdicts.weights(c.name, t)
+                if np.any(weight != 1.0):
                     c = replace(c, weight=weight)
             rows.append(c)
         return replace(problem, constraints=tuple(rows))
