@@ -23,12 +23,10 @@ from graphnav.state import DIM, Parameter, States
 from graphnav.unresolved import with_coning, with_unresolved_motion
 from graphnav.wheels import MeanSpeed
 
-NODE_SPACING = 5.0  # s between the nodes of a slowly moving parameter: a twentieth of the shortest correlation time
-
 
 @dataclass(frozen=True)
 class ParameterChain:
-    """A parameter and its nodes: one for a constant, one every `NODE_SPACING` for a slow one.
+    """A parameter and its nodes: one for a constant; a slow one has the next at the first keyframe after its spacing.
 
     From node to node: value - mean -> decay (value - mean) + white noise of `sigma`.
     """
@@ -193,14 +191,22 @@ def _chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterChain, 
         if p.begins is not None:
             nodes, mean, sigma, decay = p.begins, p.initial, p.sigma, np.zeros(len(p.begins))
         else:
-            count = 1 if p.constant else max(1, round((t[-1] - t[0]) / NODE_SPACING))
-            nodes = t[0] + (t[-1] - t[0]) / count * np.arange(count)
+            nodes = t[:1] if p.constant else _apart(t, p.spacing)
             ahead, added = p.step(np.diff(nodes))
-            mean = np.tile(p.initial, (count, 1))
+            mean = np.tile(p.initial, (len(nodes), 1))
             sigma, decay = np.concatenate([p.sigma[None], added]), np.concatenate([[0.0], ahead])
         node = np.maximum(np.searchsorted(nodes, t + SAME_TIME, side="right") - 1, 0)
         chains.append(ParameterChain(p, nodes, node, mean, sigma, decay))
     return tuple(chains)
+
+
+def _apart(t: Array, spacing: float) -> Array:
+    """Those of the keyframes that lie so far apart at least; the same ones however long the drive goes on."""
+    out = [float(t[0])]
+    for x in t.tolist():
+        if x - out[-1] >= spacing - SAME_TIME:
+            out.append(x)
+    return np.array(out)
 
 
 def _notes(samples: Samples, recording: Recording) -> tuple[str, ...]:

@@ -29,6 +29,7 @@ BLOCKS = {
     "bg": slice(12, 15),
 }
 DIM = 15
+NODE_SPACING = 5.0  # s between the nodes of what walks slowly: mounting angles, scale of an odometer
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Parameter:
     unit: str
     walk: float | Array = 0.0  # unit/sqrt(s) of a random walk, (k,) or one for all; 0 = constant
     correlation_time: float | None = None  # s; given, a Gauss-Markov process about zero with `sigma` at all times
+    spacing: float = NODE_SPACING  # s, at least, from one of its nodes to the next
     begins: Array | None = None  # (n,) s; given, `initial` and `sigma` hold anew from each of these times on
 
     @property

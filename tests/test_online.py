@@ -584,24 +584,25 @@ def test_a_walk_with_lost_packets_settles_on_the_batch_solution(shared_data: Pat
 
 
 # ----------------------------------------------------------------------------------------------- judged as it goes
-def settled_with(factor: float, seed: int) -> Smoothed:
-    """An hour of residuals of forward speed that scatter `factor` times as much as stated."""
+def settled_with(name: str, factor: float, seed: int) -> Smoothed:
+    """An hour of residuals of one axis of a constraint that scatter `factor` times as much as stated."""
     t = np.arange(3600.0)
     left = factor * np.random.default_rng(seed).standard_normal(3600)
-    rows = tuple((Residual("odometer", np.full((1, 1), 0.01), np.full((1, 1), x), np.ones((1, 1))),) for x in left)
+    rows = tuple((Residual(name, np.full((1, 1), 0.01), np.full((1, 1), x), np.ones((1, 1))),) for x in left)
     none = (np.empty(0),) * 3600
     return Smoothed(t, None, np.empty(0), ({},) * 3600, none, none, (None,) * 3600, rows)
 
 
+@pytest.mark.parametrize("name", ["odometer", "gnss_velocity"])
 @pytest.mark.parametrize(("factor", "lowest", "highest"), [(1.0, 1.0, 1.0), (3.0, 2.7, 3.3)])
-def test_wheels_are_judged_by_what_has_settled(factor: float, lowest: float, highest: float) -> None:
+def test_speeds_are_judged_by_what_has_settled(name: str, factor: float, lowest: float, highest: float) -> None:
     evidence = Evidence()
-    evidence.add(settled_with(factor, 1))
-    found = evidence.factors.get("odometer", np.ones(1))
+    evidence.add(settled_with(name, factor, 1))
+    found = evidence.factors.get(name, np.ones(1))
     assert lowest <= found[0] <= highest
     # what comes after was whitened with the raised sigma, and the factor stays what it was
-    evidence.add(settled_with(factor / found[0], 2))
-    assert lowest <= evidence.factors.get("odometer", np.ones(1))[0] <= highest
+    evidence.add(settled_with(name, factor / found[0], 2))
+    assert lowest <= evidence.factors.get(name, np.ones(1))[0] <= highest
 
 
 def test_an_imu_is_judged_by_ever_more_rows(drive: tuple[Recording, Trajectory]) -> None:

@@ -83,7 +83,7 @@ def nearly_linear(kind: str) -> Trio:
 NODES = {
     "states": {},
     "constants": {SCALE: 1, LEVER_ARM: 1},
-    "slow": dict.fromkeys(SLOW_ERRORS, 14),
+    "slow": dict.fromkeys(SLOW_ERRORS, 15),
     "stops": {PLACE: 2},
 }
 

@@ -43,7 +43,7 @@ from graphnav.config.gnss import GnssSettings, of_type
 from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
 from graphnav.recording import FIX_TYPES, Gnss, Imu, Recording
 from graphnav.rotation import Array, mv
-from graphnav.state import Parameter, States
+from graphnav.state import NODE_SPACING, Parameter, States
 
 LEVER_ARM = "gnss_lever_arm"
 TIME_OFFSET = "gnss_time_offset"
@@ -144,9 +144,10 @@ class GnssPosition(Constraint):
                     common["robust"] = "cauchy"
             if share > 0:
                 sigma = np.full(3, np.sqrt(0.5 * share))
+                spacing = node_spacing(share, s.slow_times, (1.0 - share) * alike, period(gnss.t[own]))
                 for slow, time in zip(SLOW_ERRORS, s.slow_times, strict=True):
                     slow = slow if kind is None else f"{slow}_{name}"
-                    process = Parameter(slow, np.zeros(3), sigma, "sd", correlation_time=time)
+                    process = Parameter(slow, np.zeros(3), sigma, "sd", correlation_time=time, spacing=spacing)
                     common["parameters"] = (*common["parameters"], process)
         if len(kinds) > 1 and common["robust"] not in ("none", "gnc"):
             common["robust_scale"] = rows["scale"][used]
@@ -274,6 +275,17 @@ def period(t: Array) -> float:
 def as_one(correlation_time: float, t: Array) -> float:
     """How many fixes at times t are worth one, of errors with that correlation time (s)."""
     return 1.0 / float(np.tanh(0.5 * period(t) / correlation_time)) if correlation_time > 0.0 else 1.0
+
+
+def node_spacing(share: float, times: tuple[float, ...], white: float, dt: float) -> float:
+    """How far apart (s) nodes of slow errors may be, whose value stays from one to the next.
+
+    Errors of the variance share/2 each and of these correlation times wander with the density q = sum share / times.
+    Over a spacing D that is a variance of q D/6 about the mean, where the fixes in it, every dt seconds with a white
+    variance, tell that mean to white dt/D. With D = sqrt(white dt / q) / 2 the one is a 24th of the other.
+    """
+    q = share * float(np.sum(1.0 / np.asarray(times)))
+    return min(NODE_SPACING, 0.5 * float(np.sqrt(white * dt / q)))
 
 
 def _usual(t: Array, sigma: Array) -> Array:

@@ -1,8 +1,8 @@
 """The chain of keyframes of a running drive: how those that are posed enter the window, and what is kept of them.
 
 A keyframe enters with the parameters that begin or move on there, and with what is decided of each of its rows by
-then: fixes found to be wrong have no weight, wheels the sigma that settled keyframes have shown. Where a fix shows that
-fixes have been wrong for some time, the keyframes since then leave again and enter without those.
+then: fixes found to be wrong have no weight, noisy ones less, speeds the sigma that settled keyframes have shown.
+Where a fix shows that fixes have been wrong for some time, the keyframes since then leave again and enter without those.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.constraints.standstill import PLACE
-from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
-from graphnav.online.evidence import Evidence
+from graphnav.online.evidence import SPEEDS, Evidence
 from graphnav.online.looks import Stops
+from graphnav.online.noise import Noise
 from graphnav.online.sensors import Sensors
-from graphnav.problem import NODE_SPACING, Problem
+from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solvers.elimination import Predicted
 from graphnav.solvers.stages import Place, Step
@@ -47,6 +47,7 @@ class Chain:
         self.opened = False  # whether the first keyframe has left the window
         self.evidence = Evidence()
         self.verdicts = Verdicts({}, {})  # which fixes are used
+        self.noise = Noise()  # of those
         self._standing = Stops()
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
@@ -87,15 +88,19 @@ class Chain:
     def _weighed(self, problem: Problem) -> Problem:
         """The problem with what is decided of each row before it enters the window.
 
-        Fixes: not used where a fault was found. Wheels: their sigma by what settled so far says of them.
+        Fixes: not used where a fault was found, and by how noisy they are. Speeds: their sigma by what settled so far
+        says of them.
         """
         factors, rows = self.evidence.factors, []
         for c in problem.constraints:
-            if isinstance(c, NonHolonomic | OdometerSpeed) and c.name in factors:
+            if isinstance(c, SPEEDS) and c.name in factors:
                 c = replace(c, sigma=c.sigma * factors[c.name])
-            elif c.watched and self.settings.gnss.faults != "off":
-                weight = self.verdicts.weights(c.name, problem.t[c.keyframe])
-                if not weight.all():
+            if c.watched or c.adaptive != "off":
+                t = problem.t[c.keyframe]
+                weight = self.noise.weights(c, t)
+                if c.watched:
+                    weight = weight * self.verdicts.weights(c.name, t)
+                if not (weight == 1.0).all():
                     c = replace(c, weight=weight)
             rows.append(c)
         return replace(problem, constraints=tuple(rows))
@@ -108,7 +113,12 @@ class Chain:
         problem, k, turn = self._weighed(posed), first, 0.0
         while k < len(problem.t):
             turn = max(turn, self._push(problem, k, ahead))
-            fault, ahead = self.window.stages[-1].fault, None
+            ahead = None
+            if self.noise.hear(problem, self.window.stages[-1]):
+                self._keep(len(self.window) - 1)
+                problem = self._weighed(posed)
+                turn = max(turn, self._push(problem, k, None))
+            fault = self.window.stages[-1].fault
             if fault is not None:
                 again = self.verdicts.settle(*fault, now=float(problem.t[k]))
                 if again < problem.t[first] - SAME_TIME:
@@ -150,7 +160,7 @@ class Chain:
             elif name not in nodes:
                 steps.append(Step(name, np.atleast_2d(p.initial)[0], np.atleast_2d(p.sigma)[0]))
                 nodes[name] = t
-            elif t - nodes[name] >= NODE_SPACING - SAME_TIME and not p.constant:
+            elif t - nodes[name] >= p.spacing - SAME_TIME and not p.constant:
                 ahead, added = p.step(np.array([t - nodes[name]]))
                 steps.append(Step(name, p.initial, added[0], float(ahead[0]), p.initial))
                 nodes[name] = t
@@ -171,6 +181,7 @@ class Chain:
         self.head, self.opened = float(self.window.t[count - 1]), True
         settled = self.window.settle(count)
         self.evidence.add(settled)
+        self.noise.forget(self.head)
         del self._nodes[:count]
         return settled
 

@@ -1,4 +1,4 @@
-"""What settled keyframes say of the wheels' sigmas, as the drive goes.
+"""What settled keyframes say of the sigmas of wheels and of the receiver's velocities, as the drive goes.
 
 The judgement is that of a whole drive (`graphnav.judgement.raised_by`): sums of whitened residuals over blocks of time,
 against what white noise of the sigmas used would sum up to. Residuals of keyframes that have settled know the lag's
@@ -12,12 +12,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from graphnav.constraints.gnss import GnssVelocity
 from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.judgement import BLOCK, raised_by
 from graphnav.rotation import Array
 from graphnav.solvers.window import Residual, Smoothed
 
-_WHEELS = (NonHolonomic.name, OdometerSpeed.name)
+SPEEDS = (NonHolonomic, OdometerSpeed, GnssVelocity)
 _KEPT = 1000  # blocks: about three hours
 _CLEARLY = 0.1  # of a factor
 _MORE = 1.2  # times the blocks of the last judgement, for the next
@@ -41,12 +42,12 @@ class _Blocks:
 
 
 class Evidence:
-    """Factors on the sigmas of wheel constraints, from the residuals of what has settled."""
+    """Factors on the sigmas of `SPEEDS`, from the residuals of what has settled."""
 
     def __init__(self) -> None:
         self.factors: dict[str, Array] = {}  # (m,) by constraint
         self.revised = False  # whether they have become clearly others
-        self._blocks: dict[str, _Blocks] = {name: _Blocks() for name in _WHEELS}
+        self._blocks: dict[str, _Blocks] = {kind.name: _Blocks() for kind in SPEEDS}
 
     def add(self, part: Smoothed) -> None:
         """Take in what has settled."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.online.buffers import SAME, Buffer
-from graphnav.recording import Gnss, Odometer, Recording
+from graphnav.recording import Gnss, ImuNoise, Odometer, Recording
 from graphnav.rotation import Array
 
 AHEAD = 60.0  # s; stamps of other sensors further than this before the IMU's are wrong
@@ -37,8 +37,12 @@ class Sensors:
     gnss: Buffer = field(default_factory=lambda: Buffer(_WIDTH["gnss"]))
     odometer: Buffer = field(default_factory=lambda: Buffer(_WIDTH["odometer"]))
     oldest: float = -np.inf  # s; rows up to here come too late
+    stated: ImuNoise = field(init=False)  # of the IMU, before it was judged
     _mean: tuple[float, tuple[float, ...]] = (-np.inf, (0.0, 0.0, 0.0))
     _suspect: tuple[float, tuple[float, ...]] | None = None  # an IMU row far ahead of the one before
+
+    def __post_init__(self) -> None:
+        self.stated = self.setup.imu.noise
 
     def add(self, sensor: str, t: float, values: tuple[float, ...]) -> bool:
         """Take in a row; False if it is of no use (`counts` says why).

@@ -259,6 +259,7 @@ class Tracker(Chain):
         other, head = copy.copy(self), self.window.head
         other.settings, other._parameters, other.verdicts = settings, {}, copy.deepcopy(self.verdicts)
         other.window = Window(head.moved(head.estimate), turn_limit(setup.imu.noise))
+        other.noise = copy.deepcopy(self.noise)
         other._nodes, other._motions, other.settled, other._ahead = [], {}, [], None
         other._settling = False
         other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)

@@ -25,6 +25,7 @@ _NEAR = 17  # fixes whose median is the factor
 _FALSE_ALARM = 1e-7  # per window
 _UNUSUAL = 1e-3  # chance of an excess that is not the usual
 _APART = 4.0  # ratio of medians of nine that is no chance: three of its standard deviations
+_ROWS = ("r", "sigma", "predicted", "loud", "factor")
 
 
 def _loud_above(m: int) -> float:
@@ -95,18 +96,34 @@ def factors(r: Array, sigma: Array, predicted: Array, always: bool = False) -> A
     return np.where(maximum_filter1d(full, WINDOW, origin=-1), f, 1.0)
 
 
-class _Kind:
-    """The fixes of one kind as a filter meets them."""
+class Kind:
+    """The fixes of one kind as they are met, row by row; a row that comes again makes those behind it void.
 
-    def __init__(self, rows: Constraint) -> None:
-        N, m = len(rows), len(rows.axes)
+    Parameters
+    ----------
+    rows : of that kind.
+    count : how many there will be, if known.
+    """
+
+    def __init__(self, rows: Constraint, count: int = 0) -> None:
+        N, m = count or 2 * WINDOW, len(rows.axes)
         self.always = rows.adaptive == "on"
         self.limit = _loud_above(m)
         self.r, self.sigma, self.predicted = np.zeros((N, m)), np.ones((N, m)), np.zeros((N, m))
         self.loud = np.zeros(N, dtype=bool)
         self.factor = np.ones(N)
 
+    def forget(self, count: int) -> None:
+        """The first `count` rows: those behind them move there."""
+        for name in _ROWS:
+            setattr(self, name, getattr(self, name)[count:].copy())
+
     def add(self, row: int, r: Array, predicted: Array, sigma: Array) -> float:
+        """The factor on a fix's variance; looks at no later one. As for `Noise.raised`."""
+        if row >= len(self.r):
+            for name in _ROWS:
+                old = getattr(self, name)
+                setattr(self, name, np.concatenate([old, np.ones((row + WINDOW, *old.shape[1:]), dtype=old.dtype)]))
         self.r[row], self.predicted[row], self.sigma[row] = r, predicted, sigma
         variance = sigma * sigma + predicted
         first = max(row - 2, 0)
@@ -127,7 +144,7 @@ class Noise:
     """The factors of all kinds of fixes that a filter adapts to."""
 
     def __init__(self, constraints: Iterable[Constraint]) -> None:
-        self._kinds = {rows.name: _Kind(rows) for rows in constraints}
+        self._kinds = {rows.name: Kind(rows, len(rows)) for rows in constraints}
 
     def raised(self, name: str, row: int, r: Array, predicted: Array, sigma: Array) -> Array:
         """The sigmas (m,) to use for an innovation; looks at no later one.
