@@ -171,7 +171,8 @@ class _Rounds:
                     self._improve(basis)
                     self._weight = {}
                 left = contradiction(*self._both(found.applied(self._settings)))[0]
-                if larger or (left < against - chance and calmer(self.noise, raised)):
+                agreed = left < max(chance, against - chance)
+                if larger or (agreed and calmer(self.noise, raised)):
                     fixes, raised = found, self.noise
         except EstimationError:
             pass  # as it was judged before
