@@ -241,3 +241,16 @@ def test_slow_errors_of_types_are_apart_and_their_jacobians_right(path: oracle.E
         assert linear.jacobians[name][rows.type == of].any()
     share = np.where(rows.type == 5, 0.8, 0.3)[:, None]
     assert rows.sigma == pytest.approx(np.sqrt(1.0 - share) * rows.stated)
+
+
+def test_slow_errors_of_two_types_have_nodes_of_their_own_at_the_same_times(path: oracle.ExactPath) -> None:
+    """Shares as different as these ask for nodes 0.4 and 5 s apart; batch and filter's smoother must still agree."""
+    recording = scattering(oracle.drive(path, seed=4, gnss_rate=5.0)[0], 1.0, 4).crop(0.0, 150.0)
+    gnss = Settings().gnss.model_copy(update={"slow_share": {"fixed": 0.98, "float": 0.1}, "sd_factor": 1.0})
+    found = run(recording, Settings().model_copy(update={"gnss": gnss}), ("rts", "batch"))
+    names = [f"{slow}_{kind}" for slow in SLOW_ERRORS for kind in ("fixed", "float")]
+    times = [found["batch"].parameters[name].t for name in names]
+    assert all(np.array_equal(t, times[0]) for t in times)
+    apart_by = np.linalg.norm(found["batch"].states.p - found["rts"].states.p, axis=1)
+    sigma = np.sqrt(np.trace(found["batch"].covariance[:, 3:6, 3:6], axis1=1, axis2=2))
+    assert np.max(apart_by / sigma) < 0.2

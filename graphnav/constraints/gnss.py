@@ -31,7 +31,7 @@ last, and slow processes, for what fixed and single-point fixes are wrong by has
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -123,6 +123,8 @@ class GnssPosition(Constraint):
         s = scene.settings.gnss
         common = _common(scene, TIME_OFFSET)
         rows: dict[str, Any] = {}
+        processes: list[Parameter] = []
+        spacings: list[float] = []
         kinds = _groups(s, gnss)
         for kind, own in kinds:
             name = FIX_TYPES[kind or 0]
@@ -144,11 +146,12 @@ class GnssPosition(Constraint):
                     common["robust"] = "cauchy"
             if share > 0:
                 sigma = np.full(3, np.sqrt(0.5 * share))
-                spacing = node_spacing(share, s.slow_times, (1.0 - share) * alike, period(gnss.t[own]))
+                spacings.append(node_spacing(share, s.slow_times, (1.0 - share) * alike, period(gnss.t[own])))
                 for slow, time in zip(SLOW_ERRORS, s.slow_times, strict=True):
                     slow = slow if kind is None else f"{slow}_{name}"
-                    process = Parameter(slow, np.zeros(3), sigma, "sd", correlation_time=time, spacing=spacing)
-                    common["parameters"] = (*common["parameters"], process)
+                    processes.append(Parameter(slow, np.zeros(3), sigma, "sd", correlation_time=time))
+        # nodes at the same times for all: a batch solution has them in one variable
+        common["parameters"] += tuple(replace(one, spacing=min(spacings)) for one in processes)
         if len(kinds) > 1 and common["robust"] not in ("none", "gnc"):
             common["robust_scale"] = rows["scale"][used]
         return cls(

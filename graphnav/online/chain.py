@@ -2,7 +2,8 @@
 
 A keyframe enters with the parameters that begin or move on there, and with what is decided of each of its rows by
 then: fixes found to be wrong have no weight, noisy ones less, speeds the sigma that settled keyframes have shown.
-Where a fix shows that fixes have been wrong for some time, the keyframes since then leave again and enter without those.
+Where a fix shows that fixes have been wrong for some time, the keyframes since then leave again and enter without
+those.
 """
 
 from __future__ import annotations
