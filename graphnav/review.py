@@ -112,6 +112,10 @@ class Review:
             self._watch(self.smoothed)
             if faults.count(self.problem) == before:
                 break
+        self._smooth()
+
+    def _smooth(self) -> None:
+        """Smooth the drive, again if that asks for other sigmas of wheels and velocities."""
         self.smoothed = self._smoothed(self.problem, self._forward)
         if self._raise():
             self._forward = self._filtered(self.problem)
@@ -152,10 +156,7 @@ class Review:
             pose(old.recording, old.settings, self._frame, begin.state, begin.sigma, found.stationary), weights
         )
         self._forward, self._raised = self._filtered(self.problem), ()
-        self.smoothed = self._smoothed(self.problem, self._forward)
-        if self._raise():
-            self._forward = self._filtered(self.problem)
-            self.smoothed = self._smoothed(self.problem, self._forward)
+        self._smooth()
 
     def _calm(self) -> None:
         """Judge the IMU once more: what faults did to the states around them may have passed for its noise."""

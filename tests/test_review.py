@@ -1,0 +1,147 @@
+"""A drive filtered again at given points, and looked at again once it is known which fixes are wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import oracle
+import pytest
+from helpers import random_states
+from test_faults import OFF, scattered
+from test_solvers import sigmas
+
+from graphnav.alignment import align
+from graphnav.config import settings_from
+from graphnav.detectors import detect
+from graphnav.earth import LocalFrame
+from graphnav.pipeline import origin, run
+from graphnav.problem import Problem, pose
+from graphnav.rotation import Array
+from graphnav.solvers import adaptive
+from graphnav.solvers.batch import batch
+from graphnav.solvers.ekf import ekf, refilter
+from graphnav.solvers.near import near
+from graphnav.solvers.passes import Points
+from graphnav.solvers.points import AtEstimate, AtPoints, Estimate
+from graphnav.solvers.rts import backward
+from graphnav.state import DIM
+
+
+@pytest.fixture(scope="module")
+def posed() -> Problem:
+    """Every constraint of a vehicle, fixes with velocities and slow errors."""
+    recording, _ = oracle.drive(
+        oracle.vehicle_path(duration=200, seed=7), seed=5, gnss_velocity_sd=(0.1, 0.1, 0.1), odometer_rate=20.0
+    )
+    settings = settings_from({"gnss": {"slow_share": 0.5, "sd_factor": 1.0}})
+    frame = LocalFrame(origin(recording))
+    found = align(recording, settings, frame, lambda p, s: batch(p, s, wanted=(0,), reintegrate=False))
+    return pose(recording, settings, frame, found.state, found.sigma, detect(recording, settings).stationary)
+
+
+def scattered_points(problem: Problem, seed: int) -> Points:
+    """Points that no vehicle goes through: far enough apart that a step between them turns and jumps."""
+    rng = np.random.default_rng(seed)
+    width = sum(at.stop - at.start for at in problem.columns.values())
+    return Points(random_states(rng, len(problem.t)), 0.01 * rng.standard_normal((len(problem.t), width)))
+
+
+def derivative(f: object, width: int, eps: float = 1e-5) -> Array:
+    """Central differences."""
+    steps = eps * np.eye(width)
+    return np.stack([(f(e) - f(-e)) / (2.0 * eps) for e in steps], axis=-1)
+
+
+def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed: Problem) -> None:
+    smoothed = backward(posed, ekf(posed))
+    rng = np.random.default_rng(1)
+    off = np.concatenate(
+        [
+            0.05 * rng.standard_normal((len(posed.t), 3)),
+            rng.standard_normal((len(posed.t), 6)),
+            1e-4 * rng.standard_normal((len(posed.t), 6)),
+        ],
+        axis=1,
+    )
+    points = Points(smoothed.states.plus(off), smoothed.values)
+    given, own = AtPoints(posed, points), AtEstimate(posed)
+
+    def here(k: int, e: Array) -> Estimate:
+        return own.plus(Estimate(points.states[k : k + 1], points.values[k]), e)
+
+    D = DIM + points.values.shape[1]
+    for k in (3, 60, 150):
+        linear = given.step(k, np.zeros(D))
+
+        def ahead(e: Array, k: int = k) -> Array:
+            return own.minus(own.step(k, here(k - 1, e))[0], here(k, np.zeros(D)))
+
+        np.testing.assert_allclose(linear[0], ahead(np.zeros(D)), atol=1e-9)
+        np.testing.assert_allclose(linear[1], derivative(ahead, D), atol=2e-5, rtol=1e-4)
+        for rows in posed.constraints:
+            (which,) = np.nonzero(rows.keyframe == k)
+            if not len(which):
+                continue
+            lo, hi = int(which[0]), int(which[-1]) + 1
+            r, H, sigma = given.rows(rows, lo, hi, k, None)
+            mine, H_own, sigma_own = own.rows(rows, lo, hi, k, here(k, np.zeros(D)))
+            np.testing.assert_allclose(r, mine, atol=1e-9)
+            np.testing.assert_allclose(H, H_own, atol=1e-9)
+            np.testing.assert_allclose(sigma, sigma_own)
+
+
+def test_filtered_again_about_its_own_end_it_is_the_batch_solution(posed: Problem) -> None:
+    """Bell 1994: the iterated smoother is Gauss and Newton's method on the whole drive."""
+    smoothed = backward(posed, ekf(posed))
+    solved = batch(posed, smoothed.states, smoothed.nodes(posed), reintegrate=False)
+    for _ in range(3):
+        smoothed = backward(posed, refilter(posed, smoothed))
+    apart = np.abs(smoothed.states.minus(solved.states)) / sigmas(solved)
+    assert np.max(apart) < 0.02  # where batch stops
+    mine = np.sqrt(np.diagonal(smoothed.P[:, :DIM, :DIM], axis1=1, axis2=2))
+    np.testing.assert_allclose(mine, sigmas(solved), rtol=1e-3)
+
+
+def test_points_that_lead_nowhere_are_given_up(posed: Problem) -> None:
+    """From anywhere at all the drive is found, if need be as a filter would."""
+    plain = backward(posed, ekf(posed))
+    _, found = near(posed, scattered_points(posed, 2))
+    sigma = np.sqrt(np.diagonal(plain.P[:, :DIM, :DIM], axis1=1, axis2=2))
+    assert np.max(np.abs(found.states.minus(plain.states)) / sigma) < 0.5
+
+
+def test_a_stop_is_found_although_noisy_fixes_speak_of_motion() -> None:
+    path = oracle.vehicle_path(duration=420, seed=11)
+    recording, _ = oracle.drive(path, seed=3, gnss_velocity_sd=(0.05, 0.05, 0.05))
+    gnss, stops = recording.gnss, detect(recording).stationary
+    long = stops[(stops[:, 0] > recording.start + 150.0) & (stops[:, 1] - stops[:, 0] > 4.0)][0]
+    bad = (gnss.t > long[0] - 40.0) & (gnss.t < long[1] + 40.0)
+    noise = np.random.default_rng(3).standard_normal((int(bad.sum()), 3))
+    v = gnss.v.copy()
+    v[bad] += 100.0 * gnss.sd_v[bad] * noise
+    wrong = scattered(replace(recording, gnss=replace(gnss, v=v)), bad, 100.0, 4)
+
+    def found(stationary: Array) -> bool:
+        return bool(np.any((stationary[:, 0] < long[1]) & (stationary[:, 1] > long[0])))
+
+    assert not found(detect(wrong).stationary)  # or the test would show nothing
+    fused = {
+        name: run(wrong, settings, ("ekf",))["ekf"].detections[-1] for name, settings in (("on", None), ("off", OFF))
+    }
+    assert found(fused["on"].intervals)
+    assert not found(fused["off"].intervals)
+
+
+def test_noise_begins_and_ends_at_a_fix() -> None:
+    """Of forty fixes thirty times as noisy as stated, those at the edges too; and hardly any besides."""
+    rng, inside, outside, N = np.random.default_rng(9), [], [], 200
+    for _ in range(50):
+        scale = np.ones(N)
+        scale[80:120] = 30.0
+        r = rng.standard_normal((N, 3)) * scale[:, None]
+        f = adaptive.factors(r, np.ones((N, 3)), np.zeros((N, 3)))
+        inside.append(np.sqrt(f[80:120]))
+        outside.append(f[np.r_[60:80, 120:140]])
+    assert np.mean(np.array(inside) > 10.0) > 0.98
+    assert np.mean(np.array(outside) < 4.0) > 0.98
