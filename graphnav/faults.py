@@ -25,8 +25,7 @@ from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import Fault
 from graphnav.solvers import adaptive
-from graphnav.solvers.passes import Smoothed
-from graphnav.state import DIM
+from graphnav.solvers.passes import Smoothed, shift
 
 _EDGE = 60.0  # s; farther from a fault a smoother without GNSS could not tell right from wrong
 _DISAGREES = 1e-3  # chance of T by which a window next to a fault is taken for a part of it
@@ -213,9 +212,5 @@ def _agreeing(problem: Problem, rows: Constraint, smoothed: Smoothed, which: Arr
 
 def _linear(problem: Problem, rows: Constraint, smoothed: Smoothed, which: Array) -> Linearized:
     at = rows.keyframe[which]
-    values = {p.name: smoothed.values[at][:, _shift(problem.columns[p.name])] for p in rows.parameters}
+    values = {p.name: smoothed.values[at][:, shift(problem.columns[p.name])] for p in rows.parameters}
     return rows.linearize(smoothed.states[at], values, which)
-
-
-def _shift(columns: slice) -> slice:
-    return slice(columns.start - DIM, columns.stop - DIM)

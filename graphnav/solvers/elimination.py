@@ -18,6 +18,7 @@ from scipy.linalg.lapack import dgeqrf, dtpmqrt, dtpqrt, dtrtri, dtrtrs
 from graphnav import rotation
 from graphnav.errors import EstimationError
 from graphnav.rotation import Array
+from graphnav.solvers.passes import shift
 from graphnav.solvers.robust import PASSES
 from graphnav.solvers.stages import Columns, Measured, Message, Place, Stage, turned, width
 from graphnav.solvers.watch import Watch
@@ -81,20 +82,20 @@ def predict(
     head[:D0, to], head[:D0, -1] = before.R, before.z
     if tests is not None:
         A[:D0, E + D + 1 :] = before.R @ tests.X
-    shift = np.zeros(DIM) if place.linked else state.minus(before.state)[0]
-    if np.any(shift):  # one and the same state, but about its new point
-        head[:D0, -1] -= before.R[:, :DIM] @ shift
-        head[:D0, E : E + 3] = head[:D0, E : E + 3] @ rotation.right_jacobian_inverse(shift[None, :3])[0]
+    apart = np.zeros(DIM) if place.linked else state.minus(before.state)[0]
+    if np.any(apart):  # one and the same state, but about its new point
+        head[:D0, -1] -= before.R[:, :DIM] @ apart
+        head[:D0, E : E + 3] = head[:D0, E : E + 3] @ rotation.right_jacobian_inverse(apart[None, :3])[0]
     moved = values[: D0 - DIM] - before.values
     for at in gone:
-        moved[_shift(at)] = 0.0
+        moved[shift(at)] = 0.0
     if np.any(moved):  # parameters that stay are about the new point's values
         head[:D0, -1] -= before.R[:, DIM:] @ moved
     row = D0
     for step in place.steps:
         at = columns[step.name]
         k = len(step.mean)
-        own, diagonal, value = np.arange(row, row + k), 1.0 / step.sigma, values[_shift(at)]
+        own, diagonal, value = np.arange(row, row + k), 1.0 / step.sigma, values[shift(at)]
         head[own, E + np.arange(at.start, at.stop)] = diagonal
         off = value - step.mean
         if step.name in before.columns and step.decay:
@@ -122,9 +123,9 @@ def predict(
     G[kept, kept] = 1.0
     g[DIM:] = values[: D0 - DIM] - before.values
     G[lost], g[lost] = -root @ R[:E, E : E + D], root @ R[:E, E + D]
-    if np.any(shift):
-        G[:DIM] = turned(G[:DIM], rotation.right_jacobian_inverse(shift[None, :3])[0])
-        g[:DIM] += shift
+    if np.any(apart):
+        G[:DIM] = turned(G[:DIM], rotation.right_jacobian_inverse(apart[None, :3])[0])
+        g[:DIM] += apart
     return Predicted(before, place, state, values, columns, top, G, g, lost, root @ root.T, tuple(rows))
 
 
@@ -203,7 +204,3 @@ def _under(top: Array, tail: Array) -> tuple[Array, Array]:
 def _upper(n: int) -> Array:
     """(n, n) 1 in the upper triangle."""
     return np.asfortranarray(np.triu(np.ones((n, n))))
-
-
-def _shift(columns: slice) -> slice:
-    return slice(columns.start - DIM, columns.stop - DIM)

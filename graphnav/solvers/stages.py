@@ -30,6 +30,7 @@ from graphnav.dynamics import SCALE, Motion
 from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array, mv
+from graphnav.solvers.passes import shift
 from graphnav.solvers.robust import softened, weight_and_cost
 from graphnav.solvers.watch import Watch
 from graphnav.state import DIM, States
@@ -192,7 +193,7 @@ def predicted(before: Message, place: Place) -> tuple[States, Array, Columns, Ar
     values = np.zeros(D - DIM)
     values[: len(before.values)] = before.values
     for step in place.steps:
-        at = _shift(columns[step.name])
+        at = shift(columns[step.name])
         old = before.value(step.name) if step.name in before.columns else step.mean_before
         values[at] = step.mean + step.decay * (old - step.mean_before)
     if not place.linked:
@@ -246,7 +247,7 @@ def at_points(
     D, skip = width(columns), int(linked)
     links: list[Array | None] = [None] * n
     if linked:
-        scale = values[0, _shift(columns[SCALE])] if SCALE in columns else None
+        scale = values[0, shift(columns[SCALE])] if SCALE in columns else None
         motion = Motion(problem.intervals[slice(first - 1, first - 1 + n)], problem.frame)
         r, Ji, Jj, Js = motion.linearize(states, scale)
         W = motion.whitener
@@ -262,7 +263,7 @@ def at_points(
         if lo == hi or any(p.name not in columns for p in constraint.parameters):
             continue  # none here, or of parameters that have not begun
         at = constraint.keyframe[lo:hi] - first + skip
-        given = {p.name: values[at, _shift(columns[p.name])] for p in constraint.parameters}
+        given = {p.name: values[at, shift(columns[p.name])] for p in constraint.parameters}
         where = states if len(at) == len(states) == 1 else states[at]
         linear = constraint.linearize(where, given, slice(lo, hi))
         sigma = weighted_sigma(constraint, linear.sigma, slice(lo, hi))
@@ -277,7 +278,3 @@ def at_points(
                 Measured(c.name, H[own], b[own], sigma[own], kernel, c.scale_of(slice(lo + own.start, lo + own.stop)))
             )
     return [Linear(link, tuple(part)) for link, part in zip(links, parts, strict=True)]
-
-
-def _shift(columns: slice) -> slice:
-    return slice(columns.start - DIM, columns.stop - DIM)
