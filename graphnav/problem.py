@@ -65,7 +65,7 @@ class Problem:
         """The parameters with their nodes."""
         return _chains(self.parameters.values(), self.t)
 
-    @property
+    @cached_property
     def columns(self) -> dict[str, slice]:
         """Where each parameter stands behind the fifteen states in an augmented error state."""
         out, at = {}, DIM

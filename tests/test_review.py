@@ -25,6 +25,7 @@ from graphnav.solvers.near import near
 from graphnav.solvers.passes import Points
 from graphnav.solvers.points import AtEstimate, AtPoints, Estimate
 from graphnav.solvers.rts import backward
+from graphnav.solvers.stack import Stack
 from graphnav.state import DIM
 
 
@@ -65,7 +66,8 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed:
         axis=1,
     )
     points = Points(smoothed.states.plus(off), smoothed.values)
-    given, own = AtPoints(posed, points), AtEstimate(posed)
+    stack = Stack(posed, len(posed.t))
+    given, own = AtPoints(posed, points, stack), AtEstimate(posed)
 
     def here(k: int, e: Array) -> Estimate:
         return own.plus(Estimate(points.states[k : k + 1], points.values[k]), e)
@@ -79,16 +81,34 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed:
 
         np.testing.assert_allclose(linear[0], ahead(np.zeros(D)), atol=1e-9)
         np.testing.assert_allclose(linear[1], derivative(ahead, D), atol=2e-5, rtol=1e-4)
-        for rows in posed.constraints:
-            (which,) = np.nonzero(rows.keyframe == k)
-            if not len(which):
-                continue
-            lo, hi = int(which[0]), int(which[-1]) + 1
-            r, H, sigma = given.rows(rows, lo, hi, k, None)
-            mine, H_own, sigma_own = own.rows(rows, lo, hi, k, here(k, np.zeros(D)))
+        for some in stack.together(k, [False] * len(posed.constraints)):
+            r, H, sigma = given.rows(some, None)
+            mine, H_own, sigma_own = own.rows(some, here(k, np.zeros(D)))
             np.testing.assert_allclose(r, mine, atol=1e-9)
             np.testing.assert_allclose(H, H_own, atol=1e-9)
             np.testing.assert_allclose(sigma, sigma_own)
+
+
+def test_rows_taken_together_are_those_taken_one_after_another(posed: Problem) -> None:
+    """A gate that nothing meets makes the filter decide on every kind by itself."""
+    weight = np.where(np.arange(200) % 7 == 3, 0.0, 0.3 + 0.7 * (np.arange(200) % 3 == 0))
+    some = tuple(
+        replace(c, weight=np.resize(weight, len(c)) if c.name.startswith("gnss") else None) for c in posed.constraints
+    )
+    together = replace(posed, constraints=some)
+    apart = replace(posed, constraints=tuple(replace(c, gate=1e9) for c in some))
+    points = backward(posed, ekf(posed))
+    one, other = refilter(together, points), refilter(apart, points)
+    sigma = np.sqrt(np.diagonal(other.P, axis1=1, axis2=2))
+    np.testing.assert_allclose(one.errors / sigma, other.errors / sigma, atol=1e-6)
+    np.testing.assert_allclose(one.P / (sigma[:, None] * sigma[:, :, None]),
+                               other.P / (sigma[:, None] * sigma[:, :, None]), atol=1e-6)  # fmt: skip
+    for name, mine in one.records.items():
+        theirs = other.records[name]
+        np.testing.assert_allclose(mine.residual / mine.sigma, theirs.residual / theirs.sigma, atol=1e-5)
+        np.testing.assert_allclose(mine.sigma, theirs.sigma, rtol=1e-6)
+        np.testing.assert_allclose(mine.nis, theirs.nis, rtol=1e-4, atol=1e-6)
+        assert np.array_equal(mine.weight, theirs.weight)
 
 
 def test_filtered_again_about_its_own_end_it_is_the_batch_solution(posed: Problem) -> None:

@@ -40,7 +40,6 @@ from graphnav.solvers.adaptive import Noise
 from graphnav.solvers.passes import (
     Filtered,
     Forward,
-    Innovations,
     Points,
     Progress,
     joined,
@@ -51,10 +50,10 @@ from graphnav.solvers.passes import (
 from graphnav.solvers.points import AtEstimate, AtPoints, Estimate, about_own
 from graphnav.solvers.robust import PASSES, softened, weight_and_cost
 from graphnav.solvers.rts import backward
+from graphnav.solvers.stack import Stack, Together
 from graphnav.solvers.watch import Bank, Verdicts
 from graphnav.state import BLOCKS, DIM, States
 
-_NOTHING = np.empty((1, 0))
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
 
 
@@ -120,8 +119,8 @@ def _forward(
 ) -> Forward:
     """Filter the first K keyframes, of which the first n are linearised at given points."""
     n = 0 if about is None else len(about.values)
-    own = AtEstimate(problem)
-    given = None if about is None else AtPoints(problem, about)
+    stack, own = Stack(problem, K), AtEstimate(problem)
+    given = None if about is None else AtPoints(problem, about, stack)
     state = problem.prior.mean
     assert state is not None
     x: Any = Estimate(state, np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)]))
@@ -129,13 +128,15 @@ def _forward(
         x = own.minus(x, _one(about, 0))
     P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
     D = len(P)
-    records = {rows.name: Innovations(rows) for rows in problem.constraints}
-    first = {rows.name: np.searchsorted(rows.keyframe, np.arange(K + 1)).tolist() for rows in problem.constraints}
+    records = stack.records
     fixes = [c for c in problem.constraints if watch and isinstance(c, GnssPosition | GnssVelocity)]
     watched = [c for c in fixes if c.watched]
     noise = Noise([c for c in fixes if c.adaptive != "off" and c.weight is None])  # weights know what follows as well
+    decided = [c.gate is not None or c.robust != "none" or c in fixes for c in problem.constraints]
+    apart = decided, [is_decided or own.alone(c) for is_decided, c in zip(decided, problem.constraints, strict=True)]
     bank = Bank(watched, problem.t, D) if watched else None
     banks: dict[int, Bank] = {}  # as they were before the latest keyframes with fixes
+    met = {int(k) for c in watched for k in c.keyframe}
     verdicts = Verdicts(
         {c.name: problem.t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
     )
@@ -146,7 +147,7 @@ def _forward(
     k = 0
     while k < K:
         where: AtEstimate | AtPoints = given if given is not None and k < n else own
-        if bank is not None and any(first[rows.name][k] < first[rows.name][k + 1] for rows in watched):
+        if bank is not None and k in met:
             banks[k] = bank.copy()
             if len(banks) > _REMEMBERED:
                 del banks[next(iter(banks))]
@@ -159,20 +160,18 @@ def _forward(
                 bank.predicted(F)
             if added is not None:
                 P.flat[:: D + 1] += added
-        for kind in watched:
+        for kind in watched if verdicts.anew else ():
             if (kind.name, problem.t[k]) in verdicts.anew:
                 block = BLOCKS["p" if isinstance(kind, GnssPosition) else "v"]
                 P[block, block] += 1e6 * np.eye(3)
         ahead[k], all_Pp[k] = x, P
         back: int | None = None
-        for rows in problem.constraints:
-            lo, hi = first[rows.name][k], first[rows.name][k + 1]
-            if hi > lo:
-                x, P, fault = _update(rows, lo, hi, x, P, where, records[rows.name], k, bank, noise)
-                if fault is not None:
-                    again = verdicts.settle(rows.name, fault, float(problem.t[k]))
-                    back = int(np.searchsorted(problem.t, again))
-                    break
+        for some in stack.together(k, apart[where is own]):
+            x, P, fault = _update(some, x, P, where, stack, bank, noise)
+            if fault is not None:
+                again = verdicts.settle(some.parts[0][0].name, fault, float(problem.t[k]))
+                back = int(np.searchsorted(problem.t, again))
+                break
         if back is not None:  # once more from before the fault, without it
             bank = banks.get(back) or bank.forgetful() if bank else None
             banks = {key: old for key, old in banks.items() if key < back}
@@ -188,6 +187,7 @@ def _forward(
         if about is not None and k == n:  # from here on linearised where the filter is
             all_P[k - 1] = P = about_own(P, x[:3])
             x = own.plus(_one(about, k - 1), x)
+    stack.finish()
     weights = {c.name: records[c.name].decided * noise.weight(c.name) for c in fixes}
     errors, errors_ahead = np.array(found[:n]).reshape(n, D), np.array(ahead[:n]).reshape(n, D)
     filtered, predicted = _points(about, errors, found[n:]), _points(about, errors_ahead, ahead[n:])
@@ -220,70 +220,68 @@ def _points(about: Points | None, errors: Array, own: list[Estimate]) -> Points:
 
 
 def _update(
-    rows: Constraint,
-    lo: int,
-    hi: int,
-    x: Any,
-    P: Array,
-    where: Any,
-    record: Innovations,
-    k: int,
-    bank: Bank | None,
-    noise: Noise,
+    some: Together, x: Any, P: Array, where: Any, stack: Stack, bank: Bank | None, noise: Noise
 ) -> tuple[Any, Array, float | None]:
-    """One measurement update with rows lo..hi of a constraint at keyframe k; when a fault began comes last."""
-    n = hi - lo
-    weight, G = float(min(record.used[lo:hi])), _NOTHING
-    at, e = where.about(x, len(P))
-    for left in range(where.passes(rows) - 1, -1, -1):
-        r, H, sigma = where.rows(rows, lo, hi, k, at)
-        r = r + H @ e
-        if 0.0 < weight < 1.0:
-            sigma = sigma / np.sqrt(weight)
+    """One measurement update; when a fault began comes last."""
+    D, (rows, lo, hi) = len(P), some.parts[0]
+    record = stack.records[rows.name]
+    weight = float(min(record.used[lo:hi])) if some.alone else 1.0
+    root_weight: float | Array = np.sqrt(weight) or 1.0 if some.alone else stack.root_weight[some.at]
+    tests = bank if bank is not None and weight > 0.0 and rows.name in bank else None
+    at, e = where.about(x)
+    for left in range(where.passes(some) - 1, -1, -1):
+        r, H, sigma = where.rows(some, at)
+        r, sigma = r if e is None else r + H @ e, sigma / root_weight
         PHt = P @ H.T
         HPHt = H @ PHt
-        if not left:
+        right = [r[None], PHt]
+        if some.alone and not left:
             sigma = noise.raised(rows.name, lo, r, HPHt.diagonal(), sigma)
-        if bank is not None and weight > 0.0 and not left:
-            G = bank.signature(rows.name, k, H)
-        # LAPACK called directly: for matrices this small the checks around it would cost more than the work
-        right = np.empty((len(r), len(P) + 1 + G.shape[1]))
-        right[:, 0], right[:, 1 : len(P) + 1], right[:, len(P) + 1 :] = r, PHt.T, G
-        S, solved = _solve(HPHt, sigma, right, rows, lo)
-        nis, bent = float(r @ solved[:, 0]), 1.0
-        if rows.robust != "none" and rows.gate is None and not left:  # a gate stands in place of a kernel
-            sigma, solved, bent = _robust(HPHt, sigma, right, solved, rows, lo, hi)
-        K = solved[:, 1 : len(P) + 1].T
-        d = e - K @ r
+            if tests is not None:
+                G = tests.signature(rows.name, some.k, H)
+                right.append(tests.own(rows.name, G).T)
+        sides = np.concatenate(right).T
+        root, solved = _solve(HPHt, sigma, sides, rows, lo)
+        if not left:
+            stack.seen(some, root, solved[:, 0])
+            if some.alone:
+                nis, bent = float(r @ solved[:, 0]), 1.0
+                if rows.robust != "none" and rows.gate is None:  # a gate stands in place of a kernel
+                    sigma, solved, bent = _robust(HPHt, sigma, sides, solved, rows, lo, hi)
+        K = solved[:, 1 : D + 1].T
+        d = -(K @ r) if e is None else e - K @ r
         if left:  # again about where this leads (Jazwinski 1970, theorem 8.2)
             at = where.plus(at, d)
             e = where.minus(x, at)
-    refused = rows.gate is not None and nis > rows.gate**2
-    weight = 0.0 if refused else weight * bent
-    spread = np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1)
-    record.set(slice(lo, hi), r.reshape(n, -1), spread, nis / n, weight, refused)
-    if bank is not None:
-        bank.seen(rows.name, k, nis)
-    if weight == 0.0:
-        return x, P, None
-    IKH = -K @ H
-    IKH.flat[:: len(P) + 1] += 1.0
-    P = IKH @ P @ IKH.T + (K * (sigma * sigma)) @ K.T
+    if some.alone:
+        refused = rows.gate is not None and nis > rows.gate**2
+        weight = 0.0 if refused else weight * bent
+        record.weight[lo:hi], record.refused[lo:hi] = weight, refused
+        if bank is not None:
+            bank.seen(rows.name, some.k, nis)
+        if weight == 0.0:
+            return x, P, None
+    # Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T
+    P = P - K @ PHt.T
+    P = P - (P @ H.T - K * (sigma * sigma)) @ K.T
     P = 0.5 * (P + P.T)  # rounding's asymmetry would grow, past what a stop leaves between its place and the state
     fault = None
-    if bank is not None:
-        fault = bank.updated(rows.name, K, G, solved[:, len(IKH) + 1 :], r, where.speed(k, x))
+    if tests is not None:
+        fault = tests.updated(rows.name, K, G, solved[:, D + 1 :], r, where.speed(some.k, x))
+    elif bank is not None:
+        bank.taken(K, H)
     return where.plus(at, d), P, fault
 
 
 def _solve(HPHt: Array, sigma: Array, right: Array, rows: Constraint, lo: int) -> tuple[Array, Array]:
-    """S = H P H^T + R and S^-1 times the right sides."""
+    """The upper root of S = H P H^T + R, and S^-1 times the right sides."""
     S = HPHt.copy()
     S.flat[:: len(S) + 1] += sigma * sigma
-    _, solved, info = dposv(S, right)
+    # LAPACK called directly: for matrices this small the checks around it would cost more than the work
+    root, solved, info = dposv(S.T, right, overwrite_a=1)
     if info:
         raise EstimationError(f"the filter's covariance broke down at '{rows.name}' row {lo}: check sigmas and units")
-    return S, solved
+    return root, solved
 
 
 def _robust(

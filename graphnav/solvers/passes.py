@@ -12,38 +12,10 @@ from graphnav.dynamics import SCALE
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.solvers.stack import Innovations
 from graphnav.state import DIM, States
 
 Progress = Callable[[str, float], None]
-
-
-class Innovations:
-    """Collects one constraint's innovations as the filter goes."""
-
-    def __init__(self, rows: Constraint) -> None:
-        self.rows = rows
-        shape = (len(rows), len(rows.axes))
-        self.residual, self.sigma = np.zeros(shape), np.ones(shape)
-        self.nis, self.weight = np.zeros(len(rows)), np.ones(len(rows))
-        self.used = np.ones(len(rows)) if rows.weight is None else rows.weight.copy()
-        self.refused = np.zeros(len(rows), dtype=bool)
-
-    def set(self, at: slice, residual: Array, sigma: Array, nis: float, weight: float, refused: bool) -> None:
-        """Of the rows `at`."""
-        self.residual[at], self.sigma[at], self.nis[at], self.weight[at] = residual, sigma, nis, weight
-        self.refused[at] = refused
-
-    @property
-    def decided(self) -> Array:
-        """(N,) weights without what a gate refused."""
-        return np.where(self.refused, 0.0, self.used)
-
-    def record(self, problem: Problem) -> ConstraintRecord:
-        """All of them."""
-        t = problem.t[self.rows.keyframe]
-        return ConstraintRecord(
-            "innovation", t, self.residual, self.sigma, self.nis, self.weight, self.rows.axes, self.rows.unit
-        )
 
 
 @dataclass(frozen=True)

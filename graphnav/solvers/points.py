@@ -13,7 +13,6 @@ A pass at given points takes a fifth of the time, and is the better one wherever
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -23,9 +22,10 @@ from graphnav.dynamics import SCALE
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array
 from graphnav.solvers.passes import Points, shift
+from graphnav.solvers.stack import Stack, Together
 from graphnav.state import DIM, States
 
-Rows = tuple[Array, Array, Array]  # residuals (n m,), Jacobian (n m, D) and sigmas (n m,)
+Rows = tuple[Array, Array, Array]  # residuals (m,), Jacobian (m, D) and sigmas (m,)
 
 
 @dataclass(frozen=True)
@@ -62,26 +62,37 @@ class AtEstimate:
                 added[column] = chain.sigma[j] ** 2
         return Estimate(ahead, values), F, motion.noise(at, x.state.R_nb)[0], added
 
-    def rows(self, rows: Constraint, lo: int, hi: int, k: int, at: Estimate) -> Rows:
-        """Rows lo..hi of a constraint at keyframe k, linearised at an estimate."""
-        n = hi - lo
-        here = at.state if n == 1 else at.state[np.zeros(n, dtype=int)]
-        given = {p.name: at.values[None, shift(self._columns[p.name])] for p in rows.parameters}
-        if n > 1:
-            given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
-        linear = rows.linearize(here, given, slice(lo, hi))
-        H = assemble(linear, self._columns, self._width).reshape(-1, self._width)
-        return linear.residual.ravel(), H, linear.sigma.ravel()
+    def rows(self, some: Together, at: Estimate) -> Rows:
+        """Rows linearised at an estimate."""
+        m = some.end - some.begin
+        r, H, sigma = np.empty(m), np.zeros((m, self._width)), np.empty(m)
+        end = 0
+        for rows, lo, hi in some.parts:
+            n = hi - lo
+            here = at.state if n == 1 else at.state[np.zeros(n, dtype=int)]
+            given = {p.name: at.values[None, shift(self._columns[p.name])] for p in rows.parameters}
+            if n > 1:
+                given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
+            linear = rows.linearize(here, given, slice(lo, hi))
+            begin, end = end, end + linear.residual.size
+            r[begin:end], sigma[begin:end] = linear.residual.ravel(), linear.sigma.ravel()
+            assemble(linear, self._columns, self._width, H[begin:end].reshape(n, -1, self._width))
+        return r, H, sigma
 
     @staticmethod
-    def about(x: Estimate, D: int) -> tuple[Estimate, Array]:
-        """What the rows of an update are linearised about, and the error state (D,) from there to x."""
-        return x, np.zeros(D)
+    def alone(rows: Constraint) -> bool:
+        """Whether rows are taken in without others: after those before them, the estimate may be another."""
+        return not rows.linear
 
     @staticmethod
-    def passes(rows: Constraint) -> int:
+    def about(x: Estimate) -> tuple[Estimate, None]:
+        """What the rows of an update are linearised about, and the error state (D,) from there to x if there is one."""
+        return x, None
+
+    @staticmethod
+    def passes(some: Together) -> int:
         """How often the rows of an update are linearised."""
-        return rows.passes
+        return some.parts[0][0].passes
 
     @staticmethod
     def plus(at: Estimate, d: Array) -> Estimate:
@@ -102,8 +113,7 @@ class AtEstimate:
 class AtPoints:
     """Steps and rows of the first n keyframes, all linearised at n points."""
 
-    def __init__(self, problem: Problem, points: Points) -> None:
-        self.points = points
+    def __init__(self, problem: Problem, points: Points, stack: Stack) -> None:
         n, columns, motion = len(points.values), problem.columns, problem.motion
         D = DIM + points.values.shape[1]
         begin, end, at = points.states[: n - 1], points.states[1:n], slice(0, n - 1)
@@ -133,31 +143,33 @@ class AtPoints:
         self._Q[:, :3] = turned @ self._Q[:, :3]
         self._Q[:, :, :3] = self._Q[:, :, :3] @ np.swapaxes(turned, -1, -2)
         self._speed = np.linalg.norm(points.states.v, axis=1)
-        self._rows: dict[str, Any] = {}
+        self._r, self._sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
+        self._H = np.zeros((n, stack.M, D))
         for rows in problem.constraints:
             at_k = rows.keyframe[: int(np.searchsorted(rows.keyframe, n))]
             if len(at_k):
                 given = {p.name: points.values[at_k, shift(columns[p.name])] for p in rows.parameters}
                 linear = rows.linearize(points.states[at_k], given, slice(0, len(at_k)))
-                self._rows[rows.name] = linear.residual, assemble(linear, columns, D), linear.sigma
+                place = at_k[:, None], stack.places[rows.name][1][: len(at_k)]
+                self._r[place], self._sigma[place] = linear.residual, linear.sigma
+                self._H[place] = assemble(linear, columns, D)
 
     def step(self, k: int, x: Array) -> tuple[Array, Array, Array, Array | None]:
         """As `AtEstimate.step`, of error states (D,)."""
         F = self.F[k - 1]
         return self._gap[k - 1] + F @ x, F, self._Q[k - 1], self._added.get(k)
 
-    def rows(self, rows: Constraint, lo: int, hi: int, k: int, at: None) -> Rows:
+    def rows(self, some: Together, at: None) -> Rows:
         """As `AtEstimate.rows`, linearised at the points."""
-        r, H, sigma = self._rows[rows.name]
-        return r[lo:hi].ravel(), H[lo:hi].reshape(-1, H.shape[2]), sigma[lo:hi].ravel()
+        return self._r[some.at], self._H[some.at], self._sigma[some.at]
 
     @staticmethod
-    def about(x: Array, D: int) -> tuple[None, Array]:
+    def about(x: Array) -> tuple[None, Array]:
         """The points, which all error states are from."""
         return None, x
 
     @staticmethod
-    def passes(rows: Constraint) -> int:
+    def passes(some: Together) -> int:
         """The points stay."""
         return 1
 

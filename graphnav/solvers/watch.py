@@ -167,20 +167,30 @@ class Bank:
         """The filter has gone on to the next keyframe."""
         self.X = F @ self.X
 
+    def __contains__(self, name: str) -> bool:
+        return name in self._slots
+
     def signature(self, name: str, k: int, H: Array) -> Array:
         """(n m, C) mean of an innovation at keyframe k for unit errors since each onset; a fix itself is one."""
-        slots = self._slots.get(name)
-        if slots is None:
-            return -(H @ self.X)
+        slots = self._slots[name]
         self.X[:, slots.begin(float(self._t[k]))] = 0.0
         G = -(H @ self.X)
-        G.reshape(-1, slots.m, G.shape[1])[:, :, slots.columns] += slots.inputs
+        own = G[:, slots.columns].reshape(-1, slots.m, slots.inputs.shape[1])
+        G[:, slots.columns] = (own + slots.inputs).reshape(len(G), -1)
         return G
+
+    def own(self, name: str, G: Array) -> Array:
+        """(n m, L m) what a signature says of errors of the fixes themselves."""
+        return G[:, self._slots[name].columns]
 
     def seen(self, name: str, k: int, nis: float) -> None:
         """The filter has seen an innovation of so many squared sigmas, used or not."""
         if slots := self._slots.get(name):
             slots.usual.add(float(self._t[k]), nis)
+
+    def taken(self, K: Array, H: Array) -> None:
+        """The filter has used rows H with the gain K that are not tested."""
+        self.X -= K @ (H @ self.X)
 
     def updated(self, name: str, K: Array, G: Array, weighted: Array, r: Array, speed: float) -> float | None:
         """The filter has used an innovation; when a fault began, or None.
@@ -188,16 +198,12 @@ class Bank:
         Parameters
         ----------
         K : (D, n m) gain.
-        G : (n m, C) its signature, and `weighted` S^-1 G.
+        G : (n m, C) its signature, and `weighted` S^-1 times its `own`.
         r : (n m,) residual, -nu.
         speed : m/s, of the vehicle.
         """
         self.X += K @ G
-        slots = self._slots.get(name)
-        if slots is None:
-            return None
-        G, weighted = G[:, slots.columns], weighted[:, slots.columns]
-        return slots.found(-(r @ weighted), G, weighted, speed)
+        return self._slots[name].found(-(r @ weighted), self.own(name, G), weighted, speed)
 
 
 class Watch:
