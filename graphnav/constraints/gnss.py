@@ -169,21 +169,21 @@ class GnssPosition(Constraint):
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        C = self.R_ln[rows]
-        CR = C @ states.R_nb
+        C, R = self.R_ln[rows], states.R_nb
         lever = parameters.get(LEVER_ARM, self.lever_arm)
-        residual = mv(C, states.p - self.p_n[rows]) + mv(CR, lever)
-        jacobians = {"theta": -CR @ rotation.skew(lever), "p": C}
+        away = states.p - self.p_n[rows] + mv(R, lever)
+        J = {"theta": -R @ rotation.skew(lever), "p": _I3[None]}
         if LEVER_ARM in parameters:
-            jacobians[LEVER_ARM] = CR
+            J[LEVER_ARM] = R
         if TIME_OFFSET in parameters:
             offset = parameters[TIME_OFFSET]
             velocity, moved = _antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
-            residual = residual + mv(C, velocity) * offset
+            away = away + velocity * offset
             for block in ("theta", "v", "bg", LEVER_ARM):
                 if block != LEVER_ARM or LEVER_ARM in parameters:
-                    jacobians[block] = jacobians.get(block, 0.0) + C @ moved[block] * offset[..., None]
-            jacobians[TIME_OFFSET] = mv(C, velocity)[..., None]
+                    J[block] = J.get(block, 0.0) + moved[block] * offset[..., None]
+            J[TIME_OFFSET] = velocity[..., None]
+        residual, jacobians = mv(C, away), {block: C @ x for block, x in J.items()}
         for name in parameters:
             if name.startswith(SLOW_ERRORS):
                 size = self.usual[rows] * self._of(name, rows)
@@ -305,12 +305,12 @@ def _antenna_velocity(states: States, gyro: Array, omega_n: Array, lever: Array)
     R = states.R_nb
     omega_ie_b = omega_n @ R
     omega = gyro - states.bg - omega_ie_b
-    L = rotation.skew(lever)
-    swing = -mv(L, omega)  # omega x lever
-    return states.v + mv(R, swing), {
-        "theta": R @ (L @ rotation.skew(omega_ie_b) - rotation.skew(swing)),
-        "v": _I3,
-        "bg": R @ L,
+    RL = R @ rotation.skew(lever)
+    swing = -mv(RL, omega)  # omega x lever, in n
+    return states.v + swing, {
+        "theta": RL @ rotation.skew(omega_ie_b) - rotation.skew(swing) @ R,
+        "v": _I3[None],
+        "bg": RL,
         LEVER_ARM: R @ rotation.skew(omega),
     }
 

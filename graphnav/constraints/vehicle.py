@@ -53,19 +53,25 @@ _LINEAR = 3.0  # m/s^2, lateral force up to which tyres behave linearly
 _BEYOND = 0.1  # m/s of sideways speed per m/s^2 beyond that
 _AXLE_LEFT = 0.2  # m, what is not known of the axle's place in a turn: front wheels steer, tyres have width
 _HALF_WHEELBASE = 1.3  # m
-_I3 = np.eye(3)
+_I2, _I3 = np.eye(2), np.eye(3)
 _E_Y = np.array([[0.0, 1.0, 0.0]])
+_AHEAD = _E_Y[None]
+_SIDE_UP = _I3[None, ::2]
+_BY_HEADING = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # u @ this = (u_y, -u_x, 0)
+_BY_AXLE = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])  # omega @ this = omega x e_y
 
 
 @dataclass(frozen=True)
 class Past:
-    """Mean velocity over the intervals that end at some keyframes, as a function of the state there."""
+    """Mean velocity and force over the intervals that end at some keyframes, as a function of the state there.
+
+    Six numbers and their derivatives by what they are made of, velocity first.
+    """
 
     frame: LocalFrame
-    turn: Array  # (N, 3, 3) `Intervals.past_*`
-    late: Array
-    dV: Array
-    by_ba: Array
+    by_seen: Array  # (N, 6, 9) of `Intervals.past_*`: by v, g - omega_n x v and omega_n, in body axes
+    by_ba: Array  # (N, 6, 3)
+    felt: Array  # (N, 6) less the velocity gained, and the mean force
     ba: Array  # (N, 3) the biases they were computed with
     bg: Array
     rate: Array  # (N, 3) mean rate and force, less those biases
@@ -78,43 +84,49 @@ class Past:
 
     @classmethod
     def of(cls, intervals: Intervals, rows: Array, frame: LocalFrame) -> Past:
-        """Of the intervals `rows`."""
-        iv = intervals
-        parts = (iv.past_turn, iv.past_late, iv.past_dV, iv.past_ba, iv.ba, iv.bg, iv.rate, iv.force)
-        return cls(frame, *(x[rows] for x in parts))
+        """The past of the intervals `rows`."""
+        iv, n = intervals, len(rows)
+        by_seen, by_ba = np.zeros((n, 6, 9)), np.empty((n, 6, 3))
+        by_seen[:, :3, :3], by_seen[:, :3, 3:6], by_seen[:, 3:, 3:6] = iv.past_turn[rows], -iv.past_late[rows], _I3
+        by_ba[:, :3], by_ba[:, 3:] = -iv.past_ba[rows], -_I3
+        felt = np.concatenate([-iv.past_dV[rows], iv.force[rows]], axis=1)
+        return cls(frame, by_seen, by_ba, felt, *(x[rows] for x in (iv.ba, iv.bg, iv.rate, iv.force)))
 
     def velocity(
         self, states: States, parameters: dict[str, Array], rows: slice | Array, lever: Array
-    ) -> tuple[Array, Array, Array, dict[str, Array], dict[str, Array]]:
-        """u (N, 3) at a lever arm, body axes; turn rate; acceleration; and the derivatives of u and acceleration."""
-        turn, late, rate, force = self.turn[rows], self.late[rows], self.rate[rows], self.force[rows]
-        omega_n = self.frame.omega_n
-        W = self.frame.W
-        Rt = np.swapaxes(states.R_nb, -1, -2)
+    ) -> tuple[Array, Array, dict[str, Array]]:
+        """u (N, 3) at a lever arm and the mean acceleration, (N, 6), turn rate, and the derivatives of the first.
+
+        All in body axes. The acceleration is without what turning brings, as springs feel it: what the accelerometer
+        reads less gravity.
+        """
+        by_seen, by_ba, rate, force = self.by_seen[rows].copy(), self.by_ba[rows], self.rate[rows], self.force[rows]
+        W, n = self.frame.W, len(states)
         da, dg = states.ba - self.ba[rows], states.bg - self.bg[rows]
         if SCALE in parameters:
             scale = parameters[SCALE]
             da, dg = da + scale[:, 3:] * force, dg + scale[:, :3] * rate
-        v, g = mv(Rt, states.v), mv(Rt, self.frame.gravity_n(states.p) - states.v @ W.T)
-        earth = mv(Rt, omega_n)
-        omega = rate - dg - earth
-        L = rotation.skew(lever)
-        turned = turn - late @ rotation.skew(dg)
-        u = mv(turned, v) - mv(late, g) - self.dV[rows] - mv(self.by_ba[rows], da) - mv(L, omega)
-        by_ba, by_bg = -self.by_ba[rows], late @ rotation.skew(v) + L
+        seen = np.empty((n, 3, 3))
+        seen[:, 0], seen[:, 1] = states.v, self.frame.gravity_n(states.p) - states.v @ W.T
+        seen[:, 2] = self.frame.omega_n
+        seen = seen @ states.R_nb
+        cross, L = rotation.skew(seen), rotation.skew(lever)
+        by_seen[:, :3, :3] += by_seen[:, :3, 3:6] @ rotation.skew(dg)
+        by_seen[:, :3, 6:] = L
+        seen[:, 2] -= rate - dg  # the turn rate, negative
+        found = mv(by_seen, seen.reshape(n, 9)) + mv(by_ba, da) + self.felt[rows]
+        by_bg = np.zeros((n, 6, 3))
+        by_bg[:, :3] = L - by_seen[:, :3, 3:6] @ cross[:, 0]
+        in_n = (by_seen.reshape(n, 18, 3) @ np.swapaxes(states.R_nb, -1, -2)).reshape(n, 6, 3, 3)
         J = {
-            "theta": turned @ rotation.skew(v) - late @ rotation.skew(g) + L @ rotation.skew(earth),
-            "v": turned @ Rt + late @ Rt @ W,
+            "theta": by_seen @ cross.reshape(n, 9, 3),
+            "v": in_n[:, :, 0] - in_n[:, :, 1] @ W,
             "ba": by_ba,
             "bg": by_bg,
         }
-        # without turning, as springs feel it: what the accelerometer reads less gravity
-        acceleration = force - da + g
-        Ja = {"theta": rotation.skew(g), "v": -Rt @ W, "ba": -_I3[None]}
         if SCALE in parameters:
             J[SCALE] = np.concatenate([by_bg * rate[:, None], by_ba * force[:, None]], axis=-1)
-            Ja[SCALE] = np.concatenate([np.zeros_like(by_ba), -_I3 * force[:, None]], axis=-1)
-        return u, omega, acceleration, J, Ja
+        return found, -seen[:, 2], J
 
 
 def _turned(u: Array, mounting: Array) -> tuple[Array, Array, Array]:
@@ -123,9 +135,8 @@ def _turned(u: Array, mounting: Array) -> tuple[Array, Array, Array]:
     zero = np.zeros_like(ca)
     R = columns(cb, sb * ca, -sb * sa, -sb, cb * ca, -cb * sa, zero, sa, ca).reshape(-1, 3, 3)
     out = mv(R, u)
-    by_pitch = mv(R, columns(zero, -u[:, 2], u[:, 1]))
-    by_heading = columns(out[:, 1], -out[:, 0], zero)
-    return out, R, columns(by_pitch, by_heading)
+    by_pitch = R[:, :, 2] * u[:, 1:2] - R[:, :, 1] * u[:, 2:]
+    return out, R, columns(by_pitch, out @ _BY_HEADING)
 
 
 @dataclass(frozen=True)
@@ -141,10 +152,7 @@ class Wheels(Constraint):
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
         return np.empty(0)  # any keyframe will do
 
-    def _velocity(
-        self, states: States, parameters: dict[str, Array], rows: slice | Array
-    ) -> tuple[Array, dict[str, Array], Array, Array, dict[str, Array]]:
-        """u_v, its derivatives, turn rate and acceleration (body axes), and the latter's derivatives."""
+    def _velocity(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> _Velocity:
         assert self.past is not None
         # both constraints on one keyframe ask the same, one after the other
         asked = self.past.asked
@@ -157,25 +165,40 @@ class Wheels(Constraint):
             and asked["lever"] is self.lever_arm
         ):
             return asked["found"]  # type: ignore[no-any-return]
-        found = self._found(states, parameters, rows)
+        lever = self.lever_arm + (parameters[AXLE] * _E_Y if AXLE in parameters else np.zeros((len(states), 3)))
+        y, omega, J = self.past.velocity(states, parameters, rows, lever)
+        u, R, by_mounting = _turned(y[:, :3], parameters.get(MOUNTING, np.zeros((len(states), 2))))
+        found = _Velocity(u, omega, y[:, 4], R, by_mounting, J)
         if len(states) == 1 and isinstance(rows, slice):
             asked |= {"states": states, "rows": rows, "values": values, "lever": self.lever_arm, "found": found}
         return found
 
-    def _found(
-        self, states: States, parameters: dict[str, Array], rows: slice | Array
-    ) -> tuple[Array, dict[str, Array], Array, Array, dict[str, Array]]:
-        assert self.past is not None
-        lever = self.lever_arm + (parameters[AXLE] * _E_Y if AXLE in parameters else np.zeros((len(states), 3)))
-        u, omega, acceleration, J, Ja = self.past.velocity(states, parameters, rows, lever)
-        mounting = parameters.get(MOUNTING, np.zeros((len(states), 2)))
-        out, R, by_mounting = _turned(u, mounting)
-        jacobians = {name: R @ x for name, x in J.items()}
+
+@dataclass(frozen=True)
+class _Velocity:
+    """Mean velocity in the vehicle's axes."""
+
+    u: Array  # (N, 3)
+    omega: Array  # (N, 3) body axes
+    forward: Array  # (N,) m/s^2, acceleration
+    R_vb: Array
+    by_mounting: Array  # (N, 3, 2)
+    J: dict[str, Array]  # (N, 6, k) `Past.velocity`
+
+    def derivatives(self, A: Array, parameters: dict[str, Array], by_forward: Array | None = None) -> dict[str, Array]:
+        """Of A u (N, m) for A (N, m, 3), plus `by_forward` (N, m) times the forward acceleration."""
+        B = A @ self.R_vb
+        if by_forward is None:
+            out = {name: B @ x[:, :3] for name, x in self.J.items()}
+        else:
+            both = np.zeros((*B.shape[:2], 6))
+            both[:, :, :3], both[:, :, 4] = B, by_forward
+            out = {name: both @ x for name, x in self.J.items()}
         if MOUNTING in parameters:
-            jacobians[MOUNTING] = by_mounting
+            out[MOUNTING] = A @ self.by_mounting
         if AXLE in parameters:
-            jacobians[AXLE] = R @ columns(-omega[:, 2], np.zeros(len(omega)), omega[:, 0])[..., None]
-        return out, jacobians, omega, acceleration, Ja
+            out[AXLE] = B @ (self.omega @ _BY_AXLE)[..., None]
+        return out
 
 
 def moving_rows(scene: Scene) -> Array:
@@ -262,29 +285,25 @@ class NonHolonomic(Wheels):
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         assert self.past is not None
-        u, J, omega, acceleration, Ja = self._velocity(states, parameters, rows)
-        residual = u[:, ::2]
-        jacobians = {name: x[:, ::2] for name, x in J.items()}
-        if BODY in parameters:
-            slip, squat = parameters[BODY].T
-            v, w, a = u[:, 1], omega[:, 2], acceleration[:, 1]
-            effect = columns(v * v * w, v * a)
-            residual = residual - parameters[BODY] * effect
-            by_v = columns(2.0 * slip * v * w, squat * a)[..., None]
-            by_a = columns(np.zeros_like(v), squat * v)[..., None]
-            for name in J:
-                jacobians[name] = jacobians[name] - by_v * J[name][:, 1:2]
-                if name in Ja:
-                    jacobians[name] = jacobians[name] - by_a * Ja[name][:, 1:2]
-            jacobians[BODY] = -effect[:, :, None] * np.eye(2)
-            # the turn rate's own share, v v d(omega_z)
-            by_w = (slip * v * v)[:, None]
-            jacobians["bg"][:, 0, 2] += by_w[:, 0]
-            Rt = np.swapaxes(states.R_nb, -1, -2)
-            jacobians["theta"][:, 0] += by_w * rotation.skew(mv(Rt, self.past.frame.omega_n))[:, 2]
-            if SCALE in parameters:
-                jacobians[SCALE][:, 0, 2] += by_w[:, 0] * self.past.rate[rows][:, 2]
-        return Linearized(residual, jacobians, self.sigma[rows])
+        found = self._velocity(states, parameters, rows)
+        residual, u, omega = found.u[:, ::2], found.u, found.omega
+        if BODY not in parameters:
+            return Linearized(residual, found.derivatives(_SIDE_UP, parameters), self.sigma[rows])
+        slip, squat = parameters[BODY].T
+        v, w, a = u[:, 1], omega[:, 2], found.forward
+        effect = columns(v * v * w, v * a)
+        A, by_forward = np.repeat(_SIDE_UP, len(v), axis=0), np.zeros((len(v), 2))
+        A[:, 0, 1], A[:, 1, 1], by_forward[:, 1] = -2.0 * slip * v * w, -squat * a, -squat * v
+        jacobians = found.derivatives(A, parameters, by_forward)
+        jacobians[BODY] = -effect[:, :, None] * _I2
+        # the turn rate's own share, v v d(omega_z)
+        by_w = (slip * v * v)[:, None]
+        jacobians["bg"][:, 0, 2] += by_w[:, 0]
+        Rt = np.swapaxes(states.R_nb, -1, -2)
+        jacobians["theta"][:, 0] += by_w * rotation.skew(mv(Rt, self.past.frame.omega_n))[:, 2]
+        if SCALE in parameters:
+            jacobians[SCALE][:, 0, 2] += by_w[:, 0] * self.past.rate[rows][:, 2]
+        return Linearized(residual - parameters[BODY] * effect, jacobians, self.sigma[rows])
 
 
 def _speed_of(odometer: Odometer, imu: Imu) -> MeanSpeed:
@@ -342,18 +361,24 @@ class OdometerSpeed(Wheels):
             **shared,
         )
 
+    @cached_property
+    def _read(self) -> Array:
+        """(N,) mean of the readings over the interval of each row, m/s."""
+        assert self.speed is not None
+        return self.speed(self.begin, self.end)[0]
+
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         assert self.speed is not None
-        u, J, *_ = self._velocity(states, parameters, rows)
-        delay = parameters[ODOMETER_DELAY][:, 0] if ODOMETER_DELAY in parameters else np.zeros(len(states))
-        # what is true now is read `delay` later
-        read, by_delay = self.speed(
-            self.begin[rows], self.end[rows], np.minimum(np.maximum(delay, -self.reach), self.reach)
-        )
-        scale = 1.0 + parameters[ODOMETER_SCALE][:, 0]
-        sign = np.ones(len(states)) if self.signed else np.where(u[:, 1] < 0.0, -1.0, 1.0)
-        residual = (sign * u[:, 1] - scale * read)[:, None]
-        jacobians = {name: sign[:, None, None] * x[:, 1:2] for name, x in J.items()}
+        found = self._velocity(states, parameters, rows)
+        if ODOMETER_DELAY in parameters:  # what is true now is read `delay` later
+            delay = np.minimum(np.maximum(parameters[ODOMETER_DELAY][:, 0], -self.reach), self.reach)
+            read, by_delay = self.speed(self.begin[rows], self.end[rows], delay)
+        else:
+            read = self._read[rows]
+        scale, ahead = 1.0 + parameters[ODOMETER_SCALE][:, 0], found.u[:, 1]
+        A = _AHEAD if self.signed else np.where(ahead < 0.0, -1.0, 1.0)[:, None, None] * _AHEAD
+        residual = (A[:, 0, 1] * ahead - scale * read)[:, None]
+        jacobians = found.derivatives(A, parameters)
         jacobians[ODOMETER_SCALE] = -read[:, None, None]
         if ODOMETER_DELAY in parameters:
             jacobians[ODOMETER_DELAY] = -(scale * by_delay)[:, None, None]
