@@ -60,7 +60,6 @@ class Motion:
         E = rotation.exp(omega * T)
         gamma1, gamma2 = rotation.integrals(omega * T)
         self.back = np.swapaxes(E, -1, -2)
-        self.force = np.concatenate([gamma2 * h * h, gamma1 * h], axis=1)  # iint E, int E: (n, 6, 3)
         gradient = frame.gravity_gradient
         n = len(intervals)
         self.post = np.zeros((n, 6, 6))  # from (E p, E u) to (p, v)
@@ -76,10 +75,12 @@ class Motion:
         coast[:, :3, :3] += 0.5 * h * h * (gradient + self.W2)
         coast[:, 3:, :3] += h * (gradient + self.W2)
         self.inner = self.post @ coast
-        # d(dP, dV) / d(ba, bg), (n, 6, 6)
-        self.bias = np.empty((n, 6, 6))
-        self.bias[:, :3, :3], self.bias[:, :3, 3:] = intervals.p_ba, intervals.p_bg
-        self.bias[:, 3:, :3], self.bias[:, 3:, 3:] = intervals.v_ba, intervals.v_bg
+        self.pushed = self.post @ np.concatenate([gamma2 * h * h, gamma1 * h], axis=1)  # by G: iint E, int E
+        # d(theta, dP, dV) / d(ba, bg), (n, 9, 6)
+        self.bias = np.zeros((n, 9, 6))
+        self.bias[:, :3, 3:] = intervals.theta_bg
+        self.bias[:, 3:6, :3], self.bias[:, 3:6, 3:] = intervals.p_ba, intervals.p_bg
+        self.bias[:, 6:, :3], self.bias[:, 6:, 3:] = intervals.v_ba, intervals.v_bg
         self.step = np.concatenate([intervals.dP, intervals.dV], axis=-1)
         self.expected = np.concatenate([intervals.ba, intervals.bg], axis=-1)
         self.mean = np.concatenate([intervals.force, intervals.rate], axis=-1)
@@ -110,28 +111,28 @@ class Motion:
         delta = np.concatenate([start.ba, start.bg], -1) - self.expected[rows]
         if scale is not None:
             delta += scale[..., [3, 4, 5, 0, 1, 2]] * self.mean[rows]
-        turn = mv(iv.theta_bg[rows], delta[:, 3:])
+        bent = mv(self.bias[rows], delta)
+        turn, moved = bent[:, :3], self.step[rows] + bent[:, 3:]  # dP, dV
         dR = iv.dR[rows] @ rotation.exp(turn)
-        moved = self.step[rows] + mv(self.bias[rows], delta)  # dP, dV
 
-        post, R2 = self.post[rows], R[:, None]
+        turned = self._turned(rows, R)
         G = self.frame.gravity_n(start.p) + start.p @ self.W2.T
-        felt = (R2 @ moved.reshape(n, 2, 3, 1)).reshape(n, 6) + mv(self.force[rows], G)
-        pv = mv(self.coast[rows], np.concatenate([start.p, start.v], -1)) + mv(post, felt)
+        pv = mv(self.coast[rows], np.concatenate([start.p, start.v], -1)) + mv(turned, moved) + mv(self.pushed[rows], G)
         end = States(self.back[rows] @ R @ dR, pv[:, :3], pv[:, 3:], start.ba, start.bg)
 
         F = np.zeros((n, DIM, DIM))
         F[:, 0:3, 0:3] = np.swapaxes(dR, -1, -2)
         # right_jacobian(turn) is I - [turn]x/2 for the small turns this is used for
         F[:, 0:3, 12:15] = (_I3 - 0.5 * rotation.skew(turn)) @ iv.theta_bg[rows]
+        F[:, 3:9, 0:3] = turned @ -rotation.skew(moved.reshape(n, 2, 3)).reshape(n, 6, 3)
         F[:, 3:9, 3:9] = self.inner[rows]
-        across = np.empty((n, 6, 9))  # (p, v) from (theta, ba, bg), before the Earth turns it
-        across[:, :, :3] = -rotation.skew(moved.reshape(n, 2, 3)).reshape(n, 6, 3)
-        across[:, :, 3:] = self.bias[rows]
-        turned = post @ (R2 @ across.reshape(n, 2, 3, 9)).reshape(n, 6, 9)
-        F[:, 3:9, 0:3], F[:, 3:9, 9:15] = turned[..., :3], turned[..., 3:]
+        F[:, 3:9, 9:15] = turned @ self.bias[rows, 3:]
         F[:, 9:15, 9:15] = _I6
         return end, F
+
+    def _turned(self, rows: slice, R_nb: Array) -> Array:
+        """(n, 6, 6) from (dP, dV) in the start's body axes to (p, v) at the end."""
+        return (self.post[rows].reshape(-1, 6, 2, 3) @ R_nb[:, None]).reshape(-1, 6, 6)
 
     def scale_columns(self, rows: slice, F: Array) -> Array:
         """d(end) / d(scale), (n, 15, 6): the bias columns of F times what the scale multiplies."""
@@ -146,14 +147,16 @@ class Motion:
         n = len(R_nb)
         L = np.zeros((n, DIM, DIM))
         L[:, 0:3, 0:3] = _I3
-        L[:, 3:9, 3:9] = (self.post[rows].reshape(n, 6, 2, 3) @ R_nb[:, None]).reshape(n, 6, 6)
+        L[:, 3:9, 3:9] = self._turned(rows, R_nb)
         L[:, 9:15, 9:15] = _I6
         return L
 
     def noise(self, rows: slice, R_nb: Array) -> Array:
         """Q (n, 15, 15), covariance of the end's error state, for starts with attitudes R_nb."""
-        L = self.frames(rows, R_nb)
-        return L @ self.intervals.covariance[rows] @ np.swapaxes(L, -1, -2)
+        Q, turned = self.intervals.covariance[rows].copy(), self._turned(rows, R_nb)
+        Q[:, 3:9] = turned @ Q[:, 3:9]
+        Q[:, :, 3:9] = Q[:, :, 3:9] @ np.swapaxes(turned, -1, -2)
+        return np.asarray(Q)
 
     def residual(self, states: States, scale: Array | None = None) -> Array:
         """(n, 15) end minus prediction for all intervals, in the frames of `Intervals.covariance`."""

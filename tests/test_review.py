@@ -72,7 +72,7 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed:
     def here(k: int, e: Array) -> Estimate:
         return own.plus(Estimate(points.states[k : k + 1], points.values[k]), e)
 
-    D = DIM + points.values.shape[1]
+    D, n = DIM + points.values.shape[1], len(posed.constraints)
     for k in (3, 60, 150):
         linear = given.step(k, np.zeros(D))
 
@@ -81,7 +81,7 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed:
 
         np.testing.assert_allclose(linear[0], ahead(np.zeros(D)), atol=1e-9)
         np.testing.assert_allclose(linear[1], derivative(ahead, D), atol=2e-5, rtol=1e-4)
-        for some in stack.together(k, [False] * len(posed.constraints)):
+        for some in stack.together(k, [True] * n):
             r, H, sigma = given.rows(some, None)
             mine, H_own, sigma_own = own.rows(some, here(k, np.zeros(D)))
             np.testing.assert_allclose(r, mine, atol=1e-9)

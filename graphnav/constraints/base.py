@@ -71,7 +71,6 @@ class Constraint(ABC):
     axes: ClassVar[tuple[str, ...]]
     unit: ClassVar[str]
     looks_ahead: ClassVar[bool] = True  # False: once the intervals and the odometer are there, rows can be built
-    linear: ClassVar[bool] = False  # True: so nearly that it does not matter at which estimate a filter linearises
     passes: ClassVar[int] = 1  # of a filter's update; more for rows that are far from linear over its uncertainty
 
     keyframe: Array  # (N,) int, ascending
@@ -107,12 +106,10 @@ class Constraint(ABC):
         """Rows `rows` at `states` (one per row) and parameter values (n, k), one per row."""
 
 
-def assemble(
-    linearized: Linearized, parameters: dict[str, slice] | None = None, width: int = DIM, out: Array | None = None
-) -> Array:
-    """(N, m, width) Jacobian over the error state, with parameters in the columns given; into zeros `out` if any."""
+def assemble(linearized: Linearized, parameters: dict[str, slice] | None = None, width: int = DIM) -> Array:
+    """(N, m, width) Jacobian over the error state, with parameters in the columns given."""
     n, m = linearized.residual.shape
-    H = np.zeros((n, m, width)) if out is None else out
+    H = np.zeros((n, m, width))
     for key, J in linearized.jacobians.items():
         if key in BLOCKS:
             H[:, :, BLOCKS[key]] = J

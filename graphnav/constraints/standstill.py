@@ -113,7 +113,6 @@ class _Standing(Constraint):
     """Rows at the ends of the intervals in which the platform stands."""
 
     looks_ahead: ClassVar[bool] = False
-    linear: ClassVar[bool] = True  # but for the Earth's rate, which no error of attitude that a filter has changes much
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:

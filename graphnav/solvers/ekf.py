@@ -132,8 +132,8 @@ def _forward(
     fixes = [c for c in problem.constraints if watch and isinstance(c, GnssPosition | GnssVelocity)]
     watched = [c for c in fixes if c.watched]
     noise = Noise([c for c in fixes if c.adaptive != "off" and c.weight is None])  # weights know what follows as well
-    decided = [c.gate is not None or c.robust != "none" or c in fixes for c in problem.constraints]
-    apart = decided, [is_decided or own.alone(c) for is_decided, c in zip(decided, problem.constraints, strict=True)]
+    alone = [c.gate is not None or c.robust != "none" or any(c is one for one in fixes) for c in problem.constraints]
+    one_by_one = [True] * len(alone)  # each linearised where those before it have led
     bank = Bank(watched, problem.t, D) if watched else None
     banks: dict[int, Bank] = {}  # as they were before the latest keyframes with fixes
     met = {int(k) for c in watched for k in c.keyframe}
@@ -166,7 +166,7 @@ def _forward(
                 P[block, block] += 1e6 * np.eye(3)
         ahead[k], all_Pp[k] = x, P
         back: int | None = None
-        for some in stack.together(k, apart[where is own]):
+        for some in stack.together(k, one_by_one if where is own else alone):
             x, P, fault = _update(some, x, P, where, stack, bank, noise)
             if fault is not None:
                 again = verdicts.settle(some.parts[0][0].name, fault, float(problem.t[k]))

@@ -13,11 +13,12 @@ A pass at given points takes a fifth of the time, and is the better one wherever
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from graphnav import rotation
-from graphnav.constraints.base import Constraint, assemble
+from graphnav.constraints.base import assemble
 from graphnav.dynamics import SCALE
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array
@@ -42,13 +43,23 @@ class AtEstimate:
     def __init__(self, problem: Problem) -> None:
         self._problem, self._columns, self._scale = problem, problem.columns, problem.columns.get(SCALE)
         self._width = DIM + sum(s.stop - s.start for s in self._columns.values())
-        self._steps = _node_steps(problem)
+        self._I = np.eye(self._width)
+
+    @cached_property
+    def _steps(self) -> dict[int, list[tuple[slice, ParameterChain, int]]]:
+        """At keyframes where a parameter moves on to its next node: its columns, its chain and that node."""
+        out: dict[int, list[tuple[slice, ParameterChain, int]]] = {}
+        for chain in self._problem.chains:
+            at = self._columns[chain.parameter.name]
+            for k in _stepping(chain).tolist():
+                out.setdefault(k, []).append((at, chain, int(chain.node[k])))
+        return out
 
     def step(self, k: int, x: Estimate) -> tuple[Estimate, Array, Array, Array | None]:
         """The estimate at keyframe k from that at the one before, F (D, D), Q (15, 15), and more variance (D,)."""
         motion, at, scale = self._problem.motion, slice(k - 1, k), self._scale
         ahead, F15 = motion.propagate(at, x.state, None if scale is None else x.values[None, shift(scale)])
-        F = np.eye(self._width)
+        F = self._I.copy()
         F[:DIM, :DIM] = F15[0]
         if scale is not None:
             F[:DIM, scale] = motion.scale_columns(at, F15)[0]
@@ -63,26 +74,16 @@ class AtEstimate:
         return Estimate(ahead, values), F, motion.noise(at, x.state.R_nb)[0], added
 
     def rows(self, some: Together, at: Estimate) -> Rows:
-        """Rows linearised at an estimate."""
-        m = some.end - some.begin
-        r, H, sigma = np.empty(m), np.zeros((m, self._width)), np.empty(m)
-        end = 0
-        for rows, lo, hi in some.parts:
-            n = hi - lo
-            here = at.state if n == 1 else at.state[np.zeros(n, dtype=int)]
-            given = {p.name: at.values[None, shift(self._columns[p.name])] for p in rows.parameters}
-            if n > 1:
-                given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
-            linear = rows.linearize(here, given, slice(lo, hi))
-            begin, end = end, end + linear.residual.size
-            r[begin:end], sigma[begin:end] = linear.residual.ravel(), linear.sigma.ravel()
-            assemble(linear, self._columns, self._width, H[begin:end].reshape(n, -1, self._width))
-        return r, H, sigma
-
-    @staticmethod
-    def alone(rows: Constraint) -> bool:
-        """Whether rows are taken in without others: after those before them, the estimate may be another."""
-        return not rows.linear
+        """Rows of one constraint linearised at an estimate."""
+        ((rows, lo, hi),) = some.parts
+        n = hi - lo
+        here = at.state if n == 1 else at.state[np.zeros(n, dtype=int)]
+        given = {p.name: at.values[None, shift(self._columns[p.name])] for p in rows.parameters}
+        if n > 1:
+            given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
+        linear = rows.linearize(here, given, slice(lo, hi))
+        H = assemble(linear, self._columns, self._width).reshape(-1, self._width)
+        return linear.residual.ravel(), H, linear.sigma.ravel()
 
     @staticmethod
     def about(x: Estimate) -> tuple[Estimate, None]:
@@ -126,16 +127,14 @@ class AtPoints:
             self.F[:, :DIM, scale] = motion.scale_columns(at, F15)
         self._Q = motion.noise(at, begin.R_nb)
         values = points.values[: n - 1].copy()
-        self._added: dict[int, Array] = {}
-        for k, steps in _node_steps(problem).items():
-            if k >= n:
-                continue
-            added = self._added.setdefault(k, np.zeros(D))
-            for column, chain, j in steps:
-                self.F[k - 1, column, column] *= chain.decay[j]
-                own = shift(column)
-                values[k - 1, own] = chain.mean[j] + chain.decay[j] * (values[k - 1, own] - chain.mean[j - 1])
-                added[column] = chain.sigma[j] ** 2
+        self._added = np.zeros((n, D))
+        for chain in problem.chains:
+            column, k = columns[chain.parameter.name], _stepping(chain, n)
+            j, own, each = chain.node[k], shift(column), np.arange(column.start, column.stop)
+            self.F[k[:, None] - 1, each, each] *= chain.decay[j, None]
+            values[k - 1, own] = chain.mean[j] + chain.decay[j, None] * (values[k - 1, own] - chain.mean[j - 1])
+            self._added[k, column] = chain.sigma[j] ** 2
+        self._steps = self._added.any(axis=1).tolist()
         self._gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
         # Exp(gap) Exp(F e) = Exp(gap + J_r^-1(gap) F e)
         turned = rotation.right_jacobian_inverse(self._gap[:, :3])
@@ -157,11 +156,12 @@ class AtPoints:
     def step(self, k: int, x: Array) -> tuple[Array, Array, Array, Array | None]:
         """As `AtEstimate.step`, of error states (D,)."""
         F = self.F[k - 1]
-        return self._gap[k - 1] + F @ x, F, self._Q[k - 1], self._added.get(k)
+        return self._gap[k - 1] + F @ x, F, self._Q[k - 1], self._added[k] if self._steps[k] else None
 
     def rows(self, some: Together, at: None) -> Rows:
         """As `AtEstimate.rows`, linearised at the points."""
-        return self._r[some.at], self._H[some.at], self._sigma[some.at]
+        at_k = some.at
+        return self._r[at_k], self._H[at_k], self._sigma[at_k]
 
     @staticmethod
     def about(x: Array) -> tuple[None, Array]:
@@ -195,10 +195,6 @@ def about_own(P: Array, e: Array) -> Array:
     return P
 
 
-def _node_steps(problem: Problem) -> dict[int, list[tuple[slice, ParameterChain, int]]]:
-    """At keyframes where a parameter moves on to its next node: its columns, its chain and that node."""
-    out: dict[int, list[tuple[slice, ParameterChain, int]]] = {}
-    for chain in problem.chains:
-        for k in np.flatnonzero(np.diff(chain.node)) + 1:
-            out.setdefault(int(k), []).append((problem.columns[chain.parameter.name], chain, int(chain.node[k])))
-    return out
+def _stepping(chain: ParameterChain, n: int | None = None) -> Array:
+    """Which of the first n keyframes a parameter moves on to its next node at."""
+    return np.flatnonzero(np.diff(chain.node[:n])) + 1

@@ -1,8 +1,8 @@
 """Rows of all constraints keyframe by keyframe: which a filter takes in at once, and the innovations it finds.
 
-Rows about which nothing is to be decided are taken in together, all kinds of a keyframe with one gain. What each kind
-would have shown after those before it comes from the root of their common covariance S = L L^T all the same: with
-w = L^-1 r, and L_jj what the kind j has on the diagonal,
+Rows linearised at given points about which nothing is to be decided are taken in together, several kinds of a keyframe
+with one gain. What each would have shown after those before it comes from the root of their common covariance
+S = L L^T all the same: with w = L^-1 r, and L_jj what the kind j has on the diagonal,
 
     r_j = L_jj w_j      S_jj = L_jj L_jj^T      NIS_j = w_j^T w_j      all of them given the kinds before
 
@@ -88,27 +88,27 @@ class Stack:
                 self.records[c.name].weight[:n] = c.weight[:n]
         self._root, self._solved = np.zeros((K, self.M, self.M)), np.zeros((K, self.M))
 
-    def together(self, k: int, apart: Sequence[bool]) -> Iterator[Together]:
+    def together(self, k: int, alone: Sequence[bool]) -> Iterator[Together]:
         """All rows of a keyframe, in the order of the constraints.
 
-        `apart` says of each constraint whether its rows are to be alone; those of weight 0 are anyway.
+        `alone` says of each constraint whether its rows are taken in without others; those of weight 0 are anyway.
         """
         some: Together | None = None
         end = 0
-        for c, first, alone, weights in zip(self._constraints, self._first, apart, self._weights, strict=True):
+        for c, first, weights, apart in zip(self._constraints, self._first, self._weights, alone, strict=True):
             lo, hi = first[k], first[k + 1]
             if lo == hi:
                 continue
             begin, end = end, end + (hi - lo) * len(c.axes)
-            alone = alone or (weights is not None and 0.0 in weights[lo:hi])
-            if some is not None and not alone:
+            apart = apart or (weights is not None and 0.0 in weights[lo:hi])
+            if some is not None and not apart:
                 some.parts.append((c, lo, hi))
                 some.end = end
                 continue
             if some is not None:
                 yield some
-            some = Together(k, begin, end, [(c, lo, hi)], alone)
-            if alone:
+            some = Together(k, begin, end, [(c, lo, hi)], apart)
+            if apart:
                 yield some
                 some = None
         if some is not None:

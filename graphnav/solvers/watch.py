@@ -50,7 +50,8 @@ class _Slots:
         self.stated = stated  # (m,) typical sigma of a whole error
         self.first = np.full(L, -1.0)  # when each slot began, -1 before
         self.inputs = np.zeros((m, L * m))  # what a unit error is to each column: the identity since its slot began
-        self.score, self.info = np.zeros((L, m)), np.tile(np.eye(m), (L, 1, 1))
+        self.one = np.eye(m)
+        self.score, self.info = np.zeros((L, m)), np.tile(self.one, (L, 1, 1))
         self.seen = 0
         self.usual = _Usual(m)
 
@@ -63,7 +64,7 @@ class _Slots:
 
     def forget(self) -> None:
         """Begin none again until its turn."""
-        self.first[:], self.score[:], self.info[:], self.inputs[:] = -1.0, 0.0, np.eye(self.m), 0.0
+        self.first[:], self.score[:], self.info[:], self.inputs[:] = -1.0, 0.0, self.one, 0.0
 
     def begin(self, t: float) -> slice:
         """Begin the slot whose turn it is; its columns in the bank."""
@@ -71,7 +72,7 @@ class _Slots:
         slot = min((self.seen & -self.seen).bit_length() - 1, self.L - 1)
         own = slice(slot * self.m, (slot + 1) * self.m)
         self.first[slot], self.score[slot], self.info[slot] = t, 0.0, 0.0
-        self.inputs[:, own] = np.eye(self.m)
+        self.inputs[:, own] = self.one
         return slice(self.columns.start + own.start, self.columns.start + own.stop)
 
     def found(self, score: Array, G: Array, weighted: Array, speed: float) -> float | None:
@@ -87,9 +88,11 @@ class _Slots:
         G3, S3 = (x.reshape(-1, L, m).swapaxes(0, 1) for x in (G, weighted))
         self.info += G3.swapaxes(1, 2) @ S3
         b = np.linalg.solve(self.info, self.score[..., None])[..., 0]
-        T = np.sum(self.score * b, axis=1)
+        T = np.einsum("lm,lm->l", self.score, b) / self.threshold
+        if T.max() <= self.usual.factor:
+            return None
         allowed = self.stated**2 + (_CLOCKS * speed if self.moves else _CLOCKS * _BRAKING) ** 2
-        T = np.where(np.sum(b**2 / allowed, axis=1) > LARGE**2, T / self.threshold, 0.0)
+        T = np.where(np.sum(b**2 / allowed, axis=1) > LARGE**2, T, 0.0)
         worst = int(np.argmax(T))
         return float(self.first[worst]) if T[worst] > self.usual.factor else None
 
