@@ -66,13 +66,13 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed:
         axis=1,
     )
     points = Points(smoothed.states.plus(off), smoothed.values)
-    stack = Stack(posed, len(posed.t))
-    given, own = AtPoints(posed, points, stack), AtEstimate(posed)
+    K, D, n = len(posed.t), DIM + points.values.shape[1], len(posed.constraints)
+    stack = Stack(posed, K)
+    given, own = AtPoints(posed, points, stack, np.empty((K - 1, D, D))), AtEstimate(posed)
 
     def here(k: int, e: Array) -> Estimate:
         return own.plus(Estimate(points.states[k : k + 1], points.values[k]), e)
 
-    D, n = DIM + points.values.shape[1], len(posed.constraints)
     for k in (3, 60, 150):
         linear = given.step(k, np.zeros(D))
 

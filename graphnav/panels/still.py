@@ -41,7 +41,7 @@ def svg(drawing: Drawing, words: str) -> str:
     body = out.getvalue()
     body = body[body.index("</defs>") + len("</defs>") :]  # the head has a date, and a style for the whole page
     body = re.sub(r' style="[^"]*"', lambda m: re.sub(r"#[0-9a-f]{6}", lambda c: f"var(--{_NAMES[c[0]]})", m[0]), body)
-    body = re.sub(r' d="[^"]*"', lambda m: re.sub(r"(\.\d\d)\d+", r"\1", m[0].replace(" \n", "")), body)
+    body = re.sub(r' d="[^"]*"', lambda m: re.sub(r"(?<=\.\d\d)\d+", "", m[0].replace(" \n", "")), body)
     body = re.sub(r'font-family: [^;]*; | transform="rotate\(-0 [^"]*"| id="[a-z0-9]+_\d+"|\n *', "", body)
     head = f'viewBox="0 0 {drawing.width:g} {drawing.height:g}" role="img" aria-label="{escape(words)}"'
     return f'<svg {head} stroke-linejoin="round">{body}'

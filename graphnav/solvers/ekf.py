@@ -23,6 +23,7 @@ throughout.
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -119,15 +120,16 @@ def _forward(
 ) -> Forward:
     """Filter the first K keyframes, of which the first n are linearised at given points."""
     n = 0 if about is None else len(about.values)
+    D = DIM + sum(c.parameter.size for c in problem.chains)
+    all_P, all_Pp, all_F = np.empty((K, D, D)), np.empty((K, D, D)), np.empty((K - 1, D, D))
     stack, own = Stack(problem, K), AtEstimate(problem)
-    given = None if about is None else AtPoints(problem, about, stack)
+    given = None if about is None else AtPoints(problem, about, stack, all_F)
     state = problem.prior.mean
     assert state is not None
     x: Any = Estimate(state, np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)]))
     if about is not None:
         x = own.minus(x, _one(about, 0))
     P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
-    D = len(P)
     records = stack.records
     fixes = [c for c in problem.constraints if watch and isinstance(c, GnssPosition | GnssVelocity)]
     watched = [c for c in fixes if c.watched]
@@ -141,7 +143,6 @@ def _forward(
         {c.name: problem.t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
     )
     begun = (x, P)
-    all_P, all_Pp, all_F = np.empty((K, D, D)), np.empty((K, D, D)), np.empty((K - 1, D, D))
     found: list[Any] = [None] * K  # estimates, or errors where points are given
     ahead = found.copy()
     k = 0
@@ -153,7 +154,8 @@ def _forward(
                 del banks[next(iter(banks))]
         if k:
             x, F, Q, added = where.step(k, x)
-            all_F[k - 1] = F
+            if where is own:
+                all_F[k - 1] = F
             P = F @ P @ F.T
             P[:DIM, :DIM] += Q
             if bank is not None:
@@ -226,7 +228,7 @@ def _update(
     D, (rows, lo, hi) = len(P), some.parts[0]
     record = stack.records[rows.name]
     weight = float(min(record.used[lo:hi])) if some.alone else 1.0
-    root_weight: float | Array = np.sqrt(weight) or 1.0 if some.alone else stack.root_weight[some.at]
+    root_weight: float | Array = math.sqrt(weight) or 1.0 if some.alone else stack.root_weight[some.at]
     tests = bank if bank is not None and weight > 0.0 and rows.name in bank else None
     at, e = where.about(x)
     for left in range(where.passes(some) - 1, -1, -1):

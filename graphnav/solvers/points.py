@@ -112,15 +112,20 @@ class AtEstimate:
 
 
 class AtPoints:
-    """Steps and rows of the first n keyframes, all linearised at n points."""
+    """Steps and rows of the first n keyframes, all linearised at n points.
 
-    def __init__(self, problem: Problem, points: Points, stack: Stack) -> None:
+    Parameters
+    ----------
+    F : (n-1, D, D) or more, for the transition matrices.
+    """
+
+    def __init__(self, problem: Problem, points: Points, stack: Stack, F: Array) -> None:
         n, columns, motion = len(points.values), problem.columns, problem.motion
         D = DIM + points.values.shape[1]
         begin, end, at = points.states[: n - 1], points.states[1:n], slice(0, n - 1)
         scale = columns.get(SCALE)
         ahead, F15 = motion.propagate(at, begin, None if scale is None else points.values[: n - 1, shift(scale)])
-        self.F = np.zeros((n - 1, D, D))
+        self.F = F[: n - 1]
         self.F[:] = np.eye(D)
         self.F[:, :DIM, :DIM] = F15
         if scale is not None:
