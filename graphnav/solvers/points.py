@@ -139,7 +139,7 @@ class AtPoints:
             self.F[k[:, None] - 1, each, each] *= chain.decay[j, None]
             values[k - 1, own] = chain.mean[j] + chain.decay[j, None] * (values[k - 1, own] - chain.mean[j - 1])
             self._added[k, column] = chain.sigma[j] ** 2
-        self._steps = self._added.any(axis=1).tolist()
+        self._steps: list[bool] = np.any(self._added, axis=1).tolist()
         self._gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
         # Exp(gap) Exp(F e) = Exp(gap + J_r^-1(gap) F e)
         turned = rotation.right_jacobian_inverse(self._gap[:, :3])
