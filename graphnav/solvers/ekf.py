@@ -30,7 +30,6 @@ from typing import Any
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.dense import dense
 from graphnav.errors import EstimationError
@@ -243,13 +242,13 @@ def _update(
                 G = tests.signature(rows.name, some.k, H)
                 right.append(tests.own(rows.name, G).T)
         sides = np.concatenate(right).T
-        root, solved = _solve(HPHt, sigma, sides, rows, lo)
+        root, solved = _solve(HPHt, sigma, sides, some)
         if not left:
             stack.seen(some, root, solved[:, 0])
             if some.alone:
                 nis, bent = float(r @ solved[:, 0]), 1.0
                 if rows.robust != "none" and rows.gate is None:  # a gate stands in place of a kernel
-                    sigma, solved, bent = _robust(HPHt, sigma, sides, solved, rows, lo, hi)
+                    sigma, solved, bent = _robust(HPHt, sigma, sides, solved, some)
         K = solved[:, 1 : D + 1].T
         d = -(K @ r) if e is None else e - K @ r
         if left:  # again about where this leads (Jazwinski 1970, theorem 8.2)
@@ -275,29 +274,29 @@ def _update(
     return where.plus(at, d), P, fault
 
 
-def _solve(HPHt: Array, sigma: Array, right: Array, rows: Constraint, lo: int) -> tuple[Array, Array]:
+def _solve(HPHt: Array, sigma: Array, right: Array, some: Together) -> tuple[Array, Array]:
     """The upper root of S = H P H^T + R, and S^-1 times the right sides."""
     S = HPHt.copy()
     S.flat[:: len(S) + 1] += sigma * sigma
     # LAPACK called directly: for matrices this small the checks around it would cost more than the work
     root, solved, info = dposv(S.T, right, overwrite_a=1)
     if info:
-        raise EstimationError(f"the filter's covariance broke down at '{rows.name}' row {lo}: check sigmas and units")
+        at = ", ".join(f"'{rows.name}' row {lo}" for rows, lo, _ in some.parts)
+        raise EstimationError(f"the filter's covariance broke down at {at}: check sigmas and units")
     return root, solved
 
 
-def _robust(
-    HPHt: Array, sigma: Array, right: Array, solved: Array, rows: Constraint, lo: int, hi: int
-) -> tuple[Array, Array, float]:
+def _robust(HPHt: Array, sigma: Array, right: Array, solved: Array, some: Together) -> tuple[Array, Array, float]:
     """Sigmas with a kernel's weights in them, S^-1 times the right sides with these, and the least weight.
 
     As the incremental smoother does with a new keyframe: none at first, then by what the update leaves, a few times.
     """
+    rows, lo, hi = some.parts[0]
     stated, weight = sigma, np.ones(hi - lo)
     for _ in range(PASSES - 1):
         left = (right[:, 0] - HPHt @ solved[:, 0]) / stated
         s = np.linalg.norm(left.reshape(hi - lo, -1), axis=1)
         weight = np.maximum(weight_and_cost(softened(rows.robust), s, rows.scale_of(slice(lo, hi)))[0], 1e-12)
         sigma = stated / np.repeat(np.sqrt(weight), len(stated) // (hi - lo))
-        _, solved = _solve(HPHt, sigma, right, rows, lo)
+        _, solved = _solve(HPHt, sigma, right, some)
     return sigma, solved, float(np.min(weight))

@@ -7,7 +7,7 @@ X_k [+] e_k the estimate, and (Bell 1994: one step of the iterated smoother)
 
     e_{k+1} <- f(X_k) [-] X_{k+1} + F e_k     nu = -(r(X) + H e)
 
-A pass at given points takes a fifth of the time, and is the better one wherever the filter has gone astray.
+A pass at given points takes a ninth of the time, and is the better one wherever the filter has gone astray.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ import numpy as np
 
 from graphnav.constraints.base import Constraint
 from graphnav.problem import Problem
-from graphnav.rotation import Array
+from graphnav.rotation import Array, mv
 from graphnav.solution import ConstraintRecord
 
 
@@ -127,7 +127,7 @@ class Stack:
         L = np.swapaxes(np.triu(self._root), -1, -2)
         white = (self._solved[:, None] @ L)[:, 0]
         L *= kind[:, :, None] == kind[:, None]
-        residual, sigma = (L @ white[..., None])[..., 0], np.sqrt(np.sum(L * L, axis=-1))
+        residual, sigma = mv(L, white), np.sqrt(np.einsum("kij,kij->ki", L, L))
         for c in self._constraints:
             record, place = self.records[c.name], self.places[c.name]
             n, k = len(place[0]), place[0][:, 0]
