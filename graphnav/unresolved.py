@@ -21,6 +21,8 @@ from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 from graphnav.samples import Samples
 
+_SHARE = 0.25  # of the variance of an evenly changing signal
+
 
 def with_unresolved_motion(samples: Samples, noise: ImuNoise) -> Samples:
     """The samples with the noise of what happens inside their periods."""
@@ -37,7 +39,7 @@ def _density(x: Array, white: float, period: float) -> Array:
     change = np.sum(np.diff(x, axis=0) ** 2, axis=1) / 3.0
     change = np.maximum(change - 2.0 * white**2 / period, 0.0)
     both = 0.5 * (np.sqrt(np.r_[change[:1], change]) + np.sqrt(np.r_[change, change[-1:]]))
-    return np.asarray(both**2 / 12.0 * period)
+    return np.asarray(_SHARE * both**2 / 12.0 * period)
 
 
 def with_coning(samples: Samples) -> Samples:
