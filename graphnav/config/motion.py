@@ -48,7 +48,6 @@ class FootSettings(Outliers):
     """What is used of a foot's way over the floor and through the air."""
 
     usual_kernel: ClassVar[str] = "cauchy"
-    usual_gate: ClassVar[float | None] = 6.0
 
     rate: float = Field(20.0, gt=0, le=200, description="Hz, keyframes within a stance and within a swing")
     stance: bool = Field(True, description="where the shoe touches the floor it does not move")
