@@ -103,7 +103,7 @@ class Stance(Constraint):
             share=_shares(landed - leaves) * _rolls(t, span, scene, s.correlation)[:, None],
             sigma=np.repeat(sigma[:, None], 3, axis=1),
             parameters=(
-                *scale_parameter(scene.recording.imu.noise),
+                *scale_parameter(scene.recording),
                 Parameter(PIVOT, np.zeros(3), np.full(3, s.pivot_sigma), "m"),
                 Parameter(TRAVEL, np.zeros(2), np.full(2, s.travel_sigma), "m"),
                 *((Parameter(PATTERN, np.zeros(_WIDE), np.full(_WIDE, s.pattern), "m/s"),) if s.pattern else ()),
@@ -176,7 +176,7 @@ class FootLateral(Constraint):
             past=past,
             sigma=sigma[:, None],
             parameters=(
-                *scale_parameter(scene.recording.imu.noise),
+                *scale_parameter(scene.recording),
                 Parameter(FOOT_AXIS, np.zeros(2), np.full(2, np.radians(s.axis_sigma)), "rad"),
             ),
             **s.outliers,

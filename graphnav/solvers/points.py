@@ -51,7 +51,7 @@ class AtEstimate:
         F = np.eye(self._width)
         F[:DIM, :DIM] = F15[0]
         if scale is not None:
-            F[:DIM, scale] = motion.scale_columns(at, F15)[0]
+            F[:DIM, scale] = motion.scale_columns(at, F15, scale.stop - scale.start)[0]
         values, added = x.values, None
         if k in self._steps:
             values, added = values.copy(), np.zeros(self._width)
@@ -113,7 +113,7 @@ class AtPoints:
         self.F[:] = np.eye(D)
         self.F[:, :DIM, :DIM] = F15
         if scale is not None:
-            self.F[:, :DIM, scale] = motion.scale_columns(at, F15)
+            self.F[:, :DIM, scale] = motion.scale_columns(at, F15, scale.stop - scale.start)
         self._Q = motion.noise(at, begin.R_nb)
         values = points.values[: n - 1].copy()
         self._added: dict[int, Array] = {}
