@@ -6,7 +6,7 @@ bias ten times less known by the rests at both ends of a walk. So the quietest s
 over `_CLUSTER`, and of them the second differences, in which a slow sway cancels. White noise of a density q leaves
 6 q^2 / `_CLUSTER` in each of their squares (Allan variance has first differences, 2 q^2 / `_CLUSTER`). A person who
 stands adds to that, so it is a bound from above; but the quietest of many stretches is quiet by chance as well, and
-the figure is what even `_CHANCE` of them would not fall below.
+the figure is one that true noise would show less than in `_CHANCE` of them.
 
 A drive is not asked: while its engine runs it vibrates as it never does at rest.
 """
@@ -25,7 +25,7 @@ from graphnav.rotation import Array
 
 _CLUSTER = 0.1  # s
 _STRETCH = 2.0  # s
-_CHANCE = 0.01
+_CHANCE = 1e-3
 _INDEPENDENT = 1.0 / (1.0 + 2.0 * ((4.0 / 6.0) ** 2 + (1.0 / 6.0) ** 2))  # of second differences: (1, -2, 1) overlap
 _WORDS = {"gyro_noise_density": "gyro", "accel_noise_density": "accelerometer"}
 _UNITS = {"gyro_noise_density": "rad/s/sqrt(Hz)", "accel_noise_density": "m/s^2/sqrt(Hz)"}
