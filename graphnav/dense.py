@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav.dynamics import Motion
+from graphnav.dynamics import Motion, as_biases
 from graphnav.earth import LocalFrame
 from graphnav.preintegration import Intervals, within
 from graphnav.problem import Problem
@@ -115,10 +115,10 @@ def _spread(rows: States, mask: Array, like: States) -> States:
 
 
 def dense(problem: Problem, states: States, covariance: Array, scale: Array | None, smooth: bool) -> Dense:
-    """For a solution of a problem; `scale` is (6,) or, as a filter knew it at each keyframe, (K, 6)."""
+    """For a solution of a problem; `scale` is (k,) or, as a filter knew it at each keyframe, (K, k)."""
     ba, bg = states.ba[:-1], states.bg[:-1]
     if scale is not None:
-        scale = np.broadcast_to(scale, (len(states), 6))[:-1]
-        bg = bg + scale[:, :3] * problem.intervals.rate
-        ba = ba + scale[:, 3:] * problem.intervals.force
+        scale = np.broadcast_to(scale, (len(states), scale.shape[-1]))[:-1]
+        of_accel, of_gyro = as_biases(scale, problem.intervals.force, problem.intervals.rate)
+        ba, bg = ba + of_accel, bg + of_gyro
     return Dense(problem.samples, problem.frame, problem.t, states, covariance, ba, bg, smooth)

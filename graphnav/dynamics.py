@@ -14,7 +14,7 @@ with G = g(p) + omega x (omega x p), and the Coriolis force is gone. Over an int
 
 E is integrated in closed form and G, which changes only with position, linearly: exact to a millimetre
 in ten minutes of free inertial. Constant scale errors s of the sensors act like biases b + s * mean
-rate (or force) of the interval, which is how they are estimated.
+rate (or force) of the interval, which is how they are estimated; so do axes that are not quite square, b + M * mean.
 
 The residual of an interval is the end state minus this prediction. Its covariance is known in the frames
 of `Intervals.covariance`; there it does not depend on the states. Filter and smoothers use the one
@@ -30,21 +30,42 @@ import numpy as np
 from graphnav import rotation
 from graphnav.earth import LocalFrame
 from graphnav.preintegration import Intervals
-from graphnav.recording import ImuNoise
+from graphnav.recording import ImuNoise, Recording
 from graphnav.rotation import Array, mv
 from graphnav.state import DIM, Parameter, States
 
 SCALE = "imu_scale"
+_TO, _FROM = np.array([0, 1, 2, 0, 0, 1, 1, 2, 2]), np.array([0, 1, 2, 1, 2, 0, 2, 0, 1])  # M_ij in its order
+_INTO = np.eye(3)[_TO]
 _I3 = np.eye(3)
 
 
+def scale_parameter(recording: Recording) -> tuple[Parameter, ...]:
+    """Scale errors (gyro x y z, accelerometer x y z), where the noise figures leave them open.
+
+    Of a foot, which turns and is shaken about all axes, also what each axis has of the others: 9 and 9, those first.
+    """
+    return _scale_parameter(recording.imu.noise, 9 if recording.platform == "foot" else 3)
+
+
 @cache
-def scale_parameter(noise: ImuNoise) -> tuple[Parameter, ...]:
-    """The six scale errors (gyro x y z, accelerometer x y z), where the noise figures leave them open."""
+def _scale_parameter(noise: ImuNoise, each: int) -> tuple[Parameter, ...]:
     if noise.gyro_scale_sigma <= 0 and noise.accel_scale_sigma <= 0:
         return ()
-    sigma = np.repeat([max(noise.gyro_scale_sigma, 1e-9), max(noise.accel_scale_sigma, 1e-9)], 3)
-    return (Parameter(SCALE, np.zeros(6), sigma, "1"),)
+    sigma = np.repeat([max(noise.gyro_scale_sigma, 1e-9), max(noise.accel_scale_sigma, 1e-9)], each)
+    return (Parameter(SCALE, np.zeros(2 * each), sigma, "1"),)
+
+
+def as_biases(scale: Array, force: Array, rate: Array) -> tuple[Array, Array]:
+    """What scale errors (k,) or (n, k) are like at means (n, 3): biases of accelerometer and gyro, (n, 3) each."""
+    half = scale.shape[-1] // 2
+    of_accel, of_gyro = scale[..., half:] * force[:, _FROM[:half]], scale[..., :half] * rate[:, _FROM[:half]]
+    return (of_accel, of_gyro) if half == 3 else (of_accel @ _INTO, of_gyro @ _INTO)
+
+
+def by_scale(by_bias: Array, mean: Array, k: int) -> Array:
+    """(n, r, k): derivative by k errors of a triad, from that by its bias (n, r, 3)."""
+    return np.asarray(by_bias[..., _TO[:k]] * mean[:, None, _FROM[:k]])
 
 
 class Motion:
@@ -83,7 +104,6 @@ class Motion:
         self.bias[:, 6:, :3], self.bias[:, 6:, 3:] = intervals.v_ba, intervals.v_bg
         self.step = np.concatenate([intervals.dP, intervals.dV], axis=-1)
         self.expected = np.concatenate([intervals.ba, intervals.bg], axis=-1)
-        self.mean = np.concatenate([intervals.force, intervals.rate], axis=-1)
 
     def prepared(self) -> Motion:
         """The same, with all that is made when it is asked for first made already."""
@@ -104,13 +124,13 @@ class Motion:
     def propagate(self, rows: slice, start: States, scale: Array | None = None) -> tuple[States, Array]:
         """The states at the ends of intervals `rows` and F (n, 15, 15) there, from the states at their starts.
 
-        `scale` is (6,), (n, 6) or None.
+        `scale` is (k,), (n, k) or None, k 6 or 18.
         """
         iv, R = self.intervals, start.R_nb
         n = len(R)
         delta = np.concatenate([start.ba, start.bg], -1) - self.expected[rows]
         if scale is not None:
-            delta += scale[..., [3, 4, 5, 0, 1, 2]] * self.mean[rows]
+            delta += np.concatenate(as_biases(scale, iv.force[rows], iv.rate[rows]), -1)
         bent = mv(self.bias[rows], delta)
         turn, moved = bent[:, :3], self.step[rows] + bent[:, 3:]  # dP, dV
         dR = iv.dR[rows] @ rotation.exp(turn)
@@ -134,12 +154,12 @@ class Motion:
         """(n, 6, 6) from (dP, dV) in the start's body axes to (p, v) at the end."""
         return (self.post[rows].reshape(-1, 6, 2, 3) @ R_nb[:, None]).reshape(-1, 6, 6)
 
-    def scale_columns(self, rows: slice, F: Array) -> Array:
-        """d(end) / d(scale), (n, 15, 6): the bias columns of F times what the scale multiplies."""
-        iv = self.intervals
-        out = np.zeros((len(F), DIM, 6))
-        out[:, :9, :3] = F[:, :9, 12:15] * iv.rate[rows][:, None]
-        out[:, :9, 3:] = F[:, :9, 9:12] * iv.force[rows][:, None]
+    def scale_columns(self, rows: slice, F: Array, k: int) -> Array:
+        """d(end) / d(scale), (n, 15, k): the bias columns of F times what the scale multiplies."""
+        iv, half = self.intervals, k // 2
+        out = np.zeros((len(F), DIM, k))
+        out[:, :9, :half] = by_scale(F[:, :9, 12:15], iv.rate[rows], half)
+        out[:, :9, half:] = by_scale(F[:, :9, 9:12], iv.force[rows], half)
         return out
 
     def frames(self, rows: slice, R_nb: Array) -> Array:
@@ -164,13 +184,13 @@ class Motion:
         return self._body(states[1:].minus(ahead), states.R_nb[:-1])
 
     def linearize(self, states: States, scale: Array | None = None) -> tuple[Array, Array, Array, Array]:
-        """`residual` of all intervals, its Jacobians by both ends (n, 15, 15) and by the scale (n, 15, 6)."""
+        """`residual` of all intervals, its Jacobians by both ends (n, 15, 15) and by the scale (n, 15, k)."""
         rows, start = slice(None), states[:-1]
         ahead, F = self.propagate(rows, start, scale)
         r = states[1:].minus(ahead)
         r_theta = r[:, :3]
         inverse = rotation.right_jacobian_inverse(r_theta)
-        S = self.scale_columns(rows, F)
+        S = self.scale_columns(rows, F, 6 if scale is None else scale.shape[-1])
         both = -np.concatenate([F, S], -1)
         both[:, :3] = inverse @ rotation.exp(-r_theta) @ both[:, :3]
         Jj = np.zeros_like(F)

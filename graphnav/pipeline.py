@@ -16,6 +16,7 @@ from graphnav.constraints.prior import InitialPrior
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import ConfigError, EstimationError
+from graphnav.own_noise import with_own_noise
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
 from graphnav.review import Review
@@ -112,6 +113,7 @@ def _solve(
     recording: Recording, settings: Settings, frame: LocalFrame, solvers: tuple[str, ...], progress: Progress | None
 ) -> dict[str, Solution]:
     began = time.perf_counter()
+    recording, shown = with_own_noise(recording, settings)
     tell("detection")
     found = detect(recording, settings)
     detected = time.perf_counter()
@@ -152,7 +154,7 @@ def _solve(
     return {
         name: replace(
             out[name],
-            notes=(*stated.notes, *found.notes, *said, *out[name].notes),
+            notes=(*stated.notes, *shown, *found.notes, *said, *out[name].notes),
             detections=found.all,
             excluded=wrong,
             timings={k: timings.get(k, 0.0) + out[name].timings.get(k, 0.0) for k in (*timings, *out[name].timings)},

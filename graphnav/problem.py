@@ -57,7 +57,7 @@ class Problem:
     @cached_property
     def parameters(self) -> dict[str, Parameter]:
         """What is estimated beside the states, by name."""
-        own = (*scale_parameter(self.recording.imu.noise), *(p for rows in self.constraints for p in rows.parameters))
+        own = (*scale_parameter(self.recording), *(p for rows in self.constraints for p in rows.parameters))
         return {p.name: p for p in own}
 
     @cached_property

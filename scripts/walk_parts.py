@@ -19,24 +19,29 @@ from unittest.mock import patch
 import numpy as np
 from walks import SETS
 
-from graphnav import load
+from graphnav import dynamics, load
 from graphnav.config import settings_from
 from graphnav.pipeline import run
 from graphnav.recording import Recording
 from graphnav.strides import walk_errors
 
+_square = dynamics._scale_parameter
+
 # settings, and what is put in the place of a function or a constant
 CASES: dict[str, tuple[Mapping[str, Any], dict[str, Any]]] = {
     "as it is": ({}, {}),
+    "nothing comes back": ({"foot": {"pattern": 0.0}}, {}),
     "no travel of the pivot": ({"foot": {"travel_sigma": 1e-6}}, {}),
-    "zero velocity of the IMU instead": ({"foot": {"pivot_sigma": 1e-6, "travel_sigma": 1e-6}}, {}),
+    "zero velocity of the IMU instead": ({"foot": {"pivot_sigma": 1e-6, "travel_sigma": 1e-6, "pattern": 0.0}}, {}),
     "no zero rate": ({"standstill": {"zero_rate": False}}, {}),
+    "noise as stated": ({"imu": {"as_stated": True}}, {}),
     "no noise of heel strikes": ({}, {"graphnav.problem.with_unresolved_motion": lambda samples, noise: samples}),
+    "axes taken as square": ({}, {"graphnav.dynamics._scale_parameter": lambda noise, _: _square(noise, 3)}),
     "peaks left cut off": ({}, {"graphnav.problem.with_whole_peaks": lambda samples, *_: (samples, ())}),
     "no coning": ({"imu": {"coning": False}}, {}),
-    "no row doubted": ({"foot": {"robust": "none", "gate": None}}, {}),
+    "no row doubted": ({"foot": {"robust": "none"}}, {}),
     "sliding taken for stance": ({}, {"graphnav.detectors.stance._without_sliding": lambda spans, *_: spans}),
-    "filter in one pass": ({}, {"graphnav.constraints.foot.Stance.passes": 1}),
+    "first steps filtered once": ({}, {"graphnav.alignment.rest._OPENING": 1}),
 }  # fmt: skip
 
 

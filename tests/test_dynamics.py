@@ -9,11 +9,11 @@ import pytest
 from helpers import FRAME, STEPS, Array, difference, random_imu, random_states
 
 from graphnav import rotation as ro
-from graphnav.dynamics import SCALE, Motion, scale_parameter
+from graphnav.dynamics import SCALE, Motion, as_biases, scale_parameter
 from graphnav.preintegration import preintegrate
-from graphnav.recording import ImuNoise
+from graphnav.recording import Imu, ImuNoise, Recording
 from graphnav.samples import bridge_gaps
-from graphnav.state import DIM, States
+from graphnav.state import DIM, Parameter, States
 
 N = 6
 
@@ -36,7 +36,7 @@ def start() -> States:
 
 
 SCALES = np.array([2e-3, -1e-3, 3e-3, -2e-3, 1e-3, 2e-3])
-SCALE_STEPS = np.full(6, 1e-4)
+SQUARE = 2e-3 * np.random.default_rng(9).normal(size=18)  # with what each axis has of the others
 
 
 def sizes(J: Array) -> Array:
@@ -58,12 +58,13 @@ def test_transition_numerically(motion: Motion, start: States, scale: Array | No
     assert np.all(np.abs(F - numerical) < 1e-6 * sizes(numerical) + 2e-7)
 
 
-def test_scale_columns_numerically(motion: Motion, start: States) -> None:
-    end, F = motion.propagate(slice(None), start, SCALES)
+@pytest.mark.parametrize("scale", [SCALES, SQUARE], ids=["scales", "square"])
+def test_scale_columns_numerically(motion: Motion, start: States, scale: Array) -> None:
+    end, F = motion.propagate(slice(None), start, scale)
     numerical = difference(
-        lambda d: motion.propagate(slice(None), start, SCALES + d)[0].minus(end), SCALE_STEPS
-    )  # fmt: skip
-    S = motion.scale_columns(slice(None), F)
+        lambda d: motion.propagate(slice(None), start, scale + d)[0].minus(end), np.full(len(scale), 1e-4)
+    )
+    S = motion.scale_columns(slice(None), F, len(scale))
     assert np.all(np.abs(S - numerical) < 3e-6 * sizes(numerical) + 2e-7)
 
 
@@ -87,7 +88,7 @@ def torn() -> tuple[Motion, States]:
 
 def test_linearize_numerically_at_large_residuals(torn: tuple[Motion, States]) -> None:
     motion, x = torn
-    value, Ji, Jj, Js = motion.linearize(x, SCALES)
+    value, Ji, Jj, _ = motion.linearize(x, SCALES)
     assert np.linalg.norm(value[:, :3], axis=1).max() > 1.5
     assert np.abs(value[:, 3:6]).max() > 100.0
     np.testing.assert_allclose(value, motion.residual(x, SCALES), atol=1e-9)
@@ -105,8 +106,10 @@ def test_linearize_numerically_at_large_residuals(torn: tuple[Motion, States]) -
         (Jj, np.where(first[:, None, None], odd, even)),
     ):
         assert np.all(np.abs(J - numerical) < 1e-6 * sizes(numerical) + 1e-6)
-    numerical = difference(lambda d: motion.residual(x, SCALES + d), SCALE_STEPS)
-    assert np.all(np.abs(Js - numerical) < 1e-6 * sizes(numerical) + 1e-6)
+    for scale in (SCALES, SQUARE):
+        Js = motion.linearize(x, scale)[3]
+        numerical = difference(lambda d, s=scale: motion.residual(x, s + d), np.full(len(scale), 1e-4))
+        assert np.all(np.abs(Js - numerical) < 1e-6 * sizes(numerical) + 1e-6)
 
 
 def test_residual_of_propagated_states_is_zero(motion: Motion) -> None:
@@ -157,8 +160,31 @@ def test_noise_by_monte_carlo(motion: Motion, start: States) -> None:
 
 
 def test_scale_parameter() -> None:
-    assert scale_parameter(ImuNoise(gyro_scale_sigma=0.0, accel_scale_sigma=0.0)) == ()
-    (p,) = scale_parameter(ImuNoise(gyro_scale_sigma=1e-3, accel_scale_sigma=2e-3))
+    def of(noise: ImuNoise, platform: str = "vehicle") -> tuple[Parameter, ...]:
+        imu = Imu(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), noise)
+        return scale_parameter(Recording("none", platform, imu))
+
+    noise = ImuNoise(gyro_scale_sigma=1e-3, accel_scale_sigma=2e-3)
+    assert of(ImuNoise(gyro_scale_sigma=0.0, accel_scale_sigma=0.0)) == ()
+    (p,) = of(noise)
     assert p.name == SCALE
     assert p.walk == 0.0
     np.testing.assert_allclose(p.sigma, [1e-3] * 3 + [2e-3] * 3)
+    (p,) = of(noise, "foot")
+    np.testing.assert_allclose(p.sigma, [1e-3] * 9 + [2e-3] * 9)
+
+
+def test_scale_errors_are_like_biases_of_a_matrix() -> None:
+    """Against M x with the matrix written out; the first three of nine are its diagonal."""
+    rng = np.random.default_rng(8)
+    force, rate, scale = rng.normal(size=(5, 3)), rng.normal(size=(5, 3)), rng.normal(size=18)
+
+    def matrix(s: Array) -> Array:
+        return np.array([[s[0], s[3], s[4]], [s[5], s[1], s[6]], [s[7], s[8], s[2]]])
+
+    of_accel, of_gyro = as_biases(scale, force, rate)
+    np.testing.assert_allclose(of_gyro, rate @ matrix(scale[:9]).T, rtol=1e-12)
+    np.testing.assert_allclose(of_accel, force @ matrix(scale[9:]).T, rtol=1e-12)
+    few = as_biases(np.r_[scale[:3], scale[9:12]], force, rate)
+    np.testing.assert_allclose(few[0], scale[9:12] * force)
+    np.testing.assert_allclose(few[1], scale[:3] * rate)

@@ -13,7 +13,7 @@ from helpers import Array
 from graphnav import rotation as ro
 from graphnav.config import Settings, settings_from
 from graphnav.constraints.base import Scene
-from graphnav.constraints.foot import FOOT_AXIS, PIVOT, TRAVEL, FootLateral, Stance
+from graphnav.constraints.foot import FOOT_AXIS, PATTERN, PIVOT, TRAVEL, FootLateral, Stance
 from graphnav.constraints.standstill import ZeroRate, _swaying
 from graphnav.detectors import detect
 from graphnav.detectors.base import Detection
@@ -168,14 +168,53 @@ def test_the_pivot_explains_what_zero_velocity_leaves(pace: str) -> None:
     assert x[4] > 0.03
 
 
+@pytest.mark.parametrize("pace", PACES)
+def test_what_comes_back_in_every_stance_is_what_the_pivot_leaves(pace: str) -> None:
+    """At the true states of an exact walk, within the sigma that the pattern has; upward most, where it adds up."""
+    walk = made(pace, exact=True)
+    scene = scene_of(walk, Settings())
+    rows = Stance.build(scene)
+    assert rows is not None
+    states = true_states(walk, scene.t[rows.keyframe], scene.frame)
+    of = {p.name: p for p in rows.parameters}
+    zero = rows.linearize(states, {name: np.zeros((len(rows), p.size)) for name, p in of.items()}, slice(None))
+    left = {}
+    for names in ((PIVOT, TRAVEL), (PIVOT, TRAVEL, PATTERN)):
+        A = np.concatenate([zero.jacobians[name] for name in names], -1)
+        prior = np.concatenate([of[name].sigma for name in names])
+        white = (A / zero.sigma[..., None]).reshape(-1, A.shape[-1])
+        wanted = np.concatenate([-(zero.residual / zero.sigma).ravel(), np.zeros(len(prior))])
+        x, *_ = np.linalg.lstsq(np.concatenate([white, np.diag(1.0 / prior)]), wanted, rcond=None)
+        left[names[-1]] = zero.residual + A @ x
+    assert np.all(np.abs(x[5:]) < 2.0 * of[PATTERN].sigma)
+    assert np.abs(x[5:].reshape(-1, 3)[:, 2]).max() > 0.003
+    assert np.sum(left[PATTERN] ** 2) < 0.75 * np.sum(left[TRAVEL] ** 2)
+    assert abs(left[PATTERN][:, 2].mean()) < 0.7 * abs(left[TRAVEL][:, 2].mean())
+
+
+def test_the_pattern_is_of_landing_and_leaving_and_not_of_standing() -> None:
+    scene = scene_of(made("normal"), Settings())
+    rows = Stance.build(scene)
+    assert rows is not None
+    total = rows.share.sum(axis=1)
+    assert np.all((total == 0.0) | (np.abs(total - 1.0) < 1e-12))
+    t = scene.t[rows.keyframe]
+    first, last = scene.stationary[0], scene.stationary[-1]
+    assert np.all(total[t < first[1] - 0.45] == 0.0)  # the recording does not begin with a landing
+    assert np.all(total[t > last[0] + 0.5] == 0.0)
+    walking = (t > scene.stationary[1, 0]) & (t <= scene.stationary[-2, 1])
+    assert np.all(total[walking] == 1.0)
+
+
 def test_zero_velocity_alone_makes_strides_too_short() -> None:
     """The known bias of foot-mounted navigation, and that the pivot takes it away."""
     walk = made("normal")
     truth = walk.truth
     way = {}
     spans = detect(walk.recording).stationary.mean(axis=1)
-    for name, sigma in (("zero velocity", 1e-6), ("pivot", 0.1)):
-        solution = run(walk.recording, settings_from({"foot": {"pivot_sigma": sigma, "travel_sigma": sigma}}), ("rts",))
+    for name, sigma, pattern in (("zero velocity", 1e-6, 0.0), ("pivot", 0.1, 0.02)):
+        foot = {"pivot_sigma": sigma, "travel_sigma": sigma, "pattern": pattern}
+        solution = run(walk.recording, settings_from({"foot": foot}), ("rts",))
         p = solution["rts"].at(spans)[1].p
         way[name] = np.sum(np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1))
     at, _ = interpolate(truth, spans)
@@ -374,10 +413,16 @@ def test_a_dense_truth_of_another_point_on_the_foot() -> None:
 
 # --------------------------------------------------------------------------------------------------------- real walks
 @pytest.mark.parametrize(
-    ("walk", "horizontal", "up"), [("gcp_walks/walk36", 0.20, np.inf), ("openshoe_loops/run34", 0.20, 0.25)]
+    ("walk", "horizontal", "up"),
+    [
+        ("gcp_walks/walk36", 0.20, np.inf),
+        ("openshoe_loops/run34", 0.20, 0.25),
+        ("openshoe_loops/run31", 0.20, 0.25),
+        ("xio_loops/long", 0.15, 0.25),
+    ],
 )
 def test_real_walks(shared_data: Path, walk: str, horizontal: float, up: float) -> None:
-    """Three and two times better than a plain zero-velocity filter (0.65 m; 0.43 m and -0.67 m), by every solver."""
+    """Twice as good as a plain zero-velocity filter (0.65, 0.43, 0.40, 0.32 m; up -0.67, -0.67, 0.59 m), by each."""
     recording = read(shared_data / f"{walk}.toml")
     solutions = run(recording)
     for solver, solution in solutions.items():
@@ -385,7 +430,7 @@ def test_real_walks(shared_data: Path, walk: str, horizontal: float, up: float) 
         assert found.horizontal < horizontal, solver
         assert not abs(found.up) > up, solver
         if recording.truth is not None and recording.truth.xyz is not None:
-            assert found.stride == pytest.approx(1.0, abs=0.004), solver
+            assert found.stride == pytest.approx(1.0, abs=0.005), solver  # of zero velocity alone 0.975
     assert solutions["batch"].stopped.startswith("converged")
 
 

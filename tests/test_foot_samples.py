@@ -10,7 +10,9 @@ import pytest
 
 from graphnav import rotation as ro
 from graphnav.clipping import cut_peaks, with_whole_peaks
+from graphnav.config import Settings, settings_from
 from graphnav.detectors import detect
+from graphnav.own_noise import quietest_density, with_own_noise
 from graphnav.preintegration import preintegrate
 from graphnav.recording import ImuNoise
 from graphnav.samples import Samples, bridge_gaps
@@ -25,7 +27,7 @@ def made(pace: str, exact: bool = False) -> Simulated:
 
 # -------------------------------------------------------------------------------------------------------- heel strikes
 def test_noise_of_what_happens_within_a_period() -> None:
-    """A ramp of D in each period has the variance D^2 / 12 in it; where nothing changes nothing is added."""
+    """A ramp of D in each period has the variance D^2 / 12 in it, of which a quarter is taken; without change, none."""
     t = 0.01 * np.arange(1, 101)
     ramp = np.zeros((100, 3))
     ramp[50:] = 0.6 * np.arange(50)[:, None]
@@ -33,8 +35,8 @@ def test_noise_of_what_happens_within_a_period() -> None:
     samples = Samples(t, ramp, 2.0 * ramp, zero, zero, 0.0, np.empty((0, 2)))
     quiet = ImuNoise(gyro_noise_density=1e-9, accel_noise_density=1e-9)
     out = with_unresolved_motion(samples, quiet)
-    np.testing.assert_allclose(out.extra_gyro[60:90], 0.6**2 / 12.0 * 0.01, rtol=1e-9)
-    np.testing.assert_allclose(out.extra_accel[60:90], 1.2**2 / 12.0 * 0.01, rtol=1e-9)
+    np.testing.assert_allclose(out.extra_gyro[60:90], 0.6**2 / 48.0 * 0.01, rtol=1e-9)
+    np.testing.assert_allclose(out.extra_accel[60:90], 1.2**2 / 48.0 * 0.01, rtol=1e-9)
     assert np.all(out.extra_gyro[:49] == 0.0)
 
 
@@ -48,6 +50,43 @@ def test_the_sensors_own_noise_is_not_counted_twice() -> None:
     out = with_unresolved_motion(Samples(t, gyro, accel, zero, zero, 0.0, np.empty((0, 2))), noise)
     assert out.extra_gyro.mean() < 0.1 * 1e-3**2
     assert out.extra_accel.mean() < 0.1 * 2e-3**2
+
+
+# --------------------------------------------------------------------------------------------------- noise of its own
+def test_a_bound_on_white_noise_from_the_quietest_stretch() -> None:
+    """Not below the true figure but by chance, nor far above it; and what sways slowly under it does not count."""
+    found = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        t = 0.005 * np.arange(1, 4001)
+        x = 1e-3 / np.sqrt(0.005) * rng.standard_normal((4000, 3)) + 0.02 * np.sin(0.5 * t)[:, None]
+        x[2000:] += rng.standard_normal((2000, 3))  # and then it walks
+        found.append(quietest_density(t, x) / 1e-3)
+    assert np.mean(np.array(found) < 1.0) <= 0.05  # the least of some ten stretches of which each is below in 0.1 %
+    assert max(found) < 1.7
+
+
+def test_what_is_too_short_for_a_bound_has_none() -> None:
+    t = 0.005 * np.arange(1, 101)
+    assert quietest_density(t, np.zeros((100, 3))) == np.inf
+    assert quietest_density(t[:1], np.zeros((1, 3))) == np.inf
+
+
+def test_figures_stated_too_large_are_lowered_for_a_walk_and_for_nothing_else() -> None:
+    walk = made("normal").recording
+    true = walk.imu.noise
+    same, said = with_own_noise(walk, Settings())
+    assert said == ()
+    assert same.imu.noise == true
+    tenfold = replace(true, gyro_noise_density=10.0 * true.gyro_noise_density)
+    stated = replace(walk, imu=replace(walk.imu, noise=tenfold))
+    found, (sentence,) = with_own_noise(stated, Settings())
+    assert true.gyro_noise_density < found.imu.noise.gyro_noise_density < 2.0 * true.gyro_noise_density
+    assert found.imu.noise.accel_noise_density == true.accel_noise_density
+    assert "gyro" in sentence
+    assert with_own_noise(stated, settings_from({"imu": {"as_stated": True}})) == (stated, ())
+    drive = replace(stated, platform="vehicle")
+    assert with_own_noise(drive, Settings()) == (drive, ())
 
 
 # ------------------------------------------------------------------------------------------------ what rows stand for

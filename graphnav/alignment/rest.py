@@ -11,17 +11,20 @@ from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.preintegration import prefix
 from graphnav.recording import Recording
+from graphnav.rotation import Array
 from graphnav.samples import bridge_gaps
 from graphnav.state import States
 
 _AT_ONCE = 0.05  # s from the start within which a foot that stands is found
+_OPENING = 10  # stances of a walk by which tilt and accelerometer bias are told apart
 _WALKING = 3.0  # m/s, 1-sigma of the start velocity of a foot in the air
 
 
 def at_rest(recording: Recording, settings: Settings, frame: LocalFrame) -> Alignment:
     """Level only; the heading stays unknown."""
     noise, gnss = recording.imu.noise, recording.gnss
-    begin, seconds = _standing(recording, settings)
+    stances = detect(recording, settings).stationary if recording.platform == "foot" else np.empty((0, 2))
+    begin, seconds = _standing(recording, stances)
     R = rotation.from_rph(np.array([*level(recording, begin, seconds), 0.0]))
     tilt, sd_v = noise.accel_bias_sigma / 9.8 + np.radians(1.0), 0.5
     bias, sd_bias = np.zeros(3), noise.gyro_bias_sigma
@@ -58,17 +61,15 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame) -> Alig
             [sd_bias] * 3,
         ]
     )
-    return Alignment(state, sigma, own, (note,))
+    return Alignment(state, sigma, own, (note,), until=float(stances[:_OPENING][-1, 1]) if len(stances) else None)
 
 
-def _standing(recording: Recording, settings: Settings) -> tuple[float, float]:
+def _standing(recording: Recording, stances: Array) -> tuple[float, float]:
     """From when (s), and for how long, to level: from the start, or for a foot that starts in the air its first stance.
 
     Of a stance the middle half is used.
     """
-    if recording.platform == "foot":
-        spans = detect(recording, settings).stationary
-        if len(spans) and spans[0, 0] > recording.start + _AT_ONCE:
-            length = float(spans[0, 1] - spans[0, 0])
-            return float(spans[0, 0]) + 0.25 * length, min(1.0, 0.5 * length)
+    if len(stances) and stances[0, 0] > recording.start + _AT_ONCE:
+        length = float(stances[0, 1] - stances[0, 0])
+        return float(stances[0, 0]) + 0.25 * length, min(1.0, 0.5 * length)
     return recording.start, 1.0

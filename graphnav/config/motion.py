@@ -48,15 +48,17 @@ class FootSettings(Outliers):
     """What is used of a foot's way over the floor and through the air."""
 
     usual_kernel: ClassVar[str] = "cauchy"
-    usual_gate: ClassVar[float | None] = 6.0
 
     rate: float = Field(20.0, gt=0, le=200, description="Hz, keyframes within a stance and within a swing")
     stance: bool = Field(True, description="where the shoe touches the floor it does not move")
-    still: float = Field(0.01, gt=0, description="m/s, 1-sigma of a stance in which nothing turns")
-    rolling: float = Field(0.02, ge=0, description="m, 1-sigma of where the pivot is; times the turn rate")
+    still: float = Field(0.005, gt=0, description="m/s, 1-sigma of a stance in which nothing turns")
+    rolling: float = Field(0.01, ge=0, description="m, 1-sigma of where the pivot is; times the turn rate")
     correlation: float = Field(0.4, ge=0, description="s, over which the errors of a stance are one: about its length")
     pivot_sigma: float = Field(0.1, gt=0, description="m, 1-sigma of the pivot's place about the IMU, estimated")
     travel_sigma: float = Field(0.1, gt=0, description="m, 1-sigma of how far it travels either way, estimated")
+    pattern: float = Field(
+        0.02, ge=0, description="m/s, 1-sigma of the velocity that comes back in every stance, estimated; 0: without"
+    )
     half_stance: float = Field(0.2, gt=0, description="s after landing and before leaving in which the pivot travels")
     lateral: bool = Field(False, description="no sideways speed in swing")
     sideways: float = Field(0.1, gt=0, description="m/s, 1-sigma of the mean sideways speed of a swing")

@@ -51,7 +51,7 @@ class ImuSettings(Section):
     """How the IMU's figures are used."""
 
     as_stated: bool = Field(
-        False, description="take the noise figures as stated, even where the drive shows them to be too small"
+        False, description="take the noise figures as stated, even where the recording shows them to be wrong"
     )
     coning: bool = Field(
         True, description="of a foot: rows are plain means; false for a unit that makes up for coning and sculling"

@@ -34,7 +34,7 @@ import numpy as np
 from graphnav import rotation
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
-from graphnav.dynamics import SCALE, scale_parameter
+from graphnav.dynamics import SCALE, as_biases, by_scale, scale_parameter
 from graphnav.earth import LocalFrame
 from graphnav.preintegration import Intervals
 from graphnav.recording import Imu, Odometer, Recording
@@ -105,7 +105,8 @@ class Past:
         da, dg = states.ba - self.ba[rows], states.bg - self.bg[rows]
         if SCALE in parameters:
             scale = parameters[SCALE]
-            da, dg = da + scale[:, 3:] * force, dg + scale[:, :3] * rate
+            of_accel, of_gyro = as_biases(scale, force, rate)
+            da, dg = da + of_accel, dg + of_gyro
         seen = np.empty((n, 3, 3))
         seen[:, 0], seen[:, 1] = states.v, self.frame.gravity_n(states.p) - states.v @ W.T
         seen[:, 2] = self.frame.omega_n
@@ -125,7 +126,8 @@ class Past:
             "bg": by_bg,
         }
         if SCALE in parameters:
-            J[SCALE] = np.concatenate([by_bg * rate[:, None], by_ba * force[:, None]], axis=-1)
+            half = scale.shape[-1] // 2
+            J[SCALE] = np.concatenate([by_scale(by_bg, rate, half), by_scale(by_ba, force, half)], axis=-1)
         return found, -seen[:, 2], J
 
 
@@ -235,7 +237,7 @@ def shared_parameters(scene: Scene) -> dict[str, Any]:
 
 def _shared_parameters(scene: Scene) -> tuple[Array, list[Parameter]]:
     s, odometer = scene.settings.vehicle, scene.recording.odometer
-    parameters = list(scale_parameter(scene.recording.imu.noise))
+    parameters = list(scale_parameter(scene.recording))
     lever = np.zeros(3) if odometer is None else odometer.lever_arm
     if s.mounting_sigma > 0:
         sigma, walk = np.radians(s.mounting_sigma), np.radians(s.mounting_walk) / 60.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from graphnav.constraints.base import SAME_TIME
 from graphnav.dense import Dense
-from graphnav.dynamics import SCALE, Motion
+from graphnav.dynamics import SCALE, Motion, as_biases
 from graphnav.earth import LocalFrame
 from graphnav.online.sensors import Sensors
 from graphnav.preintegration import preintegrate
@@ -41,7 +41,7 @@ def live(newest: Message, T: float, frame: LocalFrame, sensors: Sensors) -> Live
         F = np.zeros((DIM, len(P)))
         F[:, :DIM] = F15[0]
         if scale is not None:
-            F[:, newest.columns[SCALE]] = motion.scale_columns(one, F15)[0]
+            F[:, newest.columns[SCALE]] = motion.scale_columns(one, F15, len(scale))[0]
         P = F @ P @ F.T + motion.noise(one, state.R_nb)[0]
         state = ahead
     return Live(float(max(now, T)), state, P[:DIM, :DIM], T)
@@ -60,8 +60,9 @@ def since(newest: Message, T: float, frame: LocalFrame, sensors: Sensors) -> tup
     ba, bg = start.ba, start.bg
     if SCALE in newest.columns:
         scale, rows = newest.value(SCALE), imu.t > T
-        bg = bg + scale[:3] * (imu.gyro[rows].mean(axis=0) - bg)
-        ba = ba + scale[3:] * (imu.accel[rows].mean(axis=0) - ba)
+        mean = imu.accel[rows].mean(axis=0, keepdims=True) - ba, imu.gyro[rows].mean(axis=0, keepdims=True) - bg
+        of_accel, of_gyro = as_biases(scale, *mean)
+        ba, bg = ba + of_accel, bg + of_gyro
     ends, both = np.array([T, now.t]), np.stack([newest.covariance[:DIM, :DIM], now.covariance])
     between = Dense(
         bridge_gaps(imu), frame, ends, States.stack([start, now.state]), both, ba, bg, smooth=False

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.dense import dense
+from graphnav.dynamics import as_biases
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
@@ -208,8 +209,8 @@ def _renew(problem: Problem, point: Point) -> tuple[Problem, int]:
     """Integrate again about the present biases where the first-order correction no longer holds."""
     ba, bg = point.states.ba[:-1], point.states.bg[:-1]
     if point.scale is not None:
-        bg = bg + point.scale[:3] * problem.intervals.rate
-        ba = ba + point.scale[3:] * problem.intervals.force
+        of_accel, of_gyro = as_biases(point.scale, problem.intervals.force, problem.intervals.rate)
+        ba, bg = ba + of_accel, bg + of_gyro
     far = problem.intervals.out_of_range(bg)
     if not far.any():
         return problem, 0

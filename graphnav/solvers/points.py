@@ -62,7 +62,7 @@ class AtEstimate:
         F = self._I.copy()
         F[:DIM, :DIM] = F15[0]
         if scale is not None:
-            F[:DIM, scale] = motion.scale_columns(at, F15)[0]
+            F[:DIM, scale] = motion.scale_columns(at, F15, scale.stop - scale.start)[0]
         values, added = x.values, None
         if k in self._steps:
             values, added = values.copy(), np.zeros(self._width)
@@ -129,7 +129,7 @@ class AtPoints:
         self.F[:] = np.eye(D)
         self.F[:, :DIM, :DIM] = F15
         if scale is not None:
-            self.F[:, :DIM, scale] = motion.scale_columns(at, F15)
+            self.F[:, :DIM, scale] = motion.scale_columns(at, F15, scale.stop - scale.start)
         self._Q = motion.noise(at, begin.R_nb)
         values = points.values[: n - 1].copy()
         self._added = np.zeros((n, D))

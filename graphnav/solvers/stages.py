@@ -211,7 +211,7 @@ def predicted(before: Message, place: Place) -> tuple[States, Array, Columns, Ar
     link[:, :, DIM : 2 * DIM] = _I
     if scale is not None:
         at = columns[SCALE]
-        link[:, :, DIM + at.start : DIM + at.stop] = -motion.scale_columns(row, F)
+        link[:, :, DIM + at.start : DIM + at.stop] = -motion.scale_columns(row, F, at.stop - at.start)
     return ahead, values, columns, (W @ motion.body_rows(link, before.state.R_nb, row))[0]
 
 
