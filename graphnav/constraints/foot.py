@@ -137,8 +137,8 @@ def _rolls(t: Array, span: Array, scene: Scene, lasts: float) -> Array:
 
     A recording neither begins with a landing nor ends with a leaving.
     """
-    landed = (t - span[:, 0] < lasts) & (span[:, 0] > scene.t[0] + SAME_TIME)
-    leaves = (span[:, 1] - t < lasts) & (span[:, 1] < scene.t[-1] - SAME_TIME)
+    landed = (t - span[:, 0] < lasts) & (span[:, 0] > scene.recording.start + SAME_TIME)
+    leaves = (span[:, 1] - t < lasts) & (span[:, 1] < scene.recording.end - SAME_TIME)
     return np.asarray((landed | leaves).astype(float))
 
 
