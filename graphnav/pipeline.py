@@ -117,7 +117,7 @@ def _solve(
     detected = time.perf_counter()
     tell("alignment")
     aligned = align(
-        recording, settings, frame, lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)
+        recording, settings, frame, lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False), found.stationary
     )
     after = time.perf_counter()
     stated = with_known_heading(aligned, settings)
