@@ -20,6 +20,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, assemble
+from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.problem import Problem
 from graphnav.recording import Recording
 from graphnav.rotation import Array
@@ -141,6 +142,15 @@ def _wider(fault: Fault) -> Fault:
 def count(problem: Problem) -> int:
     """How many rows are left out, or have less say."""
     return sum(int(np.sum(c.weight < 1.0)) for c in problem.constraints if c.weight is not None)
+
+
+def said(problem: Problem) -> float:
+    """How many fixes have a say, noisier ones less of it."""
+    return sum(
+        float(len(c) if c.weight is None else np.sum(c.weight))
+        for c in problem.constraints
+        if isinstance(c, GnssPosition | GnssVelocity)
+    )
 
 
 def share(problem: Problem) -> float:

@@ -8,25 +8,34 @@ at first and at last; in between it is linearised at what is known of it by then
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
 from graphnav import faults
-from graphnav.alignment import Alignment
+from graphnav.alignment import Alignment, align, with_known_heading
+from graphnav.alignment.first import some
 from graphnav.config import Settings
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.detectors import Detections, detect
 from graphnav.earth import LocalFrame
+from graphnav.errors import EstimationError
 from graphnav.judgement import calmer, judge_speeds, judged
 from graphnav.problem import Problem, pose
 from graphnav.progress import Progress, tell
 from graphnav.recording import Recording
 from graphnav.rotation import Array
+from graphnav.solution import Solution
+from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf, refilter
 from graphnav.solvers.near import near
 from graphnav.solvers.passes import Filtered, Forward, Points, Smoothed, points_of, values_of
 from graphnav.solvers.rts import backward
+from graphnav.state import States
 
+_FAR = 0.5  # rad between the stated and the found start attitude
+_LATER = 2  # starts that are tried, each from after what the one before has seen
+_AGAIN = 2  # times that a start is looked for again without wrong fixes
 _REVIEWS = 2  # of where faults begin and end
 _MOST = 0.5  # share of the fixes of a kind that can be wrong
 
@@ -34,10 +43,11 @@ _MOST = 0.5  # share of the fixes of a kind that can be wrong
 class Review:
     """A recording's problem, its filter and smoother, and what is to be said of them.
 
+    Filtered once when made, so that starts can be compared; `finish` looks at what was found and smooths.
+
     Parameters
     ----------
     aligned : what was found of the start.
-    begin : what the problem begins with; the same, but for a heading that is stated.
     detections : where the platform stands, by all fixes.
 
     Raises
@@ -52,39 +62,57 @@ class Review:
         settings: Settings,
         frame: LocalFrame,
         aligned: Alignment,
-        begin: Alignment,
         detections: Detections,
         progress: Progress | None,
     ) -> None:
-        self._recording, self._settings, self._frame, self.detections = recording, settings, frame, detections
-        self._aligned, self._begin, self._progress = aligned, begin, progress
+        self._recording, self._settings, self._frame, self._progress = recording, settings, frame, progress
+        self.aligned, self.detections = aligned, detections
+        self.stated = with_known_heading(aligned, settings)
+        # A stated heading far from the one found sends the filter, and its linearisation with it, astray for a while.
+        # It stays in the problem as its prior, but all else is judged, and the smoother sets out, from what was found.
+        found_heading = aligned.motion is not None  # without motion heading zero is only a convention
+        turn = aligned.state.minus(self.stated.state)[0, :3]
+        self.astray = found_heading and bool(np.linalg.norm(turn) > _FAR)
+        self._begin = aligned if self.astray else self.stated
         self.timings = {"judgement": 0.0, "preintegration": 0.0, "smoother": 0.0}
+        self._began = time.perf_counter()
         # most fixes contradict the filter, or nobody asks whether they do
-        self._overruled = asked = settings.gnss.faults == "off"
-        began = time.perf_counter()
+        self._overruled = settings.gnss.faults == "off"
+        self.explained = 0.0  # how many fixes had a say when they were last tested
         self.problem, self.notes = self._posed()
         self._forward: Forward
+        self._filter()
+
+    @property
+    def refuted(self) -> bool:
+        """Whether most fixes contradicted the filter."""
+        return self._overruled and self._settings.gnss.faults != "off"
+
+    def finish(self) -> None:
+        """Find wrong fixes from both sides, judge again where they misled the judgement, and smooth."""
         self._review()
-        if self._overruled and not asked:
-            # when most are wrong it is their sigmas that are
+        if self.refuted:
+            # when most are wrong, and no other start finds them right, it is their sigmas that are
             other, says = self._posed()
             if says != self.notes:
                 self.problem, self.notes = other, says
+                self._filter()
                 self._review()
         if faults.count(self.problem):
             self._calm()
             self._stand()
         if not isinstance(self._forward, Filtered):
-            self._forward = ekf(self.problem, progress, aligned.until)
+            self._forward = ekf(self.problem, self._progress, self.aligned.until)
             self.smoothed = self._smoothed(self.problem, self._forward)
         self.forward = self._forward
         self.notes = (*self.notes, *self._raised)
         spent = sum(self.timings.values()) + self.forward.solution.timings["filter"]
-        self.timings["smoother"] = time.perf_counter() - began - spent
+        self.seconds = time.perf_counter() - self._began
+        self.timings["smoother"] = self.seconds - spent
 
     def _posed(self, wrong: tuple[faults.Fault, ...] = ()) -> tuple[Problem, tuple[str, ...]]:
         """The problem with its figures judged, without spans of wrong fixes, and what is to be said of it."""
-        frame, aligned, stationary, began = self._frame, self._aligned, self.detections.stationary, time.perf_counter()
+        frame, aligned, stationary, began = self._frame, self.aligned, self.detections.stationary, time.perf_counter()
         tell("judgement")
         recording, how, said = judged(
             self._recording, self._settings, frame, aligned, stationary, wrong, self._overruled
@@ -96,17 +124,20 @@ class Review:
         self.timings["preintegration"] += time.perf_counter() - then
         return problem, said
 
-    def _review(self) -> None:
-        """Find wrong fixes, and look at them again."""
+    def _filter(self) -> None:
+        """Filter what was posed, with an eye on its fixes."""
         self._as_judged = self.problem  # by the judgement: no sigma raised yet
         self._raised: tuple[str, ...] = ()
         self._watch(None)
+
+    def _review(self) -> None:
+        """Look at what was found from both sides."""
         for _ in range(_REVIEWS):
             before = faults.count(self.problem)
             if not before:
                 break
             apart = faults.widened(self.problem)
-            _, self.smoothed = near(apart, self._forward, self._aligned.until, self._progress)
+            _, self.smoothed = near(apart, self._forward, self.aligned.until, self._progress)
             self.problem = faults.readmitted(self.problem, self.smoothed)
             self._raise()
             self._watch(self.smoothed)
@@ -132,6 +163,7 @@ class Review:
         """Filter the drive and give up the fixes that are found wrong; linearised at points where there are any."""
         forward = self._filtered(self.problem, about, watch=True)
         self.problem = faults.weighted(self.problem, forward.weights)
+        self.explained = faults.said(self.problem)
         if self._settings.gnss.faults != "on" and faults.share(self.problem) > _MOST:
             self._overruled, self._raised = True, ()
             self.problem = faults.all_used(faults.weighted(self._as_judged, forward.weights))
@@ -166,7 +198,7 @@ class Review:
             return
         other = faults.weighted(other, weights)
         about = points_of(other, self.smoothed.states, values_of(self.problem, self.smoothed))
-        _, smoothed = near(other, about, self._aligned.until, self._progress)
+        _, smoothed = near(other, about, self.aligned.until, self._progress)
         self.problem, self._raised = judge_speeds(other, smoothed)
         self.notes, self._forward = says, self._filtered(self.problem)
         self.smoothed = self._smoothed(self.problem, self._forward)
@@ -174,7 +206,7 @@ class Review:
     def _filtered(self, problem: Problem, about: Points | None = None, watch: bool = False) -> Forward:
         if about is not None:
             return refilter(problem, about, self._progress, watch)
-        return ekf(problem, self._progress, self._aligned.until, watch)
+        return ekf(problem, self._progress, self.aligned.until, watch)
 
     def _smoothed(self, problem: Problem, forward: Forward) -> Smoothed:
         return backward(problem, forward, self._progress)
@@ -185,3 +217,68 @@ def _differ(a: Array, b: Array) -> bool:
     return any(
         not np.any((other[:, 0] < end) & (other[:, 1] > begin)) for one, other in ((a, b), (b, a)) for begin, end in one
     )
+
+
+def reviewed(
+    recording: Recording, settings: Settings, frame: LocalFrame, detections: Detections, progress: Progress | None
+) -> Review:
+    """Align a recording and review it; from another start where the fixes contradict the first.
+
+    Most fixes contradict a filter that begins wrong. So where they do, alignments over later stretches are tried, until
+    one is not contradicted, and the one that leaves most fixes a say is kept. And no start is to rest on fixes that are
+    wrong: once it is known which, the start is looked for again without them, and if that is another, so is the drive.
+
+    Raises
+    ------
+    EstimationError
+        If the recording does not determine a trajectory.
+    """
+    began = time.perf_counter()
+
+    def aligned(fixes: Recording, stationary: Array) -> Alignment:
+        tell("alignment")
+        return align(fixes, settings, frame, _smooth, stationary)
+
+    def begun(at: Alignment, detections: Detections) -> Review:
+        return Review(recording, settings, frame, at, detections, progress)
+
+    best = latest = begun(aligned(recording, detections.stationary), detections)
+    used = recording
+    for _ in range(_LATER):
+        if not best.refuted or latest.aligned.motion is None:
+            break
+        try:
+            used = _later(used, latest.aligned)
+            latest = begun(aligned(used, detections.stationary), detections)
+        except EstimationError:
+            break
+        if (not latest.refuted, latest.explained) > (not best.refuted, best.explained):
+            best = latest
+    best.finish()
+    for _ in range(_AGAIN):
+        if best.refuted or best.aligned.motion is None or not faults.count(best.problem):
+            break
+        try:
+            found = aligned(faults.doubted(recording, best.problem), best.detections.stationary)
+            if found.motion is None or not found.contradicts(best.aligned):
+                break
+            other = begun(found, best.detections)
+            other.finish()
+        except EstimationError:
+            break
+        if other.refuted or other.explained < best.explained:
+            break
+        best = other
+    best.timings["alignment"] = time.perf_counter() - began - best.seconds
+    return best
+
+
+def _smooth(problem: Problem, start: States) -> Solution:
+    return batch(problem, start, wanted=(0,), reintegrate=False)
+
+
+def _later(recording: Recording, aligned: Alignment) -> Recording:
+    """Without the fixes that an alignment has seen."""
+    assert recording.gnss is not None
+    assert aligned.until is not None
+    return replace(recording, gnss=some(recording.gnss, recording.gnss.t > aligned.until))

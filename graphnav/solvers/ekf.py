@@ -161,8 +161,7 @@ def _forward(
                 P.flat[:: D + 1] += added
         for kind in watched:
             if (kind.name, problem.t[k]) in verdicts.anew:
-                block = BLOCKS["p" if isinstance(kind, GnssPosition) else "v"]
-                P[block, block] += 1e6 * np.eye(3)
+                P = _anywhere(P, "p" if isinstance(kind, GnssPosition) else "v")
         ahead[k], all_Pp[k] = x, P
         back: int | None = None
         for rows in problem.constraints:
@@ -177,7 +176,7 @@ def _forward(
             bank = banks.get(back) or bank.forgetful() if bank else None
             banks = {key: old for key, old in banks.items() if key < back}
             k = back
-            x, P = (found[k - 1], all_P[k - 1]) if k else begun
+            x, P = (found[k - 1], all_P[k - 1]) if k else (begun[0], _placed(begun[1], records))
             if about is not None and k == n:
                 x = own.plus(_one(about, k - 1), x)
             continue
@@ -205,6 +204,19 @@ def _forward(
         errors,
         errors_ahead,
     )
+
+
+def _placed(P: Array, records: dict[str, Innovations]) -> Array:
+    """What is known at the start, but for the place where the first fix, which tells it, is not used."""
+    first = [one.used[0] for one in records.values() if isinstance(one.rows, GnssPosition) and len(one.used)]
+    return _anywhere(P, "p") if first and first[0] == 0.0 else P
+
+
+def _anywhere(P: Array, block: str) -> Array:
+    """A covariance with nothing known of a block, but for what moves with it."""
+    P = P.copy()
+    P[BLOCKS[block], BLOCKS[block]] += 1e6 * np.eye(3)
+    return P
 
 
 def _one(points: Points, k: int) -> Estimate:

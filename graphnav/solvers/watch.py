@@ -128,7 +128,8 @@ class _Usual:
             self.t.insert(k, t)
             self.nis.insert(k, nis)
         if k % _EVERY == 0:
-            self.factor = max(1.0, float(np.median(np.frombuffer(self.nis)[: k + 1])) / self.median)
+            seen = np.frombuffer(self.nis)[: k + 1]
+            self.factor = max(1.0, float(np.partition(seen, k // 2)[k // 2]) / self.median)
 
 
 class Bank:
@@ -328,19 +329,22 @@ class Verdicts:
                 return float(t[_begin(used, _begin(used, begin, 1.0), 0.0)])
         begin = _begin(used, end, 0.0)
         before = _begin(used, begin, 1.0)  # of what was used between two faults
-        lasted = t[end - 1] - t[begin]
+        lasted, first = t[end - 1] - t[begin], not np.any(used[:before])
+        outlasts = begin - before < end - begin if lasted > _PATIENCE else False
+        # at the start there is no reason to believe whoever came first
+        outlasts |= first and end - begin >= max(begin - before, _CHANCE)
         if lasted > LONGEST and (name, t[begin]) not in self.anew:
             used[begin:end] = 1.0
             self.anew.add((name, float(t[begin])))
             return float(t[begin])
-        if (name, t[begin]) not in self._tried and lasted > _PATIENCE and before > 0 and begin - before < end - begin:
+        if (name, t[begin]) not in self._tried and outlasts:
             self._tried.add((name, float(t[begin])))
             self._trial = name, begin, end, {other: u.copy() for other, u in self.used.items()}
             used[begin:end] = 1.0
-            first = float(t[_begin(used, before, 0.0)])
+            since = float(t[_begin(used, before, 0.0)])
             for other, at in self.times.items():
-                self.used[other][(at >= first) & (at < t[begin])] = 0.0
-            return first
+                self.used[other][(at >= since) & (at < t[begin])] = 0.0
+            return since
         return float(t[fault])
 
 
