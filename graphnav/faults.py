@@ -131,12 +131,15 @@ def widened(problem: Problem) -> Problem:
 
     A fault that grows is found late, and what the filter used of it before would hide it from a smoother.
     """
-    return without(problem, [_wider(fault) for fault in spans(problem)])
+    t = {rows.name: problem.t[rows.keyframe] for rows in problem.constraints}
+    return without(problem, [_wider(fault, t[fault.kind]) for fault in spans(problem)])
 
 
-def _wider(fault: Fault) -> Fault:
+def _wider(fault: Fault, t: Array) -> Fault:
+    """A fault with its surroundings, but with no more than half of all there is of a kind, at times t, on a side."""
     more = min(fault.t_end - fault.t_start, _EDGE)
-    return replace(fault, t_start=fault.t_start - more, t_end=fault.t_end + more)
+    before, after = 0.5 * float(fault.t_start - t[0]), 0.5 * float(t[-1] - fault.t_end)
+    return replace(fault, t_start=fault.t_start - min(more, before), t_end=fault.t_end + min(more, after))
 
 
 def count(problem: Problem) -> int:
@@ -175,9 +178,11 @@ def readmitted(problem: Problem, smoothed: Smoothed) -> Problem:
             better[rows.name] = weight
             continue
         for fault in (fault for fault in spans(problem) if fault.kind == rows.name):
-            wide, own = _wider(fault), (t >= fault.t_start - SAME_TIME) & (t <= fault.t_end + SAME_TIME)
+            wide, own = _wider(fault, t), (t >= fault.t_start - SAME_TIME) & (t <= fault.t_end + SAME_TIME)
             left, right = (t >= wide.t_start) & (t <= fault.t_end), (t >= fault.t_start) & (t <= wide.t_end)
             for side, step in ((left, 1), (right, -1)):
+                if own[::step][0]:
+                    continue  # nothing but the fixes themselves says where it was outside
                 inwards = np.flatnonzero(side & (own | (rows.weight > 0.0)))[::step]
                 doubted[inwards] = True
                 agree[inwards[: _agreeing(problem, rows, smoothed, inwards, f)]] = True

@@ -78,6 +78,7 @@ class Review:
         self._began = time.perf_counter()
         # most fixes contradict the filter, or nobody asks whether they do
         self._overruled = settings.gnss.faults == "off"
+        self.finished = False
         self.explained = 0.0  # how many fixes had a say when they were last tested
         self.problem, self.notes = self._posed()
         self._forward: Forward
@@ -104,7 +105,7 @@ class Review:
         if not isinstance(self._forward, Filtered):
             self._forward = ekf(self.problem, self._progress, self.aligned.until)
             self.smoothed = self._smoothed(self.problem, self._forward)
-        self.forward = self._forward
+        self.forward, self.finished = self._forward, True
         self.notes = (*self.notes, *self._raised)
         spent = sum(self.timings.values()) + self.forward.solution.timings["filter"]
         self.seconds = time.perf_counter() - self._began
@@ -243,6 +244,8 @@ def reviewed(
         return Review(recording, settings, frame, at, detections, progress)
 
     best = latest = begun(aligned(recording, detections.stationary), detections)
+    if not best.refuted:
+        best.finish()
     used = recording
     for _ in range(_LATER):
         if not best.refuted or latest.aligned.motion is None:
@@ -250,11 +253,14 @@ def reviewed(
         try:
             used = _later(used, latest.aligned)
             latest = begun(aligned(used, detections.stationary), detections)
+            if not latest.refuted:
+                latest.finish()
         except EstimationError:
             break
         if (not latest.refuted, latest.explained) > (not best.refuted, best.explained):
             best = latest
-    best.finish()
+    if not best.finished:
+        best.finish()
     for _ in range(_AGAIN):
         if best.refuted or best.aligned.motion is None or not faults.count(best.problem):
             break

@@ -139,7 +139,7 @@ def _forward(
     verdicts = Verdicts(
         {c.name: problem.t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
     )
-    begun = (x, P)
+    begun, P = (x, P), _placed(P, records)
     all_P, all_Pp, all_F = np.empty((K, D, D)), np.empty((K, D, D)), np.empty((K - 1, D, D))
     found: list[Any] = [None] * K  # estimates, or errors where points are given
     ahead = found.copy()
@@ -275,7 +275,7 @@ def _update(
     spread = np.sqrt(S.flat[:: len(r) + 1]).reshape(n, -1)
     record.set(slice(lo, hi), r.reshape(n, -1), spread, nis / n, weight, refused)
     if bank is not None:
-        bank.seen(rows.name, k, nis)
+        bank.seen(rows.name, k, nis, weight > 0.0)
     if weight == 0.0:
         return x, P, None
     IKH = -K @ H

@@ -113,23 +113,28 @@ def _slots(constraints: Iterable[GnssPosition | GnssVelocity], t: Array | None, 
 class _Usual:
     """By how much the innovations of a kind are usually larger than the filter says; all copies of a bank share it.
 
-    What half of all fixes do, those not used included, is no fault: the filter has lost its way.
+    What half of all fixes do, those not used included, is no fault: the filter has lost its way. But for those of a
+    fault that goes on and has not lasted for long: soon after the start they are half of all by themselves.
     """
 
     def __init__(self, m: int) -> None:
         self.median = 2.0 * float(gammaincinv(0.5 * m, 0.5))
-        self.t, self.nis, self.factor = array("d"), array("d"), 1.0
+        self.t, self.nis, self.used, self.factor = array("d"), array("d"), array("b"), 1.0
 
-    def add(self, t: float, nis: float) -> None:
+    def add(self, t: float, nis: float, used: bool = True) -> None:
         k = bisect_left(self.t, t)
         if k < len(self.t) and self.t[k] == t:
-            self.nis[k] = nis
+            self.nis[k], self.used[k] = nis, used
         else:
             self.t.insert(k, t)
             self.nis.insert(k, nis)
+            self.used.insert(k, used)
         if k % _EVERY == 0:
-            seen = np.frombuffer(self.nis)[: k + 1]
-            self.factor = max(1.0, float(np.partition(seen, k // 2)[k // 2]) / self.median)
+            before = np.flatnonzero(np.frombuffer(self.used, dtype=np.int8)[:k])
+            begin = int(before[-1]) + 1 if len(before) else 0
+            known = begin if begin < k and self.t[k - 1] - self.t[begin] <= _PATIENCE else k + 1
+            if known:
+                self.factor = max(1.0, float(np.median(np.frombuffer(self.nis)[:known])) / self.median)
 
 
 class Bank:
@@ -178,10 +183,10 @@ class Bank:
         G.reshape(-1, slots.m, G.shape[1])[:, :, slots.columns] += slots.inputs
         return G
 
-    def seen(self, name: str, k: int, nis: float) -> None:
+    def seen(self, name: str, k: int, nis: float, used: bool) -> None:
         """The filter has seen an innovation of so many squared sigmas, used or not."""
         if slots := self._slots.get(name):
-            slots.usual.add(float(self._t[k]), nis)
+            slots.usual.add(float(self._t[k]), nis, used)
 
     def updated(self, name: str, K: Array, G: Array, weighted: Array, r: Array, speed: float) -> float | None:
         """The filter has used an innovation; when a fault began, or None.
@@ -329,22 +334,19 @@ class Verdicts:
                 return float(t[_begin(used, _begin(used, begin, 1.0), 0.0)])
         begin = _begin(used, end, 0.0)
         before = _begin(used, begin, 1.0)  # of what was used between two faults
-        lasted, first = t[end - 1] - t[begin], not np.any(used[:before])
-        outlasts = begin - before < end - begin if lasted > _PATIENCE else False
-        # at the start there is no reason to believe whoever came first
-        outlasts |= first and end - begin >= max(begin - before, _CHANCE)
+        lasted = t[end - 1] - t[begin]
         if lasted > LONGEST and (name, t[begin]) not in self.anew:
             used[begin:end] = 1.0
             self.anew.add((name, float(t[begin])))
             return float(t[begin])
-        if (name, t[begin]) not in self._tried and outlasts:
+        if (name, t[begin]) not in self._tried and lasted > _PATIENCE and 0 < begin - before < end - begin:
             self._tried.add((name, float(t[begin])))
             self._trial = name, begin, end, {other: u.copy() for other, u in self.used.items()}
             used[begin:end] = 1.0
-            since = float(t[_begin(used, before, 0.0)])
+            first = float(t[_begin(used, before, 0.0)])
             for other, at in self.times.items():
-                self.used[other][(at >= since) & (at < t[begin])] = 0.0
-            return since
+                self.used[other][(at >= first) & (at < t[begin])] = 0.0
+            return first
         return float(t[fault])
 
 
