@@ -181,8 +181,8 @@ def readmitted(problem: Problem, smoothed: Smoothed) -> Problem:
             wide, own = _wider(fault, t), (t >= fault.t_start - SAME_TIME) & (t <= fault.t_end + SAME_TIME)
             left, right = (t >= wide.t_start) & (t <= fault.t_end), (t >= fault.t_start) & (t <= wide.t_end)
             for side, step in ((left, 1), (right, -1)):
-                if own[::step][0]:
-                    continue  # nothing but the fixes themselves says where it was outside
+                if step > 0 and own[0]:
+                    continue  # before the first fix there is only what was believed for its sake
                 inwards = np.flatnonzero(side & (own | (rows.weight > 0.0)))[::step]
                 doubted[inwards] = True
                 agree[inwards[: _agreeing(problem, rows, smoothed, inwards, f)]] = True
