@@ -34,7 +34,6 @@ from graphnav.solvers.rts import backward
 from graphnav.state import States
 
 _FAR = 0.5  # rad between the stated and the found start attitude
-_LATER = 2  # starts that are tried, each from after what the one before has seen
 _AGAIN = 2  # times that a start is looked for again without wrong fixes
 _REVIEWS = 2  # of where faults begin and end
 _MOST = 0.5  # share of the fixes of a kind that can be wrong
@@ -225,9 +224,9 @@ def reviewed(
 ) -> Review:
     """Align a recording and review it; from another start where the fixes contradict the first.
 
-    Most fixes contradict a filter that begins wrong. So where they do, alignments over later stretches are tried, until
-    one is not contradicted, and the one that leaves most fixes a say is kept. And no start is to rest on fixes that are
-    wrong: once it is known which, the start is looked for again without them, and if that is another, so is the drive.
+    Most fixes contradict a filter that begins wrong. So where they do, what comes after the stretch of the alignment is
+    aligned, and kept if most fixes agree with it. And no start is to rest on fixes that are wrong: once it is known
+    which, it is looked for again without them, and where it is another, the drive is filtered again from there.
 
     Raises
     ------
@@ -243,22 +242,18 @@ def reviewed(
     def begun(at: Alignment, detections: Detections) -> Review:
         return Review(recording, settings, frame, at, detections, progress)
 
-    best = latest = begun(aligned(recording, detections.stationary), detections)
+    best = begun(aligned(recording, detections.stationary), detections)
     if not best.refuted:
         best.finish()
-    used = recording
-    for _ in range(_LATER):
-        if not best.refuted or latest.aligned.motion is None:
-            break
+    if best.refuted and best.aligned.motion is not None:
         try:
-            used = _later(used, latest.aligned)
-            latest = begun(aligned(used, detections.stationary), detections)
-            if not latest.refuted:
-                latest.finish()
+            other = begun(aligned(_later(recording, best.aligned), detections.stationary), detections)
+            if not other.refuted:
+                other.finish()
+            if not other.refuted:
+                best = other
         except EstimationError:
-            break
-        if (not latest.refuted, latest.explained) > (not best.refuted, best.explained):
-            best = latest
+            pass  # nothing moves later on
     if not best.finished:
         best.finish()
     for _ in range(_AGAIN):

@@ -172,6 +172,8 @@ def _forward(
                     again = verdicts.settle(rows.name, fault, float(problem.t[k]))
                     back = int(np.searchsorted(problem.t, again))
                     break
+        if back is None and k == len(problem.t) - 1 and (trial := verdicts.ended()) is not None:
+            back = int(np.searchsorted(problem.t, trial))
         if back is not None:  # once more from before the fault, without it
             bank = banks.get(back) or bank.forgetful() if bank else None
             banks = {key: old for key, old in banks.items() if key < back}

@@ -271,9 +271,9 @@ class Verdicts:
     """Which fixes to give up when a fault is found: those from its onset on.
 
     Unless that outlasts what was used since the fault before, and a minute. Then it is more likely the filter that has
-    lost its way with those: it drifts while fixes are refused, and a fault that grows meets it again. So what it used
-    since, of any kind, is given up instead, and the fixes are taken back; this in turn is undone if they are refused
-    even so. After `LONGEST` of a fault the filter begins anew where the fixes are.
+    lost its way with those: it drifts while fixes are refused, and a fault that grows meets it again; or it began with
+    wrong ones. So what it used since, of any kind, is given up instead, and the fixes are taken back; this in turn is
+    undone if they are refused even so. After `LONGEST` of a fault the filter begins anew where the fixes are.
 
     The first fix that is used after a long fault meets a filter that knows little, and agrees easily; from then on the
     filter is sure of it. If one of the next does not agree, it was chance, and the fault goes on.
@@ -339,15 +339,35 @@ class Verdicts:
             used[begin:end] = 1.0
             self.anew.add((name, float(t[begin])))
             return float(t[begin])
-        if (name, t[begin]) not in self._tried and lasted > _PATIENCE and 0 < begin - before < end - begin:
-            self._tried.add((name, float(t[begin])))
-            self._trial = name, begin, end, {other: u.copy() for other, u in self.used.items()}
-            used[begin:end] = 1.0
-            first = float(t[_begin(used, before, 0.0)])
-            for other, at in self.times.items():
-                self.used[other][(at >= first) & (at < t[begin])] = 0.0
-            return first
+        if lasted > _PATIENCE and self._outlasts(name, before, begin, end):
+            return self._try(name, before, begin, end)
         return float(t[fault])
+
+    def ended(self) -> float | None:
+        """The time to go on from once no more fixes come: no more patience is needed then."""
+        for name, used in self.used.items():
+            end = len(used)
+            if end and used[-1] == 0.0:
+                begin = _begin(used, end, 0.0)
+                before = _begin(used, begin, 1.0)
+                if self._outlasts(name, before, begin, end):
+                    return self._try(name, before, begin, end)
+        return None
+
+    def _outlasts(self, name: str, before: int, begin: int, end: int) -> bool:
+        """Whether fixes begin..end, refused, are more than before..begin, which were used, and were not tried yet."""
+        return 0 < begin - before < end - begin and (name, self.times[name][begin]) not in self._tried
+
+    def _try(self, name: str, before: int, begin: int, end: int) -> float:
+        """Take fixes back, without what of any kind was used since the fault before; the time to go on from."""
+        t, used = self.times[name], self.used[name]
+        self._tried.add((name, float(t[begin])))
+        self._trial = name, begin, end, {other: u.copy() for other, u in self.used.items()}
+        used[begin:end] = 1.0
+        first = float(t[_begin(used, before, 0.0)])
+        for other, at in self.times.items():
+            self.used[other][(at >= first) & (at < t[begin])] = 0.0
+        return first
 
 
 def _begin(used: Array, end: int, value: float) -> int:
