@@ -8,6 +8,7 @@ at first and at last; in between it is linearised at what is known of it by then
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.detectors import Detections, detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
-from graphnav.judgement import calmer, judge_speeds, judged
+from graphnav.judgement import MOST_RAISED, calmer, judge_speeds, judged
 from graphnav.problem import Problem, pose
 from graphnav.progress import Progress, tell
 from graphnav.recording import Recording
@@ -87,6 +88,13 @@ class Review:
     def refuted(self) -> bool:
         """Whether most fixes contradicted the filter."""
         return self._overruled and self._settings.gnss.faults != "off"
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the start may be wrong: most fixes contradict it, or are far worse than any receiver states."""
+        factor = self.problem.settings.gnss.sd_factor if self._settings.gnss.sd_factor is None else None
+        factors = factor.values() if isinstance(factor, Mapping) else [factor or 1.0]
+        return self.refuted or max(factors, default=1.0) > MOST_RAISED
 
     def finish(self) -> None:
         """Find wrong fixes from both sides, judge again where they misled the judgement, and smooth."""
@@ -243,21 +251,21 @@ def reviewed(
         return Review(recording, settings, frame, at, detections, progress)
 
     best = begun(aligned(recording, detections.stationary), detections)
-    if not best.refuted:
+    if not best.doubtful:
         best.finish()
-    if best.refuted and best.aligned.motion is not None:
+    if best.doubtful and best.aligned.motion is not None and settings.gnss.faults != "off":
         try:
             other = begun(aligned(_later(recording, best.aligned), detections.stationary), detections)
-            if not other.refuted:
+            if not other.doubtful:
                 other.finish()
-            if not other.refuted:
+            if not other.doubtful:
                 best = other
         except EstimationError:
             pass  # nothing moves later on
     if not best.finished:
         best.finish()
     for _ in range(_AGAIN):
-        if best.refuted or best.aligned.motion is None or not faults.count(best.problem):
+        if best.doubtful or best.aligned.motion is None or not faults.count(best.problem):
             break
         try:
             found = aligned(faults.doubted(recording, best.problem), best.detections.stationary)
@@ -267,7 +275,7 @@ def reviewed(
             other.finish()
         except EstimationError:
             break
-        if other.refuted or other.explained < best.explained:
+        if other.doubtful or other.explained < best.explained:
             break
         best = other
     best.timings["alignment"] = time.perf_counter() - began - best.seconds
