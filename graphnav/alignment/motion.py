@@ -35,8 +35,8 @@ Smoother = Callable[[Problem, States], Solution]
 def plausible(recording: Recording) -> Recording:
     """Without the fixes that lie far off the running median of five: they would be taken for motion."""
     gnss = recording.gnss
-    if gnss is not None and not (known := np.isfinite(gnss.llh).all(axis=1)).all():
-        gnss = some(gnss, known)
+    if gnss is not None and not np.isfinite(gnss.llh).all():
+        gnss = some(gnss, np.flatnonzero(np.isfinite(gnss.llh).all(axis=1)))
         recording = replace(recording, gnss=gnss)
     if gnss is None or len(gnss.t) < 5:
         return recording
