@@ -171,7 +171,7 @@ def test_single_point_fixes_among_high_houses(shared_data: Path) -> None:
 
 
 def test_wheels_tell_errors_that_last_from_a_bad_imu(shared_data: Path) -> None:
-    """At their full rate, most fixes contradicting the filter. The other explanation is an IMU ten times as bad as stated.
+    """At their full rate, most fixes contradicting the filter; the other explanation is an IMU ten times as bad.
 
     Of a fifth of the fixes, as above, either choice gives the same result; smoothing all of the drive takes minutes.
     """
