@@ -20,6 +20,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, assemble
+from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.problem import Problem
 from graphnav.recording import Recording
 from graphnav.rotation import Array
@@ -130,17 +131,29 @@ def widened(problem: Problem) -> Problem:
 
     A fault that grows is found late, and what the filter used of it before would hide it from a smoother.
     """
-    return without(problem, [_wider(fault) for fault in spans(problem)])
+    t = {rows.name: problem.t[rows.keyframe] for rows in problem.constraints}
+    return without(problem, [_wider(fault, t[fault.kind]) for fault in spans(problem)])
 
 
-def _wider(fault: Fault) -> Fault:
+def _wider(fault: Fault, t: Array) -> Fault:
+    """A fault with its surroundings, but with no more than half of all there is of a kind, at times t, on a side."""
     more = min(fault.t_end - fault.t_start, _EDGE)
-    return replace(fault, t_start=fault.t_start - more, t_end=fault.t_end + more)
+    before, after = 0.5 * float(fault.t_start - t[0]), 0.5 * float(t[-1] - fault.t_end)
+    return replace(fault, t_start=fault.t_start - min(more, before), t_end=fault.t_end + min(more, after))
 
 
 def count(problem: Problem) -> int:
     """How many rows are left out, or have less say."""
     return sum(int(np.sum(c.weight < 1.0)) for c in problem.constraints if c.weight is not None)
+
+
+def said(problem: Problem) -> float:
+    """How many fixes have a say, noisier ones less of it."""
+    return sum(
+        float(len(c) if c.weight is None else np.sum(c.weight))
+        for c in problem.constraints
+        if isinstance(c, GnssPosition | GnssVelocity)
+    )
 
 
 def share(problem: Problem) -> float:
@@ -165,9 +178,11 @@ def readmitted(problem: Problem, smoothed: Smoothed) -> Problem:
             better[rows.name] = weight
             continue
         for fault in (fault for fault in spans(problem) if fault.kind == rows.name):
-            wide, own = _wider(fault), (t >= fault.t_start - SAME_TIME) & (t <= fault.t_end + SAME_TIME)
+            wide, own = _wider(fault, t), (t >= fault.t_start - SAME_TIME) & (t <= fault.t_end + SAME_TIME)
             left, right = (t >= wide.t_start) & (t <= fault.t_end), (t >= fault.t_start) & (t <= wide.t_end)
             for side, step in ((left, 1), (right, -1)):
+                if step > 0 and own[0]:
+                    continue  # before the first fix there is only what was believed for its sake
                 inwards = np.flatnonzero(side & (own | (rows.weight > 0.0)))[::step]
                 doubted[inwards] = True
                 agree[inwards[: _agreeing(problem, rows, smoothed, inwards, f)]] = True

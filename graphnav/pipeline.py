@@ -10,7 +10,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from graphnav import faults
-from graphnav.alignment import align, with_known_heading
 from graphnav.config import Settings
 from graphnav.constraints.prior import InitialPrior
 from graphnav.detectors import detect
@@ -19,7 +18,7 @@ from graphnav.errors import ConfigError, EstimationError
 from graphnav.own_noise import with_own_noise
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
-from graphnav.review import Review
+from graphnav.review import reviewed
 from graphnav.solution import Solution, joined
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf
@@ -29,7 +28,6 @@ from graphnav.solvers.rts import backward, rts
 
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
-_FAR = 0.5  # rad between the stated and the found start attitude
 _SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
 
 
@@ -117,20 +115,10 @@ def _solve(
     tell("detection")
     found = detect(recording, settings)
     detected = time.perf_counter()
-    tell("alignment")
-    aligned = align(
-        recording, settings, frame, lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)
-    )
-    after = time.perf_counter()
-    stated = with_known_heading(aligned, settings)
-    # A stated heading far from the one found sends the filter, and its linearisation with it, astray for a while. It
-    # stays in the problem as its prior, but all else is judged, and the smoother sets out, from what was found.
-    found_heading = aligned.motion is not None  # without motion heading zero is only a convention
-    astray = found_heading and bool(np.linalg.norm(aligned.state.minus(stated.state)[0, :3]) > _FAR)
-
-    review = Review(recording, settings, frame, aligned, aligned if astray else stated, found, progress)
+    review = reviewed(recording, settings, frame, found, progress)
+    aligned, stated, astray = review.aligned, review.stated, review.astray
     problem, forward, smoothed, found = review.problem, review.forward, review.smoothed, review.detections
-    timings = {"detection": detected - began, "alignment": after - detected, **review.timings}
+    timings = {"detection": detected - began, **review.timings}
     wrong = faults.spans(problem, smoothed)
     said = (*review.notes, *faults.notes(wrong, problem))
     start = smoothed

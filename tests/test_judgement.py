@@ -11,14 +11,19 @@ import oracle
 import pytest
 
 from graphnav import load
+from graphnav.alignment import align
 from graphnav.config import Settings, settings_from
+from graphnav.detectors import detect
+from graphnav.earth import LocalFrame
 from graphnav.evaluation import evaluate_recording
+from graphnav.judgement import judged
 from graphnav.judgement.chance import trimmed
 from graphnav.judgement.imu import imu_notes
-from graphnav.pipeline import run
+from graphnav.pipeline import origin, run
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.scoring import errors
+from graphnav.solvers.batch import batch
 from graphnav.trajectory import Trajectory
 
 
@@ -163,3 +168,19 @@ def test_single_point_fixes_among_high_houses(shared_data: Path) -> None:
         rms = float(np.sqrt(np.mean(found.errors.horizontal**2)))
         assert rms < 5.0, name
         assert 0.25 < float(np.nanmean(found.errors.nees_p)) / 3.0 < 2.0, name
+
+
+def test_wheels_tell_errors_that_last_from_a_bad_imu(shared_data: Path) -> None:
+    """At their full rate, most fixes contradicting the filter; the other explanation is an IMU ten times as bad.
+
+    Of a fifth of the fixes, as above, either choice gives the same result; smoothing all of the drive takes minutes.
+    """
+    recording, settings = load(shared_data / "tokyo_20201105" / "recording_spp.toml"), Settings()
+    frame, stationary = LocalFrame(origin(recording)), detect(recording, settings).stationary
+    smooth = lambda p, s: batch(p, s, wanted=(0,), reintegrate=False)  # noqa: E731
+    found = align(recording, settings, frame, smooth, stationary)
+    judged_to_be, how, _ = judged(recording, settings, frame, found, stationary, witnesses=True)
+    assert 2.0 < how.gnss.fast_time < 8.0  # type: ignore[operator]
+    noise, stated = judged_to_be.imu.noise, recording.imu.noise
+    assert noise.gyro_noise_density < 2.0 * stated.gyro_noise_density
+    assert noise.accel_noise_density < 7.0 * stated.accel_noise_density

@@ -23,18 +23,23 @@ from graphnav.alignment.first import Alignment
 from graphnav.alignment.motion import COURSE_SIGMA, Smoother, in_motion, motion, plausible
 from graphnav.alignment.rest import at_rest
 from graphnav.config import Settings
+from graphnav.detectors.base import NONE
 from graphnav.earth import LocalFrame
 from graphnav.recording import Recording
+from graphnav.rotation import Array
 
 __all__ = ["COURSE_SIGMA", "Alignment", "Smoother", "align", "ready", "with_known_heading"]
 
 
-def align(recording: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother) -> Alignment:
+def align(
+    recording: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, stationary: Array = NONE
+) -> Alignment:
     """Find the first state of a recording.
 
     Parameters
     ----------
     smooth : solves a posed problem from start states; handed in because solvers stand behind this room.
+    stationary : (N, 2) s, intervals in which a vehicle stands: fixes that jump meanwhile are no motion.
 
     Raises
     ------
@@ -42,15 +47,15 @@ def align(recording: Recording, settings: Settings, frame: LocalFrame, smooth: S
         If nothing in the recording can give an attitude.
     """
     recording = plausible(recording)
-    span = motion(recording, settings)
+    span = motion(recording, settings, stationary)
     if span is None:
         return at_rest(recording, settings, frame)
     return replace(in_motion(recording, settings, frame, smooth, span), motion=span[0], until=span[1])
 
 
-def ready(recording: Recording, settings: Settings) -> bool:
+def ready(recording: Recording, settings: Settings, stationary: Array = NONE) -> bool:
     """Whether the fixes so far show all the motion that an alignment wants to see."""
-    span = motion(plausible(recording), settings)
+    span = motion(plausible(recording), settings, stationary)
     return span is not None and recording.gnss is not None and span[1] < recording.gnss.t[-1]
 
 

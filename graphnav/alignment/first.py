@@ -11,6 +11,8 @@ from graphnav.recording import Gnss, Recording
 from graphnav.rotation import Array
 from graphnav.state import States
 
+_SIGMAS = 3.0
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -29,6 +31,12 @@ class Alignment:
     def rph(self) -> Array:
         """Roll, pitch, heading, rad."""
         return rotation.to_rph(self.state.R_nb[0])
+
+    def contradicts(self, other: Alignment) -> bool:
+        """Whether another is not where this one can be: by its own sigma of attitude, by its prior's of the rest."""
+        sigma = np.concatenate([self.own_sigma, self.sigma[3:]])
+        off = np.concatenate([rotation.wrap(self.rph - other.rph), self.state.minus(other.state)[0, 3:]])
+        return bool(np.any(np.abs(off) > _SIGMAS * sigma))
 
 
 def level(recording: Recording, begin: float, seconds: float = 1.0) -> Array:

@@ -12,6 +12,7 @@ from graphnav import rotation
 from graphnav.alignment.back import carried_back
 from graphnav.alignment.first import Alignment, level, some
 from graphnav.config import Settings
+from graphnav.detectors.base import NONE, inside
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.preintegration import prefix
@@ -34,6 +35,9 @@ Smoother = Callable[[Problem, States], Solution]
 def plausible(recording: Recording) -> Recording:
     """Without the fixes that lie far off the running median of five: they would be taken for motion."""
     gnss = recording.gnss
+    if gnss is not None and not np.isfinite(gnss.llh).all():
+        gnss = some(gnss, np.flatnonzero(np.isfinite(gnss.llh).all(axis=1)))
+        recording = replace(recording, gnss=gnss)
     if gnss is None or len(gnss.t) < 5:
         return recording
     p = LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
@@ -42,8 +46,11 @@ def plausible(recording: Recording) -> Recording:
     return replace(recording, gnss=some(gnss, off <= _JUMP * usual))
 
 
-def motion(recording: Recording, settings: Settings) -> tuple[float, float] | None:
-    """The stretch (s) to align over: from just before the first motion until enough of it was seen."""
+def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:
+    """The stretch (s) to align over: from just before the first motion until enough of it was seen.
+
+    What the fixes say of motion while a vehicle stands, `stationary` (N, 2) s, is none.
+    """
     gnss = recording.gnss
     if gnss is None:
         return None
@@ -54,6 +61,8 @@ def motion(recording: Recording, settings: Settings) -> tuple[float, float] | No
     p = LocalFrame(llh[0]).from_llh(llh)
     noise = 5.0 * np.linalg.norm(np.median(sd[:, :2], axis=0))
     away = np.linalg.norm(p[:, :2] - p[0, :2], axis=1) > 3.0 + noise
+    if recording.platform == "vehicle":
+        away &= ~inside(t, stationary)
     if not away.any():
         return None
     first = int(np.argmax(away))

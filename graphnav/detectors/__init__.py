@@ -43,7 +43,7 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
     known = speeds(recording, d.fusion)
     certain = moving(known)
     sway, s = detect_sway(low, imu.noise, d.sway, certain)
-    still, notes = candidates(b, sway, s, known, certain)
+    still, certain, notes = candidates(b, sway, s, known, certain)
     in_motion = spans_of(sway.statistic > _CLEARLY * sway.threshold, sway.t, 0.5 * d.sway.window)
     notes = (*sway.notes, *notes)
     found = [sway, *detect_windows(b, imu.noise, d.glrt, still, in_motion, _gravity(recording))]
@@ -89,7 +89,7 @@ def stops(
     if not len(low.t):
         return NONE
     sway, s = detect_sway(low, imu.noise, d.sway, certain)
-    still, _ = candidates(b, sway, s, known, certain)
+    still, certain, _ = candidates(b, sway, s, known, certain)
     if not len(still):
         return NONE
     idling = NONE

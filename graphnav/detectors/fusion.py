@@ -79,8 +79,8 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
 
 def candidates(
     b: Blocks, sway: Detection, s: Scale, speeds: list[Speeds], certain: Array
-) -> tuple[Array, tuple[str, ...]]:
-    """Still stretches with their edges found, without those that move; and sentences about these.
+) -> tuple[Array, Array, tuple[str, ...]]:
+    """Still stretches with their edges found, without those that move; what of `certain` is; and sentences.
 
     Parameters
     ----------
@@ -91,7 +91,8 @@ def candidates(
     spans = edges(b, sway.intervals, s, min(float(np.max(sway.threshold)), _EDGE))
     spans = merged(longer_than(spans, 3.0 * b.period))
     if not len(spans):
-        return NONE, ()
+        return NONE, certain, ()
+    certain = _felt(b, spans, speeds, certain)
     known = np.array([_known_speed(speeds, span) for span in spans])
     moves = moving_by_chain([link(b, one, next_one) for one, next_one in pairwise(spans)], known)
     notes = []
@@ -108,7 +109,21 @@ def candidates(
             f"{100.0 * share:.0f} % of the seconds in certain motion are as still as a stop (a simulation without "
             f"road?): a stop needs a measured speed as well, which {_count(int(unseen.sum()))} without"
         )
-    return without(spans[~moves], certain), tuple(notes)
+    return without(spans[~moves], certain), certain, tuple(notes)
+
+
+def _felt(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array) -> Array:
+    """Spans of certain motion without those in the midst of a still stretch whose speed the force does not lead to.
+
+    They begin and end where nothing changes: it is the fixes, or the wheels, that are wrong.
+    """
+    keep = np.ones(len(certain), dtype=bool)
+    for k, (begin, end) in enumerate(certain):
+        for start, last in spans[(spans[:, 0] < begin) & (spans[:, 1] > end)]:
+            one = link(b, np.array([start, begin]), np.array([end, last]))
+            said = max(float(s.speed[there].max()) for s in speeds if (there := (s.t >= begin) & (s.t <= end)).any())
+            keep[k] = one.peak + one.tolerance >= said
+    return certain[keep]
 
 
 def _still_in_motion(sway: Detection, certain: Array) -> float:

@@ -4,9 +4,10 @@ Questions to the fixes, the IMU, and wheels and receiver velocities, each answer
 not decide, and acted on only where the answer is clear (three standard deviations of what chance would do).
 """
 
+from graphnav.judgement.chance import MOST_RAISED
 from graphnav.judgement.fixes import FIXES
 from graphnav.judgement.imu import calmer
 from graphnav.judgement.rounds import judged
 from graphnav.judgement.speeds import BLOCK, judge_speeds, raised_by
 
-__all__ = ["BLOCK", "FIXES", "calmer", "judge_speeds", "judged", "raised_by"]
+__all__ = ["BLOCK", "FIXES", "MOST_RAISED", "calmer", "judge_speeds", "judged", "raised_by"]

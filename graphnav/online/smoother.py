@@ -14,6 +14,7 @@ import numpy as np
 from graphnav.alignment import Alignment, align, ready, with_known_heading
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
+from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.judgement import FIXES
@@ -184,13 +185,17 @@ class Online:
         if recording.gnss is not None and not last and not ready(recording, self.settings):
             self._wait(now)
             return
+        stationary = detect(recording, self.settings).stationary
+        if recording.gnss is not None and not last and not ready(recording, self.settings, stationary):
+            self._wait(now)  # fixes jumped while it stood
+            return
         if self.frame is None:
             self.frame = LocalFrame(origin(recording))
         frame = self.frame
         recording, shown = with_own_noise(recording, self.settings)
         try:
             found = align(recording, self.settings, frame, lambda problem, start: batch(
-                problem, start, wanted=(0,), reintegrate=False))  # fmt: skip
+                problem, start, wanted=(0,), reintegrate=False), stationary)  # fmt: skip
         except EstimationError as error:
             if last:
                 raise

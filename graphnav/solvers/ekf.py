@@ -51,7 +51,7 @@ from graphnav.solvers.passes import (
 from graphnav.solvers.points import AtEstimate, AtPoints, Estimate, about_own
 from graphnav.solvers.robust import PASSES, softened, weight_and_cost
 from graphnav.solvers.rts import backward
-from graphnav.solvers.stack import Stack, Together
+from graphnav.solvers.stack import Innovations, Stack, Together
 from graphnav.solvers.watch import Bank, Verdicts
 from graphnav.state import BLOCKS, DIM, States
 
@@ -142,7 +142,7 @@ def _forward(
     verdicts = Verdicts(
         {c.name: problem.t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
     )
-    begun = (x, P)
+    begun, P = (x, P), _placed(P, records)
     found: list[Any] = [None] * K  # estimates, or errors where points are given
     ahead = found.copy()
     k = 0
@@ -164,8 +164,7 @@ def _forward(
                 P.flat[:: D + 1] += added
         for kind in watched if verdicts.anew else ():
             if (kind.name, problem.t[k]) in verdicts.anew:
-                block = BLOCKS["p" if isinstance(kind, GnssPosition) else "v"]
-                P[block, block] += 1e6 * np.eye(3)
+                P = _anywhere(P, "p" if isinstance(kind, GnssPosition) else "v")
         ahead[k], all_Pp[k] = x, P
         back: int | None = None
         for some in stack.together(k, one_by_one if where is own else alone):
@@ -174,11 +173,13 @@ def _forward(
                 again = verdicts.settle(some.parts[0][0].name, fault, float(problem.t[k]))
                 back = int(np.searchsorted(problem.t, again))
                 break
+        if back is None and k == len(problem.t) - 1 and (trial := verdicts.ended()) is not None:
+            back = int(np.searchsorted(problem.t, trial))
         if back is not None:  # once more from before the fault, without it
             bank = banks.get(back) or bank.forgetful() if bank else None
             banks = {key: old for key, old in banks.items() if key < back}
             k = back
-            x, P = (found[k - 1], all_P[k - 1]) if k else begun
+            x, P = (found[k - 1], all_P[k - 1]) if k else (begun[0], _placed(begun[1], records))
             if about is not None and k == n:
                 x = own.plus(_one(about, k - 1), x)
             continue
@@ -207,6 +208,19 @@ def _forward(
         errors,
         errors_ahead,
     )
+
+
+def _placed(P: Array, records: dict[str, Innovations]) -> Array:
+    """What is known at the start, but for the place where the first fix, which tells it, is not used."""
+    first = [one.used[0] for one in records.values() if isinstance(one.rows, GnssPosition) and len(one.used)]
+    return _anywhere(P, "p") if first and first[0] == 0.0 else P
+
+
+def _anywhere(P: Array, block: str) -> Array:
+    """A covariance with nothing known of a block, but for what moves with it."""
+    P = P.copy()
+    P[BLOCKS[block], BLOCKS[block]] += 1e6 * np.eye(3)
+    return P
 
 
 def _one(points: Points, k: int) -> Estimate:
@@ -260,7 +274,7 @@ def _update(
         weight = 0.0 if refused else weight * bent
         record.weight[lo:hi], record.refused[lo:hi] = weight, refused
         if bank is not None:
-            bank.seen(rows.name, some.k, nis)
+            bank.seen(rows.name, some.k, nis, weight > 0.0)
         if weight == 0.0:
             return x, P, None
     # Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T

@@ -116,22 +116,28 @@ def _slots(constraints: Iterable[GnssPosition | GnssVelocity], t: Array | None, 
 class _Usual:
     """By how much the innovations of a kind are usually larger than the filter says; all copies of a bank share it.
 
-    What half of all fixes do, those not used included, is no fault: the filter has lost its way.
+    What half of all fixes do, those not used included, is no fault: the filter has lost its way. But for those of a
+    fault that goes on and has not lasted for long: soon after the start they are half of all by themselves.
     """
 
     def __init__(self, m: int) -> None:
         self.median = 2.0 * float(gammaincinv(0.5 * m, 0.5))
-        self.t, self.nis, self.factor = array("d"), array("d"), 1.0
+        self.t, self.nis, self.used, self.factor = array("d"), array("d"), array("b"), 1.0
 
-    def add(self, t: float, nis: float) -> None:
+    def add(self, t: float, nis: float, used: bool = True) -> None:
         k = bisect_left(self.t, t)
         if k < len(self.t) and self.t[k] == t:
-            self.nis[k] = nis
+            self.nis[k], self.used[k] = nis, used
         else:
             self.t.insert(k, t)
             self.nis.insert(k, nis)
+            self.used.insert(k, used)
         if k % _EVERY == 0:
-            self.factor = max(1.0, float(np.median(np.frombuffer(self.nis)[: k + 1])) / self.median)
+            before = np.flatnonzero(np.frombuffer(self.used, dtype=np.int8)[:k])
+            begin = int(before[-1]) + 1 if len(before) else 0
+            known = begin if begin < k and self.t[k - 1] - self.t[begin] <= _PATIENCE else k + 1
+            if known:
+                self.factor = max(1.0, float(np.median(np.frombuffer(self.nis)[:known])) / self.median)
 
 
 class Bank:
@@ -186,10 +192,10 @@ class Bank:
         """(n m, L m) what a signature says of errors of the fixes themselves."""
         return G[:, self._slots[name].columns]
 
-    def seen(self, name: str, k: int, nis: float) -> None:
+    def seen(self, name: str, k: int, nis: float, used: bool) -> None:
         """The filter has seen an innovation of so many squared sigmas, used or not."""
         if slots := self._slots.get(name):
-            slots.usual.add(float(self._t[k]), nis)
+            slots.usual.add(float(self._t[k]), nis, used)
 
     def taken(self, K: Array, H: Array) -> None:
         """The filter has used rows H with the gain K that are not tested."""
@@ -274,9 +280,9 @@ class Verdicts:
     """Which fixes to give up when a fault is found: those from its onset on.
 
     Unless that outlasts what was used since the fault before, and a minute. Then it is more likely the filter that has
-    lost its way with those: it drifts while fixes are refused, and a fault that grows meets it again. So what it used
-    since, of any kind, is given up instead, and the fixes are taken back; this in turn is undone if they are refused
-    even so. After `LONGEST` of a fault the filter begins anew where the fixes are.
+    lost its way with those: it drifts while fixes are refused, and a fault that grows meets it again; or it began with
+    wrong ones. So what it used since, of any kind, is given up instead, and the fixes are taken back; this in turn is
+    undone if they are refused even so. After `LONGEST` of a fault the filter begins anew where the fixes are.
 
     The first fix that is used after a long fault meets a filter that knows little, and agrees easily; from then on the
     filter is sure of it. If one of the next does not agree, it was chance, and the fault goes on.
@@ -342,15 +348,35 @@ class Verdicts:
             used[begin:end] = 1.0
             self.anew.add((name, float(t[begin])))
             return float(t[begin])
-        if (name, t[begin]) not in self._tried and lasted > _PATIENCE and before > 0 and begin - before < end - begin:
-            self._tried.add((name, float(t[begin])))
-            self._trial = name, begin, end, {other: u.copy() for other, u in self.used.items()}
-            used[begin:end] = 1.0
-            first = float(t[_begin(used, before, 0.0)])
-            for other, at in self.times.items():
-                self.used[other][(at >= first) & (at < t[begin])] = 0.0
-            return first
+        if lasted > _PATIENCE and self._outlasts(name, before, begin, end):
+            return self._try(name, before, begin, end)
         return float(t[fault])
+
+    def ended(self) -> float | None:
+        """The time to go on from once no more fixes come: no more patience is needed then."""
+        for name, used in self.used.items():
+            end = len(used)
+            if end and used[-1] == 0.0:
+                begin = _begin(used, end, 0.0)
+                before = _begin(used, begin, 1.0)
+                if self._outlasts(name, before, begin, end):
+                    return self._try(name, before, begin, end)
+        return None
+
+    def _outlasts(self, name: str, before: int, begin: int, end: int) -> bool:
+        """Whether fixes begin..end, refused, are more than before..begin, which were used, and were not tried yet."""
+        return 0 < begin - before < end - begin and (name, self.times[name][begin]) not in self._tried
+
+    def _try(self, name: str, before: int, begin: int, end: int) -> float:
+        """Take fixes back, without what of any kind was used since the fault before; the time to go on from."""
+        t, used = self.times[name], self.used[name]
+        self._tried.add((name, float(t[begin])))
+        self._trial = name, begin, end, {other: u.copy() for other, u in self.used.items()}
+        used[begin:end] = 1.0
+        first = float(t[_begin(used, before, 0.0)])
+        for other, at in self.times.items():
+            self.used[other][(at >= first) & (at < t[begin])] = 0.0
+        return first
 
 
 def _begin(used: Array, end: int, value: float) -> int:

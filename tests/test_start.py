@@ -1,0 +1,111 @@
+"""Fixes that are wrong where a drive begins: at rest, in the first motion, from before the first fix on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_faults import left_out, moved
+
+from graphnav import load
+from graphnav.alignment import Alignment, align
+from graphnav.config import Settings
+from graphnav.detectors import detect
+from graphnav.earth import LocalFrame
+from graphnav.online import Online, rows_of, without_rows
+from graphnav.pipeline import origin, run
+from graphnav.recording import Recording
+from graphnav.scoring import Errors, errors
+from graphnav.solvers.batch import batch
+from graphnav.solvers.watch import Verdicts
+from graphnav.trajectory import Trajectory
+
+
+@pytest.fixture(scope="module")
+def drive(shared_data: Path) -> Recording:
+    """It stands for 89 s, and again from 129 to 154 s; fixes of 2 cm."""
+    return load(shared_data / "oracle_drive").crop(0.0, 230.0)
+
+
+def shifted(recording: Recording, begin: float, end: float, by: float, each: float = 0.0) -> Recording:
+    """The recording with the fixes between two times `by` m too far north, and `each` m more every second."""
+    assert recording.gnss is not None
+    t = recording.gnss.t - recording.start
+    bad = (t > begin) & (t < end)
+    return moved(recording, bad, np.outer(by + each * (t[bad] - begin), [0.0, 1.0, 0.0]))
+
+
+def against_truth(track: Trajectory, recording: Recording) -> Errors:
+    truth = recording.truth
+    assert truth is not None
+    return errors(track, Trajectory(truth.t, truth.llh, v=truth.v, rph=truth.rph))
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "by"),
+    [(30.0, 70.0, 40.0), (-1.0, 50.0, 40.0), (85.0, 110.0, 200.0)],
+    ids=["at rest", "from the first fix on", "in the first motion"],
+)
+def test_a_start_rests_on_no_fix_that_is_wrong(drive: Recording, begin: float, end: float, by: float) -> None:
+    wrong = shifted(drive, begin, end, by)
+    solution = run(wrong, None, ("batch",))["batch"]
+    assert wrong.gnss is not None
+    t = wrong.gnss.t - wrong.start
+    assert np.array_equal(left_out(solution, wrong), (t > begin) & (t < end))
+    found = against_truth(solution.trajectory(), drive)
+    assert found.horizontal.max() < 0.15  # 0.03 m without the fault
+    assert np.nanmean(found.nees_p) / 3.0 < 2.0
+
+
+def test_fixes_that_jump_at_rest_are_no_motion(drive: Recording) -> None:
+    """The attitude comes from the same stretch as without the jump, and is the same."""
+    settings, frame = Settings(), LocalFrame(origin(drive))
+
+    def aligned(recording: Recording) -> Alignment:
+        smooth = lambda p, s: batch(p, s, wanted=(0,), reintegrate=False)  # noqa: E731
+        return align(recording, settings, frame, smooth, detect(recording, settings).stationary)
+
+    plain, jumped = aligned(drive), aligned(shifted(drive, 30.0, 70.0, 40.0))
+    assert jumped.motion == plain.motion
+    np.testing.assert_allclose(jumped.rph, plain.rph, atol=1e-9)
+
+
+@pytest.mark.parametrize("speed", [0.2, 1.0])
+def test_what_grows_in_the_midst_of_a_stop_is_no_motion(drive: Recording, speed: float) -> None:
+    grown = detect(shifted(drive, 30.0, 70.0, 0.0, speed)).stationary
+    np.testing.assert_allclose(grown, detect(drive).stationary, atol=0.2)
+
+
+def test_a_filter_that_began_with_wrong_fixes_gives_them_up() -> None:
+    t = np.arange(100.0)
+    used = np.ones(100)
+    verdicts = Verdicts({"p": t}, {"p": used})
+    for k in range(20, 100):  # twenty agree with each other, and none of the others with them
+        at = verdicts.settle("p", t[k], t[k])
+        if at != t[k]:
+            break
+    assert t[k] == 81.0  # once that has lasted for more than a minute
+    assert at == 0.0
+    assert not used[:20].any()
+    assert used[20:].all()
+
+
+@pytest.mark.parametrize(("right", "first"), [(20, True), (30, False)])
+def test_at_the_end_what_is_refused_is_tried_if_it_is_more(right: int, first: bool) -> None:
+    t, used = np.arange(50.0), np.ones(50)
+    used[right:] = 0.0
+    verdicts = Verdicts({"p": t}, {"p": used})
+    assert verdicts.ended() == (0.0 if first else None)
+    assert used[:right].any() != first
+    assert verdicts.ended() is None  # once
+
+
+def test_as_it_drives_a_jump_at_rest_is_no_motion(drive: Recording) -> None:
+    wrong = shifted(drive.crop(0.0, 180.0), 30.0, 70.0, 40.0)
+    online = Online(without_rows(wrong), Settings())
+    for row in rows_of(wrong)[1]:
+        online.add(row)
+    online.finish()
+    found = [against_truth(part, drive) for part in online.settled() if len(part) > 1]
+    assert max(one.horizontal.max() for one in found) < 0.1
