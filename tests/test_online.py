@@ -548,10 +548,14 @@ def test_real_recording_settles_on_the_batch_solution(shared_data: Path) -> None
     assert END == "E"
 
 
-def test_a_real_walk_settles_step_by_step(shared_data: Path) -> None:
-    """Shoe with nothing but its IMU: stances are found a second after they are over, and it is batch again."""
+@pytest.mark.parametrize(("lag", "near"), [(20.0, 0.05), (40.0, 0.003)])
+def test_a_real_walk_settles_step_by_step(shared_data: Path, lag: float, near: float) -> None:
+    """Shoe with nothing but its IMU: stances are found a second after they are over, and it is batch again.
+
+    Before the end of a lag of 20 s what comes back in every stance is half as well known: heights settle 4 cm off then.
+    """
     walk = read(shared_data / "pyshoe_vicon" / "2017-11-22-11-23-25.toml")
-    online, parts = Online(without_rows(walk), settings_from({"solver": {"lag": 20.0}})), []
+    online, parts = Online(without_rows(walk), settings_from({"solver": {"lag": lag}})), []
     behind = []
     for row in rows_of(walk)[1]:
         online.add(row)
@@ -564,7 +568,7 @@ def test_a_real_walk_settles_step_by_step(shared_data: Path) -> None:
     t, states, P = best.at(track.t)
     assert online.frame is not None
     away = online.frame.from_llh(track.llh[np.isin(track.t, t)]) - states.p
-    assert np.abs(away).max() < 0.03
+    assert np.abs(away).max() < near
     np.testing.assert_allclose(track.sd_p[-1], np.sqrt(np.diag(P[-1]))[3:6], rtol=0.15)
     assert np.quantile(behind, 0.9) < 2.5
 
@@ -575,7 +579,7 @@ def test_a_walk_with_lost_packets_settles_on_the_batch_solution(
 ) -> None:
     """Fifteen seconds of standing in pieces, a first step that has the highest readings so far, and gaps.
 
-    With the noise that the sensor shows of its own, a tenth of what is stated, headings part by a quarter of their sigma.
+    With the noise that the sensor shows of its own, a sixth of what is stated, headings part by half of their sigma.
     """
     walk = read(shared_data / "xio_loops" / "short.toml")
     settings = settings_from({"imu": {"as_stated": as_stated}})
