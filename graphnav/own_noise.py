@@ -8,7 +8,8 @@ over `_CLUSTER`, and of them the second differences, in which a slow sway cancel
 stands adds to that, so it is a bound from above; but the quietest of many stretches is quiet by chance as well, and
 the figure is one that true noise would show less than in `_CHANCE` of them.
 
-A drive is not asked: while its engine runs it vibrates as it never does at rest.
+A drive is not asked: while its engine runs it vibrates as it never does at rest. Nor is a walk that is still going on:
+its longest rest may be yet to come.
 """
 
 from __future__ import annotations

@@ -13,7 +13,6 @@ from graphnav.rotation import Array
 
 GAP = 1.5  # sample periods between rows that are a gap
 MANY = 64  # pieces of an interval beyond which it is handled apart from shorter ones
-_LAGS, _AROUND = 10, 0.1  # gaps, and s at least, on either side of a gap that say how the signal changes
 _CHUNK = 40_000  # pieces handled at once: keeps the working arrays in the processor's cache
 
 
@@ -38,10 +37,9 @@ def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
     """Put a made-up sample into every gap: the mean of its neighbours, with the noise that deserves.
 
     A row only speaks for one sample period before its stamp. What happened in a longer silence g is
-    unknown by as much as the signal itself changes over g there, which the rows around show (`_LAGS` times
-    g on either side): half their structure function, D(g)/2 = E|x(t+g) - x(t)|^2 / 2 per axis, is the
-    variance of a guess from the neighbours. That error lasts the whole gap, so the equivalent white
-    density is D(g)/2 * g.
+    unknown by as much as the signal itself usually changes over g, which the recording shows:
+    half its structure function, D(g)/2 = E|x(t+g) - x(t)|^2 / 2 per axis, is the variance of a guess
+    from the neighbours. That error lasts the whole gap, so the equivalent white density is D(g)/2 * g.
     """
     dt = imu.t[1:] - imu.t[:-1]
     period = period_of(imu.t)
@@ -53,7 +51,7 @@ def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
     length = t_fill - imu.t[gap]
     at = gap + 1  # the made-up sample stands before the row that ends the gap
     fill = {name: 0.5 * (getattr(imu, name)[gap] + getattr(imu, name)[gap + 1]) for name in ("gyro", "accel")}
-    extra = {name: _structure(getattr(imu, name), gap, length / period, period) * length for name in ("gyro", "accel")}
+    extra = {name: _structure(getattr(imu, name), length / period) * length for name in ("gyro", "accel")}
     return Samples(
         t=np.insert(imu.t, at, t_fill),
         gyro=np.insert(imu.gyro, at, fill["gyro"], axis=0),
@@ -65,18 +63,14 @@ def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
     )
 
 
-def _structure(x: Array, at: Array, lags: Array, period: float) -> Array:
-    """Half the mean squared change per axis over each lag (in samples), in the rows around the rows `at`."""
-    steps = np.clip(np.rint(lags), 1, len(x) - 1).astype(int)
-    values = np.empty(len(at))
-    for n in np.unique(steps):
-        of = steps == n
-        change = np.concatenate([[0.0], np.cumsum(np.mean((x[n:] - x[:-n]) ** 2, axis=1))])
-        around = max(_LAGS * n, round(_AROUND / period))
-        first = np.clip(at[of] - n - around, 0, len(change) - 2)
-        last = np.clip(at[of] + around, first + 1, len(change) - 1)
-        values[of] = 0.5 * (change[last] - change[first]) / (last - first)
-    return values
+def _structure(x: Array, lags: Array) -> Array:
+    """Half the mean squared change per axis over each lag (in samples)."""
+    steps = np.maximum(1, np.rint(lags)).astype(int)
+    values = {}
+    for n in np.unique(np.minimum(steps, len(x) - 1)):
+        change = x[n:] - x[:-n]
+        values[n] = 0.5 * float(np.mean(change * change))
+    return np.array([values[min(n, len(x) - 1)] for n in steps])
 
 
 @dataclass(frozen=True)

@@ -573,21 +573,20 @@ def test_a_real_walk_settles_step_by_step(shared_data: Path, lag: float, near: f
     assert np.quantile(behind, 0.9) < 2.5
 
 
-@pytest.mark.parametrize(("as_stated", "near"), [(True, 0.01), (False, 0.06)])
-def test_a_walk_with_lost_packets_settles_on_the_batch_solution(
-    shared_data: Path, as_stated: bool, near: float
-) -> None:
+def test_a_walk_with_lost_packets_settles_on_the_batch_solution(shared_data: Path) -> None:
     """Fifteen seconds of standing in pieces, a first step that has the highest readings so far, and gaps.
 
-    With the noise that the sensor shows of its own, a sixth of what is stated, headings part by half of their sigma.
+    What is left is the noise of bridged gaps, told from half a minute here and from the whole walk there; in height, where
+    little is known but by what comes back in every stance, it is seen most.
     """
     walk = read(shared_data / "xio_loops" / "short.toml")
-    settings = settings_from({"imu": {"as_stated": as_stated}})
+    settings = settings_from({"imu": {"as_stated": True}})  # as a walk that goes on has to take it
     _, track = played(walk, rows_of(walk)[1], settings)
     best = run(walk, settings, ("batch",))["batch"]
     t, states, P = best.at(track.t)
     away = best.frame.from_llh(track.llh[np.isin(track.t, t)]) - states.p
-    assert np.abs(away).max() < near
+    assert np.abs(away[:, :2]).max() < 0.02
+    assert np.abs(away[:, 2]).max() < np.sqrt(P[-1, 5, 5])
     np.testing.assert_allclose(track.sd_p[-1], np.sqrt(np.diag(P[-1]))[3:6], rtol=0.15)
 
 

@@ -23,7 +23,6 @@ from graphnav.online.judging import Again, Judgement
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import Tracker
-from graphnav.own_noise import with_own_noise
 from graphnav.pipeline import origin
 from graphnav.recording import Recording
 from graphnav.solution import Fault, to_trajectory
@@ -192,7 +191,6 @@ class Online:
         if self.frame is None:
             self.frame = LocalFrame(origin(recording))
         frame = self.frame
-        recording, shown = with_own_noise(recording, self.settings)
         try:
             found = align(recording, self.settings, frame, lambda problem, start: batch(
                 problem, start, wanted=(0,), reintegrate=False), stationary)  # fmt: skip
@@ -202,7 +200,6 @@ class Online:
             self.notes.append(f"not aligned at {now:.1f} s: {error}")
             self._wait(now)
             return
-        self.notes += shown
         self.tracker, sensors.setup = self._track(found, recording, self.settings)
         if found.motion is not None and self.settings.gnss.position and recording.platform != "foot":
             self._found, self._tentative = found, True
