@@ -576,8 +576,8 @@ def test_a_real_walk_settles_step_by_step(shared_data: Path, lag: float, near: f
 def test_a_walk_with_lost_packets_settles_on_the_batch_solution(shared_data: Path) -> None:
     """Fifteen seconds of standing in pieces, a first step that has the highest readings so far, and gaps.
 
-    What is left is the noise of bridged gaps, told from half a minute here and from the whole walk there; in height, where
-    little is known but by what comes back in every stance, it is seen most.
+    What is left is the noise of bridged gaps, told from half a minute here and from the whole walk there; most of it in
+    height, where little is known but by what comes back in every stance.
     """
     walk = read(shared_data / "xio_loops" / "short.toml")
     settings = settings_from({"imu": {"as_stated": True}})  # as a walk that goes on has to take it
