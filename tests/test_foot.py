@@ -143,14 +143,19 @@ def test_a_lost_packet_does_not_end_a_stance() -> None:
 
 
 # -------------------------------------------------------------------------------------------------------------- pivot
-@pytest.mark.parametrize("pace", PACES)
-def test_the_pivot_explains_what_zero_velocity_leaves(pace: str) -> None:
-    """At the true states of an exact walk, the best pivot and travel leave no forward velocity and little upward."""
+def stances_at_truth(pace: str) -> tuple[Stance, States]:
+    """The rows of an exact walk's stances, and its true states there."""
     walk = made(pace, exact=True)
     scene = scene_of(walk, Settings())
     rows = Stance.build(scene)
     assert rows is not None
-    states = true_states(walk, scene.t[rows.keyframe], scene.frame)
+    return rows, true_states(walk, scene.t[rows.keyframe], scene.frame)
+
+
+@pytest.mark.parametrize("pace", PACES)
+def test_the_pivot_explains_what_zero_velocity_leaves(pace: str) -> None:
+    """At the true states of an exact walk, the best pivot and travel leave no forward velocity and little upward."""
+    rows, states = stances_at_truth(pace)
     n = len(rows)
     values = {p.name: np.zeros((n, p.size)) for p in rows.parameters}
     at_zero = rows.linearize(states, values, slice(None))
@@ -171,11 +176,7 @@ def test_the_pivot_explains_what_zero_velocity_leaves(pace: str) -> None:
 @pytest.mark.parametrize("pace", PACES)
 def test_what_comes_back_in_every_stance_is_what_the_pivot_leaves(pace: str) -> None:
     """At the true states of an exact walk, within the sigma that the pattern has; upward most, where it adds up."""
-    walk = made(pace, exact=True)
-    scene = scene_of(walk, Settings())
-    rows = Stance.build(scene)
-    assert rows is not None
-    states = true_states(walk, scene.t[rows.keyframe], scene.frame)
+    rows, states = stances_at_truth(pace)
     of = {p.name: p for p in rows.parameters}
     zero = rows.linearize(states, {name: np.zeros((len(rows), p.size)) for name, p in of.items()}, slice(None))
     left = {}

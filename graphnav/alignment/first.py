@@ -23,9 +23,7 @@ class Alignment:
     own_sigma: Array  # (3,) rad, of roll, pitch, heading as the alignment itself believes them
     notes: tuple[str, ...]
     motion: float | None = None  # s, about when the vehicle first moves; None when it never does
-    until: float | None = (
-        None  # s, the end of what a filter goes through twice: what this was found from, or first steps
-    )
+    until: float | None = None  # s, the end of what a filter goes through twice: the stretch of motion, or first steps
 
     @property
     def rph(self) -> Array:
