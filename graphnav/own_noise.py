@@ -21,6 +21,7 @@ from scipy.stats import chi2
 
 from graphnav.config import Settings
 from graphnav.detectors.windows import running
+from graphnav.findings import period_of
 from graphnav.recording import ImuNoise, Recording
 from graphnav.rotation import Array
 
@@ -59,7 +60,7 @@ def with_own_noise(recording: Recording, settings: Settings) -> tuple[Recording,
 
 def quietest_density(t: Array, x: Array) -> float:
     """Bound from above of the white noise density of rows x (N, 3) at times t (N,), per axis; infinite if too short."""
-    period = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
+    period = period_of(t)
     size = max(1, round(_CLUSTER / period)) if period < _CLUSTER else 1
     count, stretch = len(t) // size, round(_STRETCH / (size * period)) if np.isfinite(period) else 1
     if stretch < 3 or count < stretch:

@@ -39,7 +39,7 @@ def align(
     Parameters
     ----------
     smooth : solves a posed problem from start states; handed in because solvers stand behind this room.
-    stationary : (N, 2) s, intervals in which a vehicle stands: fixes that jump meanwhile are no motion.
+    stationary : (N, 2) s, intervals in which a vehicle stands, where fixes that jump are no motion; a foot's stances.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def align(
     recording = plausible(recording)
     span = motion(recording, settings, stationary)
     if span is None:
-        return at_rest(recording, settings, frame)
+        return at_rest(recording, settings, frame, stationary)
     return replace(in_motion(recording, settings, frame, smooth, span), motion=span[0], until=span[1])
 
 

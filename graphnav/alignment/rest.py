@@ -7,7 +7,7 @@ import numpy as np
 from graphnav import rotation
 from graphnav.alignment.first import Alignment, level
 from graphnav.config import Settings
-from graphnav.detectors import detect
+from graphnav.detectors.base import NONE
 from graphnav.earth import LocalFrame
 from graphnav.preintegration import prefix
 from graphnav.recording import Recording
@@ -20,10 +20,10 @@ _OPENING = 10  # stances of a walk by which tilt and accelerometer bias are told
 _WALKING = 3.0  # m/s, 1-sigma of the start velocity of a foot in the air
 
 
-def at_rest(recording: Recording, settings: Settings, frame: LocalFrame) -> Alignment:
-    """Level only; the heading stays unknown."""
+def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, stationary: Array) -> Alignment:
+    """Level only; the heading stays unknown. Of a foot, `stationary` (N, 2) s are its stances."""
     noise, gnss = recording.imu.noise, recording.gnss
-    stances = detect(recording, settings).stationary if recording.platform == "foot" else np.empty((0, 2))
+    stances = stationary if recording.platform == "foot" else NONE
     begin, seconds = _standing(recording, stances)
     R = rotation.from_rph(np.array([*level(recording, begin, seconds), 0.0]))
     tilt, sd_v = noise.accel_bias_sigma / 9.8 + np.radians(1.0), 0.5
