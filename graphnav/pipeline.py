@@ -15,6 +15,7 @@ from graphnav.constraints.prior import InitialPrior
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import ConfigError, EstimationError
+from graphnav.onboard_offset import without_onboard_offset
 from graphnav.own_noise import with_own_noise
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
@@ -111,6 +112,7 @@ def _solve(
     recording: Recording, settings: Settings, frame: LocalFrame, solvers: tuple[str, ...], progress: Progress | None
 ) -> dict[str, Solution]:
     began = time.perf_counter()
+    recording, undone = without_onboard_offset(recording, settings)
     recording, shown = with_own_noise(recording, settings)
     tell("detection")
     found = detect(recording, settings)
@@ -142,7 +144,7 @@ def _solve(
     return {
         name: replace(
             out[name],
-            notes=(*stated.notes, *shown, *found.notes, *said, *out[name].notes),
+            notes=(*stated.notes, *undone, *shown, *found.notes, *said, *out[name].notes),
             detections=found.all,
             excluded=wrong,
             timings={k: timings.get(k, 0.0) + out[name].timings.get(k, 0.0) for k in (*timings, *out[name].timings)},

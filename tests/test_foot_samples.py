@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from graphnav import rotation as ro
 from graphnav.clipping import cut_peaks, with_whole_peaks
 from graphnav.config import Settings, settings_from
 from graphnav.detectors import detect
+from graphnav.formats import read
+from graphnav.onboard_offset import evidence, offset_learnt, without_onboard_offset
 from graphnav.own_noise import quietest_density, with_own_noise
 from graphnav.preintegration import preintegrate
-from graphnav.recording import ImuNoise
+from graphnav.recording import Imu, ImuNoise
+from graphnav.rotation import Array
 from graphnav.samples import Samples, bridge_gaps
 from graphnav.simulation import Simulated, simulate
 from graphnav.unresolved import with_coning, with_unresolved_motion
@@ -87,6 +92,81 @@ def test_figures_stated_too_large_are_lowered_for_a_walk_and_for_nothing_else() 
     assert with_own_noise(stated, settings_from({"imu": {"as_stated": True}})) == (stated, ())
     drive = replace(stated, platform="vehicle")
     assert with_own_noise(drive, Settings()) == (drive, ())
+
+
+# ------------------------------------------------------------------------- offsets that the unit has taken off itself
+def swaying(seed: int, bias: float) -> tuple[Array, Array, Array]:
+    """Times, rates (N, 3), forces (N, 3): 12 s of a body that sways about its balance, two strides, the same again."""
+    rng = np.random.default_rng(seed)
+    T, n = 0.005, 12 * 200
+    t = T * np.arange(1, 2 * n + 401)
+    z = rng.standard_normal((len(t), 3))
+    angle = lfilter([1e-3 * np.sqrt(2.0 * T / 0.7)], [1.0, T / 0.7 - 1.0], z, axis=0)
+    angle = lfilter(np.full(60, 1.0 / 60.0), [1.0], angle, axis=0)
+    rate = np.gradient(angle, T, axis=0) + bias * rng.standard_normal(3) + 2e-3 * rng.standard_normal(angle.shape)
+    rate[n : n + 400, 1] += 3.0 * np.sin(0.05 * np.arange(400))
+    up = np.array([0.0, 0.0, 9.81])
+    return t, rate, up - np.cross(angle, up) + 0.03 * rng.standard_normal(angle.shape)
+
+
+def corrected(t: Array, rate: Array) -> tuple[Array, Array]:
+    """What a unit passes on that takes off its gyro's offset (rows, offsets), row by row as its program does."""
+    out, taken, offset, rested = np.empty_like(rate), np.empty_like(rate), np.zeros(3), 5.0
+    for i, raw in enumerate(rate):
+        out[i] = raw - offset
+        if np.abs(out[i]).max() > np.deg2rad(3.0):
+            rested = 0.0
+        elif rested < 5.0:
+            rested += t[1] - t[0]
+        else:
+            offset = offset + 2.0 * np.pi * 0.02 * (t[1] - t[0]) * out[i]
+        taken[i] = offset
+    return out, taken
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_offset_that_the_unit_took_off_is_found_again(seed: int) -> None:
+    t, rate, force = swaying(seed, 5e-3)
+    rows, taken = corrected(t, rate)
+    away = offset_learnt(Imu(t, rows, force)) - taken
+    near = 2.0 * np.abs(np.diff(taken, axis=0)).max()  # to the row after which five seconds count as over
+    assert np.abs(away).max() < near < 0.05 * np.abs(taken).max()
+
+
+def test_whether_the_unit_corrects_its_offset_is_told_from_rests() -> None:
+    """Never believed of one that does not, of biases as large as the sway and ten times; else told when it matters."""
+    chance = 2.0 * np.log(100.0)
+    plain, served = [], []
+    for seed in range(10):
+        for bias in (1e-3, 1e-2):
+            t, rate, force = swaying(seed, bias)
+            own, of_unit = Imu(t, rate, force), Imu(t, corrected(t, rate)[0], force)
+            plain.append(evidence(own, offset_learnt(own)))
+            served.append(evidence(of_unit, offset_learnt(of_unit)))
+    assert max(plain) < chance
+    assert min(served[1::2]) > chance
+
+
+@pytest.mark.parametrize("name", ["xio_loops/long", "xio_loops/short"])
+def test_a_unit_that_corrects_its_offset_is_found_out(shared_data: Path, name: str) -> None:
+    """Both walks of one unit: the angle of the rests, less the tilt, is a line again; its own figure is 0.02 Hz."""
+    walk = read(shared_data / f"{name}.toml")
+    undone, (said,) = without_onboard_offset(walk, Settings())
+    assert "offset" in said
+    offset = offset_learnt(walk.imu)
+    np.testing.assert_array_equal(undone.imu.gyro, walk.imu.gyro + offset)
+    by_rate = [evidence(walk.imu, share * offset) for share in (0.25, 0.5, 1.0, 2.0, 4.0)]
+    assert np.argmax(by_rate) in {1, 2}
+    assert without_onboard_offset(walk, settings_from({"imu": {"onboard_offset": False}})) == (walk, ())
+    assert without_onboard_offset(replace(walk, platform="vehicle"), Settings())[1] == ()
+
+
+def test_units_that_leave_their_offset_alone_are_left_alone(shared_data: Path) -> None:
+    for path in sorted((shared_data / "gcp_walks").glob("*.toml")):
+        walk = read(path)
+        assert without_onboard_offset(walk, Settings()) == (walk, ())
+    parked = read(shared_data / "tokyo_20201105" / "recording.toml").crop(0.0, 600.0)
+    assert evidence(parked.imu, offset_learnt(parked.imu)) < -30.0
 
 
 # ------------------------------------------------------------------------------------------------ what rows stand for

@@ -56,6 +56,9 @@ class ImuSettings(Section):
     coning: bool = Field(
         True, description="of a foot: rows are plain means; false for a unit that makes up for coning and sculling"
     )
+    onboard_offset: bool = Field(
+        True, description="of a foot: where rests show that the unit corrected its gyro's offset in them, undo it"
+    )
 
 
 class SolverSettings(Section):
