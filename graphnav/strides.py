@@ -32,6 +32,7 @@ class WalkErrors:
 
     horizontal: float  # rms after the fit; of a loop, start to end
     in_stance: float  # the same over the epochs in a stance only
+    of_steps: float  # the same over the means of stances, so that a rest counts like a step
     of_point: float  # the same with the place on the foot fitted that the truth is of
     up: float  # rms with the start's height taken off; of a loop, end less start
     stride: float  # median of stride length over its truth; 1 where there is no bias
@@ -82,7 +83,7 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     _, states, covariance = solution.at(t)
     p, P = states.p, covariance[:, 3:6, 3:6]
     flat = np.column_stack([X[:, :2], np.zeros(len(X))])
-    of_point, arm = _of_point(states, flat)
+    of_point, arm = fitted_point(states, flat)
     # about the start
     q = p if X.shape[1] == 2 else p + states.R_nb @ arm
     at_start = q[0] if X.shape[1] == 2 else q[t <= t[0] + _STANDS].mean(axis=0)
@@ -100,9 +101,26 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
         true, mine = (np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1) for x in (X, p))
         stride = float(np.median((mine / true)[true > _A_STRIDE]))
     # points are measured where a foot stands; a dense truth has it in the air as well
-    standing = _in_stance(solution, t) if X.shape[1] == 3 else np.ones(len(t), dtype=bool)
-    horizontal, in_stance = _shape(p, flat), _shape(p[standing], flat[standing])
-    return WalkErrors(horizontal, in_stance, of_point, up, stride, float(np.mean(nees_h)), nees_up)
+    stances = _stances(solution) if X.shape[1] == 3 else np.empty((0, 2))
+    horizontal, in_stance, of_steps = shapes(t, p, flat, stances)
+    return WalkErrors(horizontal, in_stance, of_steps, of_point, up, stride, float(np.mean(nees_h)), nees_up)
+
+
+def shapes(t: Array, p: Array, truth: Array, stances: Array) -> tuple[float, float, float]:
+    """Horizontal rms, m, after fitting yaw and offset: over all epochs, over those in a stance, over means of stances.
+
+    Parameters
+    ----------
+    t, p, truth : (N,) s; (N, 3), (N, 3) m, places and true places.
+    stances : (S, 2) s; where they hold fewer than ten epochs, all epochs are meant.
+    """
+    rows = [(t >= a) & (t <= b) for a, b in stances]
+    inside = np.any(rows, axis=0) if rows else np.zeros(len(t), dtype=bool)
+    everywhere = _shape(p, truth)
+    if np.count_nonzero(inside) <= _TURNS:
+        return everywhere, everywhere, everywhere
+    means = [np.array([x[one].mean(axis=0) for one in rows if one.any()]) for x in (p, truth)]
+    return everywhere, _shape(p[inside], truth[inside]), _shape(*means)
 
 
 def _of_loop(solution: Solution, sigma: float) -> WalkErrors:
@@ -111,23 +129,21 @@ def _of_loop(solution: Solution, sigma: float) -> WalkErrors:
     off = p[-1] - p[0]
     nees_h = 0.5 * float(off[:2] @ np.linalg.solve(P[:2, :2], off[:2]))
     h, up = found.horizontal, found.vertical
-    return WalkErrors(h, h, h, up, np.nan, nees_h, float(off[2] ** 2 / P[2, 2]))
+    return WalkErrors(h, h, h, h, up, np.nan, nees_h, float(off[2] ** 2 / P[2, 2]))
 
 
-def _in_stance(solution: Solution, t: Array) -> Array:
-    """(N,) bool, which epochs lie in a stance; all of them where none does."""
-    spans = next((d.intervals for d in solution.detections if d.name == "fused"), np.empty((0, 2)))
-    inside = np.any((t[:, None] >= spans[:, 0]) & (t[:, None] <= spans[:, 1]), axis=1)
-    return inside if np.count_nonzero(inside) > _TURNS else np.ones(len(t), dtype=bool)
+def _stances(solution: Solution) -> Array:
+    """(S, 2) s, where the foot stands; none where it was not looked for."""
+    return next((d.intervals for d in solution.detections if d.name == "fused"), np.empty((0, 2)))
 
 
-def _shape(p: Array, flat: Array) -> float:
-    """Horizontal rms of places (N, 3) against a flat truth (N, 3) after fitting yaw and offset, m."""
+def _shape(p: Array, truth: Array) -> float:
+    flat = truth * [1.0, 1.0, 0.0]
     yaw, offset = fit_yaw(flat, p * [1.0, 1.0, 0.0])
     return float(np.sqrt(np.mean(np.sum((p[:, :2] - _turned(flat[:, :2], yaw) - offset[:2]) ** 2, axis=1))))
 
 
-def _of_point(states: States, flat: Array) -> tuple[float, Array]:
+def fitted_point(states: States, flat: Array) -> tuple[float, Array]:
     """Horizontal rms after fitting yaw, offset and a lever arm in the body, by turns, and that arm (3,), m."""
     arm = np.zeros(3)
     level = states.R_nb[:, :2]

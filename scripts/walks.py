@@ -3,10 +3,11 @@
     GRAPHNAV_DATA=... python scripts/walks.py
 
 Errors are the closure of loops, else the rms after yaw and offset are fitted to the truth; NEES per degree of freedom.
-"in stance": the same over the epochs in a stance only. "point fitted": with the place on the foot fitted that the truth
-is of, which no recording states; so is the NEES of a dense truth, the noise of which is how heights scatter over the
-floor. "bias before": with the gyro bias as the walk before on the same sensor and day had it. "plain filter": what a
-nine-state zero-velocity filter of the usual kind reached on the same recordings, in stance.
+"in stance": the same over the epochs in a stance only. "stances once": over the means of stances, so that rests count
+no more than steps. "point fitted": with the place on the foot fitted that the truth is of, which no recording states;
+so is the NEES of a dense truth, the noise of which is how heights scatter over the floor. "bias before": with the gyro
+bias as the walk before on the same sensor and day had it. "plain filter": what a nine-state zero-velocity filter of the
+usual kind reached on the same recordings, in stance (`plain_filter.py`).
 "s per min": processor time of all three solvers, alignment and detection per minute of walk.
 """
 
@@ -54,9 +55,9 @@ def main() -> None:
     options = parser.parse_args()
     folder = Path(os.environ["GRAPHNAV_DATA"])
     print("| walk | s | plain filter | " + " | ".join(f"{s}, {c} lateral" for c in CASES for s in SOLVERS), end="")
-    print(" | batch, in stance | batch, point fitted | batch, bias before", end="")
+    print(" | batch, in stance | batch, stances once | batch, point fitted | batch, bias before", end="")
     print(f" | up, m: {', '.join(SOLVERS)} | stride | NEES hor. | NEES up | s per min |")
-    print("|" + " --- |" * (3 + len(CASES) * len(SOLVERS) + 8))
+    print("|" + " --- |" * (3 + len(CASES) * len(SOLVERS) + 9))
     for name in options.sets.split(","):
         rows, before = [], None
         for plain, path in zip(PLAIN[name], sorted((folder / name).glob("*.toml")), strict=True):
@@ -101,11 +102,11 @@ def one(path: Path, plain: float, stated: float | None, before: Before | None) -
     print(
         f"| {recording.name} | {recording.duration:.0f} | {plain:g} | "
         + " | ".join(f"{x:.3f}" for x in horizontal)
-        + f" | {b.in_stance:.3f} | {b.of_point:.3f} | {helped:.3f} | {up} | {shown(b.stride)} | {b.nees_h:.2f} | "
-        f"{shown(b.nees_up, 2)} | {rate:.2f} |",
+        + f" | {b.in_stance:.3f} | {b.of_steps:.3f} | {b.of_point:.3f} | {helped:.3f} | {up} | "
+        f"{shown(b.stride)} | {b.nees_h:.2f} | {shown(b.nees_up, 2)} | {rate:.2f} |",
         flush=True,
     )
-    return [plain, *horizontal, b.in_stance, b.of_point, helped], now
+    return [plain, *horizontal, b.in_stance, b.of_steps, b.of_point, helped], now
 
 
 if __name__ == "__main__":

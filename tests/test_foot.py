@@ -28,7 +28,7 @@ from graphnav.samples import bridge_gaps
 from graphnav.simulation import Simulated, simulate
 from graphnav.solution import Solution
 from graphnav.state import States
-from graphnav.strides import floor_sigma, walk_errors
+from graphnav.strides import floor_sigma, shapes, walk_errors
 from graphnav.workflow import Request, run_request
 
 PACES = ("slow", "normal", "fast")
@@ -410,6 +410,30 @@ def test_a_dense_truth_of_another_point_on_the_foot() -> None:
     assert found.horizontal > 0.01
     assert found.of_point < 1e-3
     assert found.nees_h < 0.01
+
+
+def apart(p: Array, truth: Array) -> float:
+    """Rms after the best yaw and offset, in complex numbers."""
+    z, w = (x[:, 0] + 1j * x[:, 1] - np.mean(x[:, 0] + 1j * x[:, 1]) for x in (p, truth))
+    return float(np.sqrt(np.mean(np.abs(z - w * np.exp(1j * np.angle(np.vdot(w, z)))) ** 2)))
+
+
+def test_shape_by_epochs_and_by_stances() -> None:
+    """A rest of ten seconds counts like a step where each stance counts once, and by its epochs where epochs do."""
+    t = np.arange(0.0, 30.0, 0.1)
+    stances = np.array([[0.0, 10.0], *[[10.5 + k, 11.0 + k] for k in range(19)]])
+    truth = np.column_stack([np.cos(0.3 * t), np.sin(0.3 * t), np.zeros(300)])
+    p = truth @ ro.from_rph(np.array([0.0, 0.0, 0.7])).T + [[4.0, 5.0, 6.0]]
+    p[t > 10.2, 0] += 0.1  # all but the rest
+    inside = [(t >= a) & (t <= b) for a, b in stances]
+    means = [np.array([x[one].mean(axis=0) for one in inside]) for x in (p, truth)]
+    standing = np.any(inside, axis=0)
+    everywhere, in_stance, of_steps = shapes(t, p, truth, stances)
+    assert everywhere == pytest.approx(apart(p, truth), rel=1e-6)
+    assert in_stance == pytest.approx(apart(p[standing], truth[standing]), rel=1e-6)
+    assert of_steps == pytest.approx(apart(*means), rel=1e-6)
+    assert of_steps < 0.7 * in_stance  # one place of twenty is off, but half of the epochs
+    assert shapes(t, p, truth, np.empty((0, 2))) == (everywhere, everywhere, everywhere)
 
 
 # --------------------------------------------------------------------------------------------------------- real walks
