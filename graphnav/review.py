@@ -18,10 +18,12 @@ from graphnav.alignment import Alignment, align, with_known_heading
 from graphnav.alignment.first import some
 from graphnav.config import Settings
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity
+from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.detectors import Detections, detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
-from graphnav.judgement import MOST_RAISED, calmer, judge_speeds, judged
+from graphnav.judgement import MOST_RAISED, calmer, exhausted, judge_speeds, judged
+from graphnav.judgement.residuals import record
 from graphnav.problem import Problem, pose
 from graphnav.progress import Progress, tell
 from graphnav.recording import Recording
@@ -30,11 +32,15 @@ from graphnav.solution import Solution
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf, refilter
 from graphnav.solvers.near import near
-from graphnav.solvers.passes import Filtered, Forward, Points, Smoothed, points_of, values_of
+from graphnav.solvers.passes import Filtered, Forward, Points, Smoothed, about_solved, near_to, points_of, values_of
+from graphnav.solvers.robust import weight_and_cost
 from graphnav.solvers.rts import backward
 from graphnav.state import States
 
 _FAR = 0.5  # rad between the stated and the found start attitude
+_LOST = 0.1  # rad by which a filter may be off for a smoother to rest on it
+_WHEELS = (NonHolonomic, OdometerSpeed)
+_NOTHING = 0.1  # weight by a kernel that is next to none
 _AGAIN = 2  # times that a start is looked for again without wrong fixes
 _REVIEWS = 2  # of where faults begin and end
 _MOST = 0.5  # share of the fixes of a kind that can be wrong
@@ -109,21 +115,29 @@ class Review:
         if faults.count(self.problem):
             self._calm()
             self._stand()
+        if exhausted(self.problem.recording.imu.noise, self._recording.imu.noise):
+            # no wrong fixes explain it, and no IMU is as bad as that: most of the fixes may be wrong, for seconds each
+            other, says = self._posed(faults.spans(self.problem, noisy=True), doubted=True)
+            if says != self.notes:
+                self.problem, self.notes = other, says
+                self._filter()
+                self._review()
         if not isinstance(self._forward, Filtered):
             self._forward = ekf(self.problem, self._progress, self.aligned.until)
             self.smoothed = self._smoothed(self.problem, self._forward)
         self.forward, self.finished = self._forward, True
+        self._found_again()
         self.notes = (*self.notes, *self._raised)
         spent = sum(self.timings.values()) + self.forward.solution.timings["filter"]
         self.seconds = time.perf_counter() - self._began
         self.timings["smoother"] = self.seconds - spent
 
-    def _posed(self, wrong: tuple[faults.Fault, ...] = ()) -> tuple[Problem, tuple[str, ...]]:
+    def _posed(self, wrong: tuple[faults.Fault, ...] = (), doubted: bool = False) -> tuple[Problem, tuple[str, ...]]:
         """The problem with its figures judged, without spans of wrong fixes, and what is to be said of it."""
         frame, aligned, stationary, began = self._frame, self.aligned, self.detections.stationary, time.perf_counter()
         tell("judgement")
         recording, how, said = judged(
-            self._recording, self._settings, frame, aligned, stationary, wrong, self._overruled
+            self._recording, self._settings, frame, aligned, stationary, wrong, self._overruled, doubted
         )
         then = time.perf_counter()
         tell("preintegration")
@@ -218,6 +232,34 @@ class Review:
 
     def _smoothed(self, problem: Problem, forward: Forward) -> Smoothed:
         return backward(problem, forward, self._progress)
+
+    def _found_again(self) -> None:
+        """Filter and smooth about the batch solution where the filter was too far off for a smoother to rest on it.
+
+        Fixes that weigh little beside wheels let a filter that is not sure of its heading turn the mounting round
+        rather than the velocity, and no step finds back from there. So wheels come second.
+        """
+        problem, smoothed = self.problem, self.smoothed
+        if near_to(smoothed, self.forward.linearised, _LOST) and not _refused(problem, smoothed):
+            return
+        states = smoothed.states
+        if any(isinstance(c, _WHEELS) for c in problem.constraints):
+            free = replace(problem, constraints=tuple(c for c in problem.constraints if not isinstance(c, _WHEELS)))
+            states = backward(free, ekf(free, self._progress, self.aligned.until)).states
+            states = batch(free, states, wanted=(), reintegrate=False).states
+        solved = batch(problem, states, wanted=(), reintegrate=False)
+        about = about_solved(problem, solved, smoothed)
+        _, self.smoothed = near(problem, about, self.aligned.until, self._progress)
+        self.forward = ekf(problem, self._progress, self.aligned.until, known=self.smoothed)
+
+
+def _refused(problem: Problem, smoothed: Smoothed) -> bool:
+    """Whether most of the fixes have next to no weight in a smoothed solution: it has lost its way, not they."""
+    rows = next((c for c in problem.constraints if isinstance(c, GnssPosition)), None)
+    if rows is None or rows.robust == "none":
+        return False
+    s = np.sqrt(record(problem, rows, smoothed).nis)
+    return bool(np.mean(weight_and_cost(rows.robust, s, rows.robust_scale)[0] < _NOTHING) > _MOST)
 
 
 def _differ(a: Array, b: Array) -> bool:

@@ -17,7 +17,7 @@ ROOMS = [
     "formats", "draft", "allan", "findings", "simulation", "crosschecks", "wheels", "checks_imu", "checks_aiding",
     "checks_stated", "checks", "detectors", "samples",
     "preintegration", "own_noise", "unresolved", "clipping", "dynamics", "constraints", "problem", "solution",
-    "alignment", "dense", "solvers", "faults", "judgement", "review", "pipeline", "lever_arm",
+    "alignment", "dense", "solvers", "faults", "judgement", "onboard_offset", "review", "pipeline", "lever_arm",
     "interpolation", "metrics", "gates", "scoring", "strides", "evaluation", "exporters", "online",
     "panels", "page", "plots", "report_tables", "report_words", "report_pictures", "report_provenance", "report",
     "workflow", "staging", "outputs", "convert", "terminal", "detection_report",

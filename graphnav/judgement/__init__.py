@@ -6,8 +6,8 @@ not decide, and acted on only where the answer is clear (three standard deviatio
 
 from graphnav.judgement.chance import MOST_RAISED
 from graphnav.judgement.fixes import FIXES
-from graphnav.judgement.imu import calmer
+from graphnav.judgement.imu import calmer, exhausted
 from graphnav.judgement.rounds import judged
 from graphnav.judgement.speeds import BLOCK, judge_speeds, raised_by
 
-__all__ = ["BLOCK", "FIXES", "MOST_RAISED", "calmer", "judge_speeds", "judged", "raised_by"]
+__all__ = ["BLOCK", "FIXES", "MOST_RAISED", "calmer", "exhausted", "judge_speeds", "judged", "raised_by"]

@@ -90,6 +90,11 @@ def noisiest(noise: ImuNoise) -> ImuNoise:
     return replace(noise, **{name: MOST_RAISED * getattr(noise, name) for name in _FIGURES})
 
 
+def exhausted(noise: ImuNoise, stated: ImuNoise) -> bool:
+    """Whether a figure was raised as far as any is, and so does not explain what it was raised for."""
+    return any(getattr(noise, name) >= (1.0 - 1e-9) * MOST_RAISED * getattr(stated, name) for name in _FIGURES)
+
+
 def calmer(noise: ImuNoise, than: ImuNoise) -> bool:
     """Whether an IMU is clearly less noisy by some figure, and by none clearly more."""
     ratio = [getattr(noise, name) / getattr(than, name) for name in _FIGURES]

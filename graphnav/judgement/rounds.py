@@ -13,7 +13,7 @@ from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.judgement.chance import CLEARLY
 from graphnav.judgement.fixes import LONG, FixQuality, judge_fixes, judge_lasting, outliers, stretch, suspicious
-from graphnav.judgement.imu import calmer, imu_notes, judge_imu, noisiest
+from graphnav.judgement.imu import calmer, exhausted, imu_notes, judge_imu, noisiest
 from graphnav.judgement.speeds import contradiction
 from graphnav.judgement.types import reaching
 from graphnav.problem import Problem, pose
@@ -36,6 +36,7 @@ def judged(
     stationary: Array,
     wrong: tuple[faults.Fault, ...] = (),
     witnesses: bool = False,
+    doubted: bool = False,
 ) -> tuple[Recording, Settings, tuple[str, ...]]:
     """Recording and settings with the figures of IMU and fixes judged by the first part of the drive, and sentences.
 
@@ -44,6 +45,7 @@ def judged(
     stationary : (N, 2) s, intervals at rest.
     wrong : spans of fixes to judge without.
     witnesses : whether wheels may say that it is not the IMU that is noisy, but errors of the fixes that last.
+    doubted : whether that is thought of as well where a figure of the IMU was raised as far as any is.
 
     Raises
     ------
@@ -55,7 +57,7 @@ def judged(
     rounds = _Rounds(recording, settings, frame, aligned, stationary, wrong)
     fixes = rounds.first()
     if fixes is not None:
-        fixes = rounds.lasting(fixes, witnesses)
+        fixes = rounds.lasting(fixes, witnesses, doubted)
         settings = fixes.applied(settings)
     noise = rounds.noise
     notes = imu_notes(recording.imu.noise, noise) + (() if fixes is None else fixes.notes)
@@ -148,22 +150,28 @@ class _Rounds:
                 break
         return problem, forward, back, fixes
 
-    def lasting(self, fixes: FixQuality, witnesses: bool) -> FixQuality:
+    def lasting(self, fixes: FixQuality, witnesses: bool, doubted: bool) -> FixQuality:
         """The fixes as they are, or as errors that last explain better.
 
         The IMU may be as bad as it was found, or errors of the fixes last for seconds: wheels, without a say so far,
-        are witnesses.
+        are witnesses; and so is an IMU that no figure that it may have explains.
         """
         found, raised = self._first, self.noise
-        larger = fixes.worst > CLEARLY
-        if found is None or not found.lasts or not (larger or (witnesses and raised != self._stated)):
+        larger, spent = fixes.worst > CLEARLY, doubted and exhausted(raised, self._stated)
+        if found is None or not found.lasts or not (larger or spent or (witnesses and raised != self._stated)):
             return fixes
         part = stretch(self._recording, self._moved, LONG)
         self._part, self._weight = reaching(self._recording, self._moved, part) if fixes.types else part, {}
         try:
+            if spent:
+                self._smoothed(fixes.applied(self._free))
             against, chance = contradiction(*self._both(fixes.applied(self._settings)))
-            if larger or against > chance:
+            if larger or spent or against > chance:
                 self.noise = self._stated
+                if spent:
+                    # wheels come second: beside fixes that are believed too much they are turned round, not heard
+                    self._near = None
+                    self._smoothed(found.applied(self._free))
                 found = judge_lasting(*self._both(found.applied(self._settings)), fixes)
                 if not self._settings.imu.as_stated:
                     basis = found.applied(self._free)
@@ -171,8 +179,10 @@ class _Rounds:
                     self._improve(basis)
                     self._weight = {}
                 left = contradiction(*self._both(found.applied(self._settings)))[0]
-                agreed = left < max(chance, against - chance)
-                if larger or (agreed and calmer(self.noise, raised)):
+                agreed = left <= max(chance, against - chance)
+                # with no wheels to say so, it has to leave an IMU that is no longer as bad as any
+                shown = against > chance or not exhausted(self.noise, self._stated)
+                if larger or (agreed and shown and calmer(self.noise, raised)):
                     fixes, raised = found, self.noise
         except EstimationError:
             pass  # as it was judged before

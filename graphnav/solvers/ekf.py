@@ -59,7 +59,11 @@ _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
 
 
 def ekf(
-    problem: Problem, progress: Progress | None = None, opening: float | None = None, watch: bool = False
+    problem: Problem,
+    progress: Progress | None = None,
+    opening: float | None = None,
+    watch: bool = False,
+    known: Points | None = None,
 ) -> Filtered:
     """Run the filter over all keyframes.
 
@@ -69,12 +73,12 @@ def ekf(
         after it depend on nothing later than themselves.
     watch : look for errors that last in the rows that are to be watched, and go back to before them; and for noise
         in those whose sigmas are to be adapted.
+    known : where the opening is linearised, from its first keyframe on, if that is known better than by a first pass.
     """
     began = time.perf_counter()
     K, about = len(problem.t), None
     if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
-        first = _forward(problem, n, watch=watch)
-        about = backward(problem, first)
+        about = backward(problem, _forward(problem, n, watch=watch)) if known is None else known.first(n)
     one = _forward(problem, K, about, progress, watch)
     seconds = time.perf_counter() - began
     filtered, P = one.states, one.P[:, :DIM, :DIM]

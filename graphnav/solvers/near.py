@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from graphnav.problem import Problem
 from graphnav.solvers.ekf import ekf, refilter
-from graphnav.solvers.passes import Forward, Points, Progress, Smoothed
+from graphnav.solvers.passes import Forward, Points, Progress, Smoothed, near_to
 from graphnav.solvers.rts import backward
 
 _PASSES = 4
-_TURN = 0.02  # rad; what is linear in an error of attitude is wrong by half its square
 
 
 def near(
@@ -23,8 +20,7 @@ def near(
     for _ in range(_PASSES):
         forward = refilter(problem, about, progress)
         smoothed = backward(problem, forward, progress)
-        turned = smoothed.states.minus(about.states)[:, :3]
-        if float(np.max(np.sum(turned * turned, axis=1))) < _TURN**2:
+        if near_to(smoothed, about):
             return forward, smoothed
         about = smoothed
     forward = ekf(problem, progress, opening)

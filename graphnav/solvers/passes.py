@@ -15,6 +15,7 @@ from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.solvers.stack import Innovations
 from graphnav.state import DIM, States
 
+_TURN = 0.02  # rad; what is linear in an error of attitude is wrong by half its square
 Progress = Callable[[str, float], None]
 
 
@@ -25,18 +26,21 @@ class Points:
     states: States
     values: Array  # (K, D-15) of the parameters
 
-
-@dataclass(frozen=True)
-class Smoothed(Points):
-    """A backward pass: states, parameter values and their joint covariance at every keyframe."""
-
-    P: Array  # (K, D, D)
+    def first(self, n: int) -> Points:
+        return Points(self.states[:n], self.values[:n])
 
     def nodes(self, problem: Problem) -> dict[str, Array]:
         """(n, k) per parameter: the value of each node after the last keyframe that it governs."""
         return {
             c.parameter.name: self.values[last_of(c), shift(problem.columns[c.parameter.name])] for c in problem.chains
         }
+
+
+@dataclass(frozen=True)
+class Smoothed(Points):
+    """A backward pass: states, parameter values and their joint covariance at every keyframe."""
+
+    P: Array  # (K, D, D)
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,14 @@ class Forward(Points):
     errors: Array  # (n, D) these points, and the filtered
     errors_predicted: Array  # (n, D) and the predicted state is these errors away from them
 
+    @property
+    def linearised(self) -> Points:
+        """Where its rows were linearised: at points given, then where it was."""
+        if self.about is None:
+            return self.predicted
+        n = len(self.about.values)
+        return joined([self.about, Points(self.predicted.states[n:], self.predicted.values[n:])])
+
 
 @dataclass(frozen=True)
 class Filtered(Forward):
@@ -70,6 +82,22 @@ def moved(points: Points, errors: Array) -> Points:
 def joined(parts: list[Points]) -> Points:
     """One after the other."""
     return Points(States.stack([part.states for part in parts]), np.concatenate([part.values for part in parts]))
+
+
+def near_to(points: Points, about: Points, turn: float = _TURN) -> bool:
+    """Whether attitudes are near enough (rad) for what lies between to be linear."""
+    turned = points.states.minus(about.states)[:, :3]
+    return float(np.max(np.sum(turned * turned, axis=1))) < turn**2
+
+
+def about_solved(problem: Problem, solved: Solution, before: Points) -> Points:
+    """Points of a solution of a problem; what it does not tell, places of stops, as before: rows are linear in them."""
+    told = {
+        c.parameter.name: solved.parameters[c.parameter.name].value[c.node]
+        for c in problem.chains
+        if c.parameter.name in solved.parameters
+    }
+    return points_of(problem, solved.states, values_of(problem, before) | told)
 
 
 def points_of(problem: Problem, states: States, known: dict[str, Array]) -> Points:
