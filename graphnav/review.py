@@ -115,7 +115,8 @@ class Review:
         if faults.count(self.problem):
             self._calm()
             self._stand()
-        if exhausted(self.problem.recording.imu.noise, self._recording.imu.noise):
+        lasts = self.problem.settings.gnss.fast_time
+        if not lasts and exhausted(self.problem.recording.imu.noise, self._recording.imu.noise):
             # no wrong fixes explain it, and no IMU is as bad as that: most of the fixes may be wrong, for seconds each
             other, says = self._posed(faults.spans(self.problem, noisy=True), doubted=True)
             if says != self.notes:
