@@ -84,7 +84,8 @@ class Dense:
         start = self.states[k]
         intervals = Intervals(
             self.t[k], t, dR, dV, dP, none, none, none, none, none, start.ba, start.bg,
-            np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 15, 15)), none, none, np.zeros((n, 3)), none,
+            np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 15, 15)), np.zeros((n, 0, 15, 15)), none, none,
+            np.zeros((n, 3)), none,
         )  # fmt: skip
         return Motion(intervals, self.frame).propagate(slice(None), start)[0]
 

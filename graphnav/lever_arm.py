@@ -6,7 +6,7 @@ estimate is that of `gnss.lever_arm_sigma`, from the first part of the drive, wi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,8 +16,8 @@ from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.findings import Finding
-from graphnav.judgement import judged
-from graphnav.judgement.fixes import stretch
+from graphnav.noise.apply import with_noise
+from graphnav.noise.estimate import estimate_noise
 from graphnav.pipeline import origin
 from graphnav.problem import pose
 from graphnav.progress import tell
@@ -77,12 +77,11 @@ def find_antenna(recording: Recording) -> Antenna:
     aligned = align(recording, settings, frame, lambda p, start: batch(p, start, wanted=(0,), reintegrate=False))
     if aligned.motion is None:
         raise EstimationError(f"'{recording.name}': without motion nothing tells where the antenna is")
-    tell("judgement")
-    fit, settings, _ = judged(recording, settings, frame, aligned, still)
-    part = stretch(recording, aligned.motion)
-    part = replace(part, imu=replace(part.imu, noise=fit.imu.noise))
     gnss = settings.gnss.model_copy(update={"lever_arm_sigma": _UNKNOWN})
-    problem = pose(part, settings.model_copy(update={"gnss": gnss}), frame, aligned.state, aligned.sigma, still)
+    settings = settings.model_copy(update={"gnss": gnss})
+    problem = pose(recording, settings, frame, aligned.state, aligned.sigma, still, parts_of_noise=True)
+    tell("noise")
+    problem = with_noise(problem, estimate_noise(problem, aligned.until).noise)
     tell("filter")
     forward = ekf(problem, opening=aligned.until)
     estimate = rts(problem, forward, backward(problem, forward)).parameters["gnss_lever_arm"]

@@ -22,9 +22,9 @@ from dataclasses import replace
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.judgement.chance import independent
 from graphnav.recording import Imu, Recording
 from graphnav.rotation import Array
+from graphnav.sample_size import effective_size
 
 _AFTER = 5.0  # s of rest after which the unit begins
 _RESTS = np.deg2rad(3.0)  # rad/s, on every axis
@@ -78,7 +78,7 @@ def evidence(imu: Imu, offset: Array) -> float:
         # axes of the walk, not of the unit: about the vertical force says nothing, and the noise is another
         axes = np.linalg.svd(mean[None])[2].T
         for a, b in zip((straight @ axes).T, (corrected @ axes).T, strict=True):
-            n = min(independent(a[:, None]), independent(b[:, None]))
+            n = min(effective_size(a[:, None]), effective_size(b[:, None]))
             total += n * float(np.log((a @ a) / (b @ b)))
     return total
 

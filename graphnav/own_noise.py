@@ -39,7 +39,7 @@ def with_own_noise(recording: Recording, settings: Settings) -> tuple[Recording,
     Other recordings, and figures to be taken as stated, are as they were.
     """
     imu = recording.imu
-    if recording.platform != "foot" or settings.imu.as_stated:
+    if recording.platform != "foot" or settings.noise.mode == "stated":
         return recording, ()
     shown = {
         "gyro_noise_density": quietest_density(imu.t, imu.gyro),

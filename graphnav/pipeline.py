@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -15,11 +16,12 @@ from graphnav.constraints.prior import InitialPrior
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import ConfigError, EstimationError
+from graphnav.noise.model import NoiseModel
 from graphnav.onboard_offset import without_onboard_offset
 from graphnav.own_noise import with_own_noise
+from graphnav.preparation import prepare
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
-from graphnav.review import reviewed
 from graphnav.solution import Solution, joined
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf
@@ -37,6 +39,7 @@ def run(
     settings: Settings | None = None,
     solvers: tuple[str, ...] = SOLVERS,
     progress: Progress | None = None,
+    noise: NoiseModel | None = None,
 ) -> dict[str, Solution]:
     """Solve a recording with several solvers on exactly the same information.
 
@@ -50,6 +53,8 @@ def run(
         Out of "ekf", "rts", "incremental", "isam2", "batch".
     progress
         Called now and then with a stage and its share done, 0 to 1.
+    noise
+        How good the sensors are taken to be; estimated, or as `settings.noise` says, when None.
 
     Returns
     -------
@@ -65,11 +70,15 @@ def run(
     """
     settings = settings or Settings()
     with listening(progress):
-        return _run(recording, settings, solvers, progress)
+        return _run(recording, settings, solvers, progress, noise)
 
 
 def _run(
-    recording: Recording, settings: Settings, solvers: tuple[str, ...], progress: Progress | None
+    recording: Recording,
+    settings: Settings,
+    solvers: tuple[str, ...],
+    progress: Progress | None,
+    noise: NoiseModel | None,
 ) -> dict[str, Solution]:
     unknown = [name for name in solvers if name not in KNOWN]
     if unknown:
@@ -83,7 +92,7 @@ def _run(
         try:
             # matrices here have thirty rows: threads for them cost more than the work, twenty times on a busy machine
             with threadpool_limits(limits=1, user_api="blas"):
-                found.append(_solved(piece, settings, frame, solvers, progress))
+                found.append(_solved(piece, settings, frame, solvers, progress, noise))
         except EstimationError as error:
             if len(pieces) == 1:
                 raise
@@ -94,41 +103,50 @@ def _run(
 
 
 def _solved(
-    recording: Recording, settings: Settings, frame: LocalFrame, solvers: tuple[str, ...], progress: Progress | None
+    recording: Recording,
+    settings: Settings,
+    frame: LocalFrame,
+    solvers: tuple[str, ...],
+    progress: Progress | None,
+    noise: NoiseModel | None,
 ) -> dict[str, Solution]:
     """`_solve`, and once more without what covariances may not have the digits for."""
     try:
-        return _solve(recording, settings, frame, solvers, progress)
+        return _solve(recording, settings, frame, solvers, progress, noise)
     except (EstimationError, np.linalg.LinAlgError) as error:
         if not settings.standstill.held_position:
             raise
         still = settings.standstill.model_copy(update={"held_position": False})
-        again = _solve(recording, settings.model_copy(update={"standstill": still}), frame, solvers, progress)
+        again = _solve(recording, settings.model_copy(update={"standstill": still}), frame, solvers, progress, noise)
         note = f"places of stops are not held: with them, {error}"
         return {name: replace(one, notes=(note, *one.notes)) for name, one in again.items()}
 
 
 def _solve(
-    recording: Recording, settings: Settings, frame: LocalFrame, solvers: tuple[str, ...], progress: Progress | None
+    recording: Recording,
+    settings: Settings,
+    frame: LocalFrame,
+    solvers: tuple[str, ...],
+    progress: Progress | None,
+    noise: NoiseModel | None,
 ) -> dict[str, Solution]:
     began = time.perf_counter()
     recording, undone = without_onboard_offset(recording, settings)
     recording, shown = with_own_noise(recording, settings)
     tell("detection")
-    found = detect(recording, settings)
-    detected = time.perf_counter()
-    review = reviewed(recording, settings, frame, found, progress)
-    aligned, stated, astray = review.aligned, review.stated, review.astray
-    problem, forward, smoothed, found = review.problem, review.forward, review.smoothed, review.detections
-    timings = {"detection": detected - began, **review.timings}
+    detected = detect(recording, settings)
+    detection = time.perf_counter() - began
+    found = prepare(recording, settings, frame, detected, noise, progress)
+    problem, forward, smoothed = found.problem, found.forward, found.smoothed
     wrong = faults.spans(problem, smoothed)
-    said = (*review.notes, *faults.notes(wrong, problem))
-    start = smoothed
-    if astray:
-        prior = InitialPrior(keyframe=problem.prior.keyframe, mean=stated.state, sigma=stated.sigma[None])
+    notes = (*found.start.notes, *undone, *shown, *found.detections.notes, *found.notes, *faults.notes(wrong, problem))
+    start, passes = smoothed, Counter(found.passes)
+    if found.astray:
+        prior = InitialPrior(keyframe=problem.prior.keyframe, mean=found.start.state, sigma=found.start.sigma[None])
         problem = replace(problem, prior=prior)
-        forward = ekf(problem, progress, aligned.until)
+        forward = ekf(problem, progress, found.aligned.until)
         smoothed = backward(problem, forward, progress)
+        passes.update(filter=1, smoother=1)
     out = {"ekf": forward.solution}
     if "rts" in solvers:
         out["rts"] = rts(problem, forward, smoothed)
@@ -137,16 +155,19 @@ def _solve(
         # what it took to get there is part of it
         out["batch"] = replace(out["batch"], timings={**forward.solution.timings, **out["batch"].timings})
     if "incremental" in solvers:
-        begin = aligned.state if astray else None
+        begin = found.aligned.state if found.astray else None
         out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
     if "isam2" in solvers:
         out["isam2"] = isam2(problem, progress).settled
+    timings = {"detection": detection, **found.timings}
     return {
         name: replace(
             out[name],
-            notes=(*stated.notes, *undone, *shown, *found.notes, *said, *out[name].notes),
-            detections=found.all,
+            notes=(*notes, *out[name].notes),
+            detections=found.detections.all,
             excluded=wrong,
+            noise=found.noise,
+            passes=dict(passes),
             timings={k: timings.get(k, 0.0) + out[name].timings.get(k, 0.0) for k in (*timings, *out[name].timings)},
         )
         for name in solvers

@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,6 +39,7 @@ from graphnav.recording import Imu
 from graphnav.rotation import Array
 from graphnav.samples import MANY, Samples, chunks, pieces_of
 
+NOISE_FIGURES = ("gyro_noise_density", "accel_noise_density", "gyro_bias_walk", "accel_bias_walk")
 _CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 _WALK_POINTS = 6  # quadrature points for the effect of bias walk inside an interval
 _FEW = 16  # intervals at once, below which calls cost more than numbers
@@ -68,6 +69,7 @@ class Intervals:
     rate: Array  # (n, 3) mean rate and force less those biases: what scale errors multiply
     force: Array  # (n, 3)
     covariance: Array  # (n, 15, 15)
+    parts: Array  # (n, 4, 15, 15) of it, by each of `NOISE_FIGURES`; (n, 0, 15, 15) where not asked for
     past_turn: (
         Array  # (n, 3, 3) means over the interval, s before its end: C(s) from the axes at its end to those at s,
     )
@@ -86,6 +88,11 @@ class Intervals:
         """Lengths, s."""
         return self.t1 - self.t0
 
+    def with_noise(self, factors: Array) -> Intervals:
+        """The same with the variances of `NOISE_FIGURES` multiplied by factors (4,); needs `parts`."""
+        more = np.einsum("f,nfij->nij", factors - 1.0, self.parts)
+        return replace(self, covariance=self.covariance + more, parts=factors[:, None, None] * self.parts)
+
     def out_of_range(self, bg: Array, angle: float = 1e-3) -> Array:
         """(n,) whether the gyro bias moved so far that the first-order correction is not enough.
 
@@ -94,7 +101,7 @@ class Intervals:
         return np.linalg.norm(bg - self.bg, axis=-1) * self.T > angle
 
 
-def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array) -> Intervals:
+def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array, parts_of_noise: bool = False) -> Intervals:
     """All intervals between consecutive keyframe times.
 
     Parameters
@@ -103,6 +110,7 @@ def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array) -> 
     imu : the sensor, for its noise figures.
     t : (K,) keyframe times, strictly increasing, inside the samples.
     ba, bg : (3,) or (K-1, 3) biases to integrate with, m/s^2 and rad/s.
+    parts_of_noise : keep what each noise figure contributes to the covariances.
     """
     n = len(t) - 1
     ba, bg = np.broadcast_to(ba, (n, 3)), np.broadcast_to(bg, (n, 3))
@@ -110,7 +118,7 @@ def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array) -> 
     parts: list[tuple[Array, Intervals]] = []
     for rows in chunks(pieces.count):
         dt, index = pieces.padded(rows)
-        parts.append((rows, _integrate(samples, imu, t, rows, dt, index, ba[rows], bg[rows])))
+        parts.append((rows, _integrate(samples, imu, t, rows, dt, index, ba[rows], bg[rows], parts_of_noise)))
     if n == 1:
         return parts[0][1]
     order = np.argsort(np.concatenate([rows for rows, _ in parts]), kind="stable")
@@ -119,16 +127,22 @@ def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array) -> 
 
 
 def preintegrate_unknown(
-    samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array, known: Mapping[float, Intervals]
+    samples: Samples,
+    imu: Imu,
+    t: Array,
+    ba: Array,
+    bg: Array,
+    known: Mapping[float, Intervals],
+    parts_of_noise: bool = False,
 ) -> Intervals:
     """`preintegrate`, but for intervals that are `known` already, by the time they end at."""
     missing = [k for k, end in enumerate(t[1:].tolist()) if end not in known or known[end].t0[0] != t[k]]
     if len(missing) == len(t) - 1:
-        return preintegrate(samples, imu, t, ba, bg)
+        return preintegrate(samples, imu, t, ba, bg, parts_of_noise)
     parts = {k: known[float(t[k + 1])] for k in range(len(t) - 1) if k not in missing}
     for run in np.split(np.array(missing, dtype=int), np.flatnonzero(np.diff(missing) > 1) + 1):
         if len(run):
-            new = preintegrate(samples, imu, t[run[0] : run[-1] + 2], ba, bg)
+            new = preintegrate(samples, imu, t[run[0] : run[-1] + 2], ba, bg, parts_of_noise)
             parts |= {int(k): new[i : i + 1] for i, k in enumerate(run)}
     names = Intervals.__dataclass_fields__
     ordered = [parts[k] for k in range(len(t) - 1)]
@@ -228,7 +242,15 @@ def _products(turn: Array) -> Array:
 
 
 def _integrate(
-    samples: Samples, imu: Imu, t: Array, rows: Array, dt: Array, index: Array, ba: Array, bg: Array
+    samples: Samples,
+    imu: Imu,
+    t: Array,
+    rows: Array,
+    dt: Array,
+    index: Array,
+    ba: Array,
+    bg: Array,
+    parts_of_noise: bool = False,
 ) -> Intervals:
     L, n = dt.shape
     w, f = _less(samples.gyro, index, bg), _less(samples.accel, index, ba)
@@ -254,19 +276,26 @@ def _integrate(
     left = T - edge  # time left at each edge
     a_edge = V[-1] - V
     b_edge = P[-1] - P - V * left[:, None]
-    Q = _white(qg, qa, left, a_edge, b_edge)
-    Q += _walk(imu, edge, left, A, B, PA, PB, a_edge, b_edge)
+    walks = _walks(edge, left, A, B, PA, PB, a_edge, b_edge)
+    of_gyro, of_accel = imu.noise.gyro_bias_walk**2 * walks[0], imu.noise.accel_bias_walk**2 * walks[1]
+    Q = _white(qg, qa, left, a_edge, b_edge) + of_gyro + of_accel
 
     dR, v_ba, v_bg, p_ba, p_bg = (_last(x) for x in (R, A, B, PA, PB))
     turn = np.zeros((n, 15, 15))  # theta from the start frame to a right perturbation of dR
     turn[:, 3:, 3:] = np.eye(12)
     turn[:, :3, :3] = np.swapaxes(dR, -1, -2)
     Q = turn @ Q @ np.swapaxes(turn, -1, -2)
+    parts = np.empty((n, 0, 15, 15))
+    if parts_of_noise:
+        none, each = np.zeros_like(qg), edge[1:] - edge[:-1]
+        rate = _white(imu.noise.gyro_noise_density**2 * each, none, left, a_edge, b_edge)
+        force = _white(none, imu.noise.accel_noise_density**2 * each, left, a_edge, b_edge)
+        parts = turn[:, None] @ np.stack([rate, force, of_gyro, of_accel], 1) @ np.swapaxes(turn, -1, -2)[:, None]
     theta_bg = np.swapaxes(dR, -1, -2) @ v_ba
-    rate, force = (np.sum(x * dt[:, None], axis=0).T / T[:, None] for x in (w, f))
+    mean_rate, mean_force = (np.sum(x * dt[:, None], axis=0).T / T[:, None] for x in (w, f))
     return Intervals(
         t[rows], t[rows + 1], dR, _last(V), _last(P), theta_bg, v_ba, v_bg, p_ba, p_bg,
-        np.array(ba), np.array(bg), rate, force, Q, *_past(edge, R, V, A),
+        np.array(ba), np.array(bg), mean_rate, mean_force, Q, parts, *_past(edge, R, V, A),
     )  # fmt: skip
 
 
@@ -344,8 +373,13 @@ def _white(qg: Array, qa: Array, left: Array, a_edge: Array, b_edge: Array) -> A
     return Q
 
 
-def _walk(imu: Imu, edge: Array, left: Array, A: Array, B: Array, PA: Array, PB: Array, a: Array, b: Array) -> Array:
-    """Covariance (n, 15, 15), start frame, of bias walk inside the interval, by midpoint quadrature."""
+def _walks(
+    edge: Array, left: Array, A: Array, B: Array, PA: Array, PB: Array, a: Array, b: Array
+) -> tuple[Array, Array]:
+    """Covariances (n, 15, 15), start frame, of walks of unit density inside the interval, by midpoint quadrature.
+
+    Of the gyro's bias and of the accelerometer's.
+    """
     n = edge.shape[1]
     T = edge[-1]
     target = T * ((np.arange(_WALK_POINTS) + 0.5) / _WALK_POINTS)[:, None]
@@ -365,6 +399,8 @@ def _walk(imu: Imu, edge: Array, left: Array, A: Array, B: Array, PA: Array, PB:
     M[..., 3:6, 3:] = PA_T - PA_t - A_t * s
     M[..., 6:9, 3:] = turned
     M[..., 9:12, 3:] = eye
-    M *= np.repeat([imu.noise.gyro_bias_walk, imu.noise.accel_bias_walk], 3)
-    flat = np.swapaxes(M, 1, 2).reshape(n, 15, -1)
-    return np.asarray((T / _WALK_POINTS)[:, None, None] * (flat @ np.swapaxes(flat, -1, -2)))
+    out = []
+    for triad in (slice(0, 3), slice(3, 6)):
+        flat = np.swapaxes(M[..., triad], 1, 2).reshape(n, 15, -1)
+        out.append(np.asarray((T / _WALK_POINTS)[:, None, None] * (flat @ np.swapaxes(flat, -1, -2))))
+    return out[0], out[1]

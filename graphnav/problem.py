@@ -16,7 +16,7 @@ from graphnav.constraints.prior import InitialPrior
 from graphnav.dynamics import Motion, scale_parameter
 from graphnav.earth import LocalFrame
 from graphnav.preintegration import Intervals, preintegrate, preintegrate_unknown
-from graphnav.recording import Recording
+from graphnav.recording import ImuNoise, Recording
 from graphnav.rotation import Array
 from graphnav.samples import Samples, bridge_gaps
 from graphnav.state import DIM, Parameter, States
@@ -53,6 +53,7 @@ class Problem:
     prior: InitialPrior
     constraints: tuple[Constraint, ...]
     notes: tuple[str, ...] = ()
+    imu_noise: ImuNoise = ImuNoise()  # that the intervals were integrated with
 
     @cached_property
     def parameters(self) -> dict[str, Parameter]:
@@ -86,7 +87,8 @@ class Problem:
 
     def reintegrated(self, ba: Array, bg: Array) -> Problem:
         """The same problem with its intervals integrated anew about better biases, (K-1, 3) each."""
-        intervals = preintegrate(self.samples, self.recording.imu, self.t, ba, bg)
+        imu = replace(self.recording.imu, noise=self.imu_noise)
+        intervals = preintegrate(self.samples, imu, self.t, ba, bg)
         return replace(self, intervals=intervals, motion=Motion(intervals, self.frame))
 
 
@@ -103,6 +105,7 @@ def pose(
     known: Mapping[float, Motion] | None = None,
     highest: Array | None = None,
     complete: bool = True,
+    parts_of_noise: bool = False,
 ) -> Problem:
     """Pose the estimation problem for a recording.
 
@@ -117,6 +120,7 @@ def pose(
     known : what intervals between keyframes say that were integrated before, by the time they end at.
     highest : what the IMU has read at other times, as `graphnav.clipping.highest` says.
     complete : False leaves out the constraints that look ahead, for `Problem.completed`.
+    parts_of_noise : keep what each noise figure contributes to the intervals' covariances, for `graphnav.noise`.
     """
     stops = to_samples(stationary, recording)
     if times is None:
@@ -133,7 +137,7 @@ def pose(
     motion = known.get(float(t[1])) if known and len(t) == 2 else None
     if motion is None or motion.intervals.t0[0] != t[0]:
         before = {end: one.intervals for end, one in (known or {}).items()}
-        intervals = preintegrate_unknown(samples, recording.imu, t, start.ba[0], start.bg[0], before)
+        intervals = preintegrate_unknown(samples, recording.imu, t, start.ba[0], start.bg[0], before, parts_of_noise)
         motion = Motion(intervals, frame)
     intervals = motion.intervals
     scene = Scene(recording, settings, frame, t, stops, intervals, speed, usual)
@@ -150,6 +154,7 @@ def pose(
         prior=prior,
         constraints=built,
         notes=(*_notes(samples, recording), *said, *(note for rows in built for note in rows.notes)),
+        imu_noise=recording.imu.noise,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -10,6 +11,7 @@ import numpy as np
 from graphnav import rotation
 from graphnav.detectors.base import Detection
 from graphnav.earth import LocalFrame
+from graphnav.noise.model import STATED, NoiseModel
 from graphnav.rotation import Array
 from graphnav.state import States
 from graphnav.trajectory import Trajectory
@@ -97,6 +99,8 @@ class Solution:
     notes: tuple[str, ...] = ()
     detections: tuple[Detection, ...] = ()  # where the platform was found to stand, the fused answer last
     excluded: tuple[Fault, ...] = ()  # spans of measurements found to be wrong, which no solver used
+    noise: NoiseModel = STATED  # that all solvers used
+    passes: Mapping[str, int] = field(default_factory=dict)  # over all keyframes, before the solver's own
     between: tuple[Between, ...] = ()  # gives states between keyframes, one for each piece of the recording
 
     @property

@@ -29,6 +29,7 @@ BLOCKS = {
     "bg": slice(12, 15),
 }
 DIM = 15
+SECONDS = 3.0  # s, correlation time at first of what is wrong for seconds: reflections, slipping tyres
 NODE_SPACING = 5.0  # s between the nodes of what walks slowly: mounting angles, scale of an odometer
 
 
@@ -46,6 +47,7 @@ class Parameter:
     correlation_time: float | None = None  # s; given, a Gauss-Markov process about zero with `sigma` at all times
     spacing: float = NODE_SPACING  # s, at least, from one of its nodes to the next
     begins: Array | None = None  # (n,) s; given, `initial` and `sigma` hold anew from each of these times on
+    noise_groups: tuple[str, ...] = ()  # (k,) of a process: the variance component (`graphnav.noise`) of each number
 
     @property
     def size(self) -> int:

@@ -24,12 +24,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import oracle
+from graphnav.judgement import judged
 
 from graphnav.alignment import align
 from graphnav.config import Settings
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
-from graphnav.judgement import judged
 from graphnav.online import Online, Row, rows_of, without_rows
 from graphnav.pipeline import origin
 from graphnav.problem import Problem, pose

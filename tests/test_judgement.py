@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
+from graphnav.judgement import judged
+from graphnav.judgement.chance import trimmed
+from graphnav.judgement.imu import imu_notes
 
 from graphnav import load
 from graphnav.alignment import align
@@ -16,9 +19,6 @@ from graphnav.config import Settings, settings_from
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.evaluation import evaluate_recording
-from graphnav.judgement import judged
-from graphnav.judgement.chance import trimmed
-from graphnav.judgement.imu import imu_notes
 from graphnav.pipeline import origin, run
 from graphnav.recording import Recording
 from graphnav.rotation import Array

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
+from graphnav.judgement.chance import median, scatter
+from graphnav.judgement.types import apart, factors, reaching
 from helpers import difference, random_states
 from test_constraints import scene_of
 from test_judgement import wandering
@@ -15,8 +17,6 @@ from graphnav.config import Settings, read_settings, settings_from, settings_tex
 from graphnav.constraints.gnss import SLOW_ERRORS, GnssPosition
 from graphnav.earth import LocalFrame
 from graphnav.errors import ConfigError
-from graphnav.judgement.chance import median, scatter
-from graphnav.judgement.types import apart, factors, reaching
 from graphnav.pipeline import run
 from graphnav.recording import Gnss, Recording
 from graphnav.rotation import Array

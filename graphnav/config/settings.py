@@ -50,14 +50,19 @@ class AlignmentSettings(Section):
 class ImuSettings(Section):
     """How the IMU's figures are used."""
 
-    as_stated: bool = Field(
-        False, description="take the noise figures as stated, even where the recording shows them to be wrong"
-    )
     coning: bool = Field(
         True, description="of a foot: rows are plain means; false for a unit that makes up for coning and sculling"
     )
     onboard_offset: bool = Field(
         True, description="of a foot: where rests show that the unit corrected its gyro's offset in them, undo it"
+    )
+
+
+class NoiseSettings(Section):
+    """How good the sensors are taken to be."""
+
+    mode: Literal["estimated", "stated"] = Field(
+        "estimated", description="estimated from the recording by likelihood, or as the recording states it"
     )
 
 
@@ -83,6 +88,7 @@ class Settings(Section):
     keyframes: KeyframeSettings = KeyframeSettings()
     alignment: AlignmentSettings = AlignmentSettings()
     imu: ImuSettings = ImuSettings()
+    noise: NoiseSettings = NoiseSettings()
     gnss: GnssSettings = GnssSettings()
     detectors: DetectorSettings = DetectorSettings()
     standstill: StandstillSettings = StandstillSettings()

@@ -4,7 +4,7 @@ A constraint is N rows of m numbers, each row tied to one keyframe. `linearize` 
 parameter values of some rows, the residual (predicted minus measured), its derivative with respect to
 the error-state blocks and parameters it depends on, and the measurement's sigma. It knows nothing of
 filters or graphs, and no weights, gates or robust kernels: those belong to the solvers, which read
-`robust`, `robust_scale`, `gate`, `watched`, `adaptive` and `weight`.
+`robust`, `robust_scale`, `gate`, `watched` and `weight`.
 """
 
 from __future__ import annotations
@@ -72,20 +72,28 @@ class Constraint(ABC):
     unit: ClassVar[str]
     looks_ahead: ClassVar[bool] = True  # False: once the intervals and the odometer are there, rows can be built
     passes: ClassVar[int] = 1  # of a filter's update; more for rows that are far from linear over its uncertainty
+    noise_axes: ClassVar[tuple[str, ...]] = ()  # variance component of each axis; none: its sigmas are taken as stated
+    bursts: ClassVar[bool] = False  # what is wrong with it is so for seconds: rows weigh less together
 
     keyframe: Array  # (N,) int, ascending
     parameters: tuple[Parameter, ...] = ()
+    processes: tuple[Parameter, ...] = ()  # of its errors; parameters where a noise model has them (`graphnav.noise`)
     robust: str = "none"
     robust_scale: float | Array = 3.0  # or (N,)
     graduation: float = np.inf  # mu of graduated non-convexity; infinite at its end
     gate: float | None = None
     watched: bool = False  # for errors that last
-    adaptive: str = "off"  # whether its sigmas are raised where it is noisier than they say
     weight: Array | None = None  # (N,) of each row's information, 0 = not used; all 1 when None
     notes: tuple[str, ...] = ()  # sentences that whoever reads the result must know
 
     def __len__(self) -> int:
         return len(self.keyframe)
+
+    def noise_groups(self) -> tuple[tuple[str, ...], Array]:
+        """Names of the variance components of the rows, and which of them each number (N, m) has; -1 for none."""
+        names = tuple(dict.fromkeys(self.noise_axes))
+        index = [names.index(axis) for axis in self.noise_axes] or [-1] * len(self.axes)
+        return tuple(f"{self.name}.{name}" for name in names), np.tile(index, (len(self), 1))
 
     def scale_of(self, rows: slice | Array) -> float | Array:
         """Scale of the kernel for some rows."""

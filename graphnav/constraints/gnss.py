@@ -10,28 +10,17 @@ ENU at the fix, where receivers state their sigmas::
 d is what must be added to the stamps of the fixes, one constant for positions and one for velocities: a
 receiver's filters delay them differently (boulder's differ by 0.1 s, dresden's by 0.7 s).
 
-e is the slow part of a position's error: fixes of one receiver seconds apart are wrong alike, and a thousand of
-them are not worth a thousand. It is the sum of two Gauss-Markov processes in units of the stated sigma, one that
-changes over minutes (multipath, satellites coming and going) and one over hours (orbits, atmosphere, the base's
-coordinates). Together they have the share `slow_share` of the variance, half each, since nothing in a drive tells
-them apart; the rest is white.
-
-Or it is not: reflections from houses last for seconds, and are often far larger than any sigma says. Where the data
-show that (`fast_time`), n fixes in a row have an error in common. Over times longer than that such noise is worth
-white noise of n times the variance, n = coth(dt / 2 T) for a Gauss-Markov process of correlation time T sampled every
-dt: the ratio of their spectra at zero frequency. A kernel then weighs the fix by what its own sigma says, and n fixes
-as one,
-
-    cost = rho_k(s) / n,    which is rho of s / sqrt(n) with the scale k / sqrt(n).
-
-Where fixes are of several types and the data tell them apart, all this is of each type: sigmas, shares, how long errors
-last, and slow processes, for what fixed and single-point fixes are wrong by has nothing to do with each other.
+e is the time-correlated part of a position's error: fixes of one receiver seconds apart are wrong alike, and a thousand
+of them are not worth a thousand. It is the sum of three Gauss-Markov processes in units of the stated sigma: one of
+seconds (reflections), one of minutes (multipath as satellites move, satellites coming and going) and one of hours
+(orbits, atmosphere, the base's coordinates). The stated sigma itself is that of the white part. How much of each there
+is, the noise model says (`graphnav.noise`), for each type of fix where there are several: what fixed and single-point
+fixes are wrong by has nothing to do with each other. With stated noise there is the white part alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -39,16 +28,16 @@ from scipy.ndimage import median_filter
 
 from graphnav import earth, rotation
 from graphnav.config import Settings
-from graphnav.config.gnss import GnssSettings, of_type
 from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
-from graphnav.recording import FIX_TYPES, Gnss, Imu, Recording
+from graphnav.recording import FIX_TYPES, Imu, Recording
 from graphnav.rotation import Array, mv
-from graphnav.state import NODE_SPACING, Parameter, States
+from graphnav.state import NODE_SPACING, SECONDS, Parameter, States
 
 LEVER_ARM = "gnss_lever_arm"
 TIME_OFFSET = "gnss_time_offset"
-SLOW_ERRORS = ("gnss_error_of_minutes", "gnss_error_of_hours")
-_NO_KERNEL = 1e6  # a scale beyond which no fix is
+TIMES = ("seconds", "minutes", "hours")  # of the processes of a position's error
+ERRORS = tuple(f"gnss_error_of_{time}" for time in TIMES)
+VELOCITY_ERROR = "gnss_velocity_error"
 VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
 _I3 = np.eye(3)
 _MINUTE = 60.0  # s
@@ -75,15 +64,7 @@ def _common(scene: Scene, offset: str) -> dict[str, Any]:
         parameters.append(Parameter(LEVER_ARM, gnss.lever_arm, np.full(3, settings.lever_arm_sigma), "m"))
     if settings.time_offset_sigma > 0:
         parameters.append(Parameter(offset, np.zeros(1), np.full(1, settings.time_offset_sigma), "s"))
-    said = settings.outliers
-    if isinstance(said["robust_scale"], Mapping):  # of positions, by type
-        said["robust_scale"] = GnssSettings().robust_scale
-    return {
-        "parameters": tuple(parameters),
-        "watched": settings.faults != "off",
-        "adaptive": settings.adaptive,
-        **said,
-    }
+    return {"parameters": tuple(parameters), "watched": settings.faults != "off", **settings.outliers}
 
 
 @dataclass(frozen=True)
@@ -92,6 +73,7 @@ class GnssPosition(Constraint):
 
     name: ClassVar[str] = "gnss_position"
     axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
+    noise_axes: ClassVar[tuple[str, ...]] = ("horizontal", "horizontal", "up")
     unit: ClassVar[str] = "m"
 
     p_n: Array = field(default_factory=lambda: _empty(0, 3))  # fixes in the navigation frame
@@ -100,9 +82,8 @@ class GnssPosition(Constraint):
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
     gyro: Array = field(default_factory=lambda: _empty(0, 3))  # measured rate at the fix
     omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
-    stated: Array = field(default_factory=lambda: _empty(0, 3))  # sigma of the whole error
-    usual: Array = field(default_factory=lambda: _empty(0, 3))  # the same, smoothed: the unit of slow errors
-    type: Array | None = None  # (N,) of graphnav.recording.FIX_TYPES
+    unit_error: Array = field(default_factory=lambda: _empty(0, 3))  # the same, smoothed: the unit of lasting errors
+    type: Array | None = None  # (N,) of graphnav.recording.FIX_TYPES, where there are several
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -119,54 +100,43 @@ class GnssPosition(Constraint):
         used = keyframe >= 0
         if not used.any():
             return None
-        llh = gnss.llh[used]
-        s = scene.settings.gnss
+        llh, sd = gnss.llh[used], gnss.sd[used]
+        kinds = None if gnss.type is None or len(np.unique(gnss.type)) < 2 else gnss.type[used]
         common = _common(scene, TIME_OFFSET)
-        rows: dict[str, Any] = {}
-        processes: list[Parameter] = []
-        spacings: list[float] = []
-        kinds = _groups(s, gnss)
-        for kind, own in kinds:
-            name = FIX_TYPES[kind or 0]
-            factor, share = of_type(s.sd_factor, name, 1.0), of_type(s.slow_share, name, 0.0)
-            every = np.array([factor, factor, of_type(s.up_factor, name, factor)]) * gnss.sd[own]
-            alike = as_one(of_type(s.fast_time, name, 0.0), gnss.t[own])
-            scale = of_type(s.robust_scale, name, _NO_KERNEL) / np.sqrt(alike)
-            parts = {
-                "sigma": np.sqrt((1.0 - share) * alike) * every,
-                "stated": every,
-                "usual": _usual(gnss.t[own], every) if scene.usual is None else scene.usual,
-                "scale": np.full(len(every), scale),
-            }
-            for key, part in parts.items():
-                rows.setdefault(key, np.empty((len(gnss.t), *part.shape[1:])))[own] = part
-            if alike > 1.0:
-                common["robust_scale"] = scale
-                if s.robust == "automatic":
-                    common["robust"] = "cauchy"
-            if share > 0:
-                sigma = np.full(3, np.sqrt(0.5 * share))
-                spacings.append(node_spacing(share, s.slow_times, (1.0 - share) * alike, period(gnss.t[own])))
-                for slow, time in zip(SLOW_ERRORS, s.slow_times, strict=True):
-                    slow = slow if kind is None else f"{slow}_{name}"
-                    processes.append(Parameter(slow, np.zeros(3), sigma, "sd", correlation_time=time))
-        # nodes at the same times for all: a batch solution has them in one variable
-        common["parameters"] += tuple(replace(one, spacing=min(spacings)) for one in processes)
-        if len(kinds) > 1 and common["robust"] not in ("none", "gnc"):
-            common["robust_scale"] = rows["scale"][used]
+        names = [""] if kinds is None else [f".{FIX_TYPES[int(kind)]}" for kind in np.unique(kinds)]
+        processes: tuple[Parameter, ...] = ()
+        spacing = node_spacing(scene.settings.gnss.slow_times, period(gnss.t[used]))
+        for name in names:
+            for error, time, lasts in zip(ERRORS, TIMES, (SECONDS, *scene.settings.gnss.slow_times), strict=True):
+                groups = tuple(f"{cls.name}{name}.{time}.{axis}" for axis in cls.noise_axes)
+                processes += (
+                    Parameter(
+                        error + name.replace(".", "_"), np.zeros(3), np.ones(3), "sd",
+                        correlation_time=lasts, spacing=spacing, noise_groups=groups,
+                    ),
+                )  # fmt: skip
         return cls(
             keyframe=keyframe[used],
             p_n=scene.frame.from_llh(llh),
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
-            sigma=rows["sigma"][used],
-            stated=rows["stated"][used],
-            usual=rows["usual"][used],
-            type=None if gnss.type is None else gnss.type[used],
+            sigma=sd,
+            unit_error=_running_median(gnss.t[used], sd) if scene.usual is None else scene.usual[used],
+            type=kinds,
             lever_arm=gnss.lever_arm,
             gyro=around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
             omega_n=scene.frame.omega_n,
+            processes=processes,
             **common,
         )
+
+    def noise_groups(self) -> tuple[tuple[str, ...], Array]:
+        if self.type is None:
+            return super().noise_groups()
+        kinds, which = np.unique(self.type, return_inverse=True)
+        names = tuple(
+            f"{self.name}.{FIX_TYPES[int(kind)]}.{axis}" for kind in kinds for axis in dict.fromkeys(self.noise_axes)
+        )
+        return names, 2 * which[:, None] + np.array([0, 0, 1])
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         C, R = self.R_ln[rows], states.R_nb
@@ -185,15 +155,15 @@ class GnssPosition(Constraint):
             J[TIME_OFFSET] = velocity[..., None]
         residual, jacobians = mv(C, away), {block: C @ x for block, x in J.items()}
         for name in parameters:
-            if name.startswith(SLOW_ERRORS):
-                size = self.usual[rows] * self._of(name, rows)
+            if name.startswith(ERRORS):
+                size = self.unit_error[rows] * self._of(name, rows)
                 residual = residual + size * parameters[name]
                 jacobians[name] = size[..., None] * _I3
         return Linearized(residual, jacobians, self.sigma[rows])
 
     def _of(self, name: str, rows: slice | Array) -> float | Array:
-        """Whose a slow process is: 1 where it is the error of a fix, 0 where the fix is of another type."""
-        if self.type is None or name in SLOW_ERRORS:
+        """Whose a process is: 1 where it is the error of a fix, 0 where the fix is of another type."""
+        if self.type is None:
             return 1.0
         kind = next(k for k, kind in FIX_TYPES.items() if name.endswith(kind))
         return np.asarray(self.type[rows] == kind, dtype=float)[..., None]
@@ -205,6 +175,7 @@ class GnssVelocity(Constraint):
 
     name: ClassVar[str] = "gnss_velocity"
     axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
+    noise_axes: ClassVar[tuple[str, ...]] = ("horizontal", "horizontal", "up")
     unit: ClassVar[str] = "m/s"
 
     v_l: Array = field(default_factory=lambda: _empty(0, 3))
@@ -215,6 +186,9 @@ class GnssVelocity(Constraint):
     g_n: Array = field(default_factory=lambda: _empty(0, 3))  # gravity there
     omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
+    unit_error: Array = field(
+        default_factory=lambda: _empty(0, 3)
+    )  # stated sigma, smoothed: the unit of lasting errors
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -232,6 +206,11 @@ class GnssVelocity(Constraint):
         used = (keyframe >= 0) & np.isfinite(gnss.v).all(axis=1)
         if not used.any():
             return None
+        lasting = Parameter(
+            VELOCITY_ERROR, np.zeros(3), np.ones(3), "sd", correlation_time=SECONDS,
+            spacing=node_spacing((), period(gnss.t[used])),
+            noise_groups=tuple(f"{cls.name}.seconds.{axis}" for axis in cls.noise_axes),
+        )  # fmt: skip
         return cls(
             keyframe=keyframe[used],
             v_l=gnss.v[used],
@@ -242,6 +221,8 @@ class GnssVelocity(Constraint):
             g_n=scene.frame.gravity_n(scene.frame.from_llh(gnss.llh[used])),
             omega_n=scene.frame.omega_n,
             lever_arm=gnss.lever_arm,
+            unit_error=_running_median(gnss.t[used], gnss.sd_v[used]),
+            processes=(lasting,),
             **_common(scene, VELOCITY_TIME_OFFSET),
         )
 
@@ -258,16 +239,17 @@ class GnssVelocity(Constraint):
             residual = residual + change * offset
             jacobians["theta"] = jacobians["theta"] - CR @ rotation.skew(force) * offset[..., None]
             jacobians |= {"ba": -CR * offset[..., None], VELOCITY_TIME_OFFSET: change[..., None]}
+        if VELOCITY_ERROR in parameters:
+            size = self.unit_error[rows]
+            residual = residual + size * parameters[VELOCITY_ERROR]
+            jacobians[VELOCITY_ERROR] = size[..., None] * _I3
         return Linearized(residual, jacobians, self.sigma[rows])
 
 
-def _groups(settings: GnssSettings, gnss: Gnss) -> list[tuple[int | None, Array | slice]]:
-    """Fixes that are treated alike: a type and its rows, or None and all rows where settings know no types."""
-    tables = (settings.sd_factor, settings.slow_share, settings.fast_time, settings.up_factor, settings.robust_scale)
-    if not any(isinstance(value, Mapping) for value in tables):
-        return [(None, slice(None))]
-    kinds = np.zeros(len(gnss.t), dtype=int) if gnss.type is None else gnss.type
-    return [(int(kind), kinds == kind) for kind in np.unique(kinds)]
+def whole_sigma(rows: GnssPosition | GnssVelocity) -> Array:
+    """(3,) typical 1-sigma of a whole error: white part and what lasts."""
+    lasting = sum((p.sigma**2 for p in rows.parameters if p.noise_groups and not p.constant), np.zeros(3))
+    return np.asarray(np.median(np.sqrt(rows.sigma**2 + lasting * rows.unit_error**2), axis=0))
 
 
 def period(t: Array) -> float:
@@ -275,26 +257,18 @@ def period(t: Array) -> float:
     return max(float(np.median(np.diff(t))), 1e-3) if len(t) > 1 else 1.0
 
 
-def as_one(correlation_time: float, t: Array) -> float:
-    """How many fixes at times t are worth one, of errors with that correlation time (s)."""
-    return 1.0 / float(np.tanh(0.5 * period(t) / correlation_time)) if correlation_time > 0.0 else 1.0
+def node_spacing(slow_times: tuple[float, ...], dt: float) -> float:
+    """How far apart (s) nodes of lasting errors may be, whose value stays from one to the next.
 
-
-def node_spacing(share: float, times: tuple[float, ...], white: float, dt: float) -> float:
-    """How far apart (s) nodes of slow errors may be, whose value stays from one to the next.
-
-    Errors of the variance share/2 each and of these correlation times wander with the density q = sum share / times.
-    Over a spacing D that is a variance of q D/6 about the mean, where the fixes in it, every dt seconds with a white
-    variance, tell that mean to white dt/D. With D = sqrt(white dt / q) / 2 the one is a 24th of the other.
+    A process of seconds needs one at every fix, `dt` s apart, up to a fifth of its correlation time.
     """
-    q = share * float(np.sum(1.0 / np.asarray(times)))
-    return min(NODE_SPACING, 0.5 * float(np.sqrt(white * dt / q)))
+    return max(dt, min(0.2 * SECONDS, *(0.01 * time for time in slow_times), NODE_SPACING))
 
 
-def _usual(t: Array, sigma: Array) -> Array:
+def _running_median(t: Array, sigma: Array) -> Array:
     """Running median of sigmas over a minute.
 
-    A slow error times a sigma that jumps from fix to fix would jump with it, and so give itself away.
+    A lasting error times a sigma that jumps from fix to fix would jump with it, and so give itself away.
     """
     size = 2 * int(np.clip(_MINUTE / period(t) / 2, 0, (len(t) - 1) // 2)) + 1
     return median_filter(sigma, size=(size, 1), mode="nearest")

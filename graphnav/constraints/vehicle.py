@@ -39,7 +39,7 @@ from graphnav.earth import LocalFrame
 from graphnav.preintegration import Intervals
 from graphnav.recording import Imu, Odometer, Recording
 from graphnav.rotation import Array, columns, mv
-from graphnav.state import Parameter, States
+from graphnav.state import SECONDS, Parameter, States
 from graphnav.wheels import Figures, MeanSpeed, faults
 
 MOUNTING = "mounting"
@@ -47,6 +47,7 @@ AXLE = "axle"
 BODY = "slip_squat"
 ODOMETER_SCALE = "odometer_scale"
 ODOMETER_DELAY = "odometer_delay"
+NHC_ERROR, ODOMETER_ERROR = "nhc_error", "odometer_error"
 REACH = 4.0  # sigmas of the delay that rows are prepared for
 _SHORTEST = 0.02  # s; a mean over less says nothing
 _LINEAR = 3.0  # m/s^2, lateral force up to which tyres behave linearly
@@ -250,12 +251,27 @@ def _shared_parameters(scene: Scene) -> tuple[Array, list[Parameter]]:
     return lever, parameters
 
 
+def lasting_error(name: str, density: Array, kind: type[Wheels]) -> Parameter:
+    """Gauss-Markov process (k,) of what wheels are wrong by for seconds: camber, wind, load, slip.
+
+    Over long times it is worth white noise of the density given (m/s/sqrt(Hz)), the variance of which is 2 T sigma^2
+    for a process of the correlation time T.
+    """
+    groups = tuple(f"{kind.name}.seconds.{axis}" for axis in kind.noise_axes)
+    sigma = density / np.sqrt(2.0 * SECONDS)
+    return Parameter(
+        name, np.zeros(len(sigma)), sigma, "m/s", correlation_time=SECONDS, spacing=0.2 * SECONDS, noise_groups=groups
+    )
+
+
 @dataclass(frozen=True)
 class NonHolonomic(Wheels):
     """The vehicle moves neither sideways nor up (NHC)."""
 
     name: ClassVar[str] = "nhc"
     axes: ClassVar[tuple[str, ...]] = ("right", "up")
+    noise_axes: ClassVar[tuple[str, ...]] = ("right", "up")
+    bursts: ClassVar[bool] = True
     unit: ClassVar[str] = "m/s"
 
     sigma: Array = field(default_factory=lambda: np.empty((0, 2)))
@@ -272,6 +288,7 @@ class NonHolonomic(Wheels):
                 Parameter(BODY, np.zeros(2), np.full(2, s.body_sigma), "rad s^2/m, of lateral and forward acceleration")
             )
         shared["parameters"] = tuple(shared["parameters"])
+        shared["processes"] = (lasting_error(NHC_ERROR, np.asarray(s.nhc_density), cls),)
         past = shared_past(scene)
         density = np.asarray(s.nhc_density) / np.sqrt(scene.intervals.T[rows])[:, None]
         beyond = np.maximum(np.abs(past.force[:, 0]) - _LINEAR, 0.0)
@@ -289,8 +306,12 @@ class NonHolonomic(Wheels):
         assert self.past is not None
         found = self._velocity(states, parameters, rows)
         residual, u, omega = found.u[:, ::2], found.u, found.omega
+        lasting = {}
+        if NHC_ERROR in parameters:
+            residual = residual + parameters[NHC_ERROR]
+            lasting = {NHC_ERROR: np.broadcast_to(_I2, (len(u), 2, 2))}
         if BODY not in parameters:
-            return Linearized(residual, found.derivatives(_SIDE_UP, parameters), self.sigma[rows])
+            return Linearized(residual, found.derivatives(_SIDE_UP, parameters) | lasting, self.sigma[rows])
         slip, squat = parameters[BODY].T
         v, w, a = u[:, 1], omega[:, 2], found.forward
         effect = columns(v * v * w, v * a)
@@ -305,7 +326,7 @@ class NonHolonomic(Wheels):
         jacobians["theta"][:, 0] += by_w * rotation.skew(mv(Rt, self.past.frame.omega_n))[:, 2]
         if SCALE in parameters:
             jacobians[SCALE][:, 0, 2] += by_w[:, 0] * self.past.rate[rows][:, 2]
-        return Linearized(residual - parameters[BODY] * effect, jacobians, self.sigma[rows])
+        return Linearized(residual - parameters[BODY] * effect, jacobians | lasting, self.sigma[rows])
 
 
 def _speed_of(odometer: Odometer, imu: Imu) -> MeanSpeed:
@@ -319,6 +340,8 @@ class OdometerSpeed(Wheels):
 
     name: ClassVar[str] = "odometer"
     axes: ClassVar[tuple[str, ...]] = ("forward",)
+    noise_axes: ClassVar[tuple[str, ...]] = ("forward",)
+    bursts: ClassVar[bool] = True
     unit: ClassVar[str] = "m/s"
 
     begin: Array = field(default_factory=lambda: np.empty(0))  # the interval of each row, s
@@ -348,7 +371,9 @@ class OdometerSpeed(Wheels):
         )
         if odometer.delay_sigma > 0:
             shared["parameters"].append(Parameter(ODOMETER_DELAY, np.zeros(1), np.full(1, odometer.delay_sigma), "s"))
+        density = np.atleast_1d(np.hypot(s.odometer_density, np.median(speed.sigma(begin, end) * np.sqrt(end - begin))))
         shared["parameters"] = tuple(shared["parameters"])
+        shared["processes"] = (lasting_error(ODOMETER_ERROR, density, cls),)
         sigma = np.hypot(speed.sigma(begin, end), s.odometer_density / np.sqrt(end - begin))
         return cls(
             keyframe=rows + 1,
@@ -384,4 +409,7 @@ class OdometerSpeed(Wheels):
         jacobians[ODOMETER_SCALE] = -read[:, None, None]
         if ODOMETER_DELAY in parameters:
             jacobians[ODOMETER_DELAY] = -(scale * by_delay)[:, None, None]
+        if ODOMETER_ERROR in parameters:
+            residual = residual + parameters[ODOMETER_ERROR]
+            jacobians[ODOMETER_ERROR] = np.ones((len(residual), 1, 1))
         return Linearized(residual, jacobians, self.sigma[rows])

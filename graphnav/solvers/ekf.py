@@ -37,7 +37,6 @@ from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import Solution
-from graphnav.solvers.adaptive import Noise
 from graphnav.solvers.passes import (
     Filtered,
     Forward,
@@ -71,8 +70,7 @@ def ekf(
     ----------
     opening : s, the end of what the alignment has seen of the recording; up to there the filter runs twice. Estimates
         after it depend on nothing later than themselves.
-    watch : look for errors that last in the rows that are to be watched, and go back to before them; and for noise
-        in those whose sigmas are to be adapted.
+    watch : look for errors that last in the rows that are to be watched, and go back to before them.
     known : where the opening is linearised, from its first keyframe on, if that is known better than by a first pass.
     """
     began = time.perf_counter()
@@ -137,7 +135,6 @@ def _forward(
     records = stack.records
     fixes = [c for c in problem.constraints if watch and isinstance(c, GnssPosition | GnssVelocity)]
     watched = [c for c in fixes if c.watched]
-    noise = Noise([c for c in fixes if c.adaptive != "off" and c.weight is None])  # weights know what follows as well
     alone = [c.gate is not None or c.robust != "none" or any(c is one for one in fixes) for c in problem.constraints]
     one_by_one = [True] * len(alone)  # each linearised where those before it have led
     bank = Bank(watched, problem.t, D) if watched else None
@@ -172,7 +169,7 @@ def _forward(
         ahead[k], all_Pp[k] = x, P
         back: int | None = None
         for some in stack.together(k, one_by_one if where is own else alone):
-            x, P, fault = _update(some, x, P, where, stack, bank, noise)
+            x, P, fault = _update(some, x, P, where, stack, bank)
             if fault is not None:
                 again = verdicts.settle(some.parts[0][0].name, fault, float(problem.t[k]))
                 back = int(np.searchsorted(problem.t, again))
@@ -195,7 +192,7 @@ def _forward(
             all_P[k - 1] = P = about_own(P, x[:3])
             x = own.plus(_one(about, k - 1), x)
     stack.finish()
-    weights = {c.name: records[c.name].decided * noise.weight(c.name) for c in fixes}
+    weights = {c.name: records[c.name].decided for c in fixes}
     errors, errors_ahead = np.array(found[:n]).reshape(n, D), np.array(ahead[:n]).reshape(n, D)
     filtered, predicted = _points(about, errors, found[n:]), _points(about, errors_ahead, ahead[n:])
     return Forward(
@@ -211,6 +208,7 @@ def _forward(
         about,
         errors,
         errors_ahead,
+        stack.log_likelihood,
     )
 
 
@@ -240,7 +238,7 @@ def _points(about: Points | None, errors: Array, own: list[Estimate]) -> Points:
 
 
 def _update(
-    some: Together, x: Any, P: Array, where: Any, stack: Stack, bank: Bank | None, noise: Noise
+    some: Together, x: Any, P: Array, where: Any, stack: Stack, bank: Bank | None
 ) -> tuple[Any, Array, float | None]:
     """One measurement update; when a fault began comes last."""
     D, (rows, lo, hi) = len(P), some.parts[0]
@@ -256,7 +254,6 @@ def _update(
         HPHt = H @ PHt
         right = [r[None], PHt]
         if some.alone and not left:
-            sigma = noise.raised(rows.name, lo, r, HPHt.diagonal(), sigma)
             if tests is not None:
                 G = tests.signature(rows.name, some.k, H)
                 right.append(tests.own(rows.name, G).T)

@@ -57,6 +57,14 @@ class Forward(Points):
     about: Points | None  # where the first n keyframes were linearised; up to the last of them P is of errors about
     errors: Array  # (n, D) these points, and the filtered
     errors_predicted: Array  # (n, D) and the predicted state is these errors away from them
+    log_likelihood: Array  # (K,) of the innovations at each keyframe, but for a constant
+
+    @property
+    def predicted_from(self) -> States:
+        """(K-1) the states that the steps to the next keyframes were linearised at."""
+        n = 0 if self.about is None else len(self.about.values)
+        given = [] if self.about is None else [self.about.states[: min(n, len(self.values) - 1)]]
+        return States.stack([*given, self.states[n:-1]]) if n < len(self.values) else given[0]
 
     @property
     def linearised(self) -> Points:

@@ -134,3 +134,7 @@ class Stack:
             record.residual[:n], record.sigma[:n] = residual[place], sigma[place]
             total = np.bincount(k, np.sum(white[place] ** 2, axis=1), self.K)
             record.nis[:n] = total[k] / np.bincount(k, minlength=self.K)[k]
+        used = (kind >= 0) & (self.root_weight > 0.0)
+        spread = np.where(used, np.abs(np.diagonal(self._root, axis1=1, axis2=2)), 1.0)
+        self.log_likelihood = -np.sum(np.log(np.where(spread > 0.0, spread, 1.0)), axis=1)
+        self.log_likelihood -= 0.5 * np.sum(np.where(used, white, 0.0) ** 2, axis=1)

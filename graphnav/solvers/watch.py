@@ -26,7 +26,7 @@ import numpy as np
 from scipy.linalg.lapack import dtrtrs
 from scipy.special import chdtri, gammaincinv
 
-from graphnav.constraints.gnss import GnssPosition, GnssVelocity
+from graphnav.constraints.gnss import GnssPosition, GnssVelocity, whole_sigma
 from graphnav.rotation import Array
 from graphnav.solution import Fault
 
@@ -106,9 +106,8 @@ def _slots(constraints: Iterable[GnssPosition | GnssVelocity], t: Array | None, 
         if t is not None and len(rows) > 1:
             period = float(np.median(np.diff(t[rows.keyframe])))
         L = 1 + int(np.clip(np.log2(LONGEST / max(period, 1e-3)), 0, 12))
-        stated = rows.stated if isinstance(rows, GnssPosition) else rows.sigma
         columns = slice(end, end + L * m)
-        out[rows.name] = _Slots(columns, L, m, np.median(stated, axis=0), isinstance(rows, GnssPosition))
+        out[rows.name] = _Slots(columns, L, m, whole_sigma(rows), isinstance(rows, GnssPosition))
         end += L * m
     return out
 

@@ -1,0 +1,264 @@
+"""All noise figures of a recording at once, by the likelihood of its innovations.
+
+Maximum a posteriori: with L the innovation log-likelihood of the filter and a log-normal prior on every variance factor,
+the estimate maximises L plus the logarithm of the priors. From pass to pass, filter and smoother linearised at the
+points that the pass before left, every factor f with redundancy B and the sum of squares A (`graphnav.noise.moments`)
+goes to the maximum over x = ln(f_new / f) of
+
+    -(B x + A e^-x) / 2 - (ln f + x - m)^2 / (2 s^2)
+
+the likelihood of A / f as a chi-square variable of B degrees of freedom, and the prior. Without a prior that is the
+fixed point f <- f A / B of Foerstner (1979), Koch (1999, section 3.6) and MacKay (1992); no sensor is judged before
+another, so none is believed for having come first. What few rows say is bounded: squares that chance would leave once
+in a thousand times have no more say than that (`_CHANCE`), and a row, or what is wrong with wheels for seconds, has a
+weight by which it would be that large.
+
+The first passes see the first `_FIRST` keyframes only; the last ones see all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import chdtri
+
+from graphnav.constraints.base import Constraint
+from graphnav.noise.apply import with_noise
+from graphnav.noise.model import Figure, NoiseModel, RowWeights
+from graphnav.noise.moments import disturbances, imu_moments, lag_moments, process_moments, row_moments
+from graphnav.noise.priors import TIME_WITHIN, prior
+from graphnav.preintegration import NOISE_FIGURES
+from graphnav.problem import ParameterChain, Problem
+from graphnav.rotation import Array
+from graphnav.solvers.ekf import ekf, refilter
+from graphnav.solvers.passes import Forward, Points, Smoothed, points_of, values_of
+from graphnav.solvers.rts import backward
+from graphnav.state import SECONDS
+
+_CHANCE = 1e-3  # below which a squared residual is taken for an outlier
+_FIRST = 1500  # keyframes: figures told by a thousand numbers are good to a twentieth
+_ROUNDS = 12
+_TIMES = (0.2, 60.0)  # s, between which what lasts for seconds is looked for
+_GRID = np.linspace(-1.0, 1.0, 21)
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """A noise model, the points its last pass left, and how it came about."""
+
+    noise: NoiseModel
+    points: Smoothed
+    forward: Forward
+    log_posterior: float
+    passes: int
+
+
+@dataclass
+class _Figures:
+    """The figures as they are so far."""
+
+    log: dict[str, float]
+    freedom: dict[str, float] = field(default_factory=dict)
+    times: dict[str, float] = field(default_factory=dict)
+    weights: dict[str, RowWeights] = field(default_factory=dict)
+    excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
+    gained: float = 0.0  # twice the log-posterior that the latest changes promise
+
+    def model(self) -> NoiseModel:
+        figures = {}
+        for name, x in self.log.items():
+            m, s = prior(name)
+            B = self.freedom.get(name, 0.0)
+            figures[name] = Figure(x, float((0.5 * B + s**-2.0) ** -0.5), m, s, B)
+        return NoiseModel(figures, dict(self.times), dict(self.weights), self.excluded)
+
+    def log_prior(self) -> float:
+        return -0.5 * sum(((x - m) / s) ** 2 for name, x in self.log.items() for m, s in [prior(name)])
+
+    def update(self, name: str, A: float, B: float) -> None:
+        """One component, by its squares and its redundancy."""
+        m, s = prior(name)
+        x, before = 0.0, self.log[name]
+        for _ in range(50):
+            slope = 0.5 * (A * np.exp(-x) - B) - (before + x - m) / s**2
+            step = float(np.clip(slope / (0.5 * A * np.exp(-x) + s**-2.0), -1.0, 1.0))
+            x += step
+            if abs(step) < 1e-6:
+                break
+        x = float(np.clip(x, -3.0, 3.0))
+        self.gained += 0.5 * (A * (1.0 - np.exp(-x)) - B * x) - ((before + x - m) ** 2 - (before - m) ** 2) / (2 * s**2)
+        self.log[name], self.freedom[name] = before + x, B
+
+
+def estimate_noise(
+    problem: Problem,
+    opening: float | None = None,
+    start: NoiseModel | None = None,
+    near: tuple[Points, Problem] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> NoiseEstimate:
+    """Estimate the noise model of a problem posed with stated noise and with the parts of its intervals' noise.
+
+    Parameters
+    ----------
+    opening : as for `graphnav.solvers.ekf.ekf`.
+    start : figures to set out from, weights of rows, and what is left out; prior medians when None.
+    near : points of all keyframes to linearise at first, and the problem that they are of.
+
+    Raises
+    ------
+    EstimationError
+        If the filter breaks down.
+    """
+    figures = _begin(problem, start)
+    about = (
+        _first_points(problem, figures, opening)
+        if near is None
+        else _carried(*near, with_noise(problem, figures.model()))
+    )
+    passes, total = int(near is None), len(problem.t)
+    ends = [total] if total <= 2 * _FIRST else [_FIRST, total]
+    for end in ends:
+        best = -np.inf
+        for k in range(_ROUNDS):
+            used = with_noise(problem, figures.model())
+            forward, smoothed = _pass(used, about, end)
+            passes += 1
+            now = float(np.sum(forward.log_likelihood)) + figures.log_prior()
+            about_part = smoothed
+            if progress is not None:
+                progress("noise", (k + 1) / _ROUNDS)
+            before = figures.log.copy()
+            _improve(figures, used, forward, smoothed, end)
+            about = _spliced(about, about_part, used)
+            # what is left to gain is less than the figures would gain by chance
+            if k > 1 and now - best < 0.5 * len(before):
+                break
+            best = max(best, now)
+    return NoiseEstimate(figures.model(), smoothed, forward, now, passes)
+
+
+def _begin(problem: Problem, start: NoiseModel | None) -> _Figures:
+    names = [f"imu.{name}" for name in NOISE_FIGURES]
+    for rows in problem.constraints:
+        names += [*rows.noise_groups()[0], *(g for p in (*rows.parameters, *rows.processes) for g in p.noise_groups)]
+    names += [group for p in problem.parameters.values() for group in p.noise_groups]
+    log = {name: prior(name)[0] for name in dict.fromkeys(names)}
+    if start is None:
+        return _Figures(log)
+    log |= {name: start.figures[name].log_factor for name in log if name in start.figures}
+    return _Figures(log, times=dict(start.times), weights=dict(start.weights), excluded=start.excluded)
+
+
+def _first_points(problem: Problem, figures: _Figures, opening: float | None) -> Points:
+    used = with_noise(problem, figures.model())
+    return backward(used, ekf(used, opening=opening))
+
+
+def _carried(points: Points, before: Problem, after: Problem) -> Points:
+    return points_of(after, points.states, values_of(before, points))
+
+
+def _spliced(about: Points, part: Points, problem: Problem) -> Points:
+    """Points with the first of them replaced."""
+    n = len(part.values)
+    if n == len(about.values):
+        return Points(part.states, part.values)
+    states = type(part.states).stack([part.states, about.states[n:]])
+    return Points(states, np.concatenate([part.values, about.values[n:]]))
+
+
+def _pass(problem: Problem, about: Points, end: int) -> tuple[Forward, Smoothed]:
+    forward = refilter(problem, about.first(end))
+    return forward, backward(problem, forward)
+
+
+def _capped(A: Array, B: Array, freedom: int) -> tuple[float, float]:
+    """Sums of squares and of redundancies, each square no larger than chance allows."""
+    most = float(chdtri(freedom, _CHANCE)) / freedom
+    return float(np.sum(np.minimum(A, most * B))), float(np.sum(B))
+
+
+def _improve(figures: _Figures, problem: Problem, forward: Forward, smoothed: Smoothed, end: int) -> None:
+    """One step for all figures and weights."""
+    figures.gained = 0.0
+    steps = disturbances(problem, forward, smoothed)
+    A, B = imu_moments(problem, forward, steps)
+    for i, name in enumerate(NOISE_FIGURES):
+        figures.update(f"imu.{name}", *_capped(A[:, i], B[:, i], 3))
+    driven: dict[str, tuple[Array, Array, Array]] = {}
+    for chain in problem.chains:
+        if chain.parameter.noise_groups:
+            driven[chain.parameter.name] = process_moments(problem, chain, steps, end)
+            _improve_process(figures, chain, driven[chain.parameter.name])
+            if chain.parameter.correlation_time == figures.times.get(chain.parameter.name, SECONDS):
+                _improve_time(figures, problem, chain, lag_moments(problem, chain, forward, smoothed, steps, end))
+    for rows in problem.constraints:
+        names, index = rows.noise_groups()
+        if not names:
+            continue
+        n = int(np.searchsorted(rows.keyframe, end))
+        found = row_moments(problem, rows, smoothed, n)
+        for i, name in enumerate(names):
+            own = index[:n] == i
+            if own.any():
+                figures.update(name, *_capped(found.A[own], found.B[own], 1))
+        _weigh(figures, problem, rows, found.left_out, n)
+
+
+def _improve_process(figures: _Figures, chain: ParameterChain, moments: tuple[Array, Array, Array]) -> None:
+    _, A, B = moments
+    groups = np.array(chain.parameter.noise_groups)
+    for group in dict.fromkeys(chain.parameter.noise_groups):
+        own = groups == group
+        figures.update(group, *_capped(A[:, own], B[:, own], 1))
+
+
+def _improve_time(figures: _Figures, problem: Problem, chain: ParameterChain, lags: tuple[Array, ...]) -> None:
+    """The correlation time by expectation and maximisation, on a grid, with a log-normal prior about `SECONDS`."""
+    dt, later, cross, before = lags
+    p = chain.parameter
+    assert p.correlation_time is not None
+    told = np.array([figures.freedom.get(group, 0.0) > 1.0 for group in p.noise_groups])
+    if not told.any() or not len(dt):
+        return
+    times = p.correlation_time * np.exp(_GRID)
+    a = np.exp(-dt[:, None] / times)[..., None]
+    q = (1.0 - a * a) * chain.sigma[0] ** 2
+    squares = later[:, None] - 2.0 * a * cross[:, None] + a * a * before[:, None]
+    value = -0.5 * np.sum((np.log(q) + squares / q)[..., told], axis=(0, 2))
+    value -= 0.5 * (np.log(times / SECONDS) / TIME_WITHIN) ** 2
+    j = int(np.clip(np.argmax(value), 1, len(_GRID) - 2))
+    low, here, high = value[j - 1 : j + 2]
+    bend = low - 2.0 * here + high
+    off = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
+    found = p.correlation_time * np.exp(_GRID[j] + (_GRID[1] - _GRID[0]) * np.clip(off, -1.0, 1.0))
+    figures.times[p.name] = float(np.clip(found, *_TIMES))
+
+
+def _weigh(figures: _Figures, problem: Problem, rows: Constraint, left_out: Array, n: int) -> None:
+    """Weights of the first n rows by what they are off from where all others put them."""
+    t = problem.t[rows.keyframe]
+    squared, most = np.sum(left_out, axis=1), float(chdtri(left_out.shape[1], _CHANCE))
+    if rows.bursts:
+        squared = _bursts(t[:n], squared, left_out.shape[1], most)
+    weight = np.minimum(1.0, most / np.maximum(squared, 1e-30))
+    before = np.ones(len(rows)) if rows.weight is None else rows.weight
+    weight = np.concatenate([weight, before[n:]])  # later ones as they were
+    less = (weight < 1.0) & (before > 0.0)
+    figures.weights[rows.name] = RowWeights(t[less], weight[less])
+
+
+def _bursts(t: Array, squared: Array, freedom: int, most: float) -> Array:
+    """Squared residuals (n,) with those of a burst in place of their own: as unlikely as all within `SECONDS` together.
+
+    What is wrong with wheels for seconds shows in no row alone. The mean over a window of m rows is compared with what
+    chance allows for m times the degrees of freedom.
+    """
+    first, last = np.searchsorted(t, t - 0.5 * SECONDS), np.searchsorted(t, t + 0.5 * SECONDS, side="right")
+    total = np.concatenate([[0.0], np.cumsum(squared)])
+    m = last - first
+    together = (total[last] - total[first]) / chdtri(freedom * m, _CHANCE) * most
+    return np.asarray(np.maximum(squared, together))

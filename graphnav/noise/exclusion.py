@@ -1,0 +1,163 @@
+"""Which measurements are wrong for a while: each span decided once, by evidence.
+
+The bank of likelihood-ratio tests (`graphnav.solvers.watch`) says in which spans fixes disagree with everything else by
+something that lasts. Who is wrong there is another question. With the noise model as it is, each span is put as three
+models, each with its own likelihood of the innovations from the span's beginning to that of the next one:
+
+    neither     all is as the noise model has it
+    fixes       the fixes of the span have one unknown error in common
+    wheels      what is assumed of wheels, and the odometer, have one unknown error in common there
+
+An unknown error has a Gaussian prior about zero, as wide as such errors get (`_WIDE`); what that width costs in
+likelihood is the cost of the explanation (MacKay 1992, "Bayesian interpolation": the Occam factor). The best model
+decides what is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from graphnav import faults
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
+from graphnav.noise.apply import row_weights, with_noise
+from graphnav.noise.estimate import NoiseEstimate
+from graphnav.noise.model import NoiseModel, RowWeights
+from graphnav.problem import Problem
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+from graphnav.solution import Fault
+from graphnav.solvers.ekf import refilter
+from graphnav.solvers.passes import Points, points_of, values_of
+from graphnav.state import Parameter, States
+
+FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
+_WIDE = {"m": 100.0, "m/s": 10.0}  # reflections in a city are off by up to a hundred metres; wheels by their speed
+_NONE = 1e-9  # sigma of an error that is not there
+
+
+@dataclass(frozen=True)
+class _Shifted(Constraint):
+    """Rows of a constraint with an error in common within spans."""
+
+    inner: Any = None
+    error: str = ""
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return str(self.inner.name)
+
+    @property
+    def axes(self) -> tuple[str, ...]:  # type: ignore[override]
+        return tuple(self.inner.axes)
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        return np.empty(0)
+
+    @classmethod
+    def build(cls, scene: Scene) -> None:
+        return None
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        shift = parameters[self.error]
+        linear = self.inner.linearize(states, {k: v for k, v in parameters.items() if k != self.error}, rows)
+        n, m = linear.residual.shape
+        J = linear.jacobians | {self.error: np.broadcast_to(np.eye(m), (n, m, m))}
+        return Linearized(linear.residual + shift, J, linear.sigma)
+
+
+def with_common_errors(problem: Problem, spans: list[tuple[float, float]], kinds: tuple[str, ...]) -> Problem:
+    """The problem with one unknown error of each of some constraints in each span (s)."""
+    begins, wide = [float(problem.t[0]) - 1.0], [0.0]
+    for a, b in spans:
+        begins += [a - SAME_TIME, b + SAME_TIME]
+        wide += [1.0, 0.0]
+
+    def shifted(rows: Constraint) -> Constraint:
+        if rows.name not in kinds:
+            return rows
+        name, m = f"{rows.name}_fault", len(rows.axes)
+        sigma = np.maximum(np.outer(wide, np.full(m, _WIDE[rows.unit])), _NONE)
+        own = Parameter(name, np.zeros(sigma.shape), sigma, rows.unit, begins=np.array(begins))
+        return _Shifted(
+            keyframe=rows.keyframe, parameters=(*rows.parameters, own), weight=rows.weight, inner=rows, error=name
+        )
+
+    return replace(problem, constraints=tuple(shifted(rows) for rows in problem.constraints))
+
+
+def exclude(base: Problem, found: NoiseEstimate) -> tuple[NoiseModel, int]:
+    """A noise model that leaves out what is wrong in spans, and how many filter passes that took.
+
+    Parameters
+    ----------
+    base : posed with stated noise.
+    found : estimated with everything used.
+    """
+    noise = found.noise
+    # a fault that rows have lost their weight for is to be seen by the tests
+    open_ = with_noise(base, replace(noise, weights={k: w for k, w in noise.weights.items() if k not in FIXES}))
+    about = points_of(open_, found.points.states, values_of(open_, found.points))
+    watched = refilter(open_, about, watch=True)
+    spans = join_spans(faults.spans(faults.weighted(open_, watched.weights)))
+    if not spans:
+        return noise, 1
+    inside = {name: _outside(some, spans) for name, some in noise.weights.items()}
+    used = with_noise(base, replace(noise, weights=inside))
+    likelihood = evidence(used, about, spans)
+    excluded: dict[str, tuple[tuple[float, float], ...]] = {}
+    for span, one in zip(spans, likelihood, strict=True):
+        for kinds, gain in ((FIXES, one[1] - one[0]), (WHEELS, one[2] - one[0])):
+            if gain > 0.0 and gain == np.max(one - one[0]):
+                excluded |= {name: (*excluded.get(name, ()), span) for name in kinds}
+    present = {rows.name for rows in base.constraints}
+    excluded = {name: some for name, some in excluded.items() if name in present}
+    return replace(noise, weights=inside, excluded=excluded), 4
+
+
+def _outside(some: RowWeights, spans: list[tuple[float, float]]) -> RowWeights:
+    """The weights of rows outside spans."""
+    keep = np.ones(len(some.t), dtype=bool)
+    for begin, end in spans:
+        keep &= (some.t < begin - SAME_TIME) | (some.t > end + SAME_TIME)
+    return RowWeights(some.t[keep], some.weight[keep])
+
+
+def share_left_out(problem: Problem, noise: NoiseModel) -> float:
+    """Share of the information of the positions that a noise model leaves out."""
+    rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
+    return 0.0 if rows is None else 1.0 - float(np.mean(row_weights(problem.t[rows.keyframe], noise, rows.name)))
+
+
+def evidence(problem: Problem, about: Points, spans: list[tuple[float, float]]) -> Array:
+    """(M, 3) log-likelihood of the innovations from each span's beginning on: neither, fixes or wheels wrong in it.
+
+    Parameters
+    ----------
+    problem : with its noise model and no fix left out.
+    about : points of all keyframes.
+    spans : s, first and last wrong fix, in order and apart.
+    """
+    edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
+    known = values_of(problem, about)
+    found = []
+    for kinds in ((), FIXES, WHEELS):
+        one = with_common_errors(problem, spans, kinds) if kinds else problem
+        likelihood = refilter(one, points_of(one, about.states, known)).log_likelihood
+        found.append([float(np.sum(likelihood[a:b])) for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    return np.array(found).T
+
+
+def join_spans(found: tuple[Fault, ...]) -> list[tuple[float, float]]:
+    """Spans (s) of some faults, those that touch in one; a single fix is no span, its weight says what it is worth."""
+    out: list[tuple[float, float]] = []
+    for a, b in sorted((fault.t_start, fault.t_end) for fault in found if fault.count > 1):
+        if out and a <= out[-1][1] + SAME_TIME:
+            out[-1] = (out[-1][0], max(b, out[-1][1]))
+        else:
+            out.append((a, b))
+    return out

@@ -1,0 +1,107 @@
+"""What a smoother says of every variance component, and of every row.
+
+The innovation log-likelihood L of a linear Gaussian problem has, by the logarithm of the variance factor f of a component
+that adds the covariance f Q_i to a step or to rows, the derivative
+
+    dL / d ln f = (A - B) / 2      A = sum r^T f Q_i r      B = sum tr(f Q_i N)
+
+with r and N of de Jong and Koopman's disturbance smoother (Koopman 1993, "Disturbance smoother for state space models"),
+at a step
+
+    r = P-^-1 (x^s - x-)           N = P-^-1 (P- - P^s) P-^-1
+
+and at rows with residual e and Jacobian H at the smoothed state, r = R^-1 e and N = R^-1 - R^-1 H P^s H^T R^-1. B is the
+component's redundancy, the degrees of freedom that the data tell it by (Foerstner 1979; MacKay 1992 calls it the number
+of well-determined parameters), and E[A] = B where f is right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.constraints.base import Constraint, assemble
+from graphnav.problem import ParameterChain, Problem
+from graphnav.rotation import Array
+from graphnav.solvers.passes import Forward, Smoothed, values_of
+from graphnav.state import DIM
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Disturbances of all steps: `step` n leads to keyframe n, and keyframe 0 is what the prior brings."""
+
+    r: Array  # (K, D)
+    N: Array  # (K, D, D)
+    inverse: Array  # (K, D, D) P-^-1
+
+
+@dataclass(frozen=True)
+class RowMoments:
+    """Rows of a constraint at a smoothed solution."""
+
+    A: Array  # (N, m) w e^2 / R
+    B: Array  # (N, m) redundancy
+    left_out: Array  # (N, m) squared residual against its variance, predicted without the row, as if its weight were 1
+    residual: Array  # (N, m)
+
+
+def disturbances(problem: Problem, forward: Forward, smoothed: Smoothed) -> Steps:
+    """Of the steps between keyframes."""
+    ahead = forward.predicted
+    d = np.concatenate([smoothed.states.minus(ahead.states), smoothed.values - ahead.values], axis=1)
+    before = forward.P_predicted
+    inverse = np.linalg.inv(before)
+    r = (inverse @ d[..., None])[..., 0]
+    return Steps(r, inverse @ (before - smoothed.P) @ inverse, inverse)
+
+
+def imu_moments(problem: Problem, forward: Forward, steps: Steps) -> tuple[Array, Array]:
+    """A and B (K-1, 4) of `NOISE_FIGURES`, by interval."""
+    start = forward.predicted_from.R_nb
+    L = problem.motion.frames(slice(0, len(start)), start)
+    Lt = np.swapaxes(L, -1, -2)
+    r = (Lt @ steps.r[1:, :DIM, None])[..., 0]
+    N = Lt @ steps.N[1:, :DIM, :DIM] @ L
+    Q = problem.intervals.parts[: len(r)]
+    return np.einsum("ni,nfij,nj->nf", r, Q, r, optimize=True), np.einsum("nfij,nji->nf", Q, N, optimize=True)
+
+
+def process_moments(problem: Problem, chain: ParameterChain, steps: Steps, end: int) -> tuple[Array, Array, Array]:
+    """Keyframes (n,) at which a process is driven, and A and B (n, k) there; the first is its steady variance."""
+    at = problem.columns[chain.parameter.name]
+    k = np.concatenate([[0], np.flatnonzero(np.diff(chain.node[:end])) + 1])
+    q = chain.sigma[chain.node[k]] ** 2
+    N = np.diagonal(steps.N[k][:, at, at], axis1=-2, axis2=-1)
+    return k, q * steps.r[k, at] ** 2, q * N
+
+
+def row_moments(problem: Problem, rows: Constraint, smoothed: Smoothed, n: int) -> RowMoments:
+    """Of the first n rows of a constraint."""
+    at, which = rows.keyframe[:n], slice(0, n)
+    values = values_of(problem, smoothed)
+    linear = rows.linearize(smoothed.states[at], {p.name: values[p.name][at] for p in rows.parameters}, which)
+    H = assemble(linear, problem.columns, smoothed.P.shape[-1])
+    HPH = np.einsum("nij,nij->ni", H @ smoothed.P[at], H)
+    w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
+    R = linear.sigma**2
+    B = np.clip(1.0 - w * HPH / R, 1e-6, 1.0)
+    left_out = (linear.residual / B) ** 2 / (R + HPH / B)
+    return RowMoments(w * linear.residual**2 / R, np.where(w > 0.0, B, 0.0), left_out, linear.residual)
+
+
+def lag_moments(
+    problem: Problem, chain: ParameterChain, forward: Forward, smoothed: Smoothed, steps: Steps, end: int
+) -> tuple[Array, Array, Array, Array]:
+    """Of a process, from node to node: times between (n,), E[c' c'], E[c' c] and E[c c] (n, k), c' the later."""
+    at = problem.columns[chain.parameter.name]
+    own = slice(at.start - DIM, at.stop - DIM)
+    k = np.flatnonzero(np.diff(chain.node[:end])) + 1
+    # Cov(x_k-1, x_k) = P_k-1 F^T P-_k^-1 P^s_k, of the columns of the process
+    gain = forward.P[k - 1][:, at] @ np.swapaxes(forward.F[k - 1], -1, -2) @ steps.inverse[k]
+    cross = np.einsum("kid,kdi->ki", gain, smoothed.P[k][:, :, at])
+    c0, c1 = smoothed.values[k - 1, own], smoothed.values[k, own]
+    v0, v1 = (np.diagonal(smoothed.P[j][:, at, at], axis1=-2, axis2=-1) for j in (k - 1, k))
+    dt = np.diff(chain.t)[chain.node[k] - 1]
+    return dt, c1 * c1 + v1, c1 * c0 + cross, c0 * c0 + v0

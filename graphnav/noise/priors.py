@@ -1,0 +1,26 @@
+"""Priors of the variance factors: log-normal, with a median and a 1-sigma of the logarithm.
+
+A figure that somebody wrote down holds within a factor of three either way (1-sigma): data sheets give the sensor on a
+bench and not in a car, receivers print sigmas for the whole of an error or for its noise alone. That is one figure for
+all sensors, so that no sensor is believed before another; where the data tell a figure by tens of degrees of freedom
+it has no weight, where they tell nothing it is what is used.
+
+A receiver's sigma is meant to hold for the whole of its error. What part of that is white nobody states: the medians
+of the processes give it half to hours, half to minutes, and a quarter to seconds, in units of the stated variance, and
+the white part starts at all of it; the data then part it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+WITHIN = 2.0 * np.log(3.0)  # 1-sigma of the logarithm of a variance: a factor of three in sigma
+_SHARES = {"seconds": 0.25, "minutes": 0.5, "hours": 0.5}  # of a GNSS sensor's stated variance
+TIME_WITHIN = np.log(3.0)  # 1-sigma of the logarithm of a correlation time
+
+
+def prior(group: str) -> tuple[float, float]:
+    """Median and 1-sigma of the logarithm of a group's variance factor."""
+    parts = group.split(".")
+    share = next((_SHARES[part] for part in parts if part in _SHARES), 1.0) if parts[0].startswith("gnss") else 1.0
+    return float(np.log(share)), WITHIN

@@ -1,0 +1,41 @@
+"""A noise model in words and numbers that people read."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.noise.model import NoiseModel
+from graphnav.problem import Problem
+
+_IMU = {
+    "imu.gyro_noise_density": "gyro noise",
+    "imu.accel_noise_density": "accelerometer noise",
+    "imu.gyro_bias_walk": "gyro bias walk",
+    "imu.accel_bias_walk": "accelerometer bias walk",
+}
+
+
+def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
+    """Sentences on the figures used, beside those stated; none where all is as stated."""
+    out = []
+    imu = [
+        f"{words} {np.sqrt(noise.figures[name].factor):.2g}" for name, words in _IMU.items() if name in noise.figures
+    ]
+    if imu:
+        out.append(f"noise model, IMU: stated figures multiplied by: {', '.join(imu)}")
+    for rows in problem.constraints:
+        names = [g for g in rows.noise_groups()[0] if g in noise.figures]
+        errors = [p for p in rows.parameters if p.noise_groups and p.correlation_time is not None]
+        if not names:
+            continue
+        parts = [f"{g.removeprefix(rows.name + '.')} {np.sqrt(noise.figures[g].factor):.2g}" for g in names]
+        for p in errors:
+            sizes = dict.fromkeys(p.noise_groups)
+            each = ", ".join(f"{g.rsplit('.', 1)[-1]} {np.sqrt(noise.factor(g, 0.0)):.2g}" for g in sizes)
+            out_time = f"{p.correlation_time:.2g} s"
+            parts.append(f"Gauss-Markov with {out_time}: {each}")
+        out.append(f"noise model, {rows.name}: white part in stated sigmas: {'; '.join(parts)}")
+        some = noise.weights.get(rows.name)
+        if some is not None and len(some.t):
+            out.append(f"{rows.name}: {len(some.t)} of {len(rows)} rows are outliers and have less weight")
+    return tuple(out)

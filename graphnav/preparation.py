@@ -1,0 +1,231 @@
+"""From a recording to the problem that every solver gets: aligned, posed, its noise model estimated.
+
+A straight line: align, build the problem, estimate the noise model, look once for measurements that are wrong in spans
+and decide each by evidence, estimate again without them. The filter then runs as a filter would, from the start on, and
+its smoother is where the batch solver sets out.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from graphnav import faults
+from graphnav.alignment import Alignment, align, with_known_heading
+from graphnav.alignment.first import some
+from graphnav.config import Settings
+from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
+from graphnav.detectors import Detections, detect
+from graphnav.earth import LocalFrame
+from graphnav.errors import EstimationError
+from graphnav.noise.apply import with_noise, without_parts
+from graphnav.noise.estimate import NoiseEstimate, estimate_noise
+from graphnav.noise.exclusion import exclude, share_left_out
+from graphnav.noise.model import STATED, NoiseModel
+from graphnav.noise.words import describe
+from graphnav.problem import Problem, pose
+from graphnav.progress import Progress, tell
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+from graphnav.solution import Solution
+from graphnav.solvers.batch import batch
+from graphnav.solvers.ekf import ekf
+from graphnav.solvers.near import near
+from graphnav.solvers.passes import Filtered, Smoothed, about_solved, near_to
+from graphnav.solvers.rts import backward
+from graphnav.state import States
+
+_FAR = 0.5  # rad between the stated and the found start attitude, beyond which a filter is astray for a while
+_LOST = 0.1  # rad by which a filter may be off for a smoother to rest on it
+_MOST = 0.5  # share of the fixes that can be wrong; beyond it, it is the start that is
+_WHEELS = (NonHolonomic, OdometerSpeed)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What all solvers of a recording share."""
+
+    problem: Problem  # with its noise model
+    noise: NoiseModel
+    start: Alignment  # of the prior: with the heading that the user states
+    aligned: Alignment  # as found
+    detections: Detections
+    forward: Filtered
+    smoothed: Smoothed
+    notes: tuple[str, ...]
+    timings: dict[str, float]
+    passes: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def astray(self) -> bool:
+        """Whether the stated start is so far from the one found that a filter from there is astray for a while."""
+        return _astray(self.aligned, self.start)
+
+
+def prepare(
+    recording: Recording,
+    settings: Settings,
+    frame: LocalFrame,
+    detections: Detections,
+    noise: NoiseModel | None = None,
+    progress: Progress | None = None,
+) -> Prepared:
+    """Align a recording, build its problem and find its noise model.
+
+    Parameters
+    ----------
+    detections : where the platform stands.
+    noise : to be used as it is; estimated, or as stated if the settings say so, when None.
+
+    Raises
+    ------
+    EstimationError
+        If the recording does not determine a trajectory.
+    """
+    timings: dict[str, float] = {}
+    passes: Counter[str] = Counter()
+
+    def booked(stage: str, since: float) -> float:
+        now = time.perf_counter()
+        timings[stage] = timings.get(stage, 0.0) + now - since
+        return now
+
+    def aligned_by(fixes: Recording, stationary: Array) -> Alignment:
+        tell("alignment")
+        since = time.perf_counter()
+        found = align(fixes, settings, frame, _smooth, stationary)
+        booked("alignment", since)
+        return found
+
+    def build(at: Alignment, found: Detections, parts: bool) -> Problem:
+        tell("preintegration")
+        since, start = time.perf_counter(), _start(at, with_known_heading(at, settings))
+        problem = pose(recording, settings, frame, start.state, start.sigma, found.stationary, parts_of_noise=parts)
+        booked("preintegration", since)
+        return problem
+
+    aligned = aligned_by(recording, detections.stationary)
+    told = aligned.motion is not None and settings.gnss.position
+    if noise is None and (settings.noise.mode == "stated" or not told):
+        noise = STATED
+    base = build(aligned, detections, parts=noise != STATED)
+    if noise is None:
+        since = time.perf_counter()
+        tell("noise")
+        best = _estimated(base, aligned, settings, progress, passes)
+        if share_left_out(base, best.noise) > _MOST:
+            # most fixes contradict what came of the start: it is looked for in what follows
+            try:
+                later = aligned_by(_after(recording, aligned), detections.stationary)
+                other = build(later, detections, parts=True)
+                again = _estimated(other, later, settings, progress, passes)
+                if share_left_out(other, again.noise) < share_left_out(base, best.noise):
+                    aligned, base, best = later, other, again
+            except EstimationError:
+                pass  # nothing moves later on
+        if best.noise.excluded:
+            # no start, and no stop, is to rest on fixes that are wrong
+            fixes = faults.without_excluded(recording, best.noise)
+            stops = detect(fixes, settings)
+            changed = _differ(stops.stationary, detections.stationary)
+            detections = stops if changed else detections
+            try:
+                found = aligned_by(fixes, detections.stationary)
+                if found.motion is not None and found.contradicts(aligned):
+                    aligned, changed = found, True
+            except EstimationError:
+                pass
+            if changed:
+                base = build(aligned, detections, parts=True)
+                best = estimate_noise(base, aligned.until, best.noise, progress=progress)
+                passes.update(filter=best.passes, smoother=best.passes)
+        noise = best.noise
+        booked("noise", since)
+    problem = without_parts(with_noise(base, noise))
+    start = with_known_heading(aligned, settings)
+    since = time.perf_counter()
+    forward = ekf(problem, progress, aligned.until)
+    filtered = booked("filter", since)
+    smoothed = backward(problem, forward, progress)
+    forward, smoothed = _find_way(problem, aligned, forward, smoothed, progress, passes)
+    booked("smoother", filtered)
+    passes.update(filter=1, smoother=1)
+    del timings["filter"]  # the filter's own solution has it
+    return Prepared(
+        problem, noise, start, aligned, detections, forward, smoothed, describe(noise, problem), timings, passes
+    )
+
+
+def _estimated(
+    base: Problem, aligned: Alignment, settings: Settings, progress: Progress | None, passes: Counter[str]
+) -> NoiseEstimate:
+    """The noise model, with spans of wrong measurements left out where evidence says so."""
+    found = estimate_noise(base, aligned.until, progress=progress)
+    passes.update(filter=found.passes, smoother=found.passes)
+    if settings.gnss.faults == "off":
+        return found
+    noise, used = exclude(base, found)
+    passes.update(filter=used)
+    if not noise.excluded:
+        return found
+    again = estimate_noise(base, aligned.until, noise, (found.points, with_noise(base, found.noise)), progress)
+    passes.update(filter=again.passes, smoother=again.passes)
+    return again
+
+
+def _start(found: Alignment, stated: Alignment) -> Alignment:
+    """Where estimation sets out: the stated start, unless a filter from there would be astray."""
+    return found if _astray(found, stated) else stated
+
+
+def _astray(found: Alignment, stated: Alignment) -> bool:
+    turn = found.state.minus(stated.state)[0, :3]
+    return found.motion is not None and bool(np.linalg.norm(turn) > _FAR)
+
+
+def _find_way(
+    problem: Problem,
+    aligned: Alignment,
+    forward: Filtered,
+    smoothed: Smoothed,
+    progress: Progress | None,
+    passes: Counter[str],
+) -> tuple[Filtered, Smoothed]:
+    """Filter and smooth about the batch solution where the filter was too far off for a smoother to rest on it.
+
+    Fixes that weigh little beside wheels let a filter that is not sure of its heading turn the mounting round
+    rather than the velocity, and no step finds back from there. So wheels come second.
+    """
+    if near_to(smoothed, forward.linearised, _LOST):
+        return forward, smoothed
+    states = smoothed.states
+    if any(isinstance(c, _WHEELS) for c in problem.constraints):
+        free = replace(problem, constraints=tuple(c for c in problem.constraints if not isinstance(c, _WHEELS)))
+        states = backward(free, ekf(free, progress, aligned.until)).states
+        states = batch(free, states, wanted=(), reintegrate=False).states
+    solved = batch(problem, states, wanted=(), reintegrate=False)
+    about = about_solved(problem, solved, smoothed)
+    _, smoothed = near(problem, about, aligned.until, progress)
+    passes.update(filter=3, smoother=2)
+    return ekf(problem, progress, aligned.until, known=smoothed), smoothed
+
+
+def _differ(a: Array, b: Array) -> bool:
+    """Whether one has a stop that the other has nothing of."""
+    return any(
+        not np.any((other[:, 0] < end) & (other[:, 1] > begin)) for one, other in ((a, b), (b, a)) for begin, end in one
+    )
+
+
+def _smooth(problem: Problem, start: States) -> Solution:
+    return batch(problem, start, wanted=(0,), reintegrate=False)
+
+
+def _after(recording: Recording, aligned: Alignment) -> Recording:
+    """Without the fixes that an alignment has seen."""
+    assert recording.gnss is not None
+    assert aligned.until is not None
+    return replace(recording, gnss=some(recording.gnss, recording.gnss.t > aligned.until))
