@@ -19,8 +19,9 @@ from dataclasses import replace
 import numpy as np
 
 from graphnav import rotation
+from graphnav.alignment.course import COURSE_SIGMA
 from graphnav.alignment.first import Alignment
-from graphnav.alignment.motion import COURSE_SIGMA, Smoother, in_motion, motion, plausible
+from graphnav.alignment.motion import Smoother, in_motion, motion, plausible
 from graphnav.alignment.rest import at_rest
 from graphnav.config import Settings
 from graphnav.detectors.base import NONE
