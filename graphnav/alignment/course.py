@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav import rotation
-from graphnav.alignment.travel import Travel, travel
-from graphnav.rotation import Array
+from graphnav.alignment.travel import across, travel
+from graphnav.constraints.base import SAME_TIME
+from graphnav.recording import Gnss
 from graphnav.solution import Solution
 
 COURSE_SIGMA = np.radians(10.0)  # rad, a stated forward axis against the course: mounting, side slip
@@ -25,7 +26,7 @@ class Heading:
     notes: tuple[str, ...] = ()
 
 
-def with_course(solution: Solution, sd: Array, dt: float, own: float, wide: float) -> Heading:
+def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> Heading:
     """Bring in that a vehicle's forward axis is its course, forwards or in reverse, to `COURSE_SIGMA`.
 
     Forwards, unless the accelerations speak against that at three sigmas; they mean a heading of density
@@ -33,21 +34,26 @@ def with_course(solution: Solution, sd: Array, dt: float, own: float, wide: floa
 
     Parameters
     ----------
-    solution : of the stretch of motion, from accelerations alone.
-    sd : (K,) m, 1-sigma along one axis of a fix at each of its keyframes.
-    dt : s between fixes.
+    tried : solutions of the stretch of motion from several start headings; that of least cost counts.
+    fixes : those they are of.
     own, wide : rad, 1-sigma of its heading, and that of the prior it becomes.
     """
-    facing = solution.states.R_nb[:, 0, 1] + 1j * solution.states.R_nb[:, 1, 1]
-    way = travel(solution.states.p[:, :2], sd, facing / np.maximum(np.abs(facing), 1e-9))
-    length = float(solution.t[-1] - solution.t[0])
-    own *= np.sqrt(_alike(way, length, dt))
+    least = int(np.argmin([one.cost for one in tried]))
+    best, dt = tried[least], float(np.median(np.diff(fixes.t)))
+    at = np.clip(np.searchsorted(best.t, fixes.t - SAME_TIME), 0, len(best.t) - 1)
+    yaw = np.unwrap(np.arctan2(best.states.R_nb[:, 1, 1], best.states.R_nb[:, 0, 1]))
+    way = travel(best.states.p[at, :2], across(fixes.sd), yaw[at])
+    gone = fixes.t - fixes.t[0]
+    alike = _alike(float(way.turn[-1]), float(gone[-1]), dt)
+    own = float(np.hypot(np.sqrt(alike) * own, _spread(tried, least, alike)))
     wide = max(own, wide)
-    up, P = solution.states.R_nb[0, 2], solution.covariance[0][12:15, 12:15]
-    drift = 0.5 * length * float(np.sqrt(up @ P @ up))
-    of_way = float(way.sigma[-1] / max(abs(way.D[-1]), 1e-9))
-    course = float(np.sqrt(COURSE_SIGMA**2 + of_way**2 + drift**2))
-    off, notes = -float(np.angle(way.D[-1])), ()
+    # the longer the way, the less do fixes err in its direction, and the more has a biased gyro turned
+    up, P = best.states.R_nb[0, 2], best.covariance[0][12:15, 12:15]
+    drift = 0.5 * gone * np.sqrt(alike * (up @ P @ up))
+    sigma = np.hypot(way.sigma / np.maximum(np.abs(way.D), 1e-9), drift)
+    told = int(np.argmin(sigma))
+    course = float(np.hypot(COURSE_SIGMA, sigma[told]))
+    off, notes = -float(np.angle(way.D[told])), tuple[str, ...]()
     for_forwards = 2.0 * np.cos(off) / (own**2 + course**2)
     if for_forwards < -0.5 * _SIGMAS**2:
         off = float(rotation.wrap(off + np.pi))
@@ -61,10 +67,19 @@ def with_course(solution: Solution, sd: Array, dt: float, own: float, wide: floa
     return Heading(gain * off, float(np.hypot((1.0 - gain) * own, gain * course)), float(np.sqrt(gain) * course), notes)
 
 
-def _alike(way: Travel, length: float, dt: float) -> float:
+def _spread(tried: list[Solution], least: int, alike: float) -> float:
+    """How far (rad) the headings of all solutions are from the best one, each as likely as its fit says."""
+    weight = np.array([np.exp((tried[least].cost - one.cost) / alike) for one in tried])
+    heading = np.array([rotation.to_rph(one.states.R_nb[0])[2] for one in tried])
+    off = rotation.wrap(heading - heading[least])
+    return float(np.sqrt(np.sum(weight * off**2) / np.sum(weight)))
+
+
+def _alike(turn: float, length: float, dt: float) -> float:
     """How many fixes in a row are worth one at worst, for what changes as quickly as a vehicle's motion.
 
     At a rate w (rad/s), errors of the variance s^2 that are white from fix to fix have the density s^2 dt; the worst
-    that last (`graphnav.alignment.travel`), s^2 / w. The rate is that of the turns, or once in the stretch.
+    that last (`graphnav.alignment.travel`), s^2 / w. The rate is that of the turns (rad, in so many seconds), or one
+    turn in the stretch.
     """
-    return max(1.0, length / (max(float(way.turn[-1]), 2.0 * np.pi) * dt))
+    return max(1.0, length / (max(turn, 2.0 * np.pi) * dt))

@@ -12,7 +12,7 @@ from graphnav import rotation
 from graphnav.alignment.back import carried_back
 from graphnav.alignment.course import COURSE_SIGMA, with_course
 from graphnav.alignment.first import Alignment, level, some
-from graphnav.alignment.travel import across, facing, travel
+from graphnav.alignment.travel import across, travel, turned
 from graphnav.config import Settings
 from graphnav.detectors.base import NONE, inside
 from graphnav.earth import LocalFrame
@@ -30,7 +30,7 @@ _FIXES = 10  # that the short problem wants to see
 _MOVES = 5.0  # sigmas of way that are motion: noise gets there once in 270 000 fixes, exp(-5^2/2)
 _BEFORE = 10.0  # s of the stretch before the motion
 _JUMP = 6.0  # times what fixes usually are off their running median, or their sigma
-_GOOD_FIT = 2.0  # squared sigmas per row below which no other start heading is tried
+_TURNS = (0.0, np.pi, 0.5 * np.pi, 1.5 * np.pi)  # rad, of the start headings that are tried from the first guess
 
 Smoother = Callable[[Problem, States], Solution]
 
@@ -65,10 +65,10 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
     gnss = _thinned(gnss, recording.start, recording.end)
     t, p = gnss.t, LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
     if recording.platform == "vehicle":
-        axis, still = facing(recording.imu, t, _usual_rate(recording.imu)), inside(t, stationary)
+        yaw, still = turned(recording.imu, t, _usual_rate(recording.imu)), inside(t, stationary)
     else:  # a foot turns about every axis
-        axis, still = np.ones(len(t), dtype=complex), np.zeros(len(t), dtype=bool)
-    way = travel(p, across(gnss.sd), axis, still)
+        yaw, still = np.zeros(len(t)), np.zeros(len(t), dtype=bool)
+    way = travel(p, across(gnss.sd), yaw, still)
     away = way.times_sigma > _MOVES
     if not away.any():
         return None
@@ -97,20 +97,14 @@ def in_motion(
     bias = _usual_rate(imu)
     rp = level(recording, begin)
     heading = _heading_of_accelerations(part, frame, rp, bias)
-    best: Solution | None = None
-    for quarter in (0, 2, 1, 3):
-        rph = np.array([*rp, heading + 0.5 * np.pi * quarter])
-        solution = _try(part, settings, frame, smooth, rph, bias)
-        if best is None or solution.cost < best.cost:
-            best = solution
-        rows = sum(record.residual.size for record in best.records.values())
-        if best.cost < 0.5 * _GOOD_FIT * rows:
-            break
-    if best is None or not np.isfinite(best.cost):
+    tried = [_try(part, settings, frame, smooth, np.array([*rp, heading + turn]), bias) for turn in _TURNS]
+    tried = [one for one in tried if np.isfinite(one.cost)]
+    if not tried:
         raise EstimationError(
             f"'{recording.name}': no start attitude explains the GNSS fixes between {begin - recording.start:.0f} "
             f"and {end - recording.start:.0f} s; check the axes, the units and the time stamps"
         )
+    best = min(tried, key=lambda one: one.cost)
     R, P = best.states.R_nb[0], best.covariance[0][:3, :3]
     wide = settings.alignment.prior_inflation * np.sqrt(np.diag(P))
     J = rotation.rph_jacobian(rotation.to_rph(R))
@@ -118,8 +112,7 @@ def in_motion(
     said: tuple[str, ...] = ()
     if recording.platform == "vehicle":
         assert part.gnss is not None
-        sd = np.interp(best.t, part.gnss.t, across(part.gnss.sd))
-        found = with_course(best, sd, float(np.median(np.diff(part.gnss.t))), own[2], wide[2])
+        found = with_course(tried, part.gnss, own[2], wide[2])
         R = rotation.exp(np.array([0.0, 0.0, -found.turn])) @ R  # heading is clockwise, rotation about up is not
         own[2], wide[2], said = found.own, found.wide, found.notes
     notes = (

@@ -33,7 +33,7 @@ _SWAY = 0.4  # m, 1-sigma along an axis: what an antenna moves on a vehicle that
 class Travel:
     """What was travelled since the first of N points."""
 
-    D: NDArray[np.complex128]  # (N,) m, forward + i left where `facing` is forward
+    D: NDArray[np.complex128]  # (N,) m, forward + i left where `yaw` is of forward from east
     sigma: Array  # (N,) m, along one axis
     turn: Array  # (N,) rad, all turns since the start, either way
 
@@ -43,23 +43,27 @@ class Travel:
         return np.abs(self.D) / self.sigma
 
 
-def travel(p: Array, sd: Array, facing: NDArray[np.complex128], still: NDArray[np.bool_] | None = None) -> Travel:
+def travel(p: Array, sd: Array, yaw: Array, still: NDArray[np.bool_] | None = None) -> Travel:
     """What was travelled along points.
+
+    The way between two points is a chord, as far as the turn between them goes; of more than a radian it says nothing.
 
     Parameters
     ----------
     p : (N, 2) m, east and north.
     sd : (N,) m, 1-sigma of a point along one axis.
-    facing : (N,) east + i north, of length 1: an axis of the body at each point.
+    yaw : (N,) rad, what a level axis of the body has turned counter-clockwise, whole circles included.
     still : (N,) points at which the platform stands; between two of them no way is counted.
     """
     moves = np.ones(len(p) - 1) if still is None else 1.0 - (still[1:] & still[:-1])
-    step = moves * np.diff(p[:, 0] + 1j * p[:, 1])
-    turned = moves * np.angle(facing[1:] * facing[:-1].conj())
-    D = np.concatenate([[0.0], np.cumsum(step * np.exp(-0.5j * turned) * facing[:-1].conj())])
+    angle = moves * np.abs(np.diff(yaw))
     variance = sd**2 + _SWAY**2
-    within = np.concatenate([[0.0], np.cumsum(np.abs(turned) * variance[1:])])
-    return Travel(D, np.sqrt(variance[0] + variance + within), np.concatenate([[0.0], np.cumsum(np.abs(turned))]))
+    seen = angle < 1.0
+    step = seen * moves * np.diff(p[:, 0] + 1j * p[:, 1]) * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
+    angle = np.where(seen, angle, 2.0)  # an end here and a beginning there, as of two ways
+    within = np.concatenate([[0.0], np.cumsum(angle * variance[1:])])
+    D, turn = (np.concatenate([[0.0], np.cumsum(x)]) for x in (step, angle))
+    return Travel(D, np.sqrt(variance[0] + variance + within), turn)
 
 
 def across(sd: Array) -> Array:
@@ -67,8 +71,8 @@ def across(sd: Array) -> Array:
     return np.sqrt(np.mean(sd[:, :2] ** 2, axis=1))
 
 
-def facing(imu: Imu, t: Array, bias: Array) -> NDArray[np.complex128]:
-    """(N,) a level axis of the body at times `t`, as east + i north but for one unknown turn: the gyro's turn about up.
+def turned(imu: Imu, t: Array, bias: Array) -> Array:
+    """(N,) rad, what the body has turned about up since the first of the times `t`, counter-clockwise, by the gyro.
 
     Up is the mean specific force from each time to the next: what a vehicle accelerates by leans it by a few degrees,
     of which a turn rate keeps the cosine. `bias` (3,) rad/s.
@@ -81,5 +85,4 @@ def facing(imu: Imu, t: Array, bias: Array) -> NDArray[np.complex128]:
     angle, force = (np.stack([np.interp(t, edges, x[:, k]) for k in range(3)], -1) for x in (angle, force))
     up = np.diff(force, axis=0)
     up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9)
-    yaw = np.concatenate([[0.0], np.cumsum(np.sum(np.diff(angle, axis=0) * up, axis=1))])
-    return np.exp(1j * yaw)
+    return np.concatenate([[0.0], np.cumsum(np.sum(np.diff(angle, axis=0) * up, axis=1))])
