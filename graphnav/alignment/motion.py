@@ -52,7 +52,7 @@ def plausible(recording: Recording) -> Recording:
 def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:
     """The stretch (s) to align over: from just before the first motion until enough of it was seen.
 
-    It moves where it is farther away than the errors of the fixes can have brought it, in its own axes
+    It moves where it is farther away than the errors of the fixes can have brought it, over ground or in its own axes
     (`graphnav.alignment.travel`); enough is seen once these errors leave little doubt of the direction. What the fixes
     say of motion while a vehicle stands, `stationary` (N, 2) s, is none.
     """
@@ -68,8 +68,9 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
         yaw, still = turned(recording.imu, t, _usual_rate(recording.imu)), inside(t, stationary)
     else:  # a foot turns about every axis
         yaw, still = np.zeros(len(t)), np.zeros(len(t), dtype=bool)
-    way = travel(p, across(gnss.sd), yaw, still)
-    away = way.times_sigma > _MOVES
+    sd = across(gnss.sd)
+    way = travel(p, sd, yaw, still)
+    away = np.maximum(way.times_sigma, travel(p, sd, np.zeros(len(t)), still).times_sigma) > _MOVES
     if not away.any():
         return None
     first = int(np.argmax(away))
@@ -79,8 +80,8 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
     # at the speed that followed it took a while to get that far
     speed = np.abs(way.D[last] - way.D[first]) / max(t[last] - t[first], 1.0)
     under_way = np.abs(way.D[first]) / speed if speed > 0.0 else np.inf
-    begin = max(t[0], t[first] - _BEFORE - under_way)
-    return float(begin), float(t[last])
+    begin = t[first] - _BEFORE - under_way
+    return float(max(t[0], np.round(begin, 3))), float(t[last])  # what rounding did to D shall not show
 
 
 def in_motion(
