@@ -13,7 +13,8 @@ from graphnav.recording import Gnss
 from graphnav.solution import Solution
 
 COURSE_SIGMA = np.radians(10.0)  # rad, a stated forward axis against the course: mounting, side slip
-_SIGMAS = 3.0
+_SIGMAS = 3.0  # by which accelerations must speak for reverse, or against the course at all
+_DOUBT = 2.0  # sigmas for reverse beyond which forwards is not to be taken for granted either
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,8 @@ class Heading:
 def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> Heading:
     """Bring in that a vehicle's forward axis is its course, forwards or in reverse, to `COURSE_SIGMA`.
 
-    Forwards, unless the accelerations speak against that at three sigmas; they mean a heading of density
-    exp(cos(heading - found) / sigma^2) / const, which for a small sigma is that of Gauss.
+    Reverse, if the accelerations say so at three sigmas; at two the course is left aside; forwards otherwise. They mean
+    a heading of density exp(cos(heading - found) / sigma^2) / const, which for a small sigma is that of Gauss.
 
     Parameters
     ----------
@@ -56,11 +57,11 @@ def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> 
     off, notes = -float(np.angle(way.D[told])), tuple[str, ...]()
     for_forwards = 2.0 * np.cos(off) / (own**2 + course**2)
     if for_forwards < -0.5 * _SIGMAS**2:
-        off = float(rotation.wrap(off + np.pi))
+        off -= float(np.copysign(np.pi, off))
     elif for_forwards < 0.5 * _SIGMAS**2:
         notes = ("accelerations are too weak to tell forwards from reverse: the first motion is taken to be forwards",)
-    if abs(off) > _SIGMAS * np.hypot(course, own):
-        # one of them is wrong; a sigma has to cover both
+    if abs(off) > _SIGMAS * np.hypot(course, own) or -0.5 * _SIGMAS**2 < for_forwards < -0.5 * _DOUBT**2:
+        # the axes may be wrong, the accelerations or the course: a sigma has to cover them all
         notes = (f"the body's forward axis is {abs(np.degrees(off)):.0f} deg from the course: check the IMU's axes",)
         return Heading(0.0, max(own, abs(off) / _SIGMAS), max(wide, abs(off) / _SIGMAS), notes)
     gain = wide**2 / (wide**2 + course**2)
