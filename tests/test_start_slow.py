@@ -170,3 +170,16 @@ def test_a_way_on_a_circle_is_its_length() -> None:
     assert abs(way.D[-1].imag) < 1e-9
     ground = travel(p, np.full(len(t), 3.0), np.zeros(len(t)))
     assert way.times_sigma[-1] > 2.0 * ground.times_sigma.max()
+
+
+@pytest.mark.parametrize("every", [5, 20, 40])
+def test_fixes_far_apart_are_enough_for_a_start(every: int) -> None:
+    recording = drive(oracle.winding_path(150.0, 3.0, 1), 1, 1.0, 1.0)
+    gnss = recording.gnss
+    assert gnss is not None
+    few = slice(None, None, every)
+    recording = replace(recording, gnss=replace(gnss, t=gnss.t[few], llh=gnss.llh[few], sd=gnss.sd[few]))
+    found = aligned(recording, NONE)
+    assert found.motion is not None
+    assert recording.truth is not None
+    assert abs(off(found, recording, recording.truth)) < 3.0 * found.sigma[2]

@@ -46,7 +46,7 @@ def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> 
     way = travel(best.states.p[at, :2], across(fixes.sd), yaw[at])
     gone = fixes.t - fixes.t[0]
     alike = _alike(float(way.turn[-1]), float(gone[-1]), dt)
-    own = float(np.hypot(np.sqrt(alike) * own, _spread(tried, least, alike)))
+    own = min(np.pi, float(np.hypot(np.sqrt(alike) * own, _spread(tried, least, alike))))
     wide = max(own, wide)
     # the longer the way, the less do fixes err in its direction, and the more has a biased gyro turned
     up, P = best.states.R_nb[0, 2], best.covariance[0][12:15, 12:15]

@@ -27,6 +27,7 @@ from graphnav.state import States
 
 _DIRECTION = 0.5 * COURSE_SIGMA  # rad, to which the fixes shall know the direction of travel: less than the rest does
 _FIXES = 10  # that the short problem wants to see
+_FEWEST = 3  # without which there is no acceleration
 _MOVES = 5.0  # sigmas of way that are motion: noise gets there once in 270 000 fixes, exp(-5^2/2)
 _BEFORE = 10.0  # s of the stretch before the motion
 _JUMP = 6.0  # times what fixes usually are off their running median, or their sigma
@@ -60,9 +61,11 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
     if gnss is None:
         return None
     used = (gnss.t >= recording.start) & (gnss.t <= recording.end)
-    if np.count_nonzero(used) < 3:
+    if np.count_nonzero(used) < _FEWEST:
         return None
     gnss = _thinned(gnss, recording.start, recording.end)
+    if len(gnss.t) < _FEWEST:
+        return None
     t, p = gnss.t, LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
     if recording.platform == "vehicle":
         yaw, still = turned(recording.imu, t, _usual_rate(recording.imu)), inside(t, stationary)
@@ -80,7 +83,7 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
     # at the speed that followed it took a while to get that far
     speed = np.abs(way.D[last] - way.D[first]) / max(t[last] - t[first], 1.0)
     under_way = np.abs(way.D[first]) / speed if speed > 0.0 else np.inf
-    begin = t[first] - _BEFORE - under_way
+    begin = min(t[first] - _BEFORE - under_way, t[max(last - _FEWEST + 1, 0)])
     return float(max(t[0], np.round(begin, 3))), float(t[last])  # what rounding did to D shall not show
 
 
