@@ -100,7 +100,8 @@ def screen(recording: Recording) -> Screened:
             way = plausibility_odometer.track(recording.odometer)
         forward = crosschecks.forward_fit(recording.imu, way) if way is not None else None
         findings += forward_sign(recording.imu, way, forward)
-        if track is not None:
+        # stamps that are late by now this, now that have no clock
+        if track is not None and not any(f.key == "gnss.stamped_on_arrival" for f in findings):
             assert recording.gnss is not None
             places = crosschecks.track(replace(recording.gnss, v=None)) if recording.gnss.v is not None else None
             by_places = crosschecks.forward_fit(recording.imu, places) if places is not None else None

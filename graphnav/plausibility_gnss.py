@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, uniform_filter1d
 
 from graphnav.earth import LocalFrame
 from graphnav.findings import Finding, runs_of
@@ -28,6 +28,7 @@ _MOST = 8.0  # m/s^2, what tyres grip
 _WINDOW = 11  # fixes, of which most steps are right even where half of the fixes are off
 _MINORITY = 0.2  # of the fixes: fewer that are off are outvoted by the rest
 _ALIKE = 0.25  # of their size by which steps between two groups differ
+_ISOLATED = 0.01  # of the steps
 _MOVING = 3.0  # m/s, below which a step says little of the time it took
 
 
@@ -173,19 +174,18 @@ def sigmas_denied(gnss: Gnss, p: Array) -> Iterator[Finding]:
 
 def two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     """Fixes that go back and forth between two places a constant step apart: no vote tells which are right."""
-    dt, period, near = _steps(gnss)
-    p = p[:, :2]
-    ok = near & np.isfinite(p[1:]).all(axis=1) & np.isfinite(p[:-1]).all(axis=1)
-    if ok.sum() < 2 * _WINDOW:
+    there = np.isfinite(p).all(axis=1)
+    if there.sum() < 2 * _WINDOW:
         return
+    gnss, p = rows_of(gnss, there), p[there, :2]
+    dt, period, _ = _steps(gnss)
     rate = np.diff(p, axis=0) / dt[:, None]
-    rate[~ok] = 0.0
     usual = median_filter(rate, size=(_WINDOW, 1), mode="nearest")
     jump = np.diff(p, axis=0) - usual * dt[:, None]
     sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
-    # the speed changes by what tyres grip over half the window
-    limit = 5.0 * np.hypot(sd[1:], sd[:-1]) + _MOST * 0.5 * _WINDOW * period * dt
-    big = np.flatnonzero(ok & (np.linalg.norm(jump, axis=1) > limit))
+    # the speed changes by what tyres grip over half the window; over a long gap no step shows, and none is taken
+    limit = 5.0 * np.hypot(sd[1:], sd[:-1]) + _MOST * np.maximum(0.5 * _WINDOW * period, dt) * dt
+    big = np.flatnonzero(np.linalg.norm(jump, axis=1) > limit)
     if not len(big):
         return
     axis = np.linalg.svd(jump[big], full_matrices=False)[2][0]
@@ -197,17 +197,9 @@ def two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
         return
     change = np.zeros(len(dt))
     change[big[alike]] = sign[alike]
-    inside = np.zeros(2)
-    for a, b in runs_of(ok):
-        level = np.r_[0.0, np.cumsum(change[a:b])]
-        level -= level.min()
-        if level.max() == 0.0:
-            continue  # which of the two it is cannot be told
-        if level.max() > 1.0:
-            return
-        inside += [(level == 0.0).sum(), (level == 1.0).sum()]
-    share = inside / len(gnss.t)
-    if share.min() < _MINORITY:
+    level = np.r_[0.0, np.cumsum(change)]
+    share = np.array([(level == level.min()).mean(), (level == level.max()).mean()])
+    if np.ptp(level) != 1.0 or share.min() < _MINORITY:
         return
     yield Finding(
         "untrusted",
@@ -224,9 +216,11 @@ def stamped_on_arrival(gnss: Gnss, p: Array) -> Iterator[Finding]:
     near &= np.isfinite(p[1:]).all(axis=1) & np.isfinite(p[:-1]).all(axis=1)
     way = np.diff(p, axis=0)
     way[~near] = 0.0
-    usual = median_filter(way, size=(_WINDOW, 1), mode="nearest")
-    usual_size = np.linalg.norm(usual, axis=1)
     pace = median_filter(dt, size=_WINDOW, mode="nearest")
+    # the mean, which is right as well where stamps were sorted that had overtaken each other
+    size = np.maximum(uniform_filter1d(np.where(near, dt, 0.0), _WINDOW, mode="nearest"), 1e-9)
+    usual = uniform_filter1d(way, _WINDOW, axis=0, mode="nearest") * (pace / size)[:, None]
+    usual_size = np.linalg.norm(usual, axis=1)
     moving = near & (usual_size > _MOVING * pace)
     if moving.sum() < 2 * _WINDOW:
         return
@@ -238,14 +232,16 @@ def stamped_on_arrival(gnss: Gnss, p: Array) -> Iterator[Finding]:
     late = spread * period / np.sqrt(2.0)  # two stamps make a step
     if speed * late < sd or spread == 0.0:
         return
+    # stamps so late that fixes overtook each other: against the motion by more than sigmas explain
+    back = float((ahead + 1.0 < -5.0 * np.sqrt(2.0) * sd / usual_size[moving]).mean())
     ahead = np.clip(ahead, -3.0, 3.0)
     slope = float(uneven @ ahead / (uneven @ uneven))
     error = float(np.std(ahead - slope * uneven)) / (np.sqrt(len(uneven)) * spread)
-    if slope + 4.0 * error < 0.5:  # nearer to no than to full part in the advance
+    if slope + 4.0 * error < 0.5 or back > _ISOLATED:  # nearer to no than to full part in the advance
+        seen = f"go back in {100 * back:.0f} % of the steps" if back > _ISOLATED else "advance evenly"
         yield Finding(
             "warning",
-            f"the stamps of the fixes are uneven by {late:.2g} s where the positions advance evenly ({slope:.2f} of it "
-            f"shows in them): they are of the arrival and not of the measurement, {speed * late:.2g} m at the usual "
+            f"the stamps of the fixes are uneven by {late:.2g} s where the positions {seen}: they are of the arrival and not of the measurement, {speed * late:.2g} m at the usual "
             "speed; log the receiver's own time",
             "gnss.stamped_on_arrival",
         )
