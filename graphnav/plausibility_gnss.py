@@ -174,7 +174,7 @@ def sigmas_denied(gnss: Gnss, p: Array) -> Iterator[Finding]:
 
 def two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     """Fixes that go back and forth between two places a constant step apart: no vote tells which are right."""
-    there = np.isfinite(p).all(axis=1)
+    there: NDArray[np.bool_] = np.asarray(np.isfinite(p).all(axis=1))
     if there.sum() < 2 * _WINDOW:
         return
     gnss, p = rows_of(gnss, there), p[there, :2]
@@ -241,7 +241,8 @@ def stamped_on_arrival(gnss: Gnss, p: Array) -> Iterator[Finding]:
         seen = f"go back in {100 * back:.0f} % of the steps" if back > _ISOLATED else "advance evenly"
         yield Finding(
             "warning",
-            f"the stamps of the fixes are uneven by {late:.2g} s where the positions {seen}: they are of the arrival and not of the measurement, {speed * late:.2g} m at the usual "
-            "speed; log the receiver's own time",
+            f"the stamps of the fixes are uneven by {late:.2g} s where the positions {seen}: they are "
+            f"of the arrival and not of the measurement, {speed * late:.2g} m at the usual speed; log the receiver's own "
+            "time",
             "gnss.stamped_on_arrival",
         )
