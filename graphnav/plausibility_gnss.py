@@ -242,7 +242,7 @@ def stamped_on_arrival(gnss: Gnss, p: Array) -> Iterator[Finding]:
         yield Finding(
             "warning",
             f"the stamps of the fixes are uneven by {late:.2g} s where the positions {seen}: they are "
-            f"of the arrival and not of the measurement, {speed * late:.2g} m at the usual speed; log the receiver's own "
-            "time",
+            f"of the arrival and not of the measurement, {speed * late:.2g} m at the usual speed; log the receiver's "
+            "own time",
             "gnss.stamped_on_arrival",
         )
