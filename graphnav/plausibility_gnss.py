@@ -27,8 +27,8 @@ _SMOOTH = 2e-3  # of the sigma; filtered fixes of phones scatter by five thousan
 _MOST = 8.0  # m/s^2, what tyres grip
 _WINDOW = 11  # fixes, of which most steps are right even where half of the fixes are off
 _MINORITY = 0.2  # of the fixes: fewer that are off are outvoted by the rest
-_ALIKE = 0.25  # of their size by which steps between two groups differ
 _ISOLATED = 0.01  # of the steps
+_ALIKE = 0.25  # of their size by which steps between two groups differ; those of reflections are of all sizes
 _MOVING = 3.0  # m/s, below which a step says little of the time it took
 
 
@@ -179,9 +179,7 @@ def two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
         return
     gnss, p = rows_of(gnss, there), p[there, :2]
     dt, period, _ = _steps(gnss)
-    rate = np.diff(p, axis=0) / dt[:, None]
-    usual = median_filter(rate, size=(_WINDOW, 1), mode="nearest")
-    jump = np.diff(p, axis=0) - usual * dt[:, None]
+    jump = _jumps(p, dt)
     sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
     # the speed changes by what tyres grip over half the window; over a long gap no step shows, and none is taken
     limit = 5.0 * np.hypot(sd[1:], sd[:-1]) + _MOST * np.maximum(0.5 * _WINDOW * period, dt) * dt
@@ -192,14 +190,13 @@ def two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     sign = np.sign(jump[big] @ axis)
     step = np.median(sign[:, None] * jump[big], axis=0)
     size = float(np.linalg.norm(step))
-    alike = np.linalg.norm(sign[:, None] * jump[big] - step, axis=1) < _ALIKE * size
-    if alike.mean() < 1.0 - _MINORITY:
-        return
-    change = np.zeros(len(dt))
-    change[big[alike]] = sign[alike]
-    level = np.r_[0.0, np.cumsum(change)]
-    share = np.array([(level == level.min()).mean(), (level == level.max()).mean()])
-    if np.ptp(level) != 1.0 or share.min() < _MINORITY:
+    for _ in range(3):  # the motion is clearer without the steps, and the steps are with the motion
+        group = _groups(jump @ (step / size), size)
+        jump = _jumps(p - group[:, None] * step, dt)
+    left = np.linalg.norm(jump, axis=1)
+    alike = float((left[np.diff(group) != 0] < _ALIKE * size).mean())
+    share = np.array([(group == 0).mean(), (group == 1).mean()])
+    if (left > limit).sum() > _MINORITY * len(big) or alike < 1.0 - _MINORITY or share.min() < _MINORITY:
         return
     yield Finding(
         "untrusted",
@@ -209,24 +206,47 @@ def two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     )
 
 
+def _jumps(p: Array, dt: Array) -> Array:
+    """What steps between fixes at p (M, 2) m differ by from the usual pace around them, (M - 1, 2) m."""
+    rate = median_filter(np.diff(p, axis=0) / dt[:, None], size=(_WINDOW, 1), mode="nearest")
+    return np.asarray(np.diff(p, axis=0) - rate * dt[:, None])
+
+
+def _groups(jump: Array, size: float) -> NDArray[np.intp]:
+    """Group (M,) 0 or 1 of every fix: those with which jumps (M - 1,) along a step of that size are least off."""
+    cost = np.abs(jump[:, None, None] - size * np.array([[0.0, 1.0], [-1.0, 0.0]]))  # from, to
+    best, came = np.zeros(2), np.zeros((len(jump), 2), dtype=np.intp)
+    for k, one in enumerate(cost):
+        total = best[:, None] + one
+        came[k] = total.argmin(axis=0)
+        best = total.min(axis=0)
+    group = np.zeros(len(jump) + 1, dtype=np.intp)
+    group[-1] = int(best.argmin())
+    for k in range(len(jump), 0, -1):
+        group[k - 1] = came[k - 1, group[k]]
+    return group
+
+
 def stamped_on_arrival(gnss: Gnss, p: Array) -> Iterator[Finding]:
     """Stamps that are uneven where positions advance evenly: of the arrival, not of the measurement."""
-    dt, period, near = _steps(gnss)
+    dt = np.diff(gnss.t)
     p = p[:, :2]
-    near &= np.isfinite(p[1:]).all(axis=1) & np.isfinite(p[:-1]).all(axis=1)
+    # the mean steps: of fixes that arrive in bursts, the median says nothing
+    period = float(np.median(uniform_filter1d(dt, _WINDOW, mode="nearest")))
+    near = (dt < 3.5 * period) & np.isfinite(p[1:]).all(axis=1) & np.isfinite(p[:-1]).all(axis=1)
     way = np.diff(p, axis=0)
     way[~near] = 0.0
-    pace = median_filter(dt, size=_WINDOW, mode="nearest")
-    # the mean, which is right as well where stamps were sorted that had overtaken each other
-    size = np.maximum(uniform_filter1d(np.where(near, dt, 0.0), _WINDOW, mode="nearest"), 1e-9)
-    usual = uniform_filter1d(way, _WINDOW, axis=0, mode="nearest") * (pace / size)[:, None]
+    count = np.maximum(uniform_filter1d(near.astype(float), _WINDOW, mode="nearest"), 0.5 / _WINDOW)
+    pace = np.maximum(uniform_filter1d(np.where(near, dt, 0.0), _WINDOW, mode="nearest") / count, 1e-9)
+    usual = uniform_filter1d(way, _WINDOW, axis=0, mode="nearest") / count[:, None]
     usual_size = np.linalg.norm(usual, axis=1)
     moving = near & (usual_size > _MOVING * pace)
     if moving.sum() < 2 * _WINDOW:
         return
     uneven = (dt / pace - 1.0)[moving]
     ahead = (np.sum(way * usual, axis=1)[moving] / usual_size[moving] ** 2) - 1.0
-    spread = float(np.std(uneven))
+    # of most stamps: some fixes that are missing make steps uneven, too
+    spread = float(np.median(np.abs(uneven - np.median(uneven)))) / 0.6745
     speed = float(np.median(usual_size[moving] / pace[moving]))
     sd = float(np.median(gnss.sd[:, :2]))
     late = spread * period / np.sqrt(2.0)  # two stamps make a step
@@ -236,7 +256,7 @@ def stamped_on_arrival(gnss: Gnss, p: Array) -> Iterator[Finding]:
     back = float((ahead + 1.0 < -5.0 * np.sqrt(2.0) * sd / usual_size[moving]).mean())
     ahead = np.clip(ahead, -3.0, 3.0)
     slope = float(uneven @ ahead / (uneven @ uneven))
-    error = float(np.std(ahead - slope * uneven)) / (np.sqrt(len(uneven)) * spread)
+    error = float(np.std(ahead - slope * uneven)) / float(np.linalg.norm(uneven))
     if slope + 4.0 * error < 0.5 or back > _ISOLATED:  # nearer to no than to full part in the advance
         seen = f"go back in {100 * back:.0f} % of the steps" if back > _ISOLATED else "advance evenly"
         yield Finding(

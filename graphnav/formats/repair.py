@@ -67,7 +67,8 @@ def usable_rows(
     if blank.any():
         first = np.flatnonzero(blank)[0]
         at = f" (first at t = {rows['t'][first]:.3f} s)" if np.isfinite(rows["t"][first]) else ""
-        remarks.add(f"{_rows(blank, label)} with blank or NaN values dropped{at}")
+        what = "blank, NaN or infinite" if sensor == "odometer" else "blank or NaN"
+        remarks.add(f"{_rows(blank, label)} with {what} values dropped{at}")
         rows = rows.take(~blank)
 
     t = rows["t"]
