@@ -35,6 +35,7 @@ _SCALE = np.sqrt(2.0)
 _NEAR = 1.2  # between the force found and what a unit would give: a biased sensor among vibration
 _DEAD = 10.0  # s; the longest that an axis repeats itself in thirty real recordings while others move is 0.08 s
 _MOVES = 20.0  # steps of its own resolution by which an axis has moved and not only flickered
+_NOISY = 0.05  # of the steps go back on the one before; of noise up to a band B and a rate f it is 1.5 B / f
 _AXIS = "xyz"
 
 
@@ -226,10 +227,15 @@ def dead_axes(recording: Recording) -> Iterator[Finding]:
 
 
 def _moves(x: Array, same: Array) -> bool:
-    """Whether an axis moves by many steps of its resolution, and not only now and then."""
-    steps = np.abs(np.diff(x))
-    steps = steps[steps > 1e-12 * np.abs(x).max()]
-    return len(steps) > 0 and float(same.mean()) < 0.5 and float(np.ptp(x)) > _MOVES * float(steps.min())
+    """Whether an axis moves by many steps of its resolution, not only now and then, and with a sensor's noise.
+
+    Without noise an axis of a simulation may well be constant.
+    """
+    steps = np.diff(x)
+    steps = steps[np.abs(steps) > 1e-12 * np.abs(x).max()]
+    if len(steps) < 2 or float(same.mean()) >= 0.5 or float(np.ptp(x)) <= _MOVES * float(np.abs(steps).min()):
+        return False
+    return float((steps[1:] * steps[:-1] < 0.0).mean()) > _NOISY
 
 
 _SURE = 0.7  # of a correlation, and of a unit vector's component

@@ -191,6 +191,18 @@ def test_an_axis_that_rests_with_the_others_is_not_dead(tokyo: Recording) -> Non
     assert "imu.dead_axis" not in found(coarse)
 
 
+def test_an_axis_of_a_simulation_without_noise_may_be_constant(tokyo: Recording) -> None:
+    t = tokyo.imu.t[:, None]
+    smooth = replace(tokyo, odometer=None, gnss=None)
+    smooth = change(
+        smooth,
+        "imu",
+        accel=lambda x: np.sin(0.3 * t) * [0.5, 1.0, 0.0] + [0.0, 0.0, 9.8],
+        gyro=lambda x: np.sin(0.2 * t) * [0.0, 0.0, 0.1],
+    )
+    assert found(smooth) == {}
+
+
 SCALES = [
     (1.0 / 0.3048, "ft/s2"),
     (1.0 / 9.80665, "g"),
