@@ -35,6 +35,8 @@ _SCALE = np.sqrt(2.0)
 _NEAR = 1.2  # between the force found and what a unit would give: a biased sensor among vibration
 _DEAD = 10.0  # s; the longest that an axis repeats itself in thirty real recordings while others move is 0.08 s
 _MOVES = 20.0  # steps of its own resolution by which an axis has moved and not only flickered
+# What a carrier that moves exceeds by far: a thousandth of g, and the Earth's rate, which one at rest reads
+_STIRS = {"accelerometer": 1e-3 * _STANDARD_GRAVITY, "gyro": 7.3e-5}  # m/s^2, rad/s
 _NOISY = 0.05  # of the steps go back on the one before; of noise up to a band B and a rate f it is 1.5 B / f
 _AXIS = "xyz"
 
@@ -208,7 +210,7 @@ def dead_axes(recording: Recording) -> Iterator[Finding]:
             if lasts < min(_DEAD, 0.9 * whole) or b - a < _DEAD:
                 continue
             others = [k for k in range(3) if k != axis]
-            if not any(_moves(x[a : b + 1, k], same[a:b, k]) for k in others):
+            if not any(_moves(x[a : b + 1, k], same[a:b, k], _STIRS[name]) for k in others):
                 continue
             value = x[a, axis]
             when = (
@@ -226,14 +228,18 @@ def dead_axes(recording: Recording) -> Iterator[Finding]:
             )
 
 
-def _moves(x: Array, same: Array) -> bool:
+def _moves(x: Array, same: Array, least: float) -> bool:
     """Whether an axis moves by many steps of its resolution, not only now and then, and with a sensor's noise.
+
+    Its standard deviation is then above `least`.
 
     Without noise an axis of a simulation may well be constant.
     """
     steps = np.diff(x)
     steps = steps[np.abs(steps) > 1e-12 * np.abs(x).max()]
-    if len(steps) < 2 or float(same.mean()) >= 0.5 or float(np.ptp(x)) <= _MOVES * float(np.abs(steps).min()):
+    if len(steps) < 2 or float(np.std(x)) < least or float(same.mean()) >= 0.5:
+        return False
+    if float(np.ptp(x)) <= _MOVES * float(np.abs(steps).min()):
         return False
     return float((steps[1:] * steps[:-1] < 0.0).mean()) > _NOISY
 
