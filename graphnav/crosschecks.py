@@ -238,7 +238,9 @@ def forward_fit(imu: Imu, track: Track) -> Fit | None:
         return None
     level = np.linalg.svd(up_of(imu)[None, :])[2][1:]  # (2, 3)
     fit = _imu_fit(imu, imu.accel @ level.T, track, i, j, y)
-    return None if fit is None else replace(fit, coefficients=fit.coefficients @ level)
+    if fit is None or len(fit.coefficients) != len(level):  # no time in common
+        return None
+    return replace(fit, coefficients=fit.coefficients @ level)
 
 
 def yaw_fit(imu: Imu, track: Track) -> Fit | None:

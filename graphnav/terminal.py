@@ -28,8 +28,9 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     lines += [f"  {source} withheld{'' if span is None else f' {span[0]:g}-{span[1]:g} s'}"
               for source, span in outcome.request.withheld]  # fmt: skip
     notes = [note for s in outcome.solutions.values() for note in s.notes]
+    severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
-        lines.append(f"  {'warning' if note in outcome.warnings else 'note'}: {note}")
+        lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
     lines += _whole(outcome)
     lines += _spans(outcome)
