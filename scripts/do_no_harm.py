@@ -20,7 +20,6 @@ import os
 import random
 import sys
 import time
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -40,7 +39,7 @@ from graphnav.metrics import summary
 from graphnav.pipeline import SOLVERS
 from graphnav.recording import Recording
 from graphnav.solution import Solution
-from graphnav.workflow import Withheld, _score
+from graphnav.workflow import Span, Withheld, _score
 
 HERE = Path(__file__).resolve().parents[1]
 
@@ -74,6 +73,7 @@ DRIVES = {
 SENSORS = ("gnss", "+nhc", "+odometer")  # each with all before it
 VARIANTS = ("stated", "estimated")
 WINDOW, SHORT = 300.0, 120.0  # s; a usual window, and a drive too short for any
+GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 SURE = chi2.isf(math.erfc(3.0 / math.sqrt(2.0)), 3)  # of three axes together, as rare as three sigma of one
 TRUTH_GAP = 0.5  # s; between rows further apart braking at 3 m/s^2 bends the way by more than 3 * 0.5^2 / 8 = 0.1 m
 
@@ -100,7 +100,7 @@ class Job:
     drive: str
     source: str
     window: str  # "whole" or "from-to", s from the recording's start
-    span: tuple[float, float]
+    span: Span
     sensors: str
     variant: str
 
@@ -118,24 +118,26 @@ def placed(drive: Drive, folder: Path) -> str:
     return drive.source if drive.source == "kitti" else str(folder / drive.source)
 
 
-def windows(recording: Recording, source: str, count: int, seed: int, whole: bool) -> Iterator[tuple[float, float]]:
-    """The drive as far as it has fixes, unless it is only wanted in parts, and windows of it at random starts.
+def windows(recording: Recording, source: str, count: int, seed: int, whole: bool) -> Iterator[tuple[str, Span]]:
+    """Names and spans: the drive as far as it has fixes, unless only parts are wanted, and windows in it.
 
-    Fewer than `count` where the drive is shorter than two windows; those of a smaller count are the first of a larger.
+    The first starts anywhere, each of the others further by the golden ratio of all there is: so many or few lie spread
+    evenly, and the first of many are those of few. Fewer than `count` where the drive is shorter than two windows.
     """
     gnss = recording.gnss
     assert gnss is not None
     first, last = max(gnss.t[0] - recording.start, 0.0), min(gnss.t[-1] - recording.start, recording.duration)
     length = last - first
     if whole or length < SHORT:
-        yield 0.0, last
+        yield "whole", (0.0, last)
     if length < SHORT:
         return
     size = min(WINDOW, 0.5 * length)
-    draw = random.Random(f"{seed} {zlib.crc32(Path(source).name.encode())}")
-    for _ in range(math.ceil(count * min(1.0, length / (2.0 * WINDOW)))):
-        start = round(first + draw.random() * (length - size), 1)
-        yield start, round(start + size, 1)
+    place = random.Random(f"{seed} {Path(source).name}").random()
+    for k in range(math.ceil(count * min(1.0, length / (2.0 * WINDOW)))):
+        start = round(first + (place + k * GOLDEN) % 1.0 * (length - size), 1)
+        end = round(start + size, 1)
+        yield f"{start:g}-{end:g}", (start, end)
 
 
 def plan(options: argparse.Namespace) -> list[Job]:
@@ -144,8 +146,7 @@ def plan(options: argparse.Namespace) -> list[Job]:
     for name in options.drives:
         source = placed(DRIVES[name], options.data)
         recording = load(source)
-        for span in windows(recording, DRIVES[name].source, options.windows, options.seed, options.whole):
-            window = "whole" if span[0] == 0.0 else f"{span[0]:g}-{span[1]:g}"
+        for window, span in windows(recording, DRIVES[name].source, options.windows, options.seed, options.whole):
             sets = SENSORS if recording.odometer is not None else SENSORS[:2]
             cells = itertools.product(sets, VARIANTS)
             jobs.append([Job(name, source, window, span, sensors, variant) for sensors, variant in cells])

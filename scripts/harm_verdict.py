@@ -54,8 +54,8 @@ class Pair:
 
     @property
     def lost(self) -> float | None:
-        """Share of the confirmed fixes that is left out."""
-        confirmed = self.estimated.get("confirmed")
+        """Share of the confirmed fixes that is left out; None where none is, or the window cannot be solved."""
+        confirmed = self.estimated.get("confirmed") if self.solved or self.stated is None else None
         return None if not confirmed else self.estimated["confirmed_left_out"] / confirmed
 
     @property
