@@ -190,8 +190,9 @@ def solve(job: Job) -> list[Row]:
             row |= {"h": said.get("h_rms_m"), "up": said.get("up_rms_m"), "nees": said.get("nees_p")}
             row |= {**left_out(used, solutions[row["solver"]]), "seconds": round(seconds, 2)}
     except Exception as error:  # another kind than GraphnavError is a bug; the table shows it and goes on
-        kind = "" if isinstance(error, graphnav.GraphnavError) else f"{type(error).__name__}: "
-        rows = [row | {"error": kind + str(error), "seconds": round(time.process_time() - began, 2)} for row in rows]
+        said = str(error) if isinstance(error, graphnav.GraphnavError) else f"{type(error).__name__}: {error}"
+        said = " ".join(said.split("\n\n")[0].split())
+        rows = [row | {"error": said, "seconds": round(time.process_time() - began, 2)} for row in rows]
     return rows
 
 

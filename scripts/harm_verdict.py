@@ -134,7 +134,7 @@ def metres(x: float | None) -> str:
 
 
 def middle(values: Iterable[float | None]) -> str:
-    known = [x for x in values if x is not None]
+    known = [x for x in values if x is not None and math.isfinite(x)]
     return f"{np.median(known):.2f}" if known else "-"
 
 
@@ -158,7 +158,7 @@ def table(rows: list[Row]) -> Iterator[str]:
         cells += [middle(p.ratio("h") for p in good)]
         cells += [middle(row.get("nees") for row in side if row is not None) for side in (both, estimated)]
         cells += [most((r["left_out"] / max(r["fixes"], 1) for r in estimated), 100), most((p.lost for p in good), 100)]
-        cells += [f"{against_filter(groups, group, axis):.2f}" for axis in ("h", "up")] + [f"{slower(pairs):.1f}"]
+        cells += [middle([against_filter(groups, group, axis)]) for axis in ("h", "up")] + [middle([slower(pairs)])]
         yield "| " + " | ".join(cells) + " |"
 
 

@@ -237,7 +237,7 @@ def test_without_truth_withheld_fixes_are_scored(script, shared_data, tmp_path):
     assert all(len(gnss.t) - 24 <= row["fixes"] <= len(gnss.t) - 18 for row in rows)  # less two spans of ten
 
 
-def test_what_cannot_be_solved_is_a_row(script, tmp_path, monkeypatch):
+def test_what_cannot_be_solved_is_a_row(script, tmp_path, monkeypatch, capsys):
     def fail(*arguments):
         raise graphnav.GraphnavError("no motion to align with")
 
@@ -246,6 +246,9 @@ def test_what_cannot_be_solved_is_a_row(script, tmp_path, monkeypatch):
     script.main(["-o", str(path), "--drives", "tokyo_clone", "--windows", "1", "--no-whole"])
     rows = json.loads(path.read_text(encoding="utf-8"))
     assert {row["error"] for row in rows} == {"no motion to align with"}
+    text = capsys.readouterr().out
+    assert text.count("no motion to align with") == 6
+    assert "nan" not in text
 
 
 def test_a_file_of_something_else_is_left_alone(script, tmp_path, capsys):
