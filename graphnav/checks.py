@@ -6,7 +6,7 @@ Nothing is changed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,7 @@ from graphnav.checks_stated import (
     truth_findings,
     velocities,
 )
+from graphnav.clock import clock_of
 from graphnav.crosschecks import Track
 from graphnav.findings import Finding, period_of, runs_of
 from graphnav.recording import Recording
@@ -125,9 +126,9 @@ def inspect(recording: Recording) -> Inspection:
         wrong = list(velocities(recording.gnss))
         findings += wrong or gnss_jumps(recording, track)  # against wrong velocities every position jumps
     if vehicle and overlap and track is not None and recording.gnss is not None:
-        forward, yaw = crosschecks.forward_fit(recording.imu, track), crosschecks.yaw_fit(recording.imu, track)
-        places = crosschecks.track(replace(recording.gnss, v=None)) if recording.gnss.v is not None else None
-        findings += imu_clock(forward, crosschecks.forward_fit(recording.imu, places) if places is not None else None)
+        clock, yaw = clock_of(recording.imu, recording.gnss), crosschecks.yaw_fit(recording.imu, track)
+        forward = clock.by_velocity if track.instant else clock.by_places
+        findings += imu_clock(clock)
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
         findings += reversed_sign(recording.imu) if turns_back else imu_axes(recording.imu, forward)
         findings += yaw_scale(yaw)
