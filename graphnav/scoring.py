@@ -113,6 +113,7 @@ def errors(
         dof_p=dof,
         epochs=epochs,
         notes=tuple(dict.fromkeys(notes)),
+        nees_heading=_nees(rph[:, 2:], cov[:, 8:, 8:]),
     )
 
 
