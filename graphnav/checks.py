@@ -39,6 +39,7 @@ from graphnav.checks_stated import (
     truth_findings,
     velocities,
 )
+from graphnav.clock import clock_of
 from graphnav.crosschecks import Track
 from graphnav.findings import SEVERITIES, Finding, period_of, runs_of
 from graphnav.plausibility import refuse, screen
@@ -146,15 +147,12 @@ def inspect(recording: Recording) -> Inspection:
         wrong = list(velocities(recording.gnss))
         findings += wrong or gnss_jumps(recording, track)  # against wrong velocities every position jumps
     turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis"}
-    if vehicle and overlap and track is not None:
-        yaw = crosschecks.yaw_fit(recording.imu, track)
+    if vehicle and overlap and track is not None and recording.gnss is not None:
+        clock, yaw = clock_of(recording.imu, recording.gnss), crosschecks.yaw_fit(recording.imu, track)
+        forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
         if not turned:
-            findings += (
-                reversed_sign(recording.imu)
-                if turns_back
-                else imu_axes(recording.imu, crosschecks.forward_fit(recording.imu, track))
-            )
+            findings += reversed_sign(recording.imu) if turns_back else imu_axes(recording.imu, forward)
         findings += yaw_scale(yaw)
     elif vehicle and not turned:
         findings += imu_axes(recording.imu, None)

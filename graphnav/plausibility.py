@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from graphnav import crosschecks, plausibility_gnss, plausibility_odometer
 from graphnav.checks_aiding import imu_axes, imu_clock, overlap_s
+from graphnav.clock import clock_of
 from graphnav.crosschecks import Fit, Track
 from graphnav.earth import gravity
 from graphnav.errors import RecordingError
@@ -106,10 +107,8 @@ def screen(recording: Recording) -> Screened:
         # stamps that are late by now this, now that have no clock
         if track is not None and not any(f.key == "gnss.stamped_on_arrival" for f in findings):
             assert recording.gnss is not None
-            places = crosschecks.track(replace(recording.gnss, v=None)) if recording.gnss.v is not None else None
-            by_places = crosschecks.forward_fit(recording.imu, places) if places is not None else None
             odometer = crosschecks.odometer_fit(recording.odometer, track) if recording.odometer is not None else None
-            findings += imu_clock(forward, by_places, None if odometer is None else odometer[0])
+            findings += imu_clock(clock_of(recording.imu, recording.gnss), None if odometer is None else odometer[0])
     return Screened(recording, tuple(findings))
 
 

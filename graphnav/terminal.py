@@ -132,11 +132,11 @@ def short(x: float) -> str:
 
 # What the stages weigh against each other: seconds of an hour's drive at 200 Hz, for the time left and nothing else.
 _STAGES = {
-    "reading": 0.5, "checks": 0.6, "driving": 5.0, "detection": 0.2, "alignment": 0.1, "judgement": 0.4,
+    "reading": 0.5, "checks": 0.6, "driving": 5.0, "detection": 0.2, "alignment": 0.1, "noise": 2.0,
     "preintegration": 0.7, "filter": 2.5, "smoother": 0.4, "batch": 0.9, "covariances": 0.2, "incremental": 4.8,
     "isam2": 44.0, "evaluation": 0.1, "writing": 0.7,
 }  # fmt: skip
-_BEFORE = ("reading", "checks", "detection", "alignment", "judgement", "preintegration", "filter", "smoother")
+_BEFORE = ("reading", "checks", "detection", "alignment", "noise", "preintegration", "filter", "smoother")
 _WORK = {
     "info": ("reading", "checks"), "detect": ("reading", "detection", "writing"), "evaluate": ("reading",),
     "simulate": ("driving", "writing"), "convert": ("reading", "writing"), "init": ("reading", "writing"),
