@@ -18,7 +18,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphnav import cli, workflow
+from graphnav import cli, load, workflow
+from graphnav.noise.files import write_noise
+from graphnav.noise.model import NoiseModel
 
 PROGRAM = Path(sys.executable).with_name("graphnav")
 SOLVERS = ("ekf", "rts", "batch")
@@ -288,6 +290,19 @@ def test_a_run_is_repeated_with_the_noise_model_of_its_summary(tmp_path):
     with (tokyo / "recording.toml").open("rb") as file:
         says = tomllib.load(file)["imu"]["noise"]["gyro_noise_density"]
     assert one["noise"]["figures"]["imu.gyro_noise_density"]["stated"] == says
+
+
+def test_a_result_that_cannot_be_trusted_says_so_in_its_first_line(tmp_path, capsys):
+    t = load("kitti").start
+    write_noise(tmp_path / "noise.json", NoiseModel(excluded={"gnss_position": ((t + 30.0, t + 80.0),)}))
+    kitti = ["smooth", "kitti", "--end", "90", "--solver", "ekf"]
+    assert cli.run([*kitti, "--noise", str(tmp_path / "noise.json"), "-o", str(tmp_path / "o")]) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert "cannot be trusted" in first
+    assert summary(tmp_path / "o")["doubts"][0][1:] in first
+    assert cli.run([*kitti, "-o", str(tmp_path / "p")]) == 0
+    assert "cannot be trusted" not in capsys.readouterr().out
+    assert summary(tmp_path / "p")["doubts"] == []
 
 
 # ---------------------------------------------------------------------------------------------------------------- info
