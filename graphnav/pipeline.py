@@ -19,6 +19,7 @@ from graphnav.errors import ConfigError, EstimationError
 from graphnav.noise.model import NoiseModel
 from graphnav.onboard_offset import without_onboard_offset
 from graphnav.own_noise import with_own_noise
+from graphnav.plausibility import screened
 from graphnav.preparation import prepare
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
@@ -63,14 +64,18 @@ def run(
 
     Raises
     ------
+    RecordingError
+        If a sensor is wrong throughout.
     EstimationError
         If the recording does not determine a trajectory.
     ConfigError
         If the settings' profile is of another platform.
     """
     settings = settings or Settings()
+    recording, found = screened(recording)
     with listening(progress):
-        return _run(recording, settings, solvers, progress, noise)
+        solutions = _run(recording, settings, solvers, progress, noise)
+    return {name: replace(one, notes=(*found, *one.notes)) for name, one in solutions.items()}
 
 
 def _run(

@@ -36,10 +36,11 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
               for source, span in outcome.request.withheld]  # fmt: skip
     notes = [note for s in outcome.solutions.values() for note in s.notes]
     lines += [f"  {said}" for said in _noise(outcome)]
+    severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
         if note.startswith("noise model, "):
             continue  # of one sensor: the report has the table
-        lines.append(f"  {'warning' if note in outcome.warnings else 'note'}: {note}")
+        lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
     lines += _whole(outcome)
     lines += _spans(outcome)

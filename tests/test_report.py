@@ -285,7 +285,7 @@ def test_what_cannot_be_trusted_says_so_first(tmp_path, recording):
     assert "cannot be trusted" not in first_words(replace(solution(), noise=partly))
     larger = replace(solution(), records={"gnss_position": record(2.0)})
     assert "sigma cannot be trusted" in first_words(larger)
-    assert doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.08)})
+    assert doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.02)})
     assert not doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.3)})
 
 
