@@ -20,7 +20,7 @@ from graphnav.noise.model import NoiseModel
 from graphnav.onboard_offset import without_onboard_offset
 from graphnav.own_noise import with_own_noise
 from graphnav.plausibility import screened
-from graphnav.preparation import prepare
+from graphnav.preparation import prepare, start_sigma
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
 from graphnav.solution import Solution, joined
@@ -147,7 +147,7 @@ def _solve(
     notes = (*found.start.notes, *undone, *shown, *found.detections.notes, *found.notes, *faults.notes(wrong, problem))
     start, passes = smoothed, Counter(found.passes)
     if found.astray:
-        prior = InitialPrior(keyframe=problem.prior.keyframe, mean=found.start.state, sigma=found.start.sigma[None])
+        prior = InitialPrior(keyframe=problem.prior.keyframe, mean=found.start.state, sigma=start_sigma(found.start)[None])
         problem = replace(problem, prior=prior)
         forward = ekf(problem, progress, found.aligned.until)
         smoothed = backward(problem, forward, progress)

@@ -84,11 +84,7 @@ def settings_of(variant: str, sensors: str, doppler: bool = True) -> graphnav.Se
     if sensors == "gnss":
         values["standstill"] = {"zero_velocity": False, "zero_rate": False, "held_position": False}
     values["vehicle"] = {"nhc": sensors != "gnss", "odometer": sensors == "+odometer"}
-    if variant == "stated":
-        values["imu"] = {"as_stated": True}
-        values["gnss"] |= {
-            "sd_factor": 1.0, "slow_share": 0.0, "fast_time": 0.0, "faults": "off", "adaptive": "off"
-        }  # fmt: skip
+    values["noise"] = {"mode": variant}
     return settings_from(values)
 
 
