@@ -64,7 +64,8 @@ def figure_rows(
             continue
         time = next((part for part in middle if part in lasts), None)
         kind = next((part for part in middle if part not in lasts), None)
-        sigma = _stated_sigma(recording, source, kind, axis)
+        # what lasts for minutes and hours has one unit, whatever the type of a fix
+        sigma = _stated_sigma(recording, source, None if time in TIMES[1:] else kind, axis)
         words = f"{_OF.get(source, source)}{f' ({kind})' if kind else ''}, {axis}"
         words += ", white" if time is None else f", lasting {time}"
         out.append(
