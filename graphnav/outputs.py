@@ -194,6 +194,8 @@ def noise_summary(outcome: Outcome, solution: Solution) -> dict[str, Any]:
     from graphnav.noise.files import noise_values
 
     values = noise_values(solution.noise, outcome.request.settings.noise.mode)
+    if len(solution.between) > 1:
+        values["pieces"] = len(solution.between)
     for row in noise_rows(outcome, solution):
         beside = {"stated": row.stated, "used": row.used, "unit": row.unit, "correlation_time": row.correlation_time}
         values["figures"][row.group] |= beside

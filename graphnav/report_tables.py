@@ -212,6 +212,8 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Raw]:
             "Stated figures of fixes are medians of their sigmas. The white part and the lasting parts add up as "
             "variances. A figure with few degrees of freedom is mostly what was expected beforehand."
         )
+        if len(solution.between) > 1:
+            note += f" The recording was cut into {len(solution.between)} pieces: these are the figures of the first."
         out.append(page.paragraph(note, "soft"))
     less = [
         f"{len(some.t)} of {len(solution.records[name].t)} rows of {name} are off by more than chance allows once in a "

@@ -8,6 +8,8 @@ Under the key "noise", in a file of its own or in the summary.json of a run::
     weights             by constraint: t (s) and weight of rows with less information
     excluded            by constraint: [begin, end] (s) of spans left out
 
+    pieces              how many pieces the recording was cut into, the figures being those of the first; for people
+
 What else stands beside a figure (the stated one, the one used) is for people. Numbers are written with as many digits
 as bring them back exactly.
 """
@@ -33,7 +35,7 @@ from graphnav.preintegration import NOISE_FIGURES
 from graphnav.recording import FIX_TYPES
 
 MODES: tuple[str, ...] = get_args(NoiseSettings.model_fields["mode"].annotation)
-_KEYS = ("mode", "figures", "correlation_times", "weights", "excluded")
+_KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded")
 _FIGURE = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
            "degrees_of_freedom": "freedom"}  # fmt: skip
 _BESIDE = ("variance_factor", "stated", "used", "unit", "correlation_time")
