@@ -23,7 +23,7 @@ from graphnav.report import write_comparison, write_report
 from graphnav.report_provenance import command, toml_text
 from graphnav.report_tables import accuracy_row, consistency, span_row
 from graphnav.report_words import doubts
-from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution, joined
 from graphnav.state import States
 
 START, COUNT = 1000.0, 600
@@ -318,6 +318,35 @@ def test_the_noise_model_is_a_table(tmp_path, recording):
             assert words in text, words
     plain = checked(write_report(tmp_path / "r.html", recording, solution(), settings={}))[1]
     assert "as they are stated" in plain
+
+
+def test_pieces_keep_all_weights_and_spans_and_the_report_says_whose_figures_it_has(tmp_path, recording):
+    t = record().t
+    names = ("gnss_position", "nhc")
+    parts = [
+        replace(
+            solution(),
+            noise=NoiseModel(
+                {"imu.gyro_bias_walk": Figure(float(k))},
+                weights={names[k]: RowWeights(t[[k]], np.array([0.5]))},
+                excluded={"gnss_position": ((t[k], t[k + 1]),)},
+            ),
+            passes={"filter": 3, "smoother": k},
+            between=(None,),
+        )
+        for k in (0, 1)
+    ]
+    whole = joined(parts)
+    assert whole.noise.figures == parts[0].noise.figures
+    assert {name: list(some.t) for name, some in whole.noise.weights.items()} == {
+        "gnss_position": [t[0]],
+        "nhc": [t[1]],
+    }
+    assert whole.noise.excluded == {"gnss_position": ((t[0], t[1]), (t[1], t[2]))}
+    assert whole.passes == {"filter": 6, "smoother": 1}
+    rows = figure_rows(whole.noise, recording, (100.0, 3600.0))
+    shown = replace(whole, t=parts[0].t, states=parts[0].states, covariance=parts[0].covariance)
+    assert "2 pieces" in checked(write_report(tmp_path / "r.html", recording, shown, settings={}, noise=rows))[1]
 
 
 def test_innovations_speak_for_all_solvers(tmp_path, recording):
