@@ -248,7 +248,9 @@ def test_sigmas_are_true(drive: tuple[Recording, Trajectory]) -> None:
 def test_real_program_run(shared_data: Path, name: str) -> None:
     found = run(read(shared_data / name), solvers=("incremental", "batch"))
     a, b = found["incremental"], found["batch"]
-    assert np.abs(a.states.p - b.states.p).max() < 0.01
+    # what comes after the lag still tells of errors that last for minutes and hours: as much as variances say
+    var = [np.diagonal(one.covariance, axis1=1, axis2=2)[:, 3:6] for one in (a, b)]
+    assert np.all(np.abs(a.states.p - b.states.p) < 3.0 * np.sqrt(np.maximum(var[0] - var[1], 0.0)) + 0.001)
     assert any("ms (median)" in note for note in a.notes)
 
 
