@@ -39,7 +39,7 @@ _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that level a vehicle without GNSS
 _JUDGED = 120.0  # s of rows by which the sensors are judged again
 _FIXES = 600  # in motion, that tell variances to 6 %: more of them say little new
-_THINKING, _LONGEST_THOUGHT = 1.0 / 16.0, 10.0  # of the lag, and s: what judging may take
+_THINKING, _LONGEST_THOUGHT = 1.0 / 8.0, 20.0  # of the lag, and s: what judging may take, 11 s for 1100 keyframes
 _JUDGED_UNTIL = 900.0  # s of rows, where fixes are so rare that these are still too few
 _PATIENCE = 300.0  # s of rows kept while there is no motion to align with
 

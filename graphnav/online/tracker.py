@@ -210,10 +210,9 @@ class Tracker(Chain):
     def _prepare(self, sensors: Sensors, expected: float) -> None:
         """Pose and predict the keyframe that is expected, but for the fix."""
         before = self._before(len(self.window), expected)
-        problem = self._pose(sensors, np.array([*before, expected]), complete=False)
-        noisy = self._noisy(problem, sensors)
-        self._parameters |= noisy.parameters
-        place, _ = self._place(self._weighed(noisy), len(before))
+        problem = self._noisy(self._pose(sensors, np.array([*before, expected]), complete=False), sensors)
+        self._parameters |= problem.parameters
+        place, _ = self._place(self._weighed(problem), len(before))
         self._ahead = _Ahead(problem, self.window.expect(place), self.stops, self._readings.wrong)
 
     def _prepared(self, t: float) -> bool:
@@ -232,7 +231,11 @@ class Tracker(Chain):
         if ahead is None or len(times) > 1 or len(ahead.problem.t) != len(before) + 1:
             return None
         recording = sensors.recording(float(ahead.problem.t[0]) - _NEAR, float(times[-1]) + 0.1)
-        problem = self._noisy(ahead.problem.completed(recording, self._usual(sensors, recording)), sensors)
+        problem = ahead.problem.completed(recording, self._usual(sensors, recording))
+        known = {c.name for c in ahead.problem.constraints}
+        late = replace(problem, constraints=tuple(c for c in problem.constraints if c.name not in known))
+        added = {c.name: c for c in self._noisy(late, sensors, self._noise_of_rows).constraints}
+        problem = replace(problem, constraints=tuple(added.get(c.name, c) for c in problem.constraints))
         return problem if problem.parameters.keys() <= self._parameters.keys() else None
 
     def _revise(self, sensors: Sensors, always: bool = False) -> bool:
@@ -344,7 +347,13 @@ class Tracker(Chain):
         """Whether some figure of the IMU is not used as stated."""
         return any(self.noise.factor(f"imu.{name}", 1.0) != 1.0 for name in NOISE_FIGURES)
 
-    def _noisy(self, problem: Problem, sensors: Sensors) -> Problem:
+    @property
+    def _noise_of_rows(self) -> NoiseModel:
+        """The noise model for a problem whose intervals have it already."""
+        rows = {name: one for name, one in self.noise.figures.items() if not name.startswith("imu.")}
+        return replace(self.noise, figures=rows)
+
+    def _noisy(self, problem: Problem, sensors: Sensors, noise: NoiseModel | None = None) -> Problem:
         """A problem posed with stated noise as the noise model has it.
 
         A few keyframes do not tell how often fixes come, nor what they usually state: all rows do.
@@ -356,7 +365,7 @@ class Tracker(Chain):
             if isinstance(c, GnssVelocity):
                 c = replace(c, unit_error=sensors.usual(problem.t[c.keyframe])[:, 3:])
             rows.append(c)
-        return with_noise(replace(problem, constraints=tuple(rows)), self.noise)
+        return with_noise(replace(problem, constraints=tuple(rows)), self.noise if noise is None else noise)
 
     def _around(self, sensors: Sensors, begin: float, end: float) -> Recording:
         """The rows that keyframes between two times look at.
