@@ -1,12 +1,12 @@
 """Looks a recording over before it is solved: what it holds, and what in it is odd, in plain words.
 
-Each check is a small function that yields findings; it says nothing where the data do not tell.
-Nothing is changed.
+Each check is a small function that yields findings; it says nothing where the data do not tell. What cannot be right is
+looked for first (`graphnav.plausibility`), and the rest is checked without it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ from graphnav.checks_aiding import (
     gnss_coverage,
     gnss_jumps,
     imu_axes,
-    imu_clock,
     odometer_findings,
     overlap_s,
     reversed_sign,
@@ -25,8 +24,8 @@ from graphnav.checks_aiding import (
 from graphnav.checks_imu import (
     force_at_rest,
     gap_limit,
+    gyro_unit,
     imu_time,
-    imu_units,
     noise_at_rest,
     repeats,
     saturation,
@@ -40,8 +39,10 @@ from graphnav.checks_stated import (
     truth_findings,
     velocities,
 )
+from graphnav.clock import clock_of
 from graphnav.crosschecks import Track
-from graphnav.findings import Finding, period_of, runs_of
+from graphnav.findings import SEVERITIES, Finding, period_of, runs_of
+from graphnav.plausibility import refuse, screen
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 
@@ -55,16 +56,32 @@ class Inspection:
     name: str
     platform: str
     facts: dict[str, dict[str, Any]]
+    recording: Recording = field(repr=False)  # what was inspected, without what cannot be right
     findings: tuple[Finding, ...] = field(default=())
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The sentences of the warnings."""
-        return tuple(f.sentence for f in self.findings if f.severity == "warning")
+        """The sentences of the warnings, and of what is graver."""
+        return tuple(f.sentence for f in self.findings if f.severity != "note")
+
+    @property
+    def trusted(self) -> bool:
+        """Whether nothing was found with which a result may be wrong altogether."""
+        return all(f.severity in ("note", "warning") for f in self.findings)
+
+    def refuse(self) -> None:
+        """Raise what it cannot be solved with.
+
+        Raises
+        ------
+        RecordingError
+            With the first refused finding's sentence.
+        """
+        refuse(self.recording, self.findings)
 
     def values(self) -> dict[str, Any]:
         """All of it, for JSON."""
-        said = [{"severity": f.severity, "sentence": f.sentence} for f in self.findings]
+        said = [f.values() for f in self.findings]
         return {"name": self.name, "platform": self.platform, **self.facts, "findings": said}
 
     def text(self) -> str:
@@ -93,13 +110,17 @@ def _show(name: str, value: Any) -> str:
 def inspect(recording: Recording) -> Inspection:
     """Check a recording; see the module's head.
 
-    Findings are in order of the checks, remarks of the loader first.
+    Findings are in order of their severity, the gravest first, then of the checks, remarks of the loader first.
     """
+    whole = screen(recording)
+    recording = whole.recording
     findings = [Finding("note", remark) for remark in recording.remarks]
+    findings += whole.findings
     for name in ("gnss", "odometer"):
         if (sensor := getattr(recording, name)) is not None and not len(sensor.t):
             findings.append(Finding("warning", f"[{name}] holds no rows in this part of the recording"))
             recording = recording.without(name)
+    known = {f.key for f in whole.findings}
     facts: dict[str, dict[str, Any]] = {"imu": _imu_facts(recording)}
     vehicle = recording.platform == "vehicle"
     overlap = recording.gnss is not None and overlap_s(recording) > 0
@@ -108,7 +129,8 @@ def inspect(recording: Recording) -> Inspection:
     findings += imu_time(recording.imu)
     findings += repeats(recording.imu)
     findings += saturation(recording.imu)
-    findings += imu_units(recording)
+    if "imu.gyro_unit" not in known:
+        findings += gyro_unit(recording)
     findings += stated_noise(recording.imu.noise)
     findings += lever_arms(recording)
     findings += too_fast_for_a_foot(recording, track)
@@ -124,14 +146,15 @@ def inspect(recording: Recording) -> Inspection:
         findings += fix_types(recording.gnss)
         wrong = list(velocities(recording.gnss))
         findings += wrong or gnss_jumps(recording, track)  # against wrong velocities every position jumps
+    turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis"}
     if vehicle and overlap and track is not None and recording.gnss is not None:
-        forward, yaw = crosschecks.forward_fit(recording.imu, track), crosschecks.yaw_fit(recording.imu, track)
-        places = crosschecks.track(replace(recording.gnss, v=None)) if recording.gnss.v is not None else None
-        findings += imu_clock(forward, crosschecks.forward_fit(recording.imu, places) if places is not None else None)
+        clock, yaw = clock_of(recording.imu, recording.gnss), crosschecks.yaw_fit(recording.imu, track)
+        forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
-        findings += reversed_sign(recording.imu) if turns_back else imu_axes(recording.imu, forward)
+        if not turned:
+            findings += reversed_sign(recording.imu) if turns_back else imu_axes(recording.imu, forward)
         findings += yaw_scale(yaw)
-    elif vehicle:
+    elif vehicle and not turned:
         findings += imu_axes(recording.imu, None)
     if recording.odometer is not None:
         facts["odometer"] = _sensor_facts(recording.odometer.t)
@@ -144,7 +167,8 @@ def inspect(recording: Recording) -> Inspection:
         if recording.truth.closed_loop_sigma:
             facts["truth"] = {"closed_loop_sigma_m": recording.truth.closed_loop_sigma}
         findings += truth_findings(recording)
-    return Inspection(recording.name, recording.platform, facts, tuple(findings))
+    findings.sort(key=lambda f: SEVERITIES.index(f.severity))
+    return Inspection(recording.name, recording.platform, facts, whole.recording, tuple(findings))
 
 
 def _sensor_facts(t: Array) -> dict[str, Any]:

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 
 from graphnav import crosschecks, wheels
+from graphnav.clock import Clock
+from graphnav.config.gnss import GnssSettings
 from graphnav.crosschecks import Fit, Track
 from graphnav.findings import Finding, period_of
 from graphnav.recording import Imu, Odometer, Recording
 from graphnav.rotation import Array
 from graphnav.wheels.faults import FROZEN, GAP, STUCK, WILD
 
+_SURE = 4.0  # sigmas
 _MIN_SPEED = 5.0  # m/s, at which wheels are compared
 
 
@@ -91,28 +94,34 @@ def gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Finding]:
         )
 
 
-def imu_clock(forward: Fit | None, by_places: Fit | None) -> Iterator[Finding]:
-    """By GNSS speed, and by the positions alone, which in some receivers are of another time."""
-    if forward is not None and by_places is not None and min(forward.correlation, by_places.correlation) > 0.8:
-        apart = abs(forward.lag - by_places.lag)
-        if apart > 0.05 + 4.0 * np.hypot(forward.spread, by_places.spread):
-            yield Finding(
-                "note",
-                f"the stamps of GNSS positions and velocities are {apart:.2f} s apart (forward force against each): "
-                "they cannot both be right, and what is left after time_offset is estimated of each",
-            )
-            if forward.lag * by_places.lag <= 0.0 or abs(by_places.lag) < 0.05:
-                return  # between the two already, or right for the positions
-    # 4 sigma, because the sigma comes from four parts only; the course, which leads or lags with the lever arm, is
-    # not asked
-    if forward is None or forward.correlation < 0.6 or abs(forward.lag) < 0.05 + 4.0 * forward.spread:
+def imu_clock(clock: Clock, odometer: Fit | None = None) -> Iterator[Finding]:
+    """By GNSS speed, and by the positions alone, which in some receivers are of another time.
+
+    `odometer` is its fit against GNSS, which tells whose clock it is. What is further off than the stamps of the fixes
+    are allowed to be would be solved into something else. The course, which leads or lags with the lever arm, is not
+    asked.
+    """
+    if clock.apart is not None:
+        yield Finding(
+            "note",
+            f"the stamps of GNSS positions and velocities are {clock.apart:.2f} s apart: they cannot both be right, "
+            "and what is left after time_offset is estimated of each",
+            "gnss.two_clocks",
+        )
+    forward = clock.late
+    if forward is None:
         return
     lag = forward.lag
     leap = ", the leap seconds between GPS time and UTC" if abs(abs(lag) - 18.0) < 0.5 else ""
+    certain = abs(lag) - 4.0 * forward.spread > _SURE * GnssSettings().time_offset_sigma
+    # what the odometer is off by as well is the receiver's
+    own = odometer is None or odometer.correlation < 0.9 or abs(odometer.lag - lag) > 0.5 * abs(lag)
+    mend = f"{-lag:+.2f} to time_offset in [imu]" if own else f"{lag:+.2f} to time_offset in [gnss]"
     yield Finding(
-        "warning",
+        "untrusted" if certain else "warning",
         f"IMU stamps are {'late' if lag > 0 else 'early'} against GNSS by {abs(lag):.2f} s{leap} (forward force "
-        f"against speed, +-{max(forward.spread, 0.01):.2f} s): add {-lag:+.2f} to time_offset in [imu]",
+        f"against speed, +-{max(forward.spread, 0.01):.2f} s): add {mend}",
+        "imu.clock",
     )
 
 

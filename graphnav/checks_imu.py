@@ -65,18 +65,8 @@ def saturation(imu: Imu) -> Iterator[Finding]:
                     )
 
 
-def imu_units(recording: Recording) -> Iterator[Finding]:
-    x, y, z = recording.imu.accel.T
-    f = float(np.median(np.sqrt(x * x + y * y + z * z)))
-    guesses = (
-        (0.8, 1.2, 'the accelerometer seems to be in g: say units = { accel = "g" }'),
-        (85.0, 110.0, "the accelerometer seems to be in m/s2 already: leave out units.accel"),
-        (800.0, 1200.0, "the accelerometer seems to be in thousandths of g: turn it into m/s2 or g"),
-        (0.0, 0.8, "gravity seems to have been removed from the accelerometer; graphnav needs the raw force"),
-    )
-    for low, high, sentence in guesses:
-        if low <= f < high:
-            yield Finding("warning", f"the force has a median of {f:.3g} m/s2, not 9.8: {sentence}")
+def gyro_unit(recording: Recording) -> Iterator[Finding]:
+    """Turn rates that a sensor can read, but that its carrier does not reach."""
     x, y, z = np.abs(recording.imu.gyro).T
     rate = float(np.percentile(np.maximum(np.maximum(x, y), z), 99.0))
     if rate > (4.0 if recording.platform == "vehicle" else 35.0):  # 35 rad/s = 2000 deg/s, the usual full scale

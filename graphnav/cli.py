@@ -153,6 +153,7 @@ def detect(
     from graphnav import detection_report, outputs, workflow
     from graphnav.config import read_settings
     from graphnav.detectors import detect as detected
+    from graphnav.plausibility import screened
     from graphnav.staging import moved, staged
 
     withheld = _withheld(without, start, end)
@@ -160,9 +161,10 @@ def detect(
     folder = outputs.output_folder(out)
     with bar(quiet, "detect"):
         tell("reading")
-        used = workflow.read_part(recording, start, end, withheld)
+        used, said = screened(workflow.read_part(recording, start, end, withheld))
         tell("detection")
         found = detected(used, settings)
+        found = replace(found, notes=(*said, *found.notes))
         tell("writing")
         with staged(folder) as part:
             files = detection_report.write(used, found, part)

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from graphnav import lags as lags_of_clocks
 from graphnav.earth import LocalFrame
 from graphnav.recording import Gnss, Imu, Odometer
 from graphnav.rotation import Array, wrap
@@ -41,13 +41,18 @@ class Track:
         """Horizontal speed, m/s."""
         return np.hypot(self.v[:, 0], self.v[:, 1])
 
+    @property
+    def instant(self) -> bool:
+        """Whether these are velocities that the receiver gave."""
+        return not self.width.any()
+
 
 @dataclass(frozen=True)
 class Fit:
     """One regression: y = coefficients @ x, with x taken `lag` seconds later than y."""
 
     lag: float  # s
-    spread: float  # s, 1-sigma of the lag from parts of the drive
+    spread: float  # s, 1-sigma of the lag (`graphnav.lags`)
     correlation: float
     at_zero: float  # the correlation without a shift
     coefficients: Array  # (m,)
@@ -149,51 +154,39 @@ def _peak(lags: Array, c: Array) -> float:
     return float(lags[k])
 
 
-def _search(y: Array, x_at: Callable[[Index, float], Array], span: Array, valid: Callable[[float], Array]) -> Fit:
-    """The shift at which x explains y best; `x_at(rows, lag)`, `valid(lag)` a mask of the rows."""
+def _search(
+    t: Array, y: Array, x_at: Callable[[Index, float], Array], span: Array, valid: Callable[[float], Array]
+) -> Fit:
+    """The shift at which x explains y, of times t, best; `x_at(rows, lag)`, `valid(lag)` a mask of the rows."""
     every = np.arange(len(y))
 
-    def correlations(rows: Index, lags: Array, parts: int = 0) -> Array:
-        """(len(lags), 1 + parts) with all rows, and with each of as many parts of them."""
-        edges = [part[0] for part in np.array_split(rows, parts)[1:]] if parts else []
-        out = np.zeros((len(lags), 1 + parts))
-        for k, lag in enumerate(lags):
-            some = rows[valid(lag)[rows]]
-            if len(some) < MIN_PAIRS:
-                continue
-            x, of = x_at(some, lag), y[some]
-            out[k, 0] = _regress(x, of)[0]
-            cuts = [0, *np.searchsorted(some, edges), len(some)] if parts else []
-            for m, (a, b) in enumerate(pairwise(cuts), 1):
-                out[k, m] = _regress(x[a:b], of[a:b])[0] if b - a >= MIN_PAIRS else 0.0
-        return out
+    def correlations(rows: Index, lags: Array) -> Array:
+        some = (rows[valid(lag)[rows]] for lag in lags)
+        return np.array(
+            [_regress(x_at(r, lag), y[r])[0] if len(r) >= MIN_PAIRS else 0.0 for r, lag in zip(some, lags, strict=True)]
+        )
 
     def correlation(lag: float, rows: Index) -> float:
-        return float(correlations(rows, np.array([lag]))[0, 0])
+        return float(correlations(rows, np.array([lag]))[0])
 
     few = every[:: max(1, len(y) // 800)]
     many = every[:: max(1, len(y) // 4000)]
     # changes over a second stay alike for about as long: where they may fit best is seen from every fourth shift
     lags = np.arange(-5.0, 5.01, 0.1)
-    rough = np.argsort(correlations(few, lags[::4])[:, 0])[-3:] * 4
+    rough = np.argsort(correlations(few, lags[::4]))[-3:] * 4
     close = np.unique(np.clip(rough[:, None] + np.arange(-4, 5), 0, len(lags) - 1))
     c = np.full(len(lags), -np.inf)
-    c[close] = correlations(few, lags[close])[:, 0]
+    c[close] = correlations(few, lags[close])
     near = _peak(lags, c)
     coarse, reached = near, correlation(near, few)
     # far away only if nothing near explains y, and only for clearly more, for there are many far shifts
     reach = min(WIDE, 0.3 * (span[-1] - span[0]))
     if reached < 0.6 and reach > 5.0:
         wide = np.arange(-reach, reach + 0.1, 0.2)
-        far = _peak(wide, correlations(few, wide)[:, 0])
+        far = _peak(wide, correlations(few, wide))
         if abs(far) > 5.0 and correlation(far, few) > reached + 0.15:
             coarse = far
-    fine = np.arange(-0.3, 0.301, 0.02) + coarse
-    parts = 4 if len(many) // 4 >= 2 * MIN_PAIRS else 0
-    c = correlations(many, fine, parts)
-    lag = _peak(fine, c[:, 0])
-    own = [_peak(fine, column) for column in c[:, 1:].T]
-    spread = float(np.std(own) / np.sqrt(len(own))) if own else 0.1
+    lag, spread = lags_of_clocks.refined(t, y, x_at, valid, many, coarse, MIN_PAIRS)
     rows = every[valid(lag)]
     r, b = _regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
     return Fit(lag, spread, r, correlation(0.0, every), b)
@@ -215,7 +208,7 @@ def _imu_fit(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) 
     def valid(lag: float) -> Array:
         return (ti + lag - wi / 2 > imu.t[0]) & (tj + lag + wj / 2 < imu.t[-1])
 
-    return _search(y, x_at, track.t, valid)
+    return _search(0.5 * (ti + tj), y, x_at, track.t, valid)
 
 
 def up_of(imu: Imu) -> Array:
@@ -238,7 +231,9 @@ def forward_fit(imu: Imu, track: Track) -> Fit | None:
         return None
     level = np.linalg.svd(up_of(imu)[None, :])[2][1:]  # (2, 3)
     fit = _imu_fit(imu, imu.accel @ level.T, track, i, j, y)
-    return None if fit is None else replace(fit, coefficients=fit.coefficients @ level)
+    if fit is None or len(fit.coefficients) != len(level):  # no time in common
+        return None
+    return replace(fit, coefficients=fit.coefficients @ level)
 
 
 def yaw_fit(imu: Imu, track: Track) -> Fit | None:
@@ -255,6 +250,32 @@ def yaw_fit(imu: Imu, track: Track) -> Fit | None:
     if len(y) < MIN_PAIRS or y.std() < 0.04:
         return None
     return _imu_fit(imu, imu.gyro @ up_of(imu)[:, None], track, i, j, y)
+
+
+def velocity_fit(track: Track, places: Track) -> Fit | None:
+    """Change of speed by places on that by velocities: how late velocities are against places; None without changes."""
+    i, j = _pairs(places)
+    y = places.speed[j] - places.speed[i]
+    real = np.abs(y) < _FASTEST_CHANGE * (places.t[j] - places.t[i])
+    i, j, y = i[real], j[real], y[real]
+    if len(y) < MIN_PAIRS or y.std() < 0.25:
+        return None
+    t, way = track.t, np.zeros((len(track.t), 2))
+    way[1:] = np.cumsum(0.5 * (track.v[1:, :2] + track.v[:-1, :2]) * np.diff(t)[:, None], axis=0)
+
+    def speed(of: Index, lag: float) -> Array:
+        a, b = (places.t[of] + side * places.width[of] / 2 + lag for side in (-1.0, 1.0))
+        gone = [np.interp(b, t, axis) - np.interp(a, t, axis) for axis in way.T]
+        return np.asarray(np.hypot(*gone) / places.width[of])
+
+    def x_at(rows: Index, lag: float) -> Array:
+        return (speed(j[rows], lag) - speed(i[rows], lag))[:, None]
+
+    def valid(lag: float) -> Array:
+        first, last = places.t[i] - places.width[i] / 2 + lag, places.t[j] + places.width[j] / 2 + lag
+        return np.asarray((first > t[0]) & (last < t[-1]))
+
+    return _search(0.5 * (places.t[i] + places.t[j]), y, x_at, places.t, valid)
 
 
 def odometer_fit(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
@@ -284,7 +305,7 @@ def odometer_fit(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
     off = track.speed - slope * x
     off = np.abs(off - np.median(off[inside]))
     usable = off < 6.0 * np.median(off[inside]) + 0.5
-    fit = _search(track.speed, x_at, track.t, valid)
+    fit = _search(track.t, track.speed, x_at, track.t, valid)
     rows = every[valid(fit.lag)]
     x = x_at(rows, fit.lag)[:, 0]
     moving = (np.abs(x) > 0.3 * np.abs(x).max()) & (track.speed[rows] > _MIN_SPEED)

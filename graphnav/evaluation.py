@@ -130,7 +130,8 @@ def evaluate_recording(
     if found is None:
         return None
     truth, lever_arm = found
-    found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, at=at)
+    alone = recording.gnss is None
+    found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, at=at, from_start=alone)
     return measure(found_errors, trajectory.name, spans, start=recording.start)
 
 
@@ -154,6 +155,7 @@ def evaluate(
     """
     trajectory_path, truth_path = Path(trajectory_path), Path(truth_path)
     trajectory = read_trajectory(trajectory_path)
+    alone = None
     if truth_path.is_dir() or truth_path.suffix == ".toml":
         from graphnav import formats
 
@@ -165,12 +167,13 @@ def evaluate(
                 raise RecordingError(f"{truth_path}: the recording has no [truth] to evaluate against")
             return metrics
         truth, arm = found
+        alone = recording.gnss is None
         lever_arm = arm if lever_arm is None else lever_arm
     else:
         truth = read_trajectory(truth_path)
     if trajectory.t[-1] < truth.t[0] or truth.t[-1] < trajectory.t[0]:
         raise RecordingError(f"{trajectory_path}: {ranges(trajectory, truth)}{_shift_hint(trajectory, truth)}")
-    found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap)
+    found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, from_start=alone)
     hint = _leap_hint(found_errors, trajectory, truth, lever_arm, max_gap)
     return measure(
         replace(found_errors, notes=found_errors.notes + hint), trajectory.name or trajectory_path.stem, spans

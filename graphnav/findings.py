@@ -10,13 +10,25 @@ from numpy.typing import NDArray
 
 from graphnav.rotation import Array
 
+Severity = Literal["note", "warning", "untrusted", "refused"]
+SEVERITIES: tuple[Severity, ...] = ("refused", "untrusted", "warning", "note")  # the gravest first
+
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing worth knowing: a warning if results suffer from it, else a note."""
+    """One thing worth knowing.
 
-    severity: Literal["note", "warning"]
+    A *note* changes nothing, results suffer from a *warning*, what is solved with an *untrusted* one may be wrong
+    altogether whatever its sigmas say, and with a *refused* one nothing is solved.
+    """
+
+    severity: Severity
     sentence: str
+    key: str = ""  # what it is about in a word that stays the same, such as "imu.spike"
+
+    def values(self) -> dict[str, str]:
+        """All of it, for JSON."""
+        return {"key": self.key, "severity": self.severity, "sentence": self.sentence}
 
 
 def period_of(t: Array) -> float:

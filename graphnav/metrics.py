@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import gammaincinv  # scipy.stats would take a second to import
 
 from graphnav.rotation import Array
+from graphnav.sigmas import chi_square_band, chi_square_quantile, effective_epochs, over_sigmas
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class Errors:
     dof_p: int = 3  # 2 for a truth without height
     epochs: int = 0  # that there were, scored or not
     notes: tuple[str, ...] = ()
+    nees_heading: Array | None = None  # (N,) 1 degree of freedom
 
     def __len__(self) -> int:
         return len(self.t)
@@ -65,9 +66,9 @@ class Nees:
     """Average NEES per degree of freedom: 1 where the covariance is true.
 
     `low` and `high` hold the average 95 % of the time if the n epochs are independent. Errors of one
-    drive are correlated over seconds to minutes, so a true covariance leaves this band often: judge by
-    independent runs (`ensemble_nees`). `inside` is the share of epochs within the 95 % region of one
-    epoch; its expectation, 0.95, does not need independence.
+    drive are correlated over seconds to minutes, so a true covariance leaves this band often: `band` is that
+    of as many epochs as they are worth; sharper are independent runs (`ensemble_nees`). `inside` is the share
+    of epochs within the 95 % region of one epoch; its expectation, 0.95, does not need independence.
     """
 
     mean: float
@@ -76,6 +77,7 @@ class Nees:
     low: float
     high: float
     inside: float
+    effective: float  # how many independent epochs the n are worth
 
 
 @dataclass(frozen=True)
@@ -152,9 +154,11 @@ def measure(
         "ve": errors.v[:, 0], "vn": errors.v[:, 1], "vu": errors.v[:, 2],
         "roll": deg[:, 0], "pitch": deg[:, 1], "heading": deg[:, 2],
     }  # fmt: skip
+    p, v, rph = over_sigmas(errors)
     values = {
-        "p": (errors.nees_p, errors.dof_p), "e": (errors.nees_axis[:, 0], 1), "n": (errors.nees_axis[:, 1], 1),
-        "up": (errors.nees_axis[:, 2], 1), "v": (errors.nees_v, 3), "rph": (errors.nees_rph, 3),
+        "p": (errors.nees_p, errors.dof_p, p), "e": (errors.nees_axis[:, 0], 1, p[:, :1]),
+        "n": (errors.nees_axis[:, 1], 1, p[:, 1:2]), "up": (errors.nees_axis[:, 2], 1, p[:, 2:]),
+        "v": (errors.nees_v, 3, v), "rph": (errors.nees_rph, 3, rph),
     }  # fmt: skip
     return Metrics(
         name=name,
@@ -163,7 +167,7 @@ def measure(
         duration=float(errors.t[-1] - errors.t[0]) if len(errors) else 0.0,
         distance=float(errors.distance[-1]) if len(errors) else 0.0,
         components={key: found for key, x in series.items() if (found := statistic(x)) is not None},
-        nees={key: mean for key, (x, dof) in values.items() if (mean := average_nees(x, dof)) is not None},
+        nees={key: mean for key, (x, dof, z) in values.items() if (mean := average_nees(x, dof, z)) is not None},
         spans=tuple(_span(errors, a, b, start) for a, b in spans),
         notes=errors.notes,
         errors=errors,
@@ -185,23 +189,19 @@ def statistic(x: Array) -> Statistic | None:
     )
 
 
-def average_nees(x: Array, dof: int) -> Nees | None:
-    """Average per degree of freedom of NEES values (N,) with its 95 % band for independent epochs."""
-    x = x[np.isfinite(x)]
+def average_nees(x: Array, dof: int, over_sigma: Array | None = None) -> Nees | None:
+    """Average per degree of freedom of NEES values (N,) with its 95 % band for independent epochs.
+
+    `over_sigma`, (N, k), are the errors over their sigmas, by which epochs are alike; without them all count.
+    """
+    known = np.isfinite(x)
+    x = x[known]
     if not len(x):
         return None
+    effective = float(len(x)) if over_sigma is None else effective_epochs(over_sigma[known])
     low, high = chi_square_band(dof, len(x))
-    return Nees(float(x.mean()) / dof, dof, len(x), low, high, float(np.mean(x <= chi_square_quantile(0.95, dof))))
-
-
-def chi_square_band(dof: int, n: int) -> tuple[float, float]:
-    """The two-sided 95 % band of the mean of n independent chi-square values, per degree of freedom."""
-    return chi_square_quantile(0.025, dof * n) / (dof * n), chi_square_quantile(0.975, dof * n) / (dof * n)
-
-
-def chi_square_quantile(probability: float, dof: float) -> float:
-    """Where the chi-square distribution function, the regularised incomplete gamma function, is `probability`."""
-    return 2.0 * float(gammaincinv(0.5 * dof, probability))
+    inside = float(np.mean(x <= chi_square_quantile(0.95, dof)))
+    return Nees(float(x.mean()) / dof, dof, len(x), low, high, inside, effective)
 
 
 def ensemble_nees(runs: Sequence[Errors], block: str = "p") -> tuple[Array, Array, float, float]:
@@ -264,6 +264,7 @@ def summary(metrics: Metrics) -> dict[str, Any]:
         out[f"nees_{key}"] = _rounded(nees.mean)
         out[f"nees_{key}_inside_95"] = _rounded(nees.inside)
         out[f"nees_{key}_band_if_independent"] = [_rounded(nees.low), _rounded(nees.high)]
+        out[f"nees_{key}_band"] = [_rounded(x) for x in chi_square_band(nees.dof, nees.effective)]
     if metrics.closure is not None:
         c = metrics.closure
         out |= {
@@ -329,7 +330,7 @@ def comparison_rows(results: Mapping[str, Metrics]) -> list[dict[str, Any]]:
             if key == "spans":
                 for k, span in enumerate(value, 1):
                     row |= {f"span{k}_{name}": number for name, number in span.items()}
-            elif key != "notes" and not key.endswith("_band_if_independent"):
+            elif key != "notes" and not key.endswith(("_band_if_independent", "_band")):
                 row[key] = value
         rows.append(row)
     keys = list(dict.fromkeys(key for row in rows for key in row))

@@ -157,6 +157,7 @@ def solver_summary(
         "gps_zero": outcome.recording.gps_zero,
         "notes": list(dict.fromkeys(notes)),
         "remarks": list(outcome.findings),
+        "checks": [f.values() for f in outcome.checks],
         "settings": outcome.request.settings.model_dump(),
         "provenance": provenance,
     }

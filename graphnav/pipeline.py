@@ -19,7 +19,8 @@ from graphnav.errors import ConfigError, EstimationError
 from graphnav.noise.model import NoiseModel
 from graphnav.onboard_offset import without_onboard_offset
 from graphnav.own_noise import with_own_noise
-from graphnav.preparation import prepare
+from graphnav.plausibility import screened
+from graphnav.preparation import prepare, start_sigma
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
 from graphnav.solution import Solution, joined
@@ -63,14 +64,18 @@ def run(
 
     Raises
     ------
+    RecordingError
+        If a sensor is wrong throughout.
     EstimationError
         If the recording does not determine a trajectory.
     ConfigError
         If the settings' profile is of another platform.
     """
     settings = settings or Settings()
+    recording, found = screened(recording)
     with listening(progress):
-        return _run(recording, settings, solvers, progress, noise)
+        solutions = _run(recording, settings, solvers, progress, noise)
+    return {name: replace(one, notes=(*found, *one.notes)) for name, one in solutions.items()}
 
 
 def _run(
@@ -142,7 +147,7 @@ def _solve(
     notes = (*found.start.notes, *undone, *shown, *found.detections.notes, *found.notes, *faults.notes(wrong, problem))
     start, passes = smoothed, Counter(found.passes)
     if found.astray:
-        prior = InitialPrior(keyframe=problem.prior.keyframe, mean=found.start.state, sigma=found.start.sigma[None])
+        prior = InitialPrior(keyframe=problem.prior.keyframe, mean=found.start.state, sigma=start_sigma(found.start)[None])
         problem = replace(problem, prior=prior)
         forward = ekf(problem, progress, found.aligned.until)
         smoothed = backward(problem, forward, progress)

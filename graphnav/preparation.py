@@ -36,9 +36,10 @@ from graphnav.solvers.ekf import ekf
 from graphnav.solvers.near import near
 from graphnav.solvers.passes import Filtered, Smoothed, about_solved, near_to
 from graphnav.solvers.rts import backward
-from graphnav.state import States
+from graphnav.state import BLOCKS, States
 
 _FAR = 0.5  # rad between the stated and the found start attitude, beyond which a filter is astray for a while
+_FAR_AWAY = 100.0  # m, by which single fixes in a city may be wrong
 _LOST = 0.1  # rad by which a filter may be off for a smoother to rest on it
 _MOST = 0.5  # share of the fixes that can be wrong; beyond it, it is the start that is
 _WHEELS = (NonHolonomic, OdometerSpeed)
@@ -103,7 +104,7 @@ def prepare(
     def build(at: Alignment, found: Detections, parts: bool) -> Problem:
         tell("preintegration")
         since, start = time.perf_counter(), _start(at, with_known_heading(at, settings))
-        problem = pose(recording, settings, frame, start.state, start.sigma, found.stationary, parts_of_noise=parts)
+        problem = pose(recording, settings, frame, start.state, start_sigma(start), found.stationary, parts_of_noise=parts)
         booked("preintegration", since)
         return problem
 
@@ -174,6 +175,16 @@ def _estimated(
     again = estimate_noise(base, aligned.until, noise, (found.points, with_noise(base, found.noise)), progress)
     passes.update(filter=again.passes, smoother=again.passes)
     return again
+
+
+def start_sigma(start: Alignment) -> Array:
+    """(15,) 1-sigma of the start, with a place that the alignment does not claim to know.
+
+    It has the place from fixes that the problem uses too, by sigmas that may be wrong.
+    """
+    sigma = start.sigma.copy()
+    sigma[BLOCKS["p"]] = np.hypot(sigma[BLOCKS["p"]], _FAR_AWAY)
+    return sigma
 
 
 def _start(found: Alignment, stated: Alignment) -> Alignment:

@@ -125,6 +125,7 @@ class Recording:
     files: tuple[Path, ...] = ()  # everything that was read, for provenance
     gps_zero: float | None = None  # s since the GPS epoch (1980-01-06) at t = 0, where it is known
     remarks: tuple[str, ...] = ()
+    screened: bool = False  # whether `graphnav.plausibility.screen` has been over it
 
     @cached_property
     def start(self) -> float:
@@ -158,7 +159,7 @@ class Recording:
         left = None
         if span is not None:
             t = sensor.t - self.start
-            left = _rows(sensor, ~((t >= span[0]) & (t <= span[1])))
+            left = rows_of(sensor, ~((t >= span[0]) & (t <= span[1])))
         changed: dict[str, Any] = {source: left}
         return replace(self, **changed)
 
@@ -169,7 +170,7 @@ class Recording:
         lo = -np.inf if start is None else self.start + start
         hi = np.inf if end is None else self.start + end
         parts: dict[str, Any] = {
-            name: _rows(sensor, (sensor.t >= lo) & (sensor.t <= hi))
+            name: rows_of(sensor, (sensor.t >= lo) & (sensor.t <= hi))
             for name in ("imu", "gnss", "odometer")
             if (sensor := getattr(self, name)) is not None
         }
@@ -184,7 +185,7 @@ class Recording:
         return replace(self, **parts)
 
 
-def _rows(sensor: Any, mask: NDArray[np.bool_]) -> Any:
+def rows_of(sensor: Any, mask: NDArray[np.bool_]) -> Any:
     """A sensor with only the rows of `mask`."""
     parts = {
         key: value[mask]

@@ -216,18 +216,27 @@ def rejected_table(solution: Solution, start: float) -> list[Raw]:
 def nees_table(errors: Mapping[str, Errors]) -> list[Raw]:
     """Mean NEES per degree of freedom and the share of epochs inside the 95 % region, per solver."""
     from graphnav.metrics import average_nees
+    from graphnav.sigmas import judge_sigmas
 
     rows = []
+    says = {
+        "too small": "sigma too small",
+        "cautious": "sigma cautious",
+        "unclear": "chance may do that",
+        "fits": "fits",
+    }
     for name, e in errors.items():
-        for words, values, dof in (
-            ("position", e.nees_p, e.dof_p), ("velocity", e.nees_v, 3), ("attitude", e.nees_rph, 3),
-        ):  # fmt: skip
+        judged = {one.block: one for one in judge_sigmas(e)}
+        nees = {"position": (e.nees_p, e.dof_p), "velocity": (e.nees_v, 3), "attitude": (e.nees_rph, 3)}
+        if e.nees_heading is not None:
+            nees["heading"] = (e.nees_heading, 1)
+        for words, (values, dof) in nees.items():
             found = average_nees(values, dof)
             if found is not None:
-                verdict = "sigma too small" if found.mean > 2.25 else "sigma cautious" if found.mean < 0.25 else "fits"
-                inside = Raw(f"{100 * found.inside:.1f} %")
-                rows.append([page.solver(name), words, found.mean, inside, found.n, verdict])
-    head = ["solver", "of", "mean NEES / dof", "epochs inside 95 %", "epochs", "what it says"]
+                inside, one = Raw(f"{100 * found.inside:.1f} %"), judged[words]
+                worth = Raw(f"{one.effective:.0f}")
+                rows.append([page.solver(name), words, found.mean, inside, found.n, worth, says[one.verdict]])
+    head = ["solver", "of", "mean NEES / dof", "epochs inside 95 %", "epochs", "worth independent", "what it says"]
     return [page.table(head, rows)] if rows else []
 
 

@@ -88,24 +88,42 @@ def tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mappi
 
 
 def believe(name: str, errors: Errors) -> Raw:
-    """One sentence that compares position errors with their sigma (and the truth's own, where it states one)."""
-    square = errors.nees_axis[np.isfinite(errors.nees_axis)]
-    if not len(square):
+    """One sentence that compares errors with their sigma (and the truth's own, where it states one)."""
+    from graphnav.sigmas import judge_sigmas
+
+    judged = judge_sigmas(errors)
+    if not judged:
         return page.paragraph(f"{name}: no epoch has both an error and a sigma, so sigma cannot be judged.", "verdict")
-    size, inside = float(np.sqrt(np.mean(square))), float(np.mean(square <= 9.0))
-    measured = (
-        f"position errors are {size:.2f} times their sigma (RMS), {100 * inside:.1f} % of them within 3 sigma "
-        "(a Gaussian: 1 and 99.7 %)"
+    worst = [j for j in judged if j.verdict == "too small"] or [j for j in judged if j.verdict == "unclear"]
+    shown = worst or judged
+    measured = page.and_list(
+        [
+            f"{j.block} errors are {j.size:.2f} times their sigma (RMS), {100 * j.inside:.1f} % within 3 sigma"
+            for j in shown
+        ]
     )
-    if size > 1.5:
-        when = " at times" if inside > 0.9 else ""
+    measured += " (a Gaussian: 1 and 99.7 %)"
+    blocks = page.and_list([j.block for j in shown])
+    if worst and worst[0].verdict == "too small":
+        when = " at times" if all(j.inside > 0.9 for j in worst) else ""
         return page.paragraph(
-            f"{name}: the stated sigma is too small{when}: {measured}. Errors of the truth itself count here as well.",
+            f"{name}: the stated sigma is too small{when}, of {blocks}: {measured}. Errors of the truth itself count "
+            "here as well.",
             "verdict bad",
         )
-    if size < 0.5:
-        return page.paragraph(f"{name}: the stated sigma is cautious: {measured}.", "verdict")
-    return page.paragraph(f"{name}: the stated sigma can be believed: {measured}.", "verdict good")
+    if worst:
+        alike = page.and_list([f"{j.effective:.0f}" for j in worst])
+        return page.paragraph(
+            f"{name}: whether sigma of {blocks} can be relied on remains open: {measured}, but the errors are alike "
+            f"for so long that they are worth {alike} independent values, and chance may do that.",
+            "verdict",
+        )
+    seen = {j.block for j in judged}
+    unseen = [what for what in ("position", "velocity", "attitude") if what not in seen]
+    rest = f" Nothing is there to judge {page.and_list(unseen)} by." if unseen else ""
+    if all(j.verdict == "cautious" for j in judged):
+        return page.paragraph(f"{name}: the stated sigma is cautious: {measured}.{rest}", "verdict")
+    return page.paragraph(f"{name}: the stated sigma can be believed: {measured}.{rest}", "verdict good")
 
 
 def believe_without_truth(solution: Solution) -> Raw:

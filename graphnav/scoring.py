@@ -9,12 +9,14 @@ import numpy as np
 from graphnav import rotation
 from graphnav.earth import LocalFrame, enu_axes, llh_to_ecef
 from graphnav.errors import RecordingError
+from graphnav.fitted import after_fit
 from graphnav.interpolation import fit_yaw, full_covariance, interpolate, placed
 from graphnav.metrics import Closure, Errors
 from graphnav.rotation import Array
 from graphnav.trajectory import Trajectory
 
 MAX_GAP = 3.0  # s; the widest gap that is interpolated over
+_LARGER = 1.05  # times the stated sigma: worth saying
 _SLOW = 0.5  # m/s; slower than this a direction of travel means little
 
 
@@ -25,6 +27,7 @@ def errors(
     lever_arm: Array | None = None,
     max_gap: float = MAX_GAP,
     at: Array | None = None,
+    from_start: bool | None = None,
 ) -> Errors:
     """Estimate minus truth at every epoch of the sparser of the two that the other can be interpolated to.
 
@@ -42,6 +45,9 @@ def errors(
         s; the estimate is not interpolated over wider gaps.
     at
         (M,) s; compare at these times only, where the estimate has rows and is not interpolated at all.
+    from_start
+        Whether the estimate's covariance counts from its own start, as without any fix; a fit then changes it
+        (`graphnav.fitted`). Unless told: of an estimate in a local frame.
 
     Raises
     ------
@@ -59,6 +65,8 @@ def errors(
     if trajectory.covariance is None and trajectory.sd_p is not None:
         notes.append("NEES from the sigmas alone: the estimate comes without correlations between axes")
     flat = truth.frame == "local" and bool(np.isnan(truth.llh[:, 2]).all())
+    fitted = "local" in (trajectory.frame, truth.frame)
+    from_start = fitted and (trajectory.frame == "local" if from_start is None else from_start)
     if trajectory.frame == "local" or truth.frame == "local":
         trajectory, truth = _fitted(trajectory, truth, lever_arm, max_gap, at, notes)
     estimate, seen, travel, epochs = _paired(trajectory, truth, lever_arm, max_gap, at)
@@ -79,6 +87,8 @@ def errors(
 
     cov = full_covariance(estimate)
     cov = np.full((len(seen), 9, 9), np.nan) if cov is None else cov
+    if from_start:
+        cov = _of_the_rest(cov, estimate, notes)
     of_truth = full_covariance(replace(seen, covariance=None))
     if of_truth is not None:
         cov = cov + np.nan_to_num(of_truth)
@@ -113,6 +123,7 @@ def errors(
         dof_p=dof,
         epochs=epochs,
         notes=tuple(dict.fromkeys(notes)),
+        nees_heading=_nees(rph[:, 2:], cov[:, 8:, 8:]),
     )
 
 
@@ -171,6 +182,17 @@ def _fitted(
             offset[2] = 0.0
         return trajectory, placed(truth, frame, yaw, offset)
     return placed(trajectory, frame, yaw, offset), truth
+
+
+def _of_the_rest(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
+    """The covariance (N, 9, 9) of what a fit leaves of errors that count from the estimate's own start."""
+    if not np.isfinite(cov).all():
+        notes.append("NEES leaves the fit out of account: there is no covariance of place and heading at every epoch")
+        return cov
+    rest, larger = after_fit(cov, LocalFrame(estimate.llh[0]).from_llh(estimate.llh), estimate.v)
+    by = f", which takes sigmas {larger:.2f} times as large as stated" if larger > _LARGER else ""
+    notes.append(f"NEES is of what the fit leaves, errors of place and heading taken to last as in dead reckoning{by}")
+    return rest
 
 
 def _paired(

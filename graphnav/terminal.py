@@ -28,8 +28,9 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     lines += [f"  {source} withheld{'' if span is None else f' {span[0]:g}-{span[1]:g} s'}"
               for source, span in outcome.request.withheld]  # fmt: skip
     notes = [note for s in outcome.solutions.values() for note in s.notes]
+    severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
-        lines.append(f"  {'warning' if note in outcome.warnings else 'note'}: {note}")
+        lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
     lines += _whole(outcome)
     lines += _spans(outcome)
@@ -131,11 +132,11 @@ def short(x: float) -> str:
 
 # What the stages weigh against each other: seconds of an hour's drive at 200 Hz, for the time left and nothing else.
 _STAGES = {
-    "reading": 0.5, "checks": 0.6, "driving": 5.0, "detection": 0.2, "alignment": 0.1, "judgement": 0.4,
+    "reading": 0.5, "checks": 0.6, "driving": 5.0, "detection": 0.2, "alignment": 0.1, "noise": 2.0,
     "preintegration": 0.7, "filter": 2.5, "smoother": 0.4, "batch": 0.9, "covariances": 0.2, "incremental": 4.8,
     "isam2": 44.0, "evaluation": 0.1, "writing": 0.7,
 }  # fmt: skip
-_BEFORE = ("reading", "checks", "detection", "alignment", "judgement", "preintegration", "filter", "smoother")
+_BEFORE = ("reading", "checks", "detection", "alignment", "noise", "preintegration", "filter", "smoother")
 _WORK = {
     "info": ("reading", "checks"), "detect": ("reading", "detection", "writing"), "evaluate": ("reading",),
     "simulate": ("driving", "writing"), "convert": ("reading", "writing"), "init": ("reading", "writing"),

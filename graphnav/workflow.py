@@ -18,6 +18,7 @@ from graphnav import rotation
 from graphnav.complaints import nearest
 from graphnav.config import Settings
 from graphnav.errors import ConfigError, RecordingError
+from graphnav.findings import Finding
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
 from graphnav.rotation import Array
@@ -70,6 +71,7 @@ class Outcome:
     findings: tuple[str, ...]  # everything worth knowing about the recording and the comparison
     warnings: tuple[str, ...]  # those of the findings that results suffer from
     timings: dict[str, float]  # s by stage, of what all solvers share
+    checks: tuple[Finding, ...] = ()  # what the checks of the recording found, with keys and severities
 
     @property
     def used_withheld(self) -> tuple[Withheld, ...]:
@@ -127,9 +129,11 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     recording = _cropped(whole, request)
     zero = recording.start - whole.start if recording is not whole else 0.0
     moved = _moved(request.withheld, zero)
-    used, notes = _withhold(recording, moved, zero)
     with _timed(timings, "checks"):
         inspection = inspect(recording)
+        inspection.refuse()
+    recording = inspection.recording
+    used, notes = _withhold(recording, moved, zero)
     findings = [f.sentence for f in inspection.findings]
     if (sentence := gnss_apart(used)) is not None:  # it would be solved as if there were no GNSS
         raise RecordingError(f"'{recording.name}': {sentence}")
@@ -150,7 +154,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
             findings += [note for note in found.notes if note not in findings]
     return Outcome(
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
-        inspection.warnings, timings | own,
+        inspection.warnings, timings | own, inspection.findings,
     )  # fmt: skip
 
 

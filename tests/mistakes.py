@@ -18,6 +18,7 @@ from graphnav import cli
 
 ROOT = Path(__file__).resolve().parents[1]
 
+SEVERITIES = ("refused: ", "untrusted: ", "warning: ", "note: ")
 Array = np.ndarray
 Table = dict[str, Array]  # the columns of a CSV file by name
 
@@ -28,9 +29,12 @@ HEAD = """\
 What people get wrong, and the line that graphnav has for it. Each of these is made by the tests on the two minutes of
 Tokyo that come with the clone (`data/tokyo`), and the line is what was printed.
 
-A line that begins with *warning* or *note* is one of several: the recording can be read, and `graphnav info` lists what
-is odd in it (so do `smooth` and `compare`, and the reports). The others end the program with exit code 2. Run
-`graphnav info` before anything else, and read its warnings from the top: the first may be the cause of the others.
+A line that begins with *note*, *warning*, *untrusted* or *refused* is one of several: the recording can be read, and
+`graphnav info` lists what is odd in it, the gravest first (so do `smooth` and `compare`, and the reports). Results
+suffer from a *warning*. With an *untrusted* one they may be wrong altogether, whatever their sigmas say. With a
+*refused* one nothing is solved: `smooth`, `compare` and `detect` end with that sentence and exit code 2, as all
+commands do with the lines that begin with none of these. Run `graphnav info` before anything else, and read from the
+top: the first may be the cause of the others.
 """
 
 
@@ -138,7 +142,7 @@ def made(mistake: Mistake, room: Path) -> tuple[int, list[str]]:
     if code:
         return code, err.splitlines()
     said = [line.strip() for line in out.splitlines()]
-    return code, [line for line in said if line.startswith(("warning: ", "note: "))]
+    return code, [line for line in said if line.startswith(SEVERITIES)]
 
 
 def run(command: tuple[str, ...], room: Path, full: bool = False) -> tuple[int, str, str]:

@@ -76,6 +76,55 @@ def _numbered(c: Table) -> None:
     c["t_s"] = np.arange(len(c["t_s"])) + 700.0
 
 
+def _row(name: str, column: str, row: int, value: float) -> Callable[[Path], None]:
+    """One value of a column."""
+
+    def how(c: Table) -> None:
+        c[column][row] = value
+
+    return change(name, how)
+
+
+def _dead(column: str) -> Callable[[Path], None]:
+    return change("imu", lambda c: {**c, column: np.full(len(c[column]), c[column][0])})
+
+
+def _away(c: Table) -> None:
+    c["lon_deg"][0] -= 110.0  # 9000 km
+
+
+def _two_groups(c: Table) -> None:
+    off = np.random.default_rng(1).random(len(c["t_s"])) < 0.48
+    c["lat_deg"][off] += 50.0 / 111_000.0
+
+
+def _frozen(c: Table) -> None:
+    rows = (c["t_s"] > 1610.0) & (c["t_s"] < 1700.0)
+    c["h_m"][rows] = c["h_m"][rows][0]
+
+
+def _clock_jump(seconds: float) -> Callable[[Path], None]:
+    return change("odometer", lambda c: {**c, "t_s": c["t_s"] + seconds * (c["t_s"] > 1645.0)})
+
+
+def _doubled(c: Table) -> None:
+    c["speed_mps"][(c["t_s"] > 1640.0) & (c["t_s"] < 1663.0)] *= 2.0
+
+
+def _on_arrival(c: Table) -> None:
+    late = np.random.default_rng(2).uniform(0.0, 0.6, len(c["t_s"]))
+    c["t_s"] = np.maximum.accumulate(c["t_s"] + late) + 1e-4 * np.arange(len(late))  # one after the other
+
+
+def _sigmas(sd: float, zeros: bool = False) -> Callable[[Path], None]:
+    def how(c: Table) -> None:
+        for name in ("sd_e", "sd_n", "sd_u"):
+            c[name] = np.full(len(c["t_s"]), sd)
+            c[name][: 100 if zeros else 0] = 0.0
+
+    return change("gnss", how)
+
+
 def _later(name: str, seconds: float) -> Callable[[Path], None]:
     return change(name, lambda c: {**c, "t_s": c["t_s"] + seconds})
 
@@ -173,6 +222,27 @@ MISTAKES: dict[str, list[Mistake]] = {
         Mistake("rows out of order", change("imu", _shuffled), ("out of order", "sorted")),
         Mistake("NaN or blanks for missing values", change("imu", _holes), ("10 IMU rows", "NaN", "dropped")),
         Mistake(
+            "the fixes a second late, against IMU and odometer",
+            _later("gnss", 1.0),
+            ("IMU stamps are early", "time_offset in [gnss]"),
+        ),
+        Mistake(
+            "fixes stamped when they arrived, up to 0.6 s late",
+            change("gnss", _on_arrival),
+            ("uneven", "of the arrival and not of the measurement"),
+        ),
+        Mistake(
+            "the odometer's clock jumps ahead by 18 s midway",
+            _clock_jump(18.0),
+            ("odometer's clock jumps by +18", "leap seconds", "after it is not used"),
+        ),
+        Mistake(
+            "the odometer's clock is set back by 18 s midway",
+            _clock_jump(-18.0),
+            ("odometer.csv.gz", "set back by 18"),
+            error=True,
+        ),
+        Mistake(
             "the odometer's delay not taken off",
             toml("time_offset = -0.65", "time_offset = 0.0"),
             ("odometer stamps are late", "time_offset in [odometer]"),
@@ -186,7 +256,29 @@ MISTAKES: dict[str, list[Mistake]] = {
             toml('axes = "RFU"', 'axes = "RFU"\nunits = { gyro = "deg/s" }'),
             ("57 times too small", "leave out units.gyro"),
         ),
+        Mistake(
+            "g for m/s2, and smoothed all the same",
+            scaled("imu", "ax ay az", 1 / 9.80665),
+            ("seems to be in g", 'accel = "g"'),
+            SMOOTH,
+            True,
+        ),
+        Mistake("ft/s2 for m/s2", scaled("imu", "ax ay az", 1 / 0.3048), ("in ft/s2", 'accel = "ft/s2"')),
+        Mistake(
+            "the accelerometer at half its scale", scaled("imu", "ax ay az", 0.5), ("2 times too small", "multiply")
+        ),
         Mistake("gravity taken out, as phones do", change("imu", _no_gravity), ("gravity seems to have been removed",)),
+        Mistake(
+            "GNSS sigmas a thousand times too small",
+            toml("sd = [0.05, 0.05, 0.10]", "sd = [5e-5, 5e-5, 1e-4]"),
+            ("less than a carrier's phase can be measured to", "unit of the sigmas"),
+        ),
+        Mistake(
+            "GNSS sigmas a hundred times too large",
+            toml("sd = [0.05, 0.05, 0.10]", "sd = [5.0, 5.0, 10.0]"),
+            ("neighbouring fixes scatter by", "unit of the sigmas"),
+        ),
+        Mistake("GNSS sigmas printed as 0.00", _sigmas(0.05, zeros=True), ("sigma sd_e is 0 in 100", "rounded away")),
         Mistake("wheel speed in km/h", scaled("odometer", "speed_mps", 3.6), ("in km/h", 'speed = "km/h"')),
         Mistake(
             "GGA's quality taken for the type of a fix",
@@ -246,6 +338,16 @@ MISTAKES: dict[str, list[Mistake]] = {
             ("accelerometer's sign is reversed", "negate"),
         ),
         Mistake(
+            "the accelerometer's forward axis reversed",
+            scaled("imu", "ay", -1.0),
+            ("forward axis is reversed", "no axes in [imu]", "negate ay"),
+        ),
+        Mistake(
+            "the IMU built in the other way round",
+            scaled("imu", "ax ay gx gy", -1.0),
+            ("forward force falls when the speed rises", 'axes = "LBU" would agree'),
+        ),
+        Mistake(
             "latitude and longitude exchanged",
             swapped("gnss", "lat_deg", "lon_deg"),
             ("is not a latitude", "swapped"),
@@ -266,6 +368,45 @@ MISTAKES: dict[str, list[Mistake]] = {
             "a foot's platform on a car",
             toml('platform = "vehicle"', 'platform = "foot"'),
             ("too fast for a foot", 'platform = "vehicle"'),
+        ),
+    ],
+    "Sensors": [
+        Mistake("one force of 1e4 m/s2", _row("imu", "ax", 3000, 1e4), ("1 IMU row", "1e+04 m/s2", "left out")),
+        Mistake("one turn rate of 1e300 rad/s", _row("imu", "gz", 3000, 1e300), ("1 IMU row", "1e+300", "left out")),
+        Mistake("an axis of the gyro is dead", _dead("gz"), ("gyro z", "dead", "throughout")),
+        Mistake(
+            "an axis of the accelerometer is dead, and smoothed all the same",
+            _dead("ay"),
+            ("accelerometer y", "dead"),
+            SMOOTH,
+            True,
+        ),
+        Mistake("the first fix is 9000 km away", change("gnss", _away), ("1 fix out of reach", "not used")),
+        Mistake(
+            "every other fix is 50 m off, all the same way",
+            change("gnss", _two_groups),
+            ("two groups 50 m apart", "not to be trusted"),
+        ),
+        Mistake("the heights freeze", change("gnss", _frozen), ("heights", "frozen", "sigma of")),
+        Mistake(
+            "all heights are zero",
+            change("gnss", lambda c: {**c, "h_m": 0.0 * c["h_m"]}),
+            ("heights", "stay at 0 m", "frozen or not logged"),
+        ),
+        Mistake(
+            "one odometer reading of 1e300 m/s",
+            _row("odometer", "speed_mps", 2000, 1e300),
+            ("1 odometer reading beyond", "not used"),
+        ),
+        Mistake(
+            "an infinite odometer reading",
+            _row("odometer", "speed_mps", 2000, np.inf),
+            ("1 odometer row", "infinite", "dropped"),
+        ),
+        Mistake(
+            "the odometer reads double for a while",
+            change("odometer", _doubled),
+            ("odometer reads 2", "times", "not used there"),
         ),
     ],
     "recording.toml and settings": [

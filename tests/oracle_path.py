@@ -306,6 +306,28 @@ def straight_path(
     return _exact(t, _travelled(t, start, v), v, rph, f"{length_m / 1e3:g} km straight")
 
 
+def winding_path(
+    duration: float, speed: float, seed: int = 0, turn: float | None = None, rate: float = 50.0
+) -> ExactPath:
+    """A level way at one speed (m/s) after 5 s of standing, from any heading: bends at random, or a steady turn, rad/s.
+
+    No axle: the IMU itself moves along the body's forward axis.
+    """
+    rng = np.random.default_rng([seed, 7])
+    t = np.arange(round(duration * rate) + 1) / rate
+    psi = first = rng.uniform(-np.pi, np.pi)
+    knots = [(5.0, 0.0, psi), (3.0, speed, psi)]
+    for _ in range(int(duration // 15.0)):
+        psi += rng.uniform(-1.2, 1.2)
+        knots += [(10.0, speed, psi), (5.0, speed, psi)]
+    along = _smoothstep(t, knots, 1, 0.0)
+    psi = first + np.maximum(t - 5.0, 0.0) * turn if turn is not None else _smoothstep(t, knots, 2, first)
+    v = np.column_stack([along * np.sin(psi), along * np.cos(psi), np.zeros_like(t)])
+    rph = np.column_stack([np.zeros_like(t), np.zeros_like(t), psi])
+    start = np.array([np.deg2rad(45.0), np.deg2rad(7.0), 20.0])
+    return _exact(t, _travelled(t, start, v), v, rph, f"{duration:g} s at {speed:g} m/s")
+
+
 @lru_cache(maxsize=1)
 def oracle_truth_path(shared_data: Path, rate: float = 200.0) -> ExactPath:
     """The motion of the shipped oracle drive (truth.csv.gz, 10 Hz), splined, with new error-free samples.

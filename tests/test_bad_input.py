@@ -189,7 +189,10 @@ BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
     ),
     "longitude": (line("gnss.csv", 4, "0.4,50,400,115,1,1,1"), ("gnss.csv, line 4", "column 'lon'", "400")),
     "height in mm": (every("gnss.csv", shift_decimal(3, 1e3)), ("gnss.csv, line 2", "column 'h'", "millimetres")),
-    "zero sd in the file": (line("gnss.csv", 3, "0.2,50,100,115,1,0,1"), ("gnss.csv, line 3", "'sd_n'", "above zero")),
+    "negative sd in the file": (
+        line("gnss.csv", 3, "0.2,50,100,115,1,-1,1"),
+        ("gnss.csv, line 3", "'sd_n'", "above zero"),
+    ),
     # recording.toml
     "toml syntax": (toml('platform = "vehicle"', "platform = vehicle"), ("recording.toml", "not valid TOML", "line 3")),
     "toml not text": (content("recording.toml", b"\xff\xfe\x00"), ("recording.toml", "UTF-8")),

@@ -3,9 +3,9 @@
 A short smoothing problem, posed and solved with the same parts as the whole drive, over the first stretch in
 which the vehicle moves. Levelling (the mean specific force points up) and the median turn rate (a vehicle
 mostly goes straight or stands) start it, and the heading that turns the felt accelerations into those of the
-fixes. If that does not explain the fixes, the three headings 90 degrees apart from it are tried and the best
-wins, so neither "it drives forward" nor a standing start is assumed. From there the gyro carries the attitude
-back to the first sample.
+fixes, or one of three more 90 degrees apart: the one that explains the fixes best wins. So neither speed nor a standing
+start is assumed. What is too slow to feel its accelerations knows its heading by its course, which is forwards unless
+they say otherwise. From there the gyro carries the attitude back to the first sample.
 
 What the short problem learned, the long one will learn again from the same data. So the result enters as the
 point to start from, with a prior `prior_inflation` times wider than its own sigma: information counts once. Only
@@ -19,8 +19,9 @@ from dataclasses import replace
 import numpy as np
 
 from graphnav import rotation
+from graphnav.alignment.course import COURSE_SIGMA
 from graphnav.alignment.first import Alignment
-from graphnav.alignment.motion import COURSE_SIGMA, Smoother, in_motion, motion, plausible
+from graphnav.alignment.motion import Smoother, in_motion, motion, plausible
 from graphnav.alignment.rest import at_rest
 from graphnav.config import Settings
 from graphnav.detectors.base import NONE

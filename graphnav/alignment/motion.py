@@ -10,7 +10,9 @@ from scipy.ndimage import median_filter
 
 from graphnav import rotation
 from graphnav.alignment.back import carried_back
+from graphnav.alignment.course import COURSE_SIGMA, with_course
 from graphnav.alignment.first import Alignment, level, some
+from graphnav.alignment.travel import across, travel, turned
 from graphnav.config import Settings
 from graphnav.detectors.base import NONE, inside
 from graphnav.earth import LocalFrame
@@ -23,11 +25,13 @@ from graphnav.samples import bridge_gaps
 from graphnav.solution import Solution
 from graphnav.state import States
 
-COURSE_SIGMA = np.radians(10.0)  # rad, a stated forward axis against the course: mounting, side slip
-_DISTANCE = 50.0  # m of travel the short problem wants to see
-_FIXES = 10  # and fixes
+_DIRECTION = 0.5 * COURSE_SIGMA  # rad, to which the fixes shall know the direction of travel: less than the rest does
+_FIXES = 10  # that the short problem wants to see
+_FEWEST = 3  # without which there is no acceleration
+_MOVES = 5.0  # sigmas of way that are motion: noise gets there once in 270 000 fixes, exp(-5^2/2)
+_BEFORE = 10.0  # s of the stretch before the motion
 _JUMP = 6.0  # times what fixes usually are off their running median, or their sigma
-_GOOD_FIT = 2.0  # squared sigmas per row below which no other start heading is tried
+_TURNS = (0.0, np.pi, 0.5 * np.pi, 1.5 * np.pi)  # rad, of the start headings that are tried from the first guess
 
 Smoother = Callable[[Problem, States], Solution]
 
@@ -49,31 +53,38 @@ def plausible(recording: Recording) -> Recording:
 def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:
     """The stretch (s) to align over: from just before the first motion until enough of it was seen.
 
-    What the fixes say of motion while a vehicle stands, `stationary` (N, 2) s, is none.
+    It moves where it is farther away than the errors of the fixes can have brought it, over ground or in its own axes
+    (`graphnav.alignment.travel`); enough is seen once these errors leave little doubt of the direction. What the fixes
+    say of motion while a vehicle stands, `stationary` (N, 2) s, is none.
     """
     gnss = recording.gnss
     if gnss is None:
         return None
     used = (gnss.t >= recording.start) & (gnss.t <= recording.end)
-    if np.count_nonzero(used) < 3:
+    if np.count_nonzero(used) < _FEWEST:
         return None
-    t, llh, sd = gnss.t[used], gnss.llh[used], gnss.sd[used]
-    p = LocalFrame(llh[0]).from_llh(llh)
-    noise = 5.0 * np.linalg.norm(np.median(sd[:, :2], axis=0))
-    away = np.linalg.norm(p[:, :2] - p[0, :2], axis=1) > 3.0 + noise
+    gnss = _thinned(gnss, recording.start, recording.end)
+    if len(gnss.t) < _FEWEST:
+        return None
+    t, p = gnss.t, LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
     if recording.platform == "vehicle":
-        away &= ~inside(t, stationary)
+        yaw, still = turned(recording.imu, t, _usual_rate(recording.imu)), inside(t, stationary)
+    else:  # a foot turns about every axis
+        yaw, still = np.zeros(len(t)), np.zeros(len(t), dtype=bool)
+    sd = across(gnss.sd)
+    way = travel(p, sd, yaw, still)
+    away = np.maximum(way.times_sigma, travel(p, sd, np.zeros(len(t)), still).times_sigma) > _MOVES
     if not away.any():
         return None
     first = int(np.argmax(away))
-    begin = max(t[0], t[first] - 10.0)
-    # along the track in steps longer than the noise, so that jitter at rest is not distance
-    keep = np.arange(first, len(t))
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p[keep, :2], axis=0), axis=1))])
-    enough = (travelled > _DISTANCE + noise) & (t[keep] > t[first] + settings.alignment.window)
-    enough &= np.arange(len(keep)) >= _FIXES
-    end = t[keep][np.argmax(enough)] if enough.any() else t[-1]
-    return float(begin), float(end)
+    enough = (way.times_sigma > 1.0 / np.tan(_DIRECTION)) & (t > t[first] + settings.alignment.window)
+    enough &= np.arange(len(t)) >= first + _FIXES
+    last = int(np.argmax(enough)) if enough.any() else len(t) - 1
+    # at the speed that followed it took a while to get that far
+    speed = np.abs(way.D[last] - way.D[first]) / max(t[last] - t[first], 1.0)
+    under_way = np.abs(way.D[first]) / speed if speed > 0.0 else np.inf
+    begin = min(t[first] - _BEFORE - under_way, t[max(last - _FEWEST + 1, 0)])
+    return float(max(t[0], np.round(begin, 3))), float(t[last])  # what rounding did to D shall not show
 
 
 def in_motion(
@@ -90,32 +101,30 @@ def in_motion(
     bias = _usual_rate(imu)
     rp = level(recording, begin)
     heading = _heading_of_accelerations(part, frame, rp, bias)
-    best: Solution | None = None
-    for quarter in (0, 2, 1, 3):
-        rph = np.array([*rp, heading + 0.5 * np.pi * quarter])
-        solution = _try(part, settings, frame, smooth, rph, bias)
-        if best is None or solution.cost < best.cost:
-            best = solution
-        rows = sum(record.residual.size for record in best.records.values())
-        if best.cost < 0.5 * _GOOD_FIT * rows:
-            break
-    if best is None or not np.isfinite(best.cost):
+    tried = [_try(part, settings, frame, smooth, np.array([*rp, heading + turn]), bias) for turn in _TURNS]
+    tried = [one for one in tried if np.isfinite(one.cost)]
+    if not tried:
         raise EstimationError(
             f"'{recording.name}': no start attitude explains the GNSS fixes between {begin - recording.start:.0f} "
             f"and {end - recording.start:.0f} s; check the axes, the units and the time stamps"
         )
+    best = min(tried, key=lambda one: one.cost)
     R, P = best.states.R_nb[0], best.covariance[0][:3, :3]
     wide = settings.alignment.prior_inflation * np.sqrt(np.diag(P))
     J = rotation.rph_jacobian(rotation.to_rph(R))
     own = np.sqrt(np.diag(J @ P @ J.T))
-    notes = [
-        f"aligned over {begin - recording.start:.0f} to {end - recording.start:.0f} s: roll and pitch to "
-        f"{np.degrees(own[:2].max()):.2g} deg, heading to {np.degrees(own[2]):.2g} deg"
-    ]
+    said: tuple[str, ...] = ()
     if recording.platform == "vehicle":
-        R, wide[2], said = _with_course(best, R, wide[2])
-        notes += said
-    return carried_back(recording, settings, best, R, wide, own, begin, tuple(notes))
+        assert part.gnss is not None
+        found = with_course(tried, part.gnss, own[2], wide[2])
+        R = rotation.exp(np.array([0.0, 0.0, -found.turn])) @ R  # heading is clockwise, rotation about up is not
+        own[2], wide[2], said = found.own, found.wide, found.notes
+    notes = (
+        f"aligned over {begin - recording.start:.0f} to {end - recording.start:.0f} s: roll and pitch to "
+        f"{np.degrees(own[:2].max()):.2g} deg, heading to {np.degrees(own[2]):.2g} deg",
+        *said,
+    )
+    return carried_back(recording, settings, best, R, wide, own, begin, notes)
 
 
 def _heading_of_accelerations(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> float:
@@ -184,25 +193,3 @@ def _try(part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoothe
     K = len(t)
     R = R0 @ np.concatenate([np.eye(3)[None], dR])
     return smooth(problem, States(R, p, v, np.zeros((K, 3)), np.tile(bias, (K, 1))))
-
-
-def _with_course(solution: Solution, R: Array, sigma: float) -> tuple[Array, float, list[str]]:
-    """Bring in that a vehicle's forward axis is its course, forwards or in reverse, to `COURSE_SIGMA`."""
-    v = solution.states.v
-    speed = np.linalg.norm(v[:, :2], axis=1)
-    moving = speed > max(1.0, 0.5 * speed.max())
-    forward = solution.states.R_nb[moving, :, 1]
-    heading = np.arctan2(forward[:, 0], forward[:, 1])
-    course = np.arctan2(v[moving, 0], v[moving, 1])
-    off = rotation.wrap(course - heading)
-    off = np.where(np.abs(off) > 0.5 * np.pi, rotation.wrap(off + np.pi), off)  # reverse
-    mean = float(np.median(off))
-    if abs(mean) > 3.0 * np.hypot(COURSE_SIGMA, sigma):
-        return (
-            R,
-            sigma,
-            [f"the body's forward axis is {abs(np.degrees(mean)):.0f} deg from the course: check the IMU's axes"],
-        )
-    gain = sigma**2 / (sigma**2 + COURSE_SIGMA**2)
-    turn = rotation.exp(np.array([0.0, 0.0, -gain * mean]))  # heading is clockwise, rotation about up is not
-    return turn @ R, float(np.sqrt(gain) * COURSE_SIGMA), []

@@ -73,7 +73,6 @@ class Constraint(ABC):
     looks_ahead: ClassVar[bool] = True  # False: once the intervals and the odometer are there, rows can be built
     passes: ClassVar[int] = 1  # of a filter's update; more for rows that are far from linear over its uncertainty
     noise_axes: ClassVar[tuple[str, ...]] = ()  # variance component of each axis; none: its sigmas are taken as stated
-    bursts: ClassVar[bool] = False  # what is wrong with it is so for seconds: rows weigh less together
 
     keyframe: Array  # (N,) int, ascending
     parameters: tuple[Parameter, ...] = ()

@@ -83,6 +83,7 @@ class GnssPosition(Constraint):
     gyro: Array = field(default_factory=lambda: _empty(0, 3))  # measured rate at the fix
     omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
     unit_error: Array = field(default_factory=lambda: _empty(0, 3))  # the same, smoothed: the unit of lasting errors
+    usual_error: Array = field(default_factory=lambda: np.zeros(3))  # median of these: the unit of what lasts for minutes and hours
     type: Array | None = None  # (N,) of graphnav.recording.FIX_TYPES, where there are several
 
     @classmethod
@@ -121,6 +122,7 @@ class GnssPosition(Constraint):
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
             sigma=sd,
             unit_error=_running_median(gnss.t[used], sd) if scene.usual is None else scene.usual[used],
+            usual_error=np.median(sd if scene.usual is None else scene.usual, axis=0),
             type=kinds,
             lever_arm=gnss.lever_arm,
             gyro=around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
@@ -156,7 +158,9 @@ class GnssPosition(Constraint):
         residual, jacobians = mv(C, away), {block: C @ x for block, x in J.items()}
         for name in parameters:
             if name.startswith(ERRORS):
-                size = self.unit_error[rows] * self._of(name, rows)
+                # in units that change from fix to fix, a level that lasts would give itself away by these changes
+                unit = self.usual_error if name.startswith(ERRORS[1:]) else self.unit_error[rows]
+                size = np.broadcast_to(unit, residual.shape) * self._of(name, rows)
                 residual = residual + size * parameters[name]
                 jacobians[name] = size[..., None] * _I3
         return Linearized(residual, jacobians, self.sigma[rows])

@@ -271,7 +271,6 @@ class NonHolonomic(Wheels):
     name: ClassVar[str] = "nhc"
     axes: ClassVar[tuple[str, ...]] = ("right", "up")
     noise_axes: ClassVar[tuple[str, ...]] = ("right", "up")
-    bursts: ClassVar[bool] = True
     unit: ClassVar[str] = "m/s"
 
     sigma: Array = field(default_factory=lambda: np.empty((0, 2)))
@@ -341,7 +340,6 @@ class OdometerSpeed(Wheels):
     name: ClassVar[str] = "odometer"
     axes: ClassVar[tuple[str, ...]] = ("forward",)
     noise_axes: ClassVar[tuple[str, ...]] = ("forward",)
-    bursts: ClassVar[bool] = True
     unit: ClassVar[str] = "m/s"
 
     begin: Array = field(default_factory=lambda: np.empty(0))  # the interval of each row, s

@@ -158,7 +158,7 @@ class _Writer:
         self.lines += ["", "[gnss]"]
         values = source.values
         late = agreement.late_velocity
-        dropped = ("ve", "vn", "vu", "vd", "speed", "course") if late else ()
+        dropped = ("ve", "vn", "vu", "vd", "speed", "course") if late is not None else ()
         numbers = None
         if "type" in values:
             sd = values.get("sd_e")
@@ -176,7 +176,7 @@ class _Writer:
                 units["type"] = numbers
             if source.radians:
                 units["angle"] = Guess("rad", "lat and lon are all small enough")
-            if {"speed", "course"} <= values.keys() and "ve" not in values and not late:
+            if {"speed", "course"} <= values.keys() and "ve" not in values and late is None:
                 units["speed"] = fix_speed_unit(source)
             elif stated := source.stated("ve", "speed"):
                 units["speed"] = Guess(stated, "as the column's name says")
@@ -187,16 +187,16 @@ class _Writer:
             height = source.columns.names["h"]
             if "msl" in height.lower() or "alt" in height.lower():
                 self.decisions.append(f"heights: '{height}' may be above mean sea level; they are used as they are")
-        if late and agreement.position is not None and agreement.velocity is not None:
-            behind = agreement.velocity.seconds - agreement.position.seconds
-            words = f"velocities are not used: they come {behind:.2f} s after the positions"
+        if late is not None:
+            words = f"velocities are not used: they come {late:.2f} s after the positions"
             self.lines.append(f"# {words}")
             self.decisions.append(words)
         self._lever_arm(source.log.gnss if source.log else None, "from the IMU to the antenna: right, forward, up")
-        lag = agreement.best
-        if lag is not None and lag.correlation > FAIR and abs(lag.seconds) > _SMALL:
-            sure = "" if lag.correlation > CLEAR else "CHECK: "
-            self._key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_agree(lag)}")
+        if agreement.offset is not None:
+            seconds, sigma = agreement.offset
+            sure = "" if sigma < motion.STEP else "CHECK: "
+            why = f"{sure}s, +-{max(sigma, 0.01):.2f}; the accelerations agree best with the IMU's so"
+            self._key("time_offset", f"{seconds:.2f}", why)
 
     def _odometer(self, source: Source, course: motion.Course | None, felt: tuple[Array, Array]) -> None:
         self.lines += ["", "[odometer]"]

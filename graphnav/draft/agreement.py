@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphnav.clock import Clock, clock_of
 from graphnav.draft import motion
+from graphnav.recording import Gnss, Imu
 from graphnav.rotation import Array
 
 CLEAR, FAIR = 0.8, 0.5  # correlations: sure, likely
@@ -16,19 +18,18 @@ _TWO_CLOCKS = 0.15  # s; velocities further from the positions than this have a 
 
 @dataclass(frozen=True)
 class Agreement:
-    """`turn` of the turn rates; `position` and `velocity` of the accelerations, as `motion.Lag`, None where unknown."""
+    """`turn` of the turn rates; `position` and `velocity` of the accelerations, as `motion.Lag`, None where unknown.
+
+    These find clocks that have nothing in common and the way forward. How far apart clocks are that overlap is said by
+    `clock`, as in `graphnav info`, of fixes that come `far` seconds earlier than they are stamped.
+    """
 
     turn: motion.Lag | None = None
     position: motion.Lag | None = None
     velocity: motion.Lag | None = None
     forward: Array | None = None  # (3,) in file axes
-
-    @property
-    def best(self) -> motion.Lag | None:
-        """The shift of the clocks: of the positions where they say it well, else of the velocities."""
-        if self.position is not None and (self.velocity is None or self.position.correlation > FAIR):
-            return self.position
-        return self.velocity
+    far: float = 0.0  # s
+    clock: Clock | None = None
 
     @property
     def clearest(self) -> motion.Lag | None:
@@ -37,12 +38,26 @@ class Agreement:
         return max(both, key=lambda lag: lag.correlation, default=None)
 
     @property
-    def late_velocity(self) -> bool:
-        """Whether the velocities have another latency than the positions."""
-        if self.position is None or self.velocity is None:
-            return False
-        apart = abs(self.position.seconds - self.velocity.seconds)
-        return min(self.position.correlation, self.velocity.correlation) > FAIR and apart > _TWO_CLOCKS
+    def late_velocity(self) -> float | None:
+        """How much later than the positions the velocities come, s, where that is surely another latency."""
+        between = self.clock.between if self.clock is not None else None
+        if between is None or self.clock is None or self.clock.apart is None or abs(between.lag) < _TWO_CLOCKS:
+            return None
+        return between.lag
+
+    @property
+    def offset(self) -> tuple[float, float] | None:
+        """What to add to the stamps of the fixes, s, and its 1-sigma; None where nothing says that they are off."""
+        if self.clock is None:
+            return None
+        clock = self.clock if self.late_velocity is None else Clock(None, self.clock.by_places, None)
+        if clock.late is not None:
+            return clock.late.lag - self.far, clock.late.spread
+        if not self.far:
+            return None
+        known = clock.by_velocity or clock.by_places
+        sure = known is not None and known.correlation > FAIR and known.spread < motion.STEP
+        return (known.lag - self.far, known.spread) if sure and known is not None else (-self.far, motion.STEP)
 
 
 def level_axes(up: Array) -> tuple[Array, Array]:
@@ -78,11 +93,21 @@ def compare(t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array, 
         seconds = ahead.seconds if ahead is not None and ahead.correlation > FAIR else found.seconds
         lags.append(motion.Lag(seconds + shift, found.correlation, found.slope))
     position, velocity = (*lags, None)[:2]
-    out = Agreement(turn, position, velocity)
+    out = Agreement(turn, position, velocity, None, shift, _clock(t, gyro, accel, fixes, shift))
     if out.clearest is None:
         return out
     angle = np.angle(out.clearest.slope)
-    return Agreement(turn, position, velocity, np.cos(angle) * axes[0] + np.sin(angle) * axes[1])
+    return replace(out, forward=np.cos(angle) * axes[0] + np.sin(angle) * axes[1])
+
+
+def _clock(t: Array, gyro: Array, accel: Array, fixes: tuple[Array, Array, Array | None], shift: float) -> Clock:
+    """As the recording will hold them, with the fixes `shift` seconds earlier."""
+    rows = np.concatenate([[True], np.diff(fixes[0]) > 0.0]) & np.isfinite(fixes[1]).all(axis=1)
+    v = None if fixes[2] is None else fixes[2][rows]
+    if v is not None and v.shape[1] == 2:
+        v = np.column_stack([v, np.zeros(len(v))])
+    gnss = Gnss(fixes[0][rows] - shift, fixes[1][rows], np.ones((int(rows.sum()), 3)), v)
+    return clock_of(Imu(t, gyro, accel), gnss)
 
 
 def _turn_lag(grid: Array, rate: Array, course: motion.Course) -> motion.Lag | None:

@@ -13,6 +13,7 @@ from graphnav.rotation import Array
 
 _LABEL = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"}
 _HIGHEST = 9000.0  # m, that a drive on Earth may come to
+_SET_BACK = 10.0  # periods; rows that merely overtake each other are closer
 _RADIANS = (1.58, 3.15)  # |lat|, |lon| that angles in radians cannot exceed
 
 
@@ -44,12 +45,15 @@ def usable_rows(
     Raises
     ------
     RecordingError
-        For infinite values, if too few rows are left, or if the time steps cannot be seconds.
+        For infinite values but in an odometer's log, if too few rows are left, if the time steps cannot be seconds, or
+        if the stamps run over the same times twice.
     """
     label = _LABEL[sensor]
     for name in rows.columns:
         bad = np.flatnonzero(np.isinf(rows[name]))
-        if len(bad):
+        if len(bad) and sensor == "odometer":  # of which single readings can be missed
+            rows = rows.with_column(name, np.where(np.isinf(rows[name]), np.nan, rows[name]))
+        elif len(bad):
             raise RecordingError(f"{rows.where(bad[0], name)}: the value is infinite")
     if keep is not None:
         rows = rows.take(rows[Table.KEEP] >= keep.at_least)
@@ -63,13 +67,15 @@ def usable_rows(
     if blank.any():
         first = np.flatnonzero(blank)[0]
         at = f" (first at t = {rows['t'][first]:.3f} s)" if np.isfinite(rows["t"][first]) else ""
-        remarks.add(f"{_rows(blank, label)} with blank or NaN values dropped{at}")
+        what = "blank, NaN or infinite" if sensor == "odometer" else "blank or NaN"
+        remarks.add(f"{_rows(blank, label)} with {what} values dropped{at}")
         rows = rows.take(~blank)
 
     t = rows["t"]
     step = np.diff(t)
     if (step < 0).any():
         first = np.flatnonzero(step < 0)[0]
+        _check_passes(rows, label)
         remarks.add(
             f"{label} rows out of order sorted by time ({(step < 0).sum()} steps back, "
             f"the first after t = {t[first]:.3f} s)"
@@ -90,6 +96,26 @@ def usable_rows(
     if sensor == "imu":
         _check_imu_time(rows, unit)
     return rows
+
+
+def _check_passes(rows: Table, label: str) -> None:
+    """Refuse a clock that was set back: the stamps before and after it then lie among each other."""
+    t = rows["t"]
+    period = float(np.median(np.abs(np.diff(t))))
+    back = np.flatnonzero(np.diff(t) < -_SET_BACK * period)
+    for k in back[:20]:
+        again, before = float(t[k + 1]), t[: k + 1]
+        before = before[before >= again]
+        after = t[k + 1 :][t[k + 1 :] <= t[k]]
+        # rows that were only written later than others fill the hole that they left
+        shared = min(before.max(), after.max()) - max(before.min(), after.min())
+        if shared > 0.5 * (t[k] - again) and shared > _SET_BACK * period:
+            jump = float(t[k] - again + period)
+            leap = " (GPS time and UTC are 18 s apart)" if abs(jump - 18.0) < 0.5 else ""
+            raise RecordingError(
+                f"{rows.path}: the clock of the {label} is set back by {jump:.2f} s after t = {t[k]:.3f} s{leap}: what "
+                "lies between is there twice; write all stamps on one clock"
+            )
 
 
 def _rows(mask: Mask, label: str) -> str:
@@ -175,7 +201,7 @@ def sigmas(
     Raises
     ------
     RecordingError
-        If the file holds a sigma that is not above zero.
+        If the file holds a sigma below zero, or only zeros and blanks.
     """
     there = [name for name in names if name in rows]
     fallback = np.array(stated or default)
@@ -188,13 +214,38 @@ def sigmas(
         return np.tile(fallback, (len(rows), 1))
     sd = rows.stack(*names)
     for k, name in enumerate(names):
-        bad = np.flatnonzero(used & (sd[:, k] <= 0))
+        zero = used & (sd[:, k] == 0)
+        floor = _floor(sd[used & (sd[:, k] > 0), k])
+        bad = np.flatnonzero(used & ((sd[:, k] < 0) | (zero & (floor is None))))
         if len(bad):
             raise RecordingError(f"{rows.where(bad[0], name)}: a 1-sigma must be above zero, not {sd[bad[0], k]:g}")
+        if zero.any():
+            sd[zero, k] = floor
+            remarks.add(
+                f"{what} sigma {name} is 0 in {zero.sum()} of {len(rows)} rows: rounded away, {floor:g} is taken there "
+                "(half of the column's last digit, or its smallest above zero)"
+            )
     blank = np.isnan(sd)
     if stated is None and (n := (blank.any(-1) & used).sum()):
         remarks.add(f"{assumed} where the file's own are blank ({n} of {len(rows)} rows)")
     return np.where(blank, fallback, sd)
+
+
+_FINEST = 5  # decimals that are written on purpose; with more, a column is not rounded
+
+
+def _floor(positive: Array) -> float | None:
+    """What a sigma is at most that was printed as zero: half a unit of the last decimal of the others in its column.
+
+    Where they are not rounded it is the smallest of them; None where there is none.
+    """
+    if not len(positive):
+        return None
+    for digits in range(_FINEST + 1):
+        scaled = positive * 10.0**digits
+        if np.abs(scaled - np.round(scaled)).max() < 1e-6 * max(1.0, scaled.max()):
+            return float(0.5 * 10.0**-digits)
+    return float(positive.min())
 
 
 def fixes_by_type(rows: Table, numbers: str) -> NDArray[np.intp] | None:

@@ -56,7 +56,7 @@ Sigmas = Annotated[tuple[float, float, float], BeforeValidator(_three_positive)]
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 ANGLE = {"deg": np.pi / 180.0, "rad": 1.0}
 RATE = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180e3}
-FORCE = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3}  # standard gravity, by definition
+FORCE = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ft/s2": 0.3048}  # standard gravity, by definition
 SPEED = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600}
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -103,7 +103,7 @@ class ImuUnits(_Section):
 
     t: TimeUnit = "s"
     gyro: Literal["rad/s", "deg/s", "mdeg/s"] = "rad/s"
-    accel: Literal["m/s2", "g", "mg"] = "m/s2"
+    accel: Literal["m/s2", "g", "mg", "ft/s2"] = "m/s2"
 
 
 class GnssUnits(_Section):

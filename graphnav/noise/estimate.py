@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri
 
 from graphnav.constraints.base import Constraint
 from graphnav.noise.apply import with_noise
@@ -38,6 +38,7 @@ from graphnav.solvers.rts import backward
 from graphnav.state import SECONDS
 
 _CHANCE = 1e-3  # below which a squared residual is taken for an outlier
+_USUAL = 0.05  # of the squares of an aiding sensor, that count for no more: nearly two in five may be wrong
 _FIRST = 1500  # keyframes: figures told by a thousand numbers are good to a twentieth
 _ROUNDS = 12
 _TIMES = (0.2, 60.0)  # s, between which what lasts for seconds is looked for
@@ -175,10 +176,14 @@ def _pass(problem: Problem, about: Points, end: int) -> tuple[Forward, Smoothed]
     return forward, backward(problem, forward)
 
 
-def _capped(A: Array, B: Array, freedom: int) -> tuple[float, float]:
-    """Sums of squares and of redundancies, each square no larger than chance allows."""
-    most = float(chdtri(freedom, _CHANCE)) / freedom
-    return float(np.sum(np.minimum(A, most * B))), float(np.sum(B))
+def _capped(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, float]:
+    """Sums of squares and of redundancies; no square counts for more than chance allows, made up for in the mean.
+
+    For z^2 chi-square with m degrees of freedom and the limit q, E[min(z^2, q)] = m P(chi2_m+2 < q) + q P(chi2_m > q).
+    """
+    most = float(chdtri(freedom, chance))
+    mean = freedom * (1.0 - float(chdtrc(freedom + 2, most))) + most * chance
+    return float(np.sum(np.minimum(A, most / freedom * B))) * freedom / mean, float(np.sum(B))
 
 
 def _improve(figures: _Figures, problem: Problem, forward: Forward, smoothed: Smoothed, end: int) -> None:
@@ -187,7 +192,7 @@ def _improve(figures: _Figures, problem: Problem, forward: Forward, smoothed: Sm
     steps = disturbances(problem, forward, smoothed)
     A, B = imu_moments(problem, forward, steps)
     for i, name in enumerate(NOISE_FIGURES):
-        figures.update(f"imu.{name}", *_capped(A[:, i], B[:, i], 3))
+        figures.update(f"imu.{name}", *_capped(A[:, i], B[:, i], 3, _CHANCE))
     driven: dict[str, tuple[Array, Array, Array]] = {}
     for chain in problem.chains:
         if chain.parameter.noise_groups:
@@ -204,8 +209,8 @@ def _improve(figures: _Figures, problem: Problem, forward: Forward, smoothed: Sm
         for i, name in enumerate(names):
             own = index[:n] == i
             if own.any():
-                figures.update(name, *_capped(found.A[own], found.B[own], 1))
-        _weigh(figures, problem, rows, found.left_out, n)
+                figures.update(name, *_capped(found.A[own], found.B[own], 1, _USUAL))
+        _weigh(figures, problem, rows, np.maximum(found.left_out.sum(axis=1), found.whole.sum(axis=1)), n)
 
 
 def _improve_process(figures: _Figures, chain: ParameterChain, moments: tuple[Array, Array, Array]) -> None:
@@ -213,7 +218,7 @@ def _improve_process(figures: _Figures, chain: ParameterChain, moments: tuple[Ar
     groups = np.array(chain.parameter.noise_groups)
     for group in dict.fromkeys(chain.parameter.noise_groups):
         own = groups == group
-        figures.update(group, *_capped(A[:, own], B[:, own], 1))
+        figures.update(group, *_capped(A[:, own], B[:, own], 1, _USUAL))
 
 
 def _improve_time(figures: _Figures, problem: Problem, chain: ParameterChain, lags: tuple[Array, ...]) -> None:
@@ -238,27 +243,11 @@ def _improve_time(figures: _Figures, problem: Problem, chain: ParameterChain, la
     figures.times[p.name] = float(np.clip(found, *_TIMES))
 
 
-def _weigh(figures: _Figures, problem: Problem, rows: Constraint, left_out: Array, n: int) -> None:
-    """Weights of the first n rows by what they are off from where all others put them."""
-    t = problem.t[rows.keyframe]
-    squared, most = np.sum(left_out, axis=1), float(chdtri(left_out.shape[1], _CHANCE))
-    if rows.bursts:
-        squared = _bursts(t[:n], squared, left_out.shape[1], most)
+def _weigh(figures: _Figures, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:
+    """Weights of the first n rows by their squared errors (n,): of their own, and of the whole with what lasts."""
+    t, most = problem.t[rows.keyframe], float(chdtri(len(rows.axes), _CHANCE))
     weight = np.minimum(1.0, most / np.maximum(squared, 1e-30))
     before = np.ones(len(rows)) if rows.weight is None else rows.weight
     weight = np.concatenate([weight, before[n:]])  # later ones as they were
     less = (weight < 1.0) & (before > 0.0)
     figures.weights[rows.name] = RowWeights(t[less], weight[less])
-
-
-def _bursts(t: Array, squared: Array, freedom: int, most: float) -> Array:
-    """Squared residuals (n,) with those of a burst in place of their own: as unlikely as all within `SECONDS` together.
-
-    What is wrong with wheels for seconds shows in no row alone. The mean over a window of m rows is compared with what
-    chance allows for m times the degrees of freedom.
-    """
-    first, last = np.searchsorted(t, t - 0.5 * SECONDS), np.searchsorted(t, t + 0.5 * SECONDS, side="right")
-    total = np.concatenate([[0.0], np.cumsum(squared)])
-    m = last - first
-    together = (total[last] - total[first]) / chdtri(freedom * m, _CHANCE) * most
-    return np.asarray(np.maximum(squared, together))

@@ -44,7 +44,7 @@ class RowMoments:
     A: Array  # (N, m) w e^2 / R
     B: Array  # (N, m) redundancy
     left_out: Array  # (N, m) squared residual against its variance, predicted without the row, as if its weight were 1
-    residual: Array  # (N, m)
+    whole: Array  # (N, m) squared whole error, what lasts included, against its steady variance
 
 
 def disturbances(problem: Problem, forward: Forward, smoothed: Smoothed) -> Steps:
@@ -88,7 +88,13 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: Smoothed, n: int) 
     R = linear.sigma**2
     B = np.clip(1.0 - w * HPH / R, 1e-6, 1.0)
     left_out = (linear.residual / B) ** 2 / (R + HPH / B)
-    return RowMoments(w * linear.residual**2 / R, np.where(w > 0.0, B, 0.0), left_out, linear.residual)
+    error, variance = linear.residual, R
+    for p in rows.parameters:
+        if p.correlation_time is not None:
+            J = linear.jacobians[p.name]
+            error = error - np.einsum("nij,nj->ni", J, values[p.name][at])
+            variance = variance + J**2 @ p.sigma**2
+    return RowMoments(w * linear.residual**2 / R, np.where(w > 0.0, B, 0.0), left_out, error**2 / variance)
 
 
 def lag_moments(

@@ -1,0 +1,304 @@
+"""Does estimating noise and leaving fixes out make drives worse? Stated beside estimated noise, over many windows.
+
+    python scripts/do_no_harm.py -o harm.json --windows 3 --no-whole
+    python scripts/do_no_harm.py -o harm.json --share 0.25 --seed 7 --compare before.json
+
+Every drive is solved whole and in windows at random starts, with one sensor set after the other, once with the noise
+that the recording states and every fix used, once with the defaults. Errors are against the drive's own truth; where
+it has none, against spans of fixes that are withheld. Rows go to the file as they come, and those that are there
+already are not solved again. Exit code 1 where a bound of `BOUNDS` is broken.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import math
+import multiprocessing
+import os
+import random
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from harm_verdict import BOUNDS, FLOOR, Row, broken, compared, failures, key_of, metres, table
+from scipy.stats import chi2
+
+import graphnav
+from graphnav.config import settings_from
+from graphnav.earth import LocalFrame
+from graphnav.evaluation import truth_of
+from graphnav.interpolation import interpolate
+from graphnav.metrics import summary
+from graphnav.pipeline import SOLVERS
+from graphnav.recording import Recording
+from graphnav.solution import Solution
+from graphnav.workflow import Span, Withheld, _score
+
+HERE = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Where a drive is, relative to the folder of recordings."""
+
+    source: str
+    doppler: bool = True
+    simulated: bool = False
+
+
+# The most telling first: an interrupted run has seen those.
+DRIVES = {
+    "tokyo_no_doppler": Drive("tokyo_20201105/recording.toml", doppler=False),
+    "tokyo": Drive("tokyo_20201105/recording.toml"),
+    "tokyo_spp": Drive("tokyo_20201105/recording_spp.toml"),
+    "boulder": Drive("boulder_drive_20250708"),
+    "kitti": Drive("kitti"),
+    "comma": Drive("comma_highway_20180802"),
+    "dresden": Drive("dresden_car_20140326"),
+    "circles_2024": Drive("car_circles_boston_20241021"),
+    "circles_2025": Drive("car_circles_boston_20251119"),
+    "canada_rover": Drive("canada_rover"),
+    "motorbike": Drive("motorbike_dresden_20160809"),
+    "tokyo_clone": Drive(str(HERE / "data" / "tokyo")),
+    "oracle": Drive("oracle_drive/recording.toml", simulated=True),
+    "oracle_spp": Drive("oracle_drive/recording_spp.toml", simulated=True),
+}
+SENSORS = ("gnss", "+nhc", "+odometer")  # each with all before it
+VARIANTS = ("stated", "estimated")
+WINDOW, SHORT = 300.0, 120.0  # s; a usual window, and a drive too short for any
+GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+SURE = chi2.isf(math.erfc(3.0 / math.sqrt(2.0)), 3)  # of three axes together, as rare as three sigma of one
+TRUTH_GAP = 0.5  # s; between rows further apart braking at 3 m/s^2 bends the way by more than 3 * 0.5^2 / 8 = 0.1 m
+
+
+def settings_of(variant: str, sensors: str, doppler: bool = True) -> graphnav.Settings:
+    """The settings of one cell of the table."""
+    values: dict[str, dict[str, Any]] = {"gnss": {"velocity": doppler}}
+    if sensors == "gnss":
+        values["standstill"] = {"zero_velocity": False, "zero_rate": False, "held_position": False}
+    values["vehicle"] = {"nhc": sensors != "gnss", "odometer": sensors == "+odometer"}
+    values["noise"] = {"mode": variant}
+    return settings_from(values)
+
+
+# ------------------------------------------------------------------------------------------------------- what is solved
+@dataclass(frozen=True)
+class Job:
+    """One window of one drive with one sensor set and one variant of noise: three rows, one of each solver."""
+
+    drive: str
+    source: str
+    window: str  # "whole" or "from-to", s from the recording's start
+    span: Span
+    sensors: str
+    variant: str
+
+    def key(self, solver: str) -> tuple[str, ...]:
+        return self.drive, self.window, self.sensors, self.variant, solver
+
+
+@lru_cache(maxsize=1)
+def load(source: str) -> Recording:
+    return graphnav.load(source)
+
+
+def placed(drive: Drive, folder: Path) -> str:
+    """The path of a drive, or its built-in name."""
+    return drive.source if drive.source == "kitti" else str(folder / drive.source)
+
+
+def windows(recording: Recording, source: str, count: int, seed: int, whole: bool) -> Iterator[tuple[str, Span]]:
+    """Names and spans: the drive as far as it has fixes, unless only parts are wanted, and windows in it.
+
+    The first starts anywhere, each of the others further by the golden ratio of all there is: so many or few lie spread
+    evenly, and the first of many are those of few. Fewer than `count` where the drive is shorter than two windows.
+    """
+    gnss = recording.gnss
+    assert gnss is not None
+    first, last = max(gnss.t[0] - recording.start, 0.0), min(gnss.t[-1] - recording.start, recording.duration)
+    length = last - first
+    if whole or length < SHORT:
+        yield "whole", (0.0, last)
+    if length < SHORT:
+        return
+    size = min(WINDOW, 0.5 * length)
+    place = random.Random(f"{seed} {Path(source).name}").random()
+    for k in range(math.ceil(count * min(1.0, length / (2.0 * WINDOW)))):
+        start = round(first + (place + k * GOLDEN) % 1.0 * (length - size), 1)
+        end = round(start + size, 1)
+        yield f"{start:g}-{end:g}", (start, end)
+
+
+def plan(options: argparse.Namespace) -> list[Job]:
+    """Every job asked for, by drive, window by window."""
+    jobs: list[list[Job]] = []
+    for name in options.drives:
+        source = placed(DRIVES[name], options.data)
+        recording = load(source)
+        for window, span in windows(recording, DRIVES[name].source, options.windows, options.seed, options.whole):
+            sets = SENSORS if recording.odometer is not None else SENSORS[:2]
+            cells = itertools.product(sets, VARIANTS)
+            jobs.append([Job(name, source, window, span, sensors, variant) for sensors, variant in cells])
+    if options.share < 1.0:
+        picked = random.Random(options.seed).sample(range(len(jobs)), max(1, round(options.share * len(jobs))))
+        jobs = [jobs[k] for k in sorted(picked)]
+    return [job for window in jobs for job in window]
+
+
+def withheld_of(part: Recording, length: float) -> tuple[Withheld, ...]:
+    """Spans of fixes to score on: 20 s every 100 s from 40 s on; of a drive shorter than `SHORT`, two of 10 s."""
+    if length < SHORT:  # the first after the motion that the attitude is found from, the last with fixes behind it
+        starts, size = [0.4 * length, 0.75 * length], 10.0
+    else:
+        starts, size = list(np.arange(40.0, part.duration - 20.0, 100.0)), 20.0
+    return tuple(("gnss", (round(float(s), 1), round(float(s) + size, 1))) for s in starts)
+
+
+def solve(job: Job) -> list[Row]:
+    """The rows of a job, by solver; with what went wrong in place of numbers where it cannot be solved."""
+    drive, whole = DRIVES[job.drive], load(job.source)
+    names = ("drive", "window", "sensors", "variant", "solver")
+    rows: list[Row] = [
+        {**dict(zip(names, job.key(solver), strict=True)), "simulated": drive.simulated} for solver in SOLVERS
+    ]
+    began = time.process_time()
+    try:
+        part = whole.crop(*job.span)
+        if job.sensors != "+odometer" and part.odometer is not None:
+            part = part.without("odometer")
+        withheld = withheld_of(part, whole.duration) if part.truth is None else ()
+        used = part
+        for source, span in withheld:
+            used = used.without(source, span)
+        began = time.process_time()
+        solutions = graphnav.run(used, settings_of(job.variant, job.sensors, drive.doppler), SOLVERS)
+        seconds = time.process_time() - began
+        metrics = _score(part, used, solutions, withheld)[0]
+        for row in rows:
+            said = summary(metrics[row["solver"]])
+            row |= {"h": said.get("h_rms_m"), "up": said.get("up_rms_m"), "nees": said.get("nees_p")}
+            row |= {**left_out(used, solutions[row["solver"]]), "seconds": round(seconds, 2)}
+    except Exception as error:  # another kind than GraphnavError is a bug; the table shows it and goes on
+        said = str(error) if isinstance(error, graphnav.GraphnavError) else f"{type(error).__name__}: {error}"
+        said = " ".join(said.split("\n\n")[0].split())
+        rows = [row | {"error": said, "seconds": round(time.process_time() - began, 2)} for row in rows]
+    return rows
+
+
+def left_out(recording: Recording, solution: Solution) -> Row:
+    """How many fixes there are and are left out, and the same of those that the truth confirms (None without truth)."""
+    gnss, record = recording.gnss, solution.records["gnss_position"]
+    assert gnss is not None
+    there = np.isfinite(gnss.llh).all(axis=1)
+    out = np.zeros(len(gnss.t), dtype=bool)
+    for t in record.t[record.weight == 0.0]:
+        out |= np.abs(gnss.t - t) < 1e-5
+    for fault in solution.excluded:
+        if fault.kind == "gnss_position":
+            out |= (gnss.t >= fault.t_start - 1e-5) & (gnss.t <= fault.t_end + 1e-5)
+    out &= there
+    velocities = sum(fault.count for fault in solution.excluded if fault.kind == "gnss_velocity")
+    found: Row = {"fixes": int(there.sum()), "left_out": int(out.sum()), "left_out_velocities": velocities}
+    reference = truth_of(recording)
+    if reference is None:
+        return found | {"confirmed": None, "confirmed_left_out": None}
+    truth, of_antenna = reference[0], reference[1] is not None
+    arm = None if of_antenna or not gnss.lever_arm.any() else gnss.lever_arm
+    at, reached = interpolate(truth, gnss.t, max_gap=TRUTH_GAP, lever_arm=arm)
+    frame = LocalFrame(gnss.llh[0])
+    away = np.full(gnss.llh.shape, np.nan)
+    away[reached] = frame.from_llh(gnss.llh[reached]) - frame.from_llh(at.llh)
+    sigma = gnss.sd * np.maximum(1.0, FLOOR / np.linalg.norm(gnss.sd, axis=1))[:, None]  # a truth has errors of its own
+    confirmed = np.sum((away / sigma) ** 2, axis=1) < SURE  # false where the truth says nothing
+    return found | {"confirmed": int(confirmed.sum()), "confirmed_left_out": int((confirmed & out).sum())}
+
+
+def run(jobs: list[Job], path: Path, rows: list[Row], processes: int) -> list[Row]:
+    """All rows: those that are there, and those of the jobs that are not, written as they come."""
+    have = {key_of(row) for row in rows}
+    todo = [job for job in jobs if job.key(SOLVERS[0]) not in have]
+    pool = multiprocessing.get_context("spawn").Pool(processes) if processes > 1 and len(todo) > 1 else None
+    try:
+        for k, new in enumerate(pool.imap(solve, todo) if pool else map(solve, todo), 1):
+            rows = [*rows, *new]
+            beside = path.with_suffix(".part")
+            beside.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n", encoding="utf-8")
+            beside.replace(path)  # whole at any time
+            one = new[-1]
+            said = one.get("error") or " / ".join(f"{metres(r['h'])}, {metres(r['up'])}" for r in new)
+            print(
+                f"{k}/{len(todo)} {' '.join(key_of(one)[:4])}: {said}; {one['seconds']} s", file=sys.stderr, flush=True
+            )
+    finally:
+        if pool:
+            pool.terminate()
+    return rows
+
+
+def options_of(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, required=True, help="the rows, JSON; those there are kept")
+    parser.add_argument("--data", type=Path, default=os.environ.get("GRAPHNAV_DATA", HERE.parent / "shared" / "data"))
+    parser.add_argument("--drives", default=",".join(DRIVES), help="some of %(default)s")
+    parser.add_argument("--windows", type=int, default=8, help="of each drive that is long enough")
+    parser.add_argument("--whole", action=argparse.BooleanOptionalAction, default=True, help="whole drives as well")
+    parser.add_argument("--share", type=float, default=1.0, help="of all windows, drawn by the seed")
+    parser.add_argument("--seed", type=int, default=1, help="of where windows start, and of the share")
+    parser.add_argument("--only", choices=VARIANTS, help="solve with one noise only")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--compare", type=Path, metavar="OLD.json", help="the rows of an earlier run")
+    options = parser.parse_args(arguments)
+    options.data, options.drives = Path(options.data), options.drives.split(",")
+    if unknown := [name for name in options.drives if name not in DRIVES]:
+        parser.error(f"--drives: no drive '{unknown[0]}'; known: {', '.join(DRIVES)}")
+    if not 0.0 < options.share <= 1.0:
+        parser.error(f"--share {options.share:g}: must be above 0 and at most 1")
+    return options
+
+
+def rows_in(path: Path) -> list[Row]:
+    """The rows of a file."""
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+        list(map(key_of, rows))
+    except OSError as error:
+        raise graphnav.GraphnavError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, KeyError, TypeError):
+        raise graphnav.GraphnavError(f"{path}: holds no rows of this script; name another file") from None
+    return list(rows)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The exit code: 1 where a bound is broken, 2 where there is nothing to work with."""
+    options = options_of(arguments)
+    try:
+        rows = rows_in(options.output) if options.output.exists() else []
+        old = rows_in(options.compare) if options.compare else []
+        jobs = plan(options)
+    except graphnav.GraphnavError as error:
+        print(error, file=sys.stderr)
+        return 2
+    wanted = {job.key(solver) for job in jobs for solver in SOLVERS}
+    todo = [job for job in jobs if options.only in (None, job.variant)]
+    rows = [row for row in run(todo, options.output, rows, options.jobs) if key_of(row) in wanted]
+    print("\n".join(table(rows)))
+    print("\n".join(["", *failures(rows)]))
+    if options.compare:
+        print("\n".join(["", *compared(rows, old)]))
+    found = broken(rows)
+    for name, bound in BOUNDS.items():
+        own = [said for which, said in found if which == name]
+        print(f"\n{name} ({bound:g}): " + (f"broken {len(own)} times" if own else "holds"))
+        print("".join(f"  {said}\n" for said in own), end="")
+    return int(bool(found))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,88 @@
+"""How far the clocks of an IMU and its fixes are apart: the stated error is kept to, and everybody says the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphnav import crosschecks, lags
+from graphnav.clock import clock_of
+from graphnav.draft.agreement import compare
+from graphnav.formats import read
+
+
+def lasting(rng: np.random.Generator, n: int, steps: float) -> np.ndarray:
+    """White noise that was smoothed, of variance one."""
+    kernel = np.exp(-0.5 * (np.arange(-4 * steps, 4 * steps + 1) / steps) ** 2)
+    x = np.convolve(rng.normal(size=n + len(kernel)), kernel, "same")[:n]
+    return x / x.std()
+
+
+@pytest.mark.parametrize("misfit_lasts", [1.0, 5.0, 15.0])  # rows of 0.2 s
+def test_the_error_of_a_lag_is_as_large_as_stated(misfit_lasts: float) -> None:
+    n, step, late = 600, 0.2, 0.13
+    t = step * np.arange(n)
+    off, sigma = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        moved = np.linspace(-10.0, t[-1] + 10.0, 2800)
+        x = lasting(rng, len(moved), 16.0)
+        y = np.interp(t + late, moved, x) + 0.7 * lasting(rng, n, misfit_lasts)
+
+        def x_at(rows: np.ndarray, lag: float, moved: np.ndarray = moved, x: np.ndarray = x) -> np.ndarray:
+            return np.interp(t[rows] + lag, moved, x)[:, None]
+
+        lag, spread = lags.refined(t, y, x_at, lambda lag: np.ones(n, dtype=bool), np.arange(n), 0.0, 20)
+        off.append(lag - late)
+        sigma.append(spread)
+    z = np.array(off) / np.array(sigma)
+    assert 0.4 < np.sqrt(np.mean(z**2)) < 1.5
+    assert np.abs(z).max() < 4.5
+
+
+def test_nothing_is_known_of_a_lag_where_nothing_changes() -> None:
+    t = 0.2 * np.arange(300)
+    y = np.random.default_rng(1).normal(size=300)
+
+    def x_at(rows: np.ndarray, lag: float) -> np.ndarray:
+        return (t[rows, None] + lag) * 1e-3
+
+    _, sigma = lags.refined(t, y, x_at, lambda lag: np.ones(300, dtype=bool), np.arange(300), 0.0, 20)
+    assert sigma > 1.0
+
+
+@pytest.mark.parametrize("name", ["oracle_drive", "tokyo_20201105"])  # stamps right to 0.02 s, as their READMEs say
+def test_parts_of_a_drive_keep_to_the_error(shared_data: Path, name: str) -> None:
+    drive = read(shared_data / name)
+    z = []
+    for a in np.arange(0.0, min(drive.duration, 900.0) - 60.0, 60.0):
+        part = drive.crop(a, a + 60.0)
+        assert part.gnss is not None
+        track = crosschecks.track(part.gnss)
+        fit = None if track is None else crosschecks.forward_fit(part.imu, track)
+        if fit is not None and fit.correlation > 0.6:
+            z.append(max(abs(fit.lag) - 0.02, 0.0) / fit.spread)
+    assert len(z) >= 6
+    assert max(z) < 4.0
+    assert np.sqrt(np.mean(np.square(z))) < 1.5
+
+
+@pytest.mark.parametrize("name", ["boulder_drive_20250708", "dresden_car_20140326", "oracle_drive"])
+@pytest.mark.parametrize("shift", [-0.6, 0.0, 0.6])
+def test_a_draft_and_the_checks_say_the_same(shared_data: Path, name: str, shift: float) -> None:
+    drive = read(shared_data / name).crop(0.0, 300.0)
+    imu, gnss = replace(drive.imu, t=drive.imu.t + shift), drive.gnss
+    assert gnss is not None
+    up = crosschecks.up_of(imu)
+    drafted = compare(imu.t, imu.gyro, imu.accel, up, (gnss.t, gnss.llh, None if gnss.v is None else gnss.v[:, :2]))
+    said = clock_of(imu, gnss).late
+    assert (drafted.offset is None) == (said is None)
+    if drafted.offset is not None and said is not None:
+        assert drafted.offset[0] == pytest.approx(said.lag, abs=1e-6)
+        # what is then left is no longer complained of
+        assert clock_of(imu, replace(gnss, t=gnss.t + drafted.offset[0])).late is None
+    # of dresden, whose receiver wanders, it is not sure
+    assert (said is not None) == (shift != 0.0) or name.startswith("dresden")
