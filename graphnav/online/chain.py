@@ -19,6 +19,7 @@ from graphnav.noise.apply import row_weights
 from graphnav.noise.model import STATED, NoiseModel
 from graphnav.online.looks import Stops
 from graphnav.online.sensors import Sensors
+from graphnav.preintegration import NOISE_FIGURES
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import Fault
@@ -78,6 +79,17 @@ class Chain:
         times, used = self.verdicts.times, self.verdicts.used
         left = {name: used[name] * (row_weights(t, self.noise, name) > 0.0) for name, t in times.items()}
         return Verdicts(times, left).faults()
+
+    @property
+    def _judged_imu(self) -> bool:
+        """Whether some figure of the IMU is not used as stated."""
+        return any(self.noise.factor(f"imu.{name}", 1.0) != 1.0 for name in NOISE_FIGURES)
+
+    @property
+    def _noise_of_rows(self) -> NoiseModel:
+        """The noise model for a problem whose intervals have it already."""
+        rows = {name: one for name, one in self.noise.figures.items() if not name.startswith("imu.")}
+        return replace(self.noise, figures=rows)
 
     @property
     def _oldest(self) -> float:

@@ -9,7 +9,7 @@ first one's place when it has caught up.
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from graphnav import faults
 from graphnav.alignment import Alignment
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
+from graphnav.constraints.gnss import TIMES, GnssPosition
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
@@ -26,8 +27,9 @@ from graphnav.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.noise.exclusion import exclude
 from graphnav.noise.model import NoiseModel
 from graphnav.noise.words import describe
-from graphnav.online.sensors import Sensors
+from graphnav.online.sensors import Sensors, unit_of
 from graphnav.online.tracker import Tracker
+from graphnav.preparation import start_sigma
 from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
@@ -52,14 +54,22 @@ class Judgement:
     Parameters
     ----------
     times : (K,) s, keyframes, the first at the start of the recording: weights of rows hold at these.
+    unit : (3,) m, in which the answer is to tell errors of the fixes that last for minutes and hours.
     due : s, when the answer is to be used.
     """
 
     def __init__(
-        self, recording: Recording, settings: Settings, frame: LocalFrame, found: Alignment, times: Array, due: float
+        self,
+        recording: Recording,
+        settings: Settings,
+        frame: LocalFrame,
+        found: Alignment,
+        times: Array,
+        unit: Array,
+        due: float,
     ) -> None:
         self.found, self.due, self.until = found, due, float(times[-1])
-        self._asked = recording, settings, frame, times
+        self._asked = recording, settings, frame, times, unit
         self._begin()
 
     def answer(self) -> Answer:
@@ -82,16 +92,18 @@ class Judgement:
         self._thread.start()
 
     def _work(self) -> None:
-        recording, settings, frame, times = self._asked
+        recording, settings, frame, times, unit = self._asked
         start = self.found
         try:
             stationary = detect(recording, settings).stationary
             base = pose(
-                recording, settings, frame, start.state, start.sigma, stationary, times, parts_of_noise=True
+                recording, settings, frame, start.state, start_sigma(start), stationary, times, parts_of_noise=True
             )  # fmt: skip
+            base = _level(base)
             noise = _estimated(base, start.until, settings).noise
             used = with_noise(base, noise)
-            self._answer = Answer(noise, describe(noise, used), stationary, faults.spans(used))
+            said, wrong = describe(noise, used), faults.spans(used)
+            self._answer = Answer(_in_unit(noise, base, unit), said, stationary, wrong)
         except (EstimationError, np.linalg.LinAlgError) as error:
             self._answer = EstimationError(str(error))
         except BaseException as error:  # said by whoever asks
@@ -114,6 +126,27 @@ def _estimated(base: Problem, opening: float | None, settings: Settings) -> Nois
     if not noise.excluded:
         return found
     return estimate_noise(base, opening, noise, (found.points, with_noise(base, found.noise)))
+
+
+def _level(base: Problem) -> Problem:
+    """The problem with one unit for both horizontal axes of what lasts for minutes and hours."""
+    rows = (replace(c, usual_error=unit_of(c.sigma)) if isinstance(c, GnssPosition) else c for c in base.constraints)
+    return replace(base, constraints=tuple(rows))
+
+
+def _in_unit(noise: NoiseModel, base: Problem, unit: Array) -> NoiseModel:
+    """The model that says the same of errors that last for minutes and hours in another unit (3,), m.
+
+    An estimate has what the fixes state by then for its unit; the parameters of a drive keep theirs.
+    """
+    own = next((c.usual_error for c in base.constraints if isinstance(c, GnssPosition)), unit)
+    level, up = (2.0 * np.log(own / unit)[1:]).tolist()
+    figures = dict(noise.figures)
+    for name, one in noise.figures.items():
+        if name.startswith(GnssPosition.name) and any(f".{time}." in name for time in TIMES[1:]):
+            more = up if name.endswith(".up") else level
+            figures[name] = replace(one, log_factor=one.log_factor + more, prior=one.prior + more)
+    return replace(noise, figures=figures)
 
 
 class Again:

@@ -37,6 +37,7 @@ class Sensors:
     gnss: Buffer = field(default_factory=lambda: Buffer(_WIDTH["gnss"]))
     odometer: Buffer = field(default_factory=lambda: Buffer(_WIDTH["odometer"]))
     oldest: float = -np.inf  # s; rows up to here come too late
+    _unit: Array | None = None  # `unit`, once asked for
     _means: dict[str, tuple[float, tuple[float, ...]]] = field(default_factory=dict)  # usual sigmas, and since when
     _suspect: tuple[float, tuple[float, ...]] | None = None  # an IMU row far ahead of the one before
 
@@ -80,6 +81,12 @@ class Sensors:
     def usual(self, t: Array) -> Array:
         """(N, 6) sigmas that the fixes at some times usually state, m and m/s: the units of errors that last."""
         return self.gnss.rows[np.searchsorted(self.gnss.t, t - 1e-6), 13:19]
+
+    def unit(self) -> Array:
+        """(3,) m, in which errors of the fixes that last for minutes and hours are told, from the first question on."""
+        if self._unit is None:
+            self._unit = unit_of(self.gnss.rows[:, 4:7])
+        return self._unit
 
     def _usually(self, kind: str, t: float, sd: tuple[float, ...]) -> tuple[float, ...]:
         """A mean that looks back only, and so is the same whenever a fix is posed.
@@ -140,6 +147,13 @@ class Sensors:
         way = rows[:, 2] if np.isfinite(rows[:, 2]).all() else None
         wheels = rows[:, 3:7] if np.isfinite(rows[:, 3:7]).any() else None
         return replace(self.setup.odometer, t=rows[:, 0], speed=rows[:, 1], way=way, wheels=wheels)
+
+
+def unit_of(sd: Array) -> Array:
+    """(3,) median of stated sigmas (N, 3), one for both horizontal axes: their errors have one figure in common."""
+    east, north, up = np.median(sd, axis=0)
+    level = np.sqrt(0.5 * (east**2 + north**2))
+    return np.array([level, level, up])
 
 
 def without_rows(recording: Recording) -> Recording:

@@ -24,6 +24,7 @@ from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import Tracker
 from graphnav.pipeline import origin
+from graphnav.preparation import start_sigma
 from graphnav.recording import Recording
 from graphnav.solution import Fault, to_trajectory
 from graphnav.solvers.batch import batch
@@ -219,7 +220,7 @@ class Online:
         assert self.frame is not None
         stated = with_known_heading(found, self.settings)
         self.notes += [note for note in stated.notes if note not in self.notes]
-        message = first_message(stated.state, stated.sigma)
+        message = first_message(stated.state, start_sigma(stated))
         tracker = Tracker(self.settings, self.frame, message, start, self._setup, noise)
         if found is not stated:
             tracker.window.head = message.moved(found.state.minus(stated.state)[0])
@@ -250,7 +251,7 @@ class Online:
         times = np.concatenate([self._times, tracker.window.t])
         recording = self.sensors.recording(-np.inf, tracker.newest + AFTER)
         due = tracker.newest + min(_THINKING * self.settings.solver.lag, _LONGEST_THOUGHT)
-        self._judgement = Judgement(recording, self.settings, self.frame, found, times, due)
+        self._judgement = Judgement(recording, self.settings, self.frame, found, times, self.sensors.unit(), due)
 
     def _use(self, judgement: Judgement, tracker: Tracker) -> None:
         """Begin to go through what has not settled with what the sensors were judged to be."""

@@ -32,7 +32,7 @@ from graphnav.online.chain import Chain
 from graphnav.online.looks import CONTEXT, SURE, Readings, clipped
 from graphnav.online.sensors import Sensors
 from graphnav.online.steps import Steps
-from graphnav.preintegration import NOISE_FIGURES, preintegrate
+from graphnav.preintegration import preintegrate
 from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
@@ -342,30 +342,21 @@ class Tracker(Chain):
                 self._motions[t] = Motion(problem.intervals[k : k + 1], self.frame)
         return problem
 
-    @property
-    def _judged_imu(self) -> bool:
-        """Whether some figure of the IMU is not used as stated."""
-        return any(self.noise.factor(f"imu.{name}", 1.0) != 1.0 for name in NOISE_FIGURES)
-
-    @property
-    def _noise_of_rows(self) -> NoiseModel:
-        """The noise model for a problem whose intervals have it already."""
-        rows = {name: one for name, one in self.noise.figures.items() if not name.startswith("imu.")}
-        return replace(self.noise, figures=rows)
-
     def _noisy(self, problem: Problem, sensors: Sensors, noise: NoiseModel | None = None) -> Problem:
         """A problem posed with stated noise as the noise model has it.
 
-        A few keyframes do not tell how often fixes come, nor what they usually state: all rows do.
+        A few keyframes do not tell how often fixes come, nor what they usually state.
         """
         spacing, rows = node_spacing(self.settings.gnss.slow_times, period(sensors.gnss.t)), []
         for c in problem.constraints:
+            if isinstance(c, GnssPosition):
+                c = replace(c, usual_error=sensors.unit())
+            elif isinstance(c, GnssVelocity):
+                c = replace(c, unit_error=sensors.usual(problem.t[c.keyframe])[:, 3:])
             if isinstance(c, GnssPosition | GnssVelocity):
                 c = replace(c, processes=tuple(replace(p, spacing=spacing) for p in c.processes))
-            if isinstance(c, GnssVelocity):
-                c = replace(c, unit_error=sensors.usual(problem.t[c.keyframe])[:, 3:])
             rows.append(c)
-        return with_noise(replace(problem, constraints=tuple(rows)), self.noise if noise is None else noise)
+        return with_noise(replace(problem, constraints=tuple(rows)), noise or self.noise)
 
     def _around(self, sensors: Sensors, begin: float, end: float) -> Recording:
         """The rows that keyframes between two times look at.
