@@ -182,9 +182,12 @@ def _estimated(
 def start_sigma(start: Alignment) -> Array:
     """(15,) 1-sigma of the start, with a place that the alignment does not claim to know.
 
-    It has the place from fixes that the problem uses too, by sigmas that may be wrong.
+    It has the place from fixes that the problem uses too, by sigmas that may be wrong; without fixes it is where the
+    start is said to be.
     """
     sigma = start.sigma.copy()
+    if start.motion is None:
+        return sigma
     sigma[BLOCKS["p"]] = np.hypot(sigma[BLOCKS["p"]], _FAR_AWAY)
     return sigma
 

@@ -24,12 +24,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import oracle
-from graphnav.judgement import judged
 
 from graphnav.alignment import align
 from graphnav.config import Settings
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
+from graphnav.noise.apply import with_noise
+from graphnav.noise.estimate import estimate_noise
 from graphnav.online import Online, Row, rows_of, without_rows
 from graphnav.pipeline import origin
 from graphnav.problem import Problem, pose
@@ -116,11 +117,11 @@ def filter_seconds(recording: Recording, settings: Settings) -> float:
 
 
 def posed(recording: Recording, settings: Settings) -> Problem:
-    """A recording aligned, judged and posed, as for any solver."""
+    """A recording aligned and posed with its noise model, as for any solver."""
     frame, stationary = LocalFrame(origin(recording)), detect(recording, settings).stationary
     found = align(recording, settings, frame, lambda p, x: batch(p, x, wanted=(0,), reintegrate=False))
-    recording, settings, _ = judged(recording, settings, frame, found, stationary)
-    return pose(recording, settings, frame, found.state, found.sigma, stationary)
+    base = pose(recording, settings, frame, found.state, found.sigma, stationary, parts_of_noise=True)
+    return with_noise(base, estimate_noise(base, found.until).noise)
 
 
 def report(hour: int, found: np.ndarray, filtered: float, errors: np.ndarray, cpu: float, rows: int) -> None:

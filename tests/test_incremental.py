@@ -14,6 +14,8 @@ from graphnav.config import settings_from
 from graphnav.constraints.vehicle import OdometerSpeed
 from graphnav.earth import LocalFrame
 from graphnav.formats import read
+from graphnav.noise.apply import with_noise
+from graphnav.noise.model import STATED, Figure, NoiseModel
 from graphnav.pipeline import run
 from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
@@ -30,6 +32,16 @@ from graphnav.state import DIM, States
 from graphnav.trajectory import Trajectory
 
 EVERYTHING = 1e9  # s, a lag longer than any drive
+# errors of the fixes that last, for two fifths of the stated variance, and of wheels
+LASTING = NoiseModel(
+    {f"gnss_position.{axis}": Figure(float(np.log(0.6))) for axis in ("horizontal", "up")}
+    | {
+        f"gnss_position.{t}.{axis}": Figure(float(np.log(0.2)))
+        for t in ("minutes", "hours")
+        for axis in ("horizontal", "up")
+    }
+    | {f"nhc.seconds.{axis}": Figure(0.0) for axis in ("right", "up")}
+)
 
 
 def sigmas(solution: Solution) -> Array:
@@ -54,9 +66,11 @@ def posed(drive: tuple[Recording, Trajectory]) -> Problem:
     frame = LocalFrame(recording.gnss.llh[0])
     start = truth_states(truth, np.zeros(1), frame)
     start = replace(start, R_nb=start.R_nb @ exp(np.array([[0.01, -0.01, 0.06]])), ba=0 * start.ba, bg=0 * start.bg)
-    settings = settings_from({"gnss": {"slow_share": 0.4, "sd_factor": 1.0, "lever_arm_sigma": 0.2}})
+    settings = settings_from({"gnss": {"lever_arm_sigma": 0.2}})
     still = np.array([[0.0, 8.0]]) if np.linalg.norm(truth.v[truth.t <= 8.0], axis=1).max() < 1e-3 else None
-    return pose(recording, settings, frame, start, np.repeat([0.1, 1.0, 0.5, 0.05, 5e-3], 3), still)
+    return with_noise(
+        pose(recording, settings, frame, start, np.repeat([0.1, 1.0, 0.5, 0.05, 5e-3], 3), still), LASTING
+    )
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +94,7 @@ def test_a_window_is_the_dense_least_squares_solution(drive: tuple[Recording, Tr
     """Ten seconds against one QR of all rows as `helpers.factors` makes them, with none of the solver's code."""
     part = posed.recording.crop(40.0, 50.0)
     start = truth_states(drive[1], np.round(np.array([part.start]), 6), posed.frame)
-    problem = pose(part, posed.settings, posed.frame, start, posed.prior.sigma[0])
+    problem = with_noise(pose(part, posed.settings, posed.frame, start, posed.prior.sigma[0]), LASTING)
     found = incremental(problem, lag=EVERYTHING).settled
     parts, widths = factors(problem, found.states, {n: p.value for n, p in found.parameters.items()})
     step, covariance = dense(parts, widths)
@@ -97,6 +111,7 @@ def test_the_live_estimate_is_the_end_of_a_batch_solution_so_far(posed: Problem)
         # what the odometer is worth is told from its readings: the same ones
         part = pose(posed.recording.crop(0.0, end), posed.settings, posed.frame, posed.prior.mean,
                     posed.prior.sigma[0], np.array([[0.0, 8.0]]), speed=speed)  # fmt: skip
+        part = with_noise(part, LASTING)
         smoothed = backward(part, ekf(part))
         so_far = batch(part, smoothed.states, smoothed.nodes(part), reintegrate=False)
         k = int(np.searchsorted(posed.t, part.t[-1] - 1e-6))
@@ -108,6 +123,7 @@ def test_the_live_estimate_is_the_end_of_a_batch_solution_so_far(posed: Problem)
 def test_isam2_holds_the_same_as_the_window(posed: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two eliminations of the same rows, one of them GTSAM's, over the first motion and all parameters."""
     part = pose(posed.recording.crop(0.0, 60.0), posed.settings, posed.frame, posed.prior.mean, posed.prior.sigma[0])
+    part = with_noise(part, LASTING)
     monkeypatch.setattr("graphnav.solvers.incremental.turn_limit", lambda noise: 1e9)  # as the tree: only at the end
     tree, window = isam2(part), incremental(part, lag=EVERYTHING)
     assert np.abs(apart(tree.live, window.live)).max() < 0.05
@@ -117,13 +133,12 @@ def test_isam2_holds_the_same_as_the_window(posed: Problem, monkeypatch: pytest.
 
 
 def test_a_lag_over_the_outage_gives_the_batch_solution_to_a_centimetre(drive: tuple[Recording, Trajectory]) -> None:
-    settings = {"gnss": {"slow_share": 0.4, "sd_factor": 1.0}}
-    best = run(drive[0], settings_from(settings), solvers=("batch",))["batch"]
+    best = run(drive[0], solvers=("batch",), noise=LASTING)["batch"]
 
     def far(lag: float) -> float:
         """m"""
-        more = settings_from({**settings, "solver": {"lag": lag}})
-        found = run(drive[0], more, solvers=("incremental",))["incremental"]
+        settings = settings_from({"solver": {"lag": lag}})
+        found = run(drive[0], settings, solvers=("incremental",), noise=LASTING)["incremental"]
         return float(np.abs(found.states.p - best.states.p).max())
 
     assert far(60.0) < 0.01
@@ -206,8 +221,8 @@ def test_outliers_are_given_up_as_by_the_batch_solver(drive: tuple[Recording, Tr
     rows = np.arange(10, len(p), 12)
     p[rows] += [15.0, -10.0, 5.0]
     bad = replace(recording, gnss=replace(gnss, llh=frame.to_llh(p)))
-    settings = settings_from({"gnss": {"robust": "cauchy", "slow_share": 0.0, "sd_factor": 1.0}})
-    found = run(bad, settings, solvers=("incremental", "batch"))
+    settings = settings_from({"gnss": {"robust": "cauchy"}})
+    found = run(bad, settings, solvers=("incremental", "batch"), noise=STATED)
     a, b = found["incremental"], found["batch"]
     far = np.abs(a.states.p - b.states.p)[a.t > a.t[0] + 20.0]
     assert far.max() < 0.05
@@ -219,8 +234,8 @@ def test_sigmas_are_true(drive: tuple[Recording, Trajectory]) -> None:
     ratio = []
     for seed in range(4):
         recording, truth = oracle.drive(oracle.vehicle_path(240.0), seed=20 + seed, outages=[(110.0, 150.0)])
-        settings = settings_from({"gnss": {"slow_share": 0.0, "sd_factor": 1.0}, "solver": {"lag": 30.0}})
-        solution = run(recording, settings, solvers=("incremental",))["incremental"]
+        settings = settings_from({"solver": {"lag": 30.0}})
+        solution = run(recording, settings, solvers=("incremental",), noise=STATED)["incremental"]
         i = np.clip(np.searchsorted(truth.t, solution.t - 1e-6), 0, len(truth.t) - 1)
         met = np.abs(truth.t[i] - solution.t) < 1e-6  # not where a stop begins or ends
         at_rows = replace(solution, t=solution.t[met], states=solution.states[met], covariance=solution.covariance[met])
@@ -233,7 +248,9 @@ def test_sigmas_are_true(drive: tuple[Recording, Trajectory]) -> None:
 def test_real_program_run(shared_data: Path, name: str) -> None:
     found = run(read(shared_data / name), solvers=("incremental", "batch"))
     a, b = found["incremental"], found["batch"]
-    assert np.abs(a.states.p - b.states.p).max() < 0.01
+    # what comes after the lag still tells of errors that last for minutes and hours: as much as variances say
+    var = [np.diagonal(one.covariance, axis1=1, axis2=2)[:, 3:6] for one in (a, b)]
+    assert np.all(np.abs(a.states.p - b.states.p) < 3.0 * np.sqrt(np.maximum(var[0] - var[1], 0.0)) + 0.001)
     assert any("ms (median)" in note for note in a.notes)
 
 
@@ -297,30 +314,3 @@ def test_linearised_again_in_portions_it_is_the_same(posed: Problem) -> None:
     np.testing.assert_allclose(at_once[1], sd, rtol=1e-7)
     np.testing.assert_allclose(changed[0] / sd, off / sd, atol=0.02)
     np.testing.assert_allclose(changed[1], sd, rtol=1e-3)
-
-
-def test_residuals_of_what_settled_are_those_at_the_solution(posed: Problem) -> None:
-    """Whitened, and with the variance that is left of them: against the rows taken at the settled states."""
-    solver = Incremental(Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3), lag=30.0)
-    steps = node_steps(posed)
-    for k in range(len(posed.t)):
-        solver.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=k > 0))
-    solver.finish()
-    rows = next(c for c in posed.constraints if c.name == "odometer")
-    seen = 0
-    for part in solver.settled:
-        for i, k in enumerate(np.searchsorted(posed.t, part.t)):
-            at = np.flatnonzero(rows.keyframe == k)
-            mine = [r for r in part.residuals[i] if r.name == "odometer"]
-            assert len(mine) == len(at)
-            if not len(at) or not part.columns[i]:
-                continue
-            seen += 1
-            given = {
-                p.name: part.values[i][None, part.columns[i][p.name].start - DIM : part.columns[i][p.name].stop - DIM]
-                for p in rows.parameters
-            }
-            linear = rows.linearize(part.states[i : i + 1], given, at)
-            np.testing.assert_allclose(mine[0].left, linear.residual / linear.sigma, atol=0.02)
-            assert np.all((mine[0].variance > 0.0) & (mine[0].variance <= 1.0))
-    assert seen > 100

@@ -362,6 +362,8 @@ class OdometerSpeed(Wheels):
         if not good.all():
             rows, begin, end = rows[good], begin[good], end[good]
             past = Past.of(scene.intervals, rows, scene.frame)
+        if not len(rows):
+            return None
         shared = shared_parameters(scene)
         walk = s.scale_walk / np.sqrt(60.0)
         shared["parameters"].append(

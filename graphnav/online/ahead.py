@@ -10,8 +10,9 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.dense import Dense
 from graphnav.dynamics import SCALE, Motion, as_biases
 from graphnav.earth import LocalFrame
+from graphnav.noise.model import NoiseModel
 from graphnav.online.sensors import Sensors
-from graphnav.preintegration import preintegrate
+from graphnav.preintegration import NOISE_FIGURES, preintegrate
 from graphnav.rotation import Array
 from graphnav.samples import bridge_gaps
 from graphnav.solvers.window import Message
@@ -28,13 +29,17 @@ class Live:
     keyframe: float  # s
 
 
-def live(newest: Message, T: float, frame: LocalFrame, sensors: Sensors) -> Live:
+def live(newest: Message, T: float, frame: LocalFrame, sensors: Sensors, noise: NoiseModel) -> Live:
     """The state at the newest IMU row, from the message `newest` of the newest keyframe at T (s)."""
     now = sensors.imu.newest
     state, P = newest.state, newest.covariance
     if now > T + SAME_TIME:
         imu = sensors.recording(T - 1.0, now).imu
-        intervals = preintegrate(bridge_gaps(imu), imu, np.array([T, now]), state.ba[0], state.bg[0])
+        factors = np.array([noise.factor(f"imu.{name}", 1.0) for name in NOISE_FIGURES])
+        ends, differs = np.array([T, now]), bool(np.any(factors != 1.0))
+        intervals = preintegrate(bridge_gaps(imu), imu, ends, state.ba[0], state.bg[0], differs)
+        if differs:
+            intervals = intervals.with_noise(factors)
         motion, one = Motion(intervals, frame), slice(0, 1)
         scale = newest.value(SCALE) if SCALE in newest.columns else None
         ahead, F15 = motion.propagate(one, state, scale)
@@ -47,7 +52,9 @@ def live(newest: Message, T: float, frame: LocalFrame, sensors: Sensors) -> Live
     return Live(float(max(now, T)), state, P[:DIM, :DIM], T)
 
 
-def since(newest: Message, T: float, frame: LocalFrame, sensors: Sensors) -> tuple[Array, States, Array]:
+def since(
+    newest: Message, T: float, frame: LocalFrame, sensors: Sensors, noise: NoiseModel
+) -> tuple[Array, States, Array]:
     """Times (M,), states and covariances (M, 15, 15) at every IMU row since the newest keyframe at T (s).
 
     Predicted through each row; covariances lie on the straight line between those at both ends.
@@ -55,7 +62,7 @@ def since(newest: Message, T: float, frame: LocalFrame, sensors: Sensors) -> tup
     t = sensors.imu.t[sensors.imu.t > T + SAME_TIME].copy()
     if not len(t):
         return t, newest.state[:0], np.empty((0, DIM, DIM))
-    now = live(newest, T, frame, sensors)
+    now = live(newest, T, frame, sensors, noise)
     imu, start = sensors.recording(T - 1.0, now.t).imu, newest.state
     ba, bg = start.ba, start.bg
     if SCALE in newest.columns:

@@ -1,9 +1,8 @@
 """The chain of keyframes of a running drive: how those that are posed enter the window, and what is kept of them.
 
-A keyframe enters with the parameters that begin or move on there, and with what is decided of each of its rows by
-then: fixes found to be wrong have no weight, noisy ones less, speeds the sigma that settled keyframes have shown.
-Where a fix shows that fixes have been wrong for some time, the keyframes since then leave again and enter without
-those.
+A keyframe enters with the parameters that begin or move on there, with the noise model as it is by then, and without
+the fixes that tests have found to be wrong. Where a fix shows that fixes have been wrong for some time, the keyframes
+since then leave again and enter without those.
 """
 
 from __future__ import annotations
@@ -16,12 +15,14 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.constraints.standstill import PLACE
-from graphnav.online.evidence import SPEEDS, Evidence
+from graphnav.noise.apply import row_weights
+from graphnav.noise.model import STATED, NoiseModel
 from graphnav.online.looks import Stops
-from graphnav.online.noise import Noise
 from graphnav.online.sensors import Sensors
+from graphnav.preintegration import NOISE_FIGURES
 from graphnav.problem import Problem
 from graphnav.rotation import Array
+from graphnav.solution import Fault
 from graphnav.solvers.elimination import Predicted
 from graphnav.solvers.stages import Place, Step
 from graphnav.solvers.watch import Verdicts, Watch
@@ -39,16 +40,17 @@ class Chain:
     ----------
     message, t0 : the prior and the time it is for.
     turn : rad, how far an attitude may move before rows are linearised anew.
+    noise : how good the sensors are taken to be.
     """
 
-    def __init__(self, settings: Settings, message: Message, t0: float, turn: float) -> None:
-        self.settings = settings
+    def __init__(
+        self, settings: Settings, message: Message, t0: float, turn: float, noise: NoiseModel = STATED
+    ) -> None:
+        self.settings, self.noise = settings, noise
         self.window = Window(message, turn)
         self.head = t0  # time of the message before the window, or of the first keyframe as long as it is in it
         self.opened = False  # whether the first keyframe has left the window
-        self.evidence = Evidence()
         self.verdicts = Verdicts({}, {})  # which fixes are used
-        self.noise = Noise()  # of those
         self._standing = Stops()
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
@@ -72,6 +74,24 @@ class Chain:
         return np.concatenate([[self.head], t]) if self.opened else t
 
     @property
+    def excluded(self) -> tuple[Fault, ...]:
+        """Spans of fixes that are not used, whoever found them."""
+        times, used = self.verdicts.times, self.verdicts.used
+        left = {name: used[name] * (row_weights(t, self.noise, name) > 0.0) for name, t in times.items()}
+        return Verdicts(times, left).faults()
+
+    @property
+    def _judged_imu(self) -> bool:
+        """Whether some figure of the IMU is not used as stated."""
+        return any(self.noise.factor(f"imu.{name}", 1.0) != 1.0 for name in NOISE_FIGURES)
+
+    @property
+    def _noise_of_rows(self) -> NoiseModel:
+        """The noise model for a problem whose intervals have it already."""
+        rows = {name: one for name, one in self.noise.figures.items() if not name.startswith("imu.")}
+        return replace(self.noise, figures=rows)
+
+    @property
     def _oldest(self) -> float:
         """Time of the oldest keyframe in the window, s."""
         return self.window.stages[0].place.t if self.window.stages else self.newest
@@ -87,22 +107,13 @@ class Chain:
             self.window.watch(Watch(watched, period, len(self.window.newest.z)))
 
     def _weighed(self, problem: Problem) -> Problem:
-        """The problem with what is decided of each row before it enters the window.
-
-        Fixes: not used where a fault was found, and by how noisy they are. Speeds: their sigma by what settled so far
-        says of them.
-        """
-        factors, rows = self.evidence.factors, []
+        """The problem without the fixes in which a fault was found."""
+        rows = []
         for c in problem.constraints:
-            if isinstance(c, SPEEDS) and c.name in factors:
-                c = replace(c, sigma=c.sigma * factors[c.name])
-            if c.watched or c.adaptive != "off":
-                t = problem.t[c.keyframe]
-                weight = self.noise.weights(c, t)
-                if c.watched:
-                    weight = weight * self.verdicts.weights(c.name, t)
+            if c.watched:
+                weight = self.verdicts.weights(c.name, problem.t[c.keyframe])
                 if not (weight == 1.0).all():
-                    c = replace(c, weight=weight)
+                    c = replace(c, weight=weight if c.weight is None else c.weight * weight)
             rows.append(c)
         return replace(problem, constraints=tuple(rows))
 
@@ -115,10 +126,6 @@ class Chain:
         while k < len(problem.t):
             turn = max(turn, self._push(problem, k, ahead))
             ahead = None
-            if self.noise.hear(problem, self.window.stages[-1]):
-                self._keep(len(self.window) - 1)
-                problem = self._weighed(posed)
-                turn = max(turn, self._push(problem, k, None))
             fault = self.window.stages[-1].fault
             if fault is not None:
                 again = self.verdicts.settle(*fault, now=float(problem.t[k]))
@@ -181,8 +188,6 @@ class Chain:
         self._head_nodes = self._nodes[count - 1]
         self.head, self.opened = float(self.window.t[count - 1]), True
         settled = self.window.settle(count)
-        self.evidence.add(settled)
-        self.noise.forget(self.head)
         del self._nodes[:count]
         return settled
 

@@ -1,42 +1,61 @@
-"""Judging the sensors again by more rows, beside the drive: no keyframe waits for it.
+"""Estimating the noise model again by more rows, beside the drive: no keyframe waits for it.
 
-The judgement itself, which filters some minutes twice or more, is made in a thread. Its answer is used at the first
-row after a fixed time of the drive, so that what comes out does not depend on how long it took. A second tracker
-then goes through what has not settled with the new figures, some keyframes at a row, and takes the first one's place
-when it has caught up.
+The estimate itself (`graphnav.noise`), which filters and smooths some minutes a dozen times, is made in a thread. Its
+answer is used at the first row after a fixed time of the drive, so that what comes out does not depend on how long it
+took. A second tracker then goes through what has not settled with the new model, some keyframes at a row, and takes the
+first one's place when it has caught up.
 """
 
 from __future__ import annotations
 
 import threading
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from graphnav import faults
 from graphnav.alignment import Alignment
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
+from graphnav.constraints.gnss import TIMES, GnssPosition
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
-from graphnav.judgement import judged
-from graphnav.online.sensors import Sensors
+from graphnav.noise.apply import with_noise
+from graphnav.noise.estimate import NoiseEstimate, estimate_noise
+from graphnav.noise.exclusion import exclude
+from graphnav.noise.model import NoiseModel
+from graphnav.noise.words import describe
+from graphnav.online.sensors import Sensors, unit_of
 from graphnav.online.tracker import Tracker
+from graphnav.preparation import start_sigma
+from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
 from graphnav.rotation import Array
+from graphnav.solution import Fault
 
 _PORTION = 4  # keyframes gone through again at a row
 
-Answer = tuple[Recording, Settings, tuple[str, ...], Array]  # recording, settings, notes, stops
+
+@dataclass(frozen=True)
+class Answer:
+    """What some rows say of the sensors."""
+
+    noise: NoiseModel
+    notes: tuple[str, ...]
+    stationary: Array  # (M, 2) s
+    excluded: tuple[Fault, ...]  # spans that the noise model leaves out
 
 
 class Judgement:
-    """What the sensors are worth by the rows of a recording.
+    """The noise model that the rows of a recording tell.
 
     Parameters
     ----------
+    times : (K,) s, keyframes, the first at the start of the recording: weights of rows hold at these.
+    unit : (3,) m, in which the answer is to tell errors of the fixes that last for minutes and hours.
     due : s, when the answer is to be used.
-    overruled : most fixes contradict the smoother.
     """
 
     def __init__(
@@ -45,11 +64,12 @@ class Judgement:
         settings: Settings,
         frame: LocalFrame,
         found: Alignment,
+        times: Array,
+        unit: Array,
         due: float,
-        overruled: bool = False,
     ) -> None:
-        self.found, self.due, self.until = found, due, recording.end
-        self._asked = recording, settings, frame, overruled
+        self.found, self.due, self.until = found, due, float(times[-1])
+        self._asked = recording, settings, frame, times, unit
         self._begin()
 
     def answer(self) -> Answer:
@@ -72,11 +92,18 @@ class Judgement:
         self._thread.start()
 
     def _work(self) -> None:
-        recording, settings, frame, overruled = self._asked
+        recording, settings, frame, times, unit = self._asked
+        start = self.found
         try:
             stationary = detect(recording, settings).stationary
-            how = judged(recording, settings, frame, self.found, stationary, witnesses=overruled)
-            self._answer = *how, stationary
+            base = pose(
+                recording, settings, frame, start.state, start_sigma(start), stationary, times, parts_of_noise=True
+            )  # fmt: skip
+            base = _level(base)
+            noise = _estimated(base, start.until, settings).noise
+            used = with_noise(base, noise)
+            said, wrong = describe(noise, used), faults.spans(used)
+            self._answer = Answer(_in_unit(noise, base, unit), said, stationary, wrong)
         except (EstimationError, np.linalg.LinAlgError) as error:
             self._answer = EstimationError(str(error))
         except BaseException as error:  # said by whoever asks
@@ -90,17 +117,48 @@ class Judgement:
         self._begin()
 
 
+def _estimated(base: Problem, opening: float | None, settings: Settings) -> NoiseEstimate:
+    """The noise model, with spans of wrong measurements left out where evidence says so: as for a recording."""
+    found = estimate_noise(base, opening)
+    if settings.gnss.faults == "off":
+        return found
+    noise, _ = exclude(base, found)
+    if not noise.excluded:
+        return found
+    return estimate_noise(base, opening, noise, (found.points, with_noise(base, found.noise)))
+
+
+def _level(base: Problem) -> Problem:
+    """The problem with one unit for both horizontal axes of what lasts for minutes and hours."""
+    rows = (replace(c, usual_error=unit_of(c.sigma)) if isinstance(c, GnssPosition) else c for c in base.constraints)
+    return replace(base, constraints=tuple(rows))
+
+
+def _in_unit(noise: NoiseModel, base: Problem, unit: Array) -> NoiseModel:
+    """The model that says the same of errors that last for minutes and hours in another unit (3,), m.
+
+    An estimate has what the fixes state by then for its unit; the parameters of a drive keep theirs.
+    """
+    own = next((c.usual_error for c in base.constraints if isinstance(c, GnssPosition)), unit)
+    level, up = (2.0 * np.log(own / unit)[1:]).tolist()
+    figures = dict(noise.figures)
+    for name, one in noise.figures.items():
+        if name.startswith(GnssPosition.name) and any(f".{time}." in name for time in TIMES[1:]):
+            more = up if name.endswith(".up") else level
+            figures[name] = replace(one, log_factor=one.log_factor + more, prior=one.prior + more)
+    return replace(noise, figures=figures)
+
+
 class Again:
     """A tracker that goes through the keyframes of another, which goes on meanwhile.
 
     Parameters
     ----------
     tracker : without keyframes.
-    setup : of the sensors, as it sees them.
     """
 
-    def __init__(self, tracker: Tracker, setup: Recording) -> None:
-        self.tracker, self.setup = tracker, setup
+    def __init__(self, tracker: Tracker) -> None:
+        self.tracker = tracker
 
     def step(self, sensors: Sensors, other: Tracker) -> bool:
         """Go through a few more keyframes of the other; True once it has caught up."""
@@ -108,9 +166,5 @@ class Again:
         end = min(done + _PORTION, len(t))
         while end < len(t) and np.any(np.abs(other.stops[:, 0] - t[end - 1]) < SAME_TIME):
             end += 1  # where a stop begins shows only in what follows
-        used, sensors.setup = sensors.setup, self.setup
-        try:
-            self.tracker.update(sensors, t[done:end])
-        finally:
-            sensors.setup = used
+        self.tracker.update(sensors, t[done:end])
         return len(self.tracker.window) >= len(t)

@@ -6,8 +6,6 @@ take effect at the next keyframe.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from graphnav.config import Settings
@@ -54,8 +52,6 @@ class Stops:
             self._reviewed, answered = now, since
         self.looked = now
         recording = sensors.recording(-np.inf if whole else now - _LOOK, now)
-        # by the figures that a whole recording is looked at with: judged ones would have it stand where it crawls
-        recording = replace(recording, imu=replace(recording.imu, noise=sensors.stated))
         self._seen = since, stops(recording, settings, since, now - SURE, self.spans, answered)
 
     def replace(self, spans: Array, edges: Array) -> None:

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.online.buffers import SAME, Buffer
-from graphnav.recording import Gnss, ImuNoise, Odometer, Recording
+from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.rotation import Array
 
 AHEAD = 60.0  # s; stamps of other sensors further than this before the IMU's are wrong
-_WIDTH = {"imu": 6, "gnss": 15, "odometer": 6}  # the last three of a fix: its usual sigma
+_WIDTH = {"imu": 6, "gnss": 18, "odometer": 6}  # the last six of a fix: usual sigmas of place and velocity
 _USUAL = 60.0  # s over which the usual sigma of fixes is averaged
 _NAN = float("nan")
 
@@ -37,12 +37,9 @@ class Sensors:
     gnss: Buffer = field(default_factory=lambda: Buffer(_WIDTH["gnss"]))
     odometer: Buffer = field(default_factory=lambda: Buffer(_WIDTH["odometer"]))
     oldest: float = -np.inf  # s; rows up to here come too late
-    stated: ImuNoise = field(init=False)  # of the IMU, before it was judged
-    _mean: tuple[float, tuple[float, ...]] = (-np.inf, (0.0, 0.0, 0.0))
+    _unit: Array | None = None  # `unit`, once asked for
+    _means: dict[str, tuple[float, tuple[float, ...]]] = field(default_factory=dict)  # usual sigmas, and since when
     _suspect: tuple[float, tuple[float, ...]] | None = None  # an IMU row far ahead of the one before
-
-    def __post_init__(self) -> None:
-        self.stated = self.setup.imu.noise
 
     def add(self, sensor: str, t: float, values: tuple[float, ...]) -> bool:
         """Take in a row; False if it is of no use (`counts` says why).
@@ -64,7 +61,7 @@ class Sensors:
             self.counts[f"{sensor}: stamp in the future"] += 1
             return False
         if sensor == "gnss":
-            values = (*values, *self._usually(t, values[3:6]))
+            values = (*values, *self._usually("position", t, values[3:6]), *self._usually("velocity", t, values[9:12]))
         if not buffer.add(t, values):
             self.counts[f"{sensor}: repeated"] += 1
             return False
@@ -82,19 +79,27 @@ class Sensors:
         return True
 
     def usual(self, t: Array) -> Array:
-        """(N, 3) what the fixes at some times usually state, m: the unit of their slow errors."""
-        return self.gnss.rows[np.searchsorted(self.gnss.t, t - 1e-6), 13:16]
+        """(N, 6) sigmas that the fixes at some times usually state, m and m/s: the units of errors that last."""
+        return self.gnss.rows[np.searchsorted(self.gnss.t, t - 1e-6), 13:19]
 
-    def _usually(self, t: float, sd: tuple[float, ...]) -> tuple[float, ...]:
+    def unit(self) -> Array:
+        """(3,) m, in which errors of the fixes that last for minutes and hours are told, from the first question on."""
+        if self._unit is None:
+            self._unit = unit_of(self.gnss.rows[:, 4:7])
+        return self._unit
+
+    def _usually(self, kind: str, t: float, sd: tuple[float, ...]) -> tuple[float, ...]:
         """A mean that looks back only, and so is the same whenever a fix is posed.
 
         The median of a minute that `graphnav.constraints.gnss` takes would change with every row that follows, and
         a slow error in such a unit would give itself away.
         """
-        last, mean = self._mean
+        last, mean = self._means.get(kind, (-np.inf, sd))
+        if not math.isfinite(sum(sd)):
+            return mean  # a fix without a velocity
         gain = -np.expm1(-max(t - last, 0.0) / _USUAL) if np.isfinite(last) else 1.0
         mean = tuple(float(m + gain * (s - m)) for m, s in zip(mean, sd, strict=True))
-        self._mean = max(t, last), mean
+        self._means[kind] = max(t, last), mean
         return mean
 
     def _add_imu(self, t: float, values: tuple[float, ...]) -> bool:
@@ -142,6 +147,13 @@ class Sensors:
         way = rows[:, 2] if np.isfinite(rows[:, 2]).all() else None
         wheels = rows[:, 3:7] if np.isfinite(rows[:, 3:7]).any() else None
         return replace(self.setup.odometer, t=rows[:, 0], speed=rows[:, 1], way=way, wheels=wheels)
+
+
+def unit_of(sd: Array) -> Array:
+    """(3,) median of stated sigmas (N, 3), one for both horizontal axes: their errors have one figure in common."""
+    east, north, up = np.median(sd, axis=0)
+    level = np.sqrt(0.5 * (east**2 + north**2))
+    return np.array([level, level, up])
 
 
 def without_rows(recording: Recording) -> Recording:

@@ -7,7 +7,6 @@ comes out depends on the rows and their order alone, never on when or in what po
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 
@@ -17,13 +16,15 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
-from graphnav.judgement import FIXES
+from graphnav.noise.exclusion import FIXES
+from graphnav.noise.model import STATED, NoiseModel
 from graphnav.online.ahead import Live
 from graphnav.online.judging import Again, Judgement
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import Tracker
 from graphnav.pipeline import origin
+from graphnav.preparation import start_sigma
 from graphnav.recording import Recording
 from graphnav.solution import Fault, to_trajectory
 from graphnav.solvers.batch import batch
@@ -38,7 +39,8 @@ _STEP = 0.5  # s between looks at a walk
 _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that level a vehicle without GNSS
 _JUDGED = 120.0  # s of rows by which the sensors are judged again
-_THINKING, _LONGEST_THOUGHT = 1.0 / 16.0, 10.0  # of the lag, and s: what judging may take
+_FIXES = 600  # in motion, that tell variances to 6 %: more of them say little new
+_THINKING, _LONGEST_THOUGHT = 1.0 / 8.0, 20.0  # of the lag, and s: what judging may take, 11 s for 1100 keyframes
 _JUDGED_UNTIL = 900.0  # s of rows, where fixes are so rare that these are still too few
 _PATIENCE = 300.0  # s of rows kept while there is no motion to align with
 
@@ -65,6 +67,8 @@ class Online:
         self._found: Alignment | None = None  # as long as the sensors are still to be judged by more rows
         self._said: tuple[str, ...] = ()  # of the notes, those about what the sensors are judged to be
         self._judged = 0.0  # s of rows that they were judged by
+        self._times: list[float] = []  # s, of keyframes that have settled meanwhile
+        self._left_out: tuple[Fault, ...] = ()  # of other measurements than fixes
         self._fixes: list[float] = []  # s, not yet in the graph
         self._began = -np.inf  # s, of what is being smoothed
         self._due = -np.inf  # s, of IMU time at which the next keyframes can be made
@@ -76,8 +80,8 @@ class Online:
 
     @property
     def excluded(self) -> tuple[Fault, ...]:
-        """Spans of fixes found to be wrong, which were not used."""
-        return self._faults + (self.tracker.verdicts.faults() if self.tracker is not None else ())
+        """Spans of measurements found to be wrong, which were not used."""
+        return self._faults + (self.tracker.excluded + self._left_out if self.tracker is not None else ())
 
     @property
     def status(self) -> str:
@@ -134,7 +138,7 @@ class Online:
         elif tracker.spare(self.sensors, expected := self._expected(tracker), not self._tentative):
             self._collect(tracker)
         elif tracker.stale and not self._tentative:
-            self._again = Again(tracker.afresh(tracker.settings, self.sensors.setup), self.sensors.setup)
+            self._again = Again(tracker.afresh(tracker.noise, self._setup))
         else:
             if self._found is not None and self._judgement is None and not self._tentative:
                 self._judge_again(self._found, tracker)
@@ -200,26 +204,27 @@ class Online:
             self.notes.append(f"not aligned at {now:.1f} s: {error}")
             self._wait(now)
             return
-        self.tracker, sensors.setup = self._track(found, recording, self.settings)
-        if found.motion is not None and self.settings.gnss.position and recording.platform != "foot":
+        tracker = self.tracker = self._track(found, recording.start, STATED)
+        told = found.motion is not None and self.settings.gnss.position and recording.platform != "foot"
+        if told and self.settings.noise.mode == "estimated":
             self._found, self._tentative = found, True
-            self._have_judged(recording, found, now)
         self._fixes = [t for t in sensors.gnss.t.tolist() if t >= recording.start - SAME_TIME]
         self._began, self._judged = recording.start, recording.duration
         sensors.oldest = recording.start
-        self._advance(self.tracker)
+        self._advance(tracker)
+        if self._found is not None and self.tracker is tracker:
+            self._have_judged(self._found, tracker)
 
-    def _track(self, found: Alignment, recording: Recording, settings: Settings) -> tuple[Tracker, Recording]:
-        """Begin at the first row of a recording, with what the sensors were judged to be; and their setup."""
+    def _track(self, found: Alignment, start: float, noise: NoiseModel) -> Tracker:
+        """Begin at the first row of what an alignment has seen, s."""
         assert self.frame is not None
-        setup = replace(self._setup, imu=replace(self._setup.imu, noise=recording.imu.noise))
         stated = with_known_heading(found, self.settings)
         self.notes += [note for note in stated.notes if note not in self.notes]
-        message = first_message(stated.state, stated.sigma)
-        tracker = Tracker(settings, self.frame, message, recording.start, recording)
+        message = first_message(stated.state, start_sigma(stated))
+        tracker = Tracker(self.settings, self.frame, message, start, self._setup, noise)
         if found is not stated:
             tracker.window.head = message.moved(found.state.minus(stated.state)[0])
-        return tracker, setup
+        return tracker
 
     def _say(self, said: tuple[str, ...]) -> None:
         """Note what the sensors are judged to be, in place of what was thought before."""
@@ -229,52 +234,47 @@ class Online:
     def _judge_again(self, found: Alignment, tracker: Tracker) -> None:
         """Have the sensors judged again before the first state settles, and whenever there are twice as many rows.
 
-        Up to `judgement.FIXES` fixes in motion, which is what offline judges by.
+        Up to `_FIXES` fixes in motion.
         """
         assert found.motion is not None
         assert self.frame is not None
         span = tracker.newest - self._began
-        enough = np.count_nonzero(self.sensors.gnss.t > found.motion) >= FIXES or span > _JUDGED_UNTIL
+        enough = np.count_nonzero(self.sensors.gnss.t > found.motion) >= _FIXES or span > _JUDGED_UNTIL
         if not enough and span < max(min(self.settings.solver.lag, _JUDGED), 2.0 * self._judged):
             return
         self._judged = span
         self._found = None if enough else found
-        used, self.sensors.setup = self.sensors.setup, self._setup
-        recording = self.sensors.recording(-np.inf, tracker.newest)
-        self.sensors.setup = used
-        self._have_judged(recording, found, tracker.newest)
+        self._have_judged(found, tracker)
 
-    def _have_judged(self, recording: Recording, found: Alignment, now: float) -> None:
+    def _have_judged(self, found: Alignment, tracker: Tracker) -> None:
         assert self.frame is not None
-        due = now + min(_THINKING * self.settings.solver.lag, _LONGEST_THOUGHT)
-        overruled = self.settings.gnss.faults == "off" or (
-            self.tracker is not None and self.tracker.verdicts.refused > 0.5
-        )
-        self._judgement = Judgement(recording, self.settings, self.frame, found, due, overruled)
+        times = np.concatenate([self._times, tracker.window.t])
+        recording = self.sensors.recording(-np.inf, tracker.newest + AFTER)
+        due = tracker.newest + min(_THINKING * self.settings.solver.lag, _LONGEST_THOUGHT)
+        self._judgement = Judgement(recording, self.settings, self.frame, found, times, self.sensors.unit(), due)
 
     def _use(self, judgement: Judgement, tracker: Tracker) -> None:
         """Begin to go through what has not settled with what the sensors were judged to be."""
         self._judgement = None
         try:
-            recording, settings, said, stationary = judgement.answer()
+            found = judgement.answer()
         except EstimationError as error:
             self.notes.append(f"not judged again: {error}")
             self._tentative = False
             return
-        self._say(said)
+        self._say(found.notes)
+        self._left_out = tuple(fault for fault in found.excluded if fault.kind not in FIXES)
         if tracker.opened:
-            setup = replace(self._setup, imu=replace(self._setup.imu, noise=recording.imu.noise))
-            self._again = Again(tracker.afresh(settings, setup), setup)
+            self._again = Again(tracker.afresh(found.noise, self._setup))
         else:
-            again, setup = self._track(judgement.found, recording, settings)
-            again.knows(tracker, stationary, judgement.until)
-            self._again = Again(again, setup)
+            again = self._track(judgement.found, self._began, found.noise)
+            again.knows(tracker, found.stationary, judgement.until)
+            self._again = Again(again)
 
     def _go_through(self, again: Again, tracker: Tracker) -> None:
         """Some of it; what has caught up takes over."""
         if again.step(self.sensors, tracker):
             self.tracker, self._again, self._tentative = again.tracker, None, False
-            self.sensors.setup = again.setup
 
     def _judged_at_last(self) -> None:
         """Nothing more will come: do not wait for what is being judged."""
@@ -300,10 +300,9 @@ class Online:
             self._advance(self.tracker, last=True)
             self.tracker.settle(sensors)
             self._collect(self.tracker)
-            self._faults += self.tracker.verdicts.faults()
+            self._faults += self.tracker.excluded + self._left_out
         self.tracker = self._found = self._judgement = self._again = None
-        self._tentative = False
-        sensors.setup = self._setup  # the IMU is judged anew as well
+        self._tentative, self._times, self._left_out = False, [], ()
         sensors.drop_before(np.inf)
         for row in after:
             sensors.imu.add(float(row[0]), tuple(row[1:]))
@@ -373,6 +372,8 @@ class Online:
 
     def _collect(self, tracker: Tracker) -> None:
         for part in tracker.settled:
+            if self._found is not None:
+                self._times += part.t.tolist()
             rows = part.t > self._last_settled
             if rows.any():
                 assert self.frame is not None

@@ -18,13 +18,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.config.gnss import of_type
 from graphnav.constraints.base import SAME_TIME
+from graphnav.constraints.gnss import GnssPosition, GnssVelocity, node_spacing, period
 from graphnav.constraints.vehicle import REACH
 from graphnav.detectors.base import merged
 from graphnav.dynamics import Motion
 from graphnav.earth import LocalFrame
 from graphnav.findings import period_of
+from graphnav.noise.apply import with_noise
+from graphnav.noise.model import STATED, NoiseModel
 from graphnav.online.ahead import Live, live, since
 from graphnav.online.chain import Chain
 from graphnav.online.looks import CONTEXT, SURE, Readings, clipped
@@ -65,10 +67,19 @@ class Tracker(Chain):
     ----------
     message, t0 : the prior and the time it is for.
     setup : of the sensors.
+    noise : how good they are taken to be.
     """
 
-    def __init__(self, settings: Settings, frame: LocalFrame, message: Message, t0: float, setup: Recording) -> None:
-        super().__init__(settings, message, t0, turn_limit(setup.imu.noise))
+    def __init__(
+        self,
+        settings: Settings,
+        frame: LocalFrame,
+        message: Message,
+        t0: float,
+        setup: Recording,
+        noise: NoiseModel = STATED,
+    ) -> None:
+        super().__init__(settings, message, t0, _turn(setup, noise), noise)
         self.frame, self.foot = frame, setup.platform == "foot"
         self._readings = Readings()
         self._steps = Steps()
@@ -118,7 +129,7 @@ class Tracker(Chain):
         ahead, self._ahead = self._ahead if self._prepared(float(times[0])) else None, None
         problem = self._completed(ahead, sensors, before, times)
         if problem is None:
-            problem, ahead = self._pose(sensors, np.concatenate([before, times])), None
+            problem, ahead = self._noisy(self._pose(sensors, np.concatenate([before, times])), sensors), None
         clock.append(time.thread_time())
         self._parameters |= problem.parameters
         self._watch(problem, sensors)
@@ -188,8 +199,8 @@ class Tracker(Chain):
         T, start = self.newest, self.window.newest.state
         imu = self._around(sensors, T, sensors.imu.newest).imu
         ends = np.array([T, expected])
-        motion = Motion(preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0]), self.frame)
-        self._motions[expected] = motion.prepared()
+        interval = preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0], self._judged_imu)
+        self._motions[expected] = Motion(interval, self.frame).prepared()
 
     def _covered(self, sensors: Sensors, t: float) -> bool:
         """Whether the odometer has come as far as rows at a keyframe ask for."""
@@ -199,7 +210,7 @@ class Tracker(Chain):
     def _prepare(self, sensors: Sensors, expected: float) -> None:
         """Pose and predict the keyframe that is expected, but for the fix."""
         before = self._before(len(self.window), expected)
-        problem = self._pose(sensors, np.array([*before, expected]), complete=False)
+        problem = self._noisy(self._pose(sensors, np.array([*before, expected]), complete=False), sensors)
         self._parameters |= problem.parameters
         place, _ = self._place(self._weighed(problem), len(before))
         self._ahead = _Ahead(problem, self.window.expect(place), self.stops, self._readings.wrong)
@@ -221,6 +232,10 @@ class Tracker(Chain):
             return None
         recording = sensors.recording(float(ahead.problem.t[0]) - _NEAR, float(times[-1]) + 0.1)
         problem = ahead.problem.completed(recording, self._usual(sensors, recording))
+        known = {c.name for c in ahead.problem.constraints}
+        late = replace(problem, constraints=tuple(c for c in problem.constraints if c.name not in known))
+        added = {c.name: c for c in self._noisy(late, sensors, self._noise_of_rows).constraints}
+        problem = replace(problem, constraints=tuple(added.get(c.name, c) for c in problem.constraints))
         return problem if problem.parameters.keys() <= self._parameters.keys() else None
 
     def _revise(self, sensors: Sensors, always: bool = False) -> bool:
@@ -254,22 +269,21 @@ class Tracker(Chain):
         self._motions = {t: one for t, one in self._motions.items() if t > self.head - CONTEXT}
         self._forget()
 
-    def afresh(self, settings: Settings, setup: Recording) -> Tracker:
-        """One with other figures of the sensors that has settled what this one has, and has no keyframes since."""
+    def afresh(self, noise: NoiseModel, setup: Recording) -> Tracker:
+        """One with another noise model that has settled what this one has, and has no keyframes since."""
         other, head = copy.copy(self), self.window.head
-        other.settings, other._parameters, other.verdicts = settings, {}, copy.deepcopy(self.verdicts)
-        other.window = Window(head.moved(head.estimate), turn_limit(setup.imu.noise))
-        other.noise = copy.deepcopy(self.noise)
+        other.noise, other._parameters, other.verdicts = noise, {}, copy.deepcopy(self.verdicts)
+        other.window = Window(head.moved(head.estimate), _turn(setup, noise))
         other._nodes, other._motions, other.settled, other._ahead = [], {}, [], None
         other._settling = False
         other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)
-        other._readings.revised = other.evidence.revised = False
+        other._readings.revised = False
         return other
 
     @property
     def stale(self) -> bool:
-        """Whether what has not settled was posed with figures of the wheels that are known better by now."""
-        return self._readings.revised or self.evidence.revised
+        """Whether what has not settled was posed with figures of the odometer that are known better by now."""
+        return self._readings.revised
 
     def knows(self, other: Tracker, stationary: Array, until: float) -> None:
         """Take over what another has seen, but for the stops up to a time, which have been looked for anew."""
@@ -285,11 +299,11 @@ class Tracker(Chain):
 
     def live(self, sensors: Sensors) -> Live:
         """The state at the newest IMU row, by prediction from the newest keyframe."""
-        return live(self.window.newest, self.newest, self.frame, sensors)
+        return live(self.window.newest, self.newest, self.frame, sensors, self.noise)
 
     def since(self, sensors: Sensors) -> tuple[Array, States, Array]:
         """Times (M,), states and covariances (M, 15, 15) at every IMU row since the newest keyframe."""
-        return since(self.window.newest, self.newest, self.frame, sensors)
+        return since(self.window.newest, self.newest, self.frame, sensors, self.noise)
 
     # ------------------------------------------------------------------------------------------------- keyframes
     def _before(self, keep: int, t: float) -> list[float]:
@@ -304,7 +318,7 @@ class Tracker(Chain):
         """The unit of the slow errors of a recording's fixes, m."""
         if recording.gnss is None:
             return None
-        return np.asarray(of_type(self.settings.gnss.sd_factor, "unknown", 1.0) * sensors.usual(recording.gnss.t))
+        return sensors.usual(recording.gnss.t)[:, :3]
 
     def _pose(self, sensors: Sensors, times: Array, complete: bool = True) -> Problem:
         begin, stops = float(times[0]), self.stops
@@ -321,12 +335,28 @@ class Tracker(Chain):
         known = {t: one for t, one in found if one is not None and not one.intervals.out_of_range(start.bg)[0]}
         problem = pose(
             recording, self.settings, self.frame, start, np.ones(DIM), stops, times, speed, usual, known,
-            self._steps.highest, complete,
+            self._steps.highest, complete, self._judged_imu,
         )  # fmt: skip
         for k, t in enumerate(times[1:].tolist()):
             if t not in known:
                 self._motions[t] = Motion(problem.intervals[k : k + 1], self.frame)
         return problem
+
+    def _noisy(self, problem: Problem, sensors: Sensors, noise: NoiseModel | None = None) -> Problem:
+        """A problem posed with stated noise as the noise model has it.
+
+        A few keyframes do not tell how often fixes come, nor what they usually state.
+        """
+        spacing, rows = node_spacing(self.settings.gnss.slow_times, period(sensors.gnss.t)), []
+        for c in problem.constraints:
+            if isinstance(c, GnssPosition):
+                c = replace(c, usual_error=sensors.unit())
+            elif isinstance(c, GnssVelocity):
+                c = replace(c, unit_error=sensors.usual(problem.t[c.keyframe])[:, 3:])
+            if isinstance(c, GnssPosition | GnssVelocity):
+                c = replace(c, processes=tuple(replace(p, spacing=spacing) for p in c.processes))
+            rows.append(c)
+        return with_noise(replace(problem, constraints=tuple(rows)), noise or self.noise)
 
     def _around(self, sensors: Sensors, begin: float, end: float) -> Recording:
         """The rows that keyframes between two times look at.
@@ -345,8 +375,15 @@ class Tracker(Chain):
         for stop in self.stops if end < len(self.window) else ():
             if stop[0] < times[until - 1] < stop[1]:
                 until = int(np.searchsorted(times, stop[1] + SAME_TIME))
-        problem = self._weighed(self._pose(sensors, times[begin:until]))
+        problem = self._weighed(self._noisy(self._pose(sensors, times[begin:until]), sensors))
         return [
             replace(stage.place, problem=problem, k=first + skip - begin + i)
             for i, stage in enumerate(self.window.stages[first:end])
         ]
+
+
+def _turn(setup: Recording, noise: NoiseModel) -> float:
+    """How far (rad) an attitude may move before rows are linearised anew, by the accelerometer as it is judged."""
+    stated = setup.imu.noise
+    density = stated.accel_noise_density * float(np.sqrt(noise.factor("imu.accel_noise_density", 1.0)))
+    return turn_limit(replace(stated, accel_noise_density=density))

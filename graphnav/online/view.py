@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphnav.noise.exclusion import FIXES
 from graphnav.online.session import Session
 from graphnav.solution import to_trajectory
 
@@ -48,7 +49,7 @@ def view(session: Session, silent: float = 0.0) -> list[tuple[str, str]]:
             ("window", f"{len(tracker.window)} keyframes, {tracker.newest - tracker.head:.0f} s"),
             ("update", ", ".join(f"{name} {1e3 * s:.1f} ms" for name, s in tracker.seconds.items())),
         ]
-    late, wrong = sum(online.late.values()), sum(fault.count for fault in online.excluded)
+    late, wrong = sum(online.late.values()), sum(fault.count for fault in online.excluded if fault.kind in FIXES)
     odd = {k: n for k, n in sensors.counts.items() if ":" in k}
     lines.append(("settled", f"{session.rows_settled} keyframes"))
     if late or wrong or odd or session.bad:

@@ -92,7 +92,7 @@ def incremental(
     message = first_message(mean, problem.prior.sigma[0])
     if start is not None:
         message = message.moved(start.minus(mean)[0])
-    solver = Incremental(Window(message, turn_limit(problem.recording.imu.noise)), lag)
+    solver = Incremental(Window(message, turn_limit(problem.imu_noise)), lag)
     steps = node_steps(problem)
     live, live_P, live_values = [], np.empty((K, DIM, DIM)), []
     seconds = np.empty(K)

@@ -132,15 +132,14 @@ class Stage:
     g: Array  # (D before,)
     lost: Array  # rows that were eliminated
     C: Array  # (lost, lost)
-    measured: tuple[Measured, ...] = ()  # about a point that the stage has moved from by `way`
-    way: Array | float = 0.0
+    measured: tuple[Measured, ...] = ()
     fault: tuple[str, float] | None = None  # whose fixes are wrong, and since when (s)
 
     def moved(self, e: Array) -> Stage:
         """The same about the point moved by the error state e."""
         J = rotation.right_jacobian_inverse(e[None, :3])[0]
         message, G, g = self.message.moved(e, J), turned(self.G, J), self.g + self.G @ e
-        return Stage(self.place, message, G, g, self.lost, self.C, self.measured, self.way + e, self.fault)
+        return Stage(self.place, message, G, g, self.lost, self.C, self.measured, self.fault)
 
     @property
     def noise(self) -> Array:

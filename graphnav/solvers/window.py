@@ -22,7 +22,6 @@ from graphnav.solvers.elimination import Predicted, predict, update
 from graphnav.solvers.revision import Renewed, Revision
 from graphnav.solvers.stages import (
     Columns,
-    Measured,
     Message,
     Place,
     Stage,
@@ -46,16 +45,6 @@ _LIMITS = {"rad": 1e-2, "s": _DELAY}
 
 
 @dataclass(frozen=True)
-class Residual:
-    """What is left of a constraint's rows at a settled keyframe, in its sigmas, and the variance it should have."""
-
-    name: str
-    sigma: Array  # (n, m)
-    left: Array  # (n, m) predicted - measured over sigma
-    variance: Array  # (n, m) of that: 1 less what the states took up
-
-
-@dataclass(frozen=True)
 class Smoothed:
     """Some keyframes with all that the window knows: states, covariances, and the parameters there."""
 
@@ -65,8 +54,6 @@ class Smoothed:
     columns: tuple[Columns, ...]
     values: tuple[Array, ...]  # (D-15,) each
     sigma: tuple[Array, ...]  # (D-15,) each
-    places: tuple[Place, ...]
-    residuals: tuple[tuple[Residual, ...], ...] = ()  # of the measurements at each
 
     def __len__(self) -> int:
         return len(self.t)
@@ -200,12 +187,11 @@ class Window:
         gone, means = self.stages[:count], self.means()[1 : count + 1]
         self._revision, self._rounds = None, 0
         columns = tuple(stage.message.columns for stage in gone)
-        rows, covariance, sigma, residuals = [], np.empty((len(gone), DIM, DIM)), [], []
-        for k, (stage, e, P) in enumerate(zip(gone, means, self._covariances(count), strict=True)):
+        rows, covariance, sigma = [], np.empty((len(gone), DIM, DIM)), []
+        for k, (stage, P) in enumerate(zip(gone, self._covariances(count), strict=True)):
             rows.append(stage.message.state)
             covariance[k] = P[:DIM, :DIM]
             sigma.append(np.sqrt(np.maximum(np.diagonal(P)[DIM:], 0.0)))
-            residuals.append(tuple(_residual(one, stage.way + e, P) for one in stage.measured))
         values = tuple(stage.message.values + e[DIM:] for stage, e in zip(gone, means, strict=True))
         states = self.head.state[:0]
         if gone:
@@ -227,8 +213,6 @@ class Window:
             columns=columns,
             values=values,
             sigma=tuple(sigma),
-            places=tuple(stage.place for stage in gone),
-            residuals=tuple(residuals),
         )
 
     def _covariances(self, count: int) -> list[Array]:
@@ -326,11 +310,6 @@ class Window:
         if self._revision.step(count, renewed):
             self._revision = None
         return True
-
-
-def _residual(rows: Measured, e: Array, P: Array) -> Residual:
-    left = rows.H @ e - rows.b
-    return Residual(rows.name, rows.sigma, left, 1.0 - np.einsum("nmi,nmi->nm", rows.H @ P, rows.H))
 
 
 def turn_limit(noise: ImuNoise) -> float:
