@@ -16,8 +16,8 @@ from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording, Truth
 from graphnav.trajectory import Trajectory
 
 __all__ = [
-    "AXLE", "LEVER_ARM", "MEMS", "RTK_SD", "SPP_SD", "ExactPath", "drive", "moving_spans", "oracle_drive",
-    "oracle_truth_path", "straight_path", "vehicle_path",
+    "AXLE", "LEVER_ARM", "MEMS", "RTK_SD", "SPP_SD", "ExactPath", "drive", "llh_rate", "moving_spans",
+    "oracle_drive", "oracle_truth_path", "straight_path", "vehicle_path",
 ]  # fmt: skip
 
 # The figures stated in the recording.toml of the shipped oracle drive.

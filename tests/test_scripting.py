@@ -317,5 +317,5 @@ def test_a_run_tells_its_stages_in_order():
     heard = []
     run(load(TOKYO).crop(0.0, 60.0), solvers=("batch",), progress=lambda stage, share: heard.append(stage))
     found = list(dict.fromkeys(heard))
-    wanted = ["detection", "alignment", "judgement", "preintegration", "filter", "smoother", "batch", "covariances"]
+    wanted = ["detection", "alignment", "preintegration", "noise", "filter", "smoother", "batch", "covariances"]
     assert found == wanted
