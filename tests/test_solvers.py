@@ -278,7 +278,9 @@ def worst(a: Solution, truth: Trajectory) -> float:
 
 def solve(recording: Recording, kernel: str) -> Solution:
     return run(
-        recording, settings_from({"gnss": {**WHITE, "robust": kernel}, "vehicle": NO_WHEELS}), solvers=("batch",)
+        recording,
+        settings_from({"gnss": {**WHITE, "robust": kernel}, "vehicle": NO_WHEELS, "noise": {"mode": "stated"}}),
+        solvers=("batch",),
     )["batch"]
 
 
