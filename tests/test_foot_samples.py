@@ -89,7 +89,7 @@ def test_figures_stated_too_large_are_lowered_for_a_walk_and_for_nothing_else() 
     assert true.gyro_noise_density < found.imu.noise.gyro_noise_density < 2.0 * true.gyro_noise_density
     assert found.imu.noise.accel_noise_density == true.accel_noise_density
     assert "gyro" in sentence
-    assert with_own_noise(stated, settings_from({"imu": {"as_stated": True}})) == (stated, ())
+    assert with_own_noise(stated, settings_from({"noise": {"mode": "stated"}})) == (stated, ())
     drive = replace(stated, platform="vehicle")
     assert with_own_noise(drive, Settings()) == (drive, ())
 

@@ -121,7 +121,7 @@ def test_a_hundred_kilometres_straight_keep_level(straight: tuple[Recording, Tra
 def test_a_hundred_kilometres_with_gnss_keep_level(straight: tuple[Recording, Trajectory]) -> None:
     """Through the batch solver: no tilt that grows with the distance from the frame's origin."""
     recording, truth = straight
-    settings = settings_from({"gnss": {"time_offset_sigma": 0.0, "sd_factor": 1.0, "slow_share": 0.0}})
+    settings = settings_from({"gnss": {"time_offset_sigma": 0.0}, "noise": {"mode": "stated"}})
     solution = run(recording, settings, solvers=("batch",))["batch"]
     t = np.round(solution.t, 6)
     position, rph = missed(solution.states, truth, t, solution.frame)

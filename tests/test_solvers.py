@@ -12,11 +12,13 @@ import pytest
 from helpers import Array, Factor, dense, errors, factors, truth_states
 
 from graphnav.config import Settings, settings_from
-from graphnav.constraints.gnss import LEVER_ARM, SLOW_ERRORS
+from graphnav.constraints.gnss import ERRORS, LEVER_ARM
 from graphnav.constraints.standstill import PLACE
 from graphnav.dynamics import SCALE
 from graphnav.earth import LocalFrame
 from graphnav.formats import read
+from graphnav.noise.apply import with_noise
+from graphnav.noise.model import STATED, Figure, NoiseModel
 from graphnav.pipeline import run
 from graphnav.problem import Problem, pose
 from graphnav.recording import Gnss, Recording
@@ -34,9 +36,17 @@ NO_WHEELS = {"nhc": False, "odometer": False}
 WHITE = {
     "faults": False,
     "time_offset_sigma": 0.0,
-    "sd_factor": 1.0,
-    "slow_share": 0.0,
 }  # fixes are what they are simulated as
+
+
+# errors of minutes and of hours beside the white ones, given, because a bad start would find others
+LASTING = NoiseModel(
+    {
+        f"gnss_position.{time}.{axis}": Figure(float(np.log(0.5)))
+        for time in ("minutes", "hours")
+        for axis in ("horizontal", "up")
+    }
+)
 
 
 # ----------------------------------------------------------------------------------------------- linear problems
@@ -67,14 +77,14 @@ def nearly_linear(kind: str) -> Trio:
     path = oracle.straight_path(1500.0, speed=10.0, stand=5.0)
     recording, truth = oracle.drive(path, imu_noise=noise, seed=5)
     recording = recording.crop(0.0, 70.0 if kind == "slow" else 30.0)
-    gnss = {**WHITE, "slow_share": 0.6 if kind == "slow" else 0.0, "lever_arm_sigma": 0.005 if estimated else None}
+    gnss = {**WHITE, "lever_arm_sigma": 0.005 if estimated else None}
     frame = LocalFrame(recording.gnss.llh[0])
     start = truth_states(truth, np.array([recording.start]), frame)
     start = replace(start, ba=np.zeros((1, 3)), bg=np.zeros((1, 3)))
     sigma = np.repeat([1e-5, 0.05, 1e-3, 1e-3, 1e-6], 3)
     settings = settings_from({"gnss": gnss, "vehicle": NO_WHEELS})
     stops = np.array([[0.5, 2.0], [3.0, 4.5]]) if kind == "stops" else None
-    problem = pose(recording, settings, frame, start, sigma, stops)
+    problem = with_noise(pose(recording, settings, frame, start, sigma, stops), LASTING if kind == "slow" else STATED)
     forward = ekf(problem)
     smoothed = rts(problem, forward)
     return Trio(problem, smoothed, batch(problem, smoothed.states), truth)
@@ -83,7 +93,7 @@ def nearly_linear(kind: str) -> Trio:
 NODES = {
     "states": {},
     "constants": {SCALE: 1, LEVER_ARM: 1},
-    "slow": dict.fromkeys(SLOW_ERRORS, 15),
+    "slow": dict.fromkeys(ERRORS[1:], 71),
     "stops": {PLACE: 2},
 }
 
@@ -268,7 +278,9 @@ def worst(a: Solution, truth: Trajectory) -> float:
 
 def solve(recording: Recording, kernel: str) -> Solution:
     return run(
-        recording, settings_from({"gnss": {**WHITE, "robust": kernel}, "vehicle": NO_WHEELS}), solvers=("batch",)
+        recording,
+        settings_from({"gnss": {**WHITE, "robust": kernel}, "vehicle": NO_WHEELS, "noise": {"mode": "stated"}}),
+        solvers=("batch",),
     )["batch"]
 
 
@@ -320,9 +332,6 @@ def test_huber_is_pulled_by_a_burst_and_redescending_kernels_are_not(lap: tuple[
 
 
 # --------------------------------------------------------------------------------------------------- convergence
-CORRELATED = {"sd_factor": 1.0, "slow_share": 0.5}  # given, because a bad start would find others
-
-
 @pytest.fixture(scope="module")
 def shipped(shared_data: Path) -> Recording:
     return read(shared_data / "oracle_drive")
@@ -330,17 +339,15 @@ def shipped(shared_data: Path) -> Recording:
 
 @pytest.fixture(scope="module")
 def reference(shipped: Recording) -> Solution:
-    return run(shipped, settings_from({"gnss": CORRELATED}), solvers=("batch",))["batch"]
+    return run(shipped, solvers=("batch",), noise=LASTING)["batch"]
 
 
 @pytest.mark.parametrize(("off", "sigma"), [(90.0, 180.0), (-90.0, 90.0), (45.0, 60.0)])
 def test_a_wrong_start_heading_is_found_out(shipped: Recording, reference: Solution, off: float, sigma: float) -> None:
     """Batch ends in the same optimum: within the prior's own, weak, pull on a heading known to 0.01 deg."""
     heading = np.degrees(reference.trajectory().rph[0, 2]) + off
-    settings = settings_from(
-        {"gnss": CORRELATED, "alignment": {"heading": (heading + 180) % 360 - 180, "heading_sigma": sigma}}
-    )
-    solution = run(shipped, settings, solvers=("batch",))["batch"]
+    settings = settings_from({"alignment": {"heading": (heading + 180) % 360 - 180, "heading_sigma": sigma}})
+    solution = run(shipped, settings, solvers=("batch",), noise=LASTING)["batch"]
     assert "converged" in solution.stopped
     d = solution.states.minus(reference.states)
     assert np.abs(d[:, 3:6]).max() < 2e-3

@@ -12,13 +12,14 @@ from test_faults import OFF, scattered
 from test_solvers import sigmas
 
 from graphnav.alignment import align
-from graphnav.config import settings_from
+from graphnav.config import Settings
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
+from graphnav.noise.apply import with_noise
+from graphnav.noise.model import Figure, NoiseModel
 from graphnav.pipeline import origin, run
 from graphnav.problem import Problem, pose
 from graphnav.rotation import Array
-from graphnav.solvers import adaptive
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf, refilter
 from graphnav.solvers.near import near
@@ -31,14 +32,16 @@ from graphnav.state import DIM
 
 @pytest.fixture(scope="module")
 def posed() -> Problem:
-    """Every constraint of a vehicle, fixes with velocities and slow errors."""
+    """Every constraint of a vehicle, fixes with velocities and errors that last."""
     recording, _ = oracle.drive(
         oracle.vehicle_path(duration=200, seed=7), seed=5, gnss_velocity_sd=(0.1, 0.1, 0.1), odometer_rate=20.0
     )
-    settings = settings_from({"gnss": {"slow_share": 0.5, "sd_factor": 1.0}})
+    settings = Settings()
     frame = LocalFrame(origin(recording))
     found = align(recording, settings, frame, lambda p, s: batch(p, s, wanted=(0,), reintegrate=False))
-    return pose(recording, settings, frame, found.state, found.sigma, detect(recording, settings).stationary)
+    base = pose(recording, settings, frame, found.state, found.sigma, detect(recording, settings).stationary)
+    lasting = (f"gnss_position.{time}.{axis}" for time in ("minutes", "hours") for axis in ("horizontal", "up"))
+    return with_noise(base, NoiseModel({name: Figure(float(np.log(0.25))) for name in lasting}))
 
 
 def scattered_points(problem: Problem, seed: int) -> Points:
@@ -151,17 +154,3 @@ def test_a_stop_is_found_although_noisy_fixes_speak_of_motion() -> None:
     }
     assert found(fused["on"].intervals)
     assert not found(fused["off"].intervals)
-
-
-def test_noise_begins_and_ends_at_a_fix() -> None:
-    """Of forty fixes thirty times as noisy as stated, those at the edges too; and hardly any besides."""
-    rng, inside, outside, N = np.random.default_rng(9), [], [], 200
-    for _ in range(50):
-        scale = np.ones(N)
-        scale[80:120] = 30.0
-        r = rng.standard_normal((N, 3)) * scale[:, None]
-        f = adaptive.factors(r, np.ones((N, 3)), np.zeros((N, 3)))
-        inside.append(np.sqrt(f[80:120]))
-        outside.append(f[np.r_[60:80, 120:140]])
-    assert np.mean(np.array(inside) > 10.0) > 0.98
-    assert np.mean(np.array(outside) < 4.0) > 0.98
