@@ -7,10 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.noise.apply import row_weights
-from graphnav.noise.model import NoiseModel
 from graphnav.problem import Problem
-from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import Fault
 from graphnav.solvers.passes import Smoothed, residual_record, values_of
@@ -57,16 +54,3 @@ def weighted(problem: Problem, weights: Mapping[str, Array]) -> Problem:
     """A problem with its rows weighted, (N,) by constraint."""
     constraints = (replace(c, weight=weights[c.name]) if c.name in weights else c for c in problem.constraints)
     return replace(problem, constraints=tuple(constraints))
-
-
-def without_excluded(recording: Recording, noise: NoiseModel) -> Recording:
-    """The recording without the fixes that a noise model leaves out."""
-    gnss = recording.gnss
-    assert gnss is not None
-    p, v = (row_weights(gnss.t, noise, name)[:, None] for name in ("gnss_position", "gnss_velocity"))
-    gnss = replace(
-        gnss,
-        llh=np.where(p > 0.0, gnss.llh, np.nan),
-        v=None if gnss.v is None else np.where(v > 0.0, gnss.v, np.nan),
-    )
-    return replace(recording, gnss=gnss)

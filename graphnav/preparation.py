@@ -23,7 +23,7 @@ from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.noise.apply import with_noise, without_parts
 from graphnav.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.noise.exclusion import exclude, share_left_out
+from graphnav.noise.exclusion import exclude, share_left_out, without_excluded
 from graphnav.noise.model import STATED, NoiseModel
 from graphnav.noise.words import describe
 from graphnav.problem import Problem, pose
@@ -32,9 +32,9 @@ from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import Solution
 from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import ekf
+from graphnav.solvers.ekf import ekf, refilter
 from graphnav.solvers.near import near
-from graphnav.solvers.passes import Filtered, Smoothed, about_solved, near_to
+from graphnav.solvers.passes import Filtered, Points, Smoothed, about_solved, near_to
 from graphnav.solvers.rts import backward
 from graphnav.state import BLOCKS, States
 
@@ -110,6 +110,22 @@ def prepare(
         booked("preintegration", since)
         return problem
 
+    def without_wrong(noise: NoiseModel) -> tuple[Alignment, Detections, bool]:
+        """Start and stops, which are not to rest on fixes that are wrong, and whether they are others then."""
+        if not noise.excluded or recording.gnss is None:
+            return aligned, detections, False
+        fixes = without_excluded(recording, noise)
+        stops = detect(fixes, settings)
+        changed = _differ(stops.stationary, detections.stationary)
+        stops = stops if changed else detections
+        try:
+            found = aligned_by(fixes, stops.stationary)
+        except EstimationError:
+            return aligned, stops, changed
+        other = found.motion is not None and found.contradicts(aligned)
+        return (found if other else aligned), stops, changed or other
+
+    known: Points | None = None
     aligned = aligned_by(recording, detections.stationary)
     told = aligned.motion is not None and settings.gnss.position
     if noise is None and (settings.noise.mode == "stated" or not told):
@@ -129,31 +145,26 @@ def prepare(
                     aligned, base, best = later, other, again
             except EstimationError:
                 pass  # nothing moves later on
-        if best.noise.excluded:
-            # no start, and no stop, is to rest on fixes that are wrong
-            fixes = faults.without_excluded(recording, best.noise)
-            stops = detect(fixes, settings)
-            changed = _differ(stops.stationary, detections.stationary)
-            detections = stops if changed else detections
-            try:
-                found = aligned_by(fixes, detections.stationary)
-                if found.motion is not None and found.contradicts(aligned):
-                    aligned, changed = found, True
-            except EstimationError:
-                pass
-            if changed:
-                base = build(aligned, detections, parts=True)
-                best = estimate_noise(base, aligned.until, best.noise, progress=progress)
-                passes.update(filter=best.passes, smoother=best.passes)
-        noise = best.noise
+        aligned, detections, changed = without_wrong(best.noise)
+        if changed:
+            base = build(aligned, detections, parts=True)
+            best = estimate_noise(base, aligned.until, best.noise, progress=progress)
+            passes.update(filter=best.passes, smoother=best.passes)
+        noise, known = best.noise, best.points
         booked("noise", since)
+    else:
+        aligned, detections, changed = without_wrong(noise)
+        base = build(aligned, detections, parts=noise != STATED) if changed else base
     problem = without_parts(with_noise(base, noise))
     start = with_known_heading(aligned, settings)
     since = time.perf_counter()
     forward = ekf(problem, progress, aligned.until)
     filtered = booked("filter", since)
     smoothed = backward(problem, forward, progress)
-    forward, smoothed = _find_way(problem, aligned, forward, smoothed, progress, passes)
+    problem = _without_refused(problem, forward)
+    if any(rows.gate is not None for rows in problem.constraints):
+        smoothed = backward(problem, refilter(problem, smoothed, progress), progress)
+    forward, smoothed = _find_way(problem, aligned, known, forward, smoothed, progress, passes)
     booked("smoother", filtered)
     passes.update(filter=1, smoother=1)
     del timings["filter"]  # the filter's own solution has it
@@ -205,18 +216,26 @@ def _astray(found: Alignment, stated: Alignment) -> bool:
 def _find_way(
     problem: Problem,
     aligned: Alignment,
+    known: Points | None,
     forward: Filtered,
     smoothed: Smoothed,
     progress: Progress | None,
     passes: Counter[str],
 ) -> tuple[Filtered, Smoothed]:
-    """Filter and smooth about the batch solution where the filter was too far off for a smoother to rest on it.
+    """Filter and smooth about better points where the filter was too far off for a smoother to rest on it.
+
+    These are `known`, from the estimation of the noise, where it came about; else those of a batch solution.
 
     Fixes that weigh little beside wheels let a filter that is not sure of its heading turn the mounting round
     rather than the velocity, and no step finds back from there. So wheels come second.
     """
     if near_to(smoothed, forward.linearised, _LOST):
         return forward, smoothed
+    if known is not None and len(known.states) == len(problem.t):
+        passes.update(filter=2, smoother=1)
+        smoothed = backward(problem, refilter(problem, known, progress), progress)
+        if near_to(smoothed, known, _LOST):
+            return ekf(problem, progress, aligned.until, known=smoothed), smoothed
     states = smoothed.states
     if any(isinstance(c, _WHEELS) for c in problem.constraints):
         free = replace(problem, constraints=tuple(c for c in problem.constraints if not isinstance(c, _WHEELS)))
@@ -227,6 +246,12 @@ def _find_way(
     _, smoothed = near(problem, about, aligned.until, progress)
     passes.update(filter=3, smoother=2)
     return ekf(problem, progress, aligned.until, known=smoothed), smoothed
+
+
+def _without_refused(problem: Problem, forward: Filtered) -> Problem:
+    """The problem without the rows that a gate refused in the filter: no solver uses them."""
+    refused = {c.name: forward.records[c.name].decided for c in problem.constraints if c.gate is not None}
+    return faults.weighted(problem, refused) if refused else problem
 
 
 def _differ(a: Array, b: Array) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -53,7 +53,7 @@ class Problem:
     prior: InitialPrior
     constraints: tuple[Constraint, ...]
     notes: tuple[str, ...] = ()
-    imu_noise: ImuNoise = ImuNoise()  # that the intervals were integrated with
+    imu_noise: ImuNoise = field(default_factory=ImuNoise)  # that the intervals were integrated with
 
     @cached_property
     def parameters(self) -> dict[str, Parameter]:

@@ -25,6 +25,7 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from graphnav.constraints.base import Constraint
+from graphnav.constraints.gnss import TIMES
 from graphnav.noise.apply import with_noise
 from graphnav.noise.model import Figure, NoiseModel, RowWeights
 from graphnav.noise.moments import disturbances, imu_moments, lag_moments, process_moments, row_moments
@@ -72,17 +73,25 @@ class _Figures:
     def model(self) -> NoiseModel:
         figures = {}
         for name, x in self.log.items():
-            m, s = prior(name)
+            m, s = self.prior(name)
             B = self.freedom.get(name, 0.0)
             figures[name] = Figure(x, float((0.5 * B + s**-2.0) ** -0.5), m, s, B)
         return NoiseModel(figures, dict(self.times), dict(self.weights), self.excluded)
 
+    def prior(self, name: str) -> tuple[float, float]:
+        """Median and 1-sigma of a log factor; fixes that scatter more than stated are worse in what lasts as well."""
+        m, s = prior(name)
+        sensor, *kind, axis = name.split(".")
+        if sensor == "gnss_position" and kind and kind[-1] in TIMES:
+            m += max(0.0, self.log.get(".".join([sensor, *kind[:-1], axis]), 0.0))
+        return m, s
+
     def log_prior(self) -> float:
-        return -0.5 * sum(((x - m) / s) ** 2 for name, x in self.log.items() for m, s in [prior(name)])
+        return -0.5 * sum(((x - m) / s) ** 2 for name, x in self.log.items() for m, s in [self.prior(name)])
 
     def update(self, name: str, A: float, B: float) -> None:
         """One component, by its squares and its redundancy."""
-        m, s = prior(name)
+        m, s = self.prior(name)
         x, before = 0.0, self.log[name]
         for _ in range(50):
             slope = 0.5 * (A * np.exp(-x) - B) - (before + x - m) / s**2
@@ -250,9 +259,14 @@ def _improve_time(figures: _Figures, problem: Problem, chain: ParameterChain, la
 
 def _weigh(figures: _Figures, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:
     """Weights of the first n rows by their squared errors (n,): of their own, and of the whole with what lasts."""
-    t, most = problem.t[rows.keyframe], float(chdtri(len(rows.axes), _CHANCE))
-    weight = np.minimum(1.0, most / np.maximum(squared, 1e-30))
+    m = len(rows.axes)
+    t, most = problem.t[rows.keyframe], float(chdtri(m, _CHANCE))
     before = np.ones(len(rows)) if rows.weight is None else rows.weight
+    some = squared[before[:n] > 0.0]
+    # what half of the rows do is no error of rows: the figures have not come to what they are yet
+    usual = float(np.median(some)) / float(chdtri(m, 0.5)) if len(some) else 1.0
+    squared = squared / max(usual, 1.0)
+    weight = np.minimum(1.0, most / np.maximum(squared, 1e-30))
     weight = np.concatenate([weight, before[n:]])  # later ones as they were
     less = (weight < 1.0) & (before > 0.0)
     figures.weights[rows.name] = RowWeights(t[less], weight[less])

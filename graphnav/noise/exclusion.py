@@ -15,6 +15,7 @@ as rare beforehand as the tests take it to be. The best model decides what is le
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -150,7 +151,7 @@ def evidence(problem: Problem, about: Points, spans: list[tuple[float, float]]) 
     for kinds in ((), FIXES, WHEELS):
         one = with_common_errors(problem, spans, kinds) if kinds else problem
         likelihood = refilter(one, points_of(one, about.states, known)).log_likelihood
-        found.append([float(np.sum(likelihood[a:b])) for a, b in zip(edges[:-1], edges[1:], strict=True)])
+        found.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)])
     return np.array(found).T
 
 
@@ -163,3 +164,16 @@ def join_spans(found: tuple[Fault, ...]) -> list[tuple[float, float]]:
         else:
             out.append((a, b))
     return out
+
+
+def without_excluded(recording: Recording, noise: NoiseModel) -> Recording:
+    """The recording without the fixes that a noise model leaves out."""
+    gnss = recording.gnss
+    assert gnss is not None
+    p, v = (row_weights(gnss.t, noise, name)[:, None] for name in ("gnss_position", "gnss_velocity"))
+    gnss = replace(
+        gnss,
+        llh=np.where(p > 0.0, gnss.llh, np.nan),
+        v=None if gnss.v is None else np.where(v > 0.0, gnss.v, np.nan),
+    )
+    return replace(recording, gnss=gnss)

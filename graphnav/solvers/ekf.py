@@ -253,10 +253,9 @@ def _update(
         PHt = P @ H.T
         HPHt = H @ PHt
         right = [r[None], PHt]
-        if some.alone and not left:
-            if tests is not None:
-                G = tests.signature(rows.name, some.k, H)
-                right.append(tests.own(rows.name, G).T)
+        if some.alone and not left and tests is not None:
+            G = tests.signature(rows.name, some.k, H)
+            right.append(tests.own(rows.name, G).T)
         sides = np.concatenate(right).T
         root, solved = _solve(HPHt, sigma, sides, some)
         if not left:
