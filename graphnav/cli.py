@@ -20,6 +20,7 @@ from graphnav.cli_options import (
     Config,
     End,
     Json,
+    Noise,
     Out,
     Profile,
     Quiet,
@@ -94,6 +95,7 @@ def smooth(
     ] = "batch",
     profile: Profile = None,
     config: Config = None,
+    noise: Noise = None,
     without: Without = None,
     rate: Rate = None,
     start: Start = None,
@@ -109,7 +111,7 @@ def smooth(
     json: Json = False,
 ) -> None:
     """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
-    asked = _Asked(recording, out, profile, config, without, rate, start, end, require, quiet, json)
+    asked = _Asked(recording, out, profile, config, noise, without, rate, start, end, require, quiet, json)
     _solve(asked, solver, "--solver", export, point)
 
 
@@ -125,6 +127,7 @@ def compare(
     ] = "ekf,rts,batch",
     profile: Profile = None,
     config: Config = None,
+    noise: Noise = None,
     without: Without = None,
     rate: Rate = None,
     start: Start = None,
@@ -134,7 +137,7 @@ def compare(
     json: Json = False,
 ) -> None:
     """Put the same recording through several solvers and compare them, against the truth where there is one."""
-    asked = _Asked(recording, out, profile, config, without, rate, start, end, require, quiet, json)
+    asked = _Asked(recording, out, profile, config, noise, without, rate, start, end, require, quiet, json)
     _solve(asked, solvers, "--solvers")
 
 
@@ -234,6 +237,7 @@ class _Asked:
     out: Path
     profile: str | None
     config: Path | None
+    noise: str | None
     without: list[str] | None
     rate: float | None
     start: float | None
@@ -258,17 +262,18 @@ def _solve(asked: _Asked, solvers: str, option: str, export: str | None = None, 
     requirements = [gates.parse_requirement(one, chosen) for one in asked.require or ()]
     given: dict[str, Any] = {
         "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
-        "config": asked.config and str(asked.config), "without": asked.without, "rate": asked.rate,
-        "start": asked.start, "end": asked.end,
+        "config": asked.config and str(asked.config), "noise": asked.noise, "without": asked.without,
+        "rate": asked.rate, "start": asked.start, "end": asked.end,
     }  # fmt: skip
     folder = outputs.output_folder(asked.out)
     if point is not None and export is None:
         raise ConfigError(f"--point {point}: is of the files of --export; name some")
     exported = listed(export, NAMES, "--export", "format to write") if export is not None else ()
     convert.parse_point(point)
+    settings, noise = workflow.parse_noise(asked.noise, read_settings(asked.config, asked.profile))
     request = workflow.Request(
-        asked.recording, chosen, read_settings(asked.config, asked.profile), withheld, asked.start, asked.end,
-        asked.rate, {k: v for k, v in given.items() if v is not None},
+        asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
+        {k: v for k, v in given.items() if v is not None}, noise,
     )  # fmt: skip
     with bar(asked.quiet, *chosen) as progress:
         outcome = workflow.run_request(request, progress)

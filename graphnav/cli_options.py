@@ -28,6 +28,14 @@ Without = Annotated[
 Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Output rate; default: at the keyframes.")]
 Start = Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from the recording's start.")]
 End = Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from the recording's start.")]
+Noise = Annotated[
+    str | None,
+    typer.Option(
+        "--noise",
+        metavar="stated|estimated|FILE",
+        help="How good the sensors are: as stated, estimated, or as in a file or the summary.json of a run.",
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")]
 Require = Annotated[

@@ -27,6 +27,7 @@ from graphnav.workflow import Outcome, outages
 
 if TYPE_CHECKING:
     from graphnav.metrics import Metrics
+    from graphnav.noise.table import FigureRow
     from graphnav.page import Raw
 
 
@@ -78,6 +79,7 @@ def write_comparison(outcome: Outcome, folder: Path) -> list[Path]:
         outages=outages(outcome.recording),
         findings=_odd(outcome),
         provenance=provenance,
+        noise=noise_rows(outcome, next(iter(outcome.solutions.values()))),
     )
     return [folder / "comparison.html", folder / "comparison.csv"]
 
@@ -109,6 +111,7 @@ def write_solver(
         findings=_odd(outcome),
         provenance=provenance,
         detectors=detectors,
+        noise=noise_rows(outcome, solution),
     )
     spent = {"writing": written - began, "report": time.perf_counter() - written}
     write_json(folder / "summary.json", solver_summary(outcome, name, spent, provenance))
@@ -119,6 +122,7 @@ def solver_summary(
 ) -> dict[str, Any]:
     """What summary.json holds; `spent` are the seconds of writing, which only the writer knows."""
     from graphnav.metrics import summary
+    from graphnav.report_words import doubts
 
     solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
     errors = None if metrics is None else summary(metrics)
@@ -128,6 +132,7 @@ def solver_summary(
     if errors is not None:
         nees = {key: value for key, value in errors.items() if key.startswith("nees_")}
         errors = {key: value for key, value in errors.items() if key not in nees}
+    doubted = doubts({name: solution}, {} if metrics is None or metrics.errors is None else {name: metrics.errors})
     timings = {**solution.timings, "evaluation": outcome.timings["evaluation"], **spent}
     rejected = {key: int(np.sum(r.weight <= 1e-9)) for key, r in solution.records.items()}
     return {
@@ -139,6 +144,9 @@ def solver_summary(
         "rejected": rejected,
         "stationary": {"stops": len(solution.stationary), "seconds": float(np.diff(solution.stationary).sum())},
         "iterations": solution.iterations,
+        "passes": {"filter": 0, "smoother": 0, **solution.passes, "eliminations": solution.iterations},
+        "noise": noise_summary(outcome, solution),
+        "doubts": list(doubted),
         "stopped": solution.stopped,
         "final_cost": solution.cost,
         "timings": {stage: round(seconds, 4) for stage, seconds in timings.items()},
@@ -161,6 +169,37 @@ def solver_summary(
         "settings": outcome.request.settings.model_dump(),
         "provenance": provenance,
     }
+
+
+def noise_rows(outcome: Outcome, solution: Solution) -> tuple[FigureRow, ...]:
+    """The figures of a solution's noise model beside those stated."""
+    from graphnav.noise.table import figure_rows
+
+    recording, settings = outcome.recording, outcome.request.settings
+    for source, span in outcome.used_withheld:
+        if getattr(recording, source) is not None:
+            recording = recording.without(source, span)
+    imu = None
+    if recording.platform == "foot" and any(group.startswith("imu.") for group in solution.noise.figures):
+        # factors of a walk are relative to the densities of its rests
+        from graphnav.onboard_offset import without_onboard_offset
+        from graphnav.own_noise import with_own_noise
+
+        imu = with_own_noise(without_onboard_offset(recording, settings)[0], settings)[0].imu.noise
+    return figure_rows(solution.noise, recording, settings.gnss.slow_times, imu)
+
+
+def noise_summary(outcome: Outcome, solution: Solution) -> dict[str, Any]:
+    """What `graphnav.noise.files.read_noise` reads, with what is stated and used beside each figure."""
+    from graphnav.noise.files import noise_values
+
+    values = noise_values(solution.noise, outcome.request.settings.noise.mode)
+    if len(solution.between) > 1:
+        values["pieces"] = len(solution.between)
+    for row in noise_rows(outcome, solution):
+        beside = {"stated": row.stated, "used": row.used, "unit": row.unit, "correlation_time": row.correlation_time}
+        values["figures"][row.group] |= beside
+    return values
 
 
 def antenna_lever_arm(recording: Recording, solution: Solution) -> Array | None:
@@ -277,14 +316,20 @@ def _odd(outcome: Outcome) -> list[str]:
 
 
 def _provenance(outcome: Outcome) -> dict[str, Any]:
-    """Versions, what was read (with its sha256) and how the program was called."""
+    """Versions, what was read (with its sha256), where the noise model is from, and how the program was called."""
+    given = outcome.request.noise
+    files = [*outcome.recording.files, *([given.file] if given is not None and given.file is not None else [])]
+    used: str = outcome.request.settings.noise.mode
+    if given is not None:
+        used = "given" if given.file is None else str(given.file)
     return {
         "graphnav": graphnav.__version__,
         "gtsam": version("gtsam"),
         "numpy": np.__version__,
         "scipy": version("scipy"),
         "python": platform.python_version(),
-        "inputs": {str(path): _sha256(path) for path in outcome.recording.files},
+        "noise": used,
+        "inputs": {str(path): _sha256(path) for path in files},
         "options": dict(outcome.request.options),
     }
 

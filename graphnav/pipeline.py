@@ -147,7 +147,9 @@ def _solve(
     notes = (*found.start.notes, *undone, *shown, *found.detections.notes, *found.notes, *faults.notes(wrong, problem))
     start, passes = smoothed, Counter(found.passes)
     if found.astray:
-        prior = InitialPrior(keyframe=problem.prior.keyframe, mean=found.start.state, sigma=start_sigma(found.start)[None])
+        prior = InitialPrior(
+            keyframe=problem.prior.keyframe, mean=found.start.state, sigma=start_sigma(found.start)[None]
+        )
         problem = replace(problem, prior=prior)
         forward = ekf(problem, progress, found.aligned.until)
         smoothed = backward(problem, forward, progress)

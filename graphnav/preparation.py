@@ -104,7 +104,9 @@ def prepare(
     def build(at: Alignment, found: Detections, parts: bool) -> Problem:
         tell("preintegration")
         since, start = time.perf_counter(), _start(at, with_known_heading(at, settings))
-        problem = pose(recording, settings, frame, start.state, start_sigma(start), found.stationary, parts_of_noise=parts)
+        problem = pose(
+            recording, settings, frame, start.state, start_sigma(start), found.stationary, parts_of_noise=parts
+        )
         booked("preintegration", since)
         return problem
 

@@ -19,6 +19,7 @@ from graphnav.solution import Solution
 
 if TYPE_CHECKING:
     from graphnav.metrics import Errors
+    from graphnav.noise.table import FigureRow
 
 Sections = list[tuple[str, Sequence[str]]]
 
@@ -36,6 +37,7 @@ def write_report(
     findings: Sequence[str] = (),
     provenance: Mapping[str, Any] | None = None,
     detectors: Sequence[page.Raw] | None = None,
+    noise: Sequence[FigureRow] = (),
 ) -> Path:
     """One solver's report as one self-contained HTML file.
 
@@ -48,6 +50,7 @@ def write_report(
     findings : sentences about what was odd in the recording.
     provenance : version, input hashes and the like, plain values; `options` are those of the command.
     detectors : of `detector_pictures`, for who writes several reports of one recording; drawn here if None.
+    noise : figures of the noise model, of `graphnav.noise.table.figure_rows`.
     """
     name, start, track = solution.solver, recording.start, solution.trajectory()
     only, every = {name: solution}, {} if errors is None else {name: errors}
@@ -73,17 +76,18 @@ def write_report(
             [
                 *_gallery(pictures.timeline_picture(solution, recording, spans)),
                 *tables.constraint_table(solution),
-                *tables.excluded_table(solution, start),
                 *tables.rejected_table(solution, start),
                 *_gallery(pictures.record_pictures(solution, start, spans)),
             ],
         ),
+        ("Noise model", [*tables.noise_tables(noise, solution), *tables.excluded_table(solution, start)]),
         ("Detectors", _gallery(detectors)),
         ("What was odd", tables.odd(recording, findings)),
         ("How it ran", tables.run_table(only)),
         ("Provenance", provenance_tables(settings, provenance)),
     ]  # fmt: skip
     lead = [
+        *_doubts(only, every),
         page.paragraph(words.what_was_done(recording, only, withheld, outages)),
         *_verdicts(only, every, {} if metrics is None else {name: metrics}),
         words.tiles(recording, only, every),
@@ -103,10 +107,12 @@ def write_comparison(
     outages: Spans = (),
     findings: Sequence[str] = (),
     provenance: Mapping[str, Any] | None = None,
+    noise: Sequence[FigureRow] = (),
 ) -> Path:
     """Several solvers on one recording as one self-contained HTML file; arguments as in `write_report`, per solver."""
     start, every, metrics_of = recording.start, errors or {}, metrics or {}
-    spans = _shades(next(iter(solutions.values())), start, withheld, outages)
+    first = next(iter(solutions.values()))
+    spans = _shades(first, start, withheld, outages)
     gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
     zooms = pictures.zoom_pictures(every, start, gone)
     if not gone:
@@ -128,11 +134,13 @@ def write_comparison(
         ("Can sigma be believed?", _consistency(every, start, spans)),
         ("Uncertainty", _gallery(pictures.sigma_pictures(tracks, start, spans))),
         ("Constraints", [page.table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
+        ("Noise model", [*tables.noise_tables(noise, first), *tables.excluded_table(first, start)]),
         ("What was odd", tables.odd(recording, findings)),
         ("How they ran", tables.run_table(solutions)),
         ("Provenance", provenance_tables(settings, provenance)),
     ]
     lead = [
+        *_doubts(solutions, every),
         page.paragraph(words.what_was_done(recording, solutions, withheld, outages)),
         *_verdicts(solutions, every, metrics_of),
         words.tiles(recording, solutions, every),
@@ -150,6 +158,11 @@ def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans
     excluded = [(part.t_start - start, part.t_end - start) for part in getattr(solution, "excluded", ())]
     gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
     return {"withheld": gone, "no GNSS": list(outages), "excluded": excluded}
+
+
+def _doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[page.Raw]:
+    """Why the result cannot be trusted, where it cannot."""
+    return [page.paragraph(said, "verdict bad") for said in words.doubts(solutions, errors)]
 
 
 def _verdicts(

@@ -17,6 +17,7 @@ from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
 
 if TYPE_CHECKING:
     from graphnav.metrics import Errors
+    from graphnav.noise.table import FigureRow
 
 _LISTED = 40  # rejected measurements
 Withheld = Sequence[tuple[str, tuple[float, float] | None]]
@@ -179,6 +180,56 @@ def accuracy_tables(errors: Mapping[str, Errors], withheld: Withheld, start: flo
 def _notes(errors: Mapping[str, Errors]) -> list[Raw]:
     notes = list(dict.fromkeys(note for e in errors.values() for note in e.notes))
     return [page.bullets(notes)] if notes else []
+
+
+NOISE_HEAD = ("figure", "stated", "used", "unit", "times stated sigma", "1-sigma", "correlation time [s]",
+              "degrees of freedom", "expected beforehand")  # fmt: skip
+
+
+def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Raw]:
+    """How good the sensors were taken to be, and which rows weigh less."""
+    noise = solution.noise
+    if not rows and not noise.weights:
+        return [page.paragraph("All noise figures are used as they are stated.")]
+    out = []
+    if rows:
+        cells = [
+            [
+                row.words,
+                float("nan") if row.stated is None else row.stated,
+                float("nan") if row.used is None else row.used,
+                row.unit or "-",
+                float(np.exp(0.5 * row.figure.log_factor)),
+                _range(row.figure.log_factor, row.figure.sigma),
+                float("nan") if row.correlation_time is None else row.correlation_time,
+                Raw(f"{row.figure.freedom:.0f}"),
+                _range(row.figure.prior, row.figure.prior_sigma),
+            ]
+            for row in rows
+        ]
+        out.append(page.table(NOISE_HEAD, cells))
+        note = (
+            "Stated figures of fixes are medians of their sigmas. The white part and the lasting parts add up as "
+            "variances. A figure with few degrees of freedom is mostly what was expected beforehand."
+        )
+        if len(solution.between) > 1:
+            note += f" The recording was cut into {len(solution.between)} pieces: these are the figures of the first."
+        out.append(page.paragraph(note, "soft"))
+    less = [
+        f"{len(some.t)} of {len(solution.records[name].t)} rows of {name} are off by more than chance allows once in a "
+        f"thousand times and weigh less, the least of them {page.number(float(some.weight.min()), 2)} of a row."
+        for name, some in noise.weights.items()
+        if len(some.t) and name in solution.records
+    ]
+    return [*out, page.bullets(less)] if less else out
+
+
+def _range(log_factor: float, sigma: float) -> Raw:
+    """1-sigma range of a factor on sigma, of the logarithm of that on the variance."""
+    if sigma <= 0.0:
+        return Raw("-")
+    low, high = (page.number(float(np.exp(0.5 * (log_factor + s * sigma))), 2) for s in (-1.0, 1.0))
+    return Raw(f"{low} to {high}")
 
 
 def excluded_table(solution: Solution, start: float) -> list[Raw]:

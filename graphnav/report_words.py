@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from graphnav import page
+from graphnav.noise.apply import row_weights
 from graphnav.page import Raw
 from graphnav.panels.drawing import Spans
 from graphnav.recording import Recording
@@ -18,6 +19,50 @@ if TYPE_CHECKING:
     from graphnav.metrics import Errors
 
 _LISTED = 6  # outages
+_FEWEST = 10  # rows that say something of a sigma
+_MOST = 0.5  # share of what the fixes say; beyond it most of what was measured contradicts the result
+_TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduces residuals
+
+
+def doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> tuple[str, ...]:
+    """Sentences on why a result cannot be trusted, none where nothing speaks against it."""
+    from graphnav.sigmas import judge_sigmas
+
+    out = []
+    for solution in solutions.values():
+        fixes = solution.records.get("gnss_position")
+        left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
+        if left_out > _MOST:
+            out.append(
+                f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest and "
+                "is left out"
+            )
+            break  # all solvers use the same noise model
+    wrong = []
+    for name, e in errors.items():
+        small = [j for j in judge_sigmas(e) if j.verdict == "too small"]
+        if small:
+            sizes = page.and_list([f"{j.size:.2g} times sigma ({j.block})" for j in small])
+            wrong.append(f"{name}: errors are {sizes}")
+    if not errors:
+        met = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
+        for solution in met or solutions.values():
+            kind, size, used = _met(solution)
+            if used >= _FEWEST and size > _TOO_LARGE[kind]:
+                wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")
+    if wrong:
+        out.append(f"The stated sigma cannot be trusted: {'; '.join(wrong)}")
+    return tuple(out)
+
+
+def _met(solution: Solution) -> tuple[str, float, int]:
+    """Of a solution's records: of which kind they are, RMS over sigma, and how many rows tell it."""
+    every = [consistency(record) for record in solution.records.values() if len(record.t)]
+    every = [c for c in every if np.isfinite(c.mean_nis)]
+    used = sum(c.count - c.rejected for c in every)
+    if not used:
+        return "residual", float("nan"), 0
+    return every[0].kind, float(np.sqrt(sum((c.count - c.rejected) * c.mean_nis / c.dof for c in every) / used)), used
 
 
 def what_was_done(recording: Recording, solutions: Mapping[str, Solution], withheld: Withheld, outages: Spans) -> str:
@@ -128,19 +173,16 @@ def believe(name: str, errors: Errors) -> Raw:
 
 def believe_without_truth(solution: Solution) -> Raw:
     """One sentence on what innovations or residuals say of the sigma, where there is no truth to say it."""
-    every = [consistency(record) for record in solution.records.values() if len(record.t)]
-    every = [c for c in every if np.isfinite(c.mean_nis)]
-    used = sum(c.count - c.rejected for c in every)
+    kind, size, used = _met(solution)
     name = solution.solver
     missing = "there is no truth to compare with"
-    if used < 10:
+    if used < _FEWEST:
         return page.paragraph(
             f"{name}: no truth and too few measurements to say whether sigma can be believed.", "verdict"
         )
-    size = float(np.sqrt(sum((c.count - c.rejected) * c.mean_nis / c.dof for c in every) / used))
-    if every[0].kind == "innovation":
+    if kind == "innovation":
         measured = f"they are {size:.2f} times as large as predicted (RMS; 1 where sigma is true)"
-        if size > 1.5:
+        if size > _TOO_LARGE[kind]:
             return page.paragraph(
                 f"{name}: {missing}, and sigma looks too small for the innovations: {measured}.", "verdict bad"
             )
@@ -150,7 +192,7 @@ def believe_without_truth(solution: Solution) -> Raw:
             )
         return page.paragraph(f"{name}: {missing}. Innovations speak for the stated sigma: {measured}.", "verdict good")
     measured = f"residuals are {size:.2f} times the measurements' sigma (RMS; 1 or a little less where sigma is true)"
-    if size > 1.15:
+    if size > _TOO_LARGE[kind]:
         return page.paragraph(f"{name}: {missing}, and sigma looks too small: {measured}.", "verdict bad")
     said = f"{name}: {missing}, and residuals of a fit tell little; a filter's innovations tell more. The {measured}."
     return page.paragraph(said, "verdict")

@@ -11,7 +11,7 @@ import numpy as np
 from graphnav import rotation
 from graphnav.detectors.base import Detection
 from graphnav.earth import LocalFrame
-from graphnav.noise.model import STATED, NoiseModel
+from graphnav.noise.model import STATED, NoiseModel, RowWeights
 from graphnav.rotation import Array
 from graphnav.state import States
 from graphnav.trajectory import Trajectory
@@ -186,8 +186,21 @@ def joined(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:
         notes=(*notes, *dict.fromkeys(note for part in parts for note in part.notes)),
         detections=tuple(d for p in parts for d in p.detections),
         excluded=tuple(f for p in parts for f in p.excluded),
+        noise=_noise_of_all([p.noise for p in parts]),
+        passes=_summed([dict(p.passes) for p in parts]),
         between=tuple(b for p in parts for b in p.between),
     )
+
+
+def _noise_of_all(parts: list[NoiseModel]) -> NoiseModel:
+    """Weights and spans of all pieces, and the figures of the first: each piece has its own."""
+    weights = {}
+    for name in dict.fromkeys(key for part in parts for key in part.weights):
+        own = [part.weights[name] for part in parts if name in part.weights]
+        weights[name] = RowWeights(np.concatenate([w.t for w in own]), np.concatenate([w.weight for w in own]))
+    names = dict.fromkeys(key for part in parts for key in part.excluded)
+    excluded = {name: tuple(span for part in parts for span in part.excluded.get(name, ())) for name in names}
+    return replace(parts[0], weights=weights, excluded=excluded)
 
 
 def _summed(tables: list[dict[str, Any]]) -> dict[str, Any]:

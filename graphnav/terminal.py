@@ -10,12 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
+from graphnav.constraints.gnss import TIMES
 from graphnav.metrics import Span
 from graphnav.outputs import stated
 from graphnav.progress import Progress
 from graphnav.staging import uninterrupted
 from graphnav.workflow import Outcome
 
+_IMU = {
+    "imu.gyro_noise_density": "gyro", "imu.accel_noise_density": "accelerometer",
+    "imu.gyro_bias_walk": "gyro bias walk", "imu.accel_bias_walk": "accelerometer bias walk",
+}  # fmt: skip
+_FIXES = {"gnss_position": "positions", "gnss_velocity": "velocities"}
 _ERRORS = (
     ("hor. rms", "h", "rms", "m"), ("hor. max", "h", "max", "m"), ("up rms", "up", "rms", "m"),
     ("roll rms", "roll", "rms", "deg"), ("pitch rms", "pitch", "rms", "deg"), ("head. rms", "heading", "rms", "deg"),
@@ -24,18 +30,49 @@ _ERRORS = (
 
 def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     """What was read, what is worth knowing, how good it is, and where to look."""
-    lines = [_read(outcome)]
+    lines = [f"warning: {said[0].lower()}{said[1:]}" for said in _doubts(outcome)]
+    lines.append(_read(outcome))
     lines += [f"  {source} withheld{'' if span is None else f' {span[0]:g}-{span[1]:g} s'}"
               for source, span in outcome.request.withheld]  # fmt: skip
     notes = [note for s in outcome.solutions.values() for note in s.notes]
+    lines += [f"  {said}" for said in _noise(outcome)]
     severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
+        if note.startswith("noise model, "):
+            continue  # of one sensor: the report has the table
         lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
     lines += _whole(outcome)
     lines += _spans(outcome)
     lines += ["", _stops(outcome), "", "look at"]
     return "\n".join([*lines, *(f"  {file}" for file in files)])
+
+
+def _doubts(outcome: Outcome) -> tuple[str, ...]:
+    from graphnav.report_words import doubts
+
+    return doubts(outcome.solutions, {k: m.errors for k, m in outcome.metrics.items() if m.errors is not None})
+
+
+def _noise(outcome: Outcome) -> list[str]:
+    """The noise model in a line: what differs from what is stated."""
+    from graphnav.noise.table import whole_ratio
+
+    noise = next(iter(outcome.solutions.values())).noise
+    if not noise.figures:
+        return ["noise as stated"]
+    parts = [f"{words} x {short(float(np.exp(0.5 * noise.figures[group].log_factor)))}" for group, words in _IMU.items()
+             if group in noise.figures]  # fmt: skip
+    for source in dict.fromkeys(group.rpartition(".")[0] for group in noise.figures if group.startswith("gnss_")):
+        if source.rpartition(".")[2] in TIMES:
+            continue
+        name, _, kind = source.partition(".")
+        ratios = [(axis, whole_ratio(noise, source, axis)) for axis in ("horizontal", "up")]
+        said = " and ".join(f"x {short(ratio)} {axis}" for axis, ratio in ratios if ratio is not None)
+        parts.append(f"{_FIXES.get(name, name)}{f' ({kind})' if kind else ''} {said}")
+    given = outcome.request.noise
+    how = "estimated" if given is None else "as given" if given.file is None else f"from {given.file}"
+    return [f"noise {how}, in stated sigmas: {', '.join(parts)}"]
 
 
 def _stops(outcome: Outcome) -> str:
@@ -132,11 +169,11 @@ def short(x: float) -> str:
 
 # What the stages weigh against each other: seconds of an hour's drive at 200 Hz, for the time left and nothing else.
 _STAGES = {
-    "reading": 0.5, "checks": 0.6, "driving": 5.0, "detection": 0.2, "alignment": 0.1, "noise": 2.0,
-    "preintegration": 0.7, "filter": 2.5, "smoother": 0.4, "batch": 0.9, "covariances": 0.2, "incremental": 4.8,
+    "reading": 0.5, "checks": 0.6, "driving": 5.0, "detection": 0.2, "alignment": 0.1, "preintegration": 0.7,
+    "noise": 12.0, "filter": 2.5, "smoother": 0.4, "batch": 0.9, "covariances": 0.2, "incremental": 4.8,
     "isam2": 44.0, "evaluation": 0.1, "writing": 0.7,
 }  # fmt: skip
-_BEFORE = ("reading", "checks", "detection", "alignment", "noise", "preintegration", "filter", "smoother")
+_BEFORE = ("reading", "checks", "detection", "alignment", "preintegration", "noise", "filter", "smoother")
 _WORK = {
     "info": ("reading", "checks"), "detect": ("reading", "detection", "writing"), "evaluate": ("reading",),
     "simulate": ("driving", "writing"), "convert": ("reading", "writing"), "init": ("reading", "writing"),

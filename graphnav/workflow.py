@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,8 +18,10 @@ import numpy as np
 from graphnav import rotation
 from graphnav.complaints import nearest
 from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.findings import Finding
+from graphnav.noise.model import NoiseModel
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
 from graphnav.rotation import Array
@@ -40,6 +43,14 @@ OUTAGE = 10.0  # s; fixes further apart than this are an outage worth a line of 
 
 
 @dataclass(frozen=True)
+class GivenNoise:
+    """A noise model, and the file that it is from, if it is from one."""
+
+    model: NoiseModel
+    file: Path | None = None
+
+
+@dataclass(frozen=True)
 class Request:
     """What is asked for; times in s from the recording's start."""
 
@@ -51,6 +62,7 @@ class Request:
     end: float | None = None
     rate: float | None = None  # Hz of the output; None: at the keyframes
     options: Mapping[str, Any] = field(default_factory=dict)  # as they were given, for provenance
+    noise: GivenNoise | None = None  # to be used as it is; else what the settings say
 
 
 @dataclass(frozen=True)
@@ -105,6 +117,30 @@ def parse_withheld(text: str) -> Withheld:
     return source, span
 
 
+def parse_noise(text: str | None, settings: Settings) -> tuple[Settings, GivenNoise | None]:
+    """What `--noise` says: the settings with its mode, and the noise model of a file.
+
+    Raises
+    ------
+    ConfigError
+        If it is neither "stated" nor "estimated" nor a file that holds a noise model.
+    """
+    from graphnav.noise.files import MODES, read_noise_and_mode
+
+    if text is None:
+        return settings, None
+    given = None
+    mode = text
+    if text not in MODES:
+        if not Path(text).is_file():
+            raise ConfigError(
+                f"--noise {text}: no such file; write {', '.join(MODES)} or name the summary.json of a run"
+            )
+        model, mode = read_noise_and_mode(text)
+        given = GivenNoise(model, Path(text))
+    return settings.model_copy(update={"noise": settings.noise.model_copy(update={"mode": mode})}), given
+
+
 def run_request(request: Request, progress: Progress | None = None) -> Outcome:
     """Read, check, withhold, solve and score.
 
@@ -142,7 +178,10 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
 
     from graphnav.pipeline import run
 
-    solutions = run(used, request.settings, request.solvers, progress)
+    given = request.noise
+    solutions = run(used, request.settings, request.solvers, progress, None if given is None else given.model)
+    if given is not None:
+        notes += unused_noise(given.model, next(iter(solutions.values())))
     solutions = {
         name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
     }
@@ -156,6 +195,30 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
         inspection.warnings, timings | own, inspection.findings,
     )  # fmt: skip
+
+
+def unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
+    """Sentences on what a noise model says of measurements that a solution has not."""
+    have = {name: record.t for name, record in solution.records.items()}
+    named = {group.split(".")[0] for group in noise.figures} - {"imu"} | set(noise.weights) | set(noise.excluded)
+    notes = [
+        f"noise model: it has figures of {name}, of which nothing is used here" for name in sorted(named - set(have))
+    ]
+    for name, some in noise.weights.items():
+        if name in have and len(some.t):
+            t = have[name]
+            k = np.clip(np.searchsorted(t, some.t), 1, max(len(t) - 1, 1))
+            near = np.minimum(np.abs(t[k - 1] - some.t), np.abs(t[np.minimum(k, len(t) - 1)] - some.t))
+            lost = int(np.sum(near > SAME_TIME))
+            if lost:
+                notes.append(f"noise model: {lost} of the {len(some.t)} rows of {name} that it weighs are not here")
+    for name, spans in noise.excluded.items():
+        lost = sum(not np.any((have[name] >= a) & (have[name] <= b)) for a, b in spans) if name in have else 0
+        if lost:
+            notes.append(
+                f"noise model: {lost} of the {len(spans)} spans of {name} that it leaves out hold nothing here"
+            )
+    return notes
 
 
 def read_part(

@@ -60,8 +60,7 @@ PAPER = {
     "growing": "havoc, recovers only with GNSS (Fig. 11-12)",
     "growing/ZUPT, 20 min": "stays within bounds (Fig. 16-18)",
 }
-PLAIN = {"faults": "off", "adaptive": "off", "robust": "off", "gate": "off",
-         "slow_share": 0.0, "sd_factor": 1.0, "fast_time": 0.0, "time_offset_sigma": 0.0}  # fmt: skip
+PLAIN = {"faults": "off", "robust": "off", "gate": "off", "time_offset_sigma": 0.0}  # and noise as stated
 VARIANTS: dict[str, dict[str, Any]] = {
     "plain": PLAIN,
     "gate": {**PLAIN, "gate": 5.0},
@@ -80,6 +79,7 @@ def settings_of(variant: str, sources: tuple[str, ...]) -> Settings:
             "alignment": {} if "gnss" in sources else {"heading": 90.0, "heading_sigma": 0.5},
             "vehicle": {"nhc": "nhc" in sources, "odometer": "odometer" in sources},
             "gnss": VARIANTS[variant],
+            "noise": {"mode": "estimated" if variant == "default" else "stated"},
             "standstill": {"zero_velocity": "stops" in sources, "zero_rate": False, "held_position": False},
         }
     )

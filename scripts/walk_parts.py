@@ -34,7 +34,7 @@ CASES: dict[str, tuple[Mapping[str, Any], dict[str, Any]]] = {
     "no travel of the pivot": ({"foot": {"travel_sigma": 1e-6}}, {}),
     "zero velocity of the IMU instead": ({"foot": {"pivot_sigma": 1e-6, "travel_sigma": 1e-6, "pattern": 0.0}}, {}),
     "no zero rate": ({"standstill": {"zero_rate": False}}, {}),
-    "noise as stated": ({"imu": {"as_stated": True}}, {}),
+    "noise as stated": ({"noise": {"mode": "stated"}}, {}),
     "offset as the unit left it": ({"imu": {"onboard_offset": False}}, {}),
     "no noise of heel strikes": ({}, {"graphnav.problem.with_unresolved_motion": lambda samples, noise: samples}),
     "axes taken as square": ({}, {"graphnav.dynamics._scale_parameter": lambda noise, _: _square(noise, 3)}),

@@ -11,13 +11,16 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from html import unescape
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from graphnav import cli, workflow
+from graphnav import cli, load, workflow
+from graphnav.noise.files import write_noise
+from graphnav.noise.model import NoiseModel
 
 PROGRAM = Path(sys.executable).with_name("graphnav")
 SOLVERS = ("ekf", "rts", "batch")
@@ -236,7 +239,7 @@ def test_without_a_truth_the_summary_says_so(tmp_path):
 
 def test_a_run_is_repeated_from_the_provenance_of_its_report_alone(drive, tmp_path):
     config = tmp_path / "mine.toml"
-    config.write_text('[gnss]\nsd_factor = 2.5\nrobust = "huber"\n[keyframes]\nrate = 2.0\n', encoding="utf-8")
+    config.write_text('[noise]\nmode = "stated"\n[gnss]\nrobust = "huber"\n[keyframes]\nrate = 2.0\n', encoding="utf-8")
     part = ["--start", "10", "--end", "90", "--without", "gnss:40-60", "--without", "odometer", "--rate", "5"]
     first = program("smooth", drive, "--solver", "rts", *part, "--config", config, "-o", tmp_path / "out")
     assert first.returncode == 0, first.stderr
@@ -257,6 +260,49 @@ def test_a_run_is_repeated_from_the_provenance_of_its_report_alone(drive, tmp_pa
     plain = program(*arguments[: arguments.index("--config")], "-o", "plain", cwd=elsewhere)
     assert plain.returncode == 0, plain.stderr
     assert (elsewhere / "plain" / "trajectory.csv").read_bytes() != track.read_bytes()
+
+
+def test_a_run_is_repeated_with_the_noise_model_of_its_summary(tmp_path):
+    """Byte for byte, on two minutes of a real drive; and the noise model matters."""
+    tokyo = Path(__file__).resolve().parents[1] / "data" / "tokyo"
+    smooth = ["smooth", str(tokyo), "--quiet"]
+    given = str(tmp_path / "first" / "summary.json")
+    assert cli.run([*smooth, "-o", str(tmp_path / "first")]) == 0
+    assert cli.run([*smooth, "--noise", given, "-o", str(tmp_path / "again")]) == 0
+    assert cli.run([*smooth, "--noise", "stated", "-o", str(tmp_path / "stated")]) == 0
+    first, again, stated = ((tmp_path / name / "trajectory.csv").read_bytes() for name in ("first", "again", "stated"))
+    assert again == first
+    assert stated != first
+    one, other, plain = (summary(tmp_path / name) for name in ("first", "again", "stated"))
+    assert other["noise"] == one["noise"]
+    assert (one["provenance"]["noise"], other["provenance"]["noise"]) == ("estimated", given)
+    assert other["provenance"]["inputs"][given] == hashlib.sha256(Path(given).read_bytes()).hexdigest()
+    assert (plain["provenance"]["noise"], plain["settings"]["noise"]["mode"]) == ("stated", "stated")
+    assert plain["noise"]["figures"] == {}
+    assert other["passes"]["filter"] < one["passes"]["filter"]
+    assert one["passes"]["eliminations"] == one["iterations"] > 0
+    # what was used is what is stated times the factor
+    assert {"imu.gyro_noise_density", "gnss_position.up", "odometer.forward"} <= set(one["noise"]["figures"])
+    for group, figure in one["noise"]["figures"].items():
+        assert figure["variance_factor"] == pytest.approx(np.exp(figure["log_factor"]))
+        if group.startswith(("imu", "gnss")):
+            assert figure["used"] == pytest.approx(figure["stated"] * np.sqrt(figure["variance_factor"]))
+    with (tokyo / "recording.toml").open("rb") as file:
+        says = tomllib.load(file)["imu"]["noise"]["gyro_noise_density"]
+    assert one["noise"]["figures"]["imu.gyro_noise_density"]["stated"] == says
+
+
+def test_a_result_that_cannot_be_trusted_says_so_in_its_first_line(tmp_path, capsys):
+    t = load("kitti").start
+    write_noise(tmp_path / "noise.json", NoiseModel(excluded={"gnss_position": ((t + 30.0, t + 80.0),)}))
+    kitti = ["smooth", "kitti", "--end", "90", "--solver", "ekf"]
+    assert cli.run([*kitti, "--noise", str(tmp_path / "noise.json"), "-o", str(tmp_path / "o")]) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert "cannot be trusted" in first
+    assert summary(tmp_path / "o")["doubts"][0][1:] in first
+    assert cli.run([*kitti, "-o", str(tmp_path / "p")]) == 0
+    assert "cannot be trusted" not in capsys.readouterr().out
+    assert summary(tmp_path / "p")["doubts"] == []
 
 
 # ---------------------------------------------------------------------------------------------------------------- info
@@ -293,6 +339,7 @@ BAD = {
     "start after the end": (["smooth", "kitti", "-o", "o", "--start", "9999"], "--start 9999: lies outside"),
     "no rate": (["smooth", "kitti", "-o", "o", "--rate", "0"], "--rate 0"),
     "no config": (["smooth", "kitti", "-o", "o", "--config", "no.toml"], "no.toml: cannot be read"),
+    "unknown noise": (["smooth", "kitti", "-o", "o", "--noise", "statd"], "--noise statd: no such file"),
     "unknown key": (["smooth", "kitti", "-o", "o", "--config", "bad.toml"], "did you mean 'rate'?"),
     "not a trajectory": (["evaluate", "file", "file"], "file"),
 }

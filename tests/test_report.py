@@ -15,12 +15,15 @@ from graphnav.config import Settings
 from graphnav.detectors.base import Detection
 from graphnav.earth import LocalFrame
 from graphnav.metrics import Errors
+from graphnav.noise.model import Figure, NoiseModel, RowWeights
+from graphnav.noise.table import figure_rows
 from graphnav.panels import interactive
 from graphnav.recording import Gnss, Imu, Recording, Truth
 from graphnav.report import write_comparison, write_report
 from graphnav.report_provenance import command, toml_text
 from graphnav.report_tables import accuracy_row, consistency, span_row
-from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.report_words import doubts
+from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution, joined
 from graphnav.state import States
 
 START, COUNT = 1000.0, 600
@@ -267,6 +270,83 @@ def test_sigma_is_judged_by_what_was_met_where_there_is_no_truth(tmp_path, recor
     found = replace(solution(), records={"gnss_position": record(scale, kind)})
     _, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}))
     assert words in text
+
+
+def test_what_cannot_be_trusted_says_so_first(tmp_path, recording):
+    def first_words(found):
+        _, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}))
+        return " ".join(text.split("estimated the trajectory of")[0].split())
+
+    assert "cannot be trusted" not in first_words(solution())
+    t = record().t
+    mostly = NoiseModel(excluded={"gnss_position": ((t[100], t[500]),)})  # 401 of 600
+    assert "67 %" in first_words(replace(solution(), noise=mostly))
+    partly = NoiseModel(excluded={"gnss_position": ((t[100], t[200]),)})
+    assert "cannot be trusted" not in first_words(replace(solution(), noise=partly))
+    larger = replace(solution(), records={"gnss_position": record(2.0)})
+    assert "sigma cannot be trusted" in first_words(larger)
+    assert doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.02)})
+    assert not doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.3)})
+
+
+def test_the_noise_model_is_a_table(tmp_path, recording):
+    noise = NoiseModel(
+        {
+            "imu.gyro_bias_walk": Figure(np.log(16.0), 0.5, 0.0, 2.0, 37.0),
+            "gnss_position.seconds.up": Figure(np.log(0.09)),
+        },
+        {"gnss_error_of_seconds": 4.25},
+        {"gnss_position": RowWeights(record().t[:7], np.full(7, 0.125))},
+    )
+    rows = figure_rows(noise, recording, (100.0, 3600.0))
+    found = replace(solution(), noise=noise)
+    for text in (
+        checked(write_report(tmp_path / "r.html", recording, found, settings={}, noise=rows))[1],
+        checked(write_comparison(tmp_path / "c.html", recording, {"ekf": found}, settings={}, noise=rows))[1],
+    ):
+        # 1-sigma of the factor 4 on sigma: a quarter either way in the logarithm
+        for words in (
+            "gyro, bias random walk",
+            "4.000",
+            "3.1 to 5.1",
+            "37",
+            "0.3000",
+            "4.250",
+            "7 of 600 rows",
+            "0.12",
+        ):
+            assert words in text, words
+    plain = checked(write_report(tmp_path / "r.html", recording, solution(), settings={}))[1]
+    assert "as they are stated" in plain
+
+
+def test_pieces_keep_all_weights_and_spans_and_the_report_says_whose_figures_it_has(tmp_path, recording):
+    t = record().t
+    names = ("gnss_position", "nhc")
+    parts = [
+        replace(
+            solution(),
+            noise=NoiseModel(
+                {"imu.gyro_bias_walk": Figure(float(k))},
+                weights={names[k]: RowWeights(t[[k]], np.array([0.5]))},
+                excluded={"gnss_position": ((t[k], t[k + 1]),)},
+            ),
+            passes={"filter": 3, "smoother": k},
+            between=(None,),
+        )
+        for k in (0, 1)
+    ]
+    whole = joined(parts)
+    assert whole.noise.figures == parts[0].noise.figures
+    assert {name: list(some.t) for name, some in whole.noise.weights.items()} == {
+        "gnss_position": [t[0]],
+        "nhc": [t[1]],
+    }
+    assert whole.noise.excluded == {"gnss_position": ((t[0], t[1]), (t[1], t[2]))}
+    assert whole.passes == {"filter": 6, "smoother": 1}
+    rows = figure_rows(whole.noise, recording, (100.0, 3600.0))
+    shown = replace(whole, t=parts[0].t, states=parts[0].states, covariance=parts[0].covariance)
+    assert "2 pieces" in checked(write_report(tmp_path / "r.html", recording, shown, settings={}, noise=rows))[1]
 
 
 def test_innovations_speak_for_all_solvers(tmp_path, recording):

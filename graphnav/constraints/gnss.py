@@ -83,7 +83,9 @@ class GnssPosition(Constraint):
     gyro: Array = field(default_factory=lambda: _empty(0, 3))  # measured rate at the fix
     omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
     unit_error: Array = field(default_factory=lambda: _empty(0, 3))  # the same, smoothed: the unit of lasting errors
-    usual_error: Array = field(default_factory=lambda: np.zeros(3))  # median of these: the unit of what lasts for minutes and hours
+    usual_error: Array = field(
+        default_factory=lambda: np.zeros(3)
+    )  # median of these: the unit of what lasts for minutes and hours
     type: Array | None = None  # (N,) of graphnav.recording.FIX_TYPES, where there are several
 
     @classmethod

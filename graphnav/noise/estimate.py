@@ -40,7 +40,8 @@ from graphnav.state import SECONDS
 _CHANCE = 1e-3  # below which a squared residual is taken for an outlier
 _USUAL = 0.05  # of the squares of an aiding sensor, that count for no more: nearly two in five may be wrong
 _FIRST = 1500  # keyframes: figures told by a thousand numbers are good to a twentieth
-_ROUNDS = 12
+_ROUNDS, _AGAIN = 8, 3  # passes at most, from priors and from figures that were estimated before
+_AHEAD = 2.0  # times its own length that a step is taken at most (Aitken's extrapolation)
 _TIMES = (0.2, 60.0)  # s, between which what lasts for seconds is looked for
 _GRID = np.linspace(-1.0, 1.0, 21)
 
@@ -65,7 +66,8 @@ class _Figures:
     times: dict[str, float] = field(default_factory=dict)
     weights: dict[str, RowWeights] = field(default_factory=dict)
     excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
-    gained: float = 0.0  # twice the log-posterior that the latest changes promise
+    steps: dict[str, float] = field(default_factory=dict)  # the latest of each, as it was found
+    ahead: float = 1.0  # times its own length that a step is taken at most
 
     def model(self) -> NoiseModel:
         figures = {}
@@ -89,7 +91,11 @@ class _Figures:
             if abs(step) < 1e-6:
                 break
         x = float(np.clip(x, -3.0, 3.0))
-        self.gained += 0.5 * (A * (1.0 - np.exp(-x)) - B * x) - ((before + x - m) ** 2 - (before - m) ** 2) / (2 * s**2)
+        # components that trade with each other creep: what the steps, each a share of the one before, will add up to
+        ratio = x / self.steps[name] if self.steps.get(name) else 0.0
+        self.steps[name] = x
+        if 0.0 < ratio < 1.0 and self.ahead > 1.0:
+            x = float(np.clip(x * min(1.0 / (1.0 - ratio), self.ahead), -3.0, 3.0))
         self.log[name], self.freedom[name] = before + x, B
 
 
@@ -120,24 +126,24 @@ def estimate_noise(
         else _carried(*near, with_noise(problem, figures.model()))
     )
     passes, total = int(near is None), len(problem.t)
-    ends = [total] if total <= 2 * _FIRST else [_FIRST, total]
+    rounds = _ROUNDS if start is None else _AGAIN
+    ends = [total] if total <= 2 * _FIRST or start is not None else [_FIRST, total]
     for end in ends:
-        best = -np.inf
-        for k in range(_ROUNDS):
+        before = -np.inf
+        figures.ahead = 1.0
+        for k in range(rounds):
             used = with_noise(problem, figures.model())
             forward, smoothed = _pass(used, about, end)
             passes += 1
             now = float(np.sum(forward.log_likelihood)) + figures.log_prior()
-            about_part = smoothed
             if progress is not None:
-                progress("noise", (k + 1) / _ROUNDS)
-            before = figures.log.copy()
+                progress("noise", (k + 1) / rounds)
             _improve(figures, used, forward, smoothed, end)
-            about = _spliced(about, about_part, used)
-            # what is left to gain is less than the figures would gain by chance
-            if k > 1 and now - best < 0.5 * len(before):
+            about = _spliced(about, smoothed)
+            # what is left to gain is less than as many figures gain by chance
+            if k > 1 and abs(now - before) < 0.5 * len(figures.log):
                 break
-            best = max(best, now)
+            before, figures.ahead = now, _AHEAD if k > 1 and now > before else 1.0
     return NoiseEstimate(figures.model(), smoothed, forward, now, passes)
 
 
@@ -162,7 +168,7 @@ def _carried(points: Points, before: Problem, after: Problem) -> Points:
     return points_of(after, points.states, values_of(before, points))
 
 
-def _spliced(about: Points, part: Points, problem: Problem) -> Points:
+def _spliced(about: Points, part: Points) -> Points:
     """Points with the first of them replaced."""
     n = len(part.values)
     if n == len(about.values):
@@ -188,7 +194,6 @@ def _capped(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, flo
 
 def _improve(figures: _Figures, problem: Problem, forward: Forward, smoothed: Smoothed, end: int) -> None:
     """One step for all figures and weights."""
-    figures.gained = 0.0
     steps = disturbances(problem, forward, smoothed)
     A, B = imu_moments(problem, forward, steps)
     for i, name in enumerate(NOISE_FIGURES):

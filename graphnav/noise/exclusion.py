@@ -9,8 +9,8 @@ models, each with its own likelihood of the innovations from the span's beginnin
     wheels      what is assumed of wheels, and the odometer, have one unknown error in common there
 
 An unknown error has a Gaussian prior about zero, as wide as such errors get (`_WIDE`); what that width costs in
-likelihood is the cost of the explanation (MacKay 1992, "Bayesian interpolation": the Occam factor). The best model
-decides what is left out.
+likelihood is the cost of the explanation (MacKay 1992, "Bayesian interpolation": the Occam factor). A fault is also
+as rare beforehand as the tests take it to be. The best model decides what is left out.
 """
 
 from __future__ import annotations
@@ -32,10 +32,12 @@ from graphnav.rotation import Array
 from graphnav.solution import Fault
 from graphnav.solvers.ekf import refilter
 from graphnav.solvers.passes import Points, points_of, values_of
+from graphnav.solvers.watch import FALSE_ALARM
 from graphnav.state import Parameter, States
 
 FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
 _WIDE = {"m": 100.0, "m/s": 10.0}  # reflections in a city are off by up to a hundred metres; wheels by their speed
+_ODDS = -float(np.log(FALSE_ALARM))  # by which a fault is less likely beforehand than none
 _NONE = 1e-9  # sigma of an error that is not there
 
 
@@ -112,7 +114,7 @@ def exclude(base: Problem, found: NoiseEstimate) -> tuple[NoiseModel, int]:
     excluded: dict[str, tuple[tuple[float, float], ...]] = {}
     for span, one in zip(spans, likelihood, strict=True):
         for kinds, gain in ((FIXES, one[1] - one[0]), (WHEELS, one[2] - one[0])):
-            if gain > 0.0 and gain == np.max(one - one[0]):
+            if gain > _ODDS and gain == np.max(one - one[0]):
                 excluded |= {name: (*excluded.get(name, ()), span) for name in kinds}
     present = {rows.name for rows in base.constraints}
     excluded = {name: some for name, some in excluded.items() if name in present}

@@ -52,9 +52,13 @@ def disturbances(problem: Problem, forward: Forward, smoothed: Smoothed) -> Step
     ahead = forward.predicted
     d = np.concatenate([smoothed.states.minus(ahead.states), smoothed.values - ahead.values], axis=1)
     before = forward.P_predicted
-    inverse = np.linalg.inv(before)
+    # in units of its own sigmas: metres and rad/s apart by ten orders would leave no digits
+    root = np.sqrt(np.diagonal(before, axis1=1, axis2=2))
+    units = root[:, :, None] * root[:, None]
+    inverse = np.linalg.inv(before / units) / units
     r = (inverse @ d[..., None])[..., 0]
-    return Steps(r, inverse @ (before - smoothed.P) @ inverse, inverse)
+    N = inverse @ (before - smoothed.P) @ inverse
+    return Steps(r, 0.5 * (N + np.swapaxes(N, -1, -2)), inverse)
 
 
 def imu_moments(problem: Problem, forward: Forward, steps: Steps) -> tuple[Array, Array]:
@@ -65,7 +69,8 @@ def imu_moments(problem: Problem, forward: Forward, steps: Steps) -> tuple[Array
     r = (Lt @ steps.r[1:, :DIM, None])[..., 0]
     N = Lt @ steps.N[1:, :DIM, :DIM] @ L
     Q = problem.intervals.parts[: len(r)]
-    return np.einsum("ni,nfij,nj->nf", r, Q, r, optimize=True), np.einsum("nfij,nji->nf", Q, N, optimize=True)
+    A = np.einsum("ni,nfij,nj->nf", r, Q, r, optimize=True)
+    return A, np.maximum(np.einsum("nfij,nji->nf", Q, N, optimize=True), 0.0)
 
 
 def process_moments(problem: Problem, chain: ParameterChain, steps: Steps, end: int) -> tuple[Array, Array, Array]:
@@ -74,7 +79,7 @@ def process_moments(problem: Problem, chain: ParameterChain, steps: Steps, end: 
     k = np.concatenate([[0], np.flatnonzero(np.diff(chain.node[:end])) + 1])
     q = chain.sigma[chain.node[k]] ** 2
     N = np.diagonal(steps.N[k][:, at, at], axis1=-2, axis2=-1)
-    return k, q * steps.r[k, at] ** 2, q * N
+    return k, q * steps.r[k, at] ** 2, q * np.maximum(N, 0.0)
 
 
 def row_moments(problem: Problem, rows: Constraint, smoothed: Smoothed, n: int) -> RowMoments:

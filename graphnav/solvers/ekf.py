@@ -103,14 +103,14 @@ def ekf(
 
 
 def refilter(problem: Problem, about: Points, progress: Progress | None = None, watch: bool = False) -> Forward:
-    """Run the filter over all keyframes, linearised at given points; several times as fast as `ekf`.
+    """Run the filter over the first keyframes, linearised at given points; several times as fast as `ekf`.
 
     Parameters
     ----------
-    about : of all keyframes, near enough for what is left to be linear: an earlier pass.
+    about : of these keyframes, near enough for what is left to be linear: an earlier pass.
     watch : as for `ekf`.
     """
-    return _forward(problem, len(problem.t), about, progress, watch)
+    return _forward(problem, len(about.values), about, progress, watch)
 
 
 def _forward(

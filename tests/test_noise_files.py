@@ -1,0 +1,184 @@
+"""A noise model comes back from its file to the last digit, and a file that is no noise model is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphnav import cli
+from graphnav.config import Settings
+from graphnav.earth import LocalFrame
+from graphnav.errors import ConfigError
+from graphnav.formats import read as load
+from graphnav.noise.files import known_groups, noise_values, read_noise, read_noise_and_mode, write_noise
+from graphnav.noise.model import STATED, Figure, NoiseModel, RowWeights
+from graphnav.noise.table import figure_rows, whole_ratio
+from graphnav.problem import pose
+from graphnav.rotation import Array
+from graphnav.state import States
+from graphnav.workflow import unused_noise
+
+TOKYO = Path(__file__).resolve().parents[1] / "data" / "tokyo"
+
+
+def some_noise(seed: int = 0) -> NoiseModel:
+    """Every group there is, with figures of all digits."""
+    rng = np.random.default_rng(seed)
+    figures = {name: Figure(*rng.normal(size=1), *rng.uniform(0.1, 3.0, 4)) for name in known_groups()}
+    t = np.sort(rng.uniform(1.6e9, 1.7e9, 50))  # of a clock that counts from 1970
+    return NoiseModel(
+        figures,
+        {"gnss_error_of_seconds": float(rng.uniform(0.2, 60.0)), "nhc_error": 1.0 / 3.0},
+        {"gnss_position": RowWeights(t, rng.uniform(0.0, 1.0, 50))},
+        {"gnss_position": ((t[3], t[7]), (t[9], t[9])), "nhc": ((t[1], t[2]),)},
+    )
+
+
+def test_a_noise_model_comes_back_to_the_last_digit(tmp_path: Path) -> None:
+    noise = some_noise()
+    again, mode = read_noise_and_mode(write_noise(tmp_path / "noise.json", noise, "stated"))
+    assert mode == "stated"
+    assert (again.figures, again.times, again.excluded) == (noise.figures, noise.times, noise.excluded)
+    assert again.weights.keys() == noise.weights.keys()
+    for name, some in noise.weights.items():
+        np.testing.assert_array_equal(again.weights[name].t, some.t)
+        np.testing.assert_array_equal(again.weights[name].weight, some.weight)
+    empty = read_noise(write_noise(tmp_path / "stated.json", STATED))
+    assert not empty.figures
+    assert not empty.excluded
+
+
+def test_every_group_of_a_problem_can_be_written_down() -> None:
+    """Else what a run finds could not be read again."""
+    recording = load(TOKYO).crop(0.0, 20.0)
+    assert recording.gnss is not None
+    frame = LocalFrame(recording.gnss.llh[0])
+    zero: Array = np.zeros((1, 3))
+    start = States(np.eye(3)[None], zero, zero, zero, zero)
+    problem = pose(recording, Settings(), frame, start, np.ones(15), np.empty((0, 2)))
+    groups = {g for rows in problem.constraints for g in rows.noise_groups()[0]}
+    groups |= {g for rows in problem.constraints for p in (*rows.parameters, *rows.processes) for g in p.noise_groups}
+    assert {"odometer.forward", "gnss_velocity.seconds.up", "nhc.seconds.right"} <= groups
+    assert groups <= set(known_groups())
+
+
+def changed(key: str, value: Any) -> dict[str, Any]:
+    """The values of a good file with one of them another; a key with dots leads to it."""
+    values = json.loads(json.dumps({"noise": noise_values(some_noise())}))
+    at = values
+    *way, last = key.split("/")
+    for part in way:
+        at = at[part]
+    at[last] = value
+    return values
+
+
+FIGURE = "noise/figures/imu.gyro_noise_density"
+BAD = {
+    "no noise model": ({"settings": {}}, ("holds no table 'noise'",)),
+    "a list": ([1, 2], ("holds no table 'noise'",)),
+    "unknown part": (changed("noise/weight", {}), ("noise.weight", "did you mean 'weights'")),
+    "unknown mode": (changed("noise/mode", "guessed"), ("noise.mode", "guessed")),
+    "unknown group": (changed("noise/figures/imu.gyro_noise", {"log_factor": 0.0}), ("imu.gyro_noise", "did you mean")),
+    "unknown key of a figure": (changed(f"{FIGURE}/sigmas", 1.0), ("sigmas", "did you mean 'sigma'")),
+    "no figure": (changed(FIGURE, {"sigma": 1.0}), ("neither", "log_factor")),
+    "a figure is a number": (changed(FIGURE, 2.0), ("must be a table",)),
+    "words": (changed(f"{FIGURE}/log_factor", "1"), ("log_factor", "number")),
+    "true": (changed(f"{FIGURE}/log_factor", True), ("log_factor", "number")),
+    "null": (changed(f"{FIGURE}/sigma", None), ("sigma", "null", "number")),
+    "infinite": (changed(f"{FIGURE}/log_factor", float("inf")), ("log_factor", "number")),
+    "nothing left of a variance": (changed(FIGURE, {"variance_factor": 0.0}), ("variance_factor", "between")),
+    "two figures": (changed(f"{FIGURE}/variance_factor", 4.0), ("disagree",)),
+    "negative sigma": (changed(f"{FIGURE}/sigma", -1.0), ("sigma", "between")),
+    "figures in a list": (changed("noise/figures", []), ("noise.figures", "table")),
+    "time of no process": (changed("noise/correlation_times/nhc", 2.0), ("correlation_times.nhc", "nhc_error")),
+    "no time": (changed("noise/correlation_times/nhc_error", 0.0), ("nhc_error", "between")),
+    "weights of nothing": (changed("noise/weights/gnss", {"t": [], "weight": []}), ("weights.gnss", "gnss_position")),
+    "weights without times": (changed("noise/weights/nhc", {"weight": [0.5]}), ("weights.nhc", "t and weight")),
+    "too few weights": (changed("noise/weights/nhc", {"t": [1.0, 2.0], "weight": [0.5]}), ("2 times and 1 weights",)),
+    "weight above one": (changed("noise/weights/nhc", {"t": [1.0], "weight": [1.5]}), ("weight", "between 0 and 1")),
+    "times not sorted": (changed("noise/weights/nhc", {"t": [2.0, 1.0], "weight": [0.5, 0.5]}), ("ascending",)),
+    "weights are a number": (changed("noise/weights/nhc", {"t": 1.0, "weight": [0.5]}), ("must be a list",)),
+    "half a span": (changed("noise/excluded/nhc", [[1.0]]), ("excluded.nhc", "[begin, end]")),
+    "backward span": (changed("noise/excluded/nhc", [[2.0, 1.0]]), ("excluded.nhc", "ends before it begins")),
+}
+
+
+@pytest.mark.parametrize(("values", "words"), BAD.values(), ids=BAD)
+def test_what_is_no_noise_model_is_refused_in_one_sentence(values: Any, words: tuple[str, ...], tmp_path: Path) -> None:
+    path = tmp_path / "noise.json"
+    path.write_text(json.dumps(values), encoding="utf-8")
+    with pytest.raises(ConfigError) as found:
+        read_noise(path)
+    said = str(found.value)
+    assert str(path) in said
+    assert "\n" not in said
+    for word in words:
+        assert word in said
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(None, "cannot be read"), (b'{\n"noise": ', "line 2"), (b"\xff\xfe\x00", "UTF-8"), (b"", "line 1")],
+    ids=["missing", "cut off", "not text", "empty"],
+)
+def test_a_file_that_is_no_json_is_refused(content: bytes | None, words: str, tmp_path: Path, capsys: Any) -> None:
+    path = tmp_path / "noise.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError, match=words):
+        read_noise(path)
+    assert cli.run(["smooth", "kitti", "--noise", str(path), "-o", str(tmp_path / "o")]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1
+    assert str(path) in printed.err
+    assert not (tmp_path / "o").exists()
+
+
+def test_rows_stand_beside_what_is_stated() -> None:
+    recording = load(TOKYO).crop(0.0, 20.0)
+    assert recording.gnss is not None
+    noise = NoiseModel(
+        {
+            "imu.accel_bias_walk": Figure(np.log(9.0)),
+            "gnss_position.up": Figure(np.log(4.0)),
+            "gnss_position.minutes.up": Figure(np.log(0.25)),
+            "nhc.seconds.right": Figure(0.0),
+        },
+        {"nhc_error": 7.0},
+    )
+    rows = {row.group: row for row in figure_rows(noise, recording, (90.0, 3000.0))}
+    walk = rows["imu.accel_bias_walk"]
+    assert (walk.stated, walk.correlation_time) == (recording.imu.noise.accel_bias_walk, None)
+    assert walk.used == pytest.approx(3.0 * recording.imu.noise.accel_bias_walk)
+    up = float(np.median(recording.gnss.sd[:, 2]))
+    assert rows["gnss_position.up"].used == pytest.approx(2.0 * up)
+    assert rows["gnss_position.minutes.up"].used == pytest.approx(0.5 * up)
+    assert rows["gnss_position.minutes.up"].correlation_time == 90.0
+    assert rows["nhc.seconds.right"].correlation_time == 7.0
+    assert rows["nhc.seconds.right"].stated is None
+    assert whole_ratio(noise, "gnss_position", "up") == pytest.approx(np.sqrt(4.25))
+    assert whole_ratio(noise, "gnss_position", "horizontal") is None
+
+
+def test_what_a_noise_model_says_of_nothing_is_told() -> None:
+    t = np.arange(10.0)
+    solution: Any = SimpleNamespace(records={"gnss_position": SimpleNamespace(t=t)})
+    weights = RowWeights(np.array([3.0, 4.5]), np.array([0.5, 0.5]))
+    noise = NoiseModel(
+        {"odometer.forward": Figure(0.0), "gnss_position.up": Figure(0.0), "imu.gyro_bias_walk": Figure(0.0)},
+        weights={"gnss_position": weights},
+        excluded={"gnss_position": ((2.0, 3.0), (20.0, 30.0))},
+    )
+    said = unused_noise(noise, solution)
+    assert len(said) == 3
+    assert "odometer" in said[0]
+    assert "1 of the 2 rows" in said[1]
+    assert "1 of the 2 spans" in said[2]
+    assert unused_noise(NoiseModel({"gnss_position.up": Figure(0.0)}), solution) == []
