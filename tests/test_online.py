@@ -619,8 +619,9 @@ def test_an_imu_is_judged_by_ever_more_rows(drive: tuple[Recording, Trajectory])
         assert used.factor(f"imu.{name}", 1.0) > 2.0
     told = [name for name, one in whole.figures.items() if one.freedom > 10.0]
     assert len(told) > 5
-    for name in told:
-        assert used.figures[name].log_factor == pytest.approx(whole.figures[name].log_factor, abs=0.2), name
+    for name in told:  # a recording has keyframes where stops begin and end, and so other intervals and rows there
+        one = whole.figures[name]
+        assert abs(used.figures[name].log_factor - one.log_factor) < 3.0 * one.sigma, name
     assert sum(note.startswith("noise model, IMU") for note in online.notes) == 1
     assert online.tracker.window.turn > turn_limit(quiet)
     # ended and resumed while it is being judged, and while what has not settled is gone through again
