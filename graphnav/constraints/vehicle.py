@@ -297,6 +297,7 @@ class NonHolonomic(Wheels):
             keyframe=rows + 1,
             past=past,
             sigma=np.hypot(density, columns(right, up)),
+            unscaled=columns(right, up),
             **s.outliers,
             **shared,
         )

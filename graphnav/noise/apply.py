@@ -62,10 +62,18 @@ def _rows(problem: Problem, rows: Constraint, noise: NoiseModel) -> Constraint:
     names, index = rows.noise_groups()
     if names:
         root = np.sqrt([noise.factor(name, 1.0) for name in names])
-        changed["sigma"] = rows.sigma * np.where(index >= 0, root[index], 1.0)  # type: ignore[attr-defined]
+        changed["sigma"] = _scaled(rows, np.where(index >= 0, root[index], 1.0))
     if rows.name in noise.weights or rows.name in noise.excluded:
         changed["weight"] = row_weights(problem.t[rows.keyframe], noise, rows.name)
     return replace(rows, **changed)
+
+
+def _scaled(rows: Constraint, root: Array) -> Array:
+    """(N, m) sigmas times the roots of variance factors, but for the part that has none."""
+    sigma: Array = rows.sigma  # type: ignore[attr-defined]
+    if rows.unscaled is None:
+        return sigma * root
+    return np.sqrt((sigma**2 - rows.unscaled**2) * root**2 + rows.unscaled**2)
 
 
 def _process(p: Parameter, noise: NoiseModel, missing: float) -> Parameter | None:

@@ -1,7 +1,7 @@
 """All noise figures of a recording at once, by the likelihood of its innovations.
 
-Maximum a posteriori: with L the innovation log-likelihood of the filter and a log-normal prior on every variance factor,
-the estimate maximises L plus the logarithm of the priors. From pass to pass, filter and smoother linearised at the
+Maximum a posteriori: with L the innovation log-likelihood of the filter and a log-normal prior on every variance
+factor, the estimate maximises L plus the logarithm of the priors. From pass to pass, filter and smoother linearised at the
 points that the pass before left, every factor f with redundancy B and the sum of squares A (`graphnav.noise.moments`)
 goes to the maximum over x = ln(f_new / f) of
 

@@ -1,17 +1,16 @@
 """What a smoother says of every variance component, and of every row.
 
-The innovation log-likelihood L of a linear Gaussian problem has, by the logarithm of the variance factor f of a component
-that adds the covariance f Q_i to a step or to rows, the derivative
+The innovation log-likelihood L of a linear Gaussian problem has, by the logarithm of the variance factor f of a
+component that adds the covariance f Q_i to a step or to rows, the derivative
 
     dL / d ln f = (A - B) / 2      A = sum r^T f Q_i r      B = sum tr(f Q_i N)
 
-with r and N of de Jong and Koopman's disturbance smoother (Koopman 1993, "Disturbance smoother for state space models"),
-at a step
+with r and N of the disturbance smoother (Koopman 1993, "Disturbance smoother for state space models"), at a step
 
     r = P-^-1 (x^s - x-)           N = P-^-1 (P- - P^s) P-^-1
 
-and at rows with residual e and Jacobian H at the smoothed state, r = R^-1 e and N = R^-1 - R^-1 H P^s H^T R^-1. B is the
-component's redundancy, the degrees of freedom that the data tell it by (Foerstner 1979; MacKay 1992 calls it the number
+and at rows with residual e and Jacobian H at the smoothed state, r = R^-1 e and N = R^-1 - R^-1 H P^s H^T R^-1. B is
+the component's redundancy, the degrees of freedom that the data tell it by (Foerstner 1979; MacKay 1992 calls it the number
 of well-determined parameters), and E[A] = B where f is right.
 """
 
@@ -99,7 +98,10 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: Smoothed, n: int) 
             J = linear.jacobians[p.name]
             error = error - np.einsum("nij,nj->ni", J, values[p.name][at])
             variance = variance + J**2 @ p.sigma**2
-    return RowMoments(w * linear.residual**2 / R, np.where(w > 0.0, B, 0.0), left_out, error**2 / variance)
+    # of the component that a factor scales
+    share = 1.0 if rows.unscaled is None else 1.0 - rows.unscaled[:n] ** 2 / R
+    A = share * w * linear.residual**2 / R
+    return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out, error**2 / variance)
 
 
 def lag_moments(
