@@ -16,7 +16,7 @@ from graphnav.constraints.prior import InitialPrior
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import ConfigError, EstimationError
-from graphnav.noise.model import NoiseModel
+from graphnav.noise_model import NoiseModel
 from graphnav.onboard_offset import without_onboard_offset
 from graphnav.own_noise import with_own_noise
 from graphnav.plausibility import screened

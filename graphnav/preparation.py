@@ -24,8 +24,8 @@ from graphnav.errors import EstimationError
 from graphnav.noise.apply import with_noise, without_parts
 from graphnav.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.noise.exclusion import exclude, share_left_out, without_excluded
-from graphnav.noise.model import STATED, NoiseModel
 from graphnav.noise.words import describe
+from graphnav.noise_model import STATED, NoiseModel
 from graphnav.problem import Problem, pose
 from graphnav.progress import Progress, tell
 from graphnav.recording import Recording

@@ -11,7 +11,7 @@ import numpy as np
 from graphnav import rotation
 from graphnav.detectors.base import Detection
 from graphnav.earth import LocalFrame
-from graphnav.noise.model import STATED, NoiseModel, RowWeights
+from graphnav.noise_model import STATED, NoiseModel, RowWeights
 from graphnav.rotation import Array
 from graphnav.state import States
 from graphnav.trajectory import Trajectory

@@ -21,7 +21,7 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.findings import Finding
-from graphnav.noise.model import NoiseModel
+from graphnav.noise_model import NoiseModel
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
 from graphnav.rotation import Array

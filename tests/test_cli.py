@@ -20,7 +20,7 @@ import pytest
 
 from graphnav import cli, load, workflow
 from graphnav.noise.files import write_noise
-from graphnav.noise.model import NoiseModel
+from graphnav.noise_model import NoiseModel
 
 PROGRAM = Path(sys.executable).with_name("graphnav")
 SOLVERS = ("ekf", "rts", "batch")

@@ -18,9 +18,9 @@ from graphnav.earth import LocalFrame
 from graphnav.noise.apply import row_weights, with_noise, without_parts
 from graphnav.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.noise.exclusion import FIXES, WHEELS
-from graphnav.noise.model import STATED, Figure, NoiseModel, RowWeights
 from graphnav.noise.moments import disturbances, imu_moments, lag_moments, process_moments, row_moments
 from graphnav.noise.priors import prior
+from graphnav.noise_model import STATED, Figure, NoiseModel, RowWeights
 from graphnav.pipeline import SOLVERS, origin, run
 from graphnav.preintegration import NOISE_FIGURES, preintegrate
 from graphnav.problem import Problem, pose

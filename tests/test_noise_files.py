@@ -16,8 +16,8 @@ from graphnav.earth import LocalFrame
 from graphnav.errors import ConfigError
 from graphnav.formats import read as load
 from graphnav.noise.files import known_groups, noise_values, read_noise, read_noise_and_mode, write_noise
-from graphnav.noise.model import STATED, Figure, NoiseModel, RowWeights
 from graphnav.noise.table import figure_rows, whole_ratio
+from graphnav.noise_model import STATED, Figure, NoiseModel, RowWeights
 from graphnav.problem import pose
 from graphnav.rotation import Array
 from graphnav.state import States

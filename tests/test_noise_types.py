@@ -14,7 +14,7 @@ from test_noise_scenarios import times, wandering, whole
 from graphnav.config import Settings
 from graphnav.constraints.gnss import ERRORS, GnssPosition
 from graphnav.earth import LocalFrame
-from graphnav.noise.model import Figure, NoiseModel
+from graphnav.noise_model import Figure, NoiseModel
 from graphnav.pipeline import run
 from graphnav.recording import Gnss, Recording
 from graphnav.rotation import Array

@@ -16,7 +16,7 @@ from graphnav.config import Settings
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.noise.apply import with_noise
-from graphnav.noise.model import Figure, NoiseModel
+from graphnav.noise_model import Figure, NoiseModel
 from graphnav.pipeline import origin, run
 from graphnav.problem import Problem, pose
 from graphnav.rotation import Array

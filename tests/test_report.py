@@ -15,8 +15,8 @@ from graphnav.config import Settings
 from graphnav.detectors.base import Detection
 from graphnav.earth import LocalFrame
 from graphnav.metrics import Errors
-from graphnav.noise.model import Figure, NoiseModel, RowWeights
 from graphnav.noise.table import figure_rows
+from graphnav.noise_model import Figure, NoiseModel, RowWeights
 from graphnav.panels import interactive
 from graphnav.recording import Gnss, Imu, Recording, Truth
 from graphnav.report import write_comparison, write_report

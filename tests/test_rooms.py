@@ -14,11 +14,12 @@ PACKAGE = Path(__file__).resolve().parents[1] / "graphnav"
 # Modules and packages of graphnav, left to right. A new one needs a place here, as far left as it can stand.
 ROOMS = [
     "errors", "complaints", "progress", "rotation", "earth", "state", "config", "recording", "trajectory",
-    "formats", "draft", "allan", "findings", "sample_size", "simulation", "crosschecks", "wheels", "checks_imu",
-    "checks_aiding", "checks_stated", "checks", "detectors", "samples",
+    "findings", "sample_size", "formats", "allan", "lags", "crosschecks", "clock", "draft", "simulation", "wheels",
+    "checks_imu", "checks_aiding", "checks_stated", "plausibility_gnss", "plausibility_odometer", "plausibility",
+    "checks", "detectors", "samples", "noise_model",
     "preintegration", "own_noise", "unresolved", "clipping", "dynamics", "constraints", "problem", "solution",
-    "alignment", "dense", "solvers", "noise", "faults", "onboard_offset", "preparation", "pipeline", "lever_arm",
-    "interpolation", "metrics", "gates", "scoring", "strides", "evaluation", "exporters", "online",
+    "alignment", "dense", "solvers", "faults", "noise", "onboard_offset", "preparation", "pipeline", "lever_arm",
+    "interpolation", "metrics", "sigmas", "gates", "fitted", "scoring", "strides", "evaluation", "exporters", "online",
     "panels", "page", "plots", "report_tables", "report_words", "report_pictures", "report_provenance", "report",
     "workflow", "staging", "outputs", "convert", "terminal", "detection_report",
     "talk", "cli_options", "cli_logs", "cli", "__main__",

@@ -18,7 +18,7 @@ from graphnav.dynamics import SCALE
 from graphnav.earth import LocalFrame
 from graphnav.formats import read
 from graphnav.noise.apply import with_noise
-from graphnav.noise.model import STATED, Figure, NoiseModel
+from graphnav.noise_model import STATED, Figure, NoiseModel
 from graphnav.pipeline import run
 from graphnav.problem import Problem, pose
 from graphnav.recording import Gnss, Recording

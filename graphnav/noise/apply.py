@@ -9,7 +9,7 @@ import numpy as np
 
 from graphnav.constraints.base import SAME_TIME, Constraint
 from graphnav.dynamics import Motion
-from graphnav.noise.model import NoiseModel
+from graphnav.noise_model import NoiseModel
 from graphnav.preintegration import NOISE_FIGURES
 from graphnav.problem import Problem
 from graphnav.rotation import Array

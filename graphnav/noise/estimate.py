@@ -1,9 +1,9 @@
 """All noise figures of a recording at once, by the likelihood of its innovations.
 
 Maximum a posteriori: with L the innovation log-likelihood of the filter and a log-normal prior on every variance
-factor, the estimate maximises L plus the logarithm of the priors. From pass to pass, filter and smoother linearised at the
-points that the pass before left, every factor f with redundancy B and the sum of squares A (`graphnav.noise.moments`)
-goes to the maximum over x = ln(f_new / f) of
+factor, the estimate maximises L plus the logarithm of the priors. From pass to pass, filter and smoother linearised at
+the points that the pass before left, every factor f with redundancy B and the sum of squares A
+(`graphnav.noise.moments`) goes to the maximum over x = ln(f_new / f) of
 
     -(B x + A e^-x) / 2 - (ln f + x - m)^2 / (2 s^2)
 
@@ -27,9 +27,9 @@ from scipy.special import chdtrc, chdtri
 from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import TIMES
 from graphnav.noise.apply import with_noise
-from graphnav.noise.model import Figure, NoiseModel, RowWeights
 from graphnav.noise.moments import disturbances, imu_moments, lag_moments, process_moments, row_moments
 from graphnav.noise.priors import TIME_WITHIN, prior
+from graphnav.noise_model import Figure, NoiseModel, RowWeights
 from graphnav.preintegration import NOISE_FIGURES
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array

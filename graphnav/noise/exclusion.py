@@ -26,7 +26,7 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
 from graphnav.noise.apply import row_weights, with_noise
 from graphnav.noise.estimate import NoiseEstimate
-from graphnav.noise.model import NoiseModel, RowWeights
+from graphnav.noise_model import NoiseModel, RowWeights
 from graphnav.problem import Problem
 from graphnav.recording import Recording
 from graphnav.rotation import Array

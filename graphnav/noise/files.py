@@ -30,7 +30,7 @@ from graphnav.constraints import registered
 from graphnav.constraints.gnss import ERRORS, TIMES, VELOCITY_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.errors import ConfigError
-from graphnav.noise.model import Figure, NoiseModel, RowWeights
+from graphnav.noise_model import Figure, NoiseModel, RowWeights
 from graphnav.preintegration import NOISE_FIGURES
 from graphnav.recording import FIX_TYPES
 

@@ -10,8 +10,8 @@ with r and N of the disturbance smoother (Koopman 1993, "Disturbance smoother fo
     r = P-^-1 (x^s - x-)           N = P-^-1 (P- - P^s) P-^-1
 
 and at rows with residual e and Jacobian H at the smoothed state, r = R^-1 e and N = R^-1 - R^-1 H P^s H^T R^-1. B is
-the component's redundancy, the degrees of freedom that the data tell it by (Foerstner 1979; MacKay 1992 calls it the number
-of well-determined parameters), and E[A] = B where f is right.
+the component's redundancy, the degrees of freedom that the data tell it by (Foerstner 1979; MacKay 1992 calls it the
+number of well-determined parameters), and E[A] = B where f is right.
 """
 
 from __future__ import annotations

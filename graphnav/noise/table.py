@@ -8,7 +8,7 @@ import numpy as np
 
 from graphnav.constraints.gnss import TIMES, VELOCITY_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
-from graphnav.noise.model import Figure, NoiseModel
+from graphnav.noise_model import Figure, NoiseModel
 from graphnav.recording import FIX_TYPES, ImuNoise, Recording
 from graphnav.state import SECONDS
 

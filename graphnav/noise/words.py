@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphnav.noise.model import NoiseModel
+from graphnav.noise_model import NoiseModel
 from graphnav.problem import Problem
 
 _IMU = {

@@ -10,7 +10,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.dense import Dense
 from graphnav.dynamics import SCALE, Motion, as_biases
 from graphnav.earth import LocalFrame
-from graphnav.noise.model import NoiseModel
+from graphnav.noise_model import NoiseModel
 from graphnav.online.sensors import Sensors
 from graphnav.preintegration import NOISE_FIGURES, preintegrate
 from graphnav.rotation import Array

@@ -16,7 +16,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.constraints.standstill import PLACE
 from graphnav.noise.apply import row_weights
-from graphnav.noise.model import STATED, NoiseModel
+from graphnav.noise_model import STATED, NoiseModel
 from graphnav.online.looks import Stops
 from graphnav.online.sensors import Sensors
 from graphnav.preintegration import NOISE_FIGURES

@@ -25,8 +25,8 @@ from graphnav.errors import EstimationError
 from graphnav.noise.apply import with_noise
 from graphnav.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.noise.exclusion import exclude
-from graphnav.noise.model import NoiseModel
 from graphnav.noise.words import describe
+from graphnav.noise_model import NoiseModel
 from graphnav.online.sensors import Sensors, unit_of
 from graphnav.online.tracker import Tracker
 from graphnav.preparation import start_sigma

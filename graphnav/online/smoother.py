@@ -17,7 +17,7 @@ from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.noise.exclusion import FIXES
-from graphnav.noise.model import STATED, NoiseModel
+from graphnav.noise_model import STATED, NoiseModel
 from graphnav.online.ahead import Live
 from graphnav.online.judging import Again, Judgement
 from graphnav.online.looks import CONTEXT, SURE

@@ -26,7 +26,7 @@ from graphnav.dynamics import Motion
 from graphnav.earth import LocalFrame
 from graphnav.findings import period_of
 from graphnav.noise.apply import with_noise
-from graphnav.noise.model import STATED, NoiseModel
+from graphnav.noise_model import STATED, NoiseModel
 from graphnav.online.ahead import Live, live, since
 from graphnav.online.chain import Chain
 from graphnav.online.looks import CONTEXT, SURE, Readings, clipped
