@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.rotation import Array
-from graphnav.sigmas import chi_square_band, chi_square_quantile, effective_epochs, over_sigmas
+from graphnav.sample_size import chi_square_band, chi_square_quantile, effective_epochs
 
 
 @dataclass(frozen=True)
@@ -356,3 +356,9 @@ def _short(x: float) -> str:
         return "-"
     size = abs(x)
     return f"{x:.0f}" if size >= 1000 else f"{x:.4f}" if size < 1 else f"{x:.{3 - int(math.log10(size))}f}"
+
+
+def over_sigmas(errors: Errors) -> tuple[Array, Array, Array]:
+    """Errors of position, velocity, and roll, pitch, heading over their sigmas, (N, 3) each, NaN where unknown."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.sign(errors.p) * np.sqrt(errors.nees_axis), errors.v / errors.sd_v, errors.rph / errors.sd_rph

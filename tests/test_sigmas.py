@@ -7,7 +7,8 @@ import pytest
 
 from graphnav.metrics import Errors
 from graphnav.report_words import believe
-from graphnav.sigmas import effective_epochs, judge_sigmas
+from graphnav.sample_size import effective_epochs
+from graphnav.sigmas import judge_sigmas
 
 N = 600
 

@@ -181,9 +181,7 @@ def _try(part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoothe
         ]
     )
     # one bad fix or a burst must not decide the heading
-    robust = settings.gnss.model_copy(
-        update={"robust": "cauchy", "lever_arm_sigma": None, "time_offset_sigma": 0.0, "slow_share": 0.0}
-    )
+    robust = settings.gnss.model_copy(update={"robust": "cauchy", "lever_arm_sigma": None, "time_offset_sigma": 0.0})
     # what the wheels say of the heading is brought in by `_with_course`
     problem = pose(part, settings.without_wheels().model_copy(update={"gnss": robust}), frame, start, sigma)
     dR, _, _ = prefix(problem.samples, problem.t[0], problem.t[1:], np.zeros(3), bias)
