@@ -34,7 +34,7 @@ from graphnav.solution import Solution
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf, refilter
 from graphnav.solvers.near import near
-from graphnav.solvers.passes import Filtered, Points, Smoothed, about_solved, near_to
+from graphnav.solvers.passes import Filtered, Points, Smoothed, about_solved, near_to, points_of, values_of
 from graphnav.solvers.rts import backward
 from graphnav.state import BLOCKS, States
 
@@ -151,6 +151,9 @@ def prepare(
             best = estimate_noise(base, aligned.until, best.noise, progress=progress)
             passes.update(filter=best.passes, smoother=best.passes)
         noise, known = best.noise, best.points
+        passes.update(filter=1)
+        if _explains_more(base, best):
+            noise, known = STATED, None
         booked("noise", since)
     else:
         aligned, detections, changed = without_wrong(noise)
@@ -201,6 +204,13 @@ def start_sigma(start: Alignment) -> Array:
         return sigma
     sigma[BLOCKS["p"]] = np.hypot(sigma[BLOCKS["p"]], _FAR_AWAY)
     return sigma
+
+
+def _explains_more(base: Problem, found: NoiseEstimate) -> bool:
+    """Whether the figures as stated make the innovations likelier than the estimate, with its prior, does."""
+    known = values_of(with_noise(base, found.noise), found.points)
+    plain = refilter(base, points_of(base, found.points.states, known))
+    return float(np.sum(plain.log_likelihood)) > found.log_posterior
 
 
 def _start(found: Alignment, stated: Alignment) -> Alignment:
