@@ -150,9 +150,11 @@ def test_settings_differ_in_what_the_cells_differ_in(script, sensors, doppler):
         assert (one.vehicle.nhc, one.vehicle.odometer) == (sensors != "gnss", sensors == "+odometer")
     assert stated != estimated
     defaults = graphnav.Settings()
-    assert (estimated.imu, estimated.gnss.faults, estimated.gnss.sd_factor) == (
-        defaults.imu, defaults.gnss.faults, defaults.gnss.sd_factor,
-    )  # fmt: skip
+    assert (estimated.imu, estimated.gnss.faults, estimated.noise) == (
+        defaults.imu,
+        defaults.gnss.faults,
+        defaults.noise,
+    )
 
 
 # ------------------------------------------------------------------------------------------------------- fixes left out

@@ -196,7 +196,8 @@ def test_every_real_recording_loads_and_gravity_is_up(shared_data: Path) -> None
         # a vehicle's mean force is up; a foot's is only while it stands, as all do in the first second
         first = recording.imu.t < recording.imu.t[0] + 1.0
         up = recording.imu.accel[first if recording.platform == "foot" else slice(None)].mean(axis=0)
-        assert 9.5 < np.linalg.norm(up) < 10.1, file
+        # a car's accelerometer reads 3.9 % high (its README)
+        assert 9.5 < np.linalg.norm(up) < (10.25 if "circles_boston_20241021" in str(file) else 10.1), file
         assert up[2] / np.linalg.norm(up) > 0.97, file
         assert not any("dropped" in remark or "sorted" in remark for remark in recording.remarks), file
 

@@ -1,11 +1,11 @@
 """Which measurements are wrong for a while: each span decided once, by evidence.
 
 The bank of likelihood-ratio tests (`graphnav.solvers.watch`) says in which spans fixes disagree with everything else by
-something that lasts. Who is wrong there is another question. With the noise model as it is, each span is put as three
+something that lasts. Who is wrong there is another question. With the noise model as it is, each span is put as several
 models, each with its own likelihood of the innovations from the span's beginning to that of the next one:
 
     neither     all is as the noise model has it
-    fixes       the fixes of the span have one unknown error in common
+    fixes       positions, velocities or both have one unknown error in common in the span
     wheels      what is assumed of wheels, and the odometer, have one unknown error in common there
 
 An unknown error has a Gaussian prior about zero, as wide as such errors get (`_WIDE`); what that width costs in
@@ -37,6 +37,7 @@ from graphnav.solvers.watch import FALSE_ALARM
 from graphnav.state import Parameter, States
 
 FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
+_WRONG: tuple[tuple[str, ...], ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS)
 _WIDE = {"m": 100.0, "m/s": 10.0}  # reflections in a city are off by up to a hundred metres; wheels by their speed
 _ODDS = -float(np.log(FALSE_ALARM))  # by which a fault is less likely beforehand than none
 _NONE = 1e-9  # sigma of an error that is not there
@@ -114,12 +115,12 @@ def exclude(base: Problem, found: NoiseEstimate) -> tuple[NoiseModel, int]:
     likelihood = evidence(used, about, spans)
     excluded: dict[str, tuple[tuple[float, float], ...]] = {}
     for span, one in zip(spans, likelihood, strict=True):
-        for kinds, gain in ((FIXES, one[1] - one[0]), (WHEELS, one[2] - one[0])):
-            if gain > _ODDS and gain == np.max(one - one[0]):
-                excluded |= {name: (*excluded.get(name, ()), span) for name in kinds}
+        best = int(np.argmax(one))
+        if one[best] - one[0] > _ODDS:
+            excluded |= {name: (*excluded.get(name, ()), span) for name in _WRONG[best]}
     present = {rows.name for rows in base.constraints}
     excluded = {name: some for name, some in excluded.items() if name in present}
-    return replace(noise, weights=inside, excluded=excluded), 4
+    return replace(noise, weights=inside, excluded=excluded), 1 + len(_WRONG)
 
 
 def _outside(some: RowWeights, spans: list[tuple[float, float]]) -> RowWeights:
@@ -137,7 +138,7 @@ def share_left_out(problem: Problem, noise: NoiseModel) -> float:
 
 
 def evidence(problem: Problem, about: Points, spans: list[tuple[float, float]]) -> Array:
-    """(M, 3) log-likelihood of the innovations from each span's beginning on: neither, fixes or wheels wrong in it.
+    """(M, 5) log-likelihood of the innovations from each span's beginning on, with each of `_WRONG` wrong in it.
 
     Parameters
     ----------
@@ -148,7 +149,11 @@ def evidence(problem: Problem, about: Points, spans: list[tuple[float, float]]) 
     edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
     known = values_of(problem, about)
     found = []
-    for kinds in ((), FIXES, WHEELS):
+    present = {rows.name for rows in problem.constraints}
+    for kinds in _WRONG:
+        if kinds and not (present.issuperset(kinds) if kinds != WHEELS else present & set(WHEELS)):
+            found.append([-np.inf] * len(spans))
+            continue
         one = with_common_errors(problem, spans, kinds) if kinds else problem
         likelihood = refilter(one, points_of(one, about.states, known)).log_likelihood
         found.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)])
