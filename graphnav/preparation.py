@@ -118,6 +118,9 @@ def prepare(
         stops = detect(fixes, settings)
         changed = _differ(stops.stationary, detections.stationary)
         stops = stops if changed else detections
+        seen = recording.end if aligned.until is None else aligned.until
+        if not any(begin <= seen for spans in noise.excluded.values() for begin, _ in spans):
+            return aligned, stops, changed  # the start has seen none of them
         try:
             found = aligned_by(fixes, stops.stationary)
         except EstimationError:

@@ -111,7 +111,7 @@ def test_with_positions(positions: dict[str, Score], solver: str) -> None:
 
 
 @pytest.mark.xfail(
-    strict=False, reason="position 0.13 to 0.4 per axis: what lasts for hours adds its prior to white fixes"
+    run=False, reason="position 0.13 to 0.4 per axis: what lasts for hours adds its prior to white fixes"
 )
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_with_estimated_noise(estimated: dict[str, Score], solver: str) -> None:

@@ -224,7 +224,6 @@ def test_the_outage_of_the_oracle_drive_stays_below_a_decimetre(shared_data: Pat
         assert np.linalg.norm(off[:, :2], axis=1).max() < most
 
 
-@pytest.mark.xfail(strict=False, reason="batch 1.4 m")
 def test_a_minute_in_tokyo_without_gnss(shared_data: Path) -> None:
     """Real streets, 2020: measured 0.2 m (batch) and 0.7 m (filter); inertial alone 0.9 m and 40 m."""
     recording = read(shared_data / "tokyo_20201105").crop(1050.0, 1450.0)
