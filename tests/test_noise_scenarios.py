@@ -12,7 +12,7 @@ import pytest
 from graphnav import load
 from graphnav.config import Settings, settings_from
 from graphnav.evaluation import evaluate_recording
-from graphnav.noise_model import NoiseModel
+from graphnav.noise_model import STATED, NoiseModel
 from graphnav.pipeline import run
 from graphnav.recording import Recording
 from graphnav.rotation import Array
