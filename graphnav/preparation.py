@@ -155,8 +155,9 @@ def prepare(
             passes.update(filter=best.passes, smoother=best.passes)
         noise, known = best.noise, best.points
         passes.update(filter=1)
-        if _explains_more(base, best):
-            noise, known = STATED, None
+        plain = NoiseModel(excluded=noise.excluded)
+        if _explains_more(base, plain, best):
+            noise, known = plain, None
         booked("noise", since)
     else:
         aligned, detections, changed = without_wrong(noise)
@@ -209,11 +210,15 @@ def start_sigma(start: Alignment) -> Array:
     return sigma
 
 
-def _explains_more(base: Problem, found: NoiseEstimate) -> bool:
-    """Whether the figures as stated make the innovations likelier than the estimate, with its prior, does."""
+def _explains_more(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:
+    """Whether the figures as stated make the innovations likelier than the estimate, with its prior, does.
+
+    Both without what is left out: likelihoods are compared of the same measurements.
+    """
     known = values_of(with_noise(base, found.noise), found.points)
-    plain = refilter(base, points_of(base, found.points.states, known))
-    return float(np.sum(plain.log_likelihood)) > found.log_posterior
+    problem = with_noise(base, plain)
+    forward = refilter(problem, points_of(problem, found.points.states, known))
+    return float(np.sum(forward.log_likelihood)) > found.log_posterior
 
 
 def _start(found: Alignment, stated: Alignment) -> Alignment:
