@@ -192,7 +192,9 @@ def _estimated(
     passes.update(filter=used)
     if not noise.excluded:
         return found
-    again = estimate_noise(base, aligned.until, noise, (found.points, with_noise(base, found.noise)), progress)
+    # from the priors on: figures that were estimated with what is wrong in it are far from what they come to
+    anew = NoiseModel(excluded=noise.excluded)
+    again = estimate_noise(base, aligned.until, anew, (found.points, with_noise(base, found.noise)), progress)
     passes.update(filter=again.passes, smoother=again.passes)
     return again
 

@@ -135,8 +135,9 @@ def estimate_noise(
         else _carried(*near, with_noise(problem, figures.model()))
     )
     passes, total = int(near is None), len(problem.t)
-    rounds = _ROUNDS if start is None else _AGAIN
-    ends = [total] if total <= 2 * _FIRST or start is not None else [_FIRST, total]
+    warm = start is not None and bool(start.figures)
+    rounds = _AGAIN if warm else _ROUNDS
+    ends = [total] if total <= 2 * _FIRST or warm else [_FIRST, total]
     for end in ends:
         before = -np.inf
         figures.ahead = 1.0
