@@ -18,7 +18,7 @@ from graphnav.earth import LocalFrame
 from graphnav.noise.apply import row_weights, with_noise, without_parts
 from graphnav.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.noise.exclusion import FIXES, WHEELS
-from graphnav.noise.moments import disturbances, imu_moments, lag_moments, process_moments, row_moments
+from graphnav.noise.moments import imu_moments, lag_moments, process_moments, row_moments
 from graphnav.noise.priors import prior
 from graphnav.noise_model import STATED, Figure, NoiseModel, RowWeights
 from graphnav.pipeline import SOLVERS, origin, run
@@ -62,11 +62,11 @@ def groups(problem: Problem) -> list[str]:
 
 def moments(problem: Problem, forward: Forward, smoothed: Smoothed) -> dict[str, tuple[float, float]]:
     """A and B of every component."""
-    steps, out = disturbances(problem, forward, smoothed), {}
-    A, B = imu_moments(problem, forward, steps)
+    out: dict[str, tuple[float, float]] = {}
+    A, B = imu_moments(problem, forward, smoothed)
     out |= {f"imu.{name}": (A[:, i].sum(), B[:, i].sum()) for i, name in enumerate(NOISE_FIGURES)}
     for chain in problem.chains:
-        _, A, B = process_moments(problem, chain, steps, len(problem.t))
+        _, A, B = process_moments(problem, chain, smoothed, len(problem.t))
         own = np.array(chain.parameter.noise_groups)
         out |= {g: (A[:, own == g].sum(), B[:, own == g].sum()) for g in chain.parameter.noise_groups}
     for rows in problem.constraints:
@@ -124,13 +124,13 @@ def test_lag_moments_are_the_derivative_of_the_likelihood_by_the_correlation_tim
     used, noise, about = mixed(base, opening)
     forward = refilter(used, about)
     smoothed = backward(used, forward)
-    steps, h, K = disturbances(used, forward, smoothed), 0.01, len(used.t)
+    h, K = 0.01, len(used.t)
     lasting = [c for c in used.chains if c.parameter.noise_groups]
     assert len(lasting) >= 8
     for chain in lasting:
         p = chain.parameter
         assert p.correlation_time is not None
-        dt, later, cross, before = lag_moments(used, chain, forward, smoothed, steps, K)
+        dt, later, cross, before = lag_moments(used, chain, forward, smoothed, K)
 
         def expected(time: float, p=p, dt=dt, later=later, cross=cross, before=before) -> float:
             a = np.exp(-dt / time)[:, None]

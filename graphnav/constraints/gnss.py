@@ -253,9 +253,13 @@ class GnssVelocity(Constraint):
 
 
 def whole_sigma(rows: GnssPosition | GnssVelocity) -> Array:
-    """(3,) typical 1-sigma of a whole error: white part and what lasts."""
+    """(3,) typical 1-sigma of a whole error, white part and what lasts; at least what the receiver claims.
+
+    A fix that keeps to what its receiver claims is no wrong one, however much better the others are.
+    """
     lasting = sum((p.sigma**2 for p in rows.parameters if p.noise_groups and not p.constant), np.zeros(3))
-    return np.asarray(np.median(np.sqrt(rows.sigma**2 + lasting * rows.unit_error**2), axis=0))
+    whole = np.sqrt(rows.sigma**2 + lasting * rows.unit_error**2)
+    return np.asarray(np.median(np.maximum(whole, rows.unit_error), axis=0))
 
 
 def period(t: Array) -> float:

@@ -27,7 +27,7 @@ from scipy.special import chdtrc, chdtri
 from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import TIMES
 from graphnav.noise.apply import with_noise
-from graphnav.noise.moments import disturbances, imu_moments, lag_moments, process_moments, row_moments
+from graphnav.noise.moments import imu_moments, lag_moments, process_moments, row_moments
 from graphnav.noise.priors import TIME_WITHIN, prior
 from graphnav.noise_model import Figure, NoiseModel, RowWeights
 from graphnav.preintegration import NOISE_FIGURES
@@ -204,17 +204,16 @@ def _capped(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, flo
 
 def _improve(figures: _Figures, problem: Problem, forward: Forward, smoothed: Smoothed, end: int) -> None:
     """One step for all figures and weights."""
-    steps = disturbances(problem, forward, smoothed)
-    A, B = imu_moments(problem, forward, steps)
+    A, B = imu_moments(problem, forward, smoothed)
     for i, name in enumerate(NOISE_FIGURES):
         figures.update(f"imu.{name}", *_capped(A[:, i], B[:, i], 3, _CHANCE))
     driven: dict[str, tuple[Array, Array, Array]] = {}
     for chain in problem.chains:
         if chain.parameter.noise_groups:
-            driven[chain.parameter.name] = process_moments(problem, chain, steps, end)
+            driven[chain.parameter.name] = process_moments(problem, chain, smoothed, end)
             _improve_process(figures, chain, driven[chain.parameter.name])
             if chain.parameter.correlation_time == figures.times.get(chain.parameter.name, SECONDS):
-                _improve_time(figures, problem, chain, lag_moments(problem, chain, forward, smoothed, steps, end))
+                _improve_time(figures, problem, chain, lag_moments(problem, chain, forward, smoothed, end))
     for rows in problem.constraints:
         names, index = rows.noise_groups()
         if not names:

@@ -28,15 +28,6 @@ from graphnav.state import DIM
 
 
 @dataclass(frozen=True)
-class Steps:
-    """Disturbances of all steps: `step` n leads to keyframe n, and keyframe 0 is what the prior brings."""
-
-    r: Array  # (K, D)
-    N: Array  # (K, D, D)
-    inverse: Array  # (K, D, D) P-^-1
-
-
-@dataclass(frozen=True)
 class RowMoments:
     """Rows of a constraint at a smoothed solution."""
 
@@ -46,39 +37,25 @@ class RowMoments:
     whole: Array  # (N, m) squared whole error, what lasts included, against its steady variance
 
 
-def disturbances(problem: Problem, forward: Forward, smoothed: Smoothed) -> Steps:
-    """Of the steps between keyframes."""
-    ahead = forward.predicted
-    d = np.concatenate([smoothed.states.minus(ahead.states), smoothed.values - ahead.values], axis=1)
-    before = forward.P_predicted
-    # in units of its own sigmas: metres and rad/s apart by ten orders would leave no digits
-    root = np.sqrt(np.diagonal(before, axis1=1, axis2=2))
-    units = root[:, :, None] * root[:, None]
-    inverse = np.linalg.inv(before / units) / units
-    r = (inverse @ d[..., None])[..., 0]
-    N = inverse @ (before - smoothed.P) @ inverse
-    return Steps(r, 0.5 * (N + np.swapaxes(N, -1, -2)), inverse)
-
-
-def imu_moments(problem: Problem, forward: Forward, steps: Steps) -> tuple[Array, Array]:
+def imu_moments(problem: Problem, forward: Forward, smoothed: Smoothed) -> tuple[Array, Array]:
     """A and B (K-1, 4) of `NOISE_FIGURES`, by interval."""
     start = forward.predicted_from.R_nb
     L = problem.motion.frames(slice(0, len(start)), start)
     Lt = np.swapaxes(L, -1, -2)
-    r = (Lt @ steps.r[1:, :DIM, None])[..., 0]
-    N = Lt @ steps.N[1:, :DIM, :DIM] @ L
+    r = (Lt @ smoothed.r[1:, :DIM, None])[..., 0]
+    N = Lt @ smoothed.N[1:, :DIM, :DIM] @ L
     Q = problem.intervals.parts[: len(r)]
     A = np.einsum("ni,nfij,nj->nf", r, Q, r, optimize=True)
     return A, np.maximum(np.einsum("nfij,nji->nf", Q, N, optimize=True), 0.0)
 
 
-def process_moments(problem: Problem, chain: ParameterChain, steps: Steps, end: int) -> tuple[Array, Array, Array]:
+def process_moments(problem: Problem, chain: ParameterChain, smoothed: Smoothed, end: int) -> tuple[Array, Array, Array]:
     """Keyframes (n,) at which a process is driven, and A and B (n, k) there; the first is its steady variance."""
     at = problem.columns[chain.parameter.name]
     k = np.concatenate([[0], np.flatnonzero(np.diff(chain.node[:end])) + 1])
     q = chain.sigma[chain.node[k]] ** 2
-    N = np.diagonal(steps.N[k][:, at, at], axis1=-2, axis2=-1)
-    return k, q * steps.r[k, at] ** 2, q * np.maximum(N, 0.0)
+    N = np.diagonal(smoothed.N[k][:, at, at], axis1=-2, axis2=-1)
+    return k, q * smoothed.r[k, at] ** 2, q * np.maximum(N, 0.0)
 
 
 def row_moments(problem: Problem, rows: Constraint, smoothed: Smoothed, n: int) -> RowMoments:
@@ -105,15 +82,16 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: Smoothed, n: int) 
 
 
 def lag_moments(
-    problem: Problem, chain: ParameterChain, forward: Forward, smoothed: Smoothed, steps: Steps, end: int
+    problem: Problem, chain: ParameterChain, forward: Forward, smoothed: Smoothed, end: int
 ) -> tuple[Array, Array, Array, Array]:
     """Of a process, from node to node: times between (n,), E[c' c'], E[c' c] and E[c c] (n, k), c' the later."""
     at = problem.columns[chain.parameter.name]
     own = slice(at.start - DIM, at.stop - DIM)
     k = np.flatnonzero(np.diff(chain.node[:end])) + 1
-    # Cov(x_k-1, x_k) = P_k-1 F^T P-_k^-1 P^s_k, of the columns of the process
-    gain = forward.P[k - 1][:, at] @ np.swapaxes(forward.F[k - 1], -1, -2) @ steps.inverse[k]
-    cross = np.einsum("kid,kdi->ki", gain, smoothed.P[k][:, :, at])
+    # Cov(x_k-1, x_k) = P_k-1 F^T P-_k^-1 P^s_k = P_k-1 F^T (I - N P-_k), of the columns of the process
+    ahead = forward.P[k - 1][:, at] @ np.swapaxes(forward.F[k - 1], -1, -2)
+    rest = np.eye(ahead.shape[-1])[:, at] - smoothed.N[k] @ forward.P_predicted[k][:, :, at]
+    cross = np.einsum("kid,kdi->ki", ahead, rest)
     c0, c1 = smoothed.values[k - 1, own], smoothed.values[k, own]
     v0, v1 = (np.diagonal(smoothed.P[j][:, at, at], axis1=-2, axis2=-1) for j in (k - 1, k))
     dt = np.diff(chain.t)[chain.node[k] - 1]

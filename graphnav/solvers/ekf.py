@@ -40,6 +40,7 @@ from graphnav.solution import Solution
 from graphnav.solvers.passes import (
     Filtered,
     Forward,
+    Gain,
     Points,
     Progress,
     joined,
@@ -143,6 +144,7 @@ def _forward(
     verdicts = Verdicts(
         {c.name: problem.t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
     )
+    gains: list[list[Gain]] = [[] for _ in range(n)]
     begun, P = (x, P), _placed(P, records)
     found: list[Any] = [None] * K  # estimates, or errors where points are given
     ahead = found.copy()
@@ -168,8 +170,11 @@ def _forward(
                 P = _anywhere(P, "p" if isinstance(kind, GnssPosition) else "v")
         ahead[k], all_Pp[k] = x, P
         back: int | None = None
+        taken: list[Gain] | None = None
+        if k < n:
+            taken = gains[k] = []
         for some in stack.together(k, one_by_one if where is own else alone):
-            x, P, fault = _update(some, x, P, where, stack, bank)
+            x, P, fault = _update(some, x, P, where, stack, bank, taken)
             if fault is not None:
                 again = verdicts.settle(some.parts[0][0].name, fault, float(problem.t[k]))
                 back = int(np.searchsorted(problem.t, again))
@@ -208,6 +213,7 @@ def _forward(
         about,
         errors,
         errors_ahead,
+        gains,
         stack.log_likelihood,
     )
 
@@ -238,10 +244,11 @@ def _points(about: Points | None, errors: Array, own: list[Estimate]) -> Points:
 
 
 def _update(
-    some: Together, x: Any, P: Array, where: Any, stack: Stack, bank: Bank | None
+    some: Together, x: Any, P: Array, where: Any, stack: Stack, bank: Bank | None, taken: list[Gain] | None
 ) -> tuple[Any, Array, float | None]:
-    """One measurement update; when a fault began comes last."""
+    """One measurement update, added to what the keyframe has taken in; when a fault began comes last."""
     D, (rows, lo, hi) = len(P), some.parts[0]
+    end = D + 1 if taken is None else 2 * D + 1
     record = stack.records[rows.name]
     weight = float(min(record.used[lo:hi])) if some.alone else 1.0
     root_weight: float | Array = math.sqrt(weight) or 1.0 if some.alone else stack.root_weight[some.at]
@@ -252,7 +259,7 @@ def _update(
         r, sigma = r if e is None else r + H @ e, sigma / root_weight
         PHt = P @ H.T
         HPHt = H @ PHt
-        right = [r[None], PHt]
+        right = [r[None], PHt] if taken is None else [r[None], PHt, H.T]
         if some.alone and not left and tests is not None:
             G = tests.signature(rows.name, some.k, H)
             right.append(tests.own(rows.name, G).T)
@@ -277,13 +284,15 @@ def _update(
             bank.seen(rows.name, some.k, nis, weight > 0.0)
         if weight == 0.0:
             return x, P, None
+    if taken is not None:
+        taken.append((K, H, -solved[:, 0], solved[:, D + 1 : end]))
     # Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T
     P = P - K @ PHt.T
     P = P - (P @ H.T - K * (sigma * sigma)) @ K.T
     P = 0.5 * (P + P.T)  # rounding's asymmetry would grow, past what a stop leaves between its place and the state
     fault = None
     if tests is not None:
-        fault = tests.updated(rows.name, K, G, solved[:, D + 1 :], r, where.speed(some.k, x))
+        fault = tests.updated(rows.name, K, G, solved[:, end:], r, where.speed(some.k, x))
     elif bank is not None:
         bank.taken(K, H)
     return where.plus(at, d), P, fault

@@ -17,6 +17,7 @@ from graphnav.state import DIM, States
 
 _TURN = 0.02  # rad; what is linear in an error of attitude is wrong by half its square
 Progress = Callable[[str, float], None]
+Gain = tuple[Array, Array, Array, Array]  # of an update: K (D, m), H (m, D), S^-1 nu (m,) and S^-1 H (m, D)
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,9 @@ class Smoothed(Points):
     """A backward pass: states, parameter values and their joint covariance at every keyframe."""
 
     P: Array  # (K, D, D)
+    # of the disturbances before each keyframe that was linearised at given points: P^s = P- - P- N P-
+    r: Array  # (n, D)
+    N: Array  # (n, D, D)
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,7 @@ class Forward(Points):
     about: Points | None  # where the first n keyframes were linearised; up to the last of them P is of errors about
     errors: Array  # (n, D) these points, and the filtered
     errors_predicted: Array  # (n, D) and the predicted state is these errors away from them
+    gains: list[list[Gain]]  # (n,) of the updates there, in their order
     log_likelihood: Array  # (K,) of the innovations at each keyframe, but for a constant
 
     @property
