@@ -36,14 +36,13 @@ from graphnav.rotation import Array
 from graphnav.solvers.ekf import ekf, refilter
 from graphnav.solvers.passes import Forward, Points, Smoothed, points_of, values_of
 from graphnav.solvers.rts import backward
-from graphnav.state import SECONDS
 
 _CHANCE = 1e-3  # below which a squared residual is taken for an outlier
 _USUAL = 0.05  # of the squares of an aiding sensor, that count for no more: nearly two in five may be wrong
 _FIRST = 1500  # keyframes: figures told by a thousand numbers are good to a twentieth
 _ROUNDS, _AGAIN = 8, 3  # passes at most, from priors and from figures that were estimated before
 _AHEAD = 2.0  # times its own length that a step is taken at most (Aitken's extrapolation)
-_TIMES = (0.2, 60.0)  # s, between which what lasts for seconds is looked for
+_TIMES = 30.0  # by which a correlation time may be shorter or longer than usual
 _GRID = np.linspace(-1.0, 1.0, 21)
 
 
@@ -63,6 +62,7 @@ class _Figures:
     """The figures as they are so far."""
 
     log: dict[str, float]
+    usual_times: dict[str, float]  # s, correlation times to look about
     freedom: dict[str, float] = field(default_factory=dict)
     times: dict[str, float] = field(default_factory=dict)
     weights: dict[str, RowWeights] = field(default_factory=dict)
@@ -163,10 +163,12 @@ def _begin(problem: Problem, start: NoiseModel | None) -> _Figures:
         names += [*rows.noise_groups()[0], *(g for p in (*rows.parameters, *rows.processes) for g in p.noise_groups)]
     names += [group for p in problem.parameters.values() for group in p.noise_groups]
     log = {name: prior(name)[0] for name in dict.fromkeys(names)}
+    processes = [p for rows in problem.constraints for p in (*rows.parameters, *rows.processes)]
+    times = {p.name: p.correlation_time for p in processes if p.correlation_time is not None}
     if start is None:
-        return _Figures(log)
+        return _Figures(log, times)
     log |= {name: start.figures[name].log_factor for name in log if name in start.figures}
-    return _Figures(log, times=dict(start.times), weights=dict(start.weights), excluded=start.excluded)
+    return _Figures(log, times, times=dict(start.times), weights=dict(start.weights), excluded=start.excluded)
 
 
 def _first_points(problem: Problem, figures: _Figures, opening: float | None) -> Points:
@@ -212,8 +214,8 @@ def _improve(figures: _Figures, problem: Problem, forward: Forward, smoothed: Sm
         if chain.parameter.noise_groups:
             driven[chain.parameter.name] = process_moments(problem, chain, smoothed, end)
             _improve_process(figures, chain, driven[chain.parameter.name])
-            if chain.parameter.correlation_time == figures.times.get(chain.parameter.name, SECONDS):
-                _improve_time(figures, problem, chain, lag_moments(problem, chain, forward, smoothed, end))
+            if chain.parameter.correlation_time is not None:
+                _improve_time(figures, chain, lag_moments(problem, chain, forward, smoothed, end))
     for rows in problem.constraints:
         names, index = rows.noise_groups()
         if not names:
@@ -235,8 +237,8 @@ def _improve_process(figures: _Figures, chain: ParameterChain, moments: tuple[Ar
         figures.update(group, *_capped(A[:, own], B[:, own], 1, _USUAL))
 
 
-def _improve_time(figures: _Figures, problem: Problem, chain: ParameterChain, lags: tuple[Array, ...]) -> None:
-    """The correlation time by expectation and maximisation, on a grid, with a log-normal prior about `SECONDS`."""
+def _improve_time(figures: _Figures, chain: ParameterChain, lags: tuple[Array, ...]) -> None:
+    """The correlation time by expectation and maximisation, on a grid, with a log-normal prior about what it was."""
     dt, later, cross, before = lags
     p = chain.parameter
     assert p.correlation_time is not None
@@ -248,13 +250,14 @@ def _improve_time(figures: _Figures, problem: Problem, chain: ParameterChain, la
     q = (1.0 - a * a) * chain.sigma[0] ** 2
     squares = later[:, None] - 2.0 * a * cross[:, None] + a * a * before[:, None]
     value = -0.5 * np.sum((np.log(q) + squares / q)[..., told], axis=(0, 2))
-    value -= 0.5 * (np.log(times / SECONDS) / TIME_WITHIN) ** 2
+    usual = figures.usual_times[p.name]
+    value -= 0.5 * (np.log(times / usual) / TIME_WITHIN) ** 2
     j = int(np.clip(np.argmax(value), 1, len(_GRID) - 2))
     low, here, high = value[j - 1 : j + 2]
     bend = low - 2.0 * here + high
     off = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
     found = p.correlation_time * np.exp(_GRID[j] + (_GRID[1] - _GRID[0]) * np.clip(off, -1.0, 1.0))
-    figures.times[p.name] = float(np.clip(found, *_TIMES))
+    figures.times[p.name] = float(np.clip(found, usual / _TIMES, usual * _TIMES))
 
 
 def _weigh(figures: _Figures, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:

@@ -49,7 +49,9 @@ def imu_moments(problem: Problem, forward: Forward, smoothed: Smoothed) -> tuple
     return A, np.maximum(np.einsum("nfij,nji->nf", Q, N, optimize=True), 0.0)
 
 
-def process_moments(problem: Problem, chain: ParameterChain, smoothed: Smoothed, end: int) -> tuple[Array, Array, Array]:
+def process_moments(
+    problem: Problem, chain: ParameterChain, smoothed: Smoothed, end: int
+) -> tuple[Array, Array, Array]:
     """Keyframes (n,) at which a process is driven, and A and B (n, k) there; the first is its steady variance."""
     at = problem.columns[chain.parameter.name]
     k = np.concatenate([[0], np.flatnonzero(np.diff(chain.node[:end])) + 1])
