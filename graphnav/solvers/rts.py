@@ -23,6 +23,7 @@ from scipy.linalg.lapack import dposv
 from graphnav.dense import dense
 from graphnav.errors import EstimationError
 from graphnav.problem import Problem
+from graphnav.rotation import Array
 from graphnav.solution import Solution
 from graphnav.solvers.passes import (
     Filtered,
