@@ -54,6 +54,7 @@ class NoiseModel:
     times: Mapping[str, float] = field(default_factory=dict)  # s, correlation time of a process by its parameter
     weights: Mapping[str, RowWeights] = field(default_factory=dict)  # by constraint
     excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)  # spans (s) by constraint
+    spacing: float = 0.0  # s, at least, between the fixes that are used (`graphnav.noise.spacing`)
 
     def factor(self, group: str, missing: float) -> float:
         """On the variance of a group; `missing` where nothing is said of it."""

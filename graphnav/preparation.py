@@ -24,6 +24,7 @@ from graphnav.errors import EstimationError
 from graphnav.noise.apply import with_noise, without_parts
 from graphnav.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.noise.exclusion import exclude, share_left_out, without_excluded
+from graphnav.noise.spacing import space_fixes
 from graphnav.noise.words import describe
 from graphnav.noise_model import STATED, NoiseModel
 from graphnav.problem import Problem, pose
@@ -104,9 +105,7 @@ def prepare(
     def build(at: Alignment, found: Detections, parts: bool) -> Problem:
         tell("preintegration")
         since, start = time.perf_counter(), _start(at, with_known_heading(at, settings))
-        problem = pose(
-            recording, settings, frame, start.state, start_sigma(start), found.stationary, parts_of_noise=parts
-        )
+        problem = pose(used, settings, frame, start.state, start_sigma(start), found.stationary, parts_of_noise=parts)
         booked("preintegration", since)
         return problem
 
@@ -133,6 +132,8 @@ def prepare(
     told = aligned.motion is not None and settings.gnss.position
     if noise is None and (settings.noise.mode == "stated" or not told):
         noise = STATED
+    spacing = settings.noise.spacing if noise is None else noise.spacing
+    used = space_fixes(recording, spacing) if spacing else recording
     base = build(aligned, detections, parts=noise != STATED)
     if noise is None:
         since = time.perf_counter()
@@ -158,6 +159,7 @@ def prepare(
         plain = NoiseModel(excluded=noise.excluded)
         if _explains_more(base, plain, best):
             noise, known = plain, None
+        noise = replace(noise, spacing=spacing)
         booked("noise", since)
     else:
         aligned, detections, changed = without_wrong(noise)

@@ -64,6 +64,13 @@ class NoiseSettings(Section):
     mode: Literal["estimated", "stated"] = Field(
         "estimated", description="estimated from the recording by likelihood, or as the recording states it"
     )
+    spacing: float = Field(
+        1.0,
+        ge=0,
+        le=60,
+        description="s between the fixes that are used where noise is estimated: a receiver that reports faster"
+        " repeats its errors; 0 uses all",
+    )
 
 
 class SolverSettings(Section):

@@ -7,6 +7,7 @@ Under the key "noise", in a file of its own or in the summary.json of a run::
     correlation_times   s, by the parameter of a process
     weights             by constraint: t (s) and weight of rows with less information
     excluded            by constraint: [begin, end] (s) of spans left out
+    spacing             s between the fixes that are used, 0 for all
 
     pieces              how many pieces the recording was cut into, the figures being those of the first; for people
 
@@ -35,7 +36,7 @@ from graphnav.preintegration import NOISE_FIGURES
 from graphnav.recording import FIX_TYPES
 
 MODES: tuple[str, ...] = get_args(NoiseSettings.model_fields["mode"].annotation)
-_KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded")
+_KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded", "spacing")
 _FIGURE = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
            "degrees_of_freedom": "freedom"}  # fmt: skip
 _BESIDE = ("variance_factor", "stated", "used", "unit", "correlation_time")
@@ -65,6 +66,7 @@ def noise_values(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
             if len(some.t)
         },
         "excluded": {name: [[float(a), float(b)] for a, b in spans] for name, spans in noise.excluded.items() if spans},
+        "spacing": float(noise.spacing),
     }
 
 
@@ -140,6 +142,7 @@ class _Reader:
             self.each(values, "correlation_times", _known_processes(), self.time),
             self.each(values, "weights", constraints, self.weights),
             self.each(values, "excluded", constraints, self.spans),
+            self.number("noise.spacing", values.get("spacing", 0.0), 0.0, 60.0, "s between fixes"),
         ), mode
 
     def error(self, key: str, value: Any, why: str) -> ConfigError:
