@@ -190,12 +190,12 @@ def _estimated(
     passes.update(filter=found.passes, smoother=found.passes)
     if settings.gnss.faults == "off":
         return found
-    noise, used = exclude(base, found)
-    passes.update(filter=used)
-    if not noise.excluded:
+    explained = exclude(base, found)
+    passes.update(filter=explained.passes)
+    if not explained.noise.excluded:
         return found
     # from the priors on: figures that were estimated with what is wrong in it are far from what they come to
-    anew = NoiseModel(excluded=noise.excluded)
+    anew = NoiseModel(excluded=explained.noise.excluded)
     again = estimate_noise(base, aligned.until, anew, (found.points, with_noise(base, found.noise)), progress)
     passes.update(filter=again.passes, smoother=again.passes)
     return again

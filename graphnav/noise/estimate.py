@@ -54,6 +54,7 @@ class NoiseEstimate:
     points: Smoothed
     forward: Forward
     log_posterior: float
+    log_prior: float
     passes: int
 
 
@@ -145,7 +146,8 @@ def estimate_noise(
             used = with_noise(problem, figures.model())
             forward, smoothed = _pass(used, about, end)
             passes += 1
-            now = float(np.sum(forward.log_likelihood)) + figures.log_prior()
+            prior_then = figures.log_prior()
+            now = float(np.sum(forward.log_likelihood)) + prior_then
             if progress is not None:
                 progress("noise", (k + 1) / rounds)
             _improve(figures, used, forward, smoothed, end)
@@ -154,7 +156,7 @@ def estimate_noise(
             if k > 1 and abs(now - before) < 0.5 * len(figures.log):
                 break
             before, figures.ahead = now, _AHEAD if k > 1 and now > before else 1.0
-    return NoiseEstimate(figures.model(), smoothed, forward, now, passes)
+    return NoiseEstimate(figures.model(), smoothed, forward, now, prior_then, passes)
 
 
 def _begin(problem: Problem, start: NoiseModel | None) -> _Figures:
