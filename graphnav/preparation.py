@@ -23,7 +23,7 @@ from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.noise.apply import with_noise, without_parts
 from graphnav.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.noise.exclusion import exclude, share_left_out, without_excluded
+from graphnav.noise.exclusion import estimate_without_faults, share_left_out, without_excluded
 from graphnav.noise.spacing import space_fixes
 from graphnav.noise.words import describe
 from graphnav.noise_model import STATED, NoiseModel
@@ -185,20 +185,11 @@ def prepare(
 def _estimated(
     base: Problem, aligned: Alignment, settings: Settings, progress: Progress | None, passes: Counter[str]
 ) -> NoiseEstimate:
-    """The noise model, with spans of wrong measurements left out where evidence says so."""
-    found = estimate_noise(base, aligned.until, progress=progress)
-    passes.update(filter=found.passes, smoother=found.passes)
-    if settings.gnss.faults == "off":
-        return found
-    explained = exclude(base, found)
-    passes.update(filter=explained.passes)
-    if not explained.noise.excluded:
-        return found
-    # from the priors on: figures that were estimated with what is wrong in it are far from what they come to
-    anew = NoiseModel(excluded=explained.noise.excluded)
-    again = estimate_noise(base, aligned.until, anew, (found.points, with_noise(base, found.noise)), progress)
-    passes.update(filter=again.passes, smoother=again.passes)
-    return again
+    """The noise model, with spans of wrong measurements left out if they are to be."""
+    estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
+    found = estimate(base, aligned.until, progress=progress)
+    passes.update(filter=found.passes + found.looks, smoother=found.passes)
+    return found
 
 
 def start_sigma(start: Alignment) -> Array:

@@ -55,7 +55,8 @@ class NoiseEstimate:
     forward: Forward
     log_posterior: float
     log_prior: float
-    passes: int
+    passes: int  # of filter and smoother
+    looks: int = 0  # passes of the filter alone, for measurements that are wrong
 
 
 @dataclass

@@ -20,6 +20,7 @@ is decided with these, and of the two explanations of all measurements the likel
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -55,7 +56,6 @@ class _Shifted(Constraint):
     inner: Any = None
     error: str = ""
     since: Any = None  # (N,) s since the span began
-
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -115,7 +115,34 @@ class Explained:
 
     noise: NoiseModel
     log_evidence: float
-    passes: int  # of the filter
+    passes: int  # of filter and smoother
+    looks: int  # of the filter alone
+
+
+def estimate_without_faults(
+    base: Problem, opening: float | None = None, progress: Callable[[str, float], None] | None = None
+) -> NoiseEstimate:
+    """The noise model, estimated again without the spans of wrong measurements that evidence leaves out.
+
+    Parameters
+    ----------
+    base : posed with stated noise and the parts of its intervals' noise.
+    opening : as for `graphnav.solvers.ekf.ekf`.
+
+    Raises
+    ------
+    EstimationError
+        If the filter breaks down.
+    """
+    found = estimate_noise(base, opening, progress=progress)
+    explained = exclude(base, found)
+    found = replace(found, passes=found.passes + explained.passes, looks=explained.looks)
+    if not explained.noise.excluded:
+        return found
+    # from the priors on: figures that were estimated with what is wrong in it are far from what they come to
+    anew = NoiseModel(excluded=explained.noise.excluded)
+    again = estimate_noise(base, opening, anew, (found.points, with_noise(base, found.noise)), progress)
+    return replace(again, passes=found.passes + again.passes, looks=found.looks)
 
 
 def exclude(base: Problem, found: NoiseEstimate) -> Explained:
@@ -131,12 +158,12 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
     hidden = find_spans(base, NoiseModel(medians), found)
     if all(any(a <= begin and end <= b for a, b in spans) for begin, end in hidden):
-        return replace(one, passes=one.passes + 2)
+        return replace(one, looks=one.looks + 2)
     without = NoiseModel(excluded=dict.fromkeys(FIXES, tuple(hidden)))
     other = estimate_noise(base, None, without, (found.points, with_noise(base, found.noise)))
     two = decide(base, other, hidden)
     best = two if two.log_evidence > one.log_evidence else one
-    return replace(best, passes=one.passes + two.passes + other.passes + 2)
+    return replace(best, passes=other.passes, looks=one.looks + two.looks + 2)
 
 
 def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[tuple[float, float]]:
@@ -151,7 +178,7 @@ def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[t
 def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]) -> Explained:
     """Who is wrong in each span, by the figures found."""
     if not spans:
-        return Explained(found.noise, found.log_posterior, 0)
+        return Explained(found.noise, found.log_posterior, 0, 0)
     noise = replace(found.noise, excluded={})
     inside = {name: _outside(some, spans) for name, some in noise.weights.items()}
     used = with_noise(base, replace(noise, weights=inside))
@@ -165,7 +192,7 @@ def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]
         excluded |= {name: (*excluded.get(name, ()), span) for name in _WRONG[best]}
     present = {rows.name for rows in base.constraints}
     excluded = {name: some for name, some in excluded.items() if name in present}
-    return Explained(replace(noise, weights=inside, excluded=excluded), total, len(_WRONG))
+    return Explained(replace(noise, weights=inside, excluded=excluded), total, 0, len(_WRONG))
 
 
 def _outside(some: RowWeights, spans: list[tuple[float, float]]) -> RowWeights:

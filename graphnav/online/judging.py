@@ -23,8 +23,8 @@ from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import EstimationError
 from graphnav.noise.apply import with_noise
-from graphnav.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.noise.exclusion import exclude
+from graphnav.noise.estimate import estimate_noise
+from graphnav.noise.exclusion import estimate_without_faults
 from graphnav.noise.words import describe
 from graphnav.noise_model import NoiseModel
 from graphnav.online.sensors import Sensors, unit_of
@@ -100,7 +100,8 @@ class Judgement:
                 recording, settings, frame, start.state, start_sigma(start), stationary, times, parts_of_noise=True
             )  # fmt: skip
             base = _level(base)
-            noise = _estimated(base, start.until, settings).noise
+            estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
+            noise = estimate(base, start.until).noise
             used = with_noise(base, noise)
             said, wrong = describe(noise, used), faults.spans(used)
             self._answer = Answer(_in_unit(noise, base, unit), said, stationary, wrong)
@@ -115,17 +116,6 @@ class Judgement:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._begin()
-
-
-def _estimated(base: Problem, opening: float | None, settings: Settings) -> NoiseEstimate:
-    """The noise model, with spans of wrong measurements left out where evidence says so: as for a recording."""
-    found = estimate_noise(base, opening)
-    if settings.gnss.faults == "off":
-        return found
-    noise, _ = exclude(base, found)
-    if not noise.excluded:
-        return found
-    return estimate_noise(base, opening, noise, (found.points, with_noise(base, found.noise)))
 
 
 def _level(base: Problem) -> Problem:
