@@ -16,6 +16,7 @@ from graphnav.constraints.prior import InitialPrior
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.errors import ConfigError, EstimationError
+from graphnav.noise.words import describe_far
 from graphnav.noise_model import NoiseModel
 from graphnav.onboard_offset import without_onboard_offset
 from graphnav.own_noise import with_own_noise
@@ -145,6 +146,7 @@ def _solve(
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
     wrong = faults.spans(problem, smoothed)
     notes = (*found.start.notes, *undone, *shown, *found.detections.notes, *found.notes, *faults.notes(wrong, problem))
+    notes = (*notes, *describe_far(problem, smoothed))
     start, passes = smoothed, Counter(found.passes)
     if found.astray:
         prior = InitialPrior(

@@ -6,6 +6,7 @@ import numpy as np
 
 from graphnav.noise_model import NoiseModel
 from graphnav.problem import Problem
+from graphnav.solvers.passes import Points, shift
 
 _IMU = {
     "imu.gyro_noise_density": "gyro noise",
@@ -13,6 +14,29 @@ _IMU = {
     "imu.gyro_bias_walk": "gyro bias walk",
     "imu.accel_bias_walk": "accelerometer bias walk",
 }
+
+
+_FAR = 5.0  # prior sigmas, which chance does not reach
+
+
+def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
+    """Sentences on constants that the data put farther from what is stated of them than they can be."""
+    out = []
+    for chain in problem.chains:
+        p = chain.parameter
+        if not p.constant:
+            continue
+        value = smoothed.values[-1, shift(problem.columns[p.name])]
+        away = np.abs(value - p.initial) / p.sigma
+        k = int(np.argmax(away))
+        if away[k] > _FAR:
+            which = f" (number {k + 1} of {p.size})" if p.size > 1 else ""
+            out.append(
+                f"{p.name}{which} comes out at {value[k]:.2g} {p.unit}, {away[k]:.0f} sigmas from the "
+                f"{p.initial[k]:.2g} +- {p.sigma[k]:.2g} that is stated of it: what is stated is wrong, or it stands "
+                "in for an error of another kind"
+            )
+    return tuple(out)
 
 
 def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
