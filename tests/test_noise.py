@@ -13,6 +13,8 @@ from scipy.special import chdtri
 from graphnav import load
 from graphnav.alignment import align
 from graphnav.config import Settings, settings_from
+from graphnav.config.gnss import GnssSettings
+from graphnav.constraints.gnss import STAMPS
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.noise.apply import row_weights, with_noise, without_parts
@@ -125,7 +127,7 @@ def test_lag_moments_are_the_derivative_of_the_likelihood_by_the_correlation_tim
     forward = refilter(used, about)
     smoothed = backward(used, forward)
     h, K = 0.01, len(used.t)
-    lasting = [c for c in used.chains if c.parameter.noise_groups]
+    lasting = [c for c in used.chains if c.parameter.correlation_time is not None]
     assert len(lasting) >= 8
     for chain in lasting:
         p = chain.parameter
@@ -209,7 +211,7 @@ def test_factors_of_rows_and_processes_are_of_their_own_components() -> None:
     )
     assert used["odometer"].sigma == pytest.approx(0.5 * stated["odometer"].sigma)
     assert used["nhc"].sigma == pytest.approx(stated["nhc"].sigma)
-    (process,) = (p for p in used["gnss_position"].parameters if p.noise_groups)
+    (process,) = (p for p in used["gnss_position"].parameters if p.correlation_time is not None)
     assert process.name == "gnss_error_of_minutes_float"
     assert process.correlation_time == 40.0
     assert process.sigma[2] == pytest.approx(3.0)
@@ -245,6 +247,16 @@ def with_lasting_errors(recording: Recording, variances: dict[float, float], see
     return replace(recording, gnss=replace(gnss, llh=gnss.llh + oracle.llh_rate(gnss.llh, e)))
 
 
+def with_wrong_stamps(recording: Recording, truth: Trajectory, seed: int) -> Recording:
+    """Fixes that were taken earlier or later than they say, by an offset of all and by one of each, 20 ms."""
+    gnss, rng = recording.gnss, np.random.default_rng([seed, 10])
+    assert gnss is not None
+    assert truth.v is not None
+    v = np.column_stack([np.interp(gnss.t, truth.t, truth.v[:, i]) for i in range(3)])
+    late = GnssSettings().time_offset_sigma * (rng.standard_normal() + rng.standard_normal(len(gnss.t)))
+    return replace(recording, gnss=replace(gnss, llh=gnss.llh + oracle.llh_rate(gnss.llh, v * late[:, None])))
+
+
 def stating(recording: Recording, imu: float = 1.0, fixes: float = 1.0) -> Recording:
     """The same measurements with densities or sigmas divided by a factor."""
     noise, gnss = recording.imu.noise, recording.gnss
@@ -271,11 +283,13 @@ SHARES = {3.0: 0.25, 100.0: 0.5, 3600.0: 0.5}
 
 def made(path: oracle.ExactPath, seed: int, imu: float = 1.0, fixes: float = 1.0) -> Drive:
     recording, truth = oracle.drive(path, seed=seed)
-    recording = stating(with_lasting_errors(recording, SHARES, seed), imu, fixes)
+    recording = with_wrong_stamps(with_lasting_errors(recording, SHARES, seed), truth, seed)
+    recording = stating(recording, imu, fixes)
     base, opening = posed(recording, INERTIAL)
     true = dict.fromkeys(groups(base), 0.0)
     for name in true:
-        true[name] = prior(name)[0] + 2.0 * np.log(fixes if name.startswith("gnss") else 1.0)
+        of_fixes = name.startswith("gnss") and name != STAMPS
+        true[name] = prior(name)[0] + 2.0 * np.log(fixes if of_fixes else 1.0)
     for name in ("gyro", "accel"):
         true[f"imu.{name}_noise_density"] = 2.0 * np.log(imu)
     return Drive(base, opening, truth, true)

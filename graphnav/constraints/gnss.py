@@ -8,7 +8,8 @@ ENU at the fix, where receivers state their sigmas::
     omega_nb = omega_b - b_g - R_nb^T omega_ie
 
 d is what must be added to the stamps of the fixes, one constant for positions and one for velocities: a
-receiver's filters delay them differently (boulder's differ by 0.1 s, dresden's by 0.7 s).
+receiver's filters delay them differently (boulder's differ by 0.1 s, dresden's by 0.7 s). To it comes what the stamp of
+a single fix is wrong by, where fixes are stamped when they arrive: white, the same for position and velocity of a fix.
 
 e is the time-correlated part of a position's error: fixes of one receiver seconds apart are wrong alike, and a thousand
 of them are not worth a thousand. It is the sum of three Gauss-Markov processes in units of the stated sigma: one of
@@ -35,12 +36,16 @@ from graphnav.state import NODE_SPACING, SECONDS, Parameter, States
 
 LEVER_ARM = "gnss_lever_arm"
 TIME_OFFSET = "gnss_time_offset"
+VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
 TIMES = ("seconds", "minutes", "hours")  # of the processes of a position's error
 ERRORS = tuple(f"gnss_error_of_{time}" for time in TIMES)
 VELOCITY_ERROR = "gnss_velocity_error"
-VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
+STAMP_ERROR = "gnss_stamp_error"
+STAMPS = "gnss_position.stamps"  # its variance component
+OFFSETS = {f"prior.{name}": name for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET)}  # and those of the offsets' priors
 _I3 = np.eye(3)
 _MINUTE = 60.0  # s
+_WHITE = 1e-3  # s, a correlation time that leaves nothing from one fix to the next
 _WINDOW = 0.05  # s each side over which turn rate and force at a fix are averaged
 
 
@@ -63,8 +68,27 @@ def _common(scene: Scene, offset: str) -> dict[str, Any]:
     if settings.lever_arm_sigma is not None:
         parameters.append(Parameter(LEVER_ARM, gnss.lever_arm, np.full(3, settings.lever_arm_sigma), "m"))
     if settings.time_offset_sigma > 0:
-        parameters.append(Parameter(offset, np.zeros(1), np.full(1, settings.time_offset_sigma), "s"))
+        sigma = np.full(1, settings.time_offset_sigma)
+        parameters.append(Parameter(offset, np.zeros(1), sigma, "s", noise_groups=(f"prior.{offset}",)))
     return {"parameters": tuple(parameters), "watched": settings.faults != "off", **settings.outliers}
+
+
+def _stamp_error(settings: Settings, t: Array) -> tuple[Parameter, ...]:
+    """What the stamps of single fixes are wrong by, in units of what an offset of all of them may be."""
+    sigma = np.full(1, settings.gnss.time_offset_sigma)
+    if not sigma[0] > 0.0:
+        return ()
+    spacing = node_spacing((), period(t))
+    own = (STAMPS,)
+    return (
+        Parameter(STAMP_ERROR, np.zeros(1), sigma, "s", correlation_time=_WHITE, spacing=spacing, noise_groups=own),
+    )
+
+
+def _time_offset(parameters: dict[str, Array], constant: str) -> Array | None:
+    """(n, 1) s to be added to stamps, and None where nothing of it is estimated."""
+    some = [parameters[name] for name in (constant, STAMP_ERROR) if name in parameters]
+    return np.asarray(sum(some)) if some else None
 
 
 @dataclass(frozen=True)
@@ -129,7 +153,7 @@ class GnssPosition(Constraint):
             lever_arm=gnss.lever_arm,
             gyro=around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
             omega_n=scene.frame.omega_n,
-            processes=processes,
+            processes=(*processes, *_stamp_error(scene.settings, gnss.t[used])),
             **common,
         )
 
@@ -149,14 +173,14 @@ class GnssPosition(Constraint):
         J = {"theta": -R @ rotation.skew(lever), "p": _I3[None]}
         if LEVER_ARM in parameters:
             J[LEVER_ARM] = R
-        if TIME_OFFSET in parameters:
-            offset = parameters[TIME_OFFSET]
+        offset = _time_offset(parameters, TIME_OFFSET)
+        if offset is not None:
             velocity, moved = _antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
             away = away + velocity * offset
             for block in ("theta", "v", "bg", LEVER_ARM):
                 if block != LEVER_ARM or LEVER_ARM in parameters:
                     J[block] = J.get(block, 0.0) + moved[block] * offset[..., None]
-            J[TIME_OFFSET] = velocity[..., None]
+            J |= {name: velocity[..., None] for name in (TIME_OFFSET, STAMP_ERROR) if name in parameters}
         residual, jacobians = mv(C, away), {block: C @ x for block, x in J.items()}
         for name in parameters:
             if name.startswith(ERRORS):
@@ -228,7 +252,7 @@ class GnssVelocity(Constraint):
             omega_n=scene.frame.omega_n,
             lever_arm=gnss.lever_arm,
             unit_error=_running_median(gnss.t[used], gnss.sd_v[used]),
-            processes=(lasting,),
+            processes=(lasting, *_stamp_error(scene.settings, gnss.t[used])),
             **_common(scene, VELOCITY_TIME_OFFSET),
         )
 
@@ -238,13 +262,15 @@ class GnssVelocity(Constraint):
         velocity, moved = _antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
         residual = mv(C, velocity) - self.v_l[rows]
         jacobians = {block: C @ J for block, J in moved.items() if block != LEVER_ARM or LEVER_ARM in parameters}
-        if VELOCITY_TIME_OFFSET in parameters:
-            offset = parameters[VELOCITY_TIME_OFFSET]
+        offset = _time_offset(parameters, VELOCITY_TIME_OFFSET)
+        if offset is not None:
             CR, force = C @ states.R_nb, self.accel[rows] - states.ba
             change = mv(CR, force) + mv(C, self.g_n[rows])
             residual = residual + change * offset
             jacobians["theta"] = jacobians["theta"] - CR @ rotation.skew(force) * offset[..., None]
-            jacobians |= {"ba": -CR * offset[..., None], VELOCITY_TIME_OFFSET: change[..., None]}
+            jacobians["ba"] = -CR * offset[..., None]
+            some = (VELOCITY_TIME_OFFSET, STAMP_ERROR)
+            jacobians |= {name: change[..., None] for name in some if name in parameters}
         if VELOCITY_ERROR in parameters:
             size = self.unit_error[rows]
             residual = residual + size * parameters[VELOCITY_ERROR]
@@ -257,7 +283,7 @@ def whole_sigma(rows: GnssPosition | GnssVelocity) -> Array:
 
     A fix that keeps to what its receiver claims is no wrong one, however much better the others are.
     """
-    lasting = sum((p.sigma**2 for p in rows.parameters if p.noise_groups and not p.constant), np.zeros(3))
+    lasting = sum((p.sigma**2 for p in rows.parameters if p.name.startswith((*ERRORS, VELOCITY_ERROR))), np.zeros(3))
     whole = np.sqrt(rows.sigma**2 + lasting * rows.unit_error**2)
     return np.asarray(np.median(np.maximum(whole, rows.unit_error), axis=0))
 

@@ -153,8 +153,8 @@ def estimate_noise(
                 progress("noise", (k + 1) / rounds)
             _improve(figures, used, forward, smoothed, end)
             about = _spliced(about, smoothed)
-            # what is left to gain is less than as many figures gain by chance
-            if k > 1 and abs(now - before) < 0.5 * len(figures.log):
+            # a tenth of what chance makes as many figures gain
+            if k > 1 and abs(now - before) < 0.05 * len(figures.log):
                 break
             before, figures.ahead = now, _AHEAD if k > 1 and now > before else 1.0
     return NoiseEstimate(figures.model(), smoothed, forward, now, prior_then, passes)

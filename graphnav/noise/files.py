@@ -28,7 +28,7 @@ import numpy as np
 from graphnav.complaints import nearest
 from graphnav.config.settings import NoiseSettings
 from graphnav.constraints import registered
-from graphnav.constraints.gnss import ERRORS, TIMES, VELOCITY_ERROR
+from graphnav.constraints.gnss import ERRORS, OFFSETS, STAMP_ERROR, STAMPS, TIMES, VELOCITY_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.errors import ConfigError
 from graphnav.noise_model import Figure, NoiseModel, RowWeights
@@ -107,7 +107,7 @@ def read_noise_and_mode(path: str | Path) -> tuple[NoiseModel, str]:
 
 def known_groups() -> tuple[str, ...]:
     """Names of all variance components that a recording can have."""
-    out = [f"imu.{name}" for name in NOISE_FIGURES]
+    out = [*(f"imu.{name}" for name in NOISE_FIGURES), STAMPS, *OFFSETS]
     for cls in registered():
         axes = dict.fromkeys(cls.noise_axes)
         kinds = ["", *(f".{kind}" for kind in FIX_TYPES.values())] if cls.name == "gnss_position" else [""]
@@ -122,7 +122,7 @@ def known_groups() -> tuple[str, ...]:
 
 def _known_processes() -> tuple[str, ...]:
     typed = [f"{error}_{kind}" for error in ERRORS for kind in FIX_TYPES.values()]
-    return (*ERRORS, *typed, VELOCITY_ERROR, NHC_ERROR, ODOMETER_ERROR)
+    return (*ERRORS, *typed, VELOCITY_ERROR, STAMP_ERROR, NHC_ERROR, ODOMETER_ERROR)
 
 
 class _Reader:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav.constraints.gnss import TIMES, VELOCITY_ERROR
+from graphnav.constraints.gnss import OFFSETS, STAMPS, TIMES, VELOCITY_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.noise_model import Figure, NoiseModel
 from graphnav.recording import FIX_TYPES, ImuNoise, Recording
@@ -61,6 +61,10 @@ def figure_rows(
             stated = float(getattr(recording.imu.noise, axis))
             used = root * float(getattr(imu or recording.imu.noise, axis))
             out.append(FigureRow(group, words, figure, stated, used, unit, None))
+            continue
+        if group == STAMPS or group in OFFSETS:
+            words = "fixes, stamp of each" if group == STAMPS else f"{OFFSETS[group]}, prior".replace("_", " ")
+            out.append(FigureRow(group, words, figure, None, None, "s", None))
             continue
         time = next((part for part in middle if part in lasts), None)
         kind = next((part for part in middle if part not in lasts), None)

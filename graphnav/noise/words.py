@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
 from graphnav.noise_model import NoiseModel
 from graphnav.problem import Problem
 from graphnav.solvers.passes import Points, shift
@@ -49,7 +50,9 @@ def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
         out.append(f"noise model, IMU: stated figures multiplied by: {', '.join(imu)}")
     for rows in problem.constraints:
         names = [g for g in rows.noise_groups()[0] if g in noise.figures]
-        errors = [p for p in rows.parameters if p.noise_groups and p.correlation_time is not None]
+        errors = [
+            p for p in rows.parameters if p.noise_groups and p.correlation_time is not None and p.name != STAMP_ERROR
+        ]
         if not names:
             continue
         parts = [f"{g.removeprefix(rows.name + '.')} {np.sqrt(noise.figures[g].factor):.2g}" for g in names]
@@ -58,6 +61,9 @@ def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
             each = ", ".join(f"{g.rsplit('.', 1)[-1]} {np.sqrt(noise.factor(g, 0.0)):.2g}" for g in sizes)
             out_time = f"{p.correlation_time:.2g} s"
             parts.append(f"Gauss-Markov with {out_time}: {each}")
+        stamps = next((p for p in rows.parameters if p.name == STAMP_ERROR), None)
+        if stamps is not None and rows.name == GnssPosition.name:
+            parts.append(f"stamp of each fix {stamps.sigma[0]:.2g} s")
         out.append(f"noise model, {rows.name}: white part in stated sigmas: {'; '.join(parts)}")
         some = noise.weights.get(rows.name)
         if some is not None and len(some.t):
