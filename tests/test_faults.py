@@ -155,7 +155,6 @@ def test_gross_outliers_and_a_burst(drive: tuple[Recording, Trajectory], seed: i
     assert horizontal(run(wrong, OFF)["rts"], truth).max() > 5.0  # or the test would show nothing
 
 
-@pytest.mark.xfail(strict=False, reason="27 m: taken for an error of minutes, and the fixes after it left out")
 def test_error_that_grows(drive: tuple[Recording, Trajectory]) -> None:
     """0.2 m/s for two minutes: no single fix stands out until it ends."""
     recording, truth = drive

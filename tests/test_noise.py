@@ -22,6 +22,8 @@ from graphnav.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.noise.exclusion import FIXES, WHEELS
 from graphnav.noise.moments import imu_moments, lag_moments, process_moments, row_moments
 from graphnav.noise.priors import prior
+from graphnav.noise.spacing import space_fixes
+from graphnav.noise.words import describe_far
 from graphnav.noise_model import STATED, Figure, NoiseModel, RowWeights
 from graphnav.pipeline import SOLVERS, origin, run
 from graphnav.preintegration import NOISE_FIGURES, preintegrate
@@ -502,3 +504,52 @@ def test_a_run_with_the_noise_that_another_found_is_the_same(name: str) -> None:
         for block in ("R_nb", "p", "v", "ba", "bg"):
             assert np.array_equal(getattr(a.states, block), getattr(b.states, block)), (solver, block)
         assert np.array_equal(a.covariance, b.covariance), solver
+
+
+# ---------------------------------------------------------------------------------------------------- fixes and stamps
+
+
+def test_of_a_second_the_best_fix_is_used() -> None:
+    recording, _ = oracle.drive(oracle.vehicle_path(duration=120, seed=4), seed=2)
+    gnss = recording.gnss
+    assert gnss is not None
+    assert space_fixes(recording, 1.0) is recording  # one a second
+    t = recording.start + 0.2 * np.arange(50)
+    sd = np.tile(np.array([3.0, 2.0, 5.0, 2.0, 4.0])[:, None], (10, 3))
+    fast = replace(recording, gnss=replace(gnss, t=t, llh=np.tile(gnss.llh[:1], (50, 1)), sd=sd, v=None, sd_v=None))
+    spaced = space_fixes(fast, 1.0).gnss
+    assert spaced is not None
+    assert spaced.t == pytest.approx(t[1::5])  # of two as good the first
+    assert space_fixes(fast, 0.3) is fast
+
+
+@pytest.fixture(scope="module")
+def late() -> tuple[Recording, Trajectory]:
+    """Fixes of 2 cm that are stamped when they arrive, up to 0.4 s late."""
+    recording, truth = oracle.drive(oracle.vehicle_path(duration=200, seed=6), seed=5)
+    gnss = recording.gnss
+    assert gnss is not None
+    t = gnss.t + np.random.default_rng(3).uniform(0.0, 0.4, len(gnss.t))
+    return replace(recording, gnss=replace(gnss, t=t)), truth
+
+
+def test_stamps_on_arrival_are_an_error_of_time(late: tuple[Recording, Trajectory]) -> None:
+    recording, truth = late
+    found = run(recording, None, ("batch",))["batch"]
+    stamp = GnssSettings().time_offset_sigma * np.sqrt(found.noise.figures[STAMPS].factor)
+    assert stamp == pytest.approx(0.4 / np.sqrt(12.0), rel=0.3)  # of a uniform distribution
+    assert found.parameters["gnss_time_offset"].value[-1, 0] == pytest.approx(-0.2, abs=0.05)
+    off = errors(found.trajectory(), truth)
+    assert float(np.nanmean(off.nees_p)) / 3.0 < 2.0
+    known = settings_from({"gnss": {"time_offset_sigma": 0.0}})
+    without = errors(run(recording, known, ("batch",))["batch"].trajectory(), truth)
+    assert np.mean(off.horizontal**2) < 0.25 * np.mean(without.horizontal**2)
+
+
+def test_a_constant_far_beyond_its_prior_is_said(late: tuple[Recording, Trajectory]) -> None:
+    base, opening = posed(late[0])
+    assert [line.split()[0] for line in describe_far(base, backward(base, ekf(base, opening=opening)))] == [
+        "gnss_time_offset"
+    ]
+    well, opening = posed(oracle.drive(oracle.vehicle_path(duration=200, seed=6), seed=5)[0])
+    assert not describe_far(well, backward(well, ekf(well, opening=opening)))
