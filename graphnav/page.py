@@ -282,7 +282,8 @@ def page(title: str, lead: Sequence[str], sections: Sequence[tuple[str, Sequence
         library = f'<script type="application/octet-stream" id="plotly-library">{interactive.library()}</script>'
         script = f"{library}<script>{interactive.SCRIPT}</script>"
     elif "<figure" in body:
-        body += '<p class="soft">The pictures can be zoomed where plotly is installed: graphnav[plots].</p>'
+        install = "pip install -e '.[plots]'"
+        body += f'<p class="soft">The pictures can be zoomed where plotly is installed: {install}.</p>'
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'

@@ -238,13 +238,6 @@ def test_broken_nmea_lines_are_skipped_and_named(tmp_path):
         load(path)
 
 
-def test_a_missing_library_says_what_to_install(tmp_path, monkeypatch):
-    path = logs.write_nmea(tmp_path / "a.nmea", RECORDING)
-    monkeypatch.setitem(__import__("sys").modules, "pynmeagps", None)
-    with pytest.raises(RecordingError, match=r"pip install 'graphnav\[nmea\]'"):
-        load(path)
-
-
 # ---- a recording.toml that names other programs' logs
 
 

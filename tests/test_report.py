@@ -203,7 +203,7 @@ def test_report_of_next_to_nothing(tmp_path, recording):
 
 def test_pages_say_how_to_zoom_only_where_they_cannot(tmp_path, recording, library):
     parser, text = checked(write(tmp_path, recording))
-    assert ("graphnav[plots]" in text) == (library == "still")
+    assert ("pip install -e '.[plots]'" in text) == (library == "still")
     assert ("button" in parser.tags) == (library == "zoom")
 
 

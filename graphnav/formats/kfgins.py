@@ -24,7 +24,7 @@ import numpy as np
 
 from graphnav.errors import RecordingError
 from graphnav.formats.clocks import WEEK
-from graphnav.formats.registry import Log, extra, first_bytes, log_format
+from graphnav.formats.registry import Log, first_bytes, log_format
 from graphnav.formats.repair import Remarks
 from graphnav.formats.schema import rotation_from_letters
 from graphnav.formats.text import number_table, text_lines
@@ -258,7 +258,8 @@ def _read_gnss(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    yaml = extra("yaml", "kf-gins", "the configuration of KF-GINS and OB_GINS")
+    import yaml
+
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:

@@ -15,7 +15,7 @@ import numpy as np
 from graphnav.errors import RecordingError
 from graphnav.formats import ubx
 from graphnav.formats.clocks import of_week, utc_to_gps
-from graphnav.formats.registry import Log, extra, first_bytes, log_format
+from graphnav.formats.registry import Log, first_bytes, log_format
 from graphnav.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES, Remarks, horizontal_velocity
 from graphnav.recording import Gnss, fix_types
 from graphnav.rotation import Array
@@ -58,9 +58,8 @@ def load(path: Path) -> Log:
     RecordingError
         If no sentence gives a position, naming the first line that is no sentence, if any.
     """
-    pynmea = extra("pynmeagps", "nmea", "NMEA")
     remarks = Remarks()
-    epochs, broken, lines = _epochs(path, pynmea)
+    epochs, broken, lines = _epochs(path)
     if broken:
         remarks.add(
             f"{path.name}, line {broken[0]}: not a sound sentence (checksum or form); {len(broken)} of {lines} lines "
@@ -101,8 +100,10 @@ def load(path: Path) -> Log:
     return Log(path.stem, gnss=gnss, gps_zero=zero, remarks=tuple(remarks))
 
 
-def _epochs(path: Path, pynmea: Any) -> tuple[list[_Epoch], list[int], int]:
+def _epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
     """Epochs in the order of the file, the numbers of broken lines, and how many lines hold anything."""
+    import pynmeagps
+
     epochs: list[_Epoch] = []
     broken: list[int] = []
     count = 0
@@ -117,7 +118,7 @@ def _epochs(path: Path, pynmea: Any) -> tuple[list[_Epoch], list[int], int]:
         if kind not in (b"GGA", b"GST", b"RMC", b"VTG", b"ZDA"):
             continue
         try:
-            message = pynmea.NMEAReader.parse(raw[start:].strip() + b"\r\n")
+            message = pynmeagps.NMEAReader.parse(raw[start:].strip() + b"\r\n")
         except Exception:  # the parser's own errors and whatever a cut line makes it stumble over
             broken.append(number)
             continue

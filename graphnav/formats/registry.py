@@ -6,11 +6,9 @@ A log need not hold every sensor: it is read into a `Log`, and becomes a recordi
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
 
 from graphnav.errors import RecordingError
 from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth
@@ -91,17 +89,3 @@ def first_bytes(path: Path, count: int = 4096) -> bytes:
         return b""
     with path.open("rb") as file:
         return file.read(count)
-
-
-def extra(module: str, name: str, what: str) -> ModuleType:
-    """An optional library, imported when first needed.
-
-    Raises
-    ------
-    RecordingError
-        Saying what to install, if it is not there.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        raise RecordingError(f"{what} needs the package {module}: pip install 'graphnav[{name}]'") from None

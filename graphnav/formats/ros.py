@@ -15,7 +15,7 @@ import numpy as np
 
 from graphnav.errors import RecordingError
 from graphnav.formats.clocks import unix_to_gps
-from graphnav.formats.registry import Log, extra, log_format
+from graphnav.formats.registry import Log, log_format
 from graphnav.formats.repair import DEFAULT_SD, DEFAULT_SD_V, Remarks
 from graphnav.formats.schema import rotation_from_letters
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, fix_types
@@ -53,9 +53,8 @@ def load(path: Path) -> Log:
     RecordingError
         If the bag cannot be read or holds none of these.
     """
-    highlevel = extra("rosbags.highlevel", "ros", "ROS bags")
     remarks = Remarks()
-    topics, others = _read(path, highlevel)
+    topics, others = _read(path)
     if not topics:
         kinds = ", ".join(sorted(others)[:6]) or "nothing"
         raise RecordingError(f"{path}: no Imu, NavSatFix, TwistStamped or Odometry messages in it (there are: {kinds})")
@@ -82,14 +81,15 @@ def load(path: Path) -> Log:
     )  # fmt: skip
 
 
-def _read(path: Path, highlevel: Any) -> tuple[list[_Topic], set[str]]:
+def _read(path: Path) -> tuple[list[_Topic], set[str]]:
     """The topics that can be used, with their rows, and the types of the others."""
+    from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     topics: dict[str, _Topic] = {}
     others = set()
     try:
-        with highlevel.AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             wanted = [c for c in reader.connections if c.msgtype in (_IMU, _FIX, *_TWISTS)]
             others = {c.msgtype for c in reader.connections} - {c.msgtype for c in wanted}
             for connection, _, raw in reader.messages(connections=wanted):

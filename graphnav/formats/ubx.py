@@ -15,7 +15,7 @@ import numpy as np
 
 from graphnav.errors import RecordingError
 from graphnav.formats.clocks import WEEK, utc_to_gps
-from graphnav.formats.registry import Log, extra, first_bytes, log_format
+from graphnav.formats.registry import Log, first_bytes, log_format
 from graphnav.formats.repair import Remarks
 from graphnav.recording import Gnss, Imu, Odometer, fix_types
 from graphnav.rotation import Array
@@ -53,8 +53,7 @@ def load(path: Path) -> Log:
     RecordingError
         If no position and no sensor is in it.
     """
-    pyubx2 = extra("pyubx2", "ubx", "UBX")
-    content = _messages(path, pyubx2)
+    content = _messages(path)
     remarks = Remarks()
     if content.broken:
         remarks.add(f"{content.broken} broken frames were skipped")
@@ -73,7 +72,9 @@ def load(path: Path) -> Log:
     )  # fmt: skip
 
 
-def _messages(path: Path, pyubx2: Any) -> _Content:
+def _messages(path: Path) -> _Content:
+    import pyubx2
+
     content = _Content()
     tag: int | None = None
     with path.open("rb") as stream:
