@@ -167,8 +167,23 @@ def inspect(recording: Recording) -> Inspection:
         if recording.truth.closed_loop_sigma:
             facts["truth"] = {"closed_loop_sigma_m": recording.truth.closed_loop_sigma}
         findings += truth_findings(recording)
+    if any(f.severity != "note" for f in findings) and not described(recording):
+        findings.append(
+            Finding(
+                "note",
+                "keys in brackets are those of a recording.toml, which this log has none of: graphnav init "
+                f"{recording.source} drafts one",
+                "recording.log",
+            )
+        )
     findings.sort(key=lambda f: SEVERITIES.index(f.severity))
     return Inspection(recording.name, recording.platform, facts, whole.recording, tuple(findings))
+
+
+def described(recording: Recording) -> bool:
+    """Whether keys of a recording.toml can be set: there is one, or nothing was read from files."""
+    source = recording.source
+    return source is None or source.suffix == ".toml" or not recording.files
 
 
 def _sensor_facts(t: Array) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from graphnav.clock import Clock
 from graphnav.config.gnss import GnssSettings
 from graphnav.crosschecks import Fit, Track
 from graphnav.findings import Finding, period_of
+from graphnav.formats.clocks import between_clocks
 from graphnav.recording import Imu, Odometer, Recording
 from graphnav.rotation import Array
 from graphnav.wheels.faults import FROZEN, GAP, STUCK, WILD
@@ -31,15 +32,19 @@ def gnss_apart(recording: Recording) -> str | None:
     if gnss is None or not len(gnss.t) or overlap_s(recording) >= 0:
         return None
     offset = recording.start - gnss.t[0]
+    apart = f"GNSS ({gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) do not overlap in time"
+    known = between_clocks(recording.start, recording.gps_zero, float(gnss.t[0]), None)
+    if known is not None:
+        left = gnss.t[0] + known.offset - recording.start
+        return (
+            f"{apart}: {known.words}; say time_offset = {known.offset:.0f} in [gnss], with which "
+            f"GNSS starts {abs(left):.2f} s {'after' if left > 0 else 'before'} the IMU"
+        )
     hours = round(offset / 1800.0) / 2.0
     local = (
         f"; {abs(hours):g} h apart, one may be in local time" if hours and abs(offset - 3600.0 * hours) < 60.0 else ""
     )
-    return (
-        f"GNSS ({gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) "
-        f"do not overlap in time; if their clocks differ, say time_offset in [gnss] ({offset:.3f} would start both "
-        f"together){local}"
-    )
+    return f"{apart}; if their clocks differ, say time_offset in [gnss] ({offset:.3f} would start both together){local}"
 
 
 def gnss_coverage(recording: Recording) -> Iterator[Finding]:

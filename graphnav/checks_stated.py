@@ -78,7 +78,7 @@ def rounded_positions(gnss: Gnss) -> Iterator[Finding]:
 
 def fix_types(gnss: Gnss) -> Iterator[Finding]:
     """Types in the numbers of GGA's quality, which differ."""
-    if gnss.type is not None and (guess := fix_numbers(gnss.type, gnss.sd[:, 0])).value == "nmea":
+    if gnss.type is not None and gnss.type_assumed and (guess := fix_numbers(gnss.type, gnss.sd[:, 0])).value == "nmea":
         sentence = (
             f'types of the fixes look like GGA\'s qualities: {guess.why}; say units = {{ type = "nmea" }} in [gnss]'
         )

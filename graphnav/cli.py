@@ -28,6 +28,7 @@ from graphnav.cli_options import (
     Require,
     Source,
     Start,
+    Topic,
     Without,
 )
 from graphnav.errors import ConfigError, GraphnavError
@@ -67,6 +68,7 @@ def info(
     antenna: Annotated[
         bool, typer.Option("--antenna", help="Also find the antenna from the drive, and compare with its lever arm.")
     ] = False,
+    topic: Topic = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -76,7 +78,7 @@ def info(
 
     with bar(quiet, "ekf" if antenna else "info"):
         tell("reading")
-        whole = read(recording)
+        whole = read(recording, topic or ())
         tell("checks")
         found = inspect(whole)
         if antenna:
@@ -107,11 +109,12 @@ def smooth(
         str | None, typer.Option("--point", metavar="POINT", help="Of --export: imu, antenna or x,y,z (m; RFU).")
     ] = None,
     require: Require = None,
+    topic: Topic = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
-    asked = _Asked(recording, out, profile, config, noise, without, rate, start, end, require, quiet, json)
+    asked = _Asked(recording, out, profile, config, noise, without, rate, start, end, require, topic, quiet, json)
     _solve(asked, solver, "--solver", export, point)
 
 
@@ -133,11 +136,12 @@ def compare(
     start: Start = None,
     end: End = None,
     require: Require = None,
+    topic: Topic = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Put the same recording through several solvers and compare them, against the truth where there is one."""
-    asked = _Asked(recording, out, profile, config, noise, without, rate, start, end, require, quiet, json)
+    asked = _Asked(recording, out, profile, config, noise, without, rate, start, end, require, topic, quiet, json)
     _solve(asked, solvers, "--solvers")
 
 
@@ -149,6 +153,7 @@ def detect(
     without: Without = None,
     start: Start = None,
     end: End = None,
+    topic: Topic = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -164,7 +169,7 @@ def detect(
     folder = outputs.output_folder(out)
     with bar(quiet, "detect"):
         tell("reading")
-        used, said = screened(workflow.read_part(recording, start, end, withheld))
+        used, said = screened(workflow.read_part(recording, start, end, withheld, tuple(topic or ())))
         tell("detection")
         found = detected(used, settings)
         found = replace(found, notes=(*said, *found.notes))
@@ -243,6 +248,7 @@ class _Asked:
     start: float | None
     end: float | None
     require: list[str] | None
+    topic: list[str] | None
     quiet: bool
     json: bool
 
@@ -263,7 +269,7 @@ def _solve(asked: _Asked, solvers: str, option: str, export: str | None = None, 
     given: dict[str, Any] = {
         "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
         "config": asked.config and str(asked.config), "noise": asked.noise, "without": asked.without,
-        "rate": asked.rate, "start": asked.start, "end": asked.end,
+        "rate": asked.rate, "start": asked.start, "end": asked.end, "topic": asked.topic,
     }  # fmt: skip
     folder = outputs.output_folder(asked.out)
     if point is not None and export is None:
@@ -274,6 +280,7 @@ def _solve(asked: _Asked, solvers: str, option: str, export: str | None = None, 
     request = workflow.Request(
         asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
         {k: v for k, v in given.items() if v is not None}, noise,
+        tuple(asked.topic or ()),
     )  # fmt: skip
     with bar(asked.quiet, *chosen) as progress:
         outcome = workflow.run_request(request, progress)

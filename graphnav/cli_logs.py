@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from graphnav.cli_options import Json, Quiet
+from graphnav.cli_options import Json, Quiet, Topic
 from graphnav.errors import ConfigError
 from graphnav.progress import tell
 from graphnav.talk import bar, say, show
@@ -34,6 +34,7 @@ def convert(
         str | None,
         typer.Option("--clock", metavar="TEXT", help="Trajectory: unix, 'gps week 2313' or a UTC date of t = 0."),
     ] = None,
+    topic: Topic = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -63,7 +64,7 @@ def convert(
     folder = output_folder(out)
     with bar(quiet, "convert"):
         tell("reading")
-        log, files = conversion.convert_log(source, folder, format)
+        log, files = conversion.convert_log(source, folder, format, topic or ())
     show(
         lambda: conversion.log_text(log, files),
         lambda: {**conversion.log_values(log), "files": files},
@@ -78,6 +79,7 @@ def allan(
     out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into.")],
     start: Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from its start.")] = None,
     end: Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from its start.")] = None,
+    topic: Topic = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -95,7 +97,7 @@ def allan(
         if log.endswith((".csv", ".csv.gz")):
             t, gyro, accel = imu_of(Path(log))
         else:
-            imu = load(log).imu
+            imu = load(log, topics=topic or ()).imu
             if imu is None:
                 raise RecordingError(f"{log}: holds no IMU")
             t, gyro, accel = imu.t, imu.gyro, imu.accel
@@ -134,6 +136,7 @@ def init(
     ),
     name: Annotated[str | None, typer.Option("--name", help="Of the recording; default: its folder's.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
+    topic: Topic = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -151,7 +154,7 @@ def init(
     folder = output_folder(out.parent)
     with bar(quiet, "init"):
         tell("reading")
-        drafted = draft(logs, folder, name)
+        drafted = draft(logs, folder, name, topic or ())
         for made in drafted.made:
             if (folder / made).exists() and not force:
                 raise ConfigError(f"{folder / made}: is there already; say --force to write over it")

@@ -36,6 +36,10 @@ Noise = Annotated[
         help="How good the sensors are: as stated, estimated, or as in a file or the summary.json of a run.",
     ),
 ]
+Topic = Annotated[
+    list[str] | None,
+    typer.Option("--topic", metavar="NAME", help="Of a ROS bag, one to use for its sensor; may be repeated."),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")]
 Require = Annotated[

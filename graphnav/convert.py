@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.complaints import listed, nearest
+from graphnav.draft.guesses import noise_density
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.exporters import NAMES, write_as
 from graphnav.formats import formats, load
@@ -54,7 +55,7 @@ def check_rate(rate: float | None) -> None:
         raise ConfigError(f"--rate {rate:g}: must be above 0 and at most 10000 Hz")
 
 
-def convert_log(source: str, out: Path, name: str | None) -> tuple[Log, list[Path]]:
+def convert_log(source: str, out: Path, name: str | None, topics: Sequence[str] = ()) -> tuple[Log, list[Path]]:
     """Read a log of any kind that is known and write it as a recording folder.
 
     Raises
@@ -66,12 +67,30 @@ def convert_log(source: str, out: Path, name: str | None) -> tuple[Log, list[Pat
     """
     if name is not None and name not in formats():
         raise ConfigError(f"--format {name}: no such format; {nearest(name, [*formats(), *NAMES])}")
-    log = load(source, name)
+    log = _with_measured_noise(load(source, name, topics))
     if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
         raise ConfigError(f"-o {out}: the recording is read from there; name another folder")
     with staged(out) as part:
         files = write_recording(log, part)
     return log, moved(files, part, out)
+
+
+def _with_measured_noise(log: Log) -> Log:
+    """The log with the densities that its IMU shows, where it states no figures."""
+    imu = log.imu
+    if imu is None or not imu.noise_assumed:
+        return log
+    found = {
+        f"{name}_noise_density": float(f"{value:.2g}")
+        for name, x in (("gyro", imu.gyro), ("accel", imu.accel))
+        if (value := noise_density(imu.t, x)) > 0.0
+    }
+    if not found:
+        return log
+    said = ", ".join(f"{key} = {value:g}" for key, value in found.items())
+    remark = f"noise: {said} measured, between its quietest and usual state; the other figures are of a consumer IMU"
+    noise = replace(imu.noise, **found)
+    return replace(log, imu=replace(imu, noise=noise, noise_assumed=False), remarks=(*log.remarks, remark))
 
 
 def parse_point(text: str | None) -> str | Array:

@@ -17,6 +17,7 @@ from graphnav.rotation import Array
 FASTEST = 150.0  # m/s; the fastest cars that can be bought reach 490 km/h, 136 m/s
 # A receiver cannot follow a reflection that comes more than one and a half code chips late (GPS C/A: 293 m a chip).
 _MISLED = 440.0  # m
+_CACHED = 60.0  # s; a receiver that is on fixes at least as often as that
 _FROZEN = (60.0, 300.0)  # s, and m driven: a road or the receiver's own noise moves a height within that
 _SLOPE = 0.1  # what a road climbs at most: so far may a height be from what it was
 _CARRIER = 1e-3  # m: a two-hundredth of the carrier's wave (0.19 m), what its phase can be measured to
@@ -37,6 +38,18 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
     gnss = recording.gnss
     assert gnss is not None
     findings: list[Finding] = []
+    if cached := cached_fixes(gnss.t, recording.start):
+        many = "1 fix" if cached == 1 else f"{cached} fixes"
+        early = recording.start - gnss.t[0]
+        findings.append(
+            Finding(
+                "note",
+                f"{many} of before the IMU, the first {early:.0f} s before it starts, left out: a receiver "
+                "gives out what it had kept until it has new ones",
+                "gnss.cached",
+            )
+        )
+        gnss = rows_of(gnss, np.arange(len(gnss.t)) >= cached)
     p = _positions(gnss)
     off = out_of_reach(gnss.t, p)
     if off.any():
@@ -62,6 +75,12 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
         findings += two_groups(gnss, p)
         findings += stamped_on_arrival(gnss, p)
     return replace(recording, gnss=gnss), findings
+
+
+def cached_fixes(t: Array, start: float) -> int:
+    """How many of the first fixes at t (M,) s are long before the IMU starts, with none for as long after them."""
+    before = np.flatnonzero((t[:-1] < start) & (np.diff(t) > _CACHED))
+    return int(before[-1]) + 1 if len(before) and t[-1] > start else 0
 
 
 def _positions(gnss: Gnss) -> Array:

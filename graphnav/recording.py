@@ -58,6 +58,7 @@ class Gnss:
     sd_v: Array | None = None  # (M, 3) m/s
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
     type: NDArray[np.intp] | None = None  # (M,) of FIX_TYPES; None: no fix says of what type it is
+    type_assumed: bool = False  # True when they are a CSV file's numbers, which were taken for RTKLIB's
 
     @property
     def types(self) -> dict[str, int]:

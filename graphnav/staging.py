@@ -40,6 +40,8 @@ def staged(folder: Path) -> Iterator[Path]:
         finally:
             shutil.rmtree(part, ignore_errors=True)
     except OSError as error:
+        if error.filename and not Path(error.filename).resolve().is_relative_to(folder.resolve()):
+            raise  # of a file that was to be read
         raise ConfigError(
             f"-o {folder}: cannot be written ({error.strerror or error}); what was there before is unchanged"
         ) from None

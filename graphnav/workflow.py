@@ -63,6 +63,7 @@ class Request:
     rate: float | None = None  # Hz of the output; None: at the keyframes
     options: Mapping[str, Any] = field(default_factory=dict)  # as they were given, for provenance
     noise: GivenNoise | None = None  # to be used as it is; else what the settings say
+    topics: tuple[str, ...] = ()  # of a ROS bag, as `graphnav.formats.read` takes them
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
 
     timings: dict[str, float] = {}
     with _timed(timings, "reading"):
-        whole = read(request.source)
+        whole = read(request.source, request.topics)
     recording = _cropped(whole, request)
     zero = recording.start - whole.start if recording is not whole else 0.0
     moved = _moved(request.withheld, zero)
@@ -222,7 +223,11 @@ def unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
 
 
 def read_part(
-    source: str, start: float | None = None, end: float | None = None, withheld: tuple[Withheld, ...] = ()
+    source: str,
+    start: float | None = None,
+    end: float | None = None,
+    withheld: tuple[Withheld, ...] = (),
+    topics: tuple[str, ...] = (),
 ) -> Recording:
     """The part asked for of a recording, without what is withheld; times in s from the recording's start.
 
@@ -233,7 +238,7 @@ def read_part(
     """
     from graphnav.formats import read
 
-    whole = read(source)
+    whole = read(source, topics)
     part = _cropped(whole, Request(source, (), start=start, end=end))
     zero = part.start - whole.start if part is not whole else 0.0
     return _withhold(part, _moved(withheld, zero), zero)[0]

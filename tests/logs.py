@@ -6,6 +6,8 @@ The drive is `oracle.vehicle_path`, with exact samples and fixes, so that what i
 from __future__ import annotations
 
 import datetime
+import struct
+from collections.abc import Callable
 from functools import reduce
 from operator import xor
 from pathlib import Path
@@ -13,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import oracle
 
+from graphnav.formats.clocks import gps_to_utc
 from graphnav.recording import Recording
 from graphnav.trajectory import Trajectory
 
@@ -128,4 +131,63 @@ def write_nmea(path: Path, recording: Recording, gst: bool = True) -> Path:
         where = place.rstrip(",")
         text += sentence(f"GNRMC,{clock},A,{where},{speed * 3600 / 1852:.4f},{course:.4f},{stamp:%d%m%y},,,D")
     path.write_text(text)
+    return path
+
+
+def frame(kind: int, number: int, payload: bytes) -> bytes:
+    """A UBX frame, as in u-blox' interface description."""
+    body = bytes([kind, number]) + struct.pack("<H", len(payload)) + payload
+    a = b = 0
+    for byte in body:
+        a = (a + byte) & 255
+        b = (b + a) & 255
+    return b"\xb5\x62" + body + bytes([a, b])
+
+
+def nav_pvt(gps: float, llh, v, accuracy=(0.028, 0.030, 0.087), fix: int = 3, ok: int = 1) -> bytes:
+    """NAV-PVT at a GPS time (s since its epoch); accuracies hAcc, vAcc (m), sAcc (m/s)."""
+    ms = round(gps * 1000)
+    date = str(gps_to_utc(np.array([ms / 1000]))[0])
+    year, month, day = (int(x) for x in date[:10].split("-"))
+    hour, minute, second = int(date[11:13]), int(date[14:16]), int(date[17:19])
+    lat, lon = np.degrees(llh[:2])
+    payload = struct.pack(
+        "<IHBBBBBBIiBBBB", ms % 604800000, year, month, day, hour, minute, second, 7, 30, 0, fix, ok, 0, 18
+    )
+    payload += struct.pack("<ii", round(lon * 1e7), round(lat * 1e7))
+    horizontal, vertical, speed = (round(1000 * x) for x in accuracy)
+    payload += struct.pack("<iiII", round(llh[2] * 1000), round(llh[2] * 1000) - 40000, horizontal, vertical)
+    ve, vn, vu = np.round(np.array(v) * 1000).astype(int).tolist()
+    payload += struct.pack("<iiiiiII", vn, ve, -vu, 0, 0, speed, 0) + bytes(24)
+    return frame(1, 7, payload)
+
+
+def ros_header(store, unix: float) -> Callable[[float, str], object]:
+    """header(t, frame) of messages stamped `t` s after a Unix time."""
+    types = store.types
+    Header, Time = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
+    ros1 = "seq" in Header.__dataclass_fields__
+
+    def header(t: float, name: str) -> object:
+        stamp = Time(int(unix + t), round((unix + t) % 1 * 1e9) % 10**9)
+        return Header(0, stamp, name) if ros1 else Header(stamp, name)
+
+    return header
+
+
+def write_bag(path: Path, kind: str, messages, unix: float) -> Path:
+    """A bag of `messages(store)`, which gives (time, topic, message); kind bag (ROS 1), db3 or mcap."""
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
+    plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+    with Writer1(path) if kind == "bag" else Writer(path, version=9, storage_plugin=plugin) as writer:
+        connections = {}
+        for t, topic, message in messages(store):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
+            serialise = store.serialize_ros1 if kind == "bag" else store.serialize_cdr
+            writer.write(connections[topic], round((unix + t) * 1e9), serialise(message, message.__msgtype__))
     return path

@@ -20,28 +20,8 @@ UNIX = 1646870382.0  # 9 March 2022, 23:59:42 UTC: midnight of GPS time
 # ---- UBX, as in u-blox' interface description
 
 
-def frame(kind: int, number: int, payload: bytes) -> bytes:
-    body = bytes([kind, number]) + struct.pack("<H", len(payload)) + payload
-    a = b = 0
-    for byte in body:
-        a = (a + byte) & 255
-        b = (b + a) & 255
-    return b"\xb5\x62" + body + bytes([a, b])
-
-
 def nav_pvt(t: float, llh, v, fix: int = 3, ok: int = 1) -> bytes:
-    ms = round((logs.TOW + t) * 1000)
-    utc = np.datetime64("2022-03-09T23:59:42") + np.timedelta64(round(t * 1000), "ms")
-    date = str(utc)
-    year, month, day = (int(x) for x in date[:10].split("-"))
-    hour, minute, second = int(date[11:13]), int(date[14:16]), int(date[17:19])
-    lat, lon = np.degrees(llh[:2])
-    payload = struct.pack("<IHBBBBBBIiBBBB", ms, year, month, day, hour, minute, second, 7, 30, 0, fix, ok, 0, 18)
-    payload += struct.pack("<ii", round(lon * 1e7), round(lat * 1e7))
-    payload += struct.pack("<iiII", round(llh[2] * 1000), round(llh[2] * 1000) - 40000, 28, 30)
-    ve, vn, vu = np.round(np.array(v) * 1000).astype(int).tolist()
-    payload += struct.pack("<iiiiiII", vn, ve, -vu, 0, 0, 87, 0) + bytes(24)
-    return frame(1, 7, payload)
+    return logs.nav_pvt(logs.WEEK * 604800.0 + logs.TOW + t, llh, v, fix=fix, ok=ok)
 
 
 def nav_hp(t: float, llh) -> bytes:
@@ -51,13 +31,13 @@ def nav_hp(t: float, llh) -> bytes:
     low = [w % 100 if k < 2 else w % 10 for k, w in enumerate(whole)]
     high = [(w - x) // (100 if k < 2 else 10) for k, (w, x) in enumerate(zip(whole, low, strict=True))]
     payload = bytes(4) + struct.pack("<Iiiii", ms, high[0], high[1], high[2], high[2])
-    return frame(1, 0x14, payload + struct.pack("<bbbb", *low, 0) + struct.pack("<II", 140, 200))
+    return logs.frame(1, 0x14, payload + struct.pack("<bbbb", *low, 0) + struct.pack("<II", 140, 200))
 
 
 def esf_meas(tag: int, values: dict[int, float]) -> bytes:
     scale = {14: 180 / np.pi * 4096, 13: 180 / np.pi * 4096, 5: 180 / np.pi * 4096, 11: 1000.0}
     words = [(kind << 24) | (round(x * scale.get(kind, 1024.0)) & 0xFFFFFF) for kind, x in values.items()]
-    return frame(0x10, 2, struct.pack("<IHH", tag, len(words) << 11, 0) + struct.pack(f"<{len(words)}I", *words))
+    return logs.frame(0x10, 2, struct.pack("<IHH", tag, len(words) << 11, 0) + struct.pack(f"<{len(words)}I", *words))
 
 
 def write_ubx(path: Path, esf: bool = True, hp: bool = True, delay: float = 0.1) -> Path:
@@ -143,16 +123,9 @@ def test_broken_ubx_says_so(tmp_path):
 
 def ros_messages(store):
     """(time, topic, message) of the drive: an IMU in FLU, fixes with covariances, a velocity over ground."""
-    types = store.types
-    Header, Time = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
+    types, header = store.types, logs.ros_header(store, UNIX)
     V, Q = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
     Status = types["sensor_msgs/msg/NavSatStatus"]
-    ros1 = "seq" in Header.__dataclass_fields__
-
-    def header(t, name):
-        stamp = Time(int(UNIX + t), round((UNIX + t) % 1 * 1e9) % 10**9)
-        return Header(0, stamp, name) if ros1 else Header(stamp, name)
-
     covariance = np.diag([1e-6, 1e-6, 1e-6]).ravel()
     flu = logs.FLU
     for t, w, f in zip(RECORDING.imu.t, RECORDING.imu.gyro @ flu.T, RECORDING.imu.accel @ flu.T, strict=True):
@@ -178,28 +151,7 @@ def ros_messages(store):
 
 
 def write_bag(path: Path, kind: str) -> Path:
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
-    if kind == "bag":
-        from rosbags.rosbag1 import Writer
-
-        writer = Writer(path)
-    else:
-        from rosbags.rosbag2 import StoragePlugin
-        from rosbags.rosbag2 import Writer as Writer2
-
-        writer = Writer2(
-            path, version=9, storage_plugin=StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-        )
-    with writer:
-        connections = {}
-        for t, topic, message in ros_messages(store):
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
-            serialise = store.serialize_ros1 if kind == "bag" else store.serialize_cdr
-            writer.write(connections[topic], round((UNIX + t) * 1e9), serialise(message, message.__msgtype__))
-    return path
+    return logs.write_bag(path, kind, ros_messages, UNIX)
 
 
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap", "mcap file"])

@@ -12,8 +12,9 @@ import numpy as np
 from graphnav.draft import guesses, motion
 from graphnav.draft.agreement import CLEAR, FAIR, Agreement, compare
 from graphnav.draft.guesses import Guess
-from graphnav.draft.sources import Source, fix_speed_unit, fixes, sources
+from graphnav.draft.sources import JOINED, Source, fix_speed_unit, fixes, sources
 from graphnav.errors import RecordingError
+from graphnav.formats.clocks import Epochs, between_clocks
 from graphnav.formats.schema import FORCE, RATE, SPEED
 from graphnav.formats.writer import quoted
 from graphnav.recording import Gnss, Odometer
@@ -21,7 +22,6 @@ from graphnav.rotation import Array
 
 __all__ = ["Draft", "draft"]
 
-JOINED = "imu.csv.gz"  # the file that is made of a gyro's and an accelerometer's
 _UNIX = 1e9  # s
 _SMALL = 0.03  # s; shifts of clocks below this are left to the smoother, which estimates them
 _SD = "[3.3, 3.3, 6.6]"  # m, what is assumed of fixes that state none (graphnav.formats.repair.DEFAULT_SD)
@@ -36,17 +36,21 @@ class Draft:
     made: dict[str, dict[str, Array]]  # files to lie beside it: name -> columns
 
 
-def draft(paths: Sequence[Path], folder: Path, name: str | None = None) -> Draft:
+def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: Sequence[str] = ()) -> Draft:
     """Describe logs (CSV files, or logs of programs that are known) in a recording.toml that will lie in `folder`.
+
+    Of a folder all logs in it are looked at; what holds no sensor is left out and said. `topics` are those to use of
+    a ROS bag.
 
     Raises
     ------
     RecordingError
         If a file cannot be read, holds nothing that is known, or there is no IMU among them.
     """
-    found = sources(paths)
-    writer = _Writer(folder)
-    text = writer.text(found, name or folder.resolve().name or "drive")
+    found = sources(paths, topics)
+    writer = _Writer(folder, topics)
+    writer.decisions += [f"left out: {said}" for said in found.left_out]
+    text = writer.text(found.sensors, name or folder.resolve().name or "drive")
     return Draft(text, tuple(writer.decisions), writer.made)
 
 
@@ -58,7 +62,7 @@ def imu_of(path: Path) -> tuple[Array, Array, Array]:
     RecordingError
         As `draft`.
     """
-    source = sources([path])["imu"]
+    source = sources([path]).sensors["imu"]
     gyro, accel = source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
     force = guesses.accel_unit(path, accel, source.stated("ax", "accel"))
     rate = guesses.gyro_unit(gyro, source.stated("gx", "gyro"), None, vehicle=False)
@@ -68,8 +72,10 @@ def imu_of(path: Path) -> tuple[Array, Array, Array]:
 class _Writer:
     """Lines of the file; every decision goes into a comment and into a list."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, asked: Sequence[str]) -> None:
         self.folder = folder
+        self.asked = asked  # topics
+        self.epochs: Epochs | None = None  # of the clocks of IMU and fixes
         self.lines: list[str] = []
         self.decisions: list[str] = []
         self.made: dict[str, dict[str, Array]] = {}
@@ -98,7 +104,7 @@ class _Writer:
     def _imu(self, source: Source, gnss: Source | None, vehicle: bool) -> tuple[Agreement, tuple[Array, Array]]:
         """Writes [imu]; returns what the fixes said, and times and forward forces."""
         self.lines += ["", "[imu]"]
-        self._file(source)
+        self._file(source, "imu")
         if source.log is not None:
             assert source.log.imu is not None
             imu = source.log.imu
@@ -108,7 +114,10 @@ class _Writer:
             force = guesses.accel_unit(source.path, accel, source.stated("ax", "accel"))
             accel = accel * FORCE[str(force.value)]
         up, up_why = guesses.up_of(accel)
-        agreement = compare(t, gyro, accel, up, fixes(gnss)) if gnss is not None else Agreement()
+        agreement = Agreement()
+        if gnss is not None:
+            self.epochs = _epochs(source, gnss)
+            agreement = compare(t, gyro, accel, up, fixes(gnss), self.epochs.offset if self.epochs else 0.0)
         if source.log is None:
             rate = guesses.gyro_unit(gyro, source.stated("gx", "gyro"), agreement.turn, vehicle)
             gyro = gyro * RATE[str(rate.value)]
@@ -167,7 +176,7 @@ class _Writer:
             if numbers.value is None and theirs != "type":
                 dropped = (*dropped, "type")
                 self.decisions.append(f"types of fixes: column '{theirs}' is left alone: {numbers.why}")
-        self._file(source, dropped)
+        self._file(source, "gnss", dropped)
         if source.log is None:
             if "h" not in values:
                 raise RecordingError(f"{source.path}: no column of heights beside {source.columns.names['lat']}")
@@ -196,11 +205,18 @@ class _Writer:
             seconds, sigma = agreement.offset
             sure = "" if sigma < motion.STEP else "CHECK: "
             why = f"{sure}s, +-{max(sigma, 0.01):.2f}; the accelerations agree best with the IMU's so"
+            if self.epochs is not None:
+                rest = seconds - self.epochs.offset
+                why = f"s; {self.epochs.words}"
+                if rest:
+                    why += (
+                        f"; the rest, {rest:+.2f} +-{max(sigma, 0.01):.2f}, is what the accelerations agree best with"
+                    )
             self._key("time_offset", f"{seconds:.2f}", why)
 
     def _odometer(self, source: Source, course: motion.Course | None, felt: tuple[Array, Array]) -> None:
         self.lines += ["", "[odometer]"]
-        self._file(source)
+        self._file(source, "odometer")
         if source.log is None:
             speed = guesses.speed_unit(source.t, source.values["speed"], course, source.stated("speed", "speed"))
             self._units({"t": source.t_unit, "speed": speed})
@@ -224,7 +240,7 @@ class _Writer:
         self.lines.append(f"{key} = {value}".ljust(43) + f" # {why}")
         self.decisions.append(f"{key} = {value}: {why}")
 
-    def _file(self, source: Source, dropped: Sequence[str] = ()) -> None:
+    def _file(self, source: Source, sensor: str, dropped: Sequence[str] = ()) -> None:
         relative = Path(os.path.relpath(source.path.resolve(), self.folder.resolve())).as_posix()
         if source.joined_from is not None:
             relative = JOINED
@@ -232,6 +248,11 @@ class _Writer:
             rates, forces = (path.name for path in source.joined_from)
             self.decisions.append(f"{relative}: made of {rates} and {forces}, the forces at the times of the rates")
         self.lines.append(f"file = {quoted(relative)}")
+        if source.log is not None and (topics := source.log.topics.get(sensor, ())):
+            others = f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}"
+            if topics[0] in self.asked:
+                others = "as was asked"
+            self._key("topic", quoted(topics[0]), others if len(topics) > 1 else "the only one")
         names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
         if names:
             pairs = ", ".join(f"{ours} = {quoted(theirs)}" for ours, theirs in names.items())
@@ -255,6 +276,17 @@ def _odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> motion.L
     even = np.arange(t[0], t[-1], motion.STEP)
     pull = np.gradient(motion.mean(np.interp(even, t, speed)), motion.STEP)
     return motion.lag(grid, motion.band(forward[:, 0]), even, motion.band(pull))
+
+
+def _epochs(imu: Source, gnss: Source) -> Epochs | None:
+    """What lies between the clocks of two logs, where both are known."""
+    first = [_first(source, sensor) for source, sensor in ((imu, "imu"), (gnss, "gnss"))]
+    zeros = [None if source.log is None else source.log.gps_zero for source in (imu, gnss)]
+    return between_clocks(first[0], zeros[0], first[1], zeros[1])
+
+
+def _first(source: Source, sensor: str) -> float:
+    return float((source.t if source.log is None else getattr(source.log, sensor).t)[0])
 
 
 def _agree(lag: motion.Lag) -> str:

@@ -30,6 +30,7 @@ class Agreement:
     forward: Array | None = None  # (3,) in file axes
     far: float = 0.0  # s
     clock: Clock | None = None
+    known: float = 0.0  # s, to be added to the stamps of the fixes beforehand; the rest is found on top
 
     @property
     def clearest(self) -> motion.Lag | None:
@@ -48,6 +49,14 @@ class Agreement:
     @property
     def offset(self) -> tuple[float, float] | None:
         """What to add to the stamps of the fixes, s, and its 1-sigma; None where nothing says that they are off."""
+        found = self._found_offset
+        if not self.known:
+            return found
+        return (self.known + found[0], found[1]) if found is not None else (self.known, 0.0)
+
+    @property
+    def _found_offset(self) -> tuple[float, float] | None:
+        """The same, of the fixes with what is known added to their stamps."""
         if self.clock is None:
             return None
         clock = self.clock if self.late_velocity is None else Clock(None, self.clock.by_places, None)
@@ -68,8 +77,18 @@ def level_axes(up: Array) -> tuple[Array, Array]:
     return first, np.cross(up, first)
 
 
-def compare(t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array, Array, Array | None]) -> Agreement:
-    """IMU (N, 3 each, file axes; gyro in any unit) against fixes (times, positions, velocities or None)."""
+def compare(
+    t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array, Array, Array | None], known: float = 0.0
+) -> Agreement:
+    """IMU (N, 3 each, file axes; gyro in any unit) against fixes (times, positions, velocities or None).
+
+    `known` (s) is to be added to the stamps of the fixes before anything else.
+    """
+    near = _compare(t, gyro, accel, up, (fixes[0] + known, *fixes[1:]))
+    return replace(near, known=known)
+
+
+def _compare(t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array, Array, Array | None]) -> Agreement:
     courses = [motion.course_of(fixes[0], fixes[1], v) for v in (None, fixes[2])]
     courses = courses if fixes[2] is not None else courses[:1]
     if any(len(course.t) < 10 for course in courses):

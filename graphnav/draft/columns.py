@@ -79,10 +79,12 @@ class Columns:
 
     @property
     def sensor(self) -> str | None:
-        """What the file is of: imu, gyro, accel, gnss, odometer, or None."""
+        """What the file is of: imu, gyro, accel, gravity (a phone's own estimate of it), gnss, odometer, or None."""
         gyro, accel = ({f"{s}{x}" for x in "xyz"} <= self.names.keys() for s in "ga")
         if "t" not in self.names:
             return None
+        if "pull_x" in self.names:
+            return "gravity"
         if gyro and accel:
             return "imu"
         if {"lat", "lon"} <= self.names.keys():
@@ -103,7 +105,7 @@ def match(header: Sequence[str], stem: str = "") -> Columns:
             if unit:
                 units[ours] = unit
     bare = {plain: (name, unit) for name, plain, unit in spelt if plain in ("x", "y", "z")}
-    kind = "g" if "gyr" in stem.lower() else "a" if "acc" in stem.lower() else None
+    kind = next((k for k, word in (("g", "gyr"), ("a", "acc"), ("pull_", "gravity")) if word in stem.lower()), None)
     if kind and len(bare) == 3 and not any(f"{kind}{x}" in names for x in "xyz"):
         for x in "xyz":
             names[f"{kind}{x}"] = bare[x][0]
@@ -115,6 +117,13 @@ def match(header: Sequence[str], stem: str = "") -> Columns:
             for x in "xyz":
                 names.pop(f"{kind}{x}", None)
     return Columns(names, units)
+
+
+def clocks(header: Sequence[str]) -> list[str]:
+    """The columns that may be times, the likeliest first."""
+    spelt = [(name, split_unit(name)[0]) for name in header]
+    found = [name for p in _PATTERNS["t"] for name, plain in spelt if re.fullmatch(p, plain)]
+    return list(dict.fromkeys(found))
 
 
 def split_unit(name: str) -> tuple[str, str]:

@@ -13,9 +13,11 @@ from graphnav.formats.schema import FORCE, RATE, SPEED, TIME, rotation_from_lett
 from graphnav.rotation import Array
 
 _G = 9.80665
+_LASTING = 0.5  # of the usual force is in its mean, even of a foot that swings
 _LIKELY = 0.5  # correlation
 _STRAIGHT = np.cos(np.radians(12.0))  # nearer to a file axis than this, the axis is meant
 _QUIET = 5.0  # s
+_APART = 100.0  # s; stamps further apart are in a smaller unit
 _FIXED = 0.15  # m; fixed carrier phases state less, all else usually more
 
 
@@ -31,15 +33,24 @@ def time_unit(t: Array, stated: str | None, imu: bool) -> Guess:
     """s, ms, us or ns, by the name, by the size of an epoch, by the step."""
     if stated is not None:
         return Guess(stated, "as the column's name says")
-    first, step = abs(float(t[0])), float(np.median(np.diff(t))) if len(t) > 1 else 1.0
-    for unit, scale in TIME.items():
-        if 1e9 <= first * scale < 3e9 and first > 1e8:
-            return Guess(unit, f"{t[0]:.0f} is then a date of this century in Unix time")
+    if (unit := _unix_unit(t)) is not None:
+        return Guess(unit, f"{t[0]:.0f} is then a date of this century in Unix time")
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
     low, high = (5e-4, 0.11) if imu else (0.02, 11.0)
     fits = [unit for unit, scale in TIME.items() if low <= step * scale <= high]
     if not fits:
         return Guess("s", f"rows are {step:g} apart, which fits no unit: a guess")
     return Guess(fits[0], f"rows are then {step * TIME[fits[0]]:.4g} s apart")
+
+
+def is_date(t: Array) -> bool:
+    """Whether stamps are dates of this century in Unix time, in some unit."""
+    return _unix_unit(t) is not None
+
+
+def _unix_unit(t: Array) -> str | None:
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    return next((u for u, scale in TIME.items() if 1e9 <= float(t[0]) * scale < 3e9 and step * scale < _APART), None)
 
 
 def accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
@@ -51,15 +62,16 @@ def accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
         If gravity has been taken out, or the numbers are raw counts.
     """
     size = float(np.median(np.linalg.norm(accel, axis=-1)))
+    lasting = float(np.linalg.norm(np.mean(accel, axis=0))) > _LASTING * size  # what a motion alone does not do
     for unit, scale in FORCE.items():
-        if 0.8 * _G < size * scale < 1.25 * _G:
+        if lasting and 0.8 * _G < size * scale < 1.25 * _G:
             return Guess(unit, f"the median force, {size:.4g}, is then that of gravity")
-    if stated is not None and size * FORCE[stated] > 0.8 * _G:
+    if stated is not None and lasting and size * FORCE[stated] > 0.8 * _G:
         return Guess(stated, f"as the column's name says, though the median force is {size:.4g}")
-    if size < 0.5 * _G:
+    if size < 0.5 * _G or not lasting:
         raise RecordingError(
-            f"{path}: the accelerations are {size:.3g} in size at the median, which is gravity in no unit: they are "
-            "without gravity; log the raw accelerometer (on iOS 'TotalAcceleration')"
+            f"{path}: the accelerations are {size:.3g} in size at the median and not lasting: they are without "
+            "gravity; log the raw accelerometer (on iOS 'TotalAcceleration')"
         )
     raise RecordingError(
         f"{path}: the accelerations are {size:.3g} in size at the median, which is gravity in no unit: raw counts?"

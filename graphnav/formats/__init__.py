@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Sequence
 from pathlib import Path
 
 from graphnav.complaints import nearest
@@ -24,13 +25,15 @@ def formats() -> dict[str, Format]:
     return {f.name: f for f in sorted(found, key=lambda f: (not f.builtin, f.name))}
 
 
-def read(source: str | Path) -> Recording:
+def read(source: str | Path, topics: Sequence[str] = ()) -> Recording:
     """A recording from a folder holding recording.toml, a .toml of that form, or a built-in name.
 
     Parameters
     ----------
     source
         A path, or a built-in name such as ``kitti``. A folder of that name is ``./kitti``.
+    topics
+        Of a ROS bag: those to use, each for the sensor that its type is of; the others are found.
 
     Raises
     ------
@@ -40,17 +43,19 @@ def read(source: str | Path) -> Recording:
     known = formats()
     for candidate in known.values():
         if candidate.recognises(source):
-            return candidate.read(source)
+            return _choose(candidate, source, topics).recording(source) if topics else candidate.read(source)
     raise _unknown(source, known)
 
 
-def load(source: str | Path, name: str | None = None) -> Log:
+def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()) -> Log:
     """Whatever a source holds, be it a whole recording or one sensor's log.
 
     Parameters
     ----------
     name
         The format to read it as; found from the content if None.
+    topics
+        As for `read`.
 
     Raises
     ------
@@ -63,12 +68,23 @@ def load(source: str | Path, name: str | None = None) -> Log:
     chosen = known[name] if name else next((f for f in known.values() if f.recognises(source)), None)
     if chosen is None:
         raise _unknown(source, known)
+    if topics:
+        return _choose(chosen, source, topics)
     if chosen.load is not None:
         return chosen.load(source)
     r = chosen.read(source)
     return Log(
         r.name, r.imu, r.gnss, r.odometer, r.truth, r.platform, gps_zero=r.gps_zero, files=r.files, remarks=r.remarks
     )
+
+
+def _choose(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:
+    """The log with these topics."""
+    if chosen.choose is None:
+        raise RecordingError(
+            f"--topic {topics[0]}: {source} is no ROS bag; in a recording.toml say topic in the sensor's table"
+        )
+    return chosen.choose(source, topics)
 
 
 def _unknown(source: str | Path, known: dict[str, Format]) -> RecordingError:

@@ -7,12 +7,14 @@ table of IS-GPS-200 applications). No leap second has been added since 2017, and
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 
 import numpy as np
 
 from graphnav.rotation import Array
 
 WEEK = 604800.0  # s
+UNIX = 1e9  # s; stamps above are dates of this century in Unix time
 GPS_TO_UNIX = 315964800.0  # s from the Unix to the GPS epoch, leap seconds aside
 _EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 # days on which GPS - UTC grew by one, to 1 s at the first
@@ -75,6 +77,42 @@ def parse_clock(text: str, t: float) -> float:
         return float(utc_to_gps(np.array([text.removesuffix("Z")], dtype="datetime64[us]"))[0])
     except ValueError:
         raise ValueError('must be "unix", "gps week 2313" or a UTC date such as "2024-05-01T12:00:00Z"') from None
+
+
+@dataclass(frozen=True)
+class Epochs:
+    """What lies between two clocks that are known: to be added to the second's stamps, s, and in words why."""
+
+    offset: float
+    words: str
+
+
+def between_clocks(t: float, zero: float | None, u: float, other: float | None) -> Epochs | None:
+    """From a clock that reads `u` to one that reads `t`, both s, whose zeros (s since the GPS epoch) may be known.
+
+    Stamps above 1e9 are Unix time; those below a week, beside such, are seconds of the GPS week of the others. None
+    where this does not tell, or the clocks are the same.
+    """
+    unix = [x > UNIX for x in (t, u)]
+    first = parse_clock("unix", t) if unix[0] else zero
+    second = parse_clock("unix", u) if unix[1] else other
+    if first is None and second is not None and unix[1] and 0.0 <= t < WEEK:
+        first = WEEK * float(np.floor((u + second) / WEEK))
+    if second is None and first is not None and unix[0] and 0.0 <= u < WEEK:
+        second = WEEK * float(np.floor((t + first) / WEEK))
+    if first is None or second is None or abs(second - first) < 1.0:
+        return None
+    offset = second - first
+    week = second if unix[0] else first
+    if unix[0] == unix[1] or week % WEEK:
+        return Epochs(offset, f"the clocks count from {clock_words(first)} and {clock_words(second)}")
+    leap = float(leap_seconds(gps_to_utc(np.array([week])))[0])
+    begins = week + GPS_TO_UNIX - leap
+    return Epochs(
+        offset,
+        f"GPS week {round(week / WEEK)} begins at Unix time {begins:.0f} ({GPS_TO_UNIX:.0f} + {round(week / WEEK)} x "
+        f"{WEEK:.0f} - {leap:.0f} leap seconds)",
+    )
 
 
 def clock_words(gps_zero: float) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,10 @@ def read_folder(source: str | Path) -> Recording:
     files = [path]
     logs: dict[str, Log | None] = {}  # by file; one log may hold several sensors
     zeros: list[float] = []  # of their clocks
+    topics: dict[str, tuple[str, ...]] = {}  # asked for of each file
+    for section in (d.imu, d.gnss, d.odometer):
+        if section is not None:
+            topics[section.file] = (*topics.get(section.file, ()), *section.topic)
 
     def table(name: str) -> Table:
         section = getattr(d, name)
@@ -67,8 +71,10 @@ def read_folder(source: str | Path) -> Recording:
         if section is None:
             return None
         if section.file not in logs:
-            logs[section.file] = other_log(path.parent / section.file)
+            logs[section.file] = other_log(path.parent / section.file, topics.get(section.file, ()))
         log = logs[section.file]
+        if section.topic and not (log and log.topics):
+            raise RecordingError(f"{path}: '{name}.topic' is only for ROS bags, and {section.file} is none")
         if log is None:
             return of_table(section, table(name), remarks)
         files.extend(file for file in log.files if file not in files)
@@ -145,7 +151,7 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     elif there:
         remarks.add(f"GNSS velocities need ve, vn and vu; only {', '.join(there)} is there, so none are used")
     kinds = fixes_by_type(rows, d.units.type) if "type" in rows else None
-    return Gnss(rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds)
+    return Gnss(rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds, d.units.type == "rtklib")
 
 
 def _odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odometer:
@@ -209,15 +215,15 @@ def _partial(rows: Table, names: tuple[str, ...], scale: float) -> Array | None:
     return np.stack([rows.get(name, absent) for name in names], -1) * scale
 
 
-def other_log(file: Path) -> Log | None:
-    """The log of another program, or None for a CSV file or one that is not there."""
+def other_log(file: Path, topics: Sequence[str] = ()) -> Log | None:
+    """The log of another program, or None for a CSV file or one that is not there; `topics` are for a ROS bag."""
     from graphnav.formats import formats  # which imports this module
 
     if file.name.endswith((".csv", ".csv.gz")) or not file.exists():
         return None
     for known in formats().values():
         if known.load is not None and known.recognises(file):
-            return known.load(file)
+            return known.choose(file, topics) if topics and known.choose is not None else known.load(file)
     return None
 
 

@@ -6,8 +6,8 @@ A log need not hold every sensor: it is read into a `Log`, and becomes a recordi
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from graphnav.errors import RecordingError
@@ -28,6 +28,7 @@ class Log:
     mount_known: bool = True  # whether the IMU's axes are by definition those of the vehicle
     files: tuple[Path, ...] = ()
     remarks: tuple[str, ...] = ()  # sentences about what was assumed
+    topics: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # sensor -> that used, then those it could be
 
     def recording(self, source: str | Path) -> Recording:
         """The log as a recording.
@@ -62,9 +63,16 @@ class Format:
     read: Callable[[str | Path], Recording]
     builtin: bool = False  # a name that is always there, such as "kitti", rather than a path
     load: Callable[[str | Path], Log] | None = None  # for logs of other programs
+    choose: Callable[[str | Path, Sequence[str]], Log] | None = None  # `load` of named topics, where logs have them
 
 
-def log_format(name: str, about: str, recognises: Callable[[Path], bool], load: Callable[[Path], Log]) -> Format:
+def log_format(
+    name: str,
+    about: str,
+    recognises: Callable[[Path], bool],
+    load: Callable[[Path], Log],
+    choose: Callable[[Path, Sequence[str]], Log] | None = None,
+) -> Format:
     """The `Format` of another program's log."""
 
     def known(source: str | Path) -> bool:
@@ -73,14 +81,22 @@ def log_format(name: str, about: str, recognises: Callable[[Path], bool], load: 
         except OSError:
             return False
 
-    def loaded(source: str | Path) -> Log:
+    def loaded(source: str | Path, topics: Sequence[str] = ()) -> Log:
         path = Path(source)
         if not path.exists():
             raise RecordingError(f"{path}: no such file or folder")
-        log = load(path)
-        return replace(log, files=log.files or (path,))
+        log = choose(path, topics) if choose is not None and topics else load(path)
+        return replace(log, files=log.files or _files(path))
 
-    return Format(name, about, known, lambda source: loaded(source).recording(source), load=loaded)
+    return Format(
+        name, about, known, lambda source: loaded(source).recording(source), load=loaded,
+        choose=None if choose is None else loaded,
+    )  # fmt: skip
+
+
+def _files(path: Path) -> tuple[Path, ...]:
+    """A file, or those of a folder."""
+    return tuple(sorted(file for file in path.iterdir() if file.is_file())) if path.is_dir() else (path,)
 
 
 def first_bytes(path: Path, count: int = 4096) -> bytes:

@@ -7,12 +7,14 @@ those of the headers. Read by rosbags, without ROS.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from graphnav.complaints import nearest
 from graphnav.errors import RecordingError
 from graphnav.formats.clocks import unix_to_gps
 from graphnav.formats.registry import Log, log_format
@@ -23,6 +25,7 @@ from graphnav.rotation import Array
 
 _IMU, _FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
 _TWISTS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped", "nav_msgs/msg/Odometry")
+_ROLES = {"imu": (_IMU,), "fix": (_FIX,), "twist": _TWISTS}
 _STATUS = {0: 5, 1: 3, 2: 4}  # of a NavSatFix: unaugmented, of satellites, of a base (carrier phases or not)
 _UNIX = 1e9  # s; stamps above are dates
 _SIDEWAYS = 0.2  # a body moves ahead; a velocity whose second component is larger than this is in east-north-up
@@ -45,8 +48,8 @@ def recognises(path: Path) -> bool:
     return path.suffix in (".bag", ".mcap", ".db3") and path.is_file()
 
 
-def load(path: Path) -> Log:
-    """The IMU, fixes and speed of the topics that have the most messages.
+def load(path: Path, wanted: Sequence[str] = ()) -> Log:
+    """The IMU, fixes and speed of the topics that are `wanted`, else of those that have the most messages.
 
     Raises
     ------
@@ -58,14 +61,20 @@ def load(path: Path) -> Log:
     if not topics:
         kinds = ", ".join(sorted(others)[:6]) or "nothing"
         raise RecordingError(f"{path}: no Imu, NavSatFix, TwistStamped or Odometry messages in it (there are: {kinds})")
+    for name in wanted:
+        if name not in (known := [t.name for t in topics]):
+            raise RecordingError(f"{path}: no topic '{name}' that can be used; {nearest(name, known)}")
     chosen: dict[str, _Topic] = {}
-    for wanted, types in (("imu", (_IMU,)), ("fix", (_FIX,)), ("twist", _TWISTS)):
-        found = sorted((t for t in topics if t.kind in types), key=lambda t: -len(t.rows))
+    ranked: dict[str, list[_Topic]] = {}
+    for role, types in _ROLES.items():
+        found = sorted((t for t in topics if t.kind in types), key=lambda t: (t.name not in wanted, -len(t.rows)))
+        ranked[role] = found
         if found:
-            chosen[wanted] = found[0]
+            chosen[role] = found[0]
         if len(found) > 1:
             left = ", ".join(t.name for t in found[1:])
-            remarks.add(f"{found[0].name} is used, having the most messages; not {left}")
+            why = "as was asked" if found[0].name in wanted else "having the most messages"
+            remarks.add(f"{found[0].name} is used, {why}; not {left}")
     imu = _imu(chosen["imu"], remarks) if "imu" in chosen else None
     gnss = _gnss(chosen["fix"], remarks) if "fix" in chosen else None
     odometer = None
@@ -78,7 +87,14 @@ def load(path: Path) -> Log:
     return Log(
         name, imu, gnss, odometer, gps_zero=zero,
         remarks=tuple(remarks), mount_known=False,
+        topics=_topics(ranked, odometer is not None),
     )  # fmt: skip
+
+
+def _topics(ranked: dict[str, list[_Topic]], wheel: bool) -> dict[str, tuple[str, ...]]:
+    """By sensor, the topic that is used, and those that could be."""
+    of = {"imu": "imu", "fix": "gnss"} | ({"twist": "odometer"} if wheel else {})
+    return {of[role]: tuple(t.name for t in found) for role, found in ranked.items() if found and role in of}
 
 
 def _read(path: Path) -> tuple[list[_Topic], set[str]]:
@@ -93,7 +109,7 @@ def _read(path: Path) -> tuple[list[_Topic], set[str]]:
             wanted = [c for c in reader.connections if c.msgtype in (_IMU, _FIX, *_TWISTS)]
             others = {c.msgtype for c in reader.connections} - {c.msgtype for c in wanted}
             for connection, _, raw in reader.messages(connections=wanted):
-                message = reader.deserialize(raw, connection.msgtype)
+                message: Any = reader.deserialize(raw, connection.msgtype)
                 topic = topics.setdefault(connection.topic, _Topic(connection.topic, connection.msgtype))
                 topic.t.append(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
                 topic.rows.append(_row(message, connection.msgtype))
@@ -186,4 +202,4 @@ def _twist(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> tuple[Gnss | N
     return replace(gnss, v=v, sd_v=sd_v), None
 
 
-FORMAT = log_format("ros", "ROS 1 or ROS 2 bags and MCAP files", recognises, load)
+FORMAT = log_format("ros", "ROS 1 or ROS 2 bags and MCAP files", recognises, load, load)

@@ -70,6 +70,13 @@ class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+def _one_or_more(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+Topics = Annotated[tuple[str, ...], BeforeValidator(_one_or_more)]
+
+
 class Keep(_Section):
     """Rows to use: those whose column holds at least this."""
 
@@ -87,6 +94,7 @@ class _Sensor(_Section):
     columns: dict[str, str] = Field({}, description="our name = the file's")
     time_offset: Number = Field(0.0, description="s, added to the file's stamps")
     keep: Keep | None = None
+    topic: Topics = Field((), description="of a ROS bag, or several: a fix's and a velocity's")
 
     @field_validator("columns")
     @classmethod
@@ -257,6 +265,8 @@ class TruthTable(_Sensor):
     def _one_kind(self) -> TruthTable:
         if (self.file is None) == (self.closed_loop_sigma is None):
             raise ValueError("say either file or closed_loop_sigma")
+        if self.topic:
+            raise ValueError("topic is for imu, gnss and odometer: a bag holds no truth")
         return self
 
 

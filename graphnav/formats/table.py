@@ -9,6 +9,7 @@ import warnings
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import IO, Any, ClassVar
 
@@ -124,6 +125,20 @@ def read_header(path: Path) -> list[str]:
         If the file is none.
     """
     return _header(path)[1]
+
+
+def first_rows(path: Path, count: int) -> list[list[str]]:
+    """The cells of the first rows of a .csv or .csv.gz, as text.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read.
+    """
+    try:
+        return [[cell.strip().strip('"') for cell in line.split(",")] for _, line in islice(_data_lines(path), count)]
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
+        raise _broken_gzip(path, error) from None
 
 
 def _open(path: Path) -> IO[str]:
