@@ -32,7 +32,10 @@ def gnss_apart(recording: Recording) -> str | None:
     if gnss is None or not len(gnss.t) or overlap_s(recording) >= 0:
         return None
     offset = recording.start - gnss.t[0]
-    apart = f"GNSS ({gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) do not overlap in time"
+    apart = (
+        f"GNSS ({gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) do not "
+        "overlap in time"
+    )
     known = between_clocks(recording.start, recording.gps_zero, float(gnss.t[0]), None)
     if known is not None:
         left = gnss.t[0] + known.offset - recording.start
