@@ -12,7 +12,7 @@ from graphnav.clock import Clock
 from graphnav.config.gnss import GnssSettings
 from graphnav.crosschecks import Fit, Track
 from graphnav.findings import Finding, period_of
-from graphnav.formats.clocks import between_clocks
+from graphnav.formats.clocks import NEAR, between_clocks
 from graphnav.recording import Imu, Odometer, Recording
 from graphnav.rotation import Array
 from graphnav.wheels.faults import FROZEN, GAP, STUCK, WILD
@@ -37,8 +37,8 @@ def gnss_apart(recording: Recording) -> str | None:
         "overlap in time"
     )
     known = between_clocks(recording.start, recording.gps_zero, float(gnss.t[0]), None)
-    if known is not None:
-        left = gnss.t[0] + known.offset - recording.start
+    left = gnss.t[0] + known.offset - recording.start if known is not None else np.inf
+    if known is not None and abs(left) < NEAR:
         return (
             f"{apart}: {known.words}; say time_offset = {known.offset:.0f} in [gnss], with which "
             f"GNSS starts {abs(left):.2f} s {'after' if left > 0 else 'before'} the IMU"

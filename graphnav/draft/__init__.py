@@ -14,7 +14,7 @@ from graphnav.draft.agreement import CLEAR, FAIR, Agreement, compare
 from graphnav.draft.guesses import Guess
 from graphnav.draft.sources import JOINED, Source, fix_speed_unit, fixes, sources
 from graphnav.errors import RecordingError
-from graphnav.formats.clocks import Epochs, between_clocks
+from graphnav.formats.clocks import NEAR, Epochs, between_clocks
 from graphnav.formats.schema import FORCE, RATE, SPEED
 from graphnav.formats.writer import quoted
 from graphnav.recording import Gnss, Odometer
@@ -282,7 +282,8 @@ def _epochs(imu: Source, gnss: Source) -> Epochs | None:
     """What lies between the clocks of two logs, where both are known."""
     first = [_first(source, sensor) for source, sensor in ((imu, "imu"), (gnss, "gnss"))]
     zeros = [None if source.log is None else source.log.gps_zero for source in (imu, gnss)]
-    return between_clocks(first[0], zeros[0], first[1], zeros[1])
+    found = between_clocks(first[0], zeros[0], first[1], zeros[1])
+    return found if found is not None and abs(first[1] + found.offset - first[0]) < NEAR else None
 
 
 def _first(source: Source, sensor: str) -> float:

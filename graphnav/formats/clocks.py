@@ -14,6 +14,7 @@ import numpy as np
 from graphnav.rotation import Array
 
 WEEK = 604800.0  # s
+NEAR = 3600.0  # s; logs of one drive begin within that of each other
 UNIX = 1e9  # s; stamps above are dates of this century in Unix time
 GPS_TO_UNIX = 315964800.0  # s from the Unix to the GPS epoch, leap seconds aside
 _EPOCH = np.datetime64("1980-01-06T00:00:00", "us")

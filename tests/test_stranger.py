@@ -1,0 +1,195 @@
+"""Logs that nobody prepared, from nothing to a right result; and every known kind of log through `smooth`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import logs
+import numpy as np
+import pytest
+import stranger
+from test_formats_binary import write_bag, write_ubx
+
+from graphnav import cli
+from graphnav.draft import draft
+from graphnav.draft.guesses import noise_density
+from graphnav.formats import read
+from graphnav.formats.clocks import between_clocks
+from graphnav.formats.trajectories import read_trajectory
+
+RECORDING, TRUTH = logs.simulated(60.0)
+FAST = ("--solver", "ekf", "--noise", "stated", "--quiet")
+
+
+def run(*arguments) -> None:
+    """Run a command that must succeed."""
+    assert cli.run([str(a) for a in arguments]) == 0
+
+
+@pytest.fixture(scope="module")
+def tokyo(shared_data):
+    """(a part with a turn, another): of a real drive, with a fix a second and an RTK reference."""
+    return stranger.cuts(shared_data / "tokyo_20201105", [(600.0, 720.0), (1200.0, 1320.0)])
+
+
+def errors(drive: stranger.Cut, out: Path) -> np.ndarray:
+    track = read_trajectory(out / "trajectory.csv")
+    return stranger.errors(replace(track, t=track.t - stranger.UNIX), drive.reference)
+
+
+def rms(x) -> float:
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+# ---- three logs, from nothing
+
+
+@pytest.mark.parametrize("total", [True, False])
+def test_the_folder_of_a_phone(tokyo, tmp_path, capsys, total):
+    """No edit: files of no sensor left out, gravity where it belongs, the date kept, the cached fix dropped."""
+    drive = tokyo[0]
+    folder = stranger.write_phone(tmp_path / "ride", drive, total)
+    run("init", folder, "-o", folder, "--json")
+    decisions = " ".join(json.loads(capsys.readouterr().out)["decisions"])
+    for name in (
+        "Magnetometer.csv",
+        "Barometer.csv",
+        "Annotation.csv",
+        "Metadata.csv",
+        "Orientation.csv",
+        "Gravity.csv",
+    ):
+        assert name in decisions
+    recording = read(folder)
+    assert recording.imu.t[0] == pytest.approx(stranger.UNIX + drive.recording.imu.t[0], abs=0.1)
+    assert recording.gps_zero is not None
+    force = drive.recording.imu.accel
+    mine = recording.imu.accel[: len(force)] @ recording.imu.R_bs  # back in the phone's axes
+    off = np.linalg.norm(mine, axis=1) - np.linalg.norm(force[: len(mine)], axis=1)
+    assert np.median(np.abs(off)) < 0.05  # m/s2; forces of another file's times
+    if not total:
+        return  # the forces are the same
+    run("smooth", folder, "-o", tmp_path / "out", "--solver", "rts", "--quiet")
+    checks = json.loads((tmp_path / "out" / "summary.json").read_text())["checks"]
+    assert "gnss.cached" in [check["key"] for check in checks]
+    assert rms(errors(drive, tmp_path / "out")) < rms(stranger.fix_errors(folder, drive))
+
+
+def test_a_receiver_beside_an_imu_in_other_units(tokyo, tmp_path, capsys):
+    """No edit: deg/s, g and Unix milliseconds beside the GPS week of a .ubx."""
+    drive = tokyo[1]
+    folder = stranger.write_receiver(tmp_path / "rover", drive)
+    run("init", folder, "-o", folder, "--quiet")
+    assert 'units = { t = "ms", gyro = "deg/s", accel = "g" }' in (folder / "recording.toml").read_text()
+    recording = read(folder)
+    assert recording.gnss.t == pytest.approx(stranger.UNIX + drive.recording.gnss.t, abs=0.06)
+    run("smooth", folder, "-o", tmp_path / "out", "--solver", "rts", "--quiet")
+    assert rms(errors(drive, tmp_path / "out")) < 0.1
+
+
+def test_a_bag_with_two_imus(tokyo, tmp_path, capsys):
+    """One choice: which of the two; by key or flag, and known by name."""
+    drive = tokyo[0]
+    bag = stranger.write_bag(tmp_path / "bag", drive)
+    assert 'topic = "/camera/imu"' in draft([bag], tmp_path).text  # it has more messages
+    run("init", bag, "-o", tmp_path / "bag.toml", "--topic", "/imu/data", "--quiet")
+    assert 'axes = "FLU"' in (tmp_path / "bag.toml").read_text()
+    by_key, by_flag = read(tmp_path / "bag.toml"), read(bag, ["/imu/data"])
+    assert np.array_equal(by_key.imu.gyro, by_flag.imu.gyro)
+    assert by_key.imu.t == pytest.approx(stranger.UNIX + drive.recording.imu.t, abs=1e-5)
+    run("smooth", tmp_path / "bag.toml", "-o", tmp_path / "out", "--solver", "rts", "--quiet")
+    assert rms(errors(drive, tmp_path / "out")) < 0.1
+    assert by_flag.imu.noise_assumed  # without covariances: measured where a recording is made of it
+    run("convert", bag, "-o", tmp_path / "converted", "--topic", "/imu/data", "--quiet")
+    noise = read(tmp_path / "converted").imu.noise
+    for stated, x in ((noise.gyro_noise_density, by_flag.imu.gyro), (noise.accel_noise_density, by_flag.imu.accel)):
+        assert stated == pytest.approx(noise_density(by_flag.imu.t, x), rel=0.05)
+    assert cli.run(["info", str(bag), "--topic", "/imu/dat"]) == 2
+    assert "/imu/data" in capsys.readouterr().err
+
+
+# ---- every kind of log
+
+
+def _bag(kind):
+    return lambda folder: write_bag(folder / ("a.bag" if kind == "bag" else "a"), kind)
+
+
+def _joined(write):
+    """A log of fixes beside an IMU as CSV, through init."""
+
+    def make(folder: Path) -> Path:
+        imu = RECORDING.imu
+        table = np.column_stack([logs.TOW + imu.t, imu.gyro, imu.accel])
+        np.savetxt(folder / "imu.csv", table, "%.9f", ",", header="t,gx,gy,gz,ax,ay,az", comments="")
+        run("init", folder / "imu.csv", write(folder), "-o", folder / "recording.toml", "--quiet")
+        return folder
+
+    return make
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda folder: logs.write_kf_gins(folder / "drive", RECORDING, TRUTH),
+        lambda folder: logs.write_kitti(folder, RECORDING, TRUTH),
+        lambda folder: write_ubx(folder / "a.ubx"),
+        _joined(lambda folder: logs.write_nmea(folder / "a.nmea", RECORDING)),
+        _joined(lambda folder: logs.write_rtklib(folder / "a.pos", RECORDING)),
+        _bag("bag"), _bag("db3"),
+    ],
+    ids=["kf-gins", "kitti-raw", "ubx", "nmea", "rtklib", "ros 1", "ros 2"],
+)  # fmt: skip
+def test_every_kind_of_log_is_solved(tmp_path, make):
+    source = make(tmp_path)
+    run("smooth", source, "-o", tmp_path / "out", *FAST)
+    track = read_trajectory(tmp_path / "out" / "trajectory.csv")
+    # exact fixes 0.9 m above and half a metre ahead of the IMU, whose lever arm few of the logs hold
+    frame = np.array([1.0, np.cos(TRUTH.llh[0, 0])]) * 6.37e6
+    nearest = np.abs(TRUTH.llh[:, None, :2] - track.llh[None, ::5, :2]) * frame
+    assert np.linalg.norm(nearest, axis=-1).min(0).max() < 1.5
+    inputs = json.loads((tmp_path / "out" / "summary.json").read_text())["provenance"]["inputs"]
+    assert inputs
+    assert all(len(digest) == 64 for digest in inputs.values())
+
+
+# ---- what is behind
+
+
+def test_a_topic_of_what_is_no_bag_is_one_line(tmp_path, capsys):
+    path = logs.write_rtklib(tmp_path / "a.pos", RECORDING)
+    assert cli.run(["convert", str(path), "-o", str(tmp_path / "out"), "--topic", "/a"]) == 2
+    assert "--topic /a" in capsys.readouterr().err
+    logs.write_kf_gins(tmp_path, RECORDING, TRUTH)
+    text = 'format = "graphnav-recording/1"\nplatform = "vehicle"\n[imu]\nfile = "imu.txt"\ntopic = "/a"\n'
+    (tmp_path / "recording.toml").write_text(text)
+    assert cli.run(["info", str(tmp_path)]) == 2
+    assert "imu.topic" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("t", "zero", "u", "other", "offset"),
+    [
+        # 10 March 2022, 0:00:00 GPS time: week 2200, 345600 s; 18 s earlier in UTC
+        (1646870382.0, None, 345600.0, None, 1646870382.0 - 345600.0),
+        (345600.0, None, 1646870382.0, None, 345600.0 - 1646870382.0),
+        (1646870382.0, None, 345600.0, 2200 * 604800.0, 1646870382.0 - 345600.0),
+        (345600.0, 2200 * 604800.0, 0.0, 2200 * 604800.0 + 345600.0, 345600.0),
+        (1646870382.0, None, 1646870382.5, None, None), (0.0, None, 345600.0, None, None),
+    ],
+)  # fmt: skip
+def test_what_lies_between_clocks_that_are_known(t, zero, u, other, offset):
+    found = between_clocks(t, zero, u, other)
+    assert (found and found.offset) == (None if offset is None else pytest.approx(offset, abs=1e-6))
+
+
+def test_advice_is_for_the_log_at_hand(tmp_path):
+    """Numbers of types are a matter of CSV files, and keys of a recording.toml."""
+    from graphnav.checks import inspect
+
+    bag = write_bag(tmp_path / "a", "db3")
+    found = inspect(replace(read(bag), imu=replace(RECORDING.imu, t=read(bag).imu.t, accel=-RECORDING.imu.accel)))
+    assert "recording.log" in [f.key for f in found.findings]
+    assert not any("type = " in f.sentence for f in found.findings)  # a key of recording.toml
