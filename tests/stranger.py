@@ -91,7 +91,8 @@ def write_phone(folder: Path, drive: Cut, total: bool = True) -> Path:
     _write(folder / "Accelerometer.csv", three, [*stamps(t), *(force - down).T[::-1]])
     _write(folder / "Gravity.csv", three, [*stamps(t), *down.T[::-1]])
     if total:
-        _write(folder / "TotalAcceleration.csv", three, [*stamps(t + 0.002), *force.T[::-1]])
+        at = np.column_stack([np.interp(t + 0.002, t, x) for x in force.T])
+        _write(folder / "TotalAcceleration.csv", three, [*stamps(t + 0.002), *at.T[::-1]])
     _write(folder / "Gyroscope.csv", three, [*stamps(t), *gyro.T[::-1]])
     _write(folder / "Magnetometer.csv", three, [*stamps(t[::4]), *(30 * down[::4]).T[::-1]])
     _write(

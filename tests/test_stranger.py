@@ -65,10 +65,11 @@ def test_the_folder_of_a_phone(tokyo, tmp_path, capsys, total):
     recording = read(folder)
     assert recording.imu.t[0] == pytest.approx(stranger.UNIX + drive.recording.imu.t[0], abs=0.1)
     assert recording.gps_zero is not None
-    force = drive.recording.imu.accel
-    mine = recording.imu.accel[: len(force)] @ recording.imu.R_bs  # back in the phone's axes
-    off = np.linalg.norm(mine, axis=1) - np.linalg.norm(force[: len(mine)], axis=1)
-    assert np.median(np.abs(off)) < 0.05  # m/s2; forces of another file's times
+    imu = drive.recording.imu
+    force = np.interp(recording.imu.t - stranger.UNIX, imu.t, np.linalg.norm(imu.accel, axis=1))
+    assert np.linalg.norm(recording.imu.accel, axis=1) == pytest.approx(
+        force, abs=0.3
+    )  # of other stamps, under shaking
     if not total:
         return  # the forces are the same
     run("smooth", folder, "-o", tmp_path / "out", "--solver", "rts", "--quiet")
