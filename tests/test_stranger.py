@@ -67,9 +67,7 @@ def test_the_folder_of_a_phone(tokyo, tmp_path, capsys, total):
     assert recording.gps_zero is not None
     imu = drive.recording.imu
     force = np.interp(recording.imu.t - stranger.UNIX, imu.t, np.linalg.norm(imu.accel, axis=1))
-    assert np.linalg.norm(recording.imu.accel, axis=1) == pytest.approx(
-        force, abs=0.3
-    )  # of other stamps, under shaking
+    assert rms(np.linalg.norm(recording.imu.accel, axis=1) - force) < 0.1  # m/s2; between rows 2 ms apart
     if not total:
         return  # the forces are the same
     run("smooth", folder, "-o", tmp_path / "out", "--solver", "rts", "--quiet")
