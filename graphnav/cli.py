@@ -17,11 +17,14 @@ import typer
 
 from graphnav import __version__, cli_logs
 from graphnav.cli_options import (
+    SEVERAL,
     Config,
     End,
+    Export,
     Json,
     Noise,
     Out,
+    Point,
     Profile,
     Quiet,
     Rate,
@@ -30,6 +33,7 @@ from graphnav.cli_options import (
     Start,
     Topic,
     Without,
+    only,
 )
 from graphnav.errors import ConfigError, GraphnavError
 from graphnav.progress import tell
@@ -44,6 +48,7 @@ app = typer.Typer(
     name="graphnav",
     add_completion=False,
     rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
     help="Smooths recorded drives with a factor graph, beside the Kalman filter it replaces.",
     epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out",
 )
@@ -62,8 +67,9 @@ def _program(
         raise typer.Exit(BAD_INPUT)
 
 
-@app.command(epilog="\b\nExample:\n  graphnav info kitti")
+@app.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav info kitti")
 def info(
+    context: typer.Context,
     recording: Source,
     antenna: Annotated[
         bool, typer.Option("--antenna", help="Also find the antenna from the drive, and compare with its lever arm.")
@@ -78,7 +84,7 @@ def info(
 
     with bar(quiet, "ekf" if antenna else "info"):
         tell("reading")
-        whole = read(recording, topic or ())
+        whole = read(only(context, recording), topic or ())
         tell("checks")
         found = inspect(whole)
         if antenna:
@@ -88,12 +94,13 @@ def info(
     show(found.text, found.values, quiet, json)
 
 
-@app.command(epilog="\b\nExample:\n  graphnav smooth kitti -o out/kitti")
+@app.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav smooth kitti -o out/kitti")
 def smooth(
+    context: typer.Context,
     recording: Source,
     out: Out,
     solver: Annotated[
-        str, typer.Option("--solver", metavar="NAME", help="batch, incremental, isam2, rts or ekf.")
+        str, typer.Option("--solver", "--solvers", metavar="NAME", help="batch, incremental, isam2, rts or ekf.")
     ] = "batch",
     profile: Profile = None,
     config: Config = None,
@@ -102,30 +109,34 @@ def smooth(
     rate: Rate = None,
     start: Start = None,
     end: End = None,
-    export: Annotated[
-        str | None, typer.Option("--export", metavar="NAMES", help="More formats: some of gpx,nav,nmea,csv,tum,kml.")
-    ] = None,
-    point: Annotated[
-        str | None, typer.Option("--point", metavar="POINT", help="Of --export: imu, antenna or x,y,z (m; RFU).")
-    ] = None,
+    export: Export = None,
+    point: Point = None,
     require: Require = None,
     topic: Topic = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
-    asked = _Asked(recording, out, profile, config, noise, without, rate, start, end, require, topic, quiet, json)
+    asked = _Asked(
+        only(context, recording), out, profile, config, noise, without, rate, start, end, require, topic, quiet, json
+    )
     _solve(asked, solver, "--solver", export, point)
 
 
-@app.command(epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out/kitti")
+@app.command(
+    context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out/kitti"
+)
 def compare(
+    context: typer.Context,
     recording: Source,
     out: Out,
     solvers: Annotated[
         str,
         typer.Option(
-            "--solvers", metavar="NAMES", help="Some of ekf, rts, incremental, isam2, batch, with commas between."
+            "--solvers",
+            "--solver",
+            metavar="NAMES",
+            help="Some of ekf, rts, incremental, isam2, batch, with commas between.",
         ),
     ] = "ekf,rts,batch",
     profile: Profile = None,
@@ -135,18 +146,23 @@ def compare(
     rate: Rate = None,
     start: Start = None,
     end: End = None,
+    export: Export = None,
+    point: Point = None,
     require: Require = None,
     topic: Topic = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Put the same recording through several solvers and compare them, against the truth where there is one."""
-    asked = _Asked(recording, out, profile, config, noise, without, rate, start, end, require, topic, quiet, json)
-    _solve(asked, solvers, "--solvers")
+    asked = _Asked(
+        only(context, recording), out, profile, config, noise, without, rate, start, end, require, topic, quiet, json
+    )
+    _solve(asked, solvers, "--solvers", export, point)
 
 
-@app.command(epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")
+@app.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")
 def detect(
+    context: typer.Context,
     recording: Source,
     out: Out,
     config: Config = None,
@@ -169,7 +185,7 @@ def detect(
     folder = outputs.output_folder(out)
     with bar(quiet, "detect"):
         tell("reading")
-        used, said = screened(workflow.read_part(recording, start, end, withheld, tuple(topic or ())))
+        used, said = screened(workflow.read_part(only(context, recording), start, end, withheld, tuple(topic or ())))
         tell("detection")
         found = detected(used, settings)
         found = replace(found, notes=(*said, *found.notes))

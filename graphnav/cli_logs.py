@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from graphnav.cli_options import Json, Quiet, Topic
+from graphnav.cli_options import Export, Json, Point, Quiet, Topic
 from graphnav.errors import ConfigError
 from graphnav.progress import tell
 from graphnav.talk import bar, say, show
@@ -24,11 +24,10 @@ def convert(
     source: Annotated[str, typer.Argument(metavar="SOURCE", help="Another program's log, or a trajectory file.")],
     out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder; for a trajectory, a file will do.")],
     format: Annotated[
-        str | None, typer.Option("--format", metavar="NAME", help="What the log is, or what to write a trajectory as.")
+        str | None, typer.Option("--format", metavar="NAME", help="What the log is, where that is not seen.")
     ] = None,
-    point: Annotated[
-        str | None, typer.Option("--point", metavar="POINT", help="Trajectory: imu, antenna or x,y,z (m; RFU).")
-    ] = None,
+    export: Export = None,
+    point: Point = None,
     rate: Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Trajectory: interpolate to.")] = None,
     clock: Annotated[
         str | None,
@@ -43,13 +42,15 @@ def convert(
     from graphnav.outputs import output_folder
     from graphnav.staging import moved, staged
 
-    if conversion.is_export(Path(source), out, format):
+    if export is not None and format is not None:
+        raise ConfigError(f"--format {format}: is for logs; what a trajectory is, is seen from its content")
+    if export is not None or conversion.is_export(Path(source), out, format):
         conversion.check_rate(rate)
         alone = bool(out.suffix) and not out.is_dir()
         folder = output_folder(out.parent if alone else out)
         with bar(quiet, "convert"), staged(folder) as part:
             target = part / out.name if alone else part
-            _, files, notes = conversion.export_file(Path(source), target, format, point, rate, clock)
+            _, files, notes = conversion.export_file(Path(source), target, export or format, point, rate, clock)
         files = moved(files, part, folder)
         show(
             lambda: "\n".join([*(f"note: {note}" for note in notes), *(f"wrote {file}" for file in files)]),

@@ -7,8 +7,17 @@ from typing import Annotated
 
 import typer
 
+from graphnav.errors import ConfigError
+
 Source = Annotated[
-    str, typer.Argument(metavar="RECORDING", help="A folder, a .toml in one, or a built-in name such as kitti.")
+    str, typer.Argument(metavar="RECORDING", help="A folder, a .toml, a known log, or a built-in name such as kitti.")
+]
+SEVERAL = {"allow_extra_args": True}  # of which `only` has more to say than the parser
+Export = Annotated[
+    str | None, typer.Option("--export", metavar="NAMES", help="Formats to write: some of gpx,nav,nmea,csv,tum,kml.")
+]
+Point = Annotated[
+    str | None, typer.Option("--point", metavar="POINT", help="Of --export: imu, antenna or x,y,z (m; RFU).")
 ]
 Out = Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into; made if need be.")]
 Config = Annotated[
@@ -48,3 +57,19 @@ Require = Annotated[
         "--require", metavar="NAME<NUMBER", help="Leave with 3 unless it holds, as h_rms<0.5; may be repeated."
     ),
 ]
+
+
+def only(context: typer.Context, recording: str) -> str:
+    """The one recording that is asked for.
+
+    Raises
+    ------
+    ConfigError
+        If several are.
+    """
+    if context.args:
+        logs = " ".join([recording, *context.args])
+        raise ConfigError(
+            f"{logs}: one recording at a time; graphnav init {logs} -o recording.toml joins logs into one"
+        )
+    return recording

@@ -133,11 +133,11 @@ def export_file(
     trajectory = read_trajectory(source)
     if out.suffix[1:] in NAMES and not out.is_dir():
         if name is not None and name != out.suffix[1:]:
-            raise ConfigError(f"--format {name}: but {out.name} is to be written")
+            raise ConfigError(f"--export {name}: but {out.name} is to be written")
         targets = {out.suffix[1:]: out}
     else:
         assert name is not None
-        targets = {one: out / f"{source.stem}.{one}" for one in listed(name, NAMES, "--format", "format to write")}
+        targets = {one: out / f"{source.stem}.{one}" for one in listed(name, NAMES, "--export", "format to write")}
     run = _run(source)
     arm = parse_point(point)
     if isinstance(arm, str) and arm == "antenna":
@@ -193,30 +193,35 @@ def write_formats(trajectory: Trajectory, targets: dict[str, Path], gps_zero: fl
 
 
 def export_run(outcome: Outcome, folder: Path, names: Sequence[str], point: str | None) -> list[Path]:
-    """Write the only solution of a run in some formats, in files named after the point: trajectory.gpx, antenna.gpx.
+    """Write the solutions of a run in some formats, in files named after the point: trajectory.gpx, antenna.gpx.
+
+    The only one lies in `folder`, several in folders of their names in it.
 
     Raises
     ------
     ConfigError
         If the antenna is asked for and there is none.
     """
-    ((solver, solution),) = outcome.solutions.items()
     rate = outcome.request.rate
-    trajectory = solution.trajectory(rate)
     arm = parse_point(point)
     name = "trajectory" if point in (None, "imu") else "antenna" if point == "antenna" else "point"
-    if isinstance(arm, str) and arm == "antenna":
-        found = antenna_lever_arm(outcome.recording, solution)
-        if found is None:
-            raise ConfigError("--point antenna: the recording has no GNSS")
-        arm = found
-    if not isinstance(arm, str) and np.any(arm):
-        # between keyframes a second apart the turn rate, and with it the point's velocity, would be guessed
-        dense = solution.trajectory(max(rate or 0.0, _DENSE))
-        trajectory, _ = interpolate(dense, trajectory.t, max_gap=_MAX_GAP, lever_arm=arm)
-    title = f"{outcome.recording.name}, {solver}" + (f", {name}" if name != "trajectory" else "")
-    targets = {one: folder / f"{name}.{one}" for one in names}
-    return write_formats(replace(trajectory, name=title), targets, outcome.recording.gps_zero)
+    written: list[Path] = []
+    for solver, solution in outcome.solutions.items():
+        trajectory, lever_arm = solution.trajectory(rate), arm
+        if isinstance(arm, str) and arm == "antenna":
+            found = antenna_lever_arm(outcome.recording, solution)
+            if found is None:
+                raise ConfigError("--point antenna: the recording has no GNSS")
+            lever_arm = found
+        if not isinstance(lever_arm, str) and np.any(lever_arm):
+            # between keyframes a second apart the turn rate, and with it the point's velocity, would be guessed
+            dense = solution.trajectory(max(rate or 0.0, _DENSE))
+            trajectory, _ = interpolate(dense, trajectory.t, max_gap=_MAX_GAP, lever_arm=lever_arm)
+        title = f"{outcome.recording.name}, {solver}" + (f", {name}" if name != "trajectory" else "")
+        own = folder if len(outcome.solutions) == 1 else folder / solver
+        targets = {one: own / f"{name}.{one}" for one in names}
+        written += write_formats(replace(trajectory, name=title), targets, outcome.recording.gps_zero)
+    return written
 
 
 def _run(source: Path) -> dict[str, Any]:

@@ -101,6 +101,9 @@ def parse_withheld(text: str) -> Withheld:
         If it is not of that form, or no source of that name can be withheld.
     """
     found = re.fullmatch(r"([^:]*)(?::([^-]+)-([^-]+))?", text.strip())
+    if re.fullmatch(r"[\d.]+-[\d.]+", text.strip()):
+        sensors = " or ".join(f"{source}:{text.strip()}" for source in SOURCES)
+        raise ConfigError(f"--without {text}: say of which sensor: {sensors}")
     usage = "write SOURCE or SOURCE:FROM-TO in seconds from the start, such as gnss:600-660"
     if found is None:
         raise ConfigError(f"--without {text}: not a source and a span; {usage}")

@@ -341,6 +341,9 @@ BAD = {
     "no config": (["smooth", "kitti", "-o", "o", "--config", "no.toml"], "no.toml: cannot be read"),
     "unknown noise": (["smooth", "kitti", "-o", "o", "--noise", "statd"], "--noise statd: no such file"),
     "unknown key": (["smooth", "kitti", "-o", "o", "--config", "bad.toml"], "did you mean 'rate'?"),
+    "two logs": (["info", "a.csv", "b.csv"], "graphnav init a.csv b.csv"),
+    "no sensor": (["smooth", "kitti", "-o", "o", "--without", "400-460"], "gnss:400-460"),
+    "two formats": (["convert", "file", "-o", "o", "--format", "nav", "--export", "gpx"], "--format nav"),
     "not a trajectory": (["evaluate", "file", "file"], "file"),
 }
 
@@ -401,8 +404,9 @@ def test_a_reader_that_stops_early_is_no_error():
 
 # ---------------------------------------------------------------------------------------------------------------- help
 @pytest.mark.parametrize("command", ["info", "smooth", "compare", "evaluate"])
-def test_every_command_has_help_with_an_example(command, capsys):
-    assert cli.run([command, "--help"]) == 0
+@pytest.mark.parametrize("flag", ["-h", "--help"])
+def test_every_command_has_help_with_an_example(command, flag, capsys):
+    assert cli.run([command, flag]) == 0
     printed = capsys.readouterr().out
     assert f"  graphnav {command} " in printed.split("Example:")[1]
 

@@ -176,7 +176,7 @@ def test_convert_writes_a_trajectory_for_other_programs(run, tmp_path, capsys) -
     assert "is not known" in capsys.readouterr().out
     assert len(gpxpy.parse((tmp_path / "a.gpx").read_text()).tracks[0].segments[0].points) == len(track)
     assert (
-        cli.run(["convert", source, "-o", str(tmp_path / "out"), "--format", "nav,tum,kml", "--rate", "10"]) == 0
+        cli.run(["convert", source, "-o", str(tmp_path / "out"), "--export", "nav,tum,kml", "--rate", "10"]) == 0
         or True
     )
     assert (
@@ -189,7 +189,7 @@ def test_convert_writes_a_trajectory_for_other_programs(run, tmp_path, capsys) -
     ("arguments", "sentence"),
     [
         (["--format", "gpz", "-o", "OUT"], "--format gpz: no such format; did you mean 'gpx'?"),
-        (["-o", "OUT.gpx", "--format", "nav"], "--format nav: but OUT.gpx is to be written"),
+        (["-o", "OUT.gpx", "--export", "nav"], "--export nav: but OUT.gpx is to be written"),
         (["-o", "OUT.gpx", "--point", "roof"], "--point roof: write imu, antenna, or x,y,z"),
         (["-o", "OUT.gpx", "--rate", "0"], "--rate 0: must be above 0"),
         (["-o", "OUT.gpx", "--clock", "noon"], "--clock noon: must be"),
