@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import typer
 
-from graphnav import __version__, cli_logs
+from graphnav import __version__, cli_logs, cli_online
 from graphnav.cli_options import (
     SEVERAL,
     Config,
@@ -37,7 +37,19 @@ from graphnav.cli_options import (
 )
 from graphnav.errors import ConfigError, GraphnavError
 from graphnav.progress import tell
-from graphnav.talk import BAD_INPUT, DEBUG, INTERNAL, INTERRUPTED, PIPE_CLOSED, bar, fail, insist, say, show
+from graphnav.talk import (
+    BAD_INPUT,
+    DEBUG,
+    INTERNAL,
+    INTERRUPTED,
+    PIPE_CLOSED,
+    Interrupted,
+    bar,
+    fail,
+    insist,
+    say,
+    show,
+)
 
 __all__ = ["DEBUG", "PIPE_CLOSED", "app", "main", "run"]
 
@@ -248,6 +260,7 @@ def settings(
 
 
 app.add_typer(cli_logs.commands)
+app.add_typer(cli_online.commands)
 
 
 @dataclass(frozen=True)
@@ -342,6 +355,8 @@ def run(arguments: list[str]) -> int:
         code = app(arguments, prog_name="graphnav", standalone_mode=False)
     except GraphnavError as error:
         return fail(str(error), BAD_INPUT, debug)
+    except Interrupted as error:
+        return fail(str(error), INTERRUPTED, False)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except MemoryError:

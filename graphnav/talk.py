@@ -20,6 +20,10 @@ BAD_INPUT, INTERNAL, NOT_MET, INTERRUPTED, PIPE_CLOSED = 2, 1, 3, 130, 141
 DEBUG = "GRAPHNAV_DEBUG"  # set, a traceback is shown
 
 
+class Interrupted(Exception):
+    """Ctrl-C ended a command that has more to say of it."""
+
+
 def insist(verdicts: Sequence[Verdict]) -> None:
     """Leave with `NOT_MET`, and one line that says why, unless all is as required."""
     missed = [verdict.sentence for verdict in verdicts if not verdict.met]
@@ -47,10 +51,10 @@ def bar(quiet: bool, *work: str) -> Iterator[Progress | None]:
         yield progress
 
 
-def say(text: str) -> None:
+def say(text: str, flush: bool = True) -> None:
     """Print to stdout; whoever reads may stop early."""
     try:
-        print(text, flush=True)
+        print(text, flush=flush)
     except BrokenPipeError:
         # what is still in the buffer would fail again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -18,8 +18,6 @@ import tempfile
 import time
 from pathlib import Path
 
-SCRIPT = Path(__file__).resolve().parent / "online.py"
-
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -64,7 +62,7 @@ def main() -> None:
 
 def start(recording: str, out: Path, resumed: bool) -> subprocess.Popen[bytes]:
     more = ["--resume"] if resumed else []
-    return subprocess.Popen([sys.executable, str(SCRIPT), recording, "-o", str(out), "--quiet", "--speed", "0", *more])
+    return subprocess.Popen([sys.executable, "-m", "graphnav", "online", recording, "-o", str(out), "--quiet", *more])
 
 
 def trajectory(recording: str, out: Path) -> bytes:

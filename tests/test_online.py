@@ -36,7 +36,7 @@ from graphnav.solution import to_trajectory
 from graphnav.solvers.window import turn_limit
 from graphnav.trajectory import Trajectory
 
-SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "online.py"
+ROOT = Path(__file__).resolve().parents[1]
 QUICK = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 20.0}})
 
 
@@ -337,10 +337,10 @@ def test_bad_setups_say_why(line: str, reason: str) -> None:
 
 # ------------------------------------------------------------------------------------------------------ nothing lost
 def program(*arguments: str | Path, **more: object) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "graphnav", "online", *map(str, arguments)]
     return subprocess.Popen(
-        [sys.executable, str(SCRIPT), *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": str(SCRIPT.parents[1])}, **more,
-    )  # fmt: skip
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)}, **more
+    )
 
 
 @pytest.fixture(scope="module")

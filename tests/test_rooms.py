@@ -22,7 +22,7 @@ ROOMS = [
     "interpolation", "metrics", "sigmas", "gates", "fitted", "scoring", "strides", "evaluation", "exporters", "online",
     "panels", "page", "plots", "report_tables", "report_words", "report_pictures", "report_provenance", "report",
     "workflow", "staging", "outputs", "convert", "terminal", "detection_report",
-    "talk", "cli_options", "cli_logs", "cli", "__main__",
+    "talk", "cli_options", "cli_logs", "cli_online", "cli", "__main__",
 ]  # fmt: skip
 
 GTSAM_ROOMS = {"solvers"}
