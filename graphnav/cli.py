@@ -158,6 +158,20 @@ def compare(
     rate: Rate = None,
     start: Start = None,
     end: End = None,
+    against: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--against", metavar="FILE", help="Another program's .nav, .pos, TUM or CSV to put beside; may be repeated."
+        ),
+    ] = None,
+    against_point: Annotated[
+        list[str] | None,
+        typer.Option("--against-point", metavar="POINT", help="Of each --against: imu (default), antenna or x,y,z."),
+    ] = None,
+    against_shift: Annotated[
+        list[float] | None,
+        typer.Option("--against-shift", metavar="S", help="To add to the stamps of each --against; default: found."),
+    ] = None,
     export: Export = None,
     point: Point = None,
     require: Require = None,
@@ -169,7 +183,11 @@ def compare(
     asked = _Asked(
         only(context, recording), out, profile, config, noise, without, rate, start, end, require, topic, quiet, json
     )
-    _solve(asked, solvers, "--solvers", export, point)
+    beside = _Beside(against or [], against_point or [], against_shift or [])
+    for option, values in (("--against-point", beside.points), ("--against-shift", beside.shifts)):
+        if values and len(values) != len(beside.files):
+            raise ConfigError(f"{option} {values[-1]}: say one for each of the {len(beside.files)} files of --against")
+    _solve(asked, solvers, "--solvers", export, point, beside)
 
 
 @app.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")
@@ -282,7 +300,23 @@ class _Asked:
     json: bool
 
 
-def _solve(asked: _Asked, solvers: str, option: str, export: str | None = None, point: str | None = None) -> None:
+@dataclass(frozen=True)
+class _Beside:
+    """Trajectory files to put beside the solutions, of which point they are, and what to add to their stamps."""
+
+    files: list[Path]
+    points: list[str]
+    shifts: list[float]
+
+
+def _solve(
+    asked: _Asked,
+    solvers: str,
+    option: str,
+    export: str | None = None,
+    point: str | None = None,
+    beside: _Beside | None = None,
+) -> None:
     from graphnav import convert, gates, outputs, pipeline, terminal, workflow
     from graphnav.complaints import listed
     from graphnav.config import read_settings
@@ -299,26 +333,34 @@ def _solve(asked: _Asked, solvers: str, option: str, export: str | None = None, 
         "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
         "config": asked.config and str(asked.config), "noise": asked.noise, "without": asked.without,
         "rate": asked.rate, "start": asked.start, "end": asked.end, "topic": asked.topic,
+        "against": (beside and [str(file) for file in beside.files]) or None,
     }  # fmt: skip
     folder = outputs.output_folder(asked.out)
     if point is not None and export is None:
         raise ConfigError(f"--point {point}: is of the files of --export; name some")
     exported = listed(export, NAMES, "--export", "format to write") if export is not None else ()
     convert.parse_point(point)
+    against = []
+    for k, file in enumerate(beside.files if beside is not None else ()):
+        assert beside is not None
+        if not file.is_file():
+            raise ConfigError(f"--against {file}: no such file")
+        of = convert.parse_point(beside.points[k] if beside.points else None, "--against-point")
+        against.append(workflow.Against(file, of, beside.shifts[k] if beside.shifts else None))
     settings, noise = workflow.parse_noise(asked.noise, read_settings(asked.config, asked.profile))
     request = workflow.Request(
         asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
         {k: v for k, v in given.items() if v is not None}, noise,
-        tuple(asked.topic or ()),
+        topics=tuple(asked.topic or ()), against=tuple(against),
     )  # fmt: skip
     with bar(asked.quiet, *chosen) as progress:
         outcome = workflow.run_request(request, progress)
         tell("writing")
         with staged(folder) as part:
             files = (outputs.write_run if alone else outputs.write_comparison)(outcome, part)
-            files += convert.export_run(outcome, part, exported, point) if exported else []
+            files += convert.export_run(outcome, part, exported, point, alone) if exported else []
     files = moved(files, part, folder)
-    verdicts = gates.judge(requirements, outputs.comparison(outcome)) if requirements else []
+    verdicts = gates.judge(requirements, outputs.comparison(outcome, ours=True)) if requirements else []
 
     def values() -> dict[str, Any]:
         places = {name: folder if alone else folder / name for name in chosen}

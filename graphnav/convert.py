@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.against import antenna_lever_arm, own
 from graphnav.complaints import listed, nearest
 from graphnav.draft.guesses import noise_density
 from graphnav.errors import ConfigError, RecordingError
@@ -20,7 +21,6 @@ from graphnav.formats.registry import Log
 from graphnav.formats.trajectories import read_trajectory
 from graphnav.formats.writer import write_recording
 from graphnav.interpolation import interpolate
-from graphnav.outputs import antenna_lever_arm
 from graphnav.rotation import Array
 from graphnav.staging import moved, staged
 from graphnav.trajectory import Trajectory
@@ -93,7 +93,7 @@ def _with_measured_noise(log: Log) -> Log:
     return replace(log, imu=replace(imu, noise=noise, noise_assumed=False), remarks=(*log.remarks, remark))
 
 
-def parse_point(text: str | None) -> str | Array:
+def parse_point(text: str | None, option: str = "--point") -> str | Array:
     """``imu``, ``antenna``, or a lever arm ``x,y,z`` (m; right, forward, up of the IMU).
 
     Raises
@@ -109,7 +109,7 @@ def parse_point(text: str | None) -> str | Array:
     except ValueError:
         arm = np.empty(0)
     if arm.shape != (3,) or not np.isfinite(arm).all():
-        raise ConfigError(f"--point {text}: write imu, antenna, or x,y,z in m: right, forward, up of the IMU")
+        raise ConfigError(f"{option} {text}: write imu, antenna, or x,y,z in m: right, forward, up of the IMU")
     return arm
 
 
@@ -192,10 +192,12 @@ def write_formats(trajectory: Trajectory, targets: dict[str, Path], gps_zero: fl
     return list(targets.values())
 
 
-def export_run(outcome: Outcome, folder: Path, names: Sequence[str], point: str | None) -> list[Path]:
+def export_run(
+    outcome: Outcome, folder: Path, names: Sequence[str], point: str | None, alone: bool = True
+) -> list[Path]:
     """Write the solutions of a run in some formats, in files named after the point: trajectory.gpx, antenna.gpx.
 
-    The only one lies in `folder`, several in folders of their names in it.
+    One that is `alone` lies in `folder`, else each in a folder of its name in it.
 
     Raises
     ------
@@ -206,7 +208,7 @@ def export_run(outcome: Outcome, folder: Path, names: Sequence[str], point: str 
     arm = parse_point(point)
     name = "trajectory" if point in (None, "imu") else "antenna" if point == "antenna" else "point"
     written: list[Path] = []
-    for solver, solution in outcome.solutions.items():
+    for solver, solution in own(outcome.solutions).items():
         trajectory, lever_arm = solution.trajectory(rate), arm
         if isinstance(arm, str) and arm == "antenna":
             found = antenna_lever_arm(outcome.recording, solution)
@@ -218,8 +220,8 @@ def export_run(outcome: Outcome, folder: Path, names: Sequence[str], point: str 
             dense = solution.trajectory(max(rate or 0.0, _DENSE))
             trajectory, _ = interpolate(dense, trajectory.t, max_gap=_MAX_GAP, lever_arm=lever_arm)
         title = f"{outcome.recording.name}, {solver}" + (f", {name}" if name != "trajectory" else "")
-        own = folder if len(outcome.solutions) == 1 else folder / solver
-        targets = {one: own / f"{name}.{one}" for one in names}
+        place = folder if alone else folder / solver
+        targets = {one: place / f"{name}.{one}" for one in names}
         written += write_formats(replace(trajectory, name=title), targets, outcome.recording.gps_zero)
     return written
 

@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import graphnav
+from graphnav.against import antenna_lever_arm, own
 from graphnav.detectors.base import intervals_text
 from graphnav.errors import ConfigError
-from graphnav.recording import Recording
-from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
 from graphnav.workflow import Outcome, outages
 
@@ -65,7 +64,7 @@ def write_comparison(outcome: Outcome, folder: Path) -> list[Path]:
 
     provenance = _provenance(outcome)
     detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
-    for name in outcome.solutions:
+    for name in own(outcome.solutions):
         write_solver(outcome, name, folder / name, provenance, detectors)
     write_comparison_csv(folder / "comparison.csv", comparison(outcome))
     report.write_comparison(
@@ -202,21 +201,13 @@ def noise_summary(outcome: Outcome, solution: Solution) -> dict[str, Any]:
     return values
 
 
-def antenna_lever_arm(recording: Recording, solution: Solution) -> Array | None:
-    """From the IMU to the antenna, m, RFU: as estimated, else as stated; None without GNSS."""
-    if recording.gnss is None:
-        return None
-    estimated = solution.parameters.get("gnss_lever_arm")
-    return recording.gnss.lever_arm if estimated is None else estimated.value[-1]
-
-
-def comparison(outcome: Outcome) -> list[dict[str, Any]]:
+def comparison(outcome: Outcome, ours: bool = False) -> list[dict[str, Any]]:
     """One flat row per solver: errors where there are any, stated sigmas, seconds and iterations."""
     from graphnav.metrics import comparison_rows
 
     measured = {row["solver"]: row for row in comparison_rows(outcome.metrics)}
     rows = []
-    for name, solution in outcome.solutions.items():
+    for name, solution in (own(outcome.solutions) if ours else outcome.solutions).items():
         row = measured.get(name, {"solver": name})
         row |= {key: _rounded(value) for key, value in stated(solution).items()}
         row |= {"keyframes": len(solution.t), "iterations": solution.iterations, "final_cost": _rounded(solution.cost)}

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from graphnav import page, plots
+from graphnav.against import own
 from graphnav.detectors.base import Detection
 from graphnav.interpolation import fit_yaw, yaw_matrix
 from graphnav.page import Raw
@@ -39,7 +40,7 @@ def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], 
     if recording.truth is not None and recording.truth.llh is not None:
         truth = frame.from_llh(recording.truth.llh)[:, :2]
     elif recording.truth is not None and recording.truth.xyz is not None:
-        truth = _laid_on(recording.truth.t, recording.truth.xyz, list(solutions.values())[-1])
+        truth = _laid_on(recording.truth.t, recording.truth.xyz, list(own(solutions).values())[-1])
     drawing = plots.trajectory(
         {name: (s.t - start, s.states.p[:, :2]) for name, s in solutions.items()},
         fixes=_fixes(recording, first),
@@ -205,10 +206,11 @@ def zoom_pictures(errors: Mapping[str, Errors], start: float, spans: Spans, what
 
 def difference_pictures(solutions: Mapping[str, Solution], start: float, spans: Shades) -> list[Raw]:
     """How far the solvers are from the last of them, at the keyframes they share."""
-    *others, last = solutions.items()
-    name, reference = last
+    name, reference = list(own(solutions).items())[-1]
     series = {}
-    for key, s in others:
+    for key, s in solutions.items():
+        if key == name:
+            continue
         _, mine, its = np.intersect1d(s.t, reference.t, return_indices=True)
         if len(mine) > 1:
             series[key] = Series(s.t[mine] - start, s.states.p[mine] - reference.states.p[its])

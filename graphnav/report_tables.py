@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from graphnav import page
+from graphnav.against import own
 from graphnav.page import Raw
 from graphnav.panels.drawing import Spans
 from graphnav.recording import Recording
@@ -312,6 +313,7 @@ def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Raw]:
 
 def run_table(solutions: Mapping[str, Solution]) -> list[Raw]:
     """Seconds by stage, iterations and cost, a column per solver; why each stopped."""
+    every, solutions = solutions, own(solutions)
     stages = list(dict.fromkeys(stage for s in solutions.values() for stage in s.timings))
 
     def seconds(solution: Solution, stage: str) -> Raw | None:
@@ -326,9 +328,9 @@ def run_table(solutions: Mapping[str, Solution]) -> list[Raw]:
     several = len(solutions) > 1
     notes = [f"{name} stopped: {s.stopped}" for name, s in solutions.items() if s.stopped and several]
     shared = [note for note in next(iter(solutions.values())).notes if all(note in s.notes for s in solutions.values())]
-    own = [f"{name}: {note}" for name, s in solutions.items() for note in s.notes if note not in shared]
+    theirs = [f"{name}: {note}" for name, s in every.items() for note in s.notes if note not in shared]
     table = page.table(["stage", *(page.solver(name) for name in solutions)], rows)
-    return [table, page.bullets([*notes, *shared, *own]) if notes or shared or own else Raw("")]
+    return [table, page.bullets([*notes, *shared, *theirs]) if notes or shared or theirs else Raw("")]
 
 
 def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Raw]:

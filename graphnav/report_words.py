@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from graphnav import page
+from graphnav.against import own
 from graphnav.noise.apply import row_weights
 from graphnav.page import Raw
 from graphnav.panels.drawing import Spans
@@ -29,6 +30,8 @@ def doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> t
     from graphnav.sigmas import judge_sigmas
 
     out = []
+    solutions = own(solutions)
+    errors = {name: e for name, e in errors.items() if name in solutions}
     for solution in solutions.values():
         fixes = solution.records.get("gnss_position")
         left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
@@ -77,6 +80,8 @@ def what_was_done(recording: Recording, solutions: Mapping[str, Solution], withh
         sources.append(f"{len(used.gnss.t)} GNSS fixes")
     if used.odometer is not None:
         sources.append(f"{len(used.odometer.t)} odometer rows")
+    others = [name for name in solutions if name not in own(solutions)]
+    solutions = own(solutions)
     solution = next(iter(solutions.values()))
     several = len(solutions) > 1
     who = f"The solvers {page.and_list(list(solutions))}" if several else f"The {solution.solver} solver"
@@ -84,6 +89,8 @@ def what_was_done(recording: Recording, solutions: Mapping[str, Solution], withh
         f"{who} estimated the trajectory of the {recording.platform} recording '{recording.name}' "
         f"({recording.duration:.1f} s) from {page.and_list(sources)}, at {len(solution.t)} keyframes."
     )
+    if others:
+        words += f" Beside them, of other programs: {page.and_list(others)}."
     if withheld:
         listed = [f"{source} {span[0]:g} to {span[1]:g} s" if span else f"all of {source}" for source, span in withheld]
         words += f" Withheld: {page.and_list(listed)} (seconds from the start)."

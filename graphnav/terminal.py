@@ -14,6 +14,7 @@ from graphnav.constraints.gnss import TIMES
 from graphnav.metrics import Span
 from graphnav.outputs import stated
 from graphnav.progress import Progress
+from graphnav.solution import Solution
 from graphnav.staging import uninterrupted
 from graphnav.workflow import Outcome
 
@@ -101,8 +102,7 @@ def _whole(outcome: Outcome) -> list[str]:
     if not outcome.metrics:
         head = ["solver", "keyframes", "sd hor. (m)", "sd up (m)", "sd head. (deg)", "seconds"]
         rows = [
-            [name, str(len(s.t)), *(short(x) for x in stated(s).values()), f"{sum(s.timings.values()):.2f}"]
-            for name, s in outcome.solutions.items()
+            [name, str(len(s.t)), *(short(x) for x in _sigmas(s)), _seconds(s)] for name, s in outcome.solutions.items()
         ]
         return ["no truth to compare with; medians of the sigmas stated:", *table(head, rows)]
     if all(m.closure is not None for m in outcome.metrics.values()):
@@ -118,8 +118,18 @@ def _whole(outcome: Outcome) -> list[str]:
     for name, m in outcome.metrics.items():
         row = [short(getattr(m.components[key], what)) if key in m.components else "-" for _, key, what, _ in shown]
         nees = short(m.nees["p"].mean) if "p" in m.nees else "-"
-        rows.append([name, *row, nees, f"{sum(outcome.solutions[name].timings.values()):.2f}"])
+        rows.append([name, *row, nees, _seconds(outcome.solutions[name])])
     return [f"errors against {outcome.against}:", *table(head, rows)]
+
+
+def _sigmas(solution: Solution) -> list[float]:
+    """Those that `outputs.stated` gives, NaN where there are none."""
+    found = stated(solution)
+    return [found.get(key, float("nan")) for key in ("sd_h_median_m", "sd_u_median_m", "sd_heading_median_deg")]
+
+
+def _seconds(solution: Solution) -> str:
+    return f"{sum(solution.timings.values()):.2f}" if solution.timings else "-"
 
 
 def _spans(outcome: Outcome) -> list[str]:

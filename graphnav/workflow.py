@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from graphnav import rotation
+from graphnav.against import Against, Foreign, own, read_against, without_attitude
 from graphnav.complaints import nearest
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
@@ -63,6 +64,7 @@ class Request:
     rate: float | None = None  # Hz of the output; None: at the keyframes
     options: Mapping[str, Any] = field(default_factory=dict)  # as they were given, for provenance
     noise: GivenNoise | None = None  # to be used as it is; else what the settings say
+    against: tuple[Against, ...] = ()  # trajectories of other programs to put beside the solutions
     topics: tuple[str, ...] = ()  # of a ROS bag, as `graphnav.formats.read` takes them
 
 
@@ -189,16 +191,28 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     solutions = {
         name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
     }
-    own: dict[str, float] = {}
-    with _timed(own, "evaluation"):
+    solutions |= _beside(request, recording, solutions)
+    spent: dict[str, float] = {}
+    with _timed(spent, "evaluation"):
         metrics, against, names = _score(recording, used, solutions, moved)
     for found in metrics.values():
         if found.notes:
             findings += [note for note in found.notes if note not in findings]
     return Outcome(
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
-        inspection.warnings, timings | own, inspection.findings,
+        inspection.warnings, timings | spent, inspection.findings,
     )  # fmt: skip
+
+
+def _beside(request: Request, recording: Recording, solutions: Mapping[str, Solution]) -> dict[str, Solution]:
+    """The trajectories of other programs, by the names of their files."""
+    reference = list(solutions.values())[-1]
+    out: dict[str, Solution] = {}
+    for asked in request.against:
+        taken = {*solutions, *out}
+        name = next(n for n in (asked.path.stem, asked.path.name, str(asked.path)) if n not in taken)
+        out[name] = read_against(asked, name, recording, reference)
+    return out
 
 
 def unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
@@ -310,7 +324,7 @@ def _score(
     truth = recording.truth
     gnss_withheld = any(source == "gnss" for source, _ in withheld)
     if truth is not None and truth.closed_loop_sigma is not None:
-        if any("closed_loop" in solution.records for solution in solutions.values()):
+        if any("closed_loop" in solution.records for solution in own(solutions).values()):
             return {}, None, ()  # what was put in is no measure of what came out
         against, spans = "the start, where the loop ends", []
     elif truth is not None:
@@ -341,7 +355,8 @@ def _score(
         metrics = evaluate_recording(track, recording, withheld=asked, at=at if len(at) else None)
         if metrics is None:
             return {}, None, ()
-        found[name] = metrics
+        borrowed = isinstance(solution, Foreign) and solution.borrowed
+        found[name] = without_attitude(metrics) if borrowed else metrics
     return found, against, tuple(name for name, _ in spans)
 
 
@@ -371,6 +386,9 @@ def _thinned(t: Array, solution: Solution, most: int) -> Array:
 
 def _scored(solution: Solution, t: Array, placed: bool) -> Trajectory:
     """The solution at the times, or at all keyframes where these will do; in metres of its frame if not `placed`."""
+    if isinstance(solution, Foreign):
+        track = solution.track_at(t)
+        return track if placed else replace(track, llh=solution.frame.from_llh(track.llh), frame="local")
     times, states, covariance = solution.t, solution.states, solution.covariance
     if not np.isin(t, times).all():
         times, states, covariance = solution.at(np.union1d(times[[0, -1]], t))

@@ -91,15 +91,15 @@ class Epochs:
 def between_clocks(t: float, zero: float | None, u: float, other: float | None) -> Epochs | None:
     """From a clock that reads `u` to one that reads `t`, both s, whose zeros (s since the GPS epoch) may be known.
 
-    Stamps above 1e9 are Unix time; those below a week, beside such, are seconds of the GPS week of the others. None
-    where this does not tell, or the clocks are the same.
+    Stamps above 1e9 are Unix time; those below a week are seconds of the GPS week of the others, where these are known.
+    None where this does not tell, or the clocks are the same.
     """
     unix = [x > UNIX for x in (t, u)]
     first = parse_clock("unix", t) if unix[0] else zero
     second = parse_clock("unix", u) if unix[1] else other
-    if first is None and second is not None and unix[1] and 0.0 <= t < WEEK:
+    if first is None and second is not None and 0.0 <= t < WEEK:
         first = WEEK * float(np.floor((u + second) / WEEK))
-    if second is None and first is not None and unix[0] and 0.0 <= u < WEEK:
+    if second is None and first is not None and 0.0 <= u < WEEK:
         second = WEEK * float(np.floor((t + first) / WEEK))
     if first is None or second is None or abs(second - first) < 1.0:
         return None

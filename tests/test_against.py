@@ -1,0 +1,100 @@
+"""`compare --against`: another program's trajectory is in all tables and figures, on our clock, at our point."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import logs
+import numpy as np
+import pytest
+
+from graphnav import cli
+from graphnav.earth import LocalFrame
+from graphnav.exporters import write_as
+from graphnav.formats.writer import write_folder
+from graphnav.interpolation import placed
+from graphnav.recording import Truth
+from graphnav.trajectory import Trajectory
+
+RECORDING, TRUTH = logs.simulated(60.0)
+ZERO = logs.WEEK * 604800.0 + logs.TOW
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory) -> Path:
+    """A recording with the truth of its IMU and a date."""
+    part = TRUTH.take((TRUTH.t >= RECORDING.start) & (TRUTH.t <= RECORDING.end))
+    truth = Truth(part.t, part.llh, None, part.v, part.rph)
+    folder = tmp_path_factory.mktemp("drive")
+    write_folder(replace(RECORDING, truth=truth, gps_zero=ZERO), folder)
+    return folder
+
+
+def moved(east: float, shift: float = 0.0) -> Trajectory:
+    """The truth somewhat to the east, s later, with the rows of the drive alone."""
+    part = TRUTH.take((TRUTH.t >= RECORDING.start - 1e-6) & (TRUTH.t <= RECORDING.end))
+    frame = LocalFrame(part.llh[0])
+    return replace(part, t=part.t + shift, llh=frame.to_llh(frame.from_llh(part.llh) + np.array([east, 0.0, 0.0])))
+
+
+def compare(drive: Path, out: Path, *more: object) -> dict[str, dict[str, str]]:
+    """Rows of comparison.csv by their names."""
+    arguments = ["compare", drive, "-o", out, "--solvers", "ekf", "--noise", "stated", "--quiet", *more]
+    assert cli.run([str(a) for a in arguments]) == 0
+    with (out / "comparison.csv").open(encoding="utf-8", newline="") as file:
+        return {row["solver"]: row for row in csv.DictReader(file)}
+
+
+def test_three_kinds_of_files_stand_beside_ours(drive, tmp_path):
+    utc = np.datetime64("2022-03-09T23:59:42", "us") + (moved(2.0).t * 1e6).astype("timedelta64[us]")
+    write_as("nav", moved(2.0), tmp_path / "filter.nav", utc)  # in seconds of the GPS week
+    logs.write_rtklib(tmp_path / "rover.pos", RECORDING, "UTC")  # exact, of the antenna, 18 s behind
+    local = replace(moved(0.0), t=moved(0.0).t - RECORDING.start, frame="local")
+    frame = LocalFrame(local.llh[0])
+    local = replace(local, llh=frame.from_llh(local.llh))
+    turned = placed(local, frame, 0.7, np.array([5.0, 6.0, 7.0]))
+    turned = replace(turned, llh=frame.from_llh(turned.llh), frame="local", v=None)
+    write_as("tum", turned, tmp_path / "slam.tum", None)
+    write_as("csv", moved(0.0, 0.2), tmp_path / "late.csv", None)
+    names = {"filter.nav": "imu", "rover.pos": "antenna", "slam.tum": "0,0,0", "late.csv": "imu"}
+    files = [x for name in names for x in ("--against", tmp_path / name)]
+    points = [x for point in names.values() for x in ("--against-point", point)]
+    rows = compare(drive, tmp_path / "out", *files, *points, "--require", "h_rms<2", "--export", "tum")
+    assert list(rows) == ["ekf", "filter", "rover", "slam", "late"]
+    assert float(rows["filter"]["e_mean_m"]) == pytest.approx(2.0, abs=1e-3)
+    assert float(rows["filter"]["heading_rms_deg"]) < 0.01
+    assert float(rows["rover"]["h_rms_m"]) < 0.02  # by the attitude of ours, which is not its own
+    assert rows["rover"]["heading_rms_deg"] == ""
+    assert float(rows["slam"]["h_rms_m"]) < 0.3  # laid on ours
+    assert float(rows["late"]["h_rms_m"]) > 1.0  # 0.2 s of the speed, which are its own
+    page = (tmp_path / "out" / "comparison.html").read_text(encoding="utf-8")
+    assert all(name in page for name in rows)
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"comparison.csv", "comparison.html", "ekf"}
+
+
+def test_a_shift_that_is_asked_for_is_made(drive, tmp_path):
+    write_as("csv", moved(0.0, 0.2), tmp_path / "late.csv", None)
+    rows = compare(drive, tmp_path / "b", "--against", tmp_path / "late.csv", "--against-shift", "-0.2")
+    assert float(rows["late"]["h_rms_m"]) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("more", "word"),
+    [
+        (["--against", "none.nav"], "none.nav"),
+        (["--against-point", "antenna"], "--against-point antenna"),
+        (["--against", "FAR"], "--against-shift"),
+        (["--against", "FAR", "--against-point", "roof"], "--against-point roof"),
+    ],
+)
+def test_what_cannot_stand_beside_ours_is_one_line(drive, tmp_path, capsys, more, word):
+    write_as("csv", moved(0.0, 1e6), tmp_path / "far.csv", None)
+    more = [str(tmp_path / "far.csv") if x == "FAR" else x for x in more]
+    arguments = ["compare", str(drive), "-o", str(tmp_path / "out"), "--solvers", "ekf", "--noise", "stated", *more]
+    assert cli.run(arguments) == 2
+    said = capsys.readouterr().err
+    assert word in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
