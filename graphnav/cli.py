@@ -8,34 +8,30 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from dataclasses import dataclass, replace
-from json import loads
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from graphnav import __version__, cli_logs, cli_online
+from graphnav import __version__, cli_logs, cli_online, cli_solve
 from graphnav.cli_options import (
     SEVERAL,
     Config,
     End,
-    Export,
     Json,
-    Noise,
     Out,
-    Point,
     Profile,
     Quiet,
-    Rate,
     Require,
     Source,
     Start,
     Topic,
     Without,
     only,
+    withheld_of,
 )
-from graphnav.errors import ConfigError, GraphnavError
+from graphnav.errors import GraphnavError
 from graphnav.progress import tell
 from graphnav.talk import (
     BAD_INPUT,
@@ -106,90 +102,6 @@ def info(
     show(found.text, found.values, quiet, json)
 
 
-@app.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav smooth kitti -o out/kitti")
-def smooth(
-    context: typer.Context,
-    recording: Source,
-    out: Out,
-    solver: Annotated[
-        str, typer.Option("--solver", "--solvers", metavar="NAME", help="batch, incremental, isam2, rts or ekf.")
-    ] = "batch",
-    profile: Profile = None,
-    config: Config = None,
-    noise: Noise = None,
-    without: Without = None,
-    rate: Rate = None,
-    start: Start = None,
-    end: End = None,
-    export: Export = None,
-    point: Point = None,
-    require: Require = None,
-    topic: Topic = None,
-    quiet: Quiet = False,
-    json: Json = False,
-) -> None:
-    """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
-    asked = _Asked(
-        only(context, recording), out, profile, config, noise, without, rate, start, end, require, topic, quiet, json
-    )
-    _solve(asked, solver, "--solver", export, point)
-
-
-@app.command(
-    context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out/kitti"
-)
-def compare(
-    context: typer.Context,
-    recording: Source,
-    out: Out,
-    solvers: Annotated[
-        str,
-        typer.Option(
-            "--solvers",
-            "--solver",
-            metavar="NAMES",
-            help="Some of ekf, rts, incremental, isam2, batch, with commas between.",
-        ),
-    ] = "ekf,rts,batch",
-    profile: Profile = None,
-    config: Config = None,
-    noise: Noise = None,
-    without: Without = None,
-    rate: Rate = None,
-    start: Start = None,
-    end: End = None,
-    against: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--against", metavar="FILE", help="Another program's .nav, .pos, TUM or CSV to put beside; may be repeated."
-        ),
-    ] = None,
-    against_point: Annotated[
-        list[str] | None,
-        typer.Option("--against-point", metavar="POINT", help="Of each --against: imu (default), antenna or x,y,z."),
-    ] = None,
-    against_shift: Annotated[
-        list[float] | None,
-        typer.Option("--against-shift", metavar="S", help="To add to the stamps of each --against; default: found."),
-    ] = None,
-    export: Export = None,
-    point: Point = None,
-    require: Require = None,
-    topic: Topic = None,
-    quiet: Quiet = False,
-    json: Json = False,
-) -> None:
-    """Put the same recording through several solvers and compare them, against the truth where there is one."""
-    asked = _Asked(
-        only(context, recording), out, profile, config, noise, without, rate, start, end, require, topic, quiet, json
-    )
-    beside = _Beside(against or [], against_point or [], against_shift or [])
-    for option, values in (("--against-point", beside.points), ("--against-shift", beside.shifts)):
-        if values and len(values) != len(beside.files):
-            raise ConfigError(f"{option} {values[-1]}: say one for each of the {len(beside.files)} files of --against")
-    _solve(asked, solvers, "--solvers", export, point, beside)
-
-
 @app.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")
 def detect(
     context: typer.Context,
@@ -210,7 +122,7 @@ def detect(
     from graphnav.plausibility import screened
     from graphnav.staging import moved, staged
 
-    withheld = _withheld(without, start, end)
+    withheld = withheld_of(without, start, end)
     settings = read_settings(config)
     folder = outputs.output_folder(out)
     with bar(quiet, "detect"):
@@ -277,108 +189,9 @@ def settings(
     show(lambda: settings_text(found), found.model_dump, False, json)
 
 
+app.add_typer(cli_solve.commands)
 app.add_typer(cli_logs.commands)
 app.add_typer(cli_online.commands)
-
-
-@dataclass(frozen=True)
-class _Asked:
-    """The options that smooth and compare share."""
-
-    recording: str
-    out: Path
-    profile: str | None
-    config: Path | None
-    noise: str | None
-    without: list[str] | None
-    rate: float | None
-    start: float | None
-    end: float | None
-    require: list[str] | None
-    topic: list[str] | None
-    quiet: bool
-    json: bool
-
-
-@dataclass(frozen=True)
-class _Beside:
-    """Trajectory files to put beside the solutions, of which point they are, and what to add to their stamps."""
-
-    files: list[Path]
-    points: list[str]
-    shifts: list[float]
-
-
-def _solve(
-    asked: _Asked,
-    solvers: str,
-    option: str,
-    export: str | None = None,
-    point: str | None = None,
-    beside: _Beside | None = None,
-) -> None:
-    from graphnav import convert, gates, outputs, pipeline, terminal, workflow
-    from graphnav.complaints import listed
-    from graphnav.config import read_settings
-    from graphnav.exporters import NAMES
-    from graphnav.staging import moved, staged
-
-    withheld = _withheld(asked.without, asked.start, asked.end)
-    convert.check_rate(asked.rate)
-    chosen, alone = listed(solvers, pipeline.KNOWN, option, "solver"), option == "--solver"
-    if alone and len(chosen) > 1:
-        raise ConfigError(f"--solver {solvers}: smooth uses one; several are for graphnav compare")
-    requirements = [gates.parse_requirement(one, chosen) for one in asked.require or ()]
-    given: dict[str, Any] = {
-        "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
-        "config": asked.config and str(asked.config), "noise": asked.noise, "without": asked.without,
-        "rate": asked.rate, "start": asked.start, "end": asked.end, "topic": asked.topic,
-        "against": (beside and [str(file) for file in beside.files]) or None,
-    }  # fmt: skip
-    folder = outputs.output_folder(asked.out)
-    if point is not None and export is None:
-        raise ConfigError(f"--point {point}: is of the files of --export; name some")
-    exported = listed(export, NAMES, "--export", "format to write") if export is not None else ()
-    convert.parse_point(point)
-    against = []
-    for k, file in enumerate(beside.files if beside is not None else ()):
-        assert beside is not None
-        if not file.is_file():
-            raise ConfigError(f"--against {file}: no such file")
-        of = convert.parse_point(beside.points[k] if beside.points else None, "--against-point")
-        against.append(workflow.Against(file, of, beside.shifts[k] if beside.shifts else None))
-    settings, noise = workflow.parse_noise(asked.noise, read_settings(asked.config, asked.profile))
-    request = workflow.Request(
-        asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
-        {k: v for k, v in given.items() if v is not None}, noise,
-        topics=tuple(asked.topic or ()), against=tuple(against),
-    )  # fmt: skip
-    with bar(asked.quiet, *chosen) as progress:
-        outcome = workflow.run_request(request, progress)
-        tell("writing")
-        with staged(folder) as part:
-            files = (outputs.write_run if alone else outputs.write_comparison)(outcome, part)
-            files += convert.export_run(outcome, part, exported, point, alone) if exported else []
-    files = moved(files, part, folder)
-    verdicts = gates.judge(requirements, outputs.comparison(outcome, ours=True)) if requirements else []
-
-    def values() -> dict[str, Any]:
-        places = {name: folder if alone else folder / name for name in chosen}
-        each = {name: loads((at / "summary.json").read_text(encoding="utf-8")) for name, at in places.items()}
-        found = each[chosen[0]] if alone else {"recording": outcome.recording.name, "solvers": each}
-        return {**found, "requirements": gates.values(verdicts), "files": files}
-
-    show(lambda: terminal.run_text(outcome, files) + gates.text(verdicts), values, asked.quiet, asked.json)
-    insist(verdicts)
-
-
-def _withheld(without: list[str] | None, start: float | None, end: float | None) -> tuple[Any, ...]:
-    """What is withheld; the span asked for must not be empty."""
-    from graphnav import workflow
-
-    if start is not None and end is not None and not start < end:
-        raise ConfigError(f"--end {end:g}: must be later than --start {start:g}")
-    return tuple(workflow.parse_withheld(one) for one in without or ())
 
 
 def main() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -73,3 +73,12 @@ def only(context: typer.Context, recording: str) -> str:
             f"{logs}: one recording at a time; graphnav init {logs} -o recording.toml joins logs into one"
         )
     return recording
+
+
+def withheld_of(without: list[str] | None, start: float | None, end: float | None) -> tuple[Any, ...]:
+    """What is withheld; the span asked for must not be empty."""
+    from graphnav import workflow
+
+    if start is not None and end is not None and not start < end:
+        raise ConfigError(f"--end {end:g}: must be later than --start {start:g}")
+    return tuple(workflow.parse_withheld(one) for one in without or ())

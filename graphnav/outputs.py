@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -18,10 +17,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import graphnav
+from graphnav import stored
 from graphnav.against import antenna_lever_arm, own
 from graphnav.detectors.base import intervals_text
 from graphnav.errors import ConfigError
 from graphnav.solution import ParameterEstimate, Solution
+from graphnav.stored import read_again, sha256, write_outcome
 from graphnav.workflow import Outcome, outages
 
 if TYPE_CHECKING:
@@ -53,20 +54,57 @@ def output_folder(path: str | Path) -> Path:
 def write_run(outcome: Outcome, folder: Path) -> list[Path]:
     """Everything of the only solver of a run, straight into `folder`; returns the files to look at first."""
     ((name, _),) = outcome.solutions.items()
-    write_solver(outcome, name, folder, _provenance(outcome))
+    provenance = _provenance(outcome)
+    write_solver(outcome, name, folder, provenance)
+    write_outcome(outcome, provenance, folder / stored.NAME)
     return [folder / "report.html", folder / "trajectory.csv", folder / "summary.json"]
 
 
 def write_comparison(outcome: Outcome, folder: Path) -> list[Path]:
     """Everything per solver under its own name, and the table and page that compare them."""
     from graphnav import report
-    from graphnav.metrics import summary, write_comparison_csv
+    from graphnav.metrics import write_comparison_csv
 
     provenance = _provenance(outcome)
     detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
     for name in own(outcome.solutions):
         write_solver(outcome, name, folder / name, provenance, detectors)
     write_comparison_csv(folder / "comparison.csv", comparison(outcome))
+    _draw_comparison(outcome, folder, provenance)
+    write_outcome(outcome, provenance, folder / stored.NAME)
+    return [folder / "comparison.html", folder / "comparison.csv"]
+
+
+def draw_again(folder: Path, part: Path) -> list[Path]:
+    """The pages of a run that was written into `folder`, drawn again into `part` without solving.
+
+    Raises
+    ------
+    GraphnavError
+        If there is none, or its recording has changed.
+    """
+    from graphnav import report
+
+    outcome, provenance = stored.read_outcome(folder / stored.NAME)
+    outcome = read_again(outcome, provenance["inputs"])
+    alone = not (folder / "comparison.csv").exists()
+    detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
+    files = []
+    for name in own(outcome.solutions):
+        place = part if alone else part / name
+        place.mkdir(parents=True, exist_ok=True)
+        _draw_solver(outcome, name, place, provenance, detectors)
+        files.append(place / "report.html")
+    if not alone:
+        _draw_comparison(outcome, part, provenance)
+        files = [part / "comparison.html", *files]
+    return files
+
+
+def _draw_comparison(outcome: Outcome, folder: Path, provenance: Mapping[str, Any]) -> None:
+    from graphnav import report
+    from graphnav.metrics import summary
+
     report.write_comparison(
         folder / "comparison.html",
         outcome.recording,
@@ -80,24 +118,33 @@ def write_comparison(outcome: Outcome, folder: Path) -> list[Path]:
         provenance=provenance,
         noise=noise_rows(outcome, next(iter(outcome.solutions.values()))),
     )
-    return [folder / "comparison.html", folder / "comparison.csv"]
 
 
 def write_solver(
     outcome: Outcome, name: str, folder: Path, provenance: Mapping[str, Any], detectors: Sequence[Raw] | None = None
 ) -> None:
     """The files of one solver; a folder that holds older ones keeps none of them under the same names."""
-    from graphnav import report
     from graphnav.exporters import write_all
-    from graphnav.metrics import summary
 
-    solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
+    solution = outcome.solutions[name]
     began = time.perf_counter()
     trajectory = solution.trajectory(outcome.request.rate)
     write_all(replace(trajectory, name=f"{outcome.recording.name}, {name}"), folder)
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
     (folder / "detections.csv").write_text(intervals_text(solution.detections), encoding="utf-8")
     written = time.perf_counter()
+    _draw_solver(outcome, name, folder, provenance, detectors)
+    spent = {"writing": written - began, "report": time.perf_counter() - written}
+    write_json(folder / "summary.json", solver_summary(outcome, name, spent, provenance))
+
+
+def _draw_solver(
+    outcome: Outcome, name: str, folder: Path, provenance: Mapping[str, Any], detectors: Sequence[Raw] | None
+) -> None:
+    from graphnav import report
+    from graphnav.metrics import summary
+
+    solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
     report.write_report(
         folder / "report.html",
         outcome.recording,
@@ -112,8 +159,6 @@ def write_solver(
         detectors=detectors,
         noise=noise_rows(outcome, solution),
     )
-    spent = {"writing": written - began, "report": time.perf_counter() - written}
-    write_json(folder / "summary.json", solver_summary(outcome, name, spent, provenance))
 
 
 def solver_summary(
@@ -320,14 +365,9 @@ def _provenance(outcome: Outcome) -> dict[str, Any]:
         "scipy": version("scipy"),
         "python": platform.python_version(),
         "noise": used,
-        "inputs": {str(path): _sha256(path) for path in files},
+        "inputs": {str(path): sha256(path) for path in files},
         "options": dict(outcome.request.options),
     }
-
-
-def _sha256(path: Path) -> str:
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _rounded(x: float) -> float | None:

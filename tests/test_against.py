@@ -71,7 +71,7 @@ def test_three_kinds_of_files_stand_beside_ours(drive, tmp_path):
     assert float(rows["late"]["h_rms_m"]) > 1.0  # 0.2 s of the speed, which are its own
     page = (tmp_path / "out" / "comparison.html").read_text(encoding="utf-8")
     assert all(name in page for name in rows)
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"comparison.csv", "comparison.html", "ekf"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"comparison.csv", "comparison.html", "run.npz", "ekf"}
 
 
 def test_a_shift_that_is_asked_for_is_made(drive, tmp_path):

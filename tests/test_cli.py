@@ -9,6 +9,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -88,7 +89,7 @@ def test_compare_succeeds_and_says_where_to_look(compared):
 
 def test_compare_writes_what_it_promises(compared):
     out, _ = compared
-    assert {p.name for p in out.iterdir()} == {*SOLVERS, "comparison.csv", "comparison.html"}
+    assert {p.name for p in out.iterdir()} == {*SOLVERS, "comparison.csv", "comparison.html", "run.npz"}
     for solver in SOLVERS:
         assert {p.name for p in (out / solver).iterdir()} == FILES
         assert (out / solver / "trajectory.csv").read_text().splitlines()[0] == TRAJECTORY_COLUMNS
@@ -154,6 +155,26 @@ def test_comparison_csv_has_a_row_per_solver_with_the_numbers_of_the_summaries(c
         assert float(row["run_time_s"]) > 0
 
 
+def test_the_pages_are_drawn_again_without_solving(compared, drive, tmp_path, capsys):
+    out = tmp_path / "again"
+    shutil.copytree(compared[0], out)
+    pages = ["comparison.html", *(f"{solver}/report.html" for solver in SOLVERS)]
+    before = [(out / page).read_bytes() for page in pages]
+    for page in pages:
+        (out / page).unlink()
+    assert cli.run(["report", str(out), "--quiet"]) == 0
+    assert [(out / page).read_bytes() for page in pages] == before
+    kept = np.load(out / "run.npz")["text"].tobytes().decode()
+    digest = summary(out / "batch")["provenance"]["inputs"][str(drive / "gnss.csv")]
+    text = np.frombuffer(kept.replace(digest, "0" * 64).encode(), dtype=np.uint8)
+    np.savez(out / "run.npz", text=text, **{k: v for k, v in np.load(compared[0] / "run.npz").items() if k != "text"})
+    assert cli.run(["report", str(out)]) == 2
+    assert "gnss.csv: has changed" in capsys.readouterr().err
+    (out / "run.npz").write_bytes(b"PK")
+    assert cli.run(["report", str(out)]) == 2
+    assert "run.npz" in capsys.readouterr().err
+
+
 def test_solvers_differ_where_they_should(compared):
     """The same information, but only the filter has not seen the other side of the outage."""
     out, _ = compared
@@ -202,7 +223,7 @@ def test_smooth_a_part_of_a_real_drive_without_fixes_in_a_span(tmp_path):
         "smooth", "kitti", "--start", 100, "--end", 220, "--without", "gnss:150-170", "-o", tmp_path, "--solver", "rts"
     )
     assert run.returncode == 0, run.stderr
-    assert {p.name for p in tmp_path.iterdir()} == FILES
+    assert {p.name for p in tmp_path.iterdir()} == {*FILES, "run.npz"}
     s = summary(tmp_path)
     assert (s["solver"], s["against"]) == ("rts", "the withheld GNSS fixes")
     (span,) = s["spans"]
@@ -372,7 +393,7 @@ def test_exit_code_and_sentence_of_the_installed_program():
     ("error", "code", "words"),
     [
         (KeyboardInterrupt(), 130, "interrupted"),
-        (TypeError("what\nis this"), 1, "internal error: TypeError: what is this in cli.py:"),
+        (TypeError("what\nis this"), 1, "internal error: TypeError: what is this in cli_solve.py:"),
         (MemoryError(), 1, "out of memory"),
         (OSError(28, "No space left on device", "o/summary.json"), 2, "o/summary.json: No space left on device"),
     ],
