@@ -16,6 +16,7 @@ from graphnav.checks_aiding import (
     gnss_coverage,
     gnss_jumps,
     imu_axes,
+    mirrored,
     odometer_findings,
     overlap_s,
     reversed_sign,
@@ -145,17 +146,21 @@ def inspect(recording: Recording) -> Inspection:
         findings += rounded_positions(recording.gnss)
         findings += fix_types(recording.gnss)
         wrong = list(velocities(recording.gnss))
-        findings += wrong or gnss_jumps(recording, track)  # against wrong velocities every position jumps
+        if overlap or not wrong:
+            # against wrong velocities, or on another clock, every position jumps
+            findings += wrong or (gnss_jumps(recording, track) if overlap else ())
     turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis"}
     if vehicle and overlap and track is not None and recording.gnss is not None:
         clock, yaw = clock_of(recording.imu, recording.gnss), crosschecks.yaw_fit(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
-        if not turned:
-            findings += reversed_sign(recording.imu) if turns_back else imu_axes(recording.imu, forward)
-        findings += yaw_scale(yaw)
+        if turns_back and (said := list(mirrored(recording))):
+            findings += said
+        elif not turned:
+            findings += reversed_sign(recording.imu) if turns_back else imu_axes(recording.imu, forward, track)
+            findings += yaw_scale(yaw)
     elif vehicle and not turned:
-        findings += imu_axes(recording.imu, None)
+        findings += imu_axes(recording.imu, None, None)
     if recording.odometer is not None:
         facts["odometer"] = _sensor_facts(recording.odometer.t)
         step, speed = np.diff(recording.odometer.t), np.abs(recording.odometer.speed)

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from graphnav import crosschecks, wheels
+from graphnav.checks_stated import exchanged, exchanged_finding
 from graphnav.clock import Clock
 from graphnav.config.gnss import GnssSettings
 from graphnav.crosschecks import Fit, Track
 from graphnav.findings import Finding, period_of
 from graphnav.formats.clocks import NEAR, between_clocks
+from graphnav.formats.schema import TIME
 from graphnav.recording import Imu, Odometer, Recording
 from graphnav.rotation import Array
 from graphnav.wheels.faults import FROZEN, GAP, STUCK, WILD
 
 _SURE = 4.0  # sigmas
+_NO_BETTER = 0.05  # of a correlation
 _MIN_SPEED = 5.0  # m/s, at which wheels are compared
 
 
@@ -37,6 +41,8 @@ def gnss_apart(recording: Recording) -> str | None:
         "overlap in time"
     )
     known = between_clocks(recording.start, recording.gps_zero, float(gnss.t[0]), None)
+    if (unit := _unit_of_stamps(gnss.t, recording)) is not None:
+        return f'{apart}: the stamps of the fixes are in {unit}; say units = {{ t = "{unit}" }} in [gnss]'
     left = gnss.t[0] + known.offset - recording.start if known is not None else np.inf
     if known is not None and abs(left) < NEAR:
         return (
@@ -48,6 +54,15 @@ def gnss_apart(recording: Recording) -> str | None:
         f"; {abs(hours):g} h apart, one may be in local time" if hours and abs(offset - 3600.0 * hours) < 60.0 else ""
     )
     return f"{apart}; if their clocks differ, say time_offset in [gnss] ({offset:.3f} would start both together){local}"
+
+
+def _unit_of_stamps(t: Array, recording: Recording) -> str | None:
+    """The unit in which stamps would lie within the recording, where they do not in s."""
+    for unit, scale in TIME.items():
+        inside = (scale * t > recording.start) & (scale * t < recording.end)
+        if unit != "s" and inside.mean() > 0.5:
+            return unit
+    return None
 
 
 def gnss_coverage(recording: Recording) -> Iterator[Finding]:
@@ -133,7 +148,17 @@ def imu_clock(clock: Clock, odometer: Fit | None = None) -> Iterator[Finding]:
     )
 
 
-def imu_axes(imu: Imu, forward: Fit | None) -> Iterator[Finding]:
+def mirrored(recording: Recording) -> Iterator[Finding]:
+    """Turns against the course that are those of the course with latitude and longitude exchanged."""
+    other = exchanged(recording.gnss) if recording.gnss is not None else None
+    way = crosschecks.track(replace(other, v=None)) if other is not None else None
+    yaw = crosschecks.yaw_fit(recording.imu, way) if way is not None else None
+    if yaw is not None and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
+        yield exchanged_finding("the turns of the gyro")
+
+
+def imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Finding]:
+    """Axes that the drive contradicts: by the mean force, and by the forward force where another fits it better."""
     up = crosschecks.up_of(imu)
     if up[2] > 0.8 and (forward is None or forward.correlation < 0.7):
         return
@@ -142,6 +167,10 @@ def imu_axes(imu: Imu, forward: Fit | None) -> Iterator[Finding]:
         return
     ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
     if up[2] > 0.8 and ahead[1] > 0.7:
+        return
+    along = crosschecks.along_fit(imu, track) if up[2] > 0.8 and track is not None else None
+    # what is proposed explains no more than what is stated: few changes of speed, and none across, tell no direction
+    if along is not None and along.coefficients[0] > 0.5 and along.correlation > forward.correlation - _NO_BETTER:
         return
     letters = _letters(imu.R_bs, ahead, up)
     hint = f'; axes = "{letters}" would agree' if letters else ""
@@ -256,7 +285,9 @@ def odometer_findings(recording: Recording, track: Track | None, facts: dict[str
     odometer = recording.odometer
     assert odometer is not None
     if min(odometer.t[-1], recording.end) <= max(odometer.t[0], recording.start):
-        yield Finding("warning", "odometer and IMU do not overlap in time")
+        unit = _unit_of_stamps(odometer.t, recording)
+        hint = f'; its stamps are in {unit}: say units = {{ t = "{unit}" }} in [odometer]' if unit else ""
+        yield Finding("warning", f"odometer and IMU do not overlap in time{hint}")
         return
     yield from odometer_readings(recording, facts)
     found = crosschecks.odometer_fit(odometer, track) if track is not None else None

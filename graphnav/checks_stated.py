@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,6 +25,8 @@ _IMPOSSIBLE = {
     "accel_bias_sigma": (5.0, "m/s2", "mg"),
 }
 _SPEEDS = {1 / 3.6: "km/h", 0.44704: "mph", 1852 / 3600: "knots", 3.6: "m/s already"}
+_MENDED = 0.3  # of what is off is left by a change that mends it
+_FOOT = 0.3048  # m
 _LEAP = 18.0  # s, GPS time ahead of UTC since 2017
 
 
@@ -101,16 +104,49 @@ def velocities(gnss: Gnss) -> Iterator[Finding]:
     size = np.hypot(way[:, 0], way[:, 1])
     moving = real & (size > 2.0) & (size < 60.0 * dt)
     if moving.sum() >= crosschecks.MIN_PAIRS:
+        other = exchanged(gnss)
+        if other is not None:
+            q = crosschecks.local_positions(other)
+            off, mended = (
+                float(np.median(np.linalg.norm((x[m:] - x[:-m] - said)[moving, :2], axis=1))) for x in (p, q)
+            )
+            if mended < _MENDED * off:
+                yield exchanged_finding("the velocities")
+                return
         yield from _horizontal(way[moving, :2], said[moving, :2])
     climb, meant = way[real, 2], said[real, 2]
     if len(climb) >= crosschecks.MIN_PAIRS and climb.std() > 0.0 and meant.std() > 0.0:
         alike = float(np.corrcoef(climb, meant)[0, 1])
+        ratio = float(climb @ meant) / float(meant @ meant)
+        if alike > 0.8 and abs(ratio * _FOOT - 1.0) < 0.1:
+            yield Finding(
+                "warning",
+                f"the heights climb {ratio:.2f} times as much as the upward velocity: they are in feet, of which "
+                f"0.3048 m make one; multiply h by 0.3048 in the file",
+                "gnss.feet",
+            )
         if alike < -0.6:
             yield Finding(
                 "warning",
                 f"the upward velocity goes down where the heights go up (correlation {alike:.2f}): if it is downward, "
                 "name its column vd",
             )
+
+
+def exchanged(gnss: Gnss) -> Gnss | None:
+    """The fixes with latitude and longitude exchanged; None where that is no place."""
+    llh = gnss.llh[:, [1, 0, 2]]
+    return replace(gnss, llh=llh) if np.nanmax(np.abs(llh[:, 0])) < 0.5 * np.pi else None
+
+
+def exchanged_finding(witness: str) -> Finding:
+    """That they are, by `witness`."""
+    return Finding(
+        "refused",
+        f"latitude and longitude are exchanged: exchanged back, the positions agree with {witness}; exchange the names "
+        "in columns of [gnss]",
+        "gnss.lat_lon",
+    )
 
 
 def _horizontal(way: Array, said: Array) -> Iterator[Finding]:

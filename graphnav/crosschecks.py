@@ -236,6 +236,14 @@ def forward_fit(imu: Imu, track: Track) -> Fit | None:
     return replace(fit, coefficients=fit.coefficients @ level)
 
 
+def along_fit(imu: Imu, track: Track) -> Fit | None:
+    """The same on the force along the stated forward axis alone, (1,): whether the axes as stated explain the speed."""
+    i, j = _pairs(track)
+    y = track.speed[j] - track.speed[i]
+    real = np.abs(y) < _FASTEST_CHANGE * (track.t[j] - track.t[i])
+    return _imu_fit(imu, imu.accel[:, 1:2], track, i[real], j[real], y[real])
+
+
 def yaw_fit(imu: Imu, track: Track) -> Fit | None:
     """Change of course, counter-clockwise, on the integrated rate about the mean force: true over recorded, (1,).
 

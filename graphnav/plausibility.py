@@ -264,7 +264,7 @@ def forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iterator[F
             "imu.forward_reversed",
         )
         return
-    for said in imu_axes(imu, forward):
+    for said in imu_axes(imu, forward, way):
         yield Finding("refused", f"{said.sentence}; {along}", "imu.axes_turned")
 
 

@@ -309,6 +309,8 @@ def _read(path: Path, columns: matching.Columns, role: str) -> Source:
     table = read_table(path, tuple(names), (), names)
     needed = [n for n in wanted[: _NEEDED.get(role, len(wanted))] if n in names]
     whole = np.isfinite(table.stack(*needed)).all(-1)
+    if role == "gnss":
+        whole &= (table["lat"] != 0.0) | (table["lon"] != 0.0)  # as it will be read: no fix
     if whole.sum() < 2:
         raise RecordingError(f"{path}: fewer than two rows hold all of {', '.join(names[n] for n in needed)}")
     values = {ours: table[ours][whole] for ours in names}

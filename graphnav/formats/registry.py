@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from graphnav.errors import RecordingError
-from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth
+from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth, rows_of
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,21 @@ def log_format(
         if not path.exists():
             raise RecordingError(f"{path}: no such file or folder")
         log = choose(path, topics) if choose is not None and topics else load(path)
-        return replace(log, files=log.files or _files(path))
+        return replace(_without_nowhere(log), files=log.files or _files(path))
 
     return Format(
         name, about, known, lambda source: loaded(source).recording(source), load=loaded,
         choose=None if choose is None else loaded,
     )  # fmt: skip
+
+
+def _without_nowhere(log: Log) -> Log:
+    """The log without fixes at latitude and longitude 0, which receivers write that have none."""
+    gnss = log.gnss
+    if gnss is None or not (nowhere := (gnss.llh[:, :2] == 0.0).all(axis=1)).any() or nowhere.all():
+        return log
+    many = "1 fix" if nowhere.sum() == 1 else f"{nowhere.sum()} fixes"
+    return replace(log, gnss=rows_of(gnss, ~nowhere), remarks=(*log.remarks, f"{many} at 0, 0 (no fix) left out"))
 
 
 def _files(path: Path) -> tuple[Path, ...]:
