@@ -82,6 +82,9 @@ def info(
     antenna: Annotated[
         bool, typer.Option("--antenna", help="Also find the antenna from the drive, and compare with its lever arm.")
     ] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Leave out what takes solving: the signs of lever arms.")
+    ] = False,
     topic: Topic = None,
     quiet: Quiet = False,
     json: Json = False,
@@ -95,10 +98,10 @@ def info(
         whole = read(only(context, recording), topic or ())
         tell("checks")
         found = inspect(whole)
-        if antenna:
-            from graphnav.lever_arm import find_antenna
+        from graphnav.lever_arm import find_antenna, reversed_arms
 
-            found = replace(found, findings=(*found.findings, find_antenna(whole).finding))
+        more = reversed_arms(found.recording) if found.trusted and not quick else []
+        found = replace(found, findings=(*more, *found.findings, *([find_antenna(whole).finding] if antenna else [])))
     show(found.text, found.values, quiet, json)
 
 

@@ -182,7 +182,9 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     if truth_apart(recording):
         recording = replace(recording, truth=None)
 
+    from graphnav.lever_arm import reversed_arms
     from graphnav.pipeline import run
+    from graphnav.report_words import doubts
 
     given = request.noise
     solutions = run(used, request.settings, request.solvers, progress, None if given is None else given.model)
@@ -198,9 +200,14 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     for found in metrics.values():
         if found.notes:
             findings += [note for note in found.notes if note not in findings]
+    errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
+    checks = inspection.findings
+    if doubts(solutions, errors):  # which costs too much to be asked where nothing is wrong
+        checks = (*reversed_arms(used), *checks)
+        findings = [*(f.sentence for f in checks), *findings]
     return Outcome(
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
-        inspection.warnings, timings | spent, inspection.findings,
+        tuple(f.sentence for f in checks if f.severity != "note"), timings | spent, checks,
     )  # fmt: skip
 
 

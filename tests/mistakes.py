@@ -45,7 +45,7 @@ class Mistake:
     what: str
     make: Callable[[Path], None]
     wants: tuple[str, ...]  # fragments of the line, written by hand
-    command: tuple[str, ...] = ("info", "drive")
+    command: tuple[str, ...] = ("info", "drive", "--quick")
     error: bool = False  # else it is a warning or a note, for the recording can be used
 
 

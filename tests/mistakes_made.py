@@ -14,6 +14,7 @@ from mistakes import (
     ROOT,
     Mistake,
     Table,
+    both,
     change,
     made,
     nothing,
@@ -101,6 +102,10 @@ def _two_groups(c: Table) -> None:
 def _frozen(c: Table) -> None:
     rows = (c["t_s"] > 1610.0) & (c["t_s"] < 1700.0)
     c["h_m"][rows] = c["h_m"][rows][0]
+
+
+def _exchanged(c: Table) -> None:
+    c["lat_deg"], c["lon_deg"] = c["lon_deg"] - 100.0, c["lat_deg"].copy()
 
 
 def _clock_jump(seconds: float) -> Callable[[Path], None]:
@@ -197,6 +202,7 @@ MISTAKES: dict[str, list[Mistake]] = {
         ),
     ],
     "Times": [
+        Mistake("milliseconds beside an IMU in s", scaled("gnss", "t_s", 1e3), ("fixes are in ms", 't = "ms"')),
         Mistake("milliseconds, not said", scaled("imu", "t_s", 1e3), ("imu.csv.gz", 't = "ms"'), error=True),
         Mistake(
             "the IMU in UTC, the fixes in GPS time", _later("imu", -18.0), ("leap seconds", "time_offset in [imu]")
@@ -353,16 +359,32 @@ MISTAKES: dict[str, list[Mistake]] = {
             ("is not a latitude", "swapped"),
             error=True,
         ),
+        Mistake(
+            "the same where both are below 90 deg",
+            change("gnss", _exchanged),
+            ("refused", "latitude and longitude are exchanged"),
+        ),
+        Mistake(
+            "the same without velocities",
+            both(change("gnss", _exchanged), toml(', ve = "ve_mps", vn = "vn_mps", vu = "vu_mps"', "")),
+            ("refused", "latitude and longitude are exchanged"),
+        ),
+        Mistake(
+            "the antenna below the IMU, not above",
+            toml("[0.0, 0.0, 0.6]", "[0.0, 0.0, -0.6]"),
+            ("up part of lever_arm in [gnss]", "wrong sign"),
+            ("info", "drive"),
+        ),
+        Mistake(
+            "the rear axle before the IMU, not behind",
+            toml("[0.0, -1.8, 0.0]", "[0.0, 1.8, 0.0]"),
+            ("forward part of lever_arm in [odometer]", "wrong sign"),
+            ("info", "drive"),
+        ),
         Mistake("north and east velocity exchanged", swapped("gnss", "ve_mps", "vn_mps"), ("velocit", "exchanged")),
         Mistake("velocity down taken for up", scaled("gnss", "vu_mps", -1.0), ("upward velocity", "vd")),
         Mistake(
             "the odometer counts backward", scaled("odometer", "speed_mps", -1.0), ("odometer's sign is reversed",)
-        ),
-        Mistake(
-            "the lever arm's sign",
-            toml("[0.0, 0.0, 0.6]", "[0.0, 0.0, -0.6]"),
-            ("antenna: the drive finds it at", "lever_arm in [gnss]", "signs"),
-            ("info", "drive", "--antenna"),
         ),
         Mistake(
             "a foot's platform on a car",
@@ -480,6 +502,14 @@ MISTAKES: dict[str, list[Mistake]] = {
             nothing,
             ("no solver 'kalman'", "known: ekf"),
             ("smooth", "drive", "-o", "out", "--solver", "kalman"),
+            True,
+        ),
+        Mistake("a span without a sensor", nothing, ("gnss:40-60",), (*SMOOTH, "--without", "40-60"), True),
+        Mistake(
+            "logs for a recording",
+            nothing,
+            ("graphnav init drive/imu.csv.gz drive/gnss.csv.gz",),
+            ("info", "drive/imu.csv.gz", "drive/gnss.csv.gz"),
             True,
         ),
         Mistake("a source mistyped", nothing, ("did you mean 'gnss'?",), (*SMOOTH, "--without", "gns:10-20"), True),

@@ -9,11 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import oracle
 import pytest
 
 from graphnav.checks import Inspection, inspect
 from graphnav.formats import read
 from graphnav.formats.schema import rotation_from_letters
+from graphnav.lever_arm import reversed_arms
 from graphnav.recording import Recording
 
 TURNING = ["boulder_drive_20250708", "tokyo_20201105", "dresden_car_20140326", "oracle_drive", "kitti"]
@@ -257,3 +259,36 @@ def test_the_text_names_sensors_units_and_findings(drive: Callable[[str], Record
     assert "rate 200 Hz" in text
     assert "note: 1 gap in GNSS, the longest 61.0 s" in text
     assert text.splitlines()[0] == "oracle drive, seed 20240612, rtk (vehicle)"
+
+
+def keys(recording: Recording) -> list[str]:
+    return [f.key for f in inspect(recording).findings]
+
+
+def test_heights_in_feet_are_seen_where_it_goes_up_and_down(drive: Callable[[str], Recording]) -> None:
+    part = drive("boulder_drive_20250708").crop(0.0, 300.0)
+    feet = replace(part, gnss=replace(part.gnss, llh=part.gnss.llh * [1.0, 1.0, 1 / 0.3048]))
+    assert "gnss.feet" in keys(feet)
+    assert "gnss.feet" not in keys(part)
+
+
+def test_axes_are_denied_only_by_better_ones() -> None:
+    """Fifty seconds of fixes with one change of speed tell no direction, and the axes are right."""
+    whole = load(str(Path(__file__).parents[1] / "data" / "tokyo"))
+    late = whole.without("gnss", (0.0, 80.0))
+    assert not warned(late, "axes")
+
+
+def test_right_lever_arms_are_not_denied() -> None:
+    recording, _ = oracle.drive(oracle.vehicle_path(120.0, 50.0), seed=5, lever_arm=(0.4, -0.5, 1.2))
+    assert reversed_arms(recording) == []
+
+
+def test_fixes_of_before_the_drive_are_left_out(drive: Callable[[str], Recording]) -> None:
+    part = drive("tokyo_20201105").crop(100.0, 160.0)
+    g = part.gnss
+    t, llh = np.concatenate([[g.t[0] - 1200.0], g.t]), np.vstack([g.llh[:1] + 1e-4, g.llh])
+    cached = replace(part, gnss=replace(g, t=t, llh=llh, sd=np.vstack([g.sd[:1], g.sd]), v=None, sd_v=None))
+    assert "gnss.cached" in keys(cached)
+    assert len(inspect(cached).recording.gnss.t) == len(g.t)
+    assert "gnss.cached" not in keys(part)
