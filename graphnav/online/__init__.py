@@ -1,9 +1,24 @@
 """Smoothing while the drive happens: rows of sensors in, a live state and a settled trajectory out."""
 
 from graphnav.online.ahead import Live
+from graphnav.online.rows import Fix, ImuSample, WheelSpeed, live_setup, live_trajectory
 from graphnav.online.sensors import Row, Sensors, rows_of, without_rows
 from graphnav.online.session import Session
 from graphnav.online.smoother import Online
 from graphnav.online.tracker import Tracker
 
-__all__ = ["Live", "Online", "Row", "Sensors", "Session", "Tracker", "rows_of", "without_rows"]
+__all__ = [
+    "Fix",
+    "ImuSample",
+    "Live",
+    "Online",
+    "Row",
+    "Sensors",
+    "Session",
+    "Tracker",
+    "WheelSpeed",
+    "live_setup",
+    "live_trajectory",
+    "rows_of",
+    "without_rows",
+]

@@ -1,0 +1,199 @@
+"""Rows for `Online.add` made of what a driver has at hand, each checked: lengths, units, sizes; and what comes out.
+
+Every one of these is a plain row (sensor, time, values) as `graphnav.online.sensors.Row` has them, so that rows of both
+kinds may be mixed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from graphnav.errors import RecordingError
+from graphnav.online.smoother import Online
+from graphnav.plausibility import ACCEL_RANGE, GYRO_RANGE
+from graphnav.plausibility_gnss import FASTEST
+from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
+from graphnav.solution import to_trajectory
+from graphnav.trajectory import Trajectory
+
+_NONE, _ROWS = np.empty(0), np.empty((0, 3))
+_BLANK = (float("nan"),) * 3
+_HEIGHTS = (-1000.0, 50000.0)  # m, as in files
+
+
+class _Row(tuple[str, float, tuple[float, ...]]):
+    """A row that was checked."""
+
+    __slots__ = ()
+
+    def __reduce__(self) -> Any:
+        return tuple, (tuple(self),)
+
+
+class ImuSample(_Row):
+    """The mean rate and specific force of the sample period that ends at t.
+
+    Parameters
+    ----------
+    t : s.
+    gyro : (3,) rad/s with respect to inertial space: about right, forward, up of the body.
+    accel : (3,) m/s^2, specific force, +9.8 upward at rest.
+
+    Raises
+    ------
+    RecordingError
+        If something has another length, or a size that no sensor reads, as of degrees or g.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, t: float, gyro: Sequence[float], accel: Sequence[float]) -> ImuSample:
+        rate = _vector(cls, t, "gyro", "rad/s", gyro, GYRO_RANGE, "is it in deg/s?")
+        force = _vector(cls, t, "accel", "m/s2", accel, ACCEL_RANGE, "is it in mg?")
+        return super().__new__(cls, ("imu", _time(cls, t), (*rate, *force)))
+
+
+class Fix(_Row):
+    """A position of the antenna, and its velocity if there is one.
+
+    Parameters
+    ----------
+    t : s, on the IMU's clock.
+    lat, lon : deg.
+    h : m above the ellipsoid.
+    sd : (3,) m, 1-sigma east, north, up.
+    v, sd_v : (3,) m/s, east, north, up, and its 1-sigmas.
+
+    Raises
+    ------
+    RecordingError
+        If something has another length, or a size that cannot be.
+    """
+
+    __slots__ = ()
+
+    def __new__(
+        cls,
+        t: float,
+        lat: float,
+        lon: float,
+        h: float,
+        sd: Sequence[float],
+        v: Sequence[float] | None = None,
+        sd_v: Sequence[float] | None = None,
+    ) -> Fix:
+        place = [_number(cls, t, name, x) for name, x in (("lat", lat), ("lon", lon), ("h", h))]
+        if not abs(place[0]) <= 90.0 or not -180.0 <= place[1] <= 360.0:
+            raise RecordingError(f"Fix at t = {t}: lat {lat}, lon {lon} is no place in degrees")
+        if not _HEIGHTS[0] <= place[2] <= _HEIGHTS[1]:
+            raise RecordingError(f"Fix at t = {t}: h {h} is no height of a drive in m")
+        sigmas = _vector(cls, t, "sd", "m", sd, np.inf)
+        speeds, of_speeds = _BLANK, _BLANK
+        if (v is None) != (sd_v is None):
+            raise RecordingError(f"Fix at t = {t}: v and sd_v go together, m/s east, north, up")
+        if v is not None and sd_v is not None:
+            speeds = _vector(cls, t, "v", "m/s", v, FASTEST, "is it in km/h or mm/s?")
+            of_speeds = _vector(cls, t, "sd_v", "m/s", sd_v, np.inf)
+        for name, values in (("sd", sigmas), ("sd_v", of_speeds)):
+            if min(values) <= 0.0:
+                raise RecordingError(f"Fix at t = {t}: {name} {values}: 1-sigmas must be above zero")
+        lat_rad, lon_rad = (float(x) for x in np.radians(place[:2]))
+        return super().__new__(cls, ("gnss", _time(cls, t), (lat_rad, lon_rad, place[2], *sigmas, *speeds, *of_speeds)))
+
+
+class WheelSpeed(_Row):
+    """The forward speed of the point that does not slip, m/s, forward positive, at t (s).
+
+    Raises
+    ------
+    RecordingError
+        If it is no number, or one that no vehicle reaches.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, t: float, speed: float) -> WheelSpeed:
+        value = _number(cls, t, "speed", speed)
+        if not abs(value) <= FASTEST:
+            raise RecordingError(
+                f"WheelSpeed at t = {t}: {speed} m/s, which no vehicle reaches: is it in km/h or mm/s?"
+            )
+        return super().__new__(cls, ("odometer", _time(cls, t), (value, *_BLANK, *_BLANK[:2])))
+
+
+def live_setup(
+    noise: ImuNoise | None = None,
+    antenna: Sequence[float] | None = (0.0, 0.0, 0.0),
+    axle: Sequence[float] | None = None,
+    platform: str = "vehicle",
+    name: str = "live",
+) -> Recording:
+    """What `Online` must know before the first row: a recording without rows.
+
+    Parameters
+    ----------
+    noise : figures of the IMU; None: those of a consumer IMU are assumed.
+    antenna, axle : (3,) m from the IMU to the antenna and to the point that does not slip, right, forward, up; None
+        where there is no GNSS, no odometer.
+    platform : "vehicle" or "foot".
+
+    Raises
+    ------
+    RecordingError
+        If a lever arm has another length.
+    """
+    if platform not in ("vehicle", "foot"):
+        raise RecordingError(f"live_setup: platform '{platform}': vehicle or foot")
+    imu = Imu(_NONE, _ROWS, _ROWS, noise or ImuNoise(), noise_assumed=noise is None)
+    arms = [None if arm is None else np.array(_vector(None, 0.0, what, "m", arm, np.inf))
+            for what, arm in (("antenna", antenna), ("axle", axle))]  # fmt: skip
+    gnss = None if arms[0] is None else Gnss(_NONE, _ROWS, _ROWS, lever_arm=arms[0])
+    odometer = None if arms[1] is None else Odometer(_NONE, _NONE, arms[1])
+    return Recording(name, platform, imu, gnss, odometer)
+
+
+def live_trajectory(online: Online) -> Trajectory | None:
+    """The state at the newest IMU row as a trajectory of one row; None while aligning."""
+    now = online.live()
+    if now is None or online.frame is None:
+        return None
+    return to_trajectory("live", online.frame, np.array([now.t]), now.state, now.covariance[None])
+
+
+def _where(kind: type | None, t: float) -> str:
+    return "live_setup" if kind is None else f"{kind.__name__} at t = {t}"
+
+
+def _number(kind: type | None, t: float, name: str, value: float) -> float:
+    try:
+        found = float(value)
+    except (TypeError, ValueError):
+        raise RecordingError(f"{_where(kind, t)}: {name} is no number: {value!r}") from None
+    if not np.isfinite(found):
+        raise RecordingError(f"{_where(kind, t)}: {name} is {found}")
+    return found
+
+
+def _time(kind: type, t: float) -> float:
+    return _number(kind, t, "t", t)
+
+
+def _vector(
+    kind: type | None, t: float, name: str, unit: str, values: Sequence[float], most: float, hint: str = ""
+) -> tuple[float, float, float]:
+    """Three finite numbers of at most a size."""
+    try:
+        count = len(values)
+    except TypeError:
+        count = 1
+    if count != 3:
+        raise RecordingError(f"{_where(kind, t)}: {name} needs three numbers in {unit}, not {count}")
+    x, y, z = (_number(kind, t, name, value) for value in values)
+    if not max(abs(x), abs(y), abs(z)) <= most:
+        raise RecordingError(
+            f"{_where(kind, t)}: {name} of {max(x, y, z, key=abs):g} {unit} is beyond any sensor: {hint}"
+        )
+    return x, y, z

@@ -1,0 +1,72 @@
+"""Rows that a driver makes: the same as those of a recording, and one plain line for what cannot be."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+
+import numpy as np
+import oracle
+import pytest
+
+from graphnav.config import Settings
+from graphnav.errors import RecordingError
+from graphnav.online import Fix, ImuSample, Online, WheelSpeed, live_setup, live_trajectory, rows_of
+
+SD = (0.02, 0.02, 0.04)
+
+
+def test_they_are_the_rows_of_a_recording() -> None:
+    recording, _ = oracle.drive(oracle.vehicle_path(10.0, 50.0), odometer_rate=10.0, gnss_velocity_sd=(0.1, 0.1, 0.2))
+    made = {
+        "imu": lambda t, v: ImuSample(t, v[:3], v[3:]),
+        "gnss": lambda t, v: Fix(t, *np.degrees(v[:2]), v[2], v[3:6], v[6:9], v[9:12]),
+        "odometer": lambda t, v: WheelSpeed(t, v[0]),
+    }
+    seen = set()
+    for row in rows_of(recording)[1]:
+        sensor, t, values = row
+        mine = made[sensor](t, values)
+        assert mine[:2] == (sensor, t)
+        assert mine[2] == pytest.approx(values, abs=1e-12, nan_ok=True)
+        seen.add(sensor)
+    assert seen == set(made)
+
+
+def test_they_are_taken_in_and_kept_as_plain_rows() -> None:
+    online = Online(live_setup(antenna=SD, axle=(0.0, -1.0, 0.0)), Settings())
+    assert live_trajectory(online) is None
+    rows = [ImuSample(0.01, (0, 0, 0), (0, 0, 9.8)), Fix(0.02, 48.0, 11.0, 500.0, SD), WheelSpeed(0.02, 1.0)]
+    for row in rows:
+        online.add(row)
+        again = pickle.loads(pickle.dumps(row))
+        assert type(again) is tuple
+        assert again[:2] == row[:2]
+    assert [online.sensors.counts[name] for name in ("imu", "gnss", "odometer")] == [1, 1, 1]
+    assert online.sensors.setup.gnss.lever_arm == pytest.approx(SD)
+
+
+@pytest.mark.parametrize(
+    ("make", "word"),
+    [
+        (lambda: Fix(1.0, 48.0, 11.0, 500.0, (1.0, 1.0)), "sd needs three numbers"),
+        (lambda: Fix(1.0, 48.0, 11.0, 500.0, 1.0), "sd needs three numbers"),
+        (lambda: Fix(1.0, 48.0, 11.0, 500.0, (1.0, 0.0, 1.0)), "above zero"),
+        (lambda: Fix(1.0, 4807.038, 1131.0, 500.0, SD), "no place in degrees"),
+        (lambda: Fix(1.0, 48.0, 11.0, 500_000.0, SD), "h 500000"),
+        (lambda: Fix(1.0, 48.0, 11.0, 500.0, SD, v=(1.0, 2.0, 3.0)), "sd_v"),
+        (lambda: Fix(1.0, 48.0, 11.0, 500.0, SD, v=(1e3, 2e3, 0.0), sd_v=SD), "mm/s"),
+        (lambda: Fix(float("nan"), 48.0, 11.0, 500.0, SD), "t is nan"),
+        (lambda: ImuSample(1.0, (0.0, 0.0), (0.0, 0.0, 9.8)), "gyro needs three numbers"),
+        (lambda: ImuSample(1.0, (100.0, 0.0, 0.0), (0.0, 0.0, 9.8)), "deg/s"),
+        (lambda: ImuSample(1.0, (0.0, 0.0, 0.0), (0.0, 0.0, "g")), "accel is no number"),
+        (lambda: WheelSpeed(1.0, 5000.0), "mm/s"),
+        (lambda: live_setup(antenna=(1.0, 2.0)), "antenna needs three numbers"),
+        (lambda: live_setup(platform="boat"), "boat"),
+    ],
+)
+def test_what_cannot_be_is_one_plain_line(make: Callable[[], object], word: str) -> None:
+    with pytest.raises(RecordingError) as caught:
+        make()
+    assert word in str(caught.value)
+    assert "\n" not in str(caught.value)
