@@ -17,7 +17,8 @@ SD = (0.02, 0.02, 0.04)
 
 
 def test_they_are_the_rows_of_a_recording() -> None:
-    recording, _ = oracle.drive(oracle.vehicle_path(10.0, 50.0), odometer_rate=10.0, gnss_velocity_sd=(0.1, 0.1, 0.2))
+    recording, _ = oracle.drive(oracle.vehicle_path(120.0, 50.0), odometer_rate=10.0, gnss_velocity_sd=(0.1, 0.1, 0.2))
+    recording = recording.crop(0.0, 10.0)
     made = {
         "imu": lambda t, v: ImuSample(t, v[:3], v[3:]),
         "gnss": lambda t, v: Fix(t, *np.degrees(v[:2]), v[2], v[3:6], v[6:9], v[9:12]),

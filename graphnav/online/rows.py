@@ -34,13 +34,10 @@ class _Row(tuple[str, float, tuple[float, ...]]):
 
 
 class ImuSample(_Row):
-    """The mean rate and specific force of the sample period that ends at t.
+    """The mean rate and specific force of the sample period that ends at `t` (s).
 
-    Parameters
-    ----------
-    t : s.
-    gyro : (3,) rad/s with respect to inertial space: about right, forward, up of the body.
-    accel : (3,) m/s^2, specific force, +9.8 upward at rest.
+    `gyro` (3,) in rad/s with respect to inertial space, about right, forward, up of the body; `accel` (3,) in m/s^2,
+    specific force along them, +9.8 upward at rest.
 
     Raises
     ------
@@ -57,15 +54,10 @@ class ImuSample(_Row):
 
 
 class Fix(_Row):
-    """A position of the antenna, and its velocity if there is one.
+    """A position of the antenna at `t` (s, on the IMU's clock), and its velocity if there is one.
 
-    Parameters
-    ----------
-    t : s, on the IMU's clock.
-    lat, lon : deg.
-    h : m above the ellipsoid.
-    sd : (3,) m, 1-sigma east, north, up.
-    v, sd_v : (3,) m/s, east, north, up, and its 1-sigmas.
+    `lat`, `lon` in deg, `h` in m above the ellipsoid, `sd` (3,) in m, 1-sigma east, north, up; `v` and `sd_v` (3,) in
+    m/s, east, north, up, and its 1-sigmas.
 
     Raises
     ------
@@ -105,7 +97,7 @@ class Fix(_Row):
 
 
 class WheelSpeed(_Row):
-    """The forward speed of the point that does not slip, m/s, forward positive, at t (s).
+    """The forward speed of the point that does not slip, m/s, forward positive, at `t` (s).
 
     Raises
     ------
