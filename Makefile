@@ -12,10 +12,6 @@ export OPENBLAS_NUM_THREADS := 1
 
 demo: $(VENV)/installed
 	$(BIN)/graphnav compare kitti --without gnss:400-460 -o out/demo
-	@echo
-	@echo "The drive that GTSAM carries, with 60 s of GNSS withheld, through every solver. Open"
-	@echo "  out/demo/comparison.html    the solvers side by side"
-	@echo "  out/demo/batch/report.html  the smoothed drive alone; the numbers are in summary.json beside it"
 
 test: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .

@@ -1,11 +1,14 @@
 """The picture in README.md: the way through a withheld span, and the horizontal error of every solver in it.
 
-python scripts/picture.py ../shared/data/tokyo_20201105 --without gnss:1140-1200 -o docs/outage.png
+python scripts/picture.py data/tokyo --without gnss:40-100 --inertial -o docs/outage.png
+
+The command and the largest errors are kept in the picture, as its description.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import matplotlib
@@ -53,6 +56,7 @@ def main() -> None:
     true = frame.from_llh(truth.llh[k])
     true[np.append(np.diff(truth.t[k]) > GAP, False)] = np.nan  # no line over what is not known
     way.plot(true[:, 0], true[:, 1], color="0.75", lw=6, solid_capstyle="round", label="truth")
+    largest = {}
     for name, words in NAMES.items():
         track = outcome.solutions[name].trajectory(rate=10.0)
         p = frame.from_llh(track.llh[inside(track.t - recording.start, window)])
@@ -62,6 +66,7 @@ def main() -> None:
         t = errors.t - recording.start
         k = inside(t, window)
         size = np.maximum(errors.horizontal[k], 1e-3)
+        largest[name] = float(np.nanmax(size))
         size[np.append(np.diff(t[k]) > GAP, False)] = np.nan
         error.semilogy(t[k], size, color=PALETTE[name][0], lw=1.8, label=words)
     way.set_aspect("equal", adjustable="datalim")
@@ -75,7 +80,9 @@ def main() -> None:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(color="0.93")
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(options.out)
+    command = " ".join(["scripts/picture.py", *sys.argv[1:]])
+    said = ", ".join(f"{words} {largest[name]:.3g} m" for name, words in NAMES.items())
+    figure.savefig(options.out, metadata={"Description": f"{command}: {said}"})
 
 
 def inside(t: np.ndarray, window: tuple[float, float]) -> np.ndarray:

@@ -121,6 +121,24 @@ def test_the_readme_goes_from_a_recording_to_a_plot_in_five_lines():
     assert len([line for line in text.splitlines() if line.strip()]) == 5
 
 
+def test_make_demo_is_what_the_readme_shows():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (demo,) = re.findall(
+        r"^\t\$\(BIN\)/(graphnav compare .*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert any(page.name == "README.md" and text.startswith(f"$ {demo}\n") for page, text in blocks("text"))
+    assert "source .venv/bin/activate" in readme
+
+
+def test_the_picture_is_what_its_command_draws():
+    """Of data in the clone: the command is kept in it."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (command,) = re.findall(r"`python (scripts/picture\.py [^`]+)`", readme)
+    _, recording, *_ = shlex.split(command)
+    assert (ROOT / recording / "recording.toml").exists()
+    assert f"Description\0{command}: ".encode() in (ROOT / "docs" / "outage.png").read_bytes()
+
+
 def test_the_example_of_a_constraint_keeps_the_contract():
     (text,) = [text for page, text in PYTHON if page.name == "constraints.md"]
     module = types.ModuleType("road")
