@@ -14,7 +14,7 @@ from graphnav.complaints import listed, nearest
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.exporters import NAMES, write_as
 from graphnav.formats import formats, load
-from graphnav.formats.clocks import gps_to_utc, parse_clock
+from graphnav.timescales import gps_to_utc, parse_clock
 from graphnav.formats.registry import Log
 from graphnav.formats.trajectories import read_trajectory
 from graphnav.formats.writer import write_recording

@@ -11,7 +11,7 @@ import numpy as np
 
 from graphnav.errors import RecordingError
 from graphnav.formats import schema
-from graphnav.formats.clocks import parse_clock
+from graphnav.timescales import parse_clock
 from graphnav.formats.pulses import counted
 from graphnav.formats.registry import Format, Log
 from graphnav.formats.repair import (

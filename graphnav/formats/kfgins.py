@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.errors import RecordingError
-from graphnav.formats.clocks import WEEK
+from graphnav.timescales import WEEK
 from graphnav.formats.registry import Log, extra, first_bytes, log_format
 from graphnav.formats.repair import Remarks
 from graphnav.formats.schema import rotation_from_letters

@@ -14,7 +14,7 @@ import numpy as np
 
 from graphnav.errors import RecordingError
 from graphnav.formats import ubx
-from graphnav.formats.clocks import of_week, utc_to_gps
+from graphnav.timescales import of_week, utc_to_gps
 from graphnav.formats.registry import Log, extra, first_bytes, log_format
 from graphnav.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES, Remarks, horizontal_velocity
 from graphnav.recording import Gnss, fix_types

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.errors import RecordingError
-from graphnav.formats.clocks import unix_to_gps
+from graphnav.timescales import unix_to_gps
 from graphnav.formats.registry import Log, extra, log_format
 from graphnav.formats.repair import DEFAULT_SD, DEFAULT_SD_V, Remarks
 from graphnav.formats.schema import rotation_from_letters

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.errors import RecordingError
-from graphnav.formats.clocks import WEEK, of_week, unix_to_gps
+from graphnav.timescales import WEEK, of_week, unix_to_gps
 from graphnav.formats.registry import Log, first_bytes, log_format
 from graphnav.formats.repair import Remarks
 from graphnav.formats.text import text_lines

@@ -23,7 +23,7 @@ from pydantic.types import Strict
 
 from graphnav.complaints import complaint, nearest, read_toml
 from graphnav.errors import RecordingError
-from graphnav.formats.clocks import parse_clock
+from graphnav.timescales import parse_clock
 from graphnav.formats.figures import parse_figure
 from graphnav.formats.imu_models import MODELS, find_model
 from graphnav.recording import ImuNoise
@@ -266,7 +266,7 @@ class RecordingFile(_Section):
     format: Literal["graphnav-recording/1"]
     name: str | None = None
     platform: Literal["vehicle", "foot"]
-    clock: str | None = None  # what t = 0 is, see graphnav.formats.clocks.parse_clock; only for output
+    clock: str | None = None  # what t = 0 is, see graphnav.timescales.parse_clock; only for output
     imu: ImuTable
     gnss: GnssTable | None = None
     odometer: OdometerTable | None = None

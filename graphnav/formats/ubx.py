@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.errors import RecordingError
-from graphnav.formats.clocks import WEEK, utc_to_gps
+from graphnav.timescales import WEEK, utc_to_gps
 from graphnav.formats.registry import Log, extra, first_bytes, log_format
 from graphnav.formats.repair import Remarks
 from graphnav.recording import Gnss, Imu, Odometer, fix_types

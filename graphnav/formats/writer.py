@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav.formats.clocks import clock_words
+from graphnav.timescales import clock_words
 from graphnav.formats.registry import Log
 from graphnav.formats.schema import NOISE_UNITS, WHEELS
 from graphnav.progress import tell

@@ -1,0 +1,102 @@
+"""Raw observations of one receiver, a row for each epoch, satellite and signal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.raw.signals import C, GLONASS, Ids, frequencies, system_of
+from graphnav.rotation import Array
+
+
+@dataclass(frozen=True)
+class Observations:
+    """N rows in order of time; NaN where a number is absent."""
+
+    zero: float  # s since the GPS epoch at t = 0
+    t: Array  # (N,) s, the receiver's stamp
+    satellite: Ids  # (N,)
+    signal: Ids  # (N,)
+    code: Array  # (N,) m
+    carrier: Array  # (N,) cycles
+    doppler: Array  # (N,) Hz, positive where the satellite comes nearer
+    cn0: Array  # (N,) dB-Hz
+    slip: NDArray[np.bool_]  # (N,) the carrier lost lock since the epoch before
+    half: NDArray[np.bool_]  # (N,) the carrier may be off by half a cycle
+    lock: Array  # (N,) s that the carrier has been in lock, where the receiver says so
+    channels: dict[int, int] = field(default_factory=dict)  # of GLONASS satellites
+    marker: Array | None = None  # (3,) m in e, rough position of the antenna as the file states it
+    files: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def take(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
+        """Some of the rows."""
+        own = {
+            f.name: getattr(self, f.name)[which]
+            for f in fields(self)
+            if f.name != "marker" and isinstance(getattr(self, f.name), np.ndarray)
+        }
+        return replace(self, **own)
+
+    def on_clock(self, zero: float) -> Observations:
+        """The same on a clock with another zero (s since the GPS epoch)."""
+        return replace(self, t=self.t + (self.zero - zero), zero=zero)
+
+    @property
+    def frequency(self) -> Array:
+        """(N,) Hz."""
+        return frequencies(self.satellite, self.signal, self.channels)
+
+    @property
+    def range_rate(self) -> Array:
+        """(N,) m/s, from the Doppler shift."""
+        return np.asarray(-self.doppler * C / self.frequency)
+
+
+def joined(parts: list[Observations]) -> Observations:
+    """Several files of one receiver as one series, in order of time; what two of them hold is taken once."""
+    if len(parts) == 1:
+        return parts[0]
+    zero = parts[0].zero
+    parts = [part.on_clock(zero) for part in parts]
+    arrays = {
+        f.name: np.concatenate([getattr(part, f.name) for part in parts])
+        for f in fields(Observations)
+        if f.name != "marker" and isinstance(getattr(parts[0], f.name), np.ndarray)
+    }
+    channels = {key: value for part in parts for key, value in part.channels.items()}
+    marker = next((part.marker for part in parts if part.marker is not None), None)
+    whole = Observations(
+        zero=zero, channels=channels, marker=marker, files=tuple(f for p in parts for f in p.files),
+        remarks=tuple(r for p in parts for r in p.remarks), **arrays,
+    )  # fmt: skip
+    return once(whole)
+
+
+def once(obs: Observations) -> Observations:
+    """In order of time, satellite and signal, and each of these once: the row that was first."""
+    tick = np.round(obs.t * 1e4).astype(np.int64)
+    key = (tick - tick.min(initial=0)) * 10**7 + obs.satellite.astype(np.int64) * 10**4 + obs.signal
+    if np.all(np.diff(key) > 0):
+        return obs
+    _, first = np.unique(key, return_index=True)
+    twice = len(obs) - len(first)
+    out = obs.take(first)
+    if not twice:
+        return out
+    return replace(out, remarks=(*out.remarks, f"{twice} observations are there twice; the first of each is used"))
+
+
+def of_week_of(gps: float) -> float:
+    """Where the GPS week of a time begins, s since the GPS epoch."""
+    return float(604800.0 * np.floor(gps / 604800.0))
+
+
+def needs_channel(satellite: Ids) -> NDArray[np.bool_]:
+    """(N,) whether the frequency of a satellite depends on its channel."""
+    return np.asarray(system_of(satellite) == GLONASS)
