@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from graphnav.raw.signals import C, GLONASS, Ids, frequencies, system_of
+from graphnav.raw.signals import C, Ids, frequencies
 from graphnav.rotation import Array
 
 
@@ -92,11 +92,62 @@ def once(obs: Observations) -> Observations:
     return replace(out, remarks=(*out.remarks, f"{twice} observations are there twice; the first of each is used"))
 
 
-def of_week_of(gps: float) -> float:
-    """Where the GPS week of a time begins, s since the GPS epoch."""
-    return float(604800.0 * np.floor(gps / 604800.0))
+@dataclass(frozen=True)
+class RawGnss:
+    """Observations of a rover with their satellites placed: N rows on the recording's clock, in order of time."""
+
+    t: Array  # (N,) s, the receiver's stamp
+    satellite: Ids  # (N,)
+    signal: Ids  # (N,)
+    code: Array  # (N,) m
+    carrier: Array  # (N,) cycles
+    range_rate: Array  # (N,) m/s, from the Doppler shift
+    cn0: Array  # (N,) dB-Hz
+    slip: NDArray[np.bool_]  # (N,)
+    half: NDArray[np.bool_]  # (N,)
+    frequency: Array  # (N,) Hz
+    p: Array  # (N, 3) m, satellite in the Earth-fixed frame of the time of transmission; NaN where unknown
+    v: Array  # (N, 3) m/s
+    clock: Array  # (N,) m that the satellite's clock is ahead, group delays taken off; 0 where the code is without it
+    drift: Array  # (N,) m/s of it
+    difference: Array  # (N,) m to add to the code by a base station; NaN where there is none
+    zero: float  # s since the GPS epoch at t = 0
+    place: tuple[float, float, float]  # m in e, within kilometres of the rover
+    klobuchar: tuple[tuple[float, ...], ...] | None = None  # coefficients that were broadcast
+    troposphere: bool = False  # already taken off the codes
+    lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
+    files: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def take(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> RawGnss:
+        """Some of the rows."""
+        own = {
+            f.name: getattr(self, f.name)[which]
+            for f in fields(self)
+            if f.name != "lever_arm" and isinstance(getattr(self, f.name), np.ndarray)
+        }
+        return replace(self, **own)
+
+    @property
+    def seconds_of_week(self) -> Array:
+        """(N,) GPS seconds of the week."""
+        return np.mod(self.t + np.mod(self.zero, 604800.0), 604800.0)
+
+    @property
+    def epochs(self) -> tuple[Array, NDArray[np.intp]]:
+        """Times (E,) of the epochs, and which of them each row is of."""
+        return np.unique(self.t, return_inverse=True)
 
 
-def needs_channel(satellite: Ids) -> NDArray[np.bool_]:
-    """(N,) whether the frequency of a satellite depends on its channel."""
-    return np.asarray(system_of(satellite) == GLONASS)
+def primary(raw: RawGnss) -> NDArray[np.bool_]:
+    """(N,) one row for each satellite and epoch: the signal whose group delay is best known, L1 or B1 first."""
+    order = np.where(raw.signal // 100 == 1, 0, raw.signal // 100) + np.where(raw.signal % 100 == 2, 0.0, 0.5)
+    order = np.where(np.isfinite(raw.code), order, 100.0)
+    sorted_rows = np.lexsort((order, raw.satellite, raw.t))
+    t, satellite = raw.t[sorted_rows], raw.satellite[sorted_rows]
+    first = np.concatenate([[True], (np.diff(t) > 0) | (np.diff(satellite) != 0)])
+    out = np.zeros(len(raw), dtype=bool)
+    out[sorted_rows[first]] = True
+    return out & np.isfinite(raw.code)
