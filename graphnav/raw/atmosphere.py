@@ -1,8 +1,7 @@
 """Delays in the atmosphere and directions of satellites.
 
 Ionosphere: Klobuchar's model (IS-GPS-200N, 20.3.3.5.2.5). Troposphere: Saastamoinen's zenith delays in a standard
-atmosphere with the mapping of Niell's kind replaced by 1 / sin-like closed form of Chao for the hydrostatic part
-(RTKLIB manual 2.4.2, E.5: both parts over the cosine of the zenith angle), good to decimetres at 10 degrees.
+atmosphere over the sine of the elevation, as in RTKLIB (manual 2.4.2, E.5); good to decimetres at 10 degrees.
 """
 
 from __future__ import annotations
@@ -10,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav import earth
-from graphnav.raw.signals import C, L1
+from graphnav.raw.signals import C
 from graphnav.rotation import Array
 
-# coefficients of an ordinary day, where none are broadcast: those of 1 January 2004, as RTKLIB has them (ionmodel)
-USUAL = np.array([[0.1118e-7, -0.7451e-8, -0.5961e-7, 0.1192e-6], [0.1167e6, -0.2294e6, -0.1311e6, 0.1049e7]])
+# where no coefficients are broadcast: Klobuchar's constant part, 5 ns at the zenith, which is all there is at night
+NIGHT = np.zeros((2, 4))
 _HUMIDITY = 0.7
 _CIRCLE = np.pi  # rad of a semicircle
 
@@ -42,13 +41,18 @@ def klobuchar(coefficients: Array, gps: Array, llh: Array, azimuth: Array, eleva
     lon = llh[:, 1] / _CIRCLE + angle * np.sin(azimuth) / np.cos(lat * _CIRCLE)
     magnetic = lat + 0.064 * np.cos((lon - 1.617) * _CIRCLE)
     local = np.mod(43200.0 * lon + gps, 86400.0)
-    slant = 1.0 + 16.0 * (0.53 - el) ** 3
+    slant = obliquity(elevation)
     powers = magnetic[:, None] ** np.arange(4)
     amplitude = np.maximum(powers @ coefficients[0], 0.0)
     period = np.maximum(powers @ coefficients[1], 72000.0)
     x = 2.0 * np.pi * (local - 50400.0) / period
     day = 5e-9 + amplitude * (1.0 + x * x * (-0.5 + x * x / 24.0))
     return np.asarray(C * slant * np.where(np.abs(x) < 1.57, day, 5e-9))
+
+
+def obliquity(elevation: Array) -> Array:
+    """(N,) delay of the ionosphere at elevations (N,), rad, over that at the zenith."""
+    return np.asarray(1.0 + 16.0 * (0.53 - np.maximum(elevation, 0.0) / _CIRCLE) ** 3)
 
 
 def saastamoinen(llh: Array, elevation: Array) -> Array:

@@ -96,10 +96,10 @@ def once(obs: Observations) -> Observations:
 class RawGnss:
     """Observations of a rover with their satellites placed: N rows on the recording's clock, in order of time."""
 
-    t: Array  # (N,) s, the receiver's stamp
+    t: Array  # (N,) s at which the antenna received: the receiver's stamp less its clock error
     satellite: Ids  # (N,)
     signal: Ids  # (N,)
-    code: Array  # (N,) m
+    code: Array  # (N,) m, by the receiver's stamp
     carrier: Array  # (N,) cycles
     range_rate: Array  # (N,) m/s, from the Doppler shift
     cn0: Array  # (N,) dB-Hz
@@ -115,6 +115,8 @@ class RawGnss:
     place: tuple[float, float, float]  # m in e, within kilometres of the rover
     klobuchar: tuple[tuple[float, ...], ...] | None = None  # coefficients that were broadcast
     troposphere: bool = False  # already taken off the codes
+    antenna: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m in e, single-point, of each epoch
+    receiver_clock: Array = field(default_factory=lambda: np.empty((0, 2)))  # (N, 2) m and m/s, single-point
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
     files: tuple[str, ...] = ()
 
@@ -126,7 +128,7 @@ class RawGnss:
         own = {
             f.name: getattr(self, f.name)[which]
             for f in fields(self)
-            if f.name != "lever_arm" and isinstance(getattr(self, f.name), np.ndarray)
+            if f.name != "lever_arm" and isinstance(getattr(self, f.name), np.ndarray) and len(getattr(self, f.name))
         }
         return replace(self, **own)
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav import earth
-from graphnav.raw.atmosphere import USUAL, directions, klobuchar, saastamoinen
+from graphnav.raw.atmosphere import NIGHT, directions, klobuchar, saastamoinen
 from graphnav.raw.ephemeris import EARTH_RATE, turned
 from graphnav.raw.series import RawGnss
 from graphnav.raw.sigmas import code_sigma, rate_sigma
@@ -93,8 +93,8 @@ def stretch(raw: RawGnss, geometry: Geometry) -> Array:
 
 
 def coefficients(raw: RawGnss) -> Array:
-    """Klobuchar's coefficients: those broadcast, else those of an ordinary day."""
-    return USUAL if raw.klobuchar is None else np.array(raw.klobuchar)
+    """Klobuchar's coefficients: those broadcast, else those of the night."""
+    return NIGHT if raw.klobuchar is None else np.array(raw.klobuchar)
 
 
 def signal_groups(raw: RawGnss) -> tuple[tuple[tuple[int, int], ...], NDArray[np.intp]]:

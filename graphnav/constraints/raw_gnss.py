@@ -1,0 +1,324 @@
+"""Codes and Doppler shifts of single satellites, at an antenna at a lever arm from the IMU.
+
+With p_a = p + R_nb l the antenna, e the unit vector from it to the satellite s in the Earth-fixed frame of the
+reception, and u = v + R_nb (omega_nb x l) its velocity (Groves 2013, sections 8.4.1, 9.4.1 and 14.1.2)::
+
+    r_code    = |s - p_a| + b + b_s + m z + I + T - dt - e_l.c - P
+    r_doppler = e.(v_s - u) / k + b' - dt' - e_l.d - D
+
+b and b' are the receiver's clock and its drift, which begin anew at every epoch; b_s is the bias of the signals of
+another system, z what the model of the ionosphere is wrong by at the zenith and m how that grows towards the horizon; k
+comes of the flight time (`graphnav.raw.single_point.stretch`). c is the time-correlated part of the errors of all
+satellites together, as a shift of the antenna in east, north, up: reflections that last for seconds, and what orbits,
+atmosphere and the coming and going of satellites do over minutes and hours; d the same of velocities. How much of each
+there is, the noise model says.
+
+Distances are differences against a nominal place of each epoch, so that no digits are lost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from graphnav import earth, rotation
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
+from graphnav.constraints.gnss import LEVER_ARM, TIMES, antenna_velocity, around, node_spacing, period
+from graphnav.raw.atmosphere import obliquity
+from graphnav.raw.ephemeris import turned
+from graphnav.raw.series import RawGnss, primary
+from graphnav.raw.sigmas import code_sigma, rate_sigma
+from graphnav.raw.signals import C, L1, NAMES, signal_name
+from graphnav.raw.single_point import coefficients, look, signal_groups, stretch
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+from graphnav.state import SECONDS, Parameter, States
+
+CLOCK = "receiver_clock"
+BIASES = "gnss_signal_biases"
+IONOSPHERE = "gnss_ionosphere"
+CODE_ERRORS = tuple(f"gnss_code_error_of_{time}" for time in TIMES)
+RATE_ERROR = "gnss_doppler_error"
+_CLOCK_SIGMA = np.array([1e3, 1e2])  # m, m/s, about the single-point solution: nothing known
+_ZENITH = 3.0  # m, 1-sigma of what the model of the ionosphere is wrong by
+_AXES = ("horizontal", "horizontal", "up")
+_ERROR = np.array([1.5, 1.5, 3.0])  # m, unit of the lasting errors: a good single-frequency position
+_RATE_ERROR = np.array([0.05, 0.05, 0.1])  # m/s
+_LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have a variance factor of their own
+_CLASSES = ("strong", "fair", "weak", "faint")
+
+
+def _selected(recording: Recording, settings: Settings) -> RawGnss | None:
+    """The rows to be used: of one signal for each satellite, strong enough, where the IMU is."""
+    s, raw = settings.raw_gnss, recording.raw_gnss
+    if raw is None or not recording.tight(s.coupling) or not len(raw):
+        return None
+    used = (raw.t >= recording.start - SAME_TIME) & (raw.t <= recording.end + SAME_TIME)
+    used &= np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock) & ~(raw.cn0 < s.cn0)
+    if s.period > 0.0 and used.any():
+        used &= np.isin(raw.t, _apart(np.unique(raw.t[used]), s.period))
+    raw = raw.take(used)
+    raw = raw.take(primary(raw))
+    return raw if len(raw) else None
+
+
+def _apart(t: Array, least: float) -> Array:
+    """Those of some times that are so far apart at least."""
+    out = [float(t[0])]
+    for x in t.tolist():
+        if x - out[-1] >= least - 0.05:
+            out.append(x)
+    return np.array(out)
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """What both kinds of rows need, of the rows that are used; made once for a scene."""
+
+    raw: RawGnss
+    keyframe: Array
+    s_n: Array  # (N, 3) m, satellites
+    v_n: Array  # (N, 3) m/s
+    R_ln: Array  # (N, 3, 3)
+    elevation: Array  # (N,) rad
+    known: Array  # (N,) m, distance from the nominal antenna with the delays of the atmosphere
+    nominal: Array  # (N, 3) m
+    ionosphere: Array  # (N,) m
+    stretch: Array  # (N,)
+    clock: Parameter
+
+
+def _prepare(scene: Scene) -> _Prepared | None:
+    if "raw_gnss" not in scene.made:
+        scene.made["raw_gnss"] = _prepared(scene)
+    found: _Prepared | None = scene.made["raw_gnss"]
+    return found
+
+
+def _prepared(scene: Scene) -> _Prepared | None:
+    raw = _selected(scene.recording, scene.settings)
+    if raw is None:
+        return None
+    keyframe = scene.keyframe_at(raw.t)
+    geometry = look(raw, raw.antenna, coefficients(raw))
+    used = (keyframe >= 0) & (geometry.elevation >= np.radians(scene.settings.raw_gnss.elevation))
+    if not used.any():
+        return None
+    raw, keyframe = raw.take(used), keyframe[used]
+    geometry = look(raw, raw.antenna, coefficients(raw))
+    frame = scene.frame
+    epochs, first = np.unique(raw.t, return_index=True)
+    return _Prepared(
+        raw=raw,
+        keyframe=keyframe,
+        s_n=(geometry.s - frame.r_e) @ frame.R_ne.T,
+        v_n=turned(raw.v, geometry.distance / C) @ frame.R_ne.T,
+        R_ln=earth.enu_axes(earth.ecef_to_llh(raw.antenna)) @ frame.R_ne.T,
+        elevation=geometry.elevation,
+        known=geometry.distance + geometry.ionosphere + geometry.troposphere,
+        nominal=(raw.antenna - frame.r_e) @ frame.R_ne.T,
+        ionosphere=geometry.ionosphere,
+        stretch=stretch(raw, geometry),
+        clock=Parameter(
+            CLOCK, raw.receiver_clock[first], np.tile(_CLOCK_SIGMA, (len(epochs), 1)), "m, m/s", begins=epochs
+        ),
+    )
+
+
+def _common(scene: Scene, found: _Prepared) -> dict[str, Any]:
+    settings, raw = scene.settings, found.raw
+    parameters: tuple[Parameter, ...] = (found.clock,)
+    if settings.gnss.lever_arm_sigma is not None:
+        parameters += (Parameter(LEVER_ARM, raw.lever_arm, np.full(3, settings.gnss.lever_arm_sigma), "m"),)
+    return {
+        "keyframe": found.keyframe,
+        "s_n": found.s_n,
+        "R_ln": found.R_ln,
+        "lever_arm": raw.lever_arm,
+        "satellite": raw.satellite,
+        "elevation": found.elevation,
+        "level": np.searchsorted(-np.array(_LEVELS), -np.nan_to_num(raw.cn0, nan=_LEVELS[0]), side="left"),
+        "parameters": parameters,
+        **settings.raw_gnss.outliers,
+    }
+
+
+@dataclass(frozen=True)
+class _Satellites(Constraint):
+    """Rows of single satellites."""
+
+    axes: ClassVar[tuple[str, ...]] = ("range",)
+
+    s_n: Array = field(default_factory=lambda: np.empty((0, 3)))  # m
+    R_ln: Array = field(default_factory=lambda: np.empty((0, 3, 3)))
+    lever_arm: Array = field(default_factory=lambda: np.zeros(3))
+    sigma: Array = field(default_factory=lambda: np.empty((0, 1)))
+    satellite: Array = field(default_factory=lambda: np.empty(0, dtype=np.int16))  # (N,) graphnav.raw.signals
+    elevation: Array = field(default_factory=lambda: np.empty(0))  # (N,) rad
+    level: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of _CLASSES
+
+    def noise_groups(self) -> tuple[tuple[str, ...], Array]:
+        there, which = np.unique(self.level, return_inverse=True)
+        return tuple(f"{self.name}.{_CLASSES[int(k)]}" for k in there), which[:, None]
+
+    def _antenna(self, states: States, parameters: dict[str, Array]) -> tuple[Array, Array]:
+        """Antennas in n (N, 3), and lever arms (3,) or (N, 3)."""
+        lever = parameters.get(LEVER_ARM, self.lever_arm)
+        return states.p + rotation.mv(states.R_nb, lever), lever
+
+    def _lasting(self, parameters: dict[str, Array], names: tuple[str, ...], rows: slice | Array, e: Array) -> Any:
+        """What lasting errors, shifts in east, north, up, do to the rows, (n,), and the derivatives."""
+        there = [name for name in names if name in parameters]
+        if not there:
+            return 0.0, {}
+        towards = -rotation.mv(self.R_ln[rows], e)
+        shift = sum(parameters[name] for name in there)
+        return np.sum(towards * shift, axis=1), {name: towards[:, None] for name in there}
+
+
+@dataclass(frozen=True)
+class GnssCode(_Satellites):
+    """A satellite's code was received by the antenna."""
+
+    name: ClassVar[str] = "gnss_code"
+    unit: ClassVar[str] = "m"
+
+    offset: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, all that does not depend on the estimate
+    nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m
+    group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of the signals, 0 the reference
+    slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) of the ionosphere's delay over that at the zenith
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        raw = _selected(recording, settings) if settings.raw_gnss.code else None
+        return np.empty(0) if raw is None else np.unique(raw.t)
+
+    @classmethod
+    def build(cls, scene: Scene) -> GnssCode | None:
+        found = _prepare(scene) if scene.settings.raw_gnss.code else None
+        if found is None:
+            return None
+        raw, settings = found.raw, scene.settings
+        groups, group = signal_groups(raw)
+        common = _common(scene, found)
+        more: tuple[Parameter, ...] = (Parameter(IONOSPHERE, np.zeros(1), np.full(1, _ZENITH), "m"),)
+        if len(groups) > 1:
+            size = len(groups) - 1
+            more += (Parameter(BIASES, np.zeros(size), np.full(size, settings.raw_gnss.bias_sigma), "m"),)
+        common["parameters"] += more
+        spacing = node_spacing(settings.gnss.slow_times, period(found.clock.begins))  # type: ignore[arg-type]
+        processes = tuple(
+            Parameter(
+                error, np.zeros(3), _ERROR, "m", correlation_time=lasts, spacing=spacing,
+                noise_groups=tuple(f"{cls.name}.{time}.{axis}" for axis in _AXES),
+            )
+            for error, time, lasts in zip(CODE_ERRORS, TIMES, (SECONDS, *settings.gnss.slow_times), strict=True)
+        )  # fmt: skip
+        words = [f"{NAMES[system]} {signal_name(signal)}" for system, signal in groups]
+        note = f"gnss_code: {words[0]}"
+        note += f", with a bias each of {', '.join(words[1:])}" if words[1:] else ""
+        return cls(
+            offset=found.known - raw.code - raw.clock,
+            nominal=found.nominal,
+            group=group,
+            slant=obliquity(found.elevation) * (L1 / raw.frequency) ** 2,
+            sigma=code_sigma(raw.cn0, found.elevation, found.ionosphere)[:, None],
+            processes=processes,
+            notes=(note,),
+            **common,
+        )
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        antenna, lever = self._antenna(states, parameters)
+        away, nominal = self.s_n[rows] - antenna, self.s_n[rows] - self.nominal[rows]
+        moved = antenna - self.nominal[rows]
+        distance, before = np.linalg.norm(away, axis=1), np.linalg.norm(nominal, axis=1)
+        e = away / distance[:, None]
+        # |a| - |b| without the digits that a difference of distances would lose
+        nearer = np.sum(moved * (moved - 2.0 * nominal), axis=1) / (distance + before)
+        slant, shift = self.slant[rows], 0.0
+        residual = nearer + self.offset[rows] + parameters[CLOCK][:, 0] + slant * parameters[IONOSPHERE][:, 0]
+        J = {
+            "theta": (e[:, None] @ states.R_nb) @ rotation.skew(lever),
+            "p": -e[:, None],
+            CLOCK: np.broadcast_to(np.array([[1.0, 0.0]]), (len(e), 1, 2)),
+            IONOSPHERE: slant[:, None, None],
+        }
+        if LEVER_ARM in parameters:
+            J[LEVER_ARM] = -e[:, None] @ states.R_nb
+        if BIASES in parameters:
+            own = self.group[rows][:, None] == np.arange(1, parameters[BIASES].shape[1] + 1)
+            residual = residual + np.sum(own * parameters[BIASES], axis=1)
+            J[BIASES] = own[:, None].astype(float)
+        shift, more = self._lasting(parameters, CODE_ERRORS, rows, e)
+        return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])
+
+
+@dataclass(frozen=True)
+class GnssDoppler(_Satellites):
+    """A satellite's signal was received with a Doppler shift."""
+
+    name: ClassVar[str] = "gnss_doppler"
+    unit: ClassVar[str] = "m/s"
+
+    offset: Array = field(default_factory=lambda: np.empty(0))  # (N,) m/s
+    v_n: Array = field(default_factory=lambda: np.empty((0, 3)))  # m/s, of the satellites
+    stretch: Array = field(default_factory=lambda: np.empty(0))  # (N,)
+    gyro: Array = field(default_factory=lambda: np.empty((0, 3)))  # measured rate at the epoch
+    omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        raw = _selected(recording, settings) if settings.raw_gnss.doppler else None
+        return np.empty(0) if raw is None else np.unique(raw.t[np.isfinite(raw.range_rate)])
+
+    @classmethod
+    def build(cls, scene: Scene) -> GnssDoppler | None:
+        found = _prepare(scene) if scene.settings.raw_gnss.doppler else None
+        if found is None:
+            return None
+        raw, common = found.raw, _common(scene, found)
+        some = np.isfinite(raw.range_rate) & np.isfinite(raw.drift)
+        if not some.any():
+            return None
+        per_row = ("keyframe", "s_n", "R_ln", "satellite", "elevation", "level")
+        common |= {name: common[name][some] for name in per_row}
+        lasting = Parameter(
+            RATE_ERROR, np.zeros(3), _RATE_ERROR, "m/s", correlation_time=SECONDS,
+            spacing=node_spacing((), period(found.clock.begins)),  # type: ignore[arg-type]
+            noise_groups=tuple(f"{cls.name}.seconds.{axis}" for axis in _AXES),
+        )  # fmt: skip
+        imu = scene.recording.imu
+        return cls(
+            offset=-(raw.range_rate + raw.drift)[some],
+            v_n=found.v_n[some],
+            stretch=found.stretch[some],
+            gyro=around(imu, imu.gyro, raw.t[some]),
+            omega_n=scene.frame.omega_n,
+            sigma=rate_sigma(raw.cn0, found.elevation)[some, None],
+            processes=(lasting,),
+            **common,
+        )
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        antenna, lever = self._antenna(states, parameters)
+        u, moved = antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
+        away = self.s_n[rows] - antenna
+        distance = np.linalg.norm(away, axis=1)[:, None]
+        e, w = away / distance, self.v_n[rows] - u
+        along = np.sum(e * w, axis=1)
+        less = 1.0 / self.stretch[rows]
+        residual = along * less + self.offset[rows] + parameters[CLOCK][:, 1]
+        by_place = -((w - along[:, None] * e) / distance * less[:, None])[:, None]  # (n, 1, 3)
+        by_velocity = -(e * less[:, None])[:, None]
+        J = {name: by_velocity @ x for name, x in moved.items() if name != LEVER_ARM or LEVER_ARM in parameters}
+        J["p"] = by_place
+        J["theta"] = J["theta"] - by_place @ states.R_nb @ rotation.skew(lever)
+        J[CLOCK] = np.broadcast_to(np.array([[0.0, 1.0]]), (len(e), 1, 2))
+        if LEVER_ARM in parameters:
+            J[LEVER_ARM] = J[LEVER_ARM] + by_place @ states.R_nb
+        shift, more = self._lasting(parameters, (RATE_ERROR,), rows, e)
+        return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])
