@@ -3,15 +3,15 @@
 With p_a = p + R_nb l the antenna, e the unit vector from it to the satellite s in the Earth-fixed frame of the
 reception, and u = v + R_nb (omega_nb x l) its velocity (Groves 2013, sections 8.4.1, 9.4.1 and 14.1.2)::
 
-    r_code    = |s - p_a| + b + b_s + m z + I + T - dt - e_l.c - P
+    r_code    = |s - p_a| + b + b_s + m z + I + T - dt - e_l.c + q_s - P
     r_doppler = e.(v_s - u) / k + b' - dt' - e_l.d - D
 
 b and b' are the receiver's clock and its drift, which begin anew at every epoch; b_s is the bias of the signals of
 another system, z what the model of the ionosphere is wrong by at the zenith and m how that grows towards the horizon; k
 comes of the flight time (`graphnav.raw.single_point.stretch`). c is the time-correlated part of the errors of all
-satellites together, as a shift of the antenna in east, north, up: reflections that last for seconds, and what orbits,
-atmosphere and the coming and going of satellites do over minutes and hours; d the same of velocities. How much of each
-there is, the noise model says.
+satellites together, as a shift of the antenna in east, north, up: reflections that last for seconds, and what the
+coming and going of satellites does over minutes; d the same of velocities. q_s is what lasts for hours of one
+satellite: orbit, clock, and the atmosphere towards it. How much of each there is, the noise model says.
 
 Distances are differences against a nominal place of each epoch, so that no digits are lost.
 """
@@ -40,12 +40,17 @@ from graphnav.state import SECONDS, Parameter, States
 CLOCK = "receiver_clock"
 BIASES = "gnss_signal_biases"
 IONOSPHERE = "gnss_ionosphere"
-CODE_ERRORS = tuple(f"gnss_code_error_of_{time}" for time in TIMES)
+CODE_ERRORS = tuple(f"gnss_code_error_of_{time}" for time in TIMES[:2])
+SATELLITES = f"gnss_satellite_errors_of_{TIMES[2]}"
 RATE_ERROR = "gnss_doppler_error"
 _CLOCK_SIGMA = np.array([1e3, 1e2])  # m, m/s, about the single-point solution: nothing known
 _ZENITH = 3.0  # m, 1-sigma of what the model of the ionosphere is wrong by
+# unit/sqrt(s), of what changes over hours. Even a lever arm walks, by a centimetre in three hours: all that rows depend
+# on beside states and clocks has its nodes in common then, one variable of the graph
+_ZENITH_WALK, _BIAS_WALK, _LEVER_WALK = 0.01, 0.003, 1e-4
 _AXES = ("horizontal", "horizontal", "up")
-_ERROR = np.array([1.5, 1.5, 3.0])  # m, unit of the lasting errors: a good single-frequency position
+_ERROR = np.array([1.0, 1.0, 2.0])  # m, unit of what lasts and all satellites have in common, as a shift of the place
+_ONE = 1.0  # m, unit of what lasts of one satellite: orbit, clock, its own ionosphere
 _RATE_ERROR = np.array([0.05, 0.05, 0.1])  # m/s
 _LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have a variance factor of their own
 _CLASSES = ("strong", "fair", "weak", "faint")
@@ -132,7 +137,7 @@ def _common(scene: Scene, found: _Prepared) -> dict[str, Any]:
     settings, raw = scene.settings, found.raw
     parameters: tuple[Parameter, ...] = (found.clock,)
     if settings.gnss.lever_arm_sigma is not None:
-        parameters += (Parameter(LEVER_ARM, raw.lever_arm, np.full(3, settings.gnss.lever_arm_sigma), "m"),)
+        parameters += (Parameter(LEVER_ARM, raw.lever_arm, np.full(3, settings.gnss.lever_arm_sigma), "m", _LEVER_WALK),)
     return {
         "keyframe": found.keyframe,
         "s_n": found.s_n,
@@ -189,6 +194,7 @@ class GnssCode(_Satellites):
     offset: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, all that does not depend on the estimate
     nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m
     group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of the signals, 0 the reference
+    which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite, in the order of their errors
     slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) of the ionosphere's delay over that at the zenith
 
     @classmethod
@@ -204,18 +210,25 @@ class GnssCode(_Satellites):
         raw, settings = found.raw, scene.settings
         groups, group = signal_groups(raw)
         common = _common(scene, found)
-        more: tuple[Parameter, ...] = (Parameter(IONOSPHERE, np.zeros(1), np.full(1, _ZENITH), "m"),)
+        more: tuple[Parameter, ...] = (Parameter(IONOSPHERE, np.zeros(1), np.full(1, _ZENITH), "m", _ZENITH_WALK),)
         if len(groups) > 1:
             size = len(groups) - 1
-            more += (Parameter(BIASES, np.zeros(size), np.full(size, settings.raw_gnss.bias_sigma), "m"),)
+            more += (Parameter(BIASES, np.zeros(size), np.full(size, settings.raw_gnss.bias_sigma), "m", _BIAS_WALK),)
         common["parameters"] += more
         spacing = node_spacing(settings.gnss.slow_times, period(found.clock.begins))  # type: ignore[arg-type]
-        processes = tuple(
+        minutes, hours = settings.gnss.slow_times
+        common_errors = (
             Parameter(
                 error, np.zeros(3), _ERROR, "m", correlation_time=lasts, spacing=spacing,
                 noise_groups=tuple(f"{cls.name}.{time}.{axis}" for axis in _AXES),
             )
-            for error, time, lasts in zip(CODE_ERRORS, TIMES, (SECONDS, *settings.gnss.slow_times), strict=True)
+            for error, time, lasts in zip(CODE_ERRORS, TIMES, (SECONDS, minutes), strict=False)
+        )  # fmt: skip
+        satellites, which = np.unique(raw.satellite, return_inverse=True)
+        many = len(satellites)
+        own_errors = Parameter(
+            SATELLITES, np.zeros(many), np.full(many, _ONE), "m", correlation_time=hours, spacing=spacing,
+            noise_groups=(f"{cls.name}.{TIMES[2]}.satellite",) * many,
         )  # fmt: skip
         words = [f"{NAMES[system]} {signal_name(signal)}" for system, signal in groups]
         note = f"gnss_code: {words[0]}"
@@ -226,7 +239,8 @@ class GnssCode(_Satellites):
             group=group,
             slant=obliquity(found.elevation) * (L1 / raw.frequency) ** 2,
             sigma=code_sigma(raw.cn0, found.elevation, found.ionosphere)[:, None],
-            processes=processes,
+            which=which,
+            processes=(*common_errors, own_errors),
             notes=(note,),
             **common,
         )
@@ -253,6 +267,10 @@ class GnssCode(_Satellites):
             own = self.group[rows][:, None] == np.arange(1, parameters[BIASES].shape[1] + 1)
             residual = residual + np.sum(own * parameters[BIASES], axis=1)
             J[BIASES] = own[:, None].astype(float)
+        if SATELLITES in parameters:
+            own = self.which[rows][:, None] == np.arange(parameters[SATELLITES].shape[1])
+            residual = residual + np.sum(own * parameters[SATELLITES], axis=1)
+            J[SATELLITES] = own[:, None].astype(float)
         shift, more = self._lasting(parameters, CODE_ERRORS, rows, e)
         return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])
 
