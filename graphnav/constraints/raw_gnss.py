@@ -3,15 +3,16 @@
 With p_a = p + R_nb l the antenna, e the unit vector from it to the satellite s in the Earth-fixed frame of the
 reception, and u = v + R_nb (omega_nb x l) its velocity (Groves 2013, sections 8.4.1, 9.4.1 and 14.1.2)::
 
-    r_code    = |s - p_a| + b + b_s + m z + I + T - dt - e_l.c + q_s - P
+    r_code    = |s - p_a| + b + b_s + m z + I + T - dt - e_l.c + q - P
     r_doppler = e.(v_s - u) / k + b' - dt' - e_l.d - D
 
 b and b' are the receiver's clock and its drift, which begin anew at every epoch; b_s is the bias of the signals of
 another system, z what the model of the ionosphere is wrong by at the zenith and m how that grows towards the horizon; k
-comes of the flight time (`graphnav.raw.single_point.stretch`). c is the time-correlated part of the errors of all
-satellites together, as a shift of the antenna in east, north, up: reflections that last for seconds, and what the
-coming and going of satellites does over minutes; d the same of velocities. q_s is what lasts for hours of one
-satellite: orbit, clock, and the atmosphere towards it. How much of each there is, the noise model says.
+comes of the flight time (`graphnav.raw.single_point.stretch`). c is what lasts of the errors of all satellites
+together, for seconds or for hours, as a shift of the antenna in east, north, up, and d the same of velocities. q is what lasts of the
+errors of the one satellite: for minutes, reflections and what a receiver's smoothing of its codes leaves, in units of
+the stated sigma; and for hours, orbit, clock and the atmosphere towards it. How much of each there is, the noise model
+says.
 
 Distances are differences against a nominal place of each epoch, so that no digits are lost.
 """
@@ -22,6 +23,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from graphnav import earth, rotation
 from graphnav.config import Settings
@@ -40,8 +42,8 @@ from graphnav.state import SECONDS, Parameter, States
 CLOCK = "receiver_clock"
 BIASES = "gnss_signal_biases"
 IONOSPHERE = "gnss_ionosphere"
-CODE_ERRORS = tuple(f"gnss_code_error_of_{time}" for time in TIMES[:2])
-SATELLITES = f"gnss_satellite_errors_of_{TIMES[2]}"
+CODE_ERRORS = tuple(f"gnss_code_error_of_{time}" for time in (TIMES[0], TIMES[2]))
+SATELLITES = tuple(f"gnss_satellite_errors_of_{time}" for time in TIMES[1:])
 RATE_ERROR = "gnss_doppler_error"
 _CLOCK_SIGMA = np.array([1e3, 1e2])  # m, m/s, about the single-point solution: nothing known
 _ZENITH = 3.0  # m, 1-sigma of what the model of the ionosphere is wrong by
@@ -49,8 +51,12 @@ _ZENITH = 3.0  # m, 1-sigma of what the model of the ionosphere is wrong by
 # on beside states and clocks has its nodes in common then, one variable of the graph
 _ZENITH_WALK, _BIAS_WALK, _LEVER_WALK = 0.01, 0.003, 1e-4
 _AXES = ("horizontal", "horizontal", "up")
-_ERROR = np.array([1.0, 1.0, 2.0])  # m, unit of what lasts and all satellites have in common, as a shift of the place
-_ONE = 1.0  # m, unit of what lasts of one satellite: orbit, clock, its own ionosphere
+# m, units of what all satellites have in common, as a shift of the place: for seconds, and for hours, where the
+# ionosphere's gradient and the datum of an orbit are a metre or two; of what lasts of one satellite for hours
+_ERROR = np.array([1.0, 1.0, 2.0])
+_HOURS, _ONE = np.array([2.0, 2.0, 4.0]), 1.0
+_DIFFERENCED = 0.1  # of them, against a base station
+_MINUTE = 60.0  # s
 _RATE_ERROR = np.array([0.05, 0.05, 0.1])  # m/s
 _LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have a variance factor of their own
 _CLASSES = ("strong", "fair", "weak", "faint")
@@ -63,6 +69,8 @@ def _selected(recording: Recording, settings: Settings) -> RawGnss | None:
         return None
     used = (raw.t >= recording.start - SAME_TIME) & (raw.t <= recording.end + SAME_TIME)
     used &= np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock) & ~(raw.cn0 < s.cn0)
+    if raw.differenced:
+        used &= np.isfinite(raw.difference)
     if s.period > 0.0 and used.any():
         used &= np.isin(raw.t, _apart(np.unique(raw.t[used]), s.period))
     raw = raw.take(used)
@@ -175,13 +183,23 @@ class _Satellites(Constraint):
         return states.p + rotation.mv(states.R_nb, lever), lever
 
     def _lasting(self, parameters: dict[str, Array], names: tuple[str, ...], rows: slice | Array, e: Array) -> Any:
-        """What lasting errors, shifts in east, north, up, do to the rows, (n,), and the derivatives."""
+        """What errors that all have in common, shifts in east, north, up, do to the rows (n,), and by how much."""
         there = [name for name in names if name in parameters]
         if not there:
             return 0.0, {}
         towards = -rotation.mv(self.R_ln[rows], e)
         shift = sum(parameters[name] for name in there)
         return np.sum(towards * shift, axis=1), {name: towards[:, None] for name in there}
+
+
+def _usual(raw: RawGnss, sigma: Array) -> Array:
+    """(N,) running median of each satellite's sigmas over a minute."""
+    out = sigma.copy()
+    for one in np.unique(raw.satellite):
+        own = np.flatnonzero(raw.satellite == one)
+        size = 2 * int(np.clip(_MINUTE / period(raw.t[own]) / 2, 0, (len(own) - 1) // 2)) + 1
+        out[own] = median_filter(sigma[own], size=size, mode="nearest")
+    return out
 
 
 @dataclass(frozen=True)
@@ -195,6 +213,7 @@ class GnssCode(_Satellites):
     nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m
     group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of the signals, 0 the reference
     which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite, in the order of their errors
+    size: Array = field(default_factory=lambda: np.empty((0, 2)))  # (N, 2) m, units of the satellites' errors
     slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) of the ionosphere's delay over that at the zenith
 
     @classmethod
@@ -210,37 +229,44 @@ class GnssCode(_Satellites):
         raw, settings = found.raw, scene.settings
         groups, group = signal_groups(raw)
         common = _common(scene, found)
-        more: tuple[Parameter, ...] = (Parameter(IONOSPHERE, np.zeros(1), np.full(1, _ZENITH), "m", _ZENITH_WALK),)
+        less = _DIFFERENCED if raw.differenced else 1.0
+        more: tuple[Parameter, ...] = (Parameter(IONOSPHERE, np.zeros(1), np.full(1, less * _ZENITH), "m", less * _ZENITH_WALK),)
         if len(groups) > 1:
             size = len(groups) - 1
             more += (Parameter(BIASES, np.zeros(size), np.full(size, settings.raw_gnss.bias_sigma), "m", _BIAS_WALK),)
         common["parameters"] += more
         spacing = node_spacing(settings.gnss.slow_times, period(found.clock.begins))  # type: ignore[arg-type]
+        satellites, which = np.unique(raw.satellite, return_inverse=True)
+        sigma, many = code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)
         minutes, hours = settings.gnss.slow_times
-        common_errors = (
+        shared = tuple(
             Parameter(
-                error, np.zeros(3), _ERROR, "m", correlation_time=lasts, spacing=spacing,
+                error, np.zeros(3), unit, "m", correlation_time=lasts, spacing=spacing,
                 noise_groups=tuple(f"{cls.name}.{time}.{axis}" for axis in _AXES),
             )
-            for error, time, lasts in zip(CODE_ERRORS, TIMES, (SECONDS, minutes), strict=False)
+            for error, unit, time, lasts in (
+                (CODE_ERRORS[0], _ERROR, TIMES[0], SECONDS), (CODE_ERRORS[1], less * _HOURS, TIMES[2], hours),
+            )
         )  # fmt: skip
-        satellites, which = np.unique(raw.satellite, return_inverse=True)
-        many = len(satellites)
-        own_errors = Parameter(
-            SATELLITES, np.zeros(many), np.full(many, _ONE), "m", correlation_time=hours, spacing=spacing,
-            noise_groups=(f"{cls.name}.{TIMES[2]}.satellite",) * many,
+        own = tuple(
+            Parameter(
+                error, np.zeros(many), np.ones(many), "sd" if time == TIMES[1] else "m", correlation_time=lasts,
+                spacing=spacing, noise_groups=(f"{cls.name}.{time}.satellite",) * many,
+            )
+            for error, time, lasts in zip(SATELLITES, TIMES[1:], (minutes, hours), strict=True)
         )  # fmt: skip
         words = [f"{NAMES[system]} {signal_name(signal)}" for system, signal in groups]
         note = f"gnss_code: {words[0]}"
         note += f", with a bias each of {', '.join(words[1:])}" if words[1:] else ""
         return cls(
-            offset=found.known - raw.code - raw.clock,
+            offset=found.known - raw.code - raw.clock - (raw.difference if raw.differenced else 0.0),
             nominal=found.nominal,
             group=group,
             slant=obliquity(found.elevation) * (L1 / raw.frequency) ** 2,
-            sigma=code_sigma(raw.cn0, found.elevation, found.ionosphere)[:, None],
+            sigma=sigma[:, None],
             which=which,
-            processes=(*common_errors, own_errors),
+            size=np.stack([_usual(raw, sigma), np.full(len(raw), less * _ONE)], -1),
+            processes=(*shared, *own),
             notes=(note,),
             **common,
         )
@@ -267,10 +293,11 @@ class GnssCode(_Satellites):
             own = self.group[rows][:, None] == np.arange(1, parameters[BIASES].shape[1] + 1)
             residual = residual + np.sum(own * parameters[BIASES], axis=1)
             J[BIASES] = own[:, None].astype(float)
-        if SATELLITES in parameters:
-            own = self.which[rows][:, None] == np.arange(parameters[SATELLITES].shape[1])
-            residual = residual + np.sum(own * parameters[SATELLITES], axis=1)
-            J[SATELLITES] = own[:, None].astype(float)
+        for name, size in zip(SATELLITES, self.size[rows].T, strict=True):
+            if name in parameters:
+                own = (self.which[rows][:, None] == np.arange(parameters[name].shape[1])) * size[:, None]
+                residual = residual + np.sum(own * parameters[name], axis=1)
+                J[name] = own[:, None]
         shift, more = self._lasting(parameters, CODE_ERRORS, rows, e)
         return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])
 

@@ -35,6 +35,9 @@ from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording, Truth
 from graphnav.rotation import Array
 
 
+_RAW_FILES = ("rover", "nav", "sp3", "clk", "base")
+
+
 def read_folder(source: str | Path) -> Recording:
     """A recording from a folder holding recording.toml, or from a .toml of that form.
 
@@ -169,9 +172,12 @@ def _raw_gnss(
         raise RecordingError(
             f"{path}: 'clock': [raw_gnss] needs to know what t = 0 is: say clock = \"gps week 2130\" or a UTC date"
         )
-    some = {name: tuple(path.parent / file for file in getattr(d, name) or ()) for name in ("rover", "nav", "sp3", "clk")}
+    some = {name: tuple(path.parent / file for file in getattr(d, name) or ()) for name in _RAW_FILES}
     corrected = Corrected(clock="clock" in d.corrected, troposphere="troposphere" in d.corrected)
-    sources = Sources(**some, corrected=corrected, nominal_stamps=d.stamps == "nominal", lever_arm=d.lever_arm)
+    sources = Sources(
+        **some, base_position=d.base_position, corrected=corrected, nominal_stamps=d.stamps == "nominal",
+        lever_arm=d.lever_arm,
+    )  # fmt: skip
     files.extend(sources.files)
     given = None
     if sources.rover[0].name.endswith((".csv", ".csv.gz")):

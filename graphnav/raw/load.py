@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.errors import RecordingError
+from graphnav.raw.differential import with_differences
 from graphnav.raw.ephemeris import Ephemerides
 from graphnav.raw.files import read_bytes
 from graphnav.raw.placing import Corrected, place, with_own_stamps
@@ -21,7 +22,7 @@ from graphnav.raw.single_point import SinglePoint, solve
 from graphnav.rotation import Array
 
 _FEW = 50  # epochs that a rough place is looked for in
-_ROUGH = 5  # rounds of it
+_BASE_OFF = 100.0  # m from its stated position that a base's single-point position may be
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,8 @@ class Sources:
     nav: tuple[Path, ...] = ()
     sp3: tuple[Path, ...] = ()
     clk: tuple[Path, ...] = ()
+    base: tuple[Path, ...] = ()
+    base_position: tuple[float, float, float] | None = None  # m in e; that of the file's header when None
     corrected: Corrected = Corrected()
     nominal_stamps: bool = False
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -39,7 +42,7 @@ class Sources:
     @property
     def files(self) -> tuple[Path, ...]:
         """All of them."""
-        return (*self.rover, *self.nav, *self.sp3, *self.clk)
+        return (*self.rover, *self.nav, *self.sp3, *self.clk, *self.base)
 
 
 def read_rover(paths: tuple[Path, ...]) -> Observations:
@@ -93,7 +96,45 @@ def load_raw(
     if raw.klobuchar is None:
         said.append("no ionosphere coefficients in the navigation files: the delay of the night is assumed (5 ns at the zenith)")
     raw, fixes = _at_true_times(raw, fixes)
+    if sources.base:
+        raw, more = _differenced(raw, sources, nav, precise)
+        said += more
+        better = raw.take(primary(raw) & np.isfinite(raw.difference))
+        if len(better):
+            fixes = solve(replace(better, code=better.code + better.difference))
     return raw, fixes, tuple(said)
+
+
+def _differenced(
+    raw: RawGnss, sources: Sources, nav: Ephemerides | None, precise: Orbits | None
+) -> tuple[RawGnss, list[str]]:
+    """The series with differences by the base station, and remarks."""
+    obs = read_rover(sources.base).on_clock(raw.zero)
+    given = sources.base_position
+    position = obs.marker if given is None else np.array(given)
+    if position is None:
+        raise RecordingError(f"{sources.base[0]}: states no position; say base_position in [raw_gnss]")
+    apart = max(obs.t[0] - raw.t[-1], raw.t[0] - obs.t[-1])
+    if apart > 0.0:
+        raise RecordingError(
+            f"{sources.base[0]}: the base's observations are {apart / 3600.0:.1f} h away from those of the rover; it must "
+            "be of the same time"
+        )
+    away = float(np.linalg.norm(np.median(raw.antenna, axis=0) - position))
+    base, _ = place(obs, nav, precise, position)
+    base_fixes = solve(base.take(primary(base) & np.isfinite(base.p[:, 0])))
+    said = list(obs.remarks)
+    off = np.nanmedian(np.linalg.norm(base_fixes.p - position, axis=1))
+    if not off < _BASE_OFF:
+        raise RecordingError(
+            f"{sources.base[0]}: the base's own observations put it {off:.0f} m from its stated position; see base_position"
+        )
+    if given is None:
+        said.append(f"the base's position is that of its header, {off:.1f} m from its own single-point positions")
+    base, _ = _at_true_times(base, base_fixes)
+    raw, more = with_differences(raw, base, position)
+    said += [f"codes are differences against a base {away / 1e3:.1f} km away", *more]
+    return raw, said
 
 
 def _same_time(obs: Observations, nav: Ephemerides | None, precise: Orbits | None, sources: Sources) -> None:

@@ -133,6 +133,11 @@ class RawGnss:
         return replace(self, **own)
 
     @property
+    def differenced(self) -> bool:
+        """Whether a base station is there."""
+        return bool(np.isfinite(self.difference).any())
+
+    @property
     def seconds_of_week(self) -> Array:
         """(N,) GPS seconds of the week."""
         return np.mod(self.t + np.mod(self.zero, 604800.0), 604800.0)
