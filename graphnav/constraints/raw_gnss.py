@@ -8,11 +8,10 @@ reception, and u = v + R_nb (omega_nb x l) its velocity (Groves 2013, sections 8
 
 b and b' are the receiver's clock and its drift, which begin anew at every epoch; b_s is the bias of the signals of
 another system, z what the model of the ionosphere is wrong by at the zenith and m how that grows towards the horizon; k
-comes of the flight time (`graphnav.raw.single_point.stretch`). c is what lasts of the errors of all satellites
-together, for seconds or for hours, as a shift of the antenna in east, north, up, and d the same of velocities. q is what lasts of the
-errors of the one satellite: for minutes, reflections and what a receiver's smoothing of its codes leaves, in units of
-the stated sigma; and for hours, orbit, clock and the atmosphere towards it. How much of each there is, the noise model
-says.
+comes of the flight time (`graphnav.raw.single_point.stretch`). What lasts of the errors: c for hours of all satellites
+together, as a shift of the antenna in east, north, up, and d for seconds the same of velocities; q of the one satellite,
+for seconds to a minute, reflections and what a receiver's smoothing of its codes leaves, in units of the stated sigma,
+and for hours, orbit, clock and the atmosphere towards it. How much of each there is, the noise model says.
 
 Distances are differences against a nominal place of each epoch, so that no digits are lost.
 """
@@ -42,21 +41,21 @@ from graphnav.state import SECONDS, Parameter, States
 CLOCK = "receiver_clock"
 BIASES = "gnss_signal_biases"
 IONOSPHERE = "gnss_ionosphere"
-CODE_ERRORS = tuple(f"gnss_code_error_of_{time}" for time in (TIMES[0], TIMES[2]))
+CODE_ERROR = f"gnss_code_error_of_{TIMES[2]}"
 SATELLITES = tuple(f"gnss_satellite_errors_of_{time}" for time in TIMES[1:])
 RATE_ERROR = "gnss_doppler_error"
 _CLOCK_SIGMA = np.array([1e3, 1e2])  # m, m/s, about the single-point solution: nothing known
-_ZENITH = 3.0  # m, 1-sigma of what the model of the ionosphere is wrong by
+_ZENITH = 2.0  # m, 1-sigma of what the model of the ionosphere is wrong by: half of a delay on an ordinary day
 # unit/sqrt(s), of what changes over hours. Even a lever arm walks, by a centimetre in three hours: all that rows depend
 # on beside states and clocks has its nodes in common then, one variable of the graph
 _ZENITH_WALK, _BIAS_WALK, _LEVER_WALK = 0.01, 0.003, 1e-4
 _AXES = ("horizontal", "horizontal", "up")
-# m, units of what all satellites have in common, as a shift of the place: for seconds, and for hours, where the
-# ionosphere's gradient and the datum of an orbit are a metre or two; of what lasts of one satellite for hours
-_ERROR = np.array([1.0, 1.0, 2.0])
-_HOURS, _ONE = np.array([2.0, 2.0, 4.0]), 1.0
+# m, 1-sigma of what lasts for hours, which a drive does not tell from its place: of all satellites, as a shift of the
+# place, where the ionosphere's gradient and the datum of an orbit make a metre or two; and of one satellite
+_HOURS, _ONE = np.array([1.5, 1.5, 3.0]), 0.7
 _DIFFERENCED = 0.1  # of them, against a base station
 _MINUTE = 60.0  # s
+_MEDIAN = 0.6745  # of a normal variable's absolute value, in sigmas
 _RATE_ERROR = np.array([0.05, 0.05, 0.1])  # m/s
 _LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have a variance factor of their own
 _CLASSES = ("strong", "fair", "weak", "faint")
@@ -102,6 +101,7 @@ class _Prepared:
     ionosphere: Array  # (N,) m
     stretch: Array  # (N,)
     clock: Parameter
+    spacing: float  # s from node to node of whatever changes slowly
 
 
 def _prepare(scene: Scene) -> _Prepared | None:
@@ -138,6 +138,7 @@ def _prepared(scene: Scene) -> _Prepared | None:
         clock=Parameter(
             CLOCK, raw.receiver_clock[first], np.tile(_CLOCK_SIGMA, (len(epochs), 1)), "m, m/s", begins=epochs
         ),
+        spacing=node_spacing(scene.settings.gnss.slow_times, period(epochs)),
     )
 
 
@@ -145,7 +146,7 @@ def _common(scene: Scene, found: _Prepared) -> dict[str, Any]:
     settings, raw = scene.settings, found.raw
     parameters: tuple[Parameter, ...] = (found.clock,)
     if settings.gnss.lever_arm_sigma is not None:
-        parameters += (Parameter(LEVER_ARM, raw.lever_arm, np.full(3, settings.gnss.lever_arm_sigma), "m", _LEVER_WALK),)
+        parameters += (Parameter(LEVER_ARM, raw.lever_arm, np.full(3, settings.gnss.lever_arm_sigma), "m", _LEVER_WALK, spacing=found.spacing),)
     return {
         "keyframe": found.keyframe,
         "s_n": found.s_n,
@@ -182,23 +183,26 @@ class _Satellites(Constraint):
         lever = parameters.get(LEVER_ARM, self.lever_arm)
         return states.p + rotation.mv(states.R_nb, lever), lever
 
-    def _lasting(self, parameters: dict[str, Array], names: tuple[str, ...], rows: slice | Array, e: Array) -> Any:
-        """What errors that all have in common, shifts in east, north, up, do to the rows (n,), and by how much."""
-        there = [name for name in names if name in parameters]
-        if not there:
+    def _lasting(self, parameters: dict[str, Array], name: str, rows: slice | Array, e: Array) -> Any:
+        """What an error that all have in common, a shift in east, north, up, does to the rows (n,), and by how much."""
+        if name not in parameters:
             return 0.0, {}
         towards = -rotation.mv(self.R_ln[rows], e)
-        shift = sum(parameters[name] for name in there)
-        return np.sum(towards * shift, axis=1), {name: towards[:, None] for name in there}
+        return np.sum(towards * parameters[name], axis=1), {name: towards[:, None]}
 
 
 def _usual(raw: RawGnss, sigma: Array) -> Array:
-    """(N,) running median of each satellite's sigmas over a minute."""
+    """(N,) m, the unit of a satellite's reflections: its usual sigma over a minute, or what its codes are usually off.
+
+    A signal that comes round a corner is late by tens of metres for as long as the corner is there.
+    """
     out = sigma.copy()
+    off = np.where(np.isfinite(raw.residual), np.abs(raw.residual), 0.0)
     for one in np.unique(raw.satellite):
         own = np.flatnonzero(raw.satellite == one)
         size = 2 * int(np.clip(_MINUTE / period(raw.t[own]) / 2, 0, (len(own) - 1) // 2)) + 1
-        out[own] = median_filter(sigma[own], size=size, mode="nearest")
+        usual, usually_off = (median_filter(x[own], size=size, mode="nearest") for x in (sigma, off))
+        out[own] = np.maximum(usual, usually_off / _MEDIAN)
     return out
 
 
@@ -228,32 +232,27 @@ class GnssCode(_Satellites):
             return None
         raw, settings = found.raw, scene.settings
         groups, group = signal_groups(raw)
-        common = _common(scene, found)
+        common, spacing = _common(scene, found), found.spacing
         less = _DIFFERENCED if raw.differenced else 1.0
-        more: tuple[Parameter, ...] = (Parameter(IONOSPHERE, np.zeros(1), np.full(1, less * _ZENITH), "m", less * _ZENITH_WALK),)
+        more: tuple[Parameter, ...] = (Parameter(IONOSPHERE, np.zeros(1), np.full(1, less * _ZENITH), "m", less * _ZENITH_WALK, spacing=spacing),)
         if len(groups) > 1:
             size = len(groups) - 1
-            more += (Parameter(BIASES, np.zeros(size), np.full(size, settings.raw_gnss.bias_sigma), "m", _BIAS_WALK),)
+            more += (Parameter(BIASES, np.zeros(size), np.full(size, settings.raw_gnss.bias_sigma), "m", _BIAS_WALK, spacing=spacing),)
         common["parameters"] += more
-        spacing = node_spacing(settings.gnss.slow_times, period(found.clock.begins))  # type: ignore[arg-type]
+        satellites, which = np.unique(raw.satellite, return_inverse=True)
+        sigma, many = code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)
         satellites, which = np.unique(raw.satellite, return_inverse=True)
         sigma, many = code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)
         minutes, hours = settings.gnss.slow_times
-        shared = tuple(
+        common["parameters"] += (
+            Parameter(CODE_ERROR, np.zeros(3), less * _HOURS, "m", correlation_time=hours, spacing=spacing),
             Parameter(
-                error, np.zeros(3), unit, "m", correlation_time=lasts, spacing=spacing,
-                noise_groups=tuple(f"{cls.name}.{time}.{axis}" for axis in _AXES),
-            )
-            for error, unit, time, lasts in (
-                (CODE_ERRORS[0], _ERROR, TIMES[0], SECONDS), (CODE_ERRORS[1], less * _HOURS, TIMES[2], hours),
-            )
-        )  # fmt: skip
-        own = tuple(
-            Parameter(
-                error, np.zeros(many), np.ones(many), "sd" if time == TIMES[1] else "m", correlation_time=lasts,
-                spacing=spacing, noise_groups=(f"{cls.name}.{time}.satellite",) * many,
-            )
-            for error, time, lasts in zip(SATELLITES, TIMES[1:], (minutes, hours), strict=True)
+                SATELLITES[1], np.zeros(many), np.full(many, less * _ONE), "m", correlation_time=hours, spacing=spacing
+            ),
+        )
+        reflections = Parameter(
+            SATELLITES[0], np.zeros(many), np.ones(many), "sd", correlation_time=minutes, spacing=spacing,
+            noise_groups=(f"{cls.name}.{TIMES[1]}.satellite",) * many,
         )  # fmt: skip
         words = [f"{NAMES[system]} {signal_name(signal)}" for system, signal in groups]
         note = f"gnss_code: {words[0]}"
@@ -265,8 +264,8 @@ class GnssCode(_Satellites):
             slant=obliquity(found.elevation) * (L1 / raw.frequency) ** 2,
             sigma=sigma[:, None],
             which=which,
-            size=np.stack([_usual(raw, sigma), np.full(len(raw), less * _ONE)], -1),
-            processes=(*shared, *own),
+            size=np.stack([_usual(raw, sigma), np.ones(len(raw))], -1),
+            processes=(reflections,),
             notes=(note,),
             **common,
         )
@@ -298,7 +297,7 @@ class GnssCode(_Satellites):
                 own = (self.which[rows][:, None] == np.arange(parameters[name].shape[1])) * size[:, None]
                 residual = residual + np.sum(own * parameters[name], axis=1)
                 J[name] = own[:, None]
-        shift, more = self._lasting(parameters, CODE_ERRORS, rows, e)
+        shift, more = self._lasting(parameters, CODE_ERROR, rows, e)
         return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])
 
 
@@ -333,7 +332,7 @@ class GnssDoppler(_Satellites):
         common |= {name: common[name][some] for name in per_row}
         lasting = Parameter(
             RATE_ERROR, np.zeros(3), _RATE_ERROR, "m/s", correlation_time=SECONDS,
-            spacing=node_spacing((), period(found.clock.begins)),  # type: ignore[arg-type]
+            spacing=found.spacing,
             noise_groups=tuple(f"{cls.name}.seconds.{axis}" for axis in _AXES),
         )  # fmt: skip
         imu = scene.recording.imu
@@ -365,5 +364,5 @@ class GnssDoppler(_Satellites):
         J[CLOCK] = np.broadcast_to(np.array([[0.0, 1.0]]), (len(e), 1, 2))
         if LEVER_ARM in parameters:
             J[LEVER_ARM] = J[LEVER_ARM] + by_place @ states.R_nb
-        shift, more = self._lasting(parameters, (RATE_ERROR,), rows, e)
+        shift, more = self._lasting(parameters, RATE_ERROR, rows, e)
         return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])
