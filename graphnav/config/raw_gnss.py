@@ -21,7 +21,7 @@ class RawGnssSettings(Outliers):
     doppler: bool = Field(True, description="use the Doppler shifts")
     elevation: float = Field(10.0, ge=0, lt=90, description="deg, below which satellites are not used")
     cn0: float = Field(30.0, ge=0, description="dB-Hz, below which signals are not used: most are reflections")
-    period: float = Field(0.0, ge=0, description="s between the epochs that are used, at least")
+    period: float = Field(1.0, ge=0, description="s between the epochs that are used, at least; 0 = all")
     bias_sigma: float = Field(
         30.0, gt=0, description="m, 1-sigma of the bias of another system's signals against the first's"
     )

@@ -45,14 +45,14 @@ CODE_ERROR = f"gnss_code_error_of_{TIMES[2]}"
 SATELLITES = tuple(f"gnss_satellite_errors_of_{time}" for time in TIMES[1:])
 RATE_ERROR = "gnss_doppler_error"
 _CLOCK_SIGMA = np.array([1e3, 1e2])  # m, m/s, about the single-point solution: nothing known
-_ZENITH = 2.0  # m, 1-sigma of what the model of the ionosphere is wrong by: half of a delay on an ordinary day
+_ZENITH = 1.5  # m, 1-sigma of what the model of the ionosphere is wrong by: half of the delay on an ordinary day
 # unit/sqrt(s), of what changes over hours. Even a lever arm walks, by a centimetre in three hours: all that rows depend
 # on beside states and clocks has its nodes in common then, one variable of the graph
 _ZENITH_WALK, _BIAS_WALK, _LEVER_WALK = 0.01, 0.003, 1e-4
 _AXES = ("horizontal", "horizontal", "up")
 # m, 1-sigma of what lasts for hours, which a drive does not tell from its place: of all satellites, as a shift of the
 # place, where the ionosphere's gradient and the datum of an orbit make a metre or two; and of one satellite
-_HOURS, _ONE = np.array([1.5, 1.5, 3.0]), 0.7
+_HOURS, _ONE = np.array([1.0, 1.0, 2.0]), 0.7
 _DIFFERENCED = 0.1  # of them, against a base station
 _MINUTE = 60.0  # s
 _MEDIAN = 0.6745  # of a normal variable's absolute value, in sigmas
