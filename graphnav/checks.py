@@ -30,6 +30,7 @@ from graphnav.checks_imu import (
     repeats,
     saturation,
 )
+from graphnav.checks_raw import raw_facts, raw_findings
 from graphnav.checks_stated import (
     fix_types,
     lever_arms,
@@ -146,6 +147,9 @@ def inspect(recording: Recording) -> Inspection:
         findings += fix_types(recording.gnss)
         wrong = list(velocities(recording.gnss))
         findings += wrong or gnss_jumps(recording, track)  # against wrong velocities every position jumps
+    if recording.raw_gnss is not None and len(recording.raw_gnss):
+        facts["raw_gnss"] = raw_facts(recording.raw_gnss)
+        findings += raw_findings(recording.raw_gnss)
     turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis"}
     if vehicle and overlap and track is not None and recording.gnss is not None:
         clock, yaw = clock_of(recording.imu, recording.gnss), crosschecks.yaw_fit(recording.imu, track)

@@ -146,7 +146,16 @@ def _common(scene: Scene, found: _Prepared) -> dict[str, Any]:
     settings, raw = scene.settings, found.raw
     parameters: tuple[Parameter, ...] = (found.clock,)
     if settings.gnss.lever_arm_sigma is not None:
-        parameters += (Parameter(LEVER_ARM, raw.lever_arm, np.full(3, settings.gnss.lever_arm_sigma), "m", _LEVER_WALK, spacing=found.spacing),)
+        parameters += (
+            Parameter(
+                LEVER_ARM,
+                raw.lever_arm,
+                np.full(3, settings.gnss.lever_arm_sigma),
+                "m",
+                _LEVER_WALK,
+                spacing=found.spacing,
+            ),
+        )
     return {
         "keyframe": found.keyframe,
         "s_n": found.s_n,
@@ -234,10 +243,21 @@ class GnssCode(_Satellites):
         groups, group = signal_groups(raw)
         common, spacing = _common(scene, found), found.spacing
         less = _DIFFERENCED if raw.differenced else 1.0
-        more: tuple[Parameter, ...] = (Parameter(IONOSPHERE, np.zeros(1), np.full(1, less * _ZENITH), "m", less * _ZENITH_WALK, spacing=spacing),)
+        more: tuple[Parameter, ...] = (
+            Parameter(IONOSPHERE, np.zeros(1), np.full(1, less * _ZENITH), "m", less * _ZENITH_WALK, spacing=spacing),
+        )
         if len(groups) > 1:
             size = len(groups) - 1
-            more += (Parameter(BIASES, np.zeros(size), np.full(size, settings.raw_gnss.bias_sigma), "m", _BIAS_WALK, spacing=spacing),)
+            more += (
+                Parameter(
+                    BIASES,
+                    np.zeros(size),
+                    np.full(size, settings.raw_gnss.bias_sigma),
+                    "m",
+                    _BIAS_WALK,
+                    spacing=spacing,
+                ),
+            )
         common["parameters"] += more
         satellites, which = np.unique(raw.satellite, return_inverse=True)
         sigma, many = code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)

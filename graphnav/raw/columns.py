@@ -39,5 +39,7 @@ def observations(columns: Mapping[str, Array], zero: float, name: str) -> Observ
         slip=np.zeros(n, dtype=bool), half=np.zeros(n, dtype=bool), lock=nothing, files=(name,),
     )  # fmt: skip
     if not whole.all():
-        obs = replace(obs.take(whole), remarks=(f"{name}: {int((~whole).sum())} rows without time, prn or code left out",))
+        obs = replace(
+            obs.take(whole), remarks=(f"{name}: {int((~whole).sum())} rows without time, prn or code left out",)
+        )
     return once(obs)

@@ -36,7 +36,9 @@ def read_bytes(path: Path) -> bytes:
         try:
             hatanaka = importlib.import_module("hatanaka")
         except ImportError:
-            raise RecordingError(f"{path}: compressed RINEX needs the package hatanaka: pip install 'graphnav[raw]'") from None
+            raise RecordingError(
+                f"{path}: compressed RINEX needs the package hatanaka: pip install 'graphnav[raw]'"
+            ) from None
         try:
             data = hatanaka.decompress(data)
         except Exception as error:  # its own kinds, and those of the packers it calls

@@ -95,7 +95,9 @@ def load_raw(
         raise RecordingError(f"{sources.rover[0]}: no epoch has enough satellites for a position")
     said = [*obs.remarks, *remarks]
     if raw.klobuchar is None:
-        said.append("no ionosphere coefficients in the navigation files: the delay of the night is assumed (5 ns at the zenith)")
+        said.append(
+            "no ionosphere coefficients in the navigation files: the delay of the night is assumed (5 ns at the zenith)"
+        )
     raw, fixes = _at_true_times(raw, fixes)
     if sources.base:
         raw, more = _differenced(raw, sources, nav, precise)
