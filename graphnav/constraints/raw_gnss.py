@@ -265,15 +265,12 @@ class GnssCode(_Satellites):
         sigma, many = code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)
         minutes, hours = settings.gnss.slow_times
         common["parameters"] += (
+            Parameter(SATELLITES[0], np.zeros(many), np.ones(many), "sd", correlation_time=minutes, spacing=spacing),
             Parameter(CODE_ERROR, np.zeros(3), less * _HOURS, "m", correlation_time=hours, spacing=spacing),
             Parameter(
                 SATELLITES[1], np.zeros(many), np.full(many, less * _ONE), "m", correlation_time=hours, spacing=spacing
             ),
         )
-        reflections = Parameter(
-            SATELLITES[0], np.zeros(many), np.ones(many), "sd", correlation_time=minutes, spacing=spacing,
-            noise_groups=(f"{cls.name}.{TIMES[1]}.satellite",) * many,
-        )  # fmt: skip
         words = [f"{NAMES[system]} {signal_name(signal)}" for system, signal in groups]
         note = f"gnss_code: {words[0]}"
         note += f", with a bias each of {', '.join(words[1:])}" if words[1:] else ""
@@ -285,7 +282,6 @@ class GnssCode(_Satellites):
             sigma=sigma[:, None],
             which=which,
             size=np.stack([_usual(raw, sigma), np.ones(len(raw))], -1),
-            processes=(reflections,),
             notes=(note,),
             **common,
         )

@@ -221,7 +221,7 @@ class RawGnssTable(_Section):
     )  # fmt: skip
 
     rover: Files = Field(description="RINEX or UBX files, or one CSV file")
-    nav: Files | None = Field(None, description="RINEX navigation files")
+    nav: Files | None = Field(None, description="RINEX navigation files; UBX files may hold what they would")
     sp3: Files | None = Field(None, description="precise orbits")
     clk: Files | None = Field(None, description="precise clocks")
     base: Files | None = Field(None, description="RINEX observations of a base station")
@@ -244,8 +244,6 @@ class RawGnssTable(_Section):
 
     @model_validator(mode="after")
     def _placed(self) -> RawGnssTable:
-        if self.nav is None and self.sp3 is None:
-            raise ValueError("say nav or sp3: without either nobody knows where the satellites are")
         if self.clk is not None and self.sp3 is None:
             raise ValueError("clk says nothing without sp3")
         return self

@@ -116,6 +116,13 @@ class Ephemerides:
             remarks,
         )
 
+    def with_more(self, other: Ephemerides) -> Ephemerides:
+        """These and others; of the same satellite and toe these."""
+        kepler = [Kepler(**{n: v[k] for n, v in one.kepler.items()}) for one in (other, self) for k in range(len(one.kepler["toe"]))]
+        glonass = [Glonass(**{n: v[k] for n, v in one.glonass.items()}) for one in (other, self) for k in range(len(one.glonass["toe"]))]
+        klobuchar = other.klobuchar if self.klobuchar is None else self.klobuchar
+        return Ephemerides.of(kepler, glonass, klobuchar, (*self.remarks, *other.remarks))
+
     @property
     def channels(self) -> dict[int, int]:
         """Frequency channels of the GLONASS satellites."""

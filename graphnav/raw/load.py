@@ -19,6 +19,7 @@ from graphnav.raw.rinex_obs import parse_observations
 from graphnav.raw.series import Observations, RawGnss, joined, primary
 from graphnav.raw.signals import C
 from graphnav.raw.single_point import SinglePoint, solve
+from graphnav.raw.ubx import is_ubx, parse_ubx
 from graphnav.rotation import Array
 
 _FEW = 50  # epochs that a rough place is looked for in
@@ -45,19 +46,24 @@ class Sources:
         return (*self.rover, *self.nav, *self.sp3, *self.clk, *self.base)
 
 
-def read_rover(paths: tuple[Path, ...]) -> Observations:
-    """The observations of RINEX or UBX files of one receiver.
+def read_rover(paths: tuple[Path, ...]) -> tuple[Observations, Ephemerides | None]:
+    """The observations of RINEX or UBX files of one receiver, and the ephemerides that UBX files hold.
 
     Raises
     ------
     RecordingError
         If a file is neither, or cannot be read.
     """
-    parts = []
+    parts, sent = [], None
     for path in paths:
         data = read_bytes(path)
-        parts.append(parse_observations(data, path))
-    return joined(parts)
+        if is_ubx(data):
+            obs, found = parse_ubx(data, path)
+            sent = found if sent is None else sent.with_more(found)
+        else:
+            obs = parse_observations(data, path)
+        parts.append(obs)
+    return joined(parts), sent
 
 
 def load_raw(
@@ -75,9 +81,15 @@ def load_raw(
     RecordingError
         If a file cannot be used, or the observations determine no position.
     """
-    obs = read_rover(sources.rover) if observations is None else observations
+    obs, sent = read_rover(sources.rover) if observations is None else (observations, None)
     nav = read_navigation(list(sources.nav)) if sources.nav else None
+    if sent is not None and sent.satellites:
+        nav = sent if nav is None else nav.with_more(sent)
     precise = read_precise(list(sources.sp3), list(sources.clk)) if sources.sp3 else None
+    if nav is None and precise is None:
+        raise RecordingError(
+            f"{sources.rover[0]}: holds no ephemerides; say nav or sp3 in [raw_gnss], or nobody knows where satellites are"
+        )
     _same_time(obs, nav, precise, sources)
     if zero is not None:
         obs = obs.on_clock(zero)
@@ -120,7 +132,7 @@ def _differenced(
     raw: RawGnss, sources: Sources, nav: Ephemerides | None, precise: Orbits | None
 ) -> tuple[RawGnss, list[str]]:
     """The series with differences by the base station, and remarks."""
-    obs = read_rover(sources.base).on_clock(raw.zero)
+    obs = read_rover(sources.base)[0].on_clock(raw.zero)
     given = sources.base_position
     position = obs.marker if given is None else np.array(given)
     if position is None:
