@@ -96,7 +96,7 @@ class Inspection:
         return "\n".join(lines)
 
 
-_UNITS = {"hz": "Hz", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s2"}
+_UNITS = {"hz": "Hz", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s2", "dbhz": "dB-Hz"}
 
 
 def _show(name: str, value: Any) -> str:

@@ -17,7 +17,7 @@ _FEW = 5  # satellites, one more than a position with its clock takes
 
 def raw_facts(raw: RawGnss) -> dict[str, Any]:
     """Figures of a series, by name."""
-    epochs, of = raw.epochs
+    epochs, _ = raw.epochs
     placed = np.isfinite(raw.p[:, 0])
     by_epoch = _satellites(raw, placed)
     system = raw.satellite // 100
@@ -27,13 +27,11 @@ def raw_facts(raw: RawGnss) -> dict[str, Any]:
         facts |= {"rate_hz": round(1.0 / period, 3), "span_s": round(float(epochs[-1] - epochs[0]), 3)}
         facts["gaps"] = int((step > _LONG * period).sum())
         facts["longest_step_s"] = round(float(step.max()), 3)
-    facts["satellites"] = {
-        NAMES[k]: len(np.unique(raw.satellite[system == k])) for k in range(len(SYSTEMS)) if (system == k).any()
-    }
-    facts["signals"] = {
-        f"{NAMES[int(s)]} {signal_name(int(g))}": int(((system == s) & (raw.signal == g)).sum())
-        for s, g in np.unique(np.stack([system, raw.signal], -1), axis=0)
-    }
+    for k in range(len(SYSTEMS)):
+        if (system == k).any():
+            facts[f"satellites_{NAMES[k]}"] = len(np.unique(raw.satellite[system == k]))
+    for s, g in np.unique(np.stack([system, raw.signal], -1), axis=0):
+        facts[f"observations_{NAMES[int(s)]}_{signal_name(int(g))}"] = int(((system == s) & (raw.signal == g)).sum())
     facts["satellites_at_once"] = int(np.median(by_epoch))
     carrier = np.isfinite(raw.carrier)
     facts["carriers"] = int(carrier.sum())
@@ -43,7 +41,7 @@ def raw_facts(raw: RawGnss) -> dict[str, Any]:
         facts["half_cycles"] = int((raw.half & carrier).sum())
     if np.isfinite(raw.cn0).any():
         low, middle, high = np.nanpercentile(raw.cn0, [5.0, 50.0, 95.0])
-        facts["cn0_dbhz"] = {"5_percent": float(low), "median": float(middle), "95_percent": float(high)}
+        facts |= {"cn0_low_dbhz": float(low), "cn0_median_dbhz": float(middle), "cn0_high_dbhz": float(high)}
     missing = sorted({int(s) for s in raw.satellite} - {int(s) for s in raw.satellite[placed]})
     if missing:
         facts["without_ephemeris"] = " ".join(satellite_name(s) for s in missing)
