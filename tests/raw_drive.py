@@ -19,7 +19,7 @@ from graphnav.recording import Recording
 from graphnav.rotation import Array
 
 RADIUS, MU = 2.656e7, 3.986004418e14
-SATELLITES = [f"G{k:02d}" for k in range(1, 9)] + [f"E{k:02d}" for k in range(1, 7)]
+SATELLITES = [f"G{k:02d}" for k in range(1, 8)] + [f"E{k:02d}" for k in range(1, 6)]
 BIAS = 7.0  # m, of Galileo's signal
 ZERO = 2200 * 604800.0
 
@@ -56,7 +56,10 @@ def observe(llh_of, t: Array, above: Array, k: int) -> tuple[Array, Array, Array
 
 
 def with_observations(recording: Recording, path: ExactPath, noise: float = 0.0, seed: int = 0) -> Recording:
-    """The recording with raw observations at the times of its fixes, and these said to be derived from them."""
+    """The recording with raw observations at the times of its fixes, and these said to be derived from them.
+
+    `noise` is that of the codes, m; that of range rates is a twentieth of it, m/s.
+    """
     gnss = recording.gnss
     t, lever = gnss.t, tuple(float(x) for x in gnss.lever_arm)
     rng = np.random.default_rng(seed)
@@ -82,7 +85,7 @@ def with_observations(recording: Recording, path: ExactPath, noise: float = 0.0,
         own = {
             "t": t, "satellite": np.full(n, satellite_id(name), dtype=np.int16),
             "signal": np.full(n, signal_id("1C"), dtype=np.int16),
-            "code": distance + clock + bias + delay + white, "range_rate": rate + drift, "p": p, "v": v,
+            "code": distance + clock + bias + delay + white, "range_rate": rate + drift + 0.05 * noise * rng.standard_normal(n), "p": p, "v": v,
             "high": elevation,
         }  # fmt: skip
         for key, value in own.items():

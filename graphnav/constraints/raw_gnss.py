@@ -44,7 +44,7 @@ IONOSPHERE = "gnss_ionosphere"
 CODE_ERROR = f"gnss_code_error_of_{TIMES[2]}"
 SATELLITES = tuple(f"gnss_satellite_errors_of_{time}" for time in TIMES[1:])
 RATE_ERROR = "gnss_doppler_error"
-_CLOCK_SIGMA = np.array([1e3, 1e2])  # m, m/s, about the single-point solution: nothing known
+_CLOCK_SIGMA = np.array([100.0, 10.0])  # m, m/s, about the single-point solution: next to nothing known
 _ZENITH = 1.5  # m, 1-sigma of what the model of the ionosphere is wrong by: half of the delay on an ordinary day
 # unit/sqrt(s), of what changes over hours. Even a lever arm walks, by a centimetre in three hours: all that rows depend
 # on beside states and clocks has its nodes in common then, one variable of the graph
