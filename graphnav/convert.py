@@ -14,7 +14,6 @@ from graphnav.complaints import listed, nearest
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.exporters import NAMES, write_as
 from graphnav.formats import formats, load
-from graphnav.timescales import gps_to_utc, parse_clock
 from graphnav.formats.registry import Log
 from graphnav.formats.trajectories import read_trajectory
 from graphnav.formats.writer import write_recording
@@ -22,6 +21,7 @@ from graphnav.interpolation import interpolate
 from graphnav.outputs import antenna_lever_arm
 from graphnav.rotation import Array
 from graphnav.staging import moved, staged
+from graphnav.timescales import gps_to_utc, parse_clock
 from graphnav.trajectory import Trajectory
 from graphnav.workflow import Outcome
 

@@ -85,7 +85,8 @@ def with_observations(recording: Recording, path: ExactPath, noise: float = 0.0,
         own = {
             "t": t, "satellite": np.full(n, satellite_id(name), dtype=np.int16),
             "signal": np.full(n, signal_id("1C"), dtype=np.int16),
-            "code": distance + clock + bias + delay + white, "range_rate": rate + drift + 0.05 * noise * rng.standard_normal(n), "p": p, "v": v,
+            "code": distance + clock + bias + delay + white, "p": p, "v": v,
+            "range_rate": rate + drift + 0.05 * noise * rng.standard_normal(n),
             "high": elevation,
         }  # fmt: skip
         for key, value in own.items():

@@ -98,15 +98,14 @@ def test_glonass_and_geostationary_satellites_are_where_rtklib_has_them(rt, shar
             rt.geph2pos(rt.timeadd(one.toe, ahead), one, rs, dts, var)
             toe = rt.timediff(one.toe, rt.gpst2time(2130, 0.0))
             # of one ephemeris, at a true time: the clock is added, which is taken off again inside
-            own = np.flatnonzero((ours.glonass["satellite"] == satellite))
+            own = np.flatnonzero(ours.glonass["satellite"] == satellite)
             own = own[np.abs(ours.glonass["toe"][own] - 2130 * 604800.0 - toe) < 1.0]
             found = ours._integrated(own, np.full(1, toe + ahead + dts[0]), 2130 * 604800.0)
             assert found["p"][0] == pytest.approx([rs[i] for i in range(3)], abs=1e-3)
             assert found["clock"][0] == pytest.approx(dts[0], abs=1e-12)
     nav = f"{3.04:9.2f}           N: GNSS NAV DATA    C: BeiDou           RINEX VERSION / TYPE\n{'':60}END OF HEADER\n"
     numbers = [
-        "C03 2021 09 22 06 00 00"
-        f"{1e-4:19.12E}{2e-11:19.12E}{0.0:19.12E}",
+        f"C03 2021 09 22 06 00 00{1e-4:19.12E}{2e-11:19.12E}{0.0:19.12E}",
         f"    {1.0:19.12E}{120.0:19.12E}{-2.1e-9:19.12E}{0.7:19.12E}",
         f"    {1e-5:19.12E}{4e-4:19.12E}{2e-5:19.12E}{6493.4:19.12E}",
         f"    {281986.0:19.12E}{1e-7:19.12E}{2.9:19.12E}{-3e-8:19.12E}",
@@ -213,7 +212,7 @@ def errors(fixes, truth) -> np.ndarray:
 
 
 def test_single_point_positions_are_as_good_as_rtklibs(rt, riverside, shared_data, tmp_path):
-    raw, fixes, truth = riverside
+    _, fixes, truth = riverside
     own = errors(fixes, truth)
     h = np.hypot(own[:, 0], own[:, 1])
     assert np.isfinite(h).all()
@@ -237,7 +236,9 @@ def test_single_point_positions_are_as_good_as_rtklibs(rt, riverside, shared_dat
             name = f"{signal_name(int(obs.signal[k]))}"
             some[i].code[0] = {"1C": rt.CODE_L1C, "2I": rt.CODE_L2I}[name]
         solution = rt.sol_t()
-        assert rt.pntpos(some.ptr, len(rows), nav, option, solution, rt.Arr1Ddouble(2 * rt.MAXOBS), ssat.ptr, rt.Arr1Dchar(128))
+        assert rt.pntpos(
+            some.ptr, len(rows), nav, option, solution, rt.Arr1Ddouble(2 * rt.MAXOBS), ssat.ptr, rt.Arr1Dchar(128)
+        )
         theirs = np.array([solution.rr[i] for i in range(3)])
         k = int(np.argmin(np.abs(fixes.t - t)))
         apart.append(np.linalg.norm(fixes.p[k] - theirs))

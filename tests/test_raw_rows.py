@@ -27,7 +27,9 @@ TIGHT = settings_from({"raw_gnss": {"coupling": "tight"}})
 
 
 def scene(recording, settings=TIGHT, cls=GnssCode):
-    t = np.unique(np.concatenate([[recording.start], cls.epochs(recording, settings, np.empty((0, 2))), [recording.end]]))
+    t = np.unique(
+        np.concatenate([[recording.start], cls.epochs(recording, settings, np.empty((0, 2))), [recording.end]])
+    )
     t = t[np.concatenate([[True], np.diff(t) > 1e-6])]
     intervals = preintegrate(bridge_gaps(recording.imu), recording.imu, t, np.zeros(3), np.zeros(3))
     frame = LocalFrame(recording.gnss.llh[0])
@@ -69,7 +71,9 @@ def test_code_rows_are_gtsams_pseudorange_factor_with_a_lever_arm(exact):
     pick = np.arange(3, len(rows), 97)
     R_en = frame.R_ne.T
     for k in pick:
-        own = np.flatnonzero((np.abs(raw.t - where.t[rows.keyframe[k]]) < 1e-6) & (raw.satellite == rows.satellite[k]))[0]
+        own = np.flatnonzero((np.abs(raw.t - where.t[rows.keyframe[k]]) < 1e-6) & (raw.satellite == rows.satellite[k]))[
+            0
+        ]
         linear = rows.linearize(
             states[np.array([k])],
             {p.name: np.zeros((1, p.size)) for p in rows.parameters if p.name != CLOCK} | {CLOCK: np.zeros((1, 2))},
@@ -79,9 +83,7 @@ def test_code_rows_are_gtsams_pseudorange_factor_with_a_lever_arm(exact):
         model = gtsam.noiseModel.Isotropic.Sigma(1, 1.0)
         # the ionosphere is no part of GTSAM's: taken off the code; its clocks are in seconds
         delay = rows.slant[k] * 5e-9 * 299792458.0
-        factor = gtsam.PseudorangeFactorArm(
-            0, 1, float(raw.code[own]) - delay, raw.p[own], rows.lever_arm, 0.0, model
-        )
+        factor = gtsam.PseudorangeFactorArm(0, 1, float(raw.code[own]) - delay, raw.p[own], rows.lever_arm, 0.0, model)
         values = gtsam.Values()
         values.insert(0, pose)
         values.insert(1, 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -47,7 +48,7 @@ def level(recording: Recording, begin: float, seconds: float = 1.0) -> Array:
 
 def some(gnss: Gnss, rows: Array) -> Gnss:
     """Fixes picked by index or mask."""
-    pick = {"t": gnss.t[rows], "llh": gnss.llh[rows], "sd": gnss.sd[rows]}
+    pick: dict[str, Any] = {"t": gnss.t[rows], "llh": gnss.llh[rows], "sd": gnss.sd[rows]}
     if gnss.v is not None and gnss.sd_v is not None:
         pick |= {"v": gnss.v[rows], "sd_v": gnss.sd_v[rows]}
     if gnss.type is not None:

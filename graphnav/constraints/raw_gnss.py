@@ -9,9 +9,10 @@ reception, and u = v + R_nb (omega_nb x l) its velocity (Groves 2013, sections 8
 b and b' are the receiver's clock and its drift, which begin anew at every epoch; b_s is the bias of the signals of
 another system, z what the model of the ionosphere is wrong by at the zenith and m how that grows towards the horizon; k
 comes of the flight time (`graphnav.raw.single_point.stretch`). What lasts of the errors: c for hours of all satellites
-together, as a shift of the antenna in east, north, up, and d for seconds the same of velocities; q of the one satellite,
-for seconds to a minute, reflections and what a receiver's smoothing of its codes leaves, in units of the stated sigma,
-and for hours, orbit, clock and the atmosphere towards it. How much of each there is, the noise model says.
+together, as a shift of the antenna in east, north, up, and d for seconds the same of velocities; q of the one
+satellite, for minutes reflections and what a receiver's smoothing of its codes leaves, in units of the stated sigma,
+and for hours orbit, clock and the atmosphere towards it. How large c and q are is stated: a drive does not tell them
+from its place. White parts and d the noise model estimates.
 
 Distances are differences against a nominal place of each epoch, so that no digits are lost.
 """
@@ -32,7 +33,7 @@ from graphnav.raw.atmosphere import obliquity
 from graphnav.raw.ephemeris import turned
 from graphnav.raw.series import RawGnss, primary
 from graphnav.raw.sigmas import code_sigma, rate_sigma
-from graphnav.raw.signals import C, L1, NAMES, signal_name
+from graphnav.raw.signals import L1, NAMES, C, signal_name
 from graphnav.raw.single_point import coefficients, look, signal_groups, stretch
 from graphnav.recording import Recording
 from graphnav.rotation import Array

@@ -12,7 +12,6 @@ import numpy as np
 from graphnav.earth import ecef_to_llh, enu_axes
 from graphnav.errors import RecordingError
 from graphnav.formats import schema
-from graphnav.timescales import parse_clock
 from graphnav.formats.pulses import counted
 from graphnav.formats.registry import Format, Log
 from graphnav.formats.repair import (
@@ -33,7 +32,7 @@ from graphnav.raw.placing import Corrected
 from graphnav.raw.series import RawGnss
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording, Truth
 from graphnav.rotation import Array
-
+from graphnav.timescales import parse_clock
 
 _RAW_FILES = ("rover", "nav", "sp3", "clk", "base")
 

@@ -23,11 +23,11 @@ from pydantic.types import Strict
 
 from graphnav.complaints import complaint, nearest, read_toml
 from graphnav.errors import RecordingError
-from graphnav.timescales import parse_clock
 from graphnav.formats.figures import parse_figure
 from graphnav.formats.imu_models import MODELS, find_model
 from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
+from graphnav.timescales import parse_clock
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0)]

@@ -56,7 +56,7 @@ def obliquity(elevation: Array) -> Array:
 
 
 def saastamoinen(llh: Array, elevation: Array) -> Array:
-    """(N,) delay of the troposphere, m, at elevations (N,) above the horizon; 0 below it and outside the troposphere."""
+    """(N,) delay of the troposphere, m, at elevations (N,), rad; 0 below the horizon and outside the troposphere."""
     height = np.clip(llh[:, 2], 0.0, 10000.0)
     pressure = 1013.25 * (1.0 - 2.2557e-5 * height) ** 5.2568  # hPa
     kelvin = 15.0 - 6.5e-3 * height + 273.16

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.raw.series import RawGnss
+from graphnav.raw.series import RawGnss, median_of_epochs
 from graphnav.raw.single_point import coefficients, look
 from graphnav.rotation import Array
 
@@ -32,7 +32,7 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     high = geometry.elevation > _LEAST
     error = geometry.distance + geometry.ionosphere + geometry.troposphere - base.code - base.clock
     base, error = base.take(high), error[high]
-    error = error - _middle(base, error)
+    error = error - median_of_epochs(base.t, error)
     difference = np.full(len(rover), np.nan)
     alike = {(int(s), int(g)) for s, g in zip(base.satellite, base.signal, strict=True)}
     for satellite, signal in sorted({(int(s), int(g)) for s, g in zip(rover.satellite, rover.signal, strict=True)}):
@@ -51,15 +51,6 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     if missing.any():
         said = (f"{int(missing.sum())} of {len(rover)} codes have no counterpart at the base and are not used",)
     return replace(rover, difference=difference), said
-
-
-def _middle(base: RawGnss, error: Array) -> Array:
-    """(N,) median of the errors of each row's epoch."""
-    epochs, of = base.epochs
-    order = np.lexsort((error, of))
-    edge = np.searchsorted(of[order], np.arange(len(epochs) + 1))
-    low, high = edge[:-1] + (np.diff(edge) - 1) // 2, edge[:-1] + np.diff(edge) // 2
-    return np.asarray((0.5 * (error[order[low]] + error[order[high]]))[of])
 
 
 def _between(t: Array, at: Array, value: Array) -> Array:

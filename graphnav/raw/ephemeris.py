@@ -80,17 +80,12 @@ class Placed:
     v: Array  # (N, 3) m/s
     clock: Array  # (N,) s, ahead of GPS time
     drift: Array  # (N,) s/s
-    accuracy: Array  # (N,) m, as the ephemeris states it
 
     @staticmethod
     def unknown(n: int) -> Placed:
         """Nothing known."""
         one = np.full(n, np.nan)
-        return Placed(np.full((n, 3), np.nan), np.full((n, 3), np.nan), one, one.copy(), one.copy())
-
-    def take(self, which: NDArray[np.intp]) -> Placed:
-        """Some of the rows, each as often as it is asked for."""
-        return Placed(*(getattr(self, f.name)[which] for f in fields(self)))
+        return Placed(np.full((n, 3), np.nan), np.full((n, 3), np.nan), one, one.copy())
 
 
 @dataclass(frozen=True)
@@ -118,8 +113,16 @@ class Ephemerides:
 
     def with_more(self, other: Ephemerides) -> Ephemerides:
         """These and others; of the same satellite and toe these."""
-        kepler = [Kepler(**{n: v[k] for n, v in one.kepler.items()}) for one in (other, self) for k in range(len(one.kepler["toe"]))]
-        glonass = [Glonass(**{n: v[k] for n, v in one.glonass.items()}) for one in (other, self) for k in range(len(one.glonass["toe"]))]
+        kepler = [
+            Kepler(**{n: v[k] for n, v in one.kepler.items()})
+            for one in (other, self)
+            for k in range(len(one.kepler["toe"]))
+        ]
+        glonass = [
+            Glonass(**{n: v[k] for n, v in one.glonass.items()})
+            for one in (other, self)
+            for k in range(len(one.glonass["toe"]))
+        ]
         klobuchar = other.klobuchar if self.klobuchar is None else self.klobuchar
         return Ephemerides.of(kepler, glonass, klobuchar, (*self.remarks, *other.remarks))
 
@@ -254,7 +257,6 @@ class Ephemerides:
             "v": v,
             "clock": _polynomial(eph["clock"], since) + relative * sin_e,
             "drift": eph["clock"][:, 1] + 2.0 * eph["clock"][:, 2] * since + relative * cos_e * E_dot,
-            "accuracy": eph["accuracy"],
         }
 
     def _integrated(self, k: NDArray[np.intp], t: Array, zero: float) -> dict[str, Array]:
@@ -273,7 +275,6 @@ class Ephemerides:
             "v": x[:, 3:],
             "clock": eph["clock"] + eph["drift"] * since,
             "drift": eph["drift"],
-            "accuracy": np.full(len(t), np.nan),
         }
 
 

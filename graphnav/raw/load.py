@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +36,7 @@ class Sources:
     clk: tuple[Path, ...] = ()
     base: tuple[Path, ...] = ()
     base_position: tuple[float, float, float] | None = None  # m in e; that of the file's header when None
-    corrected: Corrected = Corrected()
+    corrected: Corrected = field(default_factory=Corrected)
     nominal_stamps: bool = False
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -87,9 +87,7 @@ def load_raw(
         nav = sent if nav is None else nav.with_more(sent)
     precise = read_precise(list(sources.sp3), list(sources.clk)) if sources.sp3 else None
     if nav is None and precise is None:
-        raise RecordingError(
-            f"{sources.rover[0]}: holds no ephemerides; say nav or sp3 in [raw_gnss], or nobody knows where satellites are"
-        )
+        raise RecordingError(f"{sources.rover[0]}: holds no ephemerides; say nav or sp3 in [raw_gnss]")
     _same_time(obs, nav, precise, sources)
     if zero is not None:
         obs = obs.on_clock(zero)
@@ -140,8 +138,8 @@ def _differenced(
     apart = max(obs.t[0] - raw.t[-1], raw.t[0] - obs.t[-1])
     if apart > 0.0:
         raise RecordingError(
-            f"{sources.base[0]}: the base's observations are {apart / 3600.0:.1f} h away from those of the rover; it must "
-            "be of the same time"
+            f"{sources.base[0]}: the base's observations are {apart / 3600.0:.1f} h away from those of the rover; "
+            "it must be of the same time"
         )
     away = float(np.linalg.norm(np.median(raw.antenna, axis=0) - position))
     base, _ = place(obs, nav, precise, position)
@@ -150,7 +148,7 @@ def _differenced(
     off = np.nanmedian(np.linalg.norm(base_fixes.p - position, axis=1))
     if not off < _BASE_OFF:
         raise RecordingError(
-            f"{sources.base[0]}: the base's own observations put it {off:.0f} m from its stated position; see base_position"
+            f"{sources.base[0]}: its observations put the base {off:.0f} m from its stated position; see base_position"
         )
     if given is None:
         said.append(f"the base's position is that of its header, {off:.1f} m from its own single-point positions")

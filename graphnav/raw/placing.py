@@ -8,7 +8,7 @@ import numpy as np
 
 from graphnav.raw.ephemeris import Ephemerides, Placed, turned
 from graphnav.raw.precise import Orbits
-from graphnav.raw.series import Observations, RawGnss
+from graphnav.raw.series import Observations, RawGnss, median_of_epochs
 from graphnav.raw.signals import C, satellite_name
 from graphnav.rotation import Array
 
@@ -78,7 +78,7 @@ def place(
         t=obs.t, satellite=obs.satellite, signal=obs.signal, code=obs.code, carrier=obs.carrier,
         range_rate=-obs.doppler * C / frequency, cn0=obs.cn0, slip=obs.slip, half=obs.half, frequency=frequency,
         p=placed.p, v=placed.v, clock=clock, drift=C * placed.drift, difference=np.full(len(obs), np.nan),
-        zero=obs.zero, place=tuple(float(x) for x in rover),
+        zero=obs.zero, place=(float(rover[0]), float(rover[1]), float(rover[2])),
         klobuchar=None if nav is None or nav.klobuchar is None else tuple(map(tuple, nav.klobuchar.tolist())),
         troposphere=corrected.troposphere, files=obs.files,
     )  # fmt: skip
@@ -96,9 +96,5 @@ def with_own_stamps(
     found = source.place(obs.satellite, obs.t - _FLIGHT, obs.zero)
     away = np.linalg.norm(turned(found.p, np.full(len(obs), _FLIGHT)) - rover, axis=1)
     error = (obs.code - away) / C + (0.0 if corrected.clock else found.clock)
-    epochs, of = np.unique(obs.t, return_inverse=True)
-    order = np.argsort(of, kind="stable")
-    edge = np.searchsorted(of[order], np.arange(len(epochs) + 1))
-    middle = np.array([np.nanmedian(error[order[a:b]]) if np.isfinite(error[order[a:b]]).any() else np.nan
-                       for a, b in zip(edge[:-1], edge[1:], strict=True)])  # fmt: skip
-    return replace(obs, t=obs.t + _TICK * np.round(np.nan_to_num(middle)[of] / _TICK))
+    off = median_of_epochs(obs.t, error)
+    return replace(obs, t=obs.t + _TICK * np.round(np.nan_to_num(off) / _TICK))

@@ -51,7 +51,6 @@ class Orbits:
             clock, drift = _between(clocks, true, zero)
             out.p[own], out.v[own], out.drift[own] = p, v, drift
             out.clock[own] = clock - 2.0 * np.sum(p * v, axis=1) / C**2
-            out.accuracy[own] = np.where(np.isfinite(p[:, 0]), 0.05, np.nan)
         return out
 
 
@@ -112,7 +111,8 @@ def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
             try:
                 numbers(lines.block(np.array([k]), 4, 60), 14)
             except ValueError:
-                raise RecordingError(f"{path}, line {k + 1}: '{lines.text(k)[:60]}' is not a position") from None
+                text = lines.text(int(k))[:60]
+                raise RecordingError(f"{path}, line {k + 1}: '{text}' is not a position") from None
         raise RecordingError(f"{path}: names a satellite of an unknown system") from None
     satellite = np.array([ids[name] for name in names], dtype=np.int16)
     of = np.searchsorted(epoch, own) - 1
@@ -136,7 +136,7 @@ def _read_clk(path: Path) -> tuple[Array, Ids, Array]:
         raise RecordingError(f"{path}: holds no clocks of satellites")
     names = [row[1].decode("latin-1") for row in rows]
     try:
-        table = np.array([row[2:8] + [row[9]] for row in rows]).astype(float)
+        table = np.array([[*row[2:8], row[9]] for row in rows]).astype(float)
         ids = {name: satellite_id(name) for name in set(names)}
     except ValueError:
         raise RecordingError(f"{path}: a record of a satellite's clock cannot be read") from None

@@ -174,16 +174,11 @@ def _add(found: _Found, system: int, number: int, date: np.datetime64, v: list[f
     found.kepler.append(
         Kepler(
             satellite=satellite, toe=toe, toc=toc, clock=(v[0], v[1], v[2]), iode=v[3], crs=v[4], delta_n=v[5], m0=v[6],
-            cuc=v[7], e=v[8], cus=v[9], root_a=v[10], toes=toes, cic=v[12], omega0=v[13], cis=v[14], i0=v[15], crc=v[16],
-            omega=v[17], omega_dot=v[18], idot=v[19], accuracy=_accuracy(system, v[23]), healthy=health == 0.0,
-            delay=(delay[0], delay[1]), fnav=fnav,
+            cuc=v[7], e=v[8], cus=v[9], root_a=v[10], toes=toes, cic=v[12], omega0=v[13], cis=v[14], i0=v[15],
+            crc=v[16], omega=v[17], omega_dot=v[18], idot=v[19], accuracy=v[23] if v[23] > 0.0 else np.nan,
+            healthy=health == 0.0, delay=(delay[0], delay[1]), fnav=fnav,
         )
     )  # fmt: skip
-
-
-def _accuracy(system: int, value: float) -> float:
-    """1-sigma of the range that a message states, m; NaN where it states none."""
-    return value if np.isfinite(value) and value > 0.0 else np.nan
 
 
 def _header(lines: list[str], path: Path, found: _Found) -> int:

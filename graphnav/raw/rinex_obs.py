@@ -7,6 +7,7 @@ are given names of version 3 as RTKLIB 2.4.3 does (rinex.c, convcode).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -49,6 +50,10 @@ class _Rows:
     satellite: Ids
 
 
+Cells = Callable[[NDArray[np.intp], int], NDArray[np.uint8]]  # the fields of some rows, so many of each
+_Body = tuple[Array, float, NDArray[np.intp], _Rows, Cells]  # stamps, their zero, flags of the epochs
+
+
 def read_observations(path: Path) -> Observations:
     """The observations of a RINEX file.
 
@@ -83,10 +88,10 @@ def parse_observations(data: bytes, path: Path) -> Observations:
         lli = block[:, :, 14].astype(np.intp) - 48
         lli[(lli < 0) | (lli > 9)] = 0
         named = [_named(name, system, header.version) for name in types]
-        some = np.isfinite(value).any(axis=0)
+        filled = np.asarray(np.isfinite(value).any(axis=0))
         unknown |= {
             f"{SYSTEMS[system]} {name}"
-            for name, there in zip(named, some, strict=True)
+            for name, there in zip(named, filled, strict=True)
             if there and name[0] in _KINDS and not known_signal(system, name[1:])
         }
         for signal in dict.fromkeys(name[1:] for name in named if known_signal(system, name[1:])):
@@ -210,7 +215,7 @@ def _since_week(fields: Array, scale: str, used: NDArray[np.bool_]) -> tuple[Arr
     return (since - 7 * week) * 86400.0 + hour * 3600.0 + minute * 60.0 + second + ahead, week * WEEK
 
 
-def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]):  # type: ignore[no-untyped-def]
+def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> _Body:
     first = lines.first()
     first[: header.end] = 0
     epoch = np.flatnonzero(first == ord(">"))
@@ -272,7 +277,7 @@ def _calendar(lines: Lines, epoch: NDArray[np.intp], begin: int, year: int) -> A
     return np.concatenate(whole, axis=1).reshape(n, 6)
 
 
-def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]):  # type: ignore[no-untyped-def]
+def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> _Body:
     types = len(next(iter(header.types.values())))
     each = -(-types // 5)  # lines of a satellite
     epochs: list[int] = []
@@ -363,7 +368,9 @@ def _bad_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path) -> RecordingEr
     return RecordingError(f"{path}: the date of an epoch cannot be read")
 
 
-def _bad_field(lines, rows, own, types, cells, path) -> RecordingError:  # type: ignore[no-untyped-def]
+def _bad_field(
+    lines: Lines, rows: _Rows, own: NDArray[np.intp], types: list[str], cells: Cells, path: Path
+) -> RecordingError:
     """For the first field that is no number."""
     for k in own:
         block = cells(np.array([k]), len(types)).reshape(len(types), _WIDTH)

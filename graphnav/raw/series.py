@@ -161,3 +161,13 @@ def primary(raw: RawGnss) -> NDArray[np.bool_]:
     out = np.zeros(len(raw), dtype=bool)
     out[sorted_rows[first]] = True
     return out & np.isfinite(raw.code)
+
+
+def median_of_epochs(t: Array, value: Array) -> Array:
+    """(N,) the median of the values of each row's epoch; NaN where an epoch has none."""
+    epochs, of = np.unique(t, return_inverse=True)
+    order = np.lexsort((value, of))  # NaN last
+    edge = np.searchsorted(of[order], np.arange(len(epochs) + 1))
+    many = np.bincount(of, weights=np.isfinite(value), minlength=len(epochs)).astype(np.intp)
+    low, high = edge[:-1] + np.maximum(many - 1, 0) // 2, edge[:-1] + np.minimum(many // 2, np.diff(edge) - 1)
+    return np.asarray((0.5 * (value[order[low]] + value[order[high]]))[of])

@@ -77,15 +77,15 @@ def frequencies(satellite: Ids, signal: Ids, channels: Mapping[int, int] | None 
     """
     table = np.full((len(SYSTEMS), 10), np.nan)
     for system, bands in _MHZ.items():
-        for band, mhz in bands.items():
-            table[system, band] = mhz * 1e6
+        for number, mhz in bands.items():
+            table[system, number] = mhz * 1e6
     band = np.asarray(signal) // 100
     out = np.asarray(table[system_of(satellite), band])
     divided = (system_of(satellite) == GLONASS) & (band <= 2)
     if np.any(divided):
-        number = np.full(100, np.nan)
+        known = np.full(100, np.nan)
         for one, channel in (channels or {}).items():
-            number[one % 100] = channel
+            known[one % 100] = channel
         step = np.where(band == 1, _STEP[1], _STEP[2]) * 1e6
-        out = np.where(divided, out + step * number[satellite % 100], out)
+        out = np.where(divided, out + step * known[satellite % 100], out)
     return out

@@ -3,7 +3,7 @@
 With rho the distance from the antenna at reception to the satellite at transmission, in the Earth-fixed frame of the
 reception,
 
-    P = rho + b + b_s - dt + I + T            b: receiver clock (m), b_s: of another system's signal, dt: satellite clock
+    P = rho + b + b_s - dt + I + T            b: receiver clock, b_s: of another system's signal, dt: satellite clock
     rho' (1 + e.(v_s + omega x s) / c) = e.(v_s - v)          e: unit vector from the antenna to the satellite s
     D = rho' + b' - dt'
 
@@ -23,7 +23,7 @@ from graphnav.raw.atmosphere import NIGHT, directions, klobuchar, saastamoinen
 from graphnav.raw.ephemeris import EARTH_RATE, turned
 from graphnav.raw.series import RawGnss
 from graphnav.raw.sigmas import code_sigma, rate_sigma
-from graphnav.raw.signals import C, L1
+from graphnav.raw.signals import L1, C
 from graphnav.rotation import Array
 
 _ROUNDS, _ATMOSPHERE = 10, 3  # iterations, and from which on the atmosphere is modelled

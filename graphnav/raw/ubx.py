@@ -118,7 +118,7 @@ def _frames(data: bytes) -> _Content:
     """All messages that are used, their check sums tested."""
     out = _Content()
     at = data.find(SYNC)
-    while 0 <= at:
+    while at >= 0:
         if at + 8 > len(data):
             out.cut = True
             break
