@@ -101,6 +101,6 @@ def with_observations(recording: Recording, path: ExactPath, noise: float = 0.0,
         **whole, carrier=np.full(n, np.nan), cn0=np.full(n, 45.0), slip=np.zeros(n, dtype=bool),
         half=np.zeros(n, dtype=bool), frequency=np.full(n, L1), clock=np.zeros(n), drift=np.zeros(n),
         difference=np.full(n, np.nan), zero=ZERO, place=tuple(above), troposphere=True, antenna=rough[at],
-        receiver_clock=np.stack([clock + 5.0, drift], -1)[at], residual=np.zeros(n), lever_arm=gnss.lever_arm,
+        receiver_clock=np.stack([clock + 5.0, drift], -1)[at], lever_arm=gnss.lever_arm,
     )  # fmt: skip
     return replace(recording, gnss=replace(gnss, derived=True), raw_gnss=raw)

@@ -8,11 +8,11 @@ reception, and u = v + R_nb (omega_nb x l) its velocity (Groves 2013, sections 8
 
 b and b' are the receiver's clock and its drift, which begin anew at every epoch; b_s is the bias of the signals of
 another system, z what the model of the ionosphere is wrong by at the zenith and m how that grows towards the horizon; k
-comes of the flight time (`graphnav.raw.single_point.stretch`). What lasts of the errors: c for hours of all satellites
-together, as a shift of the antenna in east, north, up, and d for seconds the same of velocities; q of the one
-satellite, for minutes reflections and what a receiver's smoothing of its codes leaves, in units of the stated sigma,
-and for hours orbit, clock and the atmosphere towards it. How large c and q are is stated: a drive does not tell them
-from its place. White parts and d the noise model estimates.
+comes of the flight time (`graphnav.raw.single_point.stretch`). What lasts of the errors: c of all satellites together,
+as a shift of the antenna in east, north, up, for seconds and minutes, reflections and what a receiver's smoothing of
+its codes leaves, and for hours; d for seconds the same of velocities; q for hours of the one satellite, orbit, clock
+and the atmosphere towards it. How large c and q are for hours is stated: a drive does not tell them from its place.
+The rest the noise model estimates.
 
 Distances are differences against a nominal place of each epoch, so that no digits are lost.
 """
@@ -23,7 +23,6 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from graphnav import earth, rotation
 from graphnav.config import Settings
@@ -42,8 +41,8 @@ from graphnav.state import SECONDS, Parameter, States
 CLOCK = "receiver_clock"
 BIASES = "gnss_signal_biases"
 IONOSPHERE = "gnss_ionosphere"
-CODE_ERROR = f"gnss_code_error_of_{TIMES[2]}"
-SATELLITES = tuple(f"gnss_satellite_errors_of_{time}" for time in TIMES[1:])
+CODE_ERRORS = tuple(f"gnss_code_error_of_{time}" for time in TIMES)
+SATELLITES = "gnss_satellite_errors"
 RATE_ERROR = "gnss_doppler_error"
 _CLOCK_SIGMA = np.array([100.0, 10.0])  # m, m/s, about the single-point solution: next to nothing known
 _ZENITH = 1.5  # m, 1-sigma of what the model of the ionosphere is wrong by: half of the delay on an ordinary day
@@ -54,9 +53,8 @@ _AXES = ("horizontal", "horizontal", "up")
 # m, 1-sigma of what lasts for hours, which a drive does not tell from its place: of all satellites, as a shift of the
 # place, where the ionosphere's gradient and the datum of an orbit make a metre or two; and of one satellite
 _HOURS, _ONE = np.array([1.0, 1.0, 2.0]), 0.7
-_DIFFERENCED = 0.1  # of them, against a base station
-_MINUTE = 60.0  # s
-_MEDIAN = 0.6745  # of a normal variable's absolute value, in sigmas
+_ERROR = np.array([1.0, 1.0, 2.0])  # m, unit of what lasts for seconds and minutes
+_DIFFERENCED = 0.1  # of what lasts for hours, against a base station
 _RATE_ERROR = np.array([0.05, 0.05, 0.1])  # m/s
 _LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have a variance factor of their own
 _CLASSES = ("strong", "fair", "weak", "faint")
@@ -193,27 +191,16 @@ class _Satellites(Constraint):
         lever = parameters.get(LEVER_ARM, self.lever_arm)
         return states.p + rotation.mv(states.R_nb, lever), lever
 
-    def _lasting(self, parameters: dict[str, Array], name: str, rows: slice | Array, e: Array) -> Any:
-        """What an error that all have in common, a shift in east, north, up, does to the rows (n,), and by how much."""
-        if name not in parameters:
+    def _lasting(
+        self, parameters: dict[str, Array], names: tuple[str, ...], rows: slice | Array, e: Array
+    ) -> tuple[Array | float, dict[str, Array]]:
+        """What errors that all have in common, shifts in east, north, up, do to the rows (n,), and by how much."""
+        there = [name for name in names if name in parameters]
+        if not there:
             return 0.0, {}
         towards = -rotation.mv(self.R_ln[rows], e)
-        return np.sum(towards * parameters[name], axis=1), {name: towards[:, None]}
-
-
-def _usual(raw: RawGnss, sigma: Array) -> Array:
-    """(N,) m, the unit of a satellite's reflections: its usual sigma over a minute, or what its codes are usually off.
-
-    A signal that comes round a corner is late by tens of metres for as long as the corner is there.
-    """
-    out = sigma.copy()
-    off = np.where(np.isfinite(raw.residual), np.abs(raw.residual), 0.0)
-    for one in np.unique(raw.satellite):
-        own = np.flatnonzero(raw.satellite == one)
-        size = 2 * int(np.clip(_MINUTE / period(raw.t[own]) / 2, 0, (len(own) - 1) // 2)) + 1
-        usual, usually_off = (median_filter(x[own], size=size, mode="nearest") for x in (sigma, off))
-        out[own] = np.maximum(usual, usually_off / _MEDIAN)
-    return out
+        shift = np.sum(towards * sum(parameters[name] for name in there), axis=1)
+        return shift, dict.fromkeys(there, towards[:, None])
 
 
 @dataclass(frozen=True)
@@ -227,7 +214,6 @@ class GnssCode(_Satellites):
     nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m
     group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of the signals, 0 the reference
     which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite, in the order of their errors
-    size: Array = field(default_factory=lambda: np.empty((0, 2)))  # (N, 2) m, units of the satellites' errors
     slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) of the ionosphere's delay over that at the zenith
 
     @classmethod
@@ -266,12 +252,18 @@ class GnssCode(_Satellites):
         sigma, many = code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)
         minutes, hours = settings.gnss.slow_times
         common["parameters"] += (
-            Parameter(SATELLITES[0], np.zeros(many), np.ones(many), "sd", correlation_time=minutes, spacing=spacing),
-            Parameter(CODE_ERROR, np.zeros(3), less * _HOURS, "m", correlation_time=hours, spacing=spacing),
+            Parameter(CODE_ERRORS[2], np.zeros(3), less * _HOURS, "m", correlation_time=hours, spacing=spacing),
             Parameter(
-                SATELLITES[1], np.zeros(many), np.full(many, less * _ONE), "m", correlation_time=hours, spacing=spacing
+                SATELLITES, np.zeros(many), np.full(many, less * _ONE), "m", correlation_time=hours, spacing=spacing
             ),
         )
+        processes = tuple(
+            Parameter(
+                error, np.zeros(3), _ERROR, "m", correlation_time=lasts, spacing=spacing,
+                noise_groups=tuple(f"{cls.name}.{time}.{axis}" for axis in _AXES),
+            )
+            for error, time, lasts in zip(CODE_ERRORS, TIMES, (SECONDS, minutes), strict=False)
+        )  # fmt: skip
         words = [f"{NAMES[system]} {signal_name(signal)}" for system, signal in groups]
         note = f"gnss_code: {words[0]}"
         note += f", with a bias each of {', '.join(words[1:])}" if words[1:] else ""
@@ -282,7 +274,7 @@ class GnssCode(_Satellites):
             slant=obliquity(found.elevation) * (L1 / raw.frequency) ** 2,
             sigma=sigma[:, None],
             which=which,
-            size=np.stack([_usual(raw, sigma), np.ones(len(raw))], -1),
+            processes=processes,
             notes=(note,),
             **common,
         )
@@ -295,7 +287,7 @@ class GnssCode(_Satellites):
         e = away / distance[:, None]
         # |a| - |b| without the digits that a difference of distances would lose
         nearer = np.sum(moved * (moved - 2.0 * nominal), axis=1) / (distance + before)
-        slant, shift = self.slant[rows], 0.0
+        slant = self.slant[rows]
         residual = nearer + self.offset[rows] + parameters[CLOCK][:, 0] + slant * parameters[IONOSPHERE][:, 0]
         J = {
             "theta": (e[:, None] @ states.R_nb) @ rotation.skew(lever),
@@ -309,12 +301,10 @@ class GnssCode(_Satellites):
             own = self.group[rows][:, None] == np.arange(1, parameters[BIASES].shape[1] + 1)
             residual = residual + np.sum(own * parameters[BIASES], axis=1)
             J[BIASES] = own[:, None].astype(float)
-        for name, size in zip(SATELLITES, self.size[rows].T, strict=True):
-            if name in parameters:
-                own = (self.which[rows][:, None] == np.arange(parameters[name].shape[1])) * size[:, None]
-                residual = residual + np.sum(own * parameters[name], axis=1)
-                J[name] = own[:, None]
-        shift, more = self._lasting(parameters, CODE_ERROR, rows, e)
+        own = self.which[rows][:, None] == np.arange(parameters[SATELLITES].shape[1])
+        residual = residual + np.sum(own * parameters[SATELLITES], axis=1)
+        J[SATELLITES] = own[:, None].astype(float)
+        shift, more = self._lasting(parameters, CODE_ERRORS, rows, e)
         return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])
 
 
@@ -381,5 +371,5 @@ class GnssDoppler(_Satellites):
         J[CLOCK] = np.broadcast_to(np.array([[0.0, 1.0]]), (len(e), 1, 2))
         if LEVER_ARM in parameters:
             J[LEVER_ARM] = J[LEVER_ARM] + by_place @ states.R_nb
-        shift, more = self._lasting(parameters, RATE_ERROR, rows, e)
+        shift, more = self._lasting(parameters, (RATE_ERROR,), rows, e)
         return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])

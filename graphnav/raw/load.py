@@ -100,7 +100,6 @@ def load_raw(
     if not one.any():
         raise RecordingError(f"{sources.rover[0]}: none of its satellites has an ephemeris at its times")
     fixes = solve(raw.take(one))
-    raw = _with_residuals(raw, one, fixes)
     if not np.isfinite(fixes.p[:, 0]).any():
         raise RecordingError(f"{sources.rover[0]}: no epoch has enough satellites for a position")
     said = [*obs.remarks, *remarks]
@@ -116,14 +115,7 @@ def load_raw(
         if one.any():
             better = raw.take(one)
             fixes = solve(replace(better, code=better.code + better.difference))
-            raw = _with_residuals(raw, one, fixes)
     return raw, fixes, tuple(said)
-
-
-def _with_residuals(raw: RawGnss, which: NDArray[np.bool_], fixes: SinglePoint) -> RawGnss:
-    residual = np.full(len(raw), np.nan)
-    residual[which] = fixes.residual
-    return replace(raw, residual=residual)
 
 
 def _differenced(

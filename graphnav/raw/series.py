@@ -116,9 +116,6 @@ class RawGnss:
     klobuchar: tuple[tuple[float, ...], ...] | None = None  # coefficients that were broadcast
     troposphere: bool = False  # already taken off the codes
     antenna: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m in e, single-point, of each epoch
-    residual: Array = field(
-        default_factory=lambda: np.empty(0)
-    )  # (N,) m, that single-point solutions leave of the codes
     receiver_clock: Array = field(default_factory=lambda: np.empty((0, 2)))  # (N, 2) m and m/s, single-point
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
     files: tuple[str, ...] = ()
