@@ -173,6 +173,7 @@ class _Satellites(Constraint):
     """Rows of single satellites."""
 
     axes: ClassVar[tuple[str, ...]] = ("range",)
+    noise_axes: ClassVar[tuple[str, ...]] = (*_CLASSES, "horizontal", "up")  # of white parts, and of what lasts
 
     s_n: Array = field(default_factory=lambda: np.empty((0, 3)))  # m
     R_ln: Array = field(default_factory=lambda: np.empty((0, 3, 3)))

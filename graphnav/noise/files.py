@@ -215,7 +215,7 @@ class _Reader:
         t, weight = lists["t"], lists["weight"]
         if len(t) != len(weight):
             raise ConfigError(f"{self.path}: '{key}' has {len(t)} times and {len(weight)} weights; give one for each")
-        if np.any(np.diff(t) <= 0.0):
+        if np.any(np.diff(t) < 0.0):
             raise ConfigError(f"{self.path}: '{key}.t' is not ascending; sort its rows by time")
         return RowWeights(t, weight)
 
