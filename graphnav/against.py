@@ -18,7 +18,6 @@ from graphnav.clock import CLEAR
 from graphnav.crosschecks import Track
 from graphnav.earth import LocalFrame
 from graphnav.errors import RecordingError
-from graphnav.formats.clocks import NEAR, between_clocks
 from graphnav.formats.trajectories import read_trajectory
 from graphnav.interpolation import fit_yaw, interpolate, placed
 from graphnav.metrics import Metrics
@@ -26,6 +25,7 @@ from graphnav.recording import Gnss, Recording
 from graphnav.rotation import Array
 from graphnav.solution import Solution
 from graphnav.state import DIM, States
+from graphnav.timescales import NEAR, between_clocks
 from graphnav.trajectory import Trajectory
 
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled

@@ -31,6 +31,7 @@ from graphnav.checks_imu import (
     repeats,
     saturation,
 )
+from graphnav.checks_raw import raw_facts, raw_findings
 from graphnav.checks_stated import (
     fix_types,
     lever_arms,
@@ -96,7 +97,7 @@ class Inspection:
         return "\n".join(lines)
 
 
-_UNITS = {"hz": "Hz", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s2"}
+_UNITS = {"hz": "Hz", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s2", "dbhz": "dB-Hz"}
 
 
 def _show(name: str, value: Any) -> str:
@@ -149,6 +150,9 @@ def inspect(recording: Recording) -> Inspection:
         if overlap or not wrong:
             # against wrong velocities, or on another clock, every position jumps
             findings += wrong or (gnss_jumps(recording, track) if overlap else ())
+    if recording.raw_gnss is not None and len(recording.raw_gnss):
+        facts["raw_gnss"] = raw_facts(recording.raw_gnss)
+        findings += raw_findings(recording.raw_gnss)
     turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis"}
     if vehicle and overlap and track is not None and recording.gnss is not None:
         clock, yaw = clock_of(recording.imu, recording.gnss), crosschecks.yaw_fit(recording.imu, track)

@@ -14,10 +14,10 @@ from graphnav.clock import Clock
 from graphnav.config.gnss import GnssSettings
 from graphnav.crosschecks import Fit, Track
 from graphnav.findings import Finding, period_of
-from graphnav.formats.clocks import NEAR, between_clocks
 from graphnav.formats.schema import TIME
 from graphnav.recording import Imu, Odometer, Recording
 from graphnav.rotation import Array
+from graphnav.timescales import NEAR, between_clocks
 from graphnav.wheels.faults import FROZEN, GAP, STUCK, WILD
 
 _SURE = 4.0  # sigmas

@@ -16,13 +16,13 @@ from graphnav.draft.guesses import noise_density
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.exporters import NAMES, write_as
 from graphnav.formats import formats, load
-from graphnav.formats.clocks import gps_to_utc, parse_clock
 from graphnav.formats.registry import Log
 from graphnav.formats.trajectories import read_trajectory
 from graphnav.formats.writer import write_recording
 from graphnav.interpolation import interpolate
 from graphnav.rotation import Array
 from graphnav.staging import moved, staged
+from graphnav.timescales import gps_to_utc, parse_clock
 from graphnav.trajectory import Trajectory
 from graphnav.workflow import Outcome
 

@@ -42,8 +42,8 @@ class Figure:
 class RowWeights:
     """Rows of a constraint that have less information than their sigmas say."""
 
-    t: Array  # (n,) s, ascending
-    weight: Array  # (n,) in (0, 1)
+    t: Array  # (n,) s, ascending; where a time has several rows, all of them
+    weight: Array  # (n,) in (0, 1]
 
 
 @dataclass(frozen=True)

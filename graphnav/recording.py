@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.errors import RecordingError
+from graphnav.raw.series import RawGnss
 from graphnav.rotation import Array
 
 
@@ -59,6 +60,7 @@ class Gnss:
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
     type: NDArray[np.intp] | None = None  # (M,) of FIX_TYPES; None: no fix says of what type it is
     type_assumed: bool = False  # True when they are a CSV file's numbers, which were taken for RTKLIB's
+    derived: bool = False  # single-point positions computed from the recording's own raw observations
 
     @property
     def types(self) -> dict[str, int]:
@@ -127,6 +129,7 @@ class Recording:
     gps_zero: float | None = None  # s since the GPS epoch (1980-01-06) at t = 0, where it is known
     remarks: tuple[str, ...] = ()
     screened: bool = False  # whether `graphnav.plausibility.screen` has been over it
+    raw_gnss: RawGnss | None = None  # observations of the antenna that `gnss` has fixes of
 
     @cached_property
     def start(self) -> float:
@@ -143,6 +146,12 @@ class Recording:
     def duration(self) -> float:
         """Seconds covered by the IMU."""
         return self.end - self.start
+
+    def tight(self, coupling: str) -> bool:
+        """Whether raw observations are used in place of the fixes, by `raw_gnss.coupling` of the settings."""
+        if self.raw_gnss is None or coupling == "loose":
+            return False
+        return coupling == "tight" or self.gnss is None or self.gnss.derived
 
     def without(self, source: str, span: tuple[float, float] | None = None) -> Recording:
         """The recording with one source withheld, in a span in seconds from the start or throughout.
@@ -162,6 +171,10 @@ class Recording:
             t = sensor.t - self.start
             left = rows_of(sensor, ~((t >= span[0]) & (t <= span[1])))
         changed: dict[str, Any] = {source: left}
+        if source == "gnss" and self.raw_gnss is not None:  # whose fixes they are
+            raw = self.raw_gnss.t - self.start
+            out = np.zeros(len(raw), dtype=bool) if span is None else (raw < span[0]) | (raw > span[1])
+            changed["raw_gnss"] = rows_of(self.raw_gnss, out) if out.any() else None
         return replace(self, **changed)
 
     def crop(self, start: float | None = None, end: float | None = None) -> Recording:
@@ -172,7 +185,7 @@ class Recording:
         hi = np.inf if end is None else self.start + end
         parts: dict[str, Any] = {
             name: rows_of(sensor, (sensor.t >= lo) & (sensor.t <= hi))
-            for name in ("imu", "gnss", "odometer")
+            for name in ("imu", "gnss", "odometer", "raw_gnss")
             if (sensor := getattr(self, name)) is not None
         }
         if len(parts["imu"].t) < 2:

@@ -217,8 +217,9 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Raw]:
             note += f" The recording was cut into {len(solution.between)} pieces: these are the figures of the first."
         out.append(page.paragraph(note, "soft"))
     less = [
-        f"{len(some.t)} of {len(solution.records[name].t)} rows of {name} are off by more than chance allows once in a "
-        f"thousand times and weigh less, the least of them {page.number(float(some.weight.min()), 2)} of a row."
+        f"{np.count_nonzero(some.weight < 1.0)} of {len(solution.records[name].t)} rows of {name} are off by "
+        "more than chance allows once in a thousand times and weigh less, the least of them "
+        f"{page.number(float(some.weight.min()), 2)} of a row."
         for name, some in noise.weights.items()
         if len(some.t) and name in solution.records
     ]

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import oracle
 
-from graphnav.formats.clocks import gps_to_utc
 from graphnav.recording import Recording
+from graphnav.timescales import gps_to_utc
 from graphnav.trajectory import Trajectory
 
 WEEK, TOW = 2200, 345600.0  # Thursday, 10 March 2022, 0:00 GPS time

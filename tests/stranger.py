@@ -11,10 +11,10 @@ import numpy as np
 
 from graphnav.earth import LocalFrame
 from graphnav.formats import read
-from graphnav.formats.clocks import unix_to_gps
 from graphnav.formats.schema import rotation_from_letters
 from graphnav.recording import Gnss, Recording, Truth
 from graphnav.rotation import Array, exp
+from graphnav.timescales import unix_to_gps
 from graphnav.trajectory import Trajectory
 
 UNIX = 1751990400.0  # s, 8 July 2025, 16:00 UTC, a second after the start of every cut

@@ -19,8 +19,8 @@ from graphnav.earth import LocalFrame
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.exporters import csv, gpx, nav, nmea, write_as
 from graphnav.formats import load
-from graphnav.formats.clocks import gps_to_utc
 from graphnav.formats.trajectories import read_trajectory
+from graphnav.timescales import gps_to_utc
 from graphnav.trajectory import Trajectory
 
 WEEK = 2200

@@ -13,8 +13,8 @@ from helpers import same_recording
 from graphnav import convert
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.formats import load, read
-from graphnav.formats.clocks import clock_words, gps_to_utc, leap_seconds, parse_clock, unix_to_gps, utc_to_gps
 from graphnav.formats.writer import degrees, write_recording
+from graphnav.timescales import clock_words, gps_to_utc, leap_seconds, parse_clock, unix_to_gps, utc_to_gps
 
 RECORDING, TRUTH = logs.simulated()
 

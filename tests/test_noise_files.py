@@ -98,7 +98,7 @@ BAD = {
     "figures in a list": (changed("noise/figures", []), ("noise.figures", "table")),
     "time of no process": (changed("noise/correlation_times/nhc", 2.0), ("correlation_times.nhc", "nhc_error")),
     "no time": (changed("noise/correlation_times/nhc_error", 0.0), ("nhc_error", "between")),
-    "weights of nothing": (changed("noise/weights/gnss", {"t": [], "weight": []}), ("weights.gnss", "gnss_position")),
+    "weights of nothing": (changed("noise/weights/gnss", {"t": [], "weight": []}), ("weights.gnss", "gnss_code")),
     "weights without times": (changed("noise/weights/nhc", {"weight": [0.5]}), ("weights.nhc", "t and weight")),
     "too few weights": (changed("noise/weights/nhc", {"t": [1.0, 2.0], "weight": [0.5]}), ("2 times and 1 weights",)),
     "weight above one": (changed("noise/weights/nhc", {"t": [1.0], "weight": [1.5]}), ("weight", "between 0 and 1")),

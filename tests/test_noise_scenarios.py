@@ -39,7 +39,7 @@ def found_in(recording: Recording, settings: Settings | None = None) -> NoiseMod
 
 def times(noise: NoiseModel, name: str) -> float:
     """By what factor a sigma is used."""
-    return float(np.sqrt(noise.figures[name].factor))
+    return float(np.sqrt(noise.factor(name, 1.0)))
 
 
 def whole(noise: NoiseModel, kind: str, axis: str) -> float:

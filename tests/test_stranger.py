@@ -16,8 +16,8 @@ from graphnav import cli
 from graphnav.draft import draft
 from graphnav.draft.guesses import noise_density
 from graphnav.formats import read
-from graphnav.formats.clocks import between_clocks
 from graphnav.formats.trajectories import read_trajectory
+from graphnav.timescales import between_clocks
 
 RECORDING, TRUTH = logs.simulated(60.0)
 FAST = ("--solver", "ekf", "--noise", "stated", "--quiet")

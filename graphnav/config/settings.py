@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from graphnav.config.detectors import DetectorSettings
 from graphnav.config.gnss import GnssSettings
 from graphnav.config.motion import FootSettings, StandstillSettings, VehicleSettings
+from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.config.section import Section
 
 Profile = Literal["car", "car+odometer", "foot"]
@@ -97,6 +98,7 @@ class Settings(Section):
     imu: ImuSettings = ImuSettings()
     noise: NoiseSettings = NoiseSettings()
     gnss: GnssSettings = GnssSettings()
+    raw_gnss: RawGnssSettings = RawGnssSettings()
     detectors: DetectorSettings = DetectorSettings()
     standstill: StandstillSettings = StandstillSettings()
     vehicle: VehicleSettings = VehicleSettings()

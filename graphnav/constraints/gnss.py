@@ -114,14 +114,15 @@ class GnssPosition(Constraint):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        if recording.gnss is None or not settings.gnss.position:
+        if recording.gnss is None or not settings.gnss.position or recording.tight(settings.raw_gnss.coupling):
             return _empty(0)
         return recording.gnss.t[_usable(recording)]
 
     @classmethod
     def build(cls, scene: Scene) -> GnssPosition | None:
         gnss = scene.recording.gnss
-        if gnss is None or not scene.settings.gnss.position:
+        tight = scene.recording.tight(scene.settings.raw_gnss.coupling)
+        if gnss is None or not scene.settings.gnss.position or tight:
             return None
         keyframe = scene.keyframe_at(gnss.t)
         used = keyframe >= 0
@@ -175,7 +176,7 @@ class GnssPosition(Constraint):
             J[LEVER_ARM] = R
         offset = _time_offset(parameters, TIME_OFFSET)
         if offset is not None:
-            velocity, moved = _antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
+            velocity, moved = antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
             away = away + velocity * offset
             for block in ("theta", "v", "bg", LEVER_ARM):
                 if block != LEVER_ARM or LEVER_ARM in parameters:
@@ -223,14 +224,16 @@ class GnssVelocity(Constraint):
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
         gnss = recording.gnss
-        if gnss is None or gnss.v is None or not settings.gnss.velocity:
+        tight = recording.tight(settings.raw_gnss.coupling)
+        if gnss is None or gnss.v is None or not settings.gnss.velocity or tight:
             return _empty(0)
         return gnss.t[_usable(recording) & np.isfinite(gnss.v).all(axis=1)]
 
     @classmethod
     def build(cls, scene: Scene) -> GnssVelocity | None:
         gnss = scene.recording.gnss
-        if gnss is None or gnss.v is None or gnss.sd_v is None or not scene.settings.gnss.velocity:
+        tight = scene.recording.tight(scene.settings.raw_gnss.coupling)
+        if gnss is None or gnss.v is None or gnss.sd_v is None or not scene.settings.gnss.velocity or tight:
             return None
         keyframe = scene.keyframe_at(gnss.t)
         used = (keyframe >= 0) & np.isfinite(gnss.v).all(axis=1)
@@ -259,7 +262,7 @@ class GnssVelocity(Constraint):
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         C = self.R_ln[rows]
         lever = parameters.get(LEVER_ARM, self.lever_arm)
-        velocity, moved = _antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
+        velocity, moved = antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
         residual = mv(C, velocity) - self.v_l[rows]
         jacobians = {block: C @ J for block, J in moved.items() if block != LEVER_ARM or LEVER_ARM in parameters}
         offset = _time_offset(parameters, VELOCITY_TIME_OFFSET)
@@ -310,7 +313,7 @@ def _running_median(t: Array, sigma: Array) -> Array:
     return median_filter(sigma, size=(size, 1), mode="nearest")
 
 
-def _antenna_velocity(states: States, gyro: Array, omega_n: Array, lever: Array) -> tuple[Array, dict[str, Array]]:
+def antenna_velocity(states: States, gyro: Array, omega_n: Array, lever: Array) -> tuple[Array, dict[str, Array]]:
     """v + R_nb (omega_nb x l) in n, (N, 3), and its derivatives by theta, v, bg and the lever arm."""
     R = states.R_nb
     omega_ie_b = omega_n @ R

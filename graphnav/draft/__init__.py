@@ -14,11 +14,11 @@ from graphnav.draft.agreement import CLEAR, FAIR, Agreement, compare
 from graphnav.draft.guesses import Guess
 from graphnav.draft.sources import JOINED, Source, fix_speed_unit, fixes, sources
 from graphnav.errors import RecordingError
-from graphnav.formats.clocks import NEAR, Epochs, between_clocks
 from graphnav.formats.schema import FORCE, RATE, SPEED
 from graphnav.formats.writer import quoted
 from graphnav.recording import Gnss, Odometer
 from graphnav.rotation import Array
+from graphnav.timescales import NEAR, Epochs, between_clocks
 
 __all__ = ["Draft", "draft"]
 

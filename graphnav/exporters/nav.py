@@ -13,8 +13,8 @@ import numpy as np
 from graphnav.errors import RecordingError
 from graphnav.exporters import require_geodetic
 from graphnav.exporters.csv import rows_text
-from graphnav.formats.clocks import WEEK, utc_to_gps
 from graphnav.rotation import Array
+from graphnav.timescales import WEEK, utc_to_gps
 from graphnav.trajectory import Trajectory
 
 

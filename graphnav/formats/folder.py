@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.earth import ecef_to_llh, enu_axes
 from graphnav.errors import RecordingError
 from graphnav.formats import schema
-from graphnav.formats.clocks import parse_clock
 from graphnav.formats.pulses import counted
 from graphnav.formats.registry import Format, Log
 from graphnav.formats.repair import (
@@ -26,8 +26,15 @@ from graphnav.formats.repair import (
 )
 from graphnav.formats.table import Table, read_table
 from graphnav.formats.trajectories import read_trajectory
+from graphnav.raw import columns
+from graphnav.raw.load import Sources, load_raw
+from graphnav.raw.placing import Corrected
+from graphnav.raw.series import RawGnss
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording, Truth
 from graphnav.rotation import Array
+from graphnav.timescales import parse_clock
+
+_RAW_FILES = ("rover", "nav", "sp3", "clk", "base")
 
 
 def read_folder(source: str | Path) -> Recording:
@@ -91,6 +98,13 @@ def read_folder(source: str | Path) -> Recording:
     imu = sensor("imu", _imu, _imu_of)
     gnss = sensor("gnss", _gnss, _gnss_of)
     odometer = sensor("odometer", _odometer, _odometer_of)
+    gps_zero = parse_clock(d.clock, float(imu.t[0])) if d.clock else next(iter(zeros), None)
+    raw = None
+    if d.raw_gnss is not None:
+        raw, fixes = _raw_gnss(d.raw_gnss, path, gps_zero, remarks, files)
+        if gnss is None:
+            gnss = fixes
+            remarks.add(f"no [gnss]: {len(fixes.t)} single-point fixes of the raw observations stand in for it")
     truth = None
     if d.truth and d.truth.closed_loop_sigma:
         truth = Truth(imu.t[[0, -1]], of=d.truth.of, closed_loop_sigma=d.truth.closed_loop_sigma)
@@ -100,8 +114,9 @@ def read_folder(source: str | Path) -> Recording:
     elif d.truth:
         truth = _truth(d.truth, table("truth"), remarks)
     name = d.name or (path.resolve().parent.name if path.name == "recording.toml" else path.stem)
-    gps_zero = parse_clock(d.clock, float(imu.t[0])) if d.clock else next(iter(zeros), None)
-    return Recording(name, d.platform, imu, gnss, odometer, truth, path, tuple(files), gps_zero, tuple(remarks))
+    return Recording(
+        name, d.platform, imu, gnss, odometer, truth, path, tuple(files), gps_zero, tuple(remarks), raw_gnss=raw
+    )
 
 
 def _imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
@@ -154,6 +169,43 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     return Gnss(
         rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds, kinds is not None and d.units.type == "rtklib"
     )
+
+
+def _raw_gnss(
+    d: schema.RawGnssTable, path: Path, zero: float | None, remarks: Remarks, files: list[Path]
+) -> tuple[RawGnss, Gnss]:
+    """The raw observations of [raw_gnss], and the single-point fixes that they make."""
+    if zero is None:
+        raise RecordingError(
+            f"{path}: 'clock': [raw_gnss] needs to know what t = 0 is: say clock = \"gps week 2130\" or a UTC date"
+        )
+    some = {name: tuple(path.parent / file for file in getattr(d, name) or ()) for name in _RAW_FILES}
+    corrected = Corrected(clock="clock" in d.corrected, troposphere="troposphere" in d.corrected)
+    sources = Sources(
+        **some, base_position=d.base_position, corrected=corrected, nominal_stamps=d.stamps == "nominal",
+        lever_arm=d.lever_arm,
+    )  # fmt: skip
+    files.extend(sources.files)
+    given = None
+    if sources.rover[0].name.endswith((".csv", ".csv.gz")):
+        if len(sources.rover) > 1:
+            raise RecordingError(f"{path}: 'raw_gnss.rover': one CSV file, not {len(sources.rover)}")
+        rows = read_table(sources.rover[0], columns.REQUIRED, columns.OPTIONAL, d.columns)
+        given = columns.observations(rows.columns, zero, sources.rover[0].name)
+    elif d.columns:
+        raise RecordingError(f"{path}: 'raw_gnss.columns' is only for a CSV file, and {d.rover[0]} is none")
+    raw, found, said = load_raw(sources, zero - d.time_offset, given)
+    remarks.extend(said)
+    good = np.isfinite(found.p[:, 0])
+    sd = np.sqrt(np.diagonal(found.covariance[good], axis1=1, axis2=2))
+    v = np.einsum("nij,nj->ni", enu_axes(ecef_to_llh(found.p[good])), found.v[good])
+    sd_v = np.sqrt(np.diagonal(found.covariance_v[good], axis1=1, axis2=2))
+    known = np.isfinite(v).any()
+    fixes = Gnss(
+        found.t[good], ecef_to_llh(found.p[good]), sd, v if known else None, sd_v if known else None,
+        np.array(d.lever_arm), derived=True,
+    )  # fmt: skip
+    return raw, fixes
 
 
 def _odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odometer:

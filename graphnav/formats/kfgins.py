@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from graphnav.errors import RecordingError
-from graphnav.formats.clocks import WEEK
 from graphnav.formats.registry import Log, first_bytes, log_format
 from graphnav.formats.repair import Remarks
 from graphnav.formats.schema import rotation_from_letters
@@ -31,6 +30,7 @@ from graphnav.formats.text import number_table, text_lines
 from graphnav.formats.trajectories import read_trajectory
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Truth
 from graphnav.rotation import Array
+from graphnav.timescales import WEEK
 
 DEG_PER_H = np.pi / 180 / 3600  # rad/s
 DEG_PER_SQRT_H = np.pi / 180 / 60  # rad/s/sqrt(Hz)

@@ -14,11 +14,11 @@ import numpy as np
 
 from graphnav.errors import RecordingError
 from graphnav.formats import ubx
-from graphnav.formats.clocks import of_week, utc_to_gps
 from graphnav.formats.registry import Log, first_bytes, log_format
 from graphnav.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES, Remarks, horizontal_velocity
 from graphnav.recording import Gnss, fix_types
 from graphnav.rotation import Array
+from graphnav.timescales import of_week, utc_to_gps
 
 KNOTS = 1852 / 3600  # m/s
 KMH = 1 / 3.6

@@ -16,12 +16,12 @@ import numpy as np
 
 from graphnav.complaints import nearest
 from graphnav.errors import RecordingError
-from graphnav.formats.clocks import unix_to_gps
 from graphnav.formats.registry import Log, log_format
 from graphnav.formats.repair import DEFAULT_SD, DEFAULT_SD_V, Remarks
 from graphnav.formats.schema import rotation_from_letters
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, fix_types
 from graphnav.rotation import Array
+from graphnav.timescales import unix_to_gps
 
 _IMU, _FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
 _TWISTS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped", "nav_msgs/msg/Odometry")

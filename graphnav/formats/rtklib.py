@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.errors import RecordingError
-from graphnav.formats.clocks import WEEK, of_week, unix_to_gps
 from graphnav.formats.registry import Log, first_bytes, log_format
 from graphnav.formats.repair import Remarks
 from graphnav.formats.text import text_lines
 from graphnav.formats.trajectories import read_trajectory
 from graphnav.recording import Gnss, fix_types
+from graphnav.timescales import WEEK, of_week, unix_to_gps
 
 _JST = 9 * 3600.0  # s ahead of UTC
 # 1-sigma of a receiver's own single-point velocity where the file states none (see folder.DEFAULT_SD_V)

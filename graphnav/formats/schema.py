@@ -23,11 +23,11 @@ from pydantic.types import Strict
 
 from graphnav.complaints import complaint, nearest, read_toml
 from graphnav.errors import RecordingError
-from graphnav.formats.clocks import parse_clock
 from graphnav.formats.figures import parse_figure
 from graphnav.formats.imu_models import MODELS, find_model
 from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
+from graphnav.timescales import parse_clock
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0)]
@@ -211,6 +211,52 @@ class GnssTable(_Sensor):
     sd_v: Sigmas | None = Field(None, description="m/s: east, north, up")
 
 
+def _names(value: Any) -> Any:
+    names = [value] if isinstance(value, str) else value
+    if not isinstance(names, list | tuple) or not names or not all(isinstance(x, str) and x for x in names):
+        raise ValueError("must be the name of a file, or names in brackets")
+    return tuple(names)
+
+
+Files = Annotated[tuple[str, ...], BeforeValidator(_names)]
+
+
+class RawGnssTable(_Section):
+    """[raw_gnss]: observations of a receiver, and what places its satellites"""
+
+    columns_known: ClassVar[tuple[str, ...]] = (
+        "t", "prn", "qzss", "code", "carrier", "doppler", "range_rate", "cn0",
+    )  # fmt: skip
+
+    rover: Files = Field(description="RINEX or UBX files, or one CSV file")
+    nav: Files | None = Field(None, description="RINEX navigation files; UBX files may hold what they would")
+    sp3: Files | None = Field(None, description="precise orbits")
+    clk: Files | None = Field(None, description="precise clocks")
+    base: Files | None = Field(None, description="RINEX observations of a base station")
+    base_position: Vector | None = Field(None, description="m, Earth-centred, of its antenna")
+    lever_arm: Vector = Field((0.0, 0.0, 0.0), description="m from the IMU: right, forward, up")
+    time_offset: Number = Field(0.0, description="s, added to the receiver's stamps on the recording's clock")
+    columns: dict[str, str] = Field({}, description="of a CSV file: our name = the file's")
+    corrected: tuple[Literal["clock", "troposphere"], ...] = Field((), description="already taken off the codes")
+    stamps: Literal["receiver", "nominal"] = Field(
+        "receiver", description="nominal: rounded to the epoch, while codes are of the receiver's own clock"
+    )
+
+    @field_validator("columns")
+    @classmethod
+    def _known_columns(cls, columns: dict[str, str]) -> dict[str, str]:
+        for name in columns:
+            if name not in cls.columns_known:
+                raise ValueError(f"'{name}' is not one of graphnav's columns; {nearest(name, cls.columns_known)}")
+        return columns
+
+    @model_validator(mode="after")
+    def _placed(self) -> RawGnssTable:
+        if self.clk is not None and self.sp3 is None:
+            raise ValueError("clk says nothing without sp3")
+        return self
+
+
 WHEELS = ("speed_fl", "speed_fr", "speed_rl", "speed_rr")
 
 
@@ -276,9 +322,10 @@ class RecordingFile(_Section):
     format: Literal["graphnav-recording/1"]
     name: str | None = None
     platform: Literal["vehicle", "foot"]
-    clock: str | None = None  # what t = 0 is, see graphnav.formats.clocks.parse_clock; only for output
+    clock: str | None = None  # what t = 0 is, see graphnav.timescales.parse_clock; only for output
     imu: ImuTable
     gnss: GnssTable | None = None
+    raw_gnss: RawGnssTable | None = None
     odometer: OdometerTable | None = None
     truth: TruthTable | None = None
 
@@ -292,7 +339,7 @@ class RecordingFile(_Section):
     @model_validator(mode="after")
     def _truth_of_a_sensor(self) -> RecordingFile:
         of = self.truth.of if self.truth else "imu"
-        if getattr(self, of) is None:
+        if getattr(self, of) is None and not (of == "gnss" and self.raw_gnss is not None):
             raise ValueError(f"truth.of = '{of}', but there is no [{of}] table whose lever arm would apply")
         return self
 

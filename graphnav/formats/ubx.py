@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from graphnav.errors import RecordingError
-from graphnav.formats.clocks import WEEK, utc_to_gps
 from graphnav.formats.registry import Log, first_bytes, log_format
 from graphnav.formats.repair import Remarks
 from graphnav.recording import Gnss, Imu, Odometer, fix_types
 from graphnav.rotation import Array
+from graphnav.timescales import WEEK, utc_to_gps
 
 _SYNC = b"\xb5\x62"
 _PVT, _HP, _MEAS, _RAW = (1, 7), (1, 0x14), (0x10, 2), (0x10, 3)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav.formats.clocks import clock_words
 from graphnav.formats.registry import Log
 from graphnav.formats.schema import NOISE_UNITS, WHEELS
 from graphnav.progress import tell
 from graphnav.recording import ImuNoise, Odometer, Recording
 from graphnav.rotation import Array
+from graphnav.timescales import clock_words
 
 _DEG = np.pi / 180.0
 

@@ -88,11 +88,12 @@ def _process(p: Parameter, noise: NoiseModel, missing: float) -> Parameter | Non
 
 
 def row_weights(t: Array, noise: NoiseModel, name: str) -> Array:
-    """(N,) weights of a constraint's rows at times t (N,), s."""
+    """(N,) weights of a constraint's rows at times t (N,), s; rows of one time, as of satellites, keep their order."""
     out = np.ones(len(t))
     some = noise.weights.get(name)
     if some is not None and len(some.t):
-        at = np.clip(np.searchsorted(some.t, t - SAME_TIME), 0, len(some.t) - 1)
+        number = np.arange(len(t)) - np.searchsorted(t, t - SAME_TIME)  # among the rows of its time
+        at = np.clip(np.searchsorted(some.t, t - SAME_TIME) + number, 0, len(some.t) - 1)
         same = np.abs(some.t[at] - t) <= SAME_TIME
         out[same] = some.weight[at[same]]
     for begin, end in noise.excluded.get(name, ()):

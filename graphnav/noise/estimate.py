@@ -275,4 +275,5 @@ def _weigh(figures: _Figures, problem: Problem, rows: Constraint, squared: Array
     weight = np.minimum(1.0, most / np.maximum(squared, 1e-30))
     weight = np.concatenate([weight, before[n:]])  # later ones as they were
     less = (weight < 1.0) & (before > 0.0)
+    less |= np.isin(t, t[less])  # with all rows of their times, so that each is known by its number among them
     figures.weights[rows.name] = RowWeights(t[less], weight[less])

@@ -29,6 +29,7 @@ from graphnav.complaints import nearest
 from graphnav.config.settings import NoiseSettings
 from graphnav.constraints import registered
 from graphnav.constraints.gnss import ERRORS, OFFSETS, STAMP_ERROR, STAMPS, TIMES, VELOCITY_ERROR
+from graphnav.constraints.raw_gnss import CODE_ERRORS, RATE_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.errors import ConfigError
 from graphnav.noise_model import Figure, NoiseModel, RowWeights
@@ -122,7 +123,7 @@ def known_groups() -> tuple[str, ...]:
 
 def _known_processes() -> tuple[str, ...]:
     typed = [f"{error}_{kind}" for error in ERRORS for kind in FIX_TYPES.values()]
-    return (*ERRORS, *typed, VELOCITY_ERROR, STAMP_ERROR, NHC_ERROR, ODOMETER_ERROR)
+    return (*ERRORS, *typed, VELOCITY_ERROR, *CODE_ERRORS, RATE_ERROR, STAMP_ERROR, NHC_ERROR, ODOMETER_ERROR)
 
 
 class _Reader:
@@ -214,7 +215,7 @@ class _Reader:
         t, weight = lists["t"], lists["weight"]
         if len(t) != len(weight):
             raise ConfigError(f"{self.path}: '{key}' has {len(t)} times and {len(weight)} weights; give one for each")
-        if np.any(np.diff(t) <= 0.0):
+        if np.any(np.diff(t) < 0.0):
             raise ConfigError(f"{self.path}: '{key}.t' is not ascending; sort its rows by time")
         return RowWeights(t, weight)
 

@@ -67,5 +67,6 @@ def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
         out.append(f"noise model, {rows.name}: white part in stated sigmas: {'; '.join(parts)}")
         some = noise.weights.get(rows.name)
         if some is not None and len(some.t):
-            out.append(f"{rows.name}: {len(some.t)} of {len(rows)} rows are outliers and have less weight")
+            less = np.count_nonzero(some.weight < 1.0)
+            out.append(f"{rows.name}: {less} of {len(rows)} rows are outliers and have less weight")
     return tuple(out)

@@ -55,6 +55,7 @@ from graphnav.solvers.stack import Innovations, Stack, Together
 from graphnav.solvers.watch import Bank, Verdicts
 from graphnav.state import BLOCKS, DIM, States
 
+_NONE = 1e-12  # weight of a row that is not used beside others of its keyframe
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
 
 
@@ -250,8 +251,7 @@ def _update(
     D, (rows, lo, hi) = len(P), some.parts[0]
     end = D + 1 if taken is None else 2 * D + 1
     record = stack.records[rows.name]
-    weight = float(min(record.used[lo:hi])) if some.alone else 1.0
-    root_weight: float | Array = math.sqrt(weight) or 1.0 if some.alone else stack.root_weight[some.at]
+    weight, root_weight = _weights(record, lo, hi) if some.alone else (1.0, stack.root_weight[some.at])
     tests = bank if bank is not None and weight > 0.0 and rows.name in bank else None
     at, e = where.about(x)
     for left in range(where.passes(some) - 1, -1, -1):
@@ -279,7 +279,8 @@ def _update(
     if some.alone:
         refused = rows.gate is not None and nis > rows.gate**2
         weight = 0.0 if refused else weight * bent
-        record.weight[lo:hi], record.refused[lo:hi] = weight, refused
+        record.weight[lo:hi] = weight if hi - lo == 1 else record.used[lo:hi] * (0.0 if refused else bent)
+        record.refused[lo:hi] = refused
         if bank is not None:
             bank.seen(rows.name, some.k, nis, weight > 0.0)
         if weight == 0.0:
@@ -296,6 +297,15 @@ def _update(
     elif bank is not None:
         bank.taken(K, H)
     return where.plus(at, d), P, fault
+
+
+def _weights(record: Innovations, lo: int, hi: int) -> tuple[float, float | Array]:
+    """The largest weight of some rows, and the root of each number's; ones where none is used."""
+    used = record.used[lo:hi]
+    weight = float(max(used))
+    if hi - lo == 1 or weight == 0.0:
+        return weight, math.sqrt(weight) or 1.0
+    return weight, np.repeat(np.sqrt(np.maximum(used, _NONE)), len(record.rows.axes))
 
 
 def _solve(HPHt: Array, sigma: Array, right: Array, some: Together) -> tuple[Array, Array]:

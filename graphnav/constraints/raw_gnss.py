@@ -1,0 +1,376 @@
+"""Codes and Doppler shifts of single satellites, at an antenna at a lever arm from the IMU.
+
+With p_a = p + R_nb l the antenna, e the unit vector from it to the satellite s in the Earth-fixed frame of the
+reception, and u = v + R_nb (omega_nb x l) its velocity (Groves 2013, sections 8.4.1, 9.4.1 and 14.1.2)::
+
+    r_code    = |s - p_a| + b + b_s + m z + I + T - dt - e_l.c + q - P
+    r_doppler = e.(v_s - u) / k + b' - dt' - e_l.d - D
+
+b and b' are the receiver's clock and its drift, which begin anew at every epoch; b_s is the bias of the signals of
+another system, z what the model of the ionosphere is wrong by at the zenith and m how that grows towards the horizon; k
+comes of the flight time (`graphnav.raw.single_point.stretch`). What lasts of the errors: c of all satellites together,
+as a shift of the antenna in east, north, up, for seconds and minutes, reflections and what a receiver's smoothing of
+its codes leaves, and for hours; d for seconds the same of velocities; q for hours of the one satellite, orbit, clock
+and the atmosphere towards it. How large c and q are for hours is stated: a drive does not tell them from its place.
+The rest the noise model estimates.
+
+Distances are differences against a nominal place of each epoch, so that no digits are lost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from graphnav import earth, rotation
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
+from graphnav.constraints.gnss import LEVER_ARM, TIMES, antenna_velocity, around, node_spacing, period
+from graphnav.raw.atmosphere import obliquity
+from graphnav.raw.ephemeris import turned
+from graphnav.raw.series import RawGnss, primary
+from graphnav.raw.sigmas import code_sigma, rate_sigma
+from graphnav.raw.signals import L1, NAMES, C, signal_name
+from graphnav.raw.single_point import coefficients, look, signal_groups, stretch
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+from graphnav.state import SECONDS, Parameter, States
+
+CLOCK = "receiver_clock"
+BIASES = "gnss_signal_biases"
+IONOSPHERE = "gnss_ionosphere"
+CODE_ERRORS = tuple(f"gnss_code_error_of_{time}" for time in TIMES)
+SATELLITES = "gnss_satellite_errors"
+RATE_ERROR = "gnss_doppler_error"
+_CLOCK_SIGMA = np.array([100.0, 10.0])  # m, m/s, about the single-point solution: next to nothing known
+_ZENITH = 1.5  # m, 1-sigma of what the model of the ionosphere is wrong by: half of the delay on an ordinary day
+# unit/sqrt(s), of what changes over hours. Even a lever arm walks, by a centimetre in three hours: all that rows depend
+# on beside states and clocks has its nodes in common then, one variable of the graph
+_ZENITH_WALK, _BIAS_WALK, _LEVER_WALK = 0.01, 0.003, 1e-4
+_AXES = ("horizontal", "horizontal", "up")
+# m, 1-sigma of what lasts for hours, which a drive does not tell from its place: of all satellites, as a shift of the
+# place, where the ionosphere's gradient and the datum of an orbit make a metre or two; and of one satellite
+_HOURS, _ONE = np.array([1.0, 1.0, 2.0]), 0.7
+_ERROR = np.array([1.0, 1.0, 2.0])  # m, unit of what lasts for seconds and minutes
+_DIFFERENCED = 0.1  # of what lasts for hours, against a base station
+_RATE_ERROR = np.array([0.05, 0.05, 0.1])  # m/s
+_LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have a variance factor of their own
+_CLASSES = ("strong", "fair", "weak", "faint")
+
+
+def _selected(recording: Recording, settings: Settings) -> RawGnss | None:
+    """The rows to be used: of one signal for each satellite, strong enough, where the IMU is."""
+    s, raw = settings.raw_gnss, recording.raw_gnss
+    if raw is None or not recording.tight(s.coupling) or not len(raw):
+        return None
+    used = (raw.t >= recording.start - SAME_TIME) & (raw.t <= recording.end + SAME_TIME)
+    used &= np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock) & ~(raw.cn0 < s.cn0)
+    if raw.differenced:
+        used &= np.isfinite(raw.difference)
+    if s.period > 0.0 and used.any():
+        used &= np.isin(raw.t, _apart(np.unique(raw.t[used]), s.period))
+    raw = raw.take(used)
+    raw = raw.take(primary(raw))
+    return raw if len(raw) else None
+
+
+def _apart(t: Array, least: float) -> Array:
+    """Those of some times that are so far apart at least."""
+    out = [float(t[0])]
+    for x in t.tolist():
+        if x - out[-1] >= least - 0.05:
+            out.append(x)
+    return np.array(out)
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """What both kinds of rows need, of the rows that are used; made once for a scene."""
+
+    raw: RawGnss
+    keyframe: Array
+    s_n: Array  # (N, 3) m, satellites
+    v_n: Array  # (N, 3) m/s
+    R_ln: Array  # (N, 3, 3)
+    elevation: Array  # (N,) rad
+    known: Array  # (N,) m, distance from the nominal antenna with the delays of the atmosphere
+    nominal: Array  # (N, 3) m
+    ionosphere: Array  # (N,) m
+    stretch: Array  # (N,)
+    clock: Parameter
+    spacing: float  # s from node to node of whatever changes slowly
+
+
+def _prepare(scene: Scene) -> _Prepared | None:
+    if "raw_gnss" not in scene.made:
+        scene.made["raw_gnss"] = _prepared(scene)
+    found: _Prepared | None = scene.made["raw_gnss"]
+    return found
+
+
+def _prepared(scene: Scene) -> _Prepared | None:
+    raw = _selected(scene.recording, scene.settings)
+    if raw is None:
+        return None
+    keyframe = scene.keyframe_at(raw.t)
+    geometry = look(raw, raw.antenna, coefficients(raw))
+    used = (keyframe >= 0) & (geometry.elevation >= np.radians(scene.settings.raw_gnss.elevation))
+    if not used.any():
+        return None
+    raw, keyframe = raw.take(used), keyframe[used]
+    geometry = look(raw, raw.antenna, coefficients(raw))
+    frame = scene.frame
+    epochs, first = np.unique(raw.t, return_index=True)
+    return _Prepared(
+        raw=raw,
+        keyframe=keyframe,
+        s_n=(geometry.s - frame.r_e) @ frame.R_ne.T,
+        v_n=turned(raw.v, geometry.distance / C) @ frame.R_ne.T,
+        R_ln=earth.enu_axes(earth.ecef_to_llh(raw.antenna)) @ frame.R_ne.T,
+        elevation=geometry.elevation,
+        known=geometry.distance + geometry.ionosphere + geometry.troposphere,
+        nominal=(raw.antenna - frame.r_e) @ frame.R_ne.T,
+        ionosphere=geometry.ionosphere,
+        stretch=stretch(raw, geometry),
+        clock=Parameter(
+            CLOCK, raw.receiver_clock[first], np.tile(_CLOCK_SIGMA, (len(epochs), 1)), "m, m/s", begins=epochs
+        ),
+        spacing=node_spacing(scene.settings.gnss.slow_times, period(epochs)),
+    )
+
+
+def _common(scene: Scene, found: _Prepared) -> dict[str, Any]:
+    settings, raw = scene.settings, found.raw
+    parameters: tuple[Parameter, ...] = (found.clock,)
+    if settings.gnss.lever_arm_sigma is not None:
+        parameters += (
+            Parameter(
+                LEVER_ARM,
+                raw.lever_arm,
+                np.full(3, settings.gnss.lever_arm_sigma),
+                "m",
+                _LEVER_WALK,
+                spacing=found.spacing,
+            ),
+        )
+    return {
+        "keyframe": found.keyframe,
+        "s_n": found.s_n,
+        "R_ln": found.R_ln,
+        "lever_arm": raw.lever_arm,
+        "satellite": raw.satellite,
+        "elevation": found.elevation,
+        "level": np.searchsorted(-np.array(_LEVELS), -np.nan_to_num(raw.cn0, nan=_LEVELS[0]), side="left"),
+        "parameters": parameters,
+        **settings.raw_gnss.outliers,
+    }
+
+
+@dataclass(frozen=True)
+class _Satellites(Constraint):
+    """Rows of single satellites."""
+
+    axes: ClassVar[tuple[str, ...]] = ("range",)
+    noise_axes: ClassVar[tuple[str, ...]] = (*_CLASSES, "horizontal", "up")  # of white parts, and of what lasts
+
+    s_n: Array = field(default_factory=lambda: np.empty((0, 3)))  # m
+    R_ln: Array = field(default_factory=lambda: np.empty((0, 3, 3)))
+    lever_arm: Array = field(default_factory=lambda: np.zeros(3))
+    sigma: Array = field(default_factory=lambda: np.empty((0, 1)))
+    satellite: Array = field(default_factory=lambda: np.empty(0, dtype=np.int16))  # (N,) graphnav.raw.signals
+    elevation: Array = field(default_factory=lambda: np.empty(0))  # (N,) rad
+    level: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of _CLASSES
+
+    def noise_groups(self) -> tuple[tuple[str, ...], Array]:
+        there, which = np.unique(self.level, return_inverse=True)
+        return tuple(f"{self.name}.{_CLASSES[int(k)]}" for k in there), which[:, None]
+
+    def _antenna(self, states: States, parameters: dict[str, Array]) -> tuple[Array, Array]:
+        """Antennas in n (N, 3), and lever arms (3,) or (N, 3)."""
+        lever = parameters.get(LEVER_ARM, self.lever_arm)
+        return states.p + rotation.mv(states.R_nb, lever), lever
+
+    def _lasting(
+        self, parameters: dict[str, Array], names: tuple[str, ...], rows: slice | Array, e: Array
+    ) -> tuple[Array | float, dict[str, Array]]:
+        """What errors that all have in common, shifts in east, north, up, do to the rows (n,), and by how much."""
+        there = [name for name in names if name in parameters]
+        if not there:
+            return 0.0, {}
+        towards = -rotation.mv(self.R_ln[rows], e)
+        shift = np.sum(towards * sum(parameters[name] for name in there), axis=1)
+        return shift, dict.fromkeys(there, towards[:, None])
+
+
+@dataclass(frozen=True)
+class GnssCode(_Satellites):
+    """A satellite's code was received by the antenna."""
+
+    name: ClassVar[str] = "gnss_code"
+    unit: ClassVar[str] = "m"
+
+    offset: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, all that does not depend on the estimate
+    nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m
+    group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of the signals, 0 the reference
+    which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite, in the order of their errors
+    slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) of the ionosphere's delay over that at the zenith
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        raw = _selected(recording, settings) if settings.raw_gnss.code else None
+        return np.empty(0) if raw is None else np.unique(raw.t)
+
+    @classmethod
+    def build(cls, scene: Scene) -> GnssCode | None:
+        found = _prepare(scene) if scene.settings.raw_gnss.code else None
+        if found is None:
+            return None
+        raw, settings = found.raw, scene.settings
+        groups, group = signal_groups(raw)
+        common, spacing = _common(scene, found), found.spacing
+        less = _DIFFERENCED if raw.differenced else 1.0
+        more: tuple[Parameter, ...] = (
+            Parameter(IONOSPHERE, np.zeros(1), np.full(1, less * _ZENITH), "m", less * _ZENITH_WALK, spacing=spacing),
+        )
+        if len(groups) > 1:
+            size = len(groups) - 1
+            more += (
+                Parameter(
+                    BIASES,
+                    np.zeros(size),
+                    np.full(size, settings.raw_gnss.bias_sigma),
+                    "m",
+                    _BIAS_WALK,
+                    spacing=spacing,
+                ),
+            )
+        common["parameters"] += more
+        satellites, which = np.unique(raw.satellite, return_inverse=True)
+        sigma, many = code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)
+        satellites, which = np.unique(raw.satellite, return_inverse=True)
+        sigma, many = code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)
+        minutes, hours = settings.gnss.slow_times
+        common["parameters"] += (
+            Parameter(CODE_ERRORS[2], np.zeros(3), less * _HOURS, "m", correlation_time=hours, spacing=spacing),
+            Parameter(
+                SATELLITES, np.zeros(many), np.full(many, less * _ONE), "m", correlation_time=hours, spacing=spacing
+            ),
+        )
+        processes = tuple(
+            Parameter(
+                error, np.zeros(3), _ERROR, "m", correlation_time=lasts, spacing=spacing,
+                noise_groups=tuple(f"{cls.name}.{time}.{axis}" for axis in _AXES),
+            )
+            for error, time, lasts in zip(CODE_ERRORS, TIMES, (SECONDS, minutes), strict=False)
+        )  # fmt: skip
+        words = [f"{NAMES[system]} {signal_name(signal)}" for system, signal in groups]
+        note = f"gnss_code: {words[0]}"
+        note += f", with a bias each of {', '.join(words[1:])}" if words[1:] else ""
+        return cls(
+            offset=found.known - raw.code - raw.clock - (raw.difference if raw.differenced else 0.0),
+            nominal=found.nominal,
+            group=group,
+            slant=obliquity(found.elevation) * (L1 / raw.frequency) ** 2,
+            sigma=sigma[:, None],
+            which=which,
+            processes=processes,
+            notes=(note,),
+            **common,
+        )
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        antenna, lever = self._antenna(states, parameters)
+        away, nominal = self.s_n[rows] - antenna, self.s_n[rows] - self.nominal[rows]
+        moved = antenna - self.nominal[rows]
+        distance, before = np.linalg.norm(away, axis=1), np.linalg.norm(nominal, axis=1)
+        e = away / distance[:, None]
+        # |a| - |b| without the digits that a difference of distances would lose
+        nearer = np.sum(moved * (moved - 2.0 * nominal), axis=1) / (distance + before)
+        slant = self.slant[rows]
+        residual = nearer + self.offset[rows] + parameters[CLOCK][:, 0] + slant * parameters[IONOSPHERE][:, 0]
+        J = {
+            "theta": (e[:, None] @ states.R_nb) @ rotation.skew(lever),
+            "p": -e[:, None],
+            CLOCK: np.broadcast_to(np.array([[1.0, 0.0]]), (len(e), 1, 2)),
+            IONOSPHERE: slant[:, None, None],
+        }
+        if LEVER_ARM in parameters:
+            J[LEVER_ARM] = -e[:, None] @ states.R_nb
+        if BIASES in parameters:
+            own = self.group[rows][:, None] == np.arange(1, parameters[BIASES].shape[1] + 1)
+            residual = residual + np.sum(own * parameters[BIASES], axis=1)
+            J[BIASES] = own[:, None].astype(float)
+        own = self.which[rows][:, None] == np.arange(parameters[SATELLITES].shape[1])
+        residual = residual + np.sum(own * parameters[SATELLITES], axis=1)
+        J[SATELLITES] = own[:, None].astype(float)
+        shift, more = self._lasting(parameters, CODE_ERRORS, rows, e)
+        return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])
+
+
+@dataclass(frozen=True)
+class GnssDoppler(_Satellites):
+    """A satellite's signal was received with a Doppler shift."""
+
+    name: ClassVar[str] = "gnss_doppler"
+    unit: ClassVar[str] = "m/s"
+
+    offset: Array = field(default_factory=lambda: np.empty(0))  # (N,) m/s
+    v_n: Array = field(default_factory=lambda: np.empty((0, 3)))  # m/s, of the satellites
+    stretch: Array = field(default_factory=lambda: np.empty(0))  # (N,)
+    gyro: Array = field(default_factory=lambda: np.empty((0, 3)))  # measured rate at the epoch
+    omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        raw = _selected(recording, settings) if settings.raw_gnss.doppler else None
+        return np.empty(0) if raw is None else np.unique(raw.t[np.isfinite(raw.range_rate)])
+
+    @classmethod
+    def build(cls, scene: Scene) -> GnssDoppler | None:
+        found = _prepare(scene) if scene.settings.raw_gnss.doppler else None
+        if found is None:
+            return None
+        raw, common = found.raw, _common(scene, found)
+        some = np.isfinite(raw.range_rate) & np.isfinite(raw.drift)
+        if not some.any():
+            return None
+        per_row = ("keyframe", "s_n", "R_ln", "satellite", "elevation", "level")
+        common |= {name: common[name][some] for name in per_row}
+        lasting = Parameter(
+            RATE_ERROR, np.zeros(3), _RATE_ERROR, "m/s", correlation_time=SECONDS,
+            spacing=found.spacing,
+            noise_groups=tuple(f"{cls.name}.seconds.{axis}" for axis in _AXES),
+        )  # fmt: skip
+        imu = scene.recording.imu
+        return cls(
+            offset=-(raw.range_rate + raw.drift)[some],
+            v_n=found.v_n[some],
+            stretch=found.stretch[some],
+            gyro=around(imu, imu.gyro, raw.t[some]),
+            omega_n=scene.frame.omega_n,
+            sigma=rate_sigma(raw.cn0, found.elevation)[some, None],
+            processes=(lasting,),
+            **common,
+        )
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        antenna, lever = self._antenna(states, parameters)
+        u, moved = antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
+        away = self.s_n[rows] - antenna
+        distance = np.linalg.norm(away, axis=1)[:, None]
+        e, w = away / distance, self.v_n[rows] - u
+        along = np.sum(e * w, axis=1)
+        less = 1.0 / self.stretch[rows]
+        residual = along * less + self.offset[rows] + parameters[CLOCK][:, 1]
+        by_place = -((w - along[:, None] * e) / distance * less[:, None])[:, None]  # (n, 1, 3)
+        by_velocity = -(e * less[:, None])[:, None]
+        J = {name: by_velocity @ x for name, x in moved.items() if name != LEVER_ARM or LEVER_ARM in parameters}
+        J["p"] = by_place
+        J["theta"] = J["theta"] - by_place @ states.R_nb @ rotation.skew(lever)
+        J[CLOCK] = np.broadcast_to(np.array([[0.0, 1.0]]), (len(e), 1, 2))
+        if LEVER_ARM in parameters:
+            J[LEVER_ARM] = J[LEVER_ARM] + by_place @ states.R_nb
+        shift, more = self._lasting(parameters, (RATE_ERROR,), rows, e)
+        return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])

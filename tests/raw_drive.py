@@ -1,0 +1,106 @@
+"""Raw observations for a simulated drive: satellites on circles in space, codes by the time that light takes in vacuum.
+
+Everything is worked out in a frame that does not turn, other than in the package, which turns satellites instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from oracle_path import ExactPath
+
+from graphnav import earth
+from graphnav.raw.atmosphere import NIGHT, directions, klobuchar
+from graphnav.raw.ephemeris import EARTH_RATE
+from graphnav.raw.series import RawGnss
+from graphnav.raw.signals import L1, C, satellite_id, signal_id
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+
+RADIUS, MU = 2.656e7, 3.986004418e14
+SATELLITES = [f"G{k:02d}" for k in range(1, 8)] + [f"E{k:02d}" for k in range(1, 6)]
+BIAS = 7.0  # m, of Galileo's signal
+ZERO = 2200 * 604800.0
+
+
+def turn(p: Array, angle: Array) -> Array:
+    """Coordinates (n, 3) turned by angles (n,) about z: from the Earth-fixed frame into space."""
+    s, c = np.sin(angle), np.cos(angle)
+    return np.stack([c * p[:, 0] - s * p[:, 1], s * p[:, 0] + c * p[:, 1], p[:, 2]], -1)
+
+
+def in_space(k: int, t: Array, above: Array) -> Array:
+    """(n, 3) satellite k at times t, which stands near the direction `above` (3,) at t = 0."""
+    rng = np.random.default_rng(k)
+    up = above / np.linalg.norm(above) + 0.55 * rng.standard_normal(3)
+    up /= np.linalg.norm(up)
+    along = np.cross(up, rng.standard_normal(3))
+    along /= np.linalg.norm(along)
+    angle = np.sqrt(MU / RADIUS**3) * t[:, None]
+    return RADIUS * (np.cos(angle) * up + np.sin(angle) * along)
+
+
+def observe(llh_of, t: Array, above: Array, k: int) -> tuple[Array, Array, Array]:
+    """Ranges c tau (n,), and satellites at transmission, positions and velocities in the Earth-fixed frame of then."""
+    antenna = turn(earth.llh_to_ecef(llh_of(t)), EARTH_RATE * t)
+    tau = np.full(len(t), 0.07)
+    for _ in range(8):
+        tau = np.linalg.norm(in_space(k, t - tau, above) - antenna, axis=1) / C
+    sent = t - tau
+
+    def fixed(at: Array) -> Array:
+        return turn(in_space(k, at, above), -EARTH_RATE * at)
+
+    return C * tau, fixed(sent), (fixed(sent + 0.5) - fixed(sent - 0.5))
+
+
+def with_observations(recording: Recording, path: ExactPath, noise: float = 0.0, seed: int = 0) -> Recording:
+    """The recording with raw observations at the times of its fixes, and these said to be derived from them.
+
+    `noise` is that of the codes, m; that of range rates is a twentieth of it, m/s.
+    """
+    gnss = recording.gnss
+    t, lever = gnss.t, tuple(float(x) for x in gnss.lever_arm)
+    rng = np.random.default_rng(seed)
+    drift = 1.0 + 2.0 * np.sin(0.05 * t)
+    clock = 150.0 + 1.0 * t - 40.0 * np.cos(0.05 * t)  # its derivative is the drift
+
+    def llh_of(at: Array) -> Array:
+        return path.point(at, lever)[0]
+
+    llh = llh_of(t)
+    antenna = earth.llh_to_ecef(llh)
+    above = antenna[0]
+    parts: dict[str, list[Array]] = {}
+    for k, name in enumerate(SATELLITES):
+        distance, p, v = observe(llh_of, t, above, k)
+        h = 0.02
+        inside = np.clip(t, path.t[0] + h, path.t[-1] - h)
+        rate = (observe(llh_of, inside + h, above, k)[0] - observe(llh_of, inside - h, above, k)[0]) / (2.0 * h)
+        azimuth, elevation = directions(antenna, p)
+        delay = klobuchar(NIGHT, np.mod(t, 604800.0), llh, azimuth, elevation)
+        n, white = len(t), noise * rng.standard_normal(len(t))
+        bias = BIAS if name[0] == "E" else 0.0
+        own = {
+            "t": t, "satellite": np.full(n, satellite_id(name), dtype=np.int16),
+            "signal": np.full(n, signal_id("1C"), dtype=np.int16),
+            "code": distance + clock + bias + delay + white, "p": p, "v": v,
+            "range_rate": rate + drift + 0.05 * noise * rng.standard_normal(n),
+            "high": elevation,
+        }  # fmt: skip
+        for key, value in own.items():
+            parts.setdefault(key, []).append(value)
+    whole = {key: np.concatenate(value) for key, value in parts.items()}
+    order = np.lexsort((whole["satellite"], whole["t"]))
+    order = order[whole.pop("high")[order] > np.radians(10.0)]
+    whole = {key: value[order] for key, value in whole.items()}
+    n, at = len(order), np.searchsorted(t, whole["t"])
+    rough = antenna + 20.0 * np.random.default_rng(1).standard_normal(antenna.shape)
+    raw = RawGnss(
+        **whole, carrier=np.full(n, np.nan), cn0=np.full(n, 45.0), slip=np.zeros(n, dtype=bool),
+        half=np.zeros(n, dtype=bool), frequency=np.full(n, L1), clock=np.zeros(n), drift=np.zeros(n),
+        difference=np.full(n, np.nan), zero=ZERO, place=tuple(above), troposphere=True, antenna=rough[at],
+        receiver_clock=np.stack([clock + 5.0, drift], -1)[at], lever_arm=gnss.lever_arm,
+    )  # fmt: skip
+    return replace(recording, gnss=replace(gnss, derived=True), raw_gnss=raw)
