@@ -17,6 +17,7 @@ import typer
 
 from graphnav import __version__, cli_logs
 from graphnav.cli_options import (
+    AllowOutside,
     Config,
     End,
     Json,
@@ -31,6 +32,7 @@ from graphnav.cli_options import (
     Without,
 )
 from graphnav.errors import ConfigError, GraphnavError
+from graphnav.files import outside_allowed
 from graphnav.progress import tell
 from graphnav.talk import BAD_INPUT, DEBUG, INTERNAL, INTERRUPTED, PIPE_CLOSED, bar, fail, insist, say, show
 
@@ -67,6 +69,7 @@ def info(
     antenna: Annotated[
         bool, typer.Option("--antenna", help="Also find the antenna from the drive, and compare with its lever arm.")
     ] = False,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -76,7 +79,7 @@ def info(
 
     with bar(quiet, "ekf" if antenna else "info"):
         tell("reading")
-        whole = read(recording)
+        whole = read(recording, allow_outside)
         tell("checks")
         found = inspect(whole)
         if antenna:
@@ -107,12 +110,14 @@ def smooth(
         str | None, typer.Option("--point", metavar="POINT", help="Of --export: imu, antenna or x,y,z (m; RFU).")
     ] = None,
     require: Require = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
     asked = _Asked(recording, out, profile, config, noise, without, rate, start, end, require, quiet, json)
-    _solve(asked, solver, "--solver", export, point)
+    with outside_allowed(allow_outside):
+        _solve(asked, solver, "--solver", export, point)
 
 
 @app.command(epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out/kitti")
@@ -133,12 +138,14 @@ def compare(
     start: Start = None,
     end: End = None,
     require: Require = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Put the same recording through several solvers and compare them, against the truth where there is one."""
     asked = _Asked(recording, out, profile, config, noise, without, rate, start, end, require, quiet, json)
-    _solve(asked, solvers, "--solvers")
+    with outside_allowed(allow_outside):
+        _solve(asked, solvers, "--solvers")
 
 
 @app.command(epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")
@@ -149,6 +156,7 @@ def detect(
     without: Without = None,
     start: Start = None,
     end: End = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -162,7 +170,7 @@ def detect(
     withheld = _withheld(without, start, end)
     settings = read_settings(config)
     folder = outputs.output_folder(out)
-    with bar(quiet, "detect"):
+    with bar(quiet, "detect"), outside_allowed(allow_outside):
         tell("reading")
         used, said = screened(workflow.read_part(recording, start, end, withheld))
         tell("detection")
@@ -188,6 +196,7 @@ def evaluate(
         Path | None, typer.Option("-o", "--out", metavar="OUT", help="Folder for evaluation.json and errors.csv.")
     ] = None,
     require: Require = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -199,7 +208,7 @@ def evaluate(
 
     requirements = [gates.parse_requirement(one) for one in require or ()]
     folder = None if out is None else outputs.output_folder(out)
-    with bar(quiet, "evaluate"):
+    with bar(quiet, "evaluate"), outside_allowed(allow_outside):
         tell("reading")
         metrics = compared(trajectory, truth)
     values = {"trajectory": str(trajectory), "truth": str(truth), **summary(metrics)}

@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
-from graphnav.cli_options import Json, Quiet
+from graphnav.cli_options import AllowOutside, Json, Quiet
 from graphnav.errors import ConfigError
+from graphnav.files import outside_allowed
 from graphnav.progress import tell
 from graphnav.talk import bar, say, show
 
@@ -34,6 +35,7 @@ def convert(
         str | None,
         typer.Option("--clock", metavar="TEXT", help="Trajectory: unix, 'gps week 2313' or a UTC date of t = 0."),
     ] = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -61,7 +63,7 @@ def convert(
         if value is not None:
             raise ConfigError(f"{option}: is for trajectories; a log keeps its own")
     folder = output_folder(out)
-    with bar(quiet, "convert"):
+    with bar(quiet, "convert"), outside_allowed(allow_outside):
         tell("reading")
         log, files = conversion.convert_log(source, folder, format)
     show(
@@ -78,6 +80,7 @@ def allan(
     out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into.")],
     start: Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from its start.")] = None,
     end: Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from its start.")] = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -90,7 +93,7 @@ def allan(
     from graphnav.staging import moved, staged
 
     folder = output_folder(out)
-    with bar(quiet, "allan"):
+    with bar(quiet, "allan"), outside_allowed(allow_outside):
         tell("reading")
         if log.endswith((".csv", ".csv.gz")):
             t, gyro, accel = imu_of(Path(log))

@@ -12,8 +12,10 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from graphnav.errors import ConfigError, GraphnavError
+from graphnav.files import read_text
 
 _TABLE = re.compile(r"\[([^\[\]]+)\]")
+_DEEPEST = 50  # tables in tables; what graphnav reads has four
 _KEY = re.compile(r"([\w\-.\"']+)\s*=")
 
 
@@ -25,15 +27,29 @@ def read_toml(path: Path, error: type[GraphnavError]) -> tuple[dict[str, Any], s
     GraphnavError
         Of the kind given, if it cannot be read or is not TOML.
     """
+    text = read_text(path, error)
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        return tomllib.loads(text), text
-    except OSError as cause:
-        raise error(f"{path}: cannot be read ({cause.strerror})") from None
-    except UnicodeDecodeError:
-        raise error(f"{path}: is not UTF-8 text; save it as UTF-8") from None
-    except tomllib.TOMLDecodeError as cause:
+        values = tomllib.loads(text)
+        for key, value in _leaves(values):
+            if isinstance(value, int) and not -(2**63) <= value < 2**63:
+                raise ValueError(f"'{key}' is a whole number of more than 64 bits")
+        return values, text
+    except RecursionError:
+        raise error(f"{path}: not valid TOML (nested too deep)") from None
+    except ValueError as cause:  # tomllib's own is one, and that of a number of thousands of digits
         raise error(f"{path}: not valid TOML ({cause})") from None
+
+
+def _leaves(value: Any, key: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Every value of nested tables and lists, with its key."""
+    if depth > _DEEPEST:
+        raise RecursionError
+    if isinstance(value, dict | list):
+        inner = value.items() if isinstance(value, dict) else ((key, one) for one in value)
+        for name, one in inner:
+            yield from _leaves(one, str(name), depth + 1)
+    else:
+        yield key, value
 
 
 def complaint(source: str | Path, error: ValidationError, model: type[BaseModel], text: str = "") -> str:

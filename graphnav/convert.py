@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from graphnav.complaints import listed, nearest
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.exporters import NAMES, write_as
+from graphnav.files import parse_json, read_text
 from graphnav.formats import formats, load
 from graphnav.formats.clocks import gps_to_utc, parse_clock
 from graphnav.formats.registry import Log
@@ -204,8 +204,8 @@ def _run(source: Path) -> dict[str, Any]:
     """What the summary beside a trajectory says of its points and its clock."""
     path = source.parent / SUMMARY
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        values = parse_json(read_text(path))
+    except (RecordingError, ValueError):
         return {}
     return values if isinstance(values, dict) else {}
 

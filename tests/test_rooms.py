@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "graphnav"
 
 # Modules and packages of graphnav, left to right. A new one needs a place here, as far left as it can stand.
 ROOMS = [
-    "errors", "complaints", "progress", "rotation", "earth", "state", "config", "recording", "trajectory",
+    "errors", "files", "complaints", "progress", "rotation", "earth", "state", "config", "recording", "trajectory",
     "findings", "sample_size", "formats", "allan", "lags", "crosschecks", "clock", "draft", "simulation", "wheels",
     "checks_imu", "checks_aiding", "checks_stated", "plausibility_gnss", "plausibility_odometer", "plausibility",
     "checks", "detectors", "samples", "noise_model",

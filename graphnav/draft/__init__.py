@@ -14,6 +14,7 @@ from graphnav.draft.agreement import CLEAR, FAIR, Agreement, compare
 from graphnav.draft.guesses import Guess
 from graphnav.draft.sources import Source, fix_speed_unit, fixes, sources
 from graphnav.errors import RecordingError
+from graphnav.files import inside
 from graphnav.formats.schema import FORCE, RATE, SPEED
 from graphnav.formats.writer import quoted
 from graphnav.recording import Gnss, Odometer
@@ -232,6 +233,8 @@ class _Writer:
             rates, forces = (path.name for path in source.joined_from)
             self.decisions.append(f"{relative}: made of {rates} and {forces}, the forces at the times of the rates")
         self.lines.append(f"file = {quoted(relative)}")
+        if source.joined_from is None and not inside(source.path, self.folder):
+            self.decisions.append(f"{relative}: lies outside the folder of this file; say --allow-outside to read it")
         names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
         if names:
             pairs = ", ".join(f"{ours} = {quoted(theirs)}" for ours, theirs in names.items())

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 
 from graphnav.errors import RecordingError
+from graphnav.files import check_regular, exists
 from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth
 
 
@@ -72,14 +73,18 @@ def log_format(name: str, about: str, recognises: Callable[[Path], bool], load: 
     def known(source: str | Path) -> bool:
         try:
             return recognises(Path(source))
-        except OSError:
+        except (OSError, RecordingError):
             return False
 
     def loaded(source: str | Path) -> Log:
         path = Path(source)
-        if not path.exists():
+        if not exists(path):
             raise RecordingError(f"{path}: no such file or folder")
-        log = load(path)
+        if not path.is_dir():
+            check_regular(path)
+        from graphnav.formats.soundness import sound  # which imports this module
+
+        log = sound(load(path), path)
         return replace(log, files=log.files or (path,))
 
     return Format(name, about, known, lambda source: loaded(source).recording(source), load=loaded)
