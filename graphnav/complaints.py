@@ -15,6 +15,8 @@ from graphnav.errors import ConfigError, GraphnavError
 from graphnav.files import read_text
 
 _TABLE = re.compile(r"\[([^\[\]]+)\]")
+_NAMES = 30  # that a sentence lists
+_SHOWN = 60  # characters of a value in a sentence
 _DEEPEST = 50  # tables in tables; what graphnav reads has four
 _KEY = re.compile(r"([\w\-.\"']+)\s*=")
 
@@ -71,13 +73,21 @@ def complaint(source: str | Path, error: ValidationError, model: type[BaseModel]
         return f"{where}'{key}': {what}{_meaning(loc, model)}" if key else f"{where}{what}"
     if first["type"] in ("model_type", "model_attributes_type"):
         return f"{where}'{key}' must be a table: [{key}]"
-    return f"{where}'{key}' = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}{_meaning(loc, model)}"
+    return f"{where}'{key}' = {shortened(first['input'])}: {first['msg'][0].lower()}{first['msg'][1:]}{_meaning(loc, model)}"
+
+
+def shortened(value: Any) -> str:
+    """A value as it stands in a file, no longer than people look at."""
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
     """What may have been meant: the nearest of the names there are, else all of them."""
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known) or 'none'}"
+    if close:
+        return f"did you mean '{close[0]}'?"
+    return f"known: {', '.join(known[:_NAMES]) or 'none'}{', ...' * (len(known) > _NAMES)}"
 
 
 def listed(text: str, known: Sequence[str], option: str, what: str) -> tuple[str, ...]:

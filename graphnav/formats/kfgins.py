@@ -277,7 +277,8 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark is not None else ""
-        raise RecordingError(f"{path}{line}: not valid YAML ({getattr(error, 'problem', None) or error})") from None
+        why = " ".join(str(getattr(error, "problem", None) or error).split())
+        raise RecordingError(f"{path}{line}: not valid YAML ({why})") from None
     except ValueError as error:  # a date that is none, a number of thousands of digits
         raise RecordingError(f"{path}: not valid YAML ({error})") from None
     if not isinstance(values, dict):

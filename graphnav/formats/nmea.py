@@ -140,6 +140,8 @@ def _note(epoch: _Epoch, kind: bytes, message: Any) -> None:
     if kind == b"GGA":
         for value in (message.lat, message.lon, message.alt, message.sep, message.HDOP):
             _number(value)
+        if message.lat != "" and (message.NS not in ("N", "S") or message.EW not in ("E", "W")):
+            raise ValueError("no hemisphere")
         epoch.gga = message
     elif kind == b"GST":
         for value in (message.stdLong, message.stdLat, message.stdAlt):

@@ -55,7 +55,7 @@ def number_table(
                 parse_number(fields[k].strip() or "nan")
             except ValueError:
                 raise RecordingError(
-                    f"{path}, line {number}, {names[k]}: '{fields[k].strip()}' is not a number"
+                    f"{path}, line {number}, {names[k]}: '{fields[k].strip()[:40]}' is not a number"
                 ) from None
     raise RecordingError(f"{path}: cannot be read as a table of numbers")
 

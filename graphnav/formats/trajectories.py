@@ -132,7 +132,7 @@ def _csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     local = "lat" not in columns and {"x", "y"} <= columns.keys()
     needed = ("t", "x", "y") if local else ("t", "lat", "lon", "h")
     if missing := [name for name in needed if name not in columns]:
-        raise RecordingError(f"{path}, line 1: no column '{missing[0]}'; found {', '.join(names)}")
+        raise RecordingError(f"{path}, line 1: no column '{missing[0]}'; found {', '.join(names)[:300]}")
     wanted = {names[k] for name, k in columns.items() if name in _KNOWN}
     table = number_table(path, rows, names, ",", wanted)
 
@@ -246,7 +246,7 @@ def _rtklib_times(
                 np.datetime64(stamp, "us")
             except ValueError:
                 raise RecordingError(
-                    f"{path}, line {number}: '{stamp.replace('T', ' ')}' is not a date and time"
+                    f"{path}, line {number}: '{stamp.replace('T', ' ')[:60]}' is not a date and time"
                 ) from None
         raise
     seconds = (when - _GPS_EPOCH) / np.timedelta64(1, "us") * 1e-6
