@@ -29,6 +29,7 @@ from graphnav.online.session import Session
 from graphnav.online.view import view
 from graphnav.outputs import output_folder
 
+LONGEST = 1 << 20  # bytes of a line
 TICK = 0.5  # s between views, and of waiting for a source
 
 
@@ -125,6 +126,8 @@ def follow(session: Session, chunks: Iterator[bytes], shown: Shown, asked: Asked
     for chunk in chunks:
         if chunk:
             *whole, rest = (rest + chunk).split(b"\n")
+            rest = rest[:LONGEST]  # what never ends is no row, and told as such when it does
+            whole = [line[:LONGEST] for line in whole]
             session.add_lines([line.decode("utf-8", "replace") for line in whole], asked.__bool__)
             heard = time.monotonic()
         shown.now_and_then(time.monotonic() - heard)
