@@ -274,23 +274,26 @@ def _solve(asked: _Asked, solvers: str, option: str, export: str | None = None, 
         "config": asked.config and str(asked.config), "noise": asked.noise, "without": asked.without,
         "rate": asked.rate, "start": asked.start, "end": asked.end,
     }  # fmt: skip
-    folder = outputs.output_folder(asked.out)
     if point is not None and export is None:
         raise ConfigError(f"--point {point}: is of the files of --export; name some")
     exported = listed(export, NAMES, "--export", "format to write") if export is not None else ()
+    folder = outputs.output_folder(asked.out, outputs.FILES, () if alone else chosen)
     convert.parse_point(point)
     settings, noise = workflow.parse_noise(asked.noise, read_settings(asked.config, asked.profile))
     request = workflow.Request(
         asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
-        {k: v for k, v in given.items() if v is not None}, noise,
+        {k: v for k, v in given.items() if v is not None}, noise, exported, point,
     )  # fmt: skip
     with bar(asked.quiet, *chosen) as progress:
         outcome = workflow.run_request(request, progress)
         tell("writing")
         with staged(folder) as part:
             files = (outputs.write_run if alone else outputs.write_comparison)(outcome, part)
-            files += convert.export_run(outcome, part, exported, point) if exported else []
-    files = moved(files, part, folder)
+        files = moved(files, part, folder)
+        if exported:  # by itself, so that one that fails takes nothing with it
+            with staged(folder) as part:
+                more = convert.export_run(outcome, part, exported, point)
+            files += moved(more, part, folder)
     verdicts = gates.judge(requirements, outputs.comparison(outcome)) if requirements else []
 
     def values() -> dict[str, Any]:

@@ -73,7 +73,8 @@ def complaint(source: str | Path, error: ValidationError, model: type[BaseModel]
         return f"{where}'{key}': {what}{_meaning(loc, model)}" if key else f"{where}{what}"
     if first["type"] in ("model_type", "model_attributes_type"):
         return f"{where}'{key}' must be a table: [{key}]"
-    return f"{where}'{key}' = {shortened(first['input'])}: {first['msg'][0].lower()}{first['msg'][1:]}{_meaning(loc, model)}"
+    what = f"{first['msg'][0].lower()}{first['msg'][1:]}{_meaning(loc, model)}"
+    return f"{where}'{key}' = {shortened(first['input'])}: {what}"
 
 
 def shortened(value: Any) -> str:

@@ -27,6 +27,7 @@ from graphnav.workflow import Outcome
 
 SUMMARY = "summary.json"  # of the run that wrote a trajectory: its clock and its points
 _DENSE = 20.0  # Hz
+_MOST_ROWS = 2e7
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
 
 
@@ -159,6 +160,8 @@ def at_point(trajectory: Trajectory, arm: Array | None, rate: float | None = Non
         raise RecordingError("--point: the trajectory has no attitude, so no other point of the body can be placed")
     t = trajectory.t
     if rate is not None:
+        if (t[-1] - t[0]) * rate > _MOST_ROWS:
+            raise ConfigError(f"--rate {rate:g}: makes {(t[-1] - t[0]) * rate:.3g} rows, more than {_MOST_ROWS:g}")
         t = np.arange(np.ceil(t[0] * rate - 1e-6), np.floor(t[-1] * rate + 1e-6) + 1) / rate
     moved, _ = interpolate(trajectory, t, max_gap=_MAX_GAP, lever_arm=arm)
     return moved

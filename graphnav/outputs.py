@@ -8,8 +8,9 @@ import math
 import os
 import platform
 import sys
+import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -19,7 +20,8 @@ import numpy as np
 
 import graphnav
 from graphnav.detectors.base import intervals_text
-from graphnav.errors import ConfigError
+from graphnav.errors import ConfigError, PartlyWrittenError
+from graphnav.files import exists
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
@@ -31,8 +33,18 @@ if TYPE_CHECKING:
     from graphnav.page import Raw
 
 
-def output_folder(path: str | Path) -> Path:
+FILES = (
+    "trajectory.csv", "trajectory.kml", "trajectory.tum", "calibration.json", "detections.csv", "summary.json",
+    "report.html", "comparison.csv", "comparison.html",
+)  # fmt: skip
+
+
+def output_folder(path: str | Path, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Path:
     """`path`, sure to be a folder that can be written to or made; it is not made yet.
+
+    Parameters
+    ----------
+    files, folders : what is to be written there: nothing of another kind may be in the way.
 
     Raises
     ------
@@ -41,20 +53,30 @@ def output_folder(path: str | Path) -> Path:
     """
     folder = Path(path)
     there = folder
-    while not there.exists() and there != there.parent:
+    while not exists(there, ConfigError) and there != there.parent:
         there = there.parent
     if not there.is_dir():
         what = "is a file; name a folder to write into" if there == folder else f"cannot be made, {there} is a file"
         raise ConfigError(f"-o {folder}: {what}")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise ConfigError(f"-o {folder}: no permission to write into {there}")
+    try:  # permissions, a file system that cannot be written to, a name that is too long or none: by trying
+        (folder / max(FILES, key=len)).resolve().exists()
+        os.rmdir(tempfile.mkdtemp(prefix=".graphnav-", dir=there))
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise ConfigError(f"-o {folder}: nothing can be written into {there} ({why})") from None
+    for name in files:
+        if (folder / name).is_dir():
+            raise ConfigError(f"-o {folder}: {name} is a folder there, and a file of that name is to be written")
+    for name in folders:
+        if exists(folder / name, ConfigError) and not (folder / name).is_dir():
+            raise ConfigError(f"-o {folder}: {name} is a file there, and a folder of that name is to be written")
     return folder
 
 
 def write_run(outcome: Outcome, folder: Path) -> list[Path]:
     """Everything of the only solver of a run, straight into `folder`; returns the files to look at first."""
     ((name, _),) = outcome.solutions.items()
-    write_solver(outcome, name, folder, _provenance(outcome))
+    _insist(write_solver(outcome, name, folder, _provenance(outcome)))
     return [folder / "report.html", folder / "trajectory.csv", folder / "summary.json"]
 
 
@@ -65,11 +87,12 @@ def write_comparison(outcome: Outcome, folder: Path) -> list[Path]:
 
     provenance = _provenance(outcome)
     detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
+    failed = []
     for name in outcome.solutions:
-        write_solver(outcome, name, folder / name, provenance, detectors)
+        failed += write_solver(outcome, name, folder / name, provenance, detectors)
     write_comparison_csv(folder / "comparison.csv", comparison(outcome))
-    report.write_comparison(
-        folder / "comparison.html",
+    failed += _attempt(lambda path: report.write_comparison(
+        path,
         outcome.recording,
         outcome.solutions,
         settings=outcome.request.settings.model_dump(),
@@ -80,14 +103,21 @@ def write_comparison(outcome: Outcome, folder: Path) -> list[Path]:
         findings=_odd(outcome),
         provenance=provenance,
         noise=noise_rows(outcome, next(iter(outcome.solutions.values()))),
-    )
+    ), folder / "comparison.html")  # fmt: skip
+    _insist(failed)
     return [folder / "comparison.html", folder / "comparison.csv"]
 
 
 def write_solver(
     outcome: Outcome, name: str, folder: Path, provenance: Mapping[str, Any], detectors: Sequence[Raw] | None = None
-) -> None:
-    """The files of one solver; a folder that holds older ones keeps none of them under the same names."""
+) -> list[str]:
+    """The files of one solver; a folder that holds older ones keeps none of them under the same names.
+
+    Returns
+    -------
+    list of str
+        What could not be written, and why: a picture that fails takes no number with it.
+    """
     from graphnav import report
     from graphnav.exporters import write_all
     from graphnav.metrics import summary
@@ -99,8 +129,8 @@ def write_solver(
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
     (folder / "detections.csv").write_text(intervals_text(solution.detections), encoding="utf-8")
     written = time.perf_counter()
-    report.write_report(
-        folder / "report.html",
+    failed = _attempt(lambda path: report.write_report(
+        path,
         outcome.recording,
         solution,
         settings=outcome.request.settings.model_dump(),
@@ -112,9 +142,25 @@ def write_solver(
         provenance=provenance,
         detectors=detectors,
         noise=noise_rows(outcome, solution),
-    )
+    ), folder / "report.html")  # fmt: skip
     spent = {"writing": written - began, "report": time.perf_counter() - written}
     write_json(folder / "summary.json", solver_summary(outcome, name, spent, provenance))
+    return failed
+
+
+def _attempt(write: Callable[[Path], object], path: Path) -> list[str]:
+    """Write a file; what went wrong, if anything did, and then no file."""
+    try:
+        write(path)
+    except Exception as error:
+        path.unlink(missing_ok=True)
+        return [f"{path.name} could not be written ({type(error).__name__}: {error})"]
+    return []
+
+
+def _insist(failed: Sequence[str]) -> None:
+    if failed:
+        raise PartlyWrittenError(f"{'; '.join(failed)}; all other files are there")
 
 
 def solver_summary(

@@ -3,7 +3,8 @@
 Eight characters at a time are one 64-bit word, and three multiplications turn the digits in it into their number,
 for all cells at once. Digits that make a whole number below 2^53, divided by a power of ten up to 10^22, are rounded
 once: the result is the double nearest to what is written, the same that `float` gives (Clinger, "How to read
-floating point numbers accurately", 1990). Cells that are anything else (exponents, nan, more digits) are read one by one.
+floating point numbers accurately", 1990). Cells that are anything else (exponents, nan, more digits) are read
+one by one.
 """
 
 from __future__ import annotations

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphnav.errors import RecordingError
-from graphnav.formats.repair import LATEST, VAGUEST, VAGUEST_V, on_earth
 from graphnav.formats.registry import Log
+from graphnav.formats.repair import LATEST, VAGUEST, VAGUEST_V, on_earth
 from graphnav.recording import Gnss, rows_of
 
 
@@ -24,7 +26,7 @@ def sound(log: Log, path: Path) -> Log:
     remarks = list(log.remarks)
     imu, gnss, odometer, truth = log.imu, log.gnss, log.odometer, log.truth
 
-    def kept(what: str, good: np.ndarray, why: str) -> bool:
+    def kept(what: str, good: NDArray[np.bool_], why: str) -> bool:
         if good.all():
             return True
         if good.sum() < (2 if what == "IMU" else 1):
@@ -50,12 +52,11 @@ def sound(log: Log, path: Path) -> Log:
     return replace(log, imu=imu, gnss=gnss, odometer=odometer, truth=truth, remarks=tuple(remarks))
 
 
-def _sound_gnss(gnss: Gnss, kept: object) -> Gnss:
+def _sound_gnss(gnss: Gnss, kept: Callable[[str, NDArray[np.bool_], str], bool]) -> Gnss:
     """The fixes that are somewhere, and as sure of it as any receiver is that has a fix."""
-    there = on_earth(*gnss.llh.T) & (np.abs(gnss.t) <= LATEST)
+    there: NDArray[np.bool_] = np.asarray(on_earth(*gnss.llh.T) & (np.abs(gnss.t) <= LATEST))
     first = gnss.llh[~there][:1]
     at = "".join(f" (the first at {np.degrees(p[0]):.7g}, {np.degrees(p[1]):.7g} deg, {p[2]:.7g} m)" for p in first)
-    assert callable(kept)
     if not kept("GNSS", there, f"are nowhere on Earth or at no time{at}"):
         gnss = rows_of(gnss, there)
     sure = ((gnss.sd > 0.0) & (gnss.sd <= VAGUEST)).all(axis=1)

@@ -265,4 +265,3 @@ def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: is not UTF-8 text") from None
     return np.array(rows, dtype=float).reshape(-1, len(use))
-

@@ -97,8 +97,9 @@ def _build(
             raise RecordingError(
                 f"{path}, line {numbers[k]}, {('lat', 'lon')[axis]}: {position[k, axis] / _DEG:.6f} deg is out of range"
             )
-    if (bad := np.isinf(position).any(axis=1)).any():
-        raise RecordingError(f"{path}, line {numbers[bad][0]}: a position that is infinite")
+    if np.isinf(position).any():
+        k = int(np.flatnonzero(np.isinf(position).any(axis=1))[0])
+        raise RecordingError(f"{path}, line {numbers[k]}: a position that is infinite")
     usable = np.isfinite(position[:, :2]).all(1) if local else np.isfinite(position).all(1)
     fresh = np.concatenate([[True], np.diff(t) > 0])
     if not usable.all():

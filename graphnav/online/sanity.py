@@ -107,8 +107,8 @@ def _near(dt: float, dp: Array) -> bool:
 class Clock:
     """Notices that the clock of the IMU was set back.
 
-    Rows at times that have passed are late, or sent again, or of a clock that was set back. Late ones fill a hole, those
-    sent again are as they were (a row of every second is remembered), and neither goes on and on.
+    Rows at times that have passed are late, or sent again, or of a clock that was set back. Late ones fill a hole,
+    those sent again are as they were (a row of every second is remembered), and neither goes on and on.
     """
 
     _seconds: dict[int, tuple[float, ...]] = field(default_factory=dict)  # the first row of each second

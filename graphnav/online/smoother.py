@@ -382,7 +382,8 @@ class Smoother:
             if rows.any():
                 assert self.frame is not None
                 track = to_trajectory("online", self.frame, part.t[rows], part.states[rows], part.covariance[rows])
-                if not all(np.isfinite(x).all() for x in (track.llh, track.v, track.rph, track.sd_p)):
+                known = (track.llh, track.v, track.rph, track.sd_p, track.sd_v, track.sd_rph)
+                if not all(x is None or np.isfinite(x).all() for x in known):
                     raise FloatingPointError("states that are not finite")
                 self._settled.append(track)
                 self._last_settled = float(part.t[-1])

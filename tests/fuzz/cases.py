@@ -17,7 +17,7 @@ import tempfile
 import time
 import tomllib
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, reduce
 from operator import xor
@@ -45,7 +45,7 @@ from graphnav.recording import Recording
 from graphnav.trajectory import Trajectory
 
 KINDS = ("right", "refused", "traceback", "hang", "silent wrong")
-SECONDS = 10.0
+SECONDS = 10.0  # of a processor
 QUICK = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
 _LONGEST = 2000  # characters of a sentence
 
@@ -399,7 +399,9 @@ def of_stream(folder: Path, chance: random.Random) -> None:
     session = Session(QUICK, "-", folder / "out")
     lines = mutators.stream(live(), chance)
     if chance.random() < 0.1:
-        lines[0] = mutators.value(lines[0].replace(", ", ",\n").encode(), chance).decode("utf-8", "replace").replace("\n", "")
+        lines[0] = (
+            mutators.value(lines[0].replace(", ", ",\n").encode(), chance).decode("utf-8", "replace").replace("\n", "")
+        )
     try:
         session.add_lines(lines)
         session.finish()
@@ -416,7 +418,9 @@ def of_stream(folder: Path, chance: random.Random) -> None:
 
 def of_usage(folder: Path, chance: random.Random) -> None:
     """Options that make no sense."""
-    command = chance.choice(("info", "smooth", "compare", "detect", "evaluate", "convert", "allan", "settings", "simulate"))
+    command = chance.choice(
+        ("info", "smooth", "compare", "detect", "evaluate", "convert", "allan", "settings", "simulate")
+    )
     options = ["--rate", "--start", "--end", "--without", "--solver", "--solvers", "--export", "--point", "--require",
                "--noise", "--profile", "--config", "--clock", "--format", "--set", "--seed", "-o"]  # fmt: skip
     arguments: list[str] = [command, chance.choice((str(seeds() / "absent"), nasty_word(chance)))]
@@ -460,11 +464,11 @@ def sane(log: Any) -> None:
 
 
 TARGETS: dict[str, tuple[Callable[[Path, random.Random], None], int]] = {
-    "recording": (of_recording, 14), "description": (of_description, 8), "info": (of_info, 2), "settings": (of_settings, 14),
-    "noise": (of_noise, 8), "kf-gins": (of_kf_gins, 10), "rtklib": (of_rtklib, 5), "nmea": (of_nmea, 8),
-    "ubx": (of_ubx, 8), "ubx sensors": (of_ubx_sensors, 1), "kitti-raw": (of_kitti, 4), "trajectory": (of_trajectory, 12),
-    "evaluation": (of_evaluation, 4), "export": (of_export, 4), "draft": (of_draft, 1), "usage": (of_usage, 5),
-    "solution": (of_solution, 1), "stream": (of_stream, 1),
+    "recording": (of_recording, 14), "description": (of_description, 8), "info": (of_info, 2),
+    "settings": (of_settings, 14), "noise": (of_noise, 8), "kf-gins": (of_kf_gins, 10), "rtklib": (of_rtklib, 5),
+    "nmea": (of_nmea, 8), "ubx": (of_ubx, 8), "ubx sensors": (of_ubx_sensors, 1), "kitti-raw": (of_kitti, 4),
+    "trajectory": (of_trajectory, 12), "evaluation": (of_evaluation, 4), "export": (of_export, 4),
+    "draft": (of_draft, 1), "usage": (of_usage, 5), "solution": (of_solution, 1), "stream": (of_stream, 1),
 }  # fmt: skip
 
 
@@ -480,9 +484,10 @@ def play(number: int, folder: Path, target: str | None = None) -> Result:
     at = folder / f"case-{number}"
     at.mkdir()
     chance = random.Random(f"{target} {number}")
-    before = signal.signal(signal.SIGALRM, _stop)
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
-    began = time.perf_counter()
+    before = [signal.signal(what, _stop) for what in (signal.SIGPROF, signal.SIGALRM)]
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)  # of work, which other programs do not lengthen
+    signal.setitimer(signal.ITIMER_REAL, 10.0 * SECONDS)  # of waiting for what never comes
+    began = time.process_time()
     kind, said = "right", ""
     try:
         TARGETS[target][0](at, chance)
@@ -499,10 +504,12 @@ def play(number: int, folder: Path, target: str | None = None) -> Result:
             raise
         kind, said = "traceback", "".join(traceback.format_exception(error))[-1500:]
     finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        for what, handler in zip((signal.SIGPROF, signal.SIGALRM), before, strict=True):
+            signal.signal(what, handler)
         shutil.rmtree(at, ignore_errors=True)
-    return Result(target, number, kind, said, time.perf_counter() - began)
+    return Result(target, number, kind, said, time.process_time() - began)
 
 
 def _stop(*_: object) -> None:

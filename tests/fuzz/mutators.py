@@ -176,7 +176,9 @@ def _value(chance: Chance) -> str:
     if how == 3:
         return "{ a = 1 }" if chance.random() < 0.5 else "{a: 1}"
     if how == 4:
-        return chance.choice(("2022-13-45", "2022-10-10", "07:99:00", "true", "null", "~", "!!python/object:os.system", "&a 1"))
+        return chance.choice(
+            ("2022-13-45", "2022-10-10", "07:99:00", "true", "null", "~", "!!python/object:os.system", "&a 1")
+        )
     return nasty(chance)
 
 

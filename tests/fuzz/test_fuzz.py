@@ -1,4 +1,4 @@
-"""A thousand spoilt files: none ends in a traceback, hangs, or is read as something else. scripts/fuzz.py makes more."""
+"""A thousand spoilt files: none ends in a traceback, hangs, or is misread; scripts/fuzz.py makes more."""
 
 from __future__ import annotations
 
