@@ -31,6 +31,9 @@ def read_toml(path: Path, error: type[GraphnavError]) -> tuple[dict[str, Any], s
     """
     text = read_text(path, error)
     try:
+        # keys of thousands of parts take the parser minutes
+        if any(line.partition("=")[0].count(".") > 2 * _DEEPEST for line in text.splitlines()):
+            raise RecursionError
         values = tomllib.loads(text)
         for key, value in _leaves(values):
             if isinstance(value, int) and not -(2**63) <= value < 2**63:

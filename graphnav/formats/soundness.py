@@ -59,12 +59,12 @@ def _sound_gnss(gnss: Gnss, kept: Callable[[str, NDArray[np.bool_], str], bool])
     at = "".join(f" (the first at {np.degrees(p[0]):.7g}, {np.degrees(p[1]):.7g} deg, {p[2]:.7g} m)" for p in first)
     if not kept("GNSS", there, f"are nowhere on Earth or at no time{at}"):
         gnss = rows_of(gnss, there)
-    sure = ((gnss.sd > 0.0) & (gnss.sd <= VAGUEST)).all(axis=1)
+    sure: NDArray[np.bool_] = np.asarray(((gnss.sd > 0.0) & (gnss.sd <= VAGUEST)).all(axis=1))
     if not kept("GNSS", sure, f"have a sigma that is not above 0 or beyond {VAGUEST:g} m"):
         gnss = rows_of(gnss, sure)
     if gnss.v is None or gnss.sd_v is None:
         return gnss
     with np.errstate(invalid="ignore"):
         known = np.isfinite(gnss.v) & (np.abs(gnss.v) <= VAGUEST_V) & (gnss.sd_v > 0.0) & (gnss.sd_v <= VAGUEST_V)
-    blank = ~known.all(axis=1)
-    return replace(gnss, v=np.where(blank[:, None], np.nan, gnss.v), sd_v=np.where(blank[:, None], np.nan, gnss.sd_v))
+    blank = ~np.asarray(known.all(axis=1))[:, None]
+    return replace(gnss, v=np.where(blank, np.nan, gnss.v), sd_v=np.where(blank, np.nan, gnss.sd_v))

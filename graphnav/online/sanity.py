@@ -138,18 +138,20 @@ class Clock:
 
     def hold(self, row: Row) -> bool:
         """Hold a row at a time that has passed; True once these are of a clock that was set back."""
-        _, t, values = row
-        imu = [one for one in self.behind if one[0] == "imu"]
-        if row[0] == "imu":
-            if imu and t <= imu[-1][1]:
-                self.behind, self._again, imu = [one for one in self.behind if one[0] != "imu"][-_HELD:], False, []
+        sensor, t, values = row
+        times = [one[1] for one in self.behind if one[0] == "imu"]
+        if sensor == "imu":
+            if t in times:
+                return False  # sent twice
+            if times and t < max(times) - _LASTING:  # behind these, too
+                self.behind, self._again, times = [one for one in self.behind if one[0] != "imu"][-_HELD:], False, []
             self._again |= self._seconds.get(int(t), ()) == (t, *values)
-            imu.append(row)
+            times.append(t)
         self.behind.append(row)
         if self._again:
-            self.behind = [row] if row[0] == "imu" else []
+            self.behind = [row] if sensor == "imu" else []
             return False
-        return len(imu) >= _SET_BACK and imu[-1][1] - imu[0][1] >= _LASTING
+        return len(times) >= _SET_BACK and max(times) - min(times) >= _LASTING
 
     def go_on(self) -> list[Row]:
         """Time goes on as before: the fixes and readings that were held, to be taken in now."""
