@@ -23,13 +23,14 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
-import oracle
 
-from graphnav.formats.trajectories import read_trajectory
-from graphnav.online import Row, rows_of
-from graphnav.online.lines import END, head_of, line_of
-from graphnav.recording import Recording
-from graphnav.simulation import simulate
+import oracle  # noqa: E402
+
+from graphnav.formats.trajectories import read_trajectory  # noqa: E402
+from graphnav.online import Row, rows_of  # noqa: E402
+from graphnav.online.lines import END, head_of, line_of  # noqa: E402
+from graphnav.recording import Recording  # noqa: E402
+from graphnav.simulation import simulate  # noqa: E402
 
 RATE = {"car": 50.0, "foot": 100.0}  # Hz
 LAP = 600.0  # s
@@ -88,7 +89,7 @@ def spoilt(rows: list[Row], rng: random.Random) -> list[Row]:
     fix = next((values for sensor, _, values in rows if sensor == "gnss"), None)
     blank, since, before = (float("nan"),) * 6, 0.0, rows[0][1]
     for k, row in enumerate(rows):
-        sensor, t, values = row
+        sensor, t, _ = row
         since += min(max(t - before, 0.0), 1.0)
         before = t
         if since >= minute:

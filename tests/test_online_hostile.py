@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +14,13 @@ import oracle
 import pytest
 from test_online import off, played, same
 
+import graphnav
 from graphnav.config import settings_from
-from graphnav.errors import RecordingError
+from graphnav.errors import ConfigError, RecordingError
 from graphnav.formats.trajectories import read_trajectory
 from graphnav.online import Online, Row, Session, rows_of, smoother, without_rows
 from graphnav.online.lines import HEAD, line_of, lines_of, setup_of
+from graphnav.online.store import _MAGIC, Store
 from graphnav.online.tracker import Tracker
 from graphnav.recording import Recording
 from graphnav.trajectory import Trajectory
@@ -238,3 +242,35 @@ def test_rows_are_numbers_in_ascii_digits(drive: tuple[Recording, Trajectory]) -
     session = Session(QUICK, "-")
     session.add_lines([next(lines_of(drive[0]))[1], "I,1_0,0,0,0,0,0,9.8", "O,1,\uff11", "I,1,0,0,0,0,0,9.8"])
     assert session.bad == 2
+
+
+class _Call:
+    """What a pickle of a stranger calls when it is read."""
+
+    def __init__(self, what: object, *arguments: object) -> None:
+        self.what, self.arguments = what, arguments
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return self.what, self.arguments
+
+
+def test_a_checkpoint_of_a_stranger_runs_nothing(drive: tuple[Recording, Trajectory], tmp_path: Path) -> None:
+    """With the right digest, calling what is not graphnav's own data."""
+    lines = [line for _, line in lines_of(drive[0])]
+    session = Session(QUICK, "-", tmp_path / "out")
+    session.add_lines(lines[: len(lines) * 9 // 10])
+    session.stop()
+    session.close()
+    Session(QUICK, "-", tmp_path / "out", resume=True).close()  # as it was written it can be read
+    for call in (
+        _Call(os.system, f"touch {tmp_path / 'owned'}"),
+        _Call(Path.touch, tmp_path / "owned"),
+        _Call(Store, tmp_path / "owned", "-", False, True),
+        _Call(eval, f"open({str(tmp_path / 'owned')!r}, 'w')"),
+        _Call(graphnav.__getattr__, "run"),
+    ):
+        body = pickle.dumps(call)
+        (tmp_path / "out" / "checkpoint").write_bytes(_MAGIC + hashlib.sha256(body).digest() + body)
+        with pytest.raises(ConfigError, match="checkpoint"):
+            Session(QUICK, "-", tmp_path / "out", resume=True)
+        assert not (tmp_path / "owned").exists()
