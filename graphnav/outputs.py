@@ -58,7 +58,9 @@ def output_folder(path: str | Path, files: Sequence[str] = (), folders: Sequence
     if not there.is_dir():
         what = "is a file; name a folder to write into" if there == folder else f"cannot be made, {there} is a file"
         raise ConfigError(f"-o {folder}: {what}")
-    try:  # permissions, a file system that cannot be written to, a name that is too long or none: by trying
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ConfigError(f"-o {folder}: no permission to write into {there}")
+    try:  # a file system that cannot be written to, a name that is too long or none: by trying
         (folder / max(FILES, key=len)).resolve().exists()
         os.rmdir(tempfile.mkdtemp(prefix=".graphnav-", dir=there))
     except (OSError, ValueError) as error:
