@@ -32,7 +32,7 @@ NAN = (float("nan"),) * 6
 @pytest.fixture(scope="module")
 def drive() -> tuple[Recording, Trajectory]:
     recording, truth = oracle.drive(oracle.vehicle_path(130.0, 25.0), seed=3, odometer_rate=5.0)
-    return recording.crop(15.0, 65.0), truth
+    return recording.crop(20.0, 64.0), truth
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +56,8 @@ def test_rows_that_nothing_can_have_sent_change_nothing(
 ) -> None:
     fix = next(values for sensor, t, values in rows if sensor == "gnss" and t > 40.0)
     wild: list[Row] = []
-    for k in range(45):  # every second, from before there is any state
-        t = 17.513 + k
+    for k in range(36):  # every second, from before there is any state
+        t = 22.513 + k
         imu = (1e6, 1e300, -1e300, 71.0)[k % 4]
         wild += [("imu", t, (0.0, 0.0, imu, 0.0, 0.0, 9.8)), ("imu", t + 1e-3, (0.0, 0.0, 0.0, 0.0, 1e3 * imu, 9.8))]
         wild.append(("odometer", t, ((1e300, -1e300, 151.0)[k % 3], *NAN[:5])))
@@ -68,22 +68,23 @@ def test_rows_that_nothing_can_have_sent_change_nothing(
     online, track = played(drive[0], between(rows, wild), QUICK)
     same(track, plain)
     counts = online.sensors.counts
-    assert counts["imu: beyond any sensor"] + counts["imu: not a number"] == 90
-    assert counts["odometer: beyond any sensor"] == 45
-    assert sum(n for key, n in counts.items() if key.startswith("gnss: ")) == 90
+    assert counts["imu: beyond any sensor"] + counts["imu: not a number"] == 72
+    assert counts["odometer: beyond any sensor"] == 36
+    assert sum(n for key, n in counts.items() if key.startswith("gnss: ")) == 72
     assert online.failures == []
 
 
-def test_a_velocity_that_no_vehicle_has_leaves_its_fix(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
-    without = [(s, t, v if s != "gnss" else (*v[:6], *NAN)) for s, t, v in rows]
+def test_a_velocity_that_no_vehicle_has_leaves_its_fix(
+    drive: tuple[Recording, Trajectory], rows: list[Row], plain: Trajectory
+) -> None:
     bad = (1e300, 0.0, 0.0, 0.1, 0.1, 0.1)
     wild = [(s, t, v if s != "gnss" else (*v[:6], *bad)) for s, t, v in rows]
     online, track = played(drive[0], wild, QUICK)
-    same(track, played(drive[0], without, QUICK)[1])
-    assert online.sensors.counts["gnss"] > 40
+    same(track, plain)
+    assert online.sensors.counts["gnss"] == sum(row[0] == "gnss" for row in rows)
 
 
-@pytest.mark.parametrize("k", [0, 1, 40])
+@pytest.mark.parametrize("k", [0, 30])
 def test_a_fix_far_off_is_left_out_wherever_it_comes(
     drive: tuple[Recording, Trajectory], rows: list[Row], k: int
 ) -> None:
@@ -121,26 +122,27 @@ def test_a_clock_that_is_set_back_begins_a_piece(
 
 
 def test_a_clock_set_back_by_seconds_is_noticed_before_it_spoils_anything(
-    drive: tuple[Recording, Trajectory], rows: list[Row], plain: Trajectory
+    drive: tuple[Recording, Trajectory], rows: list[Row]
 ) -> None:
     """Rows of another moment between those that are there would be read as one motion."""
     back = [(sensor, t - 20.0, values) for sensor, t, values in rows if t > 55.0]
     online, track = played(drive[0], [*(row for row in rows if row[1] <= 55.0), *back], QUICK)
     assert online.clocks == 2
     assert online.failures == []
-    early = played(drive[0], [row for row in rows if row[1] <= 55.0], QUICK)[1]
-    np.testing.assert_allclose((track.llh[: len(early)] - early.llh) * [6.4e6, 6.4e6, 1.0], 0.0, atol=1e-3)
+    old = track.t[: int(np.argmax(np.diff(track.t) < 0)) + 1] if np.any(np.diff(track.t) < 0) else track.t
+    error, sd = off(track.take(np.arange(len(old))), drive[1], drive[0])
+    assert old[-1] == pytest.approx(55.0, abs=0.05)
+    assert np.abs(error / sd).max() < 6.0
 
 
 def test_a_source_that_begins_again_is_no_other_clock(
     drive: tuple[Recording, Trajectory], rows: list[Row], plain: Trajectory
 ) -> None:
     """A sender that was cut off sends all from its start, or from ten seconds before."""
-    half = len(rows) // 2
-    for begin in (0, half - 300):
-        online, track = played(drive[0], [*rows[:half], *rows[begin:]], QUICK)
-        assert online.clocks == 1
-        same(track, plain)
+    half, more = len(rows) // 2, len(rows) * 3 // 4
+    online, track = played(drive[0], [*rows[:half], *rows[:more], *rows[more - 300 :]], QUICK)
+    assert online.clocks == 1
+    same(track, plain)
 
 
 def test_a_first_stamp_far_ahead_does_not_stop_the_clock(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:

@@ -464,11 +464,11 @@ def sane(log: Any) -> None:
 
 
 TARGETS: dict[str, tuple[Callable[[Path, random.Random], None], int]] = {
-    "recording": (of_recording, 14), "description": (of_description, 8), "info": (of_info, 2),
-    "settings": (of_settings, 14), "noise": (of_noise, 8), "kf-gins": (of_kf_gins, 10), "rtklib": (of_rtklib, 5),
-    "nmea": (of_nmea, 8), "ubx": (of_ubx, 8), "ubx sensors": (of_ubx_sensors, 1), "kitti-raw": (of_kitti, 4),
-    "trajectory": (of_trajectory, 12), "evaluation": (of_evaluation, 4), "export": (of_export, 4),
-    "draft": (of_draft, 1), "usage": (of_usage, 5), "solution": (of_solution, 1), "stream": (of_stream, 1),
+    "recording": (of_recording, 28), "description": (of_description, 16), "info": (of_info, 3),
+    "settings": (of_settings, 28), "noise": (of_noise, 16), "kf-gins": (of_kf_gins, 20), "rtklib": (of_rtklib, 10),
+    "nmea": (of_nmea, 16), "ubx": (of_ubx, 16), "ubx sensors": (of_ubx_sensors, 1), "kitti-raw": (of_kitti, 8),
+    "trajectory": (of_trajectory, 24), "evaluation": (of_evaluation, 8), "export": (of_export, 8),
+    "draft": (of_draft, 2), "usage": (of_usage, 10), "solution": (of_solution, 1), "stream": (of_stream, 1),
 }  # fmt: skip
 
 
