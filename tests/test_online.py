@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import runpy
 import signal
 import socket
 import subprocess
@@ -508,18 +509,22 @@ def test_the_view_says_what_is_going_on(drive: tuple[Recording, Trajectory], row
     assert "nhc" in said["in force"]
 
 
-def test_bad_usage_is_one_line_and_code_two(tmp_path: Path) -> None:
+def test_bad_usage_is_one_line_and_code_two(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    main = runpy.run_path(str(SCRIPT))["main"]
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # the handlers of the tests stay
     for arguments, reason in (
-        (["no-such-thing"], b"no-such-thing"),
-        (["-", "--resume"], b"say which folder"),
-        (["-", "--lag", "0"], b"at least 1 s"),
-        (["tcp:x"], b"cannot listen"),
+        (["no-such-thing"], "no-such-thing"),
+        (["-", "--resume"], "say which folder"),
+        (["-", "--lag", "0"], "at least 1 s"),
+        (["tcp:x"], "cannot listen"),
     ):
-        process = program(*arguments, stdin=subprocess.DEVNULL)
-        _, error = process.communicate(timeout=60)
-        assert process.returncode == 2
+        monkeypatch.setattr(sys, "argv", ["online.py", *arguments])
+        assert main() == 2
+        error = capsys.readouterr().err
         assert reason in error
-        assert error.count(b"\n") == 1
+        assert error.count("\n") == 1
 
 
 def test_a_source_without_its_first_line_is_refused() -> None:
