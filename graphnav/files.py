@@ -27,7 +27,7 @@ from graphnav.errors import ConfigError, GraphnavError, RecordingError
 MAX_FILE, MAX_LINE = "GRAPHNAV_MAX_FILE_MB", "GRAPHNAV_MAX_LINE_KB"
 _DEFAULTS = {MAX_FILE: 2000, MAX_LINE: 1000}
 _WRITTEN = 64 << 20  # bytes of a file that people or programs write as a whole: settings, descriptions, summaries
-_RATIO, _SMALL = 200, 64 << 20  # a log packs to a tenth or so; below so many bytes it does not matter
+_RATIO, _SMALL = 200, 8 << 20  # a log packs to a tenth or so; below so many bytes it does not matter
 _CHUNK = 1 << 16
 _GZIP = b"\x1f\x8b"
 

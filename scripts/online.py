@@ -42,6 +42,9 @@ def main() -> int:
     parser.add_argument("--send", action="store_true", help="print the recording as lines instead of smoothing it")
     parser.add_argument("--config", type=Path, help="settings, TOML")
     parser.add_argument("--lag", type=float, help="s of future that a settled state has seen")
+    parser.add_argument(
+        "--allow-outside", action="store_true", help="read what RECORDING names outside its folder, too"
+    )
     parser.add_argument("--quiet", action="store_true", help="no view")
     options = parser.parse_args()
     try:
@@ -59,7 +62,7 @@ def main() -> int:
 def send(options: argparse.Namespace) -> int:
     """Print a recording's lines, as its sensors would have sent them."""
     pace = Pace(options.speed)
-    for t, line in lines_of(read(options.source)):
+    for t, line in lines_of(read(options.source, options.allow_outside)):
         pace.wait(t)
         print(line, flush=options.speed > 0)
     return 0
@@ -76,7 +79,7 @@ def smooth(options: argparse.Namespace) -> int:
         raise ConfigError("--resume: say which folder to go on in: -o OUT")
     folder = None if options.out is None else output_folder(options.out)
     live = options.source == "-" or options.source.startswith("tcp:")
-    recording = None if live else read(options.source)
+    recording = None if live else read(options.source, options.allow_outside)
     session = Session(settings, options.source, folder, options.resume, recording)
     shown, asked = Shown(session, options.quiet), Asked()
     try:

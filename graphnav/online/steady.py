@@ -10,6 +10,8 @@ from graphnav.online.sensors import Row
 from graphnav.online.smoother import Smoother
 from graphnav.recording import Recording
 
+_MOST = 100  # failures that are remembered
+
 
 class Online(Smoother):
     """Smooths while the drive happens.
@@ -52,7 +54,8 @@ class Online(Smoother):
         """Drop the piece that is being smoothed, and begin anew with what comes."""
         now = self.sensors.imu.newest
         at = traceback.extract_tb(error.__traceback__)[-1]
-        self.failures.append(f"at {now:.3f} s: {type(error).__name__}: {error} in {Path(at.filename).name}:{at.lineno}")
+        said = f"at {now:.3f} s: {type(error).__name__}: {error} in {Path(at.filename).name}:{at.lineno}"
+        self.failures = [*self.failures[-_MOST:], said]
         since = self._last_settled
         self.notes.append(
             f"at {now:.3f} s the smoother failed ({type(error).__name__}); what had not settled"
