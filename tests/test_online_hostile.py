@@ -6,13 +6,15 @@ import hashlib
 import json
 import os
 import pickle
+import runpy
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import oracle
 import pytest
-from test_online import off, played, same
+from test_online import SCRIPT, off, played, same
 
 import graphnav
 from graphnav.config import settings_from
@@ -276,3 +278,21 @@ def test_a_checkpoint_of_a_stranger_runs_nothing(drive: tuple[Recording, Traject
         with pytest.raises(ConfigError, match="checkpoint"):
             Session(QUICK, "-", tmp_path / "out", resume=True)
         assert not (tmp_path / "owned").exists()
+
+
+def test_a_line_that_never_ends_is_one_bad_line(drive: tuple[Recording, Trajectory]) -> None:
+    """Sixteen megabytes of it, and then the drive."""
+    online = runpy.run_path(str(SCRIPT))
+    session, held = Session(QUICK, "-"), []
+
+    class Quiet:
+        def now_and_then(self, silent: float = 0.0) -> None:
+            held.append(tracemalloc.get_traced_memory()[1])
+
+    head, *lines = [line.encode() + b"\n" for _, line in lines_of(drive[0])][:200]
+    tracemalloc.start()
+    online["follow"](session, iter([head, *[b"1" * (1 << 20)] * 16, b"\n", b"".join(lines)]), Quiet(), False)
+    tracemalloc.stop()
+    assert session.bad == 1
+    assert session.taken == len(lines)
+    assert max(held) < 8 << 20
