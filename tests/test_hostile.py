@@ -246,6 +246,15 @@ def test_times_beyond_any_date(tmp_path: Path, capsys: pytest.CaptureFixture[str
     refused(capsys, "convert", tmp_path / "x.csv", "-o", tmp_path / "x.gpx")
 
 
+def test_rows_shorter_than_the_header_are_told_whichever_columns_are_used(tmp_path: Path) -> None:
+    """A header that ran into a row: its first names are whole, and what stands below them is not theirs for sure."""
+    write_small(tmp_path)
+    lines = (tmp_path / "truth.csv").read_text().splitlines()
+    (tmp_path / "truth.csv").write_text("\n".join([f"{lines[0]},ve0.1,62.0", *lines[1:], ""]))
+    with pytest.raises(RecordingError, match=r"truth\.csv, line 2"):
+        read(tmp_path)
+
+
 # ----------------------------------------------------------------------------------------- no hangs, little memory
 def test_pipes_and_devices_are_not_waited_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_small(tmp_path)

@@ -204,31 +204,31 @@ def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> Array:
         pass
     try:
         with _open(path) as file:
-            values = _loadtxt(io.StringIO(_BLANK.sub("nan", file.read())), skip, header, use)
+            text = file.read()
+        values = _loadtxt(text, skip, header, use)
     except ValueError:
         values = _parse_cells(path, header, use)
     return np.ascontiguousarray(values.T)
 
 
-def _loadtxt(source: io.StringIO, skip: int, header: list[str], use: list[int]) -> Array:
-    # Without usecols NumPy checks that no row is longer than the others; with it, only that none is too short.
-    everything = len(use) == len(header)
+def _loadtxt(text: str, skip: int, header: list[str], use: list[int]) -> Array:
+    # With usecols NumPy checks only that no row is too short for those.
+    for line in text.splitlines()[skip:]:
+        cells = line.partition("#")[0].strip()
+        if cells and cells.count(",") != len(header) - 1:
+            raise ValueError("rows and header differ in length")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # no rows: said by the caller
         values = np.loadtxt(
-            source,
+            io.StringIO(_BLANK.sub("nan", text)),
             delimiter=",",
             comments="#",
             skiprows=skip,
-            usecols=None if everything else use,
+            usecols=use,
             ndmin=2,
             encoding="utf-8",
         )
-    if not everything or not len(values):
-        return values.reshape(-1, len(use))
-    if values.shape[1] != len(header):
-        raise ValueError("rows and header differ in length")
-    return values[:, use]
+    return values.reshape(-1, len(use))
 
 
 def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
