@@ -107,6 +107,17 @@ def test_nmea_fields_that_are_no_numbers(tmp_path: Path, field: int) -> None:
     assert np.abs(np.degrees(log.gnss.llh[:, 0])).max() <= 90.0
 
 
+@pytest.mark.parametrize("kind", ["GGA", "GST", "RMC", "VTG", "ZDA"])
+def test_nmea_sentences_that_end_early(tmp_path: Path, kind: str) -> None:
+    path = logs.write_nmea(tmp_path / "a.nmea", logs.simulated(5.0)[0])
+    whole = path.read_text()
+    short = [logs.sentence(f"GN{kind},235959.00" + ",1" * n) for n in range(10)]
+    path.write_text("".join(short) + whole + "".join(short))
+    log = load(path)
+    path.write_text(whole)
+    assert np.isin(load(path).gnss.t, log.gnss.t).all()
+
+
 @pytest.fixture
 def kf_gins(tmp_path: Path) -> Path:
     return logs.write_kf_gins(tmp_path, *logs.simulated(5.0)) / "kf-gins.yaml"

@@ -131,7 +131,7 @@ def _epochs(path: Path, pynmea: Any) -> tuple[list[_Epoch], list[int], int]:
             continue
         try:
             _note(epochs[-1], kind, message)
-        except (TypeError, ValueError):  # a field that is no number, in a sentence whose checksum is right
+        except (AttributeError, TypeError, ValueError):  # no number, or no field, where the checksum is right
             broken.append(number)
     return epochs, broken, count
 
@@ -153,7 +153,8 @@ def _note(epoch: _Epoch, kind: bytes, message: Any) -> None:
         epoch.date = message.date if isinstance(message.date, datetime.date) else None
     elif kind == b"ZDA":
         try:
-            epoch.date = datetime.date(int(message.year), int(message.month), int(message.day))
+            date = datetime.date(int(message.year), int(message.month), int(message.day))
+            epoch.date = date if date.year >= 1980 else None  # before there was GPS
         except (TypeError, ValueError):
             epoch.date = None
     elif epoch.speed is None and (message.sogk != "" or message.sogn != ""):
