@@ -56,7 +56,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         session(head, plain, Path(folder) / "plain", [], options.lag)
         step = len(hostile) / (KILLS + 1)
-        kills = sorted(int(step * (k + rng.uniform(0.7, 1.3))) for k in range(1, KILLS + 1))
+        kills = sorted(int(step * (k - 1 + rng.uniform(0.7, 1.3))) for k in range(1, KILLS + 1))
         session(head, hostile, Path(folder) / "hostile", kills, options.lag)
         return compare(Path(folder) / "plain", Path(folder) / "hostile")
 
