@@ -17,6 +17,7 @@ import typer
 from graphnav import __version__, cli_logs, cli_online, cli_solve
 from graphnav.cli_options import (
     SEVERAL,
+    AllowOutside,
     Config,
     End,
     Json,
@@ -32,6 +33,7 @@ from graphnav.cli_options import (
     withheld_of,
 )
 from graphnav.errors import GraphnavError
+from graphnav.files import outside_allowed
 from graphnav.progress import tell
 from graphnav.talk import (
     BAD_INPUT,
@@ -86,6 +88,7 @@ def info(
         bool, typer.Option("--quick", help="Leave out what takes solving: the signs of lever arms.")
     ] = False,
     topic: Topic = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -95,7 +98,7 @@ def info(
 
     with bar(quiet, "ekf" if antenna else "info"):
         tell("reading")
-        whole = read(only(context, recording), topic or ())
+        whole = read(only(context, recording), topic or (), allow_outside)
         tell("checks")
         found = inspect(whole)
         from graphnav.lever_arm import find_antenna, reversed_arms
@@ -115,6 +118,7 @@ def detect(
     start: Start = None,
     end: End = None,
     topic: Topic = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -128,7 +132,7 @@ def detect(
     withheld = withheld_of(without, start, end)
     settings = read_settings(config)
     folder = outputs.output_folder(out)
-    with bar(quiet, "detect"):
+    with bar(quiet, "detect"), outside_allowed(allow_outside):
         tell("reading")
         used, said = screened(workflow.read_part(only(context, recording), start, end, withheld, tuple(topic or ())))
         tell("detection")
@@ -154,6 +158,7 @@ def evaluate(
         Path | None, typer.Option("-o", "--out", metavar="OUT", help="Folder for evaluation.json and errors.csv.")
     ] = None,
     require: Require = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -165,7 +170,7 @@ def evaluate(
 
     requirements = [gates.parse_requirement(one) for one in require or ()]
     folder = None if out is None else outputs.output_folder(out)
-    with bar(quiet, "evaluate"):
+    with bar(quiet, "evaluate"), outside_allowed(allow_outside):
         tell("reading")
         metrics = compared(trajectory, truth)
     values = {"trajectory": str(trajectory), "truth": str(truth), **summary(metrics)}

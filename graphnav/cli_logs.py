@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
-from graphnav.cli_options import Export, Json, Point, Quiet, Topic
+from graphnav.cli_options import AllowOutside, Export, Json, Point, Quiet, Topic
 from graphnav.errors import ConfigError
+from graphnav.files import outside_allowed
 from graphnav.progress import tell
 from graphnav.talk import bar, say, show
 
@@ -34,6 +35,7 @@ def convert(
         typer.Option("--clock", metavar="TEXT", help="Trajectory: unix, 'gps week 2313' or a UTC date of t = 0."),
     ] = None,
     topic: Topic = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -63,7 +65,7 @@ def convert(
         if value is not None:
             raise ConfigError(f"{option}: is for trajectories; a log keeps its own")
     folder = output_folder(out)
-    with bar(quiet, "convert"):
+    with bar(quiet, "convert"), outside_allowed(allow_outside):
         tell("reading")
         log, files = conversion.convert_log(source, folder, format, topic or ())
     show(
@@ -81,6 +83,7 @@ def allan(
     start: Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from its start.")] = None,
     end: Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from its start.")] = None,
     topic: Topic = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -93,7 +96,7 @@ def allan(
     from graphnav.staging import moved, staged
 
     folder = output_folder(out)
-    with bar(quiet, "allan"):
+    with bar(quiet, "allan"), outside_allowed(allow_outside):
         tell("reading")
         if log.endswith((".csv", ".csv.gz")):
             t, gyro, accel = imu_of(Path(log))

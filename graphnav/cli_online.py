@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from graphnav.cli_options import Config, Profile, Quiet, Topic
+from graphnav.cli_options import AllowOutside, Config, Profile, Quiet, Topic
 from graphnav.errors import ConfigError
 from graphnav.talk import Interrupted, say
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from graphnav.config import Settings
     from graphnav.online.session import Session
 
+LONGEST = 1 << 20  # bytes of a line
 TICK = 0.5  # s between views, and of waiting for a source
 
 commands = typer.Typer()
@@ -52,6 +53,7 @@ def online(
     profile: Profile = None,
     config: Config = None,
     topic: Topic = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
 ) -> None:
     """Smooth while the drive happens: a recording replayed, or lines of a live source (docs/online.md)."""
@@ -61,14 +63,14 @@ def online(
     from graphnav.outputs import output_folder
 
     if send:
-        _send(source, topic or [], speed)
+        _send(source, topic or [], allow_outside, speed)
         return
     settings = _with_lag(read_settings(config, profile), lag)
     if resume and out is None:
         raise ConfigError("--resume: say which folder to go on in: -o OUT")
     folder = None if out is None else output_folder(out)
     live = source == "-" or source.startswith("tcp:")
-    recording = None if live else read(source, topic or ())
+    recording = None if live else read(source, topic or (), allow_outside)
     session = Session(settings, source, folder, resume, recording)
     shown = Shown(session, quiet)
     with Asked() as asked:
@@ -96,13 +98,13 @@ def _with_lag(settings: Settings, lag: float | None) -> Settings:
     return settings.model_copy(update={"solver": settings.solver.model_copy(update={"lag": lag})})
 
 
-def _send(source: str, topics: list[str], speed: float) -> None:
+def _send(source: str, topics: list[str], allow_outside: bool, speed: float) -> None:
     """Print a recording's lines, as its sensors would have sent them."""
     from graphnav.formats import read
     from graphnav.online.lines import END, lines_of
 
     pace = Pace(speed)
-    for t, line in lines_of(read(source, topics)):
+    for t, line in lines_of(read(source, topics, allow_outside)):
         pace.wait(t)
         say(line, flush=speed > 0 or line == END)
 
@@ -147,6 +149,8 @@ def follow(session: Session, chunks: Iterator[bytes], shown: Shown, asked: Asked
     for chunk in chunks:
         if chunk:
             *whole, rest = (rest + chunk).split(b"\n")
+            rest = rest[:LONGEST]  # what never ends is no row, and told as such when it does
+            whole = [line[:LONGEST] for line in whole]
             session.add_lines([line.decode("utf-8", "replace") for line in whole], asked.__bool__)
             heard = time.monotonic()
         shown.now_and_then(time.monotonic() - heard)

@@ -57,6 +57,9 @@ Require = Annotated[
         "--require", metavar="NAME<NUMBER", help="Leave with 3 unless it holds, as h_rms<0.5; may be repeated."
     ),
 ]
+AllowOutside = Annotated[
+    bool, typer.Option("--allow-outside", help="Read files that RECORDING names outside its own folder, too.")
+]
 
 
 def only(context: typer.Context, recording: str) -> str:

@@ -11,6 +11,7 @@ import typer
 
 from graphnav.cli_options import (
     SEVERAL,
+    AllowOutside,
     Config,
     End,
     Export,
@@ -30,6 +31,7 @@ from graphnav.cli_options import (
     withheld_of,
 )
 from graphnav.errors import ConfigError
+from graphnav.files import outside_allowed
 from graphnav.progress import tell
 from graphnav.talk import bar, insist, show
 
@@ -55,6 +57,7 @@ def smooth(
     point: Point = None,
     require: Require = None,
     topic: Topic = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -62,7 +65,8 @@ def smooth(
     asked = _Asked(
         only(context, recording), out, profile, config, noise, without, rate, start, end, require, topic, quiet, json
     )
-    _solve(asked, solver, "--solver", export, point)
+    with outside_allowed(allow_outside):
+        _solve(asked, solver, "--solver", export, point)
 
 
 @commands.command(
@@ -106,6 +110,7 @@ def compare(
     point: Point = None,
     require: Require = None,
     topic: Topic = None,
+    allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -117,7 +122,8 @@ def compare(
     for option, values in (("--against-point", beside.points), ("--against-shift", beside.shifts)):
         if values and len(values) != len(beside.files):
             raise ConfigError(f"{option} {values[-1]}: say one for each of the {len(beside.files)} files of --against")
-    _solve(asked, solvers, "--solvers", export, point, beside)
+    with outside_allowed(allow_outside):
+        _solve(asked, solvers, "--solvers", export, point, beside)
 
 
 @commands.command(epilog="\b\nExample:\n  graphnav report out/kitti")
@@ -194,7 +200,7 @@ def _solve(
         "rate": asked.rate, "start": asked.start, "end": asked.end, "topic": asked.topic,
         "against": (beside and [str(file) for file in beside.files]) or None,
     }  # fmt: skip
-    folder = outputs.output_folder(asked.out)
+    folder = outputs.output_folder(asked.out, outputs.FILES, () if alone else chosen)
     if point is not None and export is None:
         raise ConfigError(f"--point {point}: is of the files of --export; name some")
     exported = listed(export, NAMES, "--export", "format to write") if export is not None else ()
@@ -209,7 +215,7 @@ def _solve(
     settings, noise = workflow.parse_noise(asked.noise, read_settings(asked.config, asked.profile))
     request = workflow.Request(
         asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
-        {k: v for k, v in given.items() if v is not None}, noise,
+        {k: v for k, v in given.items() if v is not None}, noise, exported=exported, point=point,
         topics=tuple(asked.topic or ()), against=tuple(against),
     )  # fmt: skip
     with bar(asked.quiet, *chosen) as progress:
@@ -217,8 +223,11 @@ def _solve(
         tell("writing")
         with staged(folder) as part:
             files = (outputs.write_run if alone else outputs.write_comparison)(outcome, part)
-            files += convert.export_run(outcome, part, exported, point, alone) if exported else []
-    files = moved(files, part, folder)
+        files = moved(files, part, folder)
+        if exported:  # by itself, so that one that fails takes nothing with it
+            with staged(folder) as part:
+                more = convert.export_run(outcome, part, exported, point, alone)
+            files += moved(more, part, folder)
     verdicts = gates.judge(requirements, outputs.comparison(outcome, ours=True)) if requirements else []
 
     def values() -> dict[str, Any]:

@@ -12,8 +12,12 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from graphnav.errors import ConfigError, GraphnavError
+from graphnav.files import read_text
 
 _TABLE = re.compile(r"\[([^\[\]]+)\]")
+_NAMES = 30  # that a sentence lists
+_SHOWN = 60  # characters of a value in a sentence
+_DEEPEST = 50  # tables in tables; what graphnav reads has four
 _KEY = re.compile(r"([\w\-.\"']+)\s*=")
 
 
@@ -25,15 +29,32 @@ def read_toml(path: Path, error: type[GraphnavError]) -> tuple[dict[str, Any], s
     GraphnavError
         Of the kind given, if it cannot be read or is not TOML.
     """
+    text = read_text(path, error)
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        return tomllib.loads(text), text
-    except OSError as cause:
-        raise error(f"{path}: cannot be read ({cause.strerror})") from None
-    except UnicodeDecodeError:
-        raise error(f"{path}: is not UTF-8 text; save it as UTF-8") from None
-    except tomllib.TOMLDecodeError as cause:
+        # keys of thousands of parts take the parser minutes
+        if any(line.partition("=")[0].count(".") > 2 * _DEEPEST for line in text.splitlines()):
+            raise RecursionError
+        values = tomllib.loads(text)
+        for key, value in _leaves(values):
+            if isinstance(value, int) and not -(2**63) <= value < 2**63:
+                raise ValueError(f"'{key}' is a whole number of more than 64 bits")
+        return values, text
+    except RecursionError:
+        raise error(f"{path}: not valid TOML (nested too deep)") from None
+    except ValueError as cause:  # tomllib's own is one, and that of a number of thousands of digits
         raise error(f"{path}: not valid TOML ({cause})") from None
+
+
+def _leaves(value: Any, key: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Every value of nested tables and lists, with its key."""
+    if depth > _DEEPEST:
+        raise RecursionError
+    if isinstance(value, dict | list):
+        inner = value.items() if isinstance(value, dict) else ((key, one) for one in value)
+        for name, one in inner:
+            yield from _leaves(one, str(name), depth + 1)
+    else:
+        yield key, value
 
 
 def complaint(source: str | Path, error: ValidationError, model: type[BaseModel], text: str = "") -> str:
@@ -55,13 +76,22 @@ def complaint(source: str | Path, error: ValidationError, model: type[BaseModel]
         return f"{where}'{key}': {what}{_meaning(loc, model)}" if key else f"{where}{what}"
     if first["type"] in ("model_type", "model_attributes_type"):
         return f"{where}'{key}' must be a table: [{key}]"
-    return f"{where}'{key}' = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}{_meaning(loc, model)}"
+    what = f"{first['msg'][0].lower()}{first['msg'][1:]}{_meaning(loc, model)}"
+    return f"{where}'{key}' = {shortened(first['input'])}: {what}"
+
+
+def shortened(value: Any) -> str:
+    """A value as it stands in a file, no longer than people look at."""
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
     """What may have been meant: the nearest of the names there are, else all of them."""
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known) or 'none'}"
+    if close:
+        return f"did you mean '{close[0]}'?"
+    return f"known: {', '.join(known[:_NAMES]) or 'none'}{', ...' * (len(known) > _NAMES)}"
 
 
 def listed(text: str, known: Sequence[str], option: str, what: str) -> tuple[str, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from graphnav.complaints import listed, nearest
 from graphnav.draft.guesses import noise_density
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.exporters import NAMES, write_as
+from graphnav.files import parse_json, read_text
 from graphnav.formats import formats, load
 from graphnav.formats.registry import Log
 from graphnav.formats.trajectories import read_trajectory
@@ -28,6 +28,7 @@ from graphnav.workflow import Outcome
 
 SUMMARY = "summary.json"  # of the run that wrote a trajectory: its clock and its points
 _DENSE = 20.0  # Hz
+_MOST_ROWS = 2e7
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
 
 
@@ -178,6 +179,8 @@ def at_point(trajectory: Trajectory, arm: Array | None, rate: float | None = Non
         raise RecordingError("--point: the trajectory has no attitude, so no other point of the body can be placed")
     t = trajectory.t
     if rate is not None:
+        if (t[-1] - t[0]) * rate > _MOST_ROWS:
+            raise ConfigError(f"--rate {rate:g}: makes {(t[-1] - t[0]) * rate:.3g} rows, more than {_MOST_ROWS:g}")
         t = np.arange(np.ceil(t[0] * rate - 1e-6), np.floor(t[-1] * rate + 1e-6) + 1) / rate
     moved, _ = interpolate(trajectory, t, max_gap=_MAX_GAP, lever_arm=arm)
     return moved
@@ -230,8 +233,8 @@ def _run(source: Path) -> dict[str, Any]:
     """What the summary beside a trajectory says of its points and its clock."""
     path = source.parent / SUMMARY
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        values = parse_json(read_text(path))
+    except (RecordingError, ValueError):
         return {}
     return values if isinstance(values, dict) else {}
 

@@ -15,5 +15,9 @@ class ConfigError(GraphnavError):
     """Settings that name an unknown key or hold an impossible value."""
 
 
+class PartlyWrittenError(GraphnavError):
+    """Results of which one file could not be written; all others are there."""
+
+
 class EstimationError(GraphnavError):
     """The data do not determine what was asked for (no motion to align with, a cut graph, ...)."""

@@ -7,8 +7,9 @@ import math
 import os
 import platform
 import sys
+import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -20,7 +21,8 @@ import graphnav
 from graphnav import stored
 from graphnav.against import antenna_lever_arm, own
 from graphnav.detectors.base import intervals_text
-from graphnav.errors import ConfigError
+from graphnav.errors import ConfigError, PartlyWrittenError
+from graphnav.files import exists
 from graphnav.solution import ParameterEstimate, Solution
 from graphnav.stored import read_again, sha256, write_outcome
 from graphnav.workflow import Outcome, outages
@@ -31,8 +33,18 @@ if TYPE_CHECKING:
     from graphnav.page import Raw
 
 
-def output_folder(path: str | Path) -> Path:
+FILES = (
+    "trajectory.csv", "trajectory.kml", "trajectory.tum", "calibration.json", "detections.csv", "summary.json",
+    "report.html", "comparison.csv", "comparison.html",
+)  # fmt: skip
+
+
+def output_folder(path: str | Path, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Path:
     """`path`, sure to be a folder that can be written to or made; it is not made yet.
+
+    Parameters
+    ----------
+    files, folders : what is to be written there: nothing of another kind may be in the way.
 
     Raises
     ------
@@ -41,22 +53,35 @@ def output_folder(path: str | Path) -> Path:
     """
     folder = Path(path)
     there = folder
-    while not there.exists() and there != there.parent:
+    while not exists(there, ConfigError) and there != there.parent:
         there = there.parent
     if not there.is_dir():
         what = "is a file; name a folder to write into" if there == folder else f"cannot be made, {there} is a file"
         raise ConfigError(f"-o {folder}: {what}")
     if not os.access(there, os.W_OK | os.X_OK):
         raise ConfigError(f"-o {folder}: no permission to write into {there}")
+    try:  # a file system that cannot be written to, a name that is too long or none: by trying
+        (folder / max(FILES, key=len)).resolve().exists()
+        os.rmdir(tempfile.mkdtemp(prefix=".graphnav-", dir=there))
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise ConfigError(f"-o {folder}: nothing can be written into {there} ({why})") from None
+    for name in files:
+        if (folder / name).is_dir():
+            raise ConfigError(f"-o {folder}: {name} is a folder there, and a file of that name is to be written")
+    for name in folders:
+        if exists(folder / name, ConfigError) and not (folder / name).is_dir():
+            raise ConfigError(f"-o {folder}: {name} is a file there, and a folder of that name is to be written")
     return folder
 
 
 def write_run(outcome: Outcome, folder: Path) -> list[Path]:
     """Everything of the only solver of a run, straight into `folder`; returns the files to look at first."""
-    ((name, _),) = outcome.solutions.items()
+    (name,) = own(outcome.solutions)
     provenance = _provenance(outcome)
-    write_solver(outcome, name, folder, provenance)
+    failed = write_solver(outcome, name, folder, provenance)
     write_outcome(outcome, provenance, folder / stored.NAME)
+    _insist(failed)
     return [folder / "report.html", folder / "trajectory.csv", folder / "summary.json"]
 
 
@@ -67,11 +92,13 @@ def write_comparison(outcome: Outcome, folder: Path) -> list[Path]:
 
     provenance = _provenance(outcome)
     detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
+    failed = []
     for name in own(outcome.solutions):
-        write_solver(outcome, name, folder / name, provenance, detectors)
+        failed += write_solver(outcome, name, folder / name, provenance, detectors)
     write_comparison_csv(folder / "comparison.csv", comparison(outcome))
-    _draw_comparison(outcome, folder, provenance)
+    failed += _attempt(lambda path: _draw_comparison(outcome, path.parent, provenance), folder / "comparison.html")
     write_outcome(outcome, provenance, folder / stored.NAME)
+    _insist(failed)
     return [folder / "comparison.html", folder / "comparison.csv"]
 
 
@@ -122,8 +149,14 @@ def _draw_comparison(outcome: Outcome, folder: Path, provenance: Mapping[str, An
 
 def write_solver(
     outcome: Outcome, name: str, folder: Path, provenance: Mapping[str, Any], detectors: Sequence[Raw] | None = None
-) -> None:
-    """The files of one solver; a folder that holds older ones keeps none of them under the same names."""
+) -> list[str]:
+    """The files of one solver; a folder that holds older ones keeps none of them under the same names.
+
+    Returns
+    -------
+    list of str
+        What could not be written, and why: a picture that fails takes no number with it.
+    """
     from graphnav.exporters import write_all
 
     solution = outcome.solutions[name]
@@ -133,9 +166,12 @@ def write_solver(
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
     (folder / "detections.csv").write_text(intervals_text(solution.detections), encoding="utf-8")
     written = time.perf_counter()
-    _draw_solver(outcome, name, folder, provenance, detectors)
+    failed = _attempt(
+        lambda path: _draw_solver(outcome, name, path.parent, provenance, detectors), folder / "report.html"
+    )
     spent = {"writing": written - began, "report": time.perf_counter() - written}
     write_json(folder / "summary.json", solver_summary(outcome, name, spent, provenance))
+    return failed
 
 
 def _draw_solver(
@@ -159,6 +195,21 @@ def _draw_solver(
         detectors=detectors,
         noise=noise_rows(outcome, solution),
     )
+
+
+def _attempt(write: Callable[[Path], object], path: Path) -> list[str]:
+    """Write a file; what went wrong, if anything did, and then no file."""
+    try:
+        write(path)
+    except Exception as error:
+        path.unlink(missing_ok=True)
+        return [f"{path.name} could not be written ({type(error).__name__}: {error})"]
+    return []
+
+
+def _insist(failed: Sequence[str]) -> None:
+    if failed:
+        raise PartlyWrittenError(f"{'; '.join(failed)}; all other files are there")
 
 
 def solver_summary(

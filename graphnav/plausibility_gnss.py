@@ -16,7 +16,7 @@ from graphnav.rotation import Array
 
 FASTEST = 150.0  # m/s; the fastest cars that can be bought reach 490 km/h, 136 m/s
 # A receiver cannot follow a reflection that comes more than one and a half code chips late (GPS C/A: 293 m a chip).
-_MISLED = 440.0  # m
+MISLED = 440.0  # m
 _CACHED = 60.0  # s; a receiver that is on fixes at least as often as that
 _FROZEN = (60.0, 300.0)  # s, and m driven: a road or the receiver's own noise moves a height within that
 _SLOPE = 0.1  # what a road climbs at most: so far may a height be from what it was
@@ -96,7 +96,7 @@ def out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
     if len(there) < 3:
         return lost
     t, p = t[there], p[there]
-    far = np.linalg.norm(np.diff(p, axis=0), axis=1) > FASTEST * np.diff(t) + _MISLED
+    far = np.linalg.norm(np.diff(p, axis=0), axis=1) > FASTEST * np.diff(t) + MISLED
     if not far.any():
         return lost
     edges = np.r_[0, np.flatnonzero(far) + 1, len(t)]
@@ -105,7 +105,7 @@ def out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
     best, before = (last - first + 1).astype(float), np.full(len(first), -1)
     for k in range(1, len(first)):
         apart = np.linalg.norm(p[first[k]] - p[last[:k]], axis=1)
-        count = np.where(apart <= FASTEST * (t[first[k]] - t[last[:k]]) + _MISLED, best[:k], 0.0)
+        count = np.where(apart <= FASTEST * (t[first[k]] - t[last[:k]]) + MISLED, best[:k], 0.0)
         if count.max() > 0.0:
             before[k] = int(np.argmax(count))
             best[k] += count.max()

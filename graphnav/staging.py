@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from graphnav.errors import ConfigError
+from graphnav.errors import ConfigError, PartlyWrittenError
 
 
 @contextmanager
@@ -20,6 +20,8 @@ def staged(folder: Path) -> Iterator[Path]:
 
     It lies inside `folder`, which is made if need be and taken away again if nothing came of it, so that moving is
     renaming. A file that was there under the same name is replaced in one step.
+
+    What ends with a `PartlyWrittenError` keeps what it has written.
 
     Raises
     ------
@@ -31,12 +33,18 @@ def staged(folder: Path) -> Iterator[Path]:
     try:
         part = Path(tempfile.mkdtemp(prefix=".graphnav-", dir=folder))
         try:
-            yield part
+            failed = None
+            try:
+                yield part
+            except PartlyWrittenError as error:
+                failed = error
             with uninterrupted():
                 for file in sorted(path for path in part.rglob("*") if path.is_file()):
                     target = folder / file.relative_to(part)
                     target.parent.mkdir(parents=True, exist_ok=True)
                     os.replace(file, target)
+            if failed is not None:
+                raise failed
         finally:
             shutil.rmtree(part, ignore_errors=True)
     except OSError as error:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from graphnav.gates import Verdict
 
 BAD_INPUT, INTERNAL, NOT_MET, INTERRUPTED, PIPE_CLOSED = 2, 1, 3, 130, 141
+_LONGEST = 1500  # characters of a line that says why
 DEBUG = "GRAPHNAV_DEBUG"  # set, a traceback is shown
 
 
@@ -54,7 +55,7 @@ def bar(quiet: bool, *work: str) -> Iterator[Progress | None]:
 def say(text: str, flush: bool = True) -> None:
     """Print to stdout; whoever reads may stop early."""
     try:
-        print(text, flush=flush)
+        print(_plain(text), flush=flush)
     except BrokenPipeError:
         # what is still in the buffer would fail again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -65,5 +66,11 @@ def fail(reason: str, code: int, debug: bool) -> int:
     """Print the one line that says why; returns the exit code."""
     if debug:
         traceback.print_exc()
-    print(f"graphnav: {' '.join(reason.split())}", file=sys.stderr)
+    line = _plain(" ".join(reason.split()))
+    print(f"graphnav: {line if len(line) <= _LONGEST else line[:_LONGEST] + '...'}", file=sys.stderr)
     return code
+
+
+def _plain(text: str) -> str:
+    """The text without characters that steer a terminal: words of a file may hold any."""
+    return "".join(c if c in "\n\t" or c.isprintable() else "\ufffd" for c in text) if not text.isprintable() else text

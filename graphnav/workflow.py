@@ -21,6 +21,7 @@ from graphnav.complaints import nearest
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.errors import ConfigError, RecordingError
+from graphnav.exporters import check_names
 from graphnav.findings import Finding
 from graphnav.noise_model import NoiseModel
 from graphnav.progress import Progress, listening, tell
@@ -66,6 +67,8 @@ class Request:
     noise: GivenNoise | None = None  # to be used as it is; else what the settings say
     against: tuple[Against, ...] = ()  # trajectories of other programs to put beside the solutions
     topics: tuple[str, ...] = ()  # of a ROS bag, as `graphnav.formats.read` takes them
+    exported: tuple[str, ...] = ()  # formats that are to be written as well, of
+    point: str | None = None  # "antenna", "imu" or a lever arm
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,9 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     timings: dict[str, float] = {}
     with _timed(timings, "reading"):
         whole = read(request.source, request.topics)
+    check_names(request.exported, whole.gps_zero)
+    if request.point == "antenna" and whole.gnss is None:
+        raise ConfigError("--point antenna: the recording has no GNSS")
     recording = _cropped(whole, request)
     zero = recording.start - whole.start if recording is not whole else 0.0
     moved = _moved(request.withheld, zero)

@@ -109,7 +109,7 @@ def write_kitti(folder: Path, recording: Recording, truth: Trajectory) -> Path:
 
 def sentence(body: str) -> str:
     """An NMEA sentence with its checksum."""
-    return f"${body}*{reduce(xor, body.encode()):02X}\r\n"
+    return f"${body}*{reduce(xor, body.encode(), 0):02X}\r\n"
 
 
 def write_nmea(path: Path, recording: Recording, gst: bool = True) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import types
@@ -59,7 +60,7 @@ PYTHON = [(page, text) for page, text in blocks("python") if JERK not in text]
 @pytest.fixture
 def clone(tmp_path):
     """A folder that looks like the clone from inside, to run in: the recordings are there."""
-    (tmp_path / "data").symlink_to(ROOT / "data")
+    shutil.copytree(ROOT / "data", tmp_path / "data")
     return tmp_path
 
 

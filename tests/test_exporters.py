@@ -280,7 +280,7 @@ def test_local_truth_in_two_dimensions(tmp_path: Path) -> None:
         ("t,lat,lon,h\n0,30,114,20\n1,30,114\n", "line 3: 3 fields where 4"),
         ("t,lat,lon,h\n5,30,114,20\n4,30,114,20\n", r"line 3, t: 4\.0+ comes after 5"),
         ("t,lat,lon,h\n0,114,30,20\n", "line 2, lat: 114"),
-        ("t,lat,lon,h\n,30,114,20\n", "line 2, t: not a finite"),
+        ("t,lat,lon,h\n,30,114,20\n", "line 2, t: nan"),
         ("t,lat,lon,h\n1,,114,20\n", "no row has a position"),
         ("# comment\n0 1 2 3\n", "line 2: 4 columns without a header"),
         ("0 1 2 3 0 0 0 2\n", "line 1, qx qy qz qw: a norm of 2"),
@@ -303,7 +303,7 @@ def test_a_file_that_is_not_there_or_cut_short(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="cannot be read"):
         read_trajectory(tmp_path / "none.csv")
     (tmp_path / "cut.csv.gz").write_bytes(gzip.compress(b"t,lat,lon,h\n0,30,114,20\n" * 50)[:-12])
-    with pytest.raises(RecordingError, match="cannot be read"):
+    with pytest.raises(RecordingError, match=r"cut\.csv\.gz"):
         read_trajectory(tmp_path / "cut.csv.gz")
 
 

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 from graphnav.complaints import complaint, read_toml
 from graphnav.config.settings import PROFILES, Profile, Settings
 from graphnav.errors import ConfigError
+from graphnav.files import parse_json, read_text
 
 
 def settings_from(values: Mapping[str, Any], source: str = "settings", text: str = "") -> Settings:
@@ -59,9 +60,7 @@ def read_settings(path: str | Path | None = None, profile: str | None = None) ->
 def _settings_of_run(path: Path) -> Mapping[str, Any]:
     """What a summary.json keeps."""
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))["settings"]
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+        values = parse_json(read_text(path, ConfigError))["settings"]
     except (ValueError, KeyError, TypeError):
         raise ConfigError(f"{path}: holds no settings; name a settings file (TOML) or a summary.json") from None
     if not isinstance(values, Mapping):

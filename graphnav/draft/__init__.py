@@ -14,6 +14,7 @@ from graphnav.draft.agreement import CLEAR, FAIR, Agreement, compare
 from graphnav.draft.guesses import Guess
 from graphnav.draft.sources import JOINED, Source, fix_speed_unit, fixes, sources
 from graphnav.errors import RecordingError
+from graphnav.files import inside
 from graphnav.formats.schema import FORCE, RATE, SPEED
 from graphnav.formats.writer import quoted
 from graphnav.recording import Gnss, Odometer
@@ -253,6 +254,8 @@ class _Writer:
             if topics[0] in self.asked:
                 others = "as was asked"
             self._key("topic", quoted(topics[0]), others if len(topics) > 1 else "the only one")
+        if source.joined_from is None and not inside(source.path, self.folder):
+            self.decisions.append(f"{relative}: lies outside the folder of this file; say --allow-outside to read it")
         names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
         if names:
             pairs = ", ".join(f"{ours} = {quoted(theirs)}" for ours, theirs in names.items())

@@ -89,8 +89,8 @@ def mean(x: Array, window: float = _WINDOW) -> Array:
     n = 2 * round(window / STEP / 2)
     kernel = np.ones(n + 1)
     kernel[[0, -1]] = 0.5
-    weight = np.convolve(np.ones(len(x)), kernel, "same")
-    return np.convolve(x, kernel, "same") / weight
+    within = slice(n // 2, n // 2 + len(x))  # "same" has the length of the longer, which may be the kernel
+    return np.convolve(x, kernel)[within] / np.convolve(np.ones(len(x)), kernel)[within]
 
 
 def lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None, anywhere: bool = False) -> Lag | None:

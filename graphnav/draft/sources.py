@@ -30,6 +30,7 @@ _WANTED = {
     "odometer": ("t", "speed", *WHEELS),
     "gravity": ("t", "pull_x", "pull_y", "pull_z"),
 }
+_PAUSES = 1000.0  # times as long as all of its rows together a log may last
 _NEEDED = {"gnss": 4, "odometer": 2}  # of those, how many must be there in a row
 
 
@@ -317,6 +318,13 @@ def _read(path: Path, columns: matching.Columns, role: str) -> Source:
     order = np.argsort(values["t"], kind="stable")
     order = order[np.concatenate([[True], np.diff(values["t"][order]) > 0])]
     values = {ours: v[order] for ours, v in values.items()}
+    step = np.diff(values["t"])
+    if step.sum() > _PAUSES * len(step) * np.median(step):
+        k = int(np.argmax(step))
+        raise RecordingError(
+            f"{path}, {names['t']}: the stamps jump from {values['t'][k]:g} to {values['t'][k + 1]:g}, which no log "
+            "does; take out what lies beyond"
+        )
     if role == "odometer" and "speed" not in values:  # as it will be read
         rear = [w for w in WHEELS[2:] if w in values] or [w for w in WHEELS if w in values]
         values["speed"] = np.mean([values[w] for w in rear], axis=0)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from graphnav.errors import RecordingError
@@ -26,6 +27,20 @@ def write_all(trajectory: Trajectory, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("csv", "kml", "tum"):
         write_as(name, trajectory, folder / f"trajectory.{name}")
+
+
+def check_names(names: Sequence[str], gps_zero: float | None) -> None:
+    """Refuse formats that a recording cannot be written in, before it is solved; `gps_zero` as `Recording` has it.
+
+    Raises
+    ------
+    RecordingError
+        Saying what is missing.
+    """
+    if "nmea" in names and gps_zero is None:
+        raise RecordingError(
+            "--export nmea: needs the time of day, and what t counts from is not known; say clock in recording.toml"
+        )
 
 
 def write_as(name: str, trajectory: Trajectory, path: Path, utc: Array | None = None) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from graphnav.complaints import nearest
 from graphnav.errors import RecordingError
+from graphnav.files import exists, outside_allowed
 from graphnav.formats.registry import Format, Log
 from graphnav.recording import Recording
 
@@ -25,7 +26,7 @@ def formats() -> dict[str, Format]:
     return {f.name: f for f in sorted(found, key=lambda f: (not f.builtin, f.name))}
 
 
-def read(source: str | Path, topics: Sequence[str] = ()) -> Recording:
+def read(source: str | Path, topics: Sequence[str] = (), allow_outside: bool = False) -> Recording:
     """A recording from a folder holding recording.toml, a .toml of that form, or a built-in name.
 
     Parameters
@@ -34,6 +35,8 @@ def read(source: str | Path, topics: Sequence[str] = ()) -> Recording:
         A path, or a built-in name such as ``kitti``. A folder of that name is ``./kitti``.
     topics
         Of a ROS bag: those to use, each for the sensor that its type is of; the others are found.
+    allow_outside
+        Whether files that are named in it may lie outside its folder.
 
     Raises
     ------
@@ -41,9 +44,11 @@ def read(source: str | Path, topics: Sequence[str] = ()) -> Recording:
         If nothing is there, if nothing knows how to read it, or if what is there cannot be used.
     """
     known = formats()
+    exists(Path(source))
     for candidate in known.values():
         if candidate.recognises(source):
-            return _choose(candidate, source, topics).recording(source) if topics else candidate.read(source)
+            with outside_allowed(allow_outside):
+                return _choose(candidate, source, topics).recording(source) if topics else candidate.read(source)
     raise _unknown(source, known)
 
 
@@ -65,6 +70,7 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
     known = formats()
     if name is not None and name not in known:
         raise RecordingError(f"--format {name}: no such format; {nearest(name, list(known))}")
+    exists(Path(source))
     chosen = known[name] if name else next((f for f in known.values() if f.recognises(source)), None)
     if chosen is None:
         raise _unknown(source, known)

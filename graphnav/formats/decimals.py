@@ -3,7 +3,8 @@
 Eight characters at a time are one 64-bit word, and three multiplications turn the digits in it into their number,
 for all cells at once. Digits that make a whole number below 2^53, divided by a power of ten up to 10^22, are rounded
 once: the result is the double nearest to what is written, the same that `float` gives (Clinger, "How to read
-floating point numbers accurately", 1990). Cells that are anything else (exponents, nan, more digits) go to `float`.
+floating point numbers accurately", 1990). Cells that are anything else (exponents, nan, more digits) are read
+one by one.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import IO
 
 import numpy as np
 
+from graphnav.files import parse_number
 from graphnav.rotation import Array
 
 _BLOCK = 1 << 18  # bytes handled at once: keeps the working arrays in the processor's cache
@@ -63,7 +65,7 @@ def _columns(text: bytes, width: int, use: list[int]) -> Array:
     value = number / scale
     np.negative(value, out=value, where=negative)
     for k in np.flatnonzero(~(plain & whole_plain & part_plain & (number < 2**53))):
-        value[k] = float(text[first[k] : stop[k]])
+        value[k] = parse_number(text[first[k] : stop[k]].decode())
     return value.reshape(len(use), -1)
 
 

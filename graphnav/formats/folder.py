@@ -11,12 +11,15 @@ import numpy as np
 
 from graphnav.earth import ecef_to_llh, enu_axes
 from graphnav.errors import RecordingError
+from graphnav.files import beside
 from graphnav.formats import schema
 from graphnav.formats.pulses import counted
 from graphnav.formats.registry import Format, Log
 from graphnav.formats.repair import (
     DEFAULT_SD,
     DEFAULT_SD_V,
+    VAGUEST,
+    VAGUEST_V,
     Remarks,
     fixes_by_type,
     geodetic,
@@ -59,7 +62,7 @@ def read_folder(source: str | Path) -> Recording:
 
     def table(name: str) -> Table:
         section = getattr(d, name)
-        file = path.parent / section.file
+        file = beside(path, section.file, f"{name}.file")
         files.append(file)
         required, optional, keep = section.required, section.optional, section.keep
         if name == "truth":
@@ -78,7 +81,7 @@ def read_folder(source: str | Path) -> Recording:
         if section is None:
             return None
         if section.file not in logs:
-            logs[section.file] = other_log(path.parent / section.file, topics.get(section.file, ()))
+            logs[section.file] = other_log(beside(path, section.file, f"{name}.file"), topics.get(section.file, ()))
         log = logs[section.file]
         if section.topic and not (log and log.topics):
             raise RecordingError(f"{path}: '{name}.topic' is only for ROS bags, and {section.file} is none")
@@ -109,7 +112,7 @@ def read_folder(source: str | Path) -> Recording:
     if d.truth and d.truth.closed_loop_sigma:
         truth = Truth(imu.t[[0, -1]], of=d.truth.of, closed_loop_sigma=d.truth.closed_loop_sigma)
     elif d.truth and d.truth.file and Path(d.truth.file).suffix in (".nav", ".pos", ".tum"):
-        files.append(path.parent / d.truth.file)
+        files.append(beside(path, d.truth.file, "truth.file"))
         truth = _truth_of_log(d.truth, files[-1], remarks)
     elif d.truth:
         truth = _truth(d.truth, table("truth"), remarks)
@@ -141,6 +144,12 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     llh, rows = geodetic(rows, d.units.angle, "GNSS", remarks)
     every = np.ones(len(rows), dtype=bool)
     sd = sigmas(rows, ("sd_e", "sd_n", "sd_u"), d.sd, DEFAULT_SD, "GNSS position", every, remarks)
+    vague = (sd > VAGUEST).any(axis=1)
+    if vague.any():
+        if vague.all():
+            raise RecordingError(f"{rows.path}: every fix has a sigma of more than {VAGUEST:g} m and says nothing")
+        remarks.add(f"{vague.sum()} of {len(rows)} fixes have a sigma of more than {VAGUEST:g} m: left out")
+        llh, sd, rows = llh[~vague], sd[~vague], rows.take(~vague)
     v = sd_v = None
     if "vd" in rows and "vu" not in rows:
         rows = rows.with_column("vu", -rows["vd"])
@@ -153,7 +162,8 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
         absent = np.isnan(v).any(-1)
         v[absent] = np.nan
         sd_v = sigmas(rows, ("sd_ve", "sd_vn", "sd_vu"), d.sd_v, DEFAULT_SD_V, "GNSS velocity", ~absent, remarks)
-        sd_v[absent] = np.nan
+        absent |= (sd_v > VAGUEST_V).any(-1)
+        v[absent] = sd_v[absent] = np.nan
         if absent.all():
             v = sd_v = None
             remarks.add("the GNSS velocity columns are blank throughout: no velocities")

@@ -16,6 +16,7 @@ YAML
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,9 @@ from typing import Any
 import numpy as np
 
 from graphnav.errors import RecordingError
+from graphnav.files import check_inside, inside, parse_number, read_bytes, read_text
 from graphnav.formats.registry import Log, first_bytes, log_format
-from graphnav.formats.repair import Remarks
+from graphnav.formats.repair import Remarks, on_earth
 from graphnav.formats.schema import rotation_from_letters
 from graphnav.formats.text import number_table, text_lines
 from graphnav.formats.trajectories import read_trajectory
@@ -37,6 +39,9 @@ DEG_PER_SQRT_H = np.pi / 180 / 60  # rad/s/sqrt(Hz)
 MGAL = 1e-5  # m/s^2
 _GAP = 1.5  # a step this many times the period is a gap: the increments after it are still of one period
 _LARGEST = 0.3  # rad or m/s: more than any IMU increments by in one sample
+_LEAST, _MOST = 1e-12, 1e12  # of a noise figure in the configuration's units: wider than any sensor
+_DEEPEST = 50  # of tables in tables: what is read has two
+_FARTHEST = 1000.0  # m, of a lever arm
 _IMU_KEYS, _GNSS_KEYS = ("imupath", "imufile"), ("gnsspath", "gnssfile")
 
 
@@ -70,6 +75,8 @@ def load(path: Path) -> Log:
             "no configuration (.yaml) of KF-GINS or OB_GINS beside it: the antenna's lever arm is taken as zero"
         )
     files = [f for f in (config_file, imu_file, gnss_file) if f is not None]
+    if path.is_dir():
+        check_inside(files, path)
     where = config_file or path
     imu = odometer = gnss = truth = zero = None
     if imu_file is not None:
@@ -83,10 +90,12 @@ def load(path: Path) -> Log:
         gnss = _read_gnss(gnss_file, _frd(where, config, "antlever"), remarks)
     folder = where.parent if config else where
     if nav := _truth_file(folder, remarks) if folder.is_dir() else None:
+        check_inside([nav], folder)
         track = read_trajectory(nav)
         truth = Truth(track.t, track.llh, v=track.v, rph=track.rph)
-        week = next((line.split()[0] for line in text_lines(nav) if line.strip() and line.strip()[0] not in "#%"), "0")
-        zero = WEEK * float(week) if float(week) > 0 else None  # KF-GINS itself writes week 0
+        first = next((line.split()[0] for line in text_lines(nav) if line.strip() and line.strip()[0] not in "#%"), "0")
+        week = parse_number(first)
+        zero = WEEK * week if 0 < week < 10_000 else None  # KF-GINS itself writes week 0
         files.append(nav)
         remarks.add(
             f"truth: {nav.name}, of the IMU, with north-east-down velocities and roll, pitch, yaw of an FRD body"
@@ -181,7 +190,7 @@ def _truth_file(folder: Path, remarks: Remarks) -> Path | None:
 
 def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
     if path.suffix.lower() == ".bin":
-        data = path.read_bytes()
+        data = read_bytes(path, text=False)
         if len(data) % 56:
             raise RecordingError(f"{path}: {len(data)} bytes are not a whole number of rows of seven doubles")
         table = np.frombuffer(data, "<f8").reshape(-1, 7)
@@ -233,9 +242,11 @@ def _read_gnss(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
     elif width != 7:
         raise RecordingError(f"{path}, line {rows[0][0]}: {width} columns where a GNSS file has 7 (or 13)")
     table = dict(zip(names, number_table(path, rows, names, None).T, strict=True))
-    beyond = np.flatnonzero((np.abs(table["lat"]) > 90) | (np.abs(table["lon"]) > 360))
+    for k in np.flatnonzero(~np.isfinite(table["t"]))[:1]:
+        raise RecordingError(f"{path}, line {rows[k][0]}, t: must be a finite number")
+    beyond = np.flatnonzero(~on_earth(np.radians(table["lat"]), np.radians(table["lon"]), table["h"]))
     if len(beyond):
-        raise RecordingError(f"{path}, line {rows[beyond[0]][0]}: lat and lon must be degrees")
+        raise RecordingError(f"{path}, line {rows[beyond[0]][0]}: lat and lon must be degrees, h a height in m")
     sd = np.stack([table["sd_e"], table["sd_n"], table["sd_u"]], -1)
     bad = np.flatnonzero((sd <= 0).any(-1))
     if len(bad):
@@ -260,17 +271,35 @@ def _read_gnss(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
 def _read_yaml(path: Path) -> dict[str, Any]:
     import yaml
 
+    text = read_text(path)
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or 'not UTF-8'})") from None
+        _check_tokens(path, yaml, text)
+        values = yaml.safe_load(text)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark is not None else ""
-        raise RecordingError(f"{path}{line}: not valid YAML ({getattr(error, 'problem', None) or error})") from None
+        why = " ".join(str(getattr(error, "problem", None) or error).split())
+        raise RecordingError(f"{path}{line}: not valid YAML ({why})") from None
+    except ValueError as error:  # a date that is none, a number of thousands of digits
+        raise RecordingError(f"{path}: not valid YAML ({error})") from None
     if not isinstance(values, dict):
         raise RecordingError(f"{path}: not a configuration of KF-GINS or OB_GINS")
     return values
+
+
+def _check_tokens(path: Path, yaml: Any, text: str) -> None:
+    """Refuse what makes much out of little: a few lines of aliases stand for any amount of values."""
+    opening = (yaml.FlowSequenceStartToken, yaml.FlowMappingStartToken,
+               yaml.BlockSequenceStartToken, yaml.BlockMappingStartToken)  # fmt: skip
+    closing = (yaml.FlowSequenceEndToken, yaml.FlowMappingEndToken, yaml.BlockEndToken)
+    depth = 0
+    for token in yaml.scan(text):
+        depth += isinstance(token, opening) - isinstance(token, closing)
+        if isinstance(token, yaml.AliasToken):
+            line = token.start_mark.line + 1
+            raise RecordingError(f"{path}, line {line}: aliases (*name) are not read; write the values out")
+        if depth > _DEEPEST:
+            raise RecordingError(f"{path}, line {token.start_mark.line + 1}: not valid YAML (nested too deep)")
 
 
 def _named(config_file: Path, config: dict[str, Any], keys: tuple[str, ...]) -> Path | None:
@@ -278,24 +307,36 @@ def _named(config_file: Path, config: dict[str, Any], keys: tuple[str, ...]) -> 
     key = next((k for k in keys if k in config), None)
     if key is None:
         return None
-    stated = Path(str(config[key]).replace("\\", "/"))
+    if not isinstance(config[key], str):
+        raise RecordingError(f"{config_file}, {key}: must be the name of a file")
+    stated = Path(config[key].replace("\\", "/"))
     folder = config_file.resolve().parent
     for candidate in [
         stated,
         *(above / stated for above in (folder, *folder.parents)),
         config_file.parent / stated.name,
     ]:
-        if candidate.is_file():
+        if inside(candidate, folder) and candidate.is_file():
             return candidate
-    raise RecordingError(f"{config_file}, {key}: no file {stated}, neither there nor beside the configuration")
+    raise RecordingError(
+        f"{config_file}, {key}: no file {str(stated)[:200]} beside the configuration or below it; elsewhere none is "
+        "read without --allow-outside"
+    )
 
 
 def _frd(where: Path, config: dict[str, Any], key: str) -> Array:
     """A lever arm of the configuration (forward, right, down) in RFU; zero where there is none."""
     value = config.get(key, [0.0, 0.0, 0.0])
-    if not (isinstance(value, list) and len(value) == 3 and all(isinstance(x, int | float) for x in value)):
-        raise RecordingError(f"{where}, {key}: must be three numbers, forward, right, down in m")
+    if not (isinstance(value, list) and len(value) == 3 and all(_is_number(x) and abs(x) <= _FARTHEST for x in value)):
+        raise RecordingError(
+            f"{where}, {key}: must be three numbers, forward, right, down in m, of {_FARTHEST:g} m at most"
+        )
     return rotation_from_letters("FRD") @ np.array(value, dtype=float)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether it is a number that a float can hold."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def _noise(where: Path, config: dict[str, Any], remarks: Remarks) -> ImuNoise:
@@ -306,9 +347,12 @@ def _noise(where: Path, config: dict[str, Any], remarks: Remarks) -> ImuNoise:
     def figure(key: str, table: dict[str, Any] = section) -> float:
         value = table.get(key)
         stated: list[Any] = value if isinstance(value, list) else [value]
-        numbers = [float(x) for x in stated if isinstance(x, int | float) and not isinstance(x, bool) and x > 0]
-        if not stated or len(numbers) < len(stated):
-            raise RecordingError(f"{where}, {key}: must be a number above zero, or three, not {value!r}")
+        numbers = [float(x) for x in stated if _is_number(x) and _LEAST <= x <= _MOST]
+        if len(numbers) not in (1, 3) or len(numbers) < len(stated):
+            raise RecordingError(
+                f"{where}, {key}: must be a number above zero, or three, not {repr(value)[:60]} "
+                f"(from {_LEAST:g} to {_MOST:g})"
+            )
         if len(set(numbers)) > 1:
             remarks.add(f"{key} differs between the axes; the root mean square is used for all")
         return float(np.sqrt(np.mean(np.square(numbers))))
@@ -335,12 +379,13 @@ def _noise(where: Path, config: dict[str, Any], remarks: Remarks) -> ImuNoise:
 def _mention(config: dict[str, Any], remarks: Remarks) -> None:
     """Keys of the configuration that have no place in a recording."""
     if any(key in config for key in ("starttime", "endtime")):
-        span = f"{config.get('starttime', '')} to {config.get('endtime', '')}"
+        span = f"{str(config.get('starttime', ''))[:30]} to {str(config.get('endtime', ''))[:30]}"
         remarks.add(f"starttime and endtime ({span}) are not applied: use --start and --end")
     if any(key in config for key in ("initpos", "initvel", "initatt")):
         remarks.add("the initial state of the configuration is not used: graphnav finds its own")
-    if any(config.get("bodyangle") or ()):
-        remarks.add(f"bodyangle {config['bodyangle']} deg is not applied: the body axes are the IMU's")
+    body = config.get("bodyangle")
+    if isinstance(body, list) and any(body):
+        remarks.add(f"bodyangle {repr(body)[:60]} deg is not applied: the body axes are the IMU's")
     odometer = config.get("odometer")
     if isinstance(odometer, dict) and odometer.get("isuseodo") is False:
         remarks.add("the configuration does not use the odometer; withhold it with --without odometer")

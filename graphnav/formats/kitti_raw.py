@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.errors import RecordingError
+from graphnav.files import check_inside, parse_number
 from graphnav.formats.registry import Log, log_format
-from graphnav.formats.repair import Remarks
+from graphnav.formats.repair import Remarks, on_earth
 from graphnav.formats.schema import rotation_from_letters
+from graphnav.formats.text import text_lines
 from graphnav.recording import Gnss, Imu, Truth
 from graphnav.rotation import Array
 
@@ -43,11 +45,16 @@ def load(path: Path) -> Log:
     if folder is None:
         raise RecordingError(f"{path}: no KITTI folder 'oxts' with timestamps.txt and data in it")
     remarks = Remarks()
-    t, zero = _times(folder / "timestamps.txt")
     samples = sorted((folder / "data").glob("*.txt"))
+    check_inside([folder / "timestamps.txt", *samples], path)
+    t, zero = _times(folder / "timestamps.txt")
     if len(samples) != len(t):
         raise RecordingError(f"{folder}: {len(t)} time stamps but {len(samples)} files in data")
     rows = np.array([_row(file) for file in samples])
+    for k in np.flatnonzero(~np.isfinite(rows).all(axis=1))[:1]:
+        raise RecordingError(f"{samples[k]}, line 1: a number that is not finite")
+    for k in np.flatnonzero(~on_earth(np.radians(rows[:, 0]), np.radians(rows[:, 1]), rows[:, 2]))[:1]:
+        raise RecordingError(f"{samples[k]}, line 1: lat, lon, alt of {rows[k, :3]} are nowhere on Earth")
     order = np.argsort(t, kind="stable")
     if (np.diff(order) < 0).any():
         remarks.add(f"{(np.diff(t) < 0).sum()} samples out of order were sorted by time")
@@ -89,7 +96,7 @@ def load(path: Path) -> Log:
 def _times(path: Path) -> tuple[Array, str]:
     """Seconds since midnight of the first stamp, and that day."""
     stamps = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    for number, line in enumerate(text_lines(path), 1):
         if line.strip():
             try:
                 stamps.append(np.datetime64(line.strip().replace(" ", "T"), "ns"))
@@ -102,9 +109,9 @@ def _times(path: Path) -> tuple[Array, str]:
 
 
 def _row(path: Path) -> list[float]:
-    text = path.read_text(encoding="utf-8", errors="replace")
+    text = " ".join(text_lines(path))
     try:
-        values = [float(x) for x in text.split()]
+        values = [parse_number(x) for x in text.split()]
     except ValueError:
         bad = next(x for x in text.split() if not _number(x))
         raise RecordingError(f"{path}, line 1: '{bad[:40]}' is not a number") from None
@@ -115,7 +122,7 @@ def _row(path: Path) -> list[float]:
 
 def _number(text: str) -> bool:
     try:
-        float(text)
+        parse_number(text)
     except ValueError:
         return False
     return True

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.errors import RecordingError
+from graphnav.files import parse_number, read_bytes
 from graphnav.formats import ubx
 from graphnav.formats.registry import Log, first_bytes, log_format
 from graphnav.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES, Remarks, horizontal_velocity
@@ -81,8 +82,8 @@ def load(path: Path) -> Log:
         remarks.add("heights: above the ellipsoid, as GGA's altitude and geoid separation add up")
     llh = np.stack(
         [
-            np.radians([e.gga.lat for e in fixes]),
-            np.radians([e.gga.lon for e in fixes]),
+            np.radians([_number(e.gga.lat) for e in fixes]),
+            np.radians([_number(e.gga.lon) for e in fixes]),
             height + np.nan_to_num(separation),
         ],
         -1,
@@ -107,7 +108,7 @@ def _epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
     epochs: list[_Epoch] = []
     broken: list[int] = []
     count = 0
-    for number, raw in enumerate(path.read_bytes().splitlines(), 1):
+    for number, raw in enumerate(read_bytes(path).splitlines(), 1):
         start = raw.find(b"$")
         if start < 0:
             count += bool(raw.strip())
@@ -129,31 +130,43 @@ def _epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
                 epochs.append(_Epoch(seconds, number))
         elif kind != b"VTG" or not epochs:
             continue
-        _note(epochs[-1], kind, message)
+        try:
+            _note(epochs[-1], kind, message)
+        except (AttributeError, TypeError, ValueError):  # no number, or no field, where the checksum is right
+            broken.append(number)
     return epochs, broken, count
 
 
 def _note(epoch: _Epoch, kind: bytes, message: Any) -> None:
     if kind == b"GGA":
+        for value in (message.lat, message.lon, message.alt, message.sep, message.HDOP):
+            _number(value)
+        if message.lat != "" and (message.NS not in ("N", "S") or message.EW not in ("E", "W")):
+            raise ValueError("no hemisphere")
         epoch.gga = message
     elif kind == b"GST":
+        for value in (message.stdLong, message.stdLat, message.stdAlt):
+            _number(value)
         epoch.gst = message
     elif kind == b"RMC":
         if message.status == "A" and message.spd != "":
-            epoch.speed, epoch.course = float(message.spd) * KNOTS, _number(message.cog)
+            epoch.speed, epoch.course = _number(message.spd) * KNOTS, _number(message.cog)
         epoch.date = message.date if isinstance(message.date, datetime.date) else None
     elif kind == b"ZDA":
         try:
-            epoch.date = datetime.date(int(message.year), int(message.month), int(message.day))
+            date = datetime.date(int(message.year), int(message.month), int(message.day))
+            epoch.date = date if date.year >= 1980 else None  # before there was GPS
         except (TypeError, ValueError):
             epoch.date = None
     elif epoch.speed is None and (message.sogk != "" or message.sogn != ""):
-        epoch.speed = float(message.sogk) * KMH if message.sogk != "" else float(message.sogn) * KNOTS
+        epoch.speed = _number(message.sogk) * KMH if message.sogk != "" else _number(message.sogn) * KNOTS
         epoch.course = _number(message.cogt)
 
 
 def _number(value: Any) -> float:
-    return float(value) if value not in ("", None) else float("nan")
+    if value in ("", None):
+        return float("nan")
+    return parse_number(value) if isinstance(value, str) else float(value)
 
 
 def _times(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Remarks) -> tuple[Array, float | None]:

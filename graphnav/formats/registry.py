@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from graphnav.errors import RecordingError
+from graphnav.files import check_regular, exists
 from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth, rows_of
 
 
@@ -78,15 +79,19 @@ def log_format(
     def known(source: str | Path) -> bool:
         try:
             return recognises(Path(source))
-        except OSError:
+        except (OSError, RecordingError):
             return False
 
     def loaded(source: str | Path, topics: Sequence[str] = ()) -> Log:
         path = Path(source)
-        if not path.exists():
+        if not exists(path):
             raise RecordingError(f"{path}: no such file or folder")
+        if not path.is_dir():
+            check_regular(path)
+        from graphnav.formats.soundness import sound  # which imports this module
+
         log = choose(path, topics) if choose is not None and topics else load(path)
-        return replace(_without_nowhere(log), files=log.files or _files(path))
+        return replace(_without_nowhere(sound(log, path)), files=log.files or _files(path))
 
     return Format(
         name, about, known, lambda source: loaded(source).recording(source), load=loaded,

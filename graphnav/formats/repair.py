@@ -12,7 +12,11 @@ from graphnav.recording import FIX_TYPES, fix_types
 from graphnav.rotation import Array
 
 _LABEL = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"}
+LATEST = 1e11  # s, either way: three thousand years
+VAGUEST, VAGUEST_V = 1e5, 1e4  # m, m/s; a fix with a sigma beyond these says nothing
+_SUREST = 1e-9  # m, m/s; a sigma below says that it was not meant as one
 _HIGHEST = 9000.0  # m, that a drive on Earth may come to
+_LOWEST, _SKY = -1000.0, 50000.0  # m, that anything may be read at
 _SET_BACK = 10.0  # periods; rows that merely overtake each other are closer
 _RADIANS = (1.58, 3.15)  # |lat|, |lon| that angles in radians cannot exceed
 
@@ -49,12 +53,17 @@ def usable_rows(
         if the stamps run over the same times twice.
     """
     label = _LABEL[sensor]
+    with np.errstate(over="ignore"):
+        t = rows["t"] * TIME[unit] + offset
+    # a stamp of thousands of years is none, as an infinite one
+    rows = rows.with_column("t", np.where(np.abs(t) > LATEST, np.inf, rows["t"]))
     for name in rows.columns:
         bad = np.flatnonzero(np.isinf(rows[name]))
         if len(bad) and sensor == "odometer":  # of which single readings can be missed
             rows = rows.with_column(name, np.where(np.isinf(rows[name]), np.nan, rows[name]))
         elif len(bad):
-            raise RecordingError(f"{rows.where(bad[0], name)}: the value is infinite")
+            what = "no time" if name == "t" else "infinite"
+            raise RecordingError(f"{rows.where(bad[0], name)}: the value is {what}")
     if keep is not None:
         rows = rows.take(rows[Table.KEEP] >= keep.at_least)
         if not len(rows):
@@ -136,6 +145,13 @@ def _check_imu_time(rows: Table, unit: str) -> None:
     raise RecordingError(f"{rows.path}: IMU rows are {step:g} s apart, which no usable IMU is{hint}")
 
 
+def on_earth(lat: Array, lon: Array, h: Array) -> Mask:
+    """Which of some places (N,) in rad and m a drive can be at."""
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(lat) <= np.pi / 2) & (np.abs(lon) <= 2 * np.pi) & (h >= _LOWEST) & (h <= _SKY)
+    return np.asarray(near)
+
+
 def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tuple[Array, Table]:
     """(lat, lon, h) in rad, rad, m of rows whose position is usable, and those rows.
 
@@ -168,7 +184,7 @@ def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tup
     if len(beyond):
         hint = _other_form(lat, lon, label)
         raise RecordingError(f"{rows.where(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude{hint}")
-    beyond = np.flatnonzero((h < -1000.0) | (h > 50000.0))
+    beyond = np.flatnonzero((h < _LOWEST) | (h > _SKY))
     if not len(beyond) and np.median(h) > _HIGHEST:
         beyond = np.flatnonzero(h > _HIGHEST)
     if len(beyond):
@@ -216,7 +232,7 @@ def sigmas(
     for k, name in enumerate(names):
         zero = used & (sd[:, k] == 0)
         floor = _floor(sd[used & (sd[:, k] > 0), k])
-        bad = np.flatnonzero(used & ((sd[:, k] < 0) | (zero & (floor is None))))
+        bad = np.flatnonzero(used & ((sd[:, k] < 0) | ((sd[:, k] < _SUREST) & ~zero) | (zero & (floor is None))))
         if len(bad):
             raise RecordingError(f"{rows.where(bad[0], name)}: a 1-sigma must be above zero, not {sd[bad[0], k]:g}")
         if zero.any():

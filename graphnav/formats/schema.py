@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -29,10 +30,21 @@ from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 from graphnav.timescales import parse_clock
 
-Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
-Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0)]
+_SMALLEST, _LARGEST = 1e-15, 1e9  # of a figure: squares of it are numbers
+_LONGEST = 1e6  # of the components of a vector: m, or of a direction
 
-NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0)]
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+
+
+def _usable(value: float) -> float:
+    if value and not _SMALLEST <= abs(value) <= _LARGEST:
+        raise ValueError(f"{value:g} must lie between {_SMALLEST:g} and {_LARGEST:g}")
+    return value
+
+
+Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0), AfterValidator(_usable)]
+
+NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0), AfterValidator(_usable)]
 
 
 def _three_numbers(value: Any) -> Any:
@@ -40,6 +52,8 @@ def _three_numbers(value: Any) -> Any:
         raise ValueError("must be three numbers in brackets")
     if any(isinstance(x, bool) or not isinstance(x, int | float) or not np.isfinite(x) for x in value):
         raise ValueError("must be three numbers in brackets")
+    if any(abs(x) > _LONGEST for x in value):
+        raise ValueError(f"must be three numbers in brackets, none beyond {_LONGEST:g}")
     return tuple(float(x) for x in value)
 
 

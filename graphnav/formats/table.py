@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import gzip
 import io
 import re
 import warnings
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -17,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.errors import RecordingError
+from graphnav.files import exists, open_file, parse_number
 from graphnav.formats.decimals import read_decimals
 from graphnav.rotation import Array
 
@@ -108,12 +107,18 @@ def read_table(
             file_names[name] = theirs
         elif name in required or name in renamed:
             hint = "" if name in renamed else f'; if it has another name, say columns = {{ {name} = "..." }}'
-            raise RecordingError(f"{path}: no column '{theirs}' (there are: {', '.join(header)}){hint}")
+            raise RecordingError(f"{path}: no column '{theirs}' (there are: {_listed(header)}){hint}")
     use = [header.index(theirs) for theirs in file_names.values()]
     values = _parse(path, skip, header, use)
     if not values.shape[1]:
         raise RecordingError(f"{path}: holds a header and no rows")
     return Table(path, dict(zip(file_names, values, strict=True)), file_names, np.arange(values.shape[1]))
+
+
+def _listed(header: list[str]) -> str:
+    """The names of columns, as many as people look at."""
+    names = [name[:40] for name in header[:30]]
+    return ", ".join(names if len(names) == len(header) else [*names, "..."])
 
 
 def read_header(path: Path) -> list[str]:
@@ -137,8 +142,8 @@ def first_rows(path: Path, count: int) -> list[list[str]]:
     """
     try:
         return [[cell.strip().strip('"') for cell in line.split(",")] for _, line in islice(_data_lines(path), count)]
-    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
-        raise _broken_gzip(path, error) from None
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: holds bytes that are not UTF-8 text; save it as UTF-8") from None
 
 
 def _open(path: Path) -> IO[str]:
@@ -147,38 +152,30 @@ def _open(path: Path) -> IO[str]:
 
 
 def _open_bytes(path: Path) -> IO[bytes]:
-    try:
-        plain = path.open("rb")
-    except IsADirectoryError:
-        raise RecordingError(f"{path}: is a folder where a CSV file is wanted") from None
-    except FileNotFoundError:
+    if not exists(path):
         other = path.with_suffix("") if path.suffix == ".gz" else path.with_name(path.name + ".gz")
-        hint = f"; there is {other.name}" if other.exists() else ""
-        raise RecordingError(f"{path}: no such file{hint}") from None
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
-    magic = plain.read(2)
-    plain.seek(0)
-    if path.suffix == ".gz" or magic in (b"", b"\x1f\x8b"):
-        plain.close()
-    if not magic:
-        raise RecordingError(f"{path}: is empty")
-    if path.suffix == ".gz":
-        if magic != b"\x1f\x8b":
-            raise RecordingError(f"{path}: is not gzip-compressed although its name ends in .gz")
-        return gzip.open(path)  # type: ignore[return-value]
-    if magic == b"\x1f\x8b":
-        raise RecordingError(f"{path}: is gzip-compressed; its name must end in .gz")
-    return plain
+        hint = f"; there is {other.name}" if exists(other) else ""
+        raise RecordingError(f"{path}: no such file{hint}")
+    if path.is_dir():
+        raise RecordingError(f"{path}: is a folder where a CSV file is wanted")
+    file = open_file(path)
+    why = None
+    if not file.size:
+        why = "is empty"
+    elif file.packed != (path.suffix == ".gz"):
+        why = "is gzip-compressed; its name must end in .gz"
+        if not file.packed:
+            why = "is not gzip-compressed although its name ends in .gz"
+    if why is not None:
+        file.close()
+        raise RecordingError(f"{path}: {why}")
+    return file
 
 
 def _header(path: Path) -> tuple[int, list[str]]:
     """How many lines come before the data, and the column names."""
-    try:
-        with _open_bytes(path) as raw:
-            start = raw.read(1 << 16)
-    except (OSError, EOFError, zlib.error) as error:
-        raise _broken_gzip(path, error) from None
+    with _open_bytes(path) as raw:
+        start = raw.read(1 << 16)
     if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise RecordingError(f"{path}: is UTF-16 text; save it as UTF-8")
     if b"\0" in start:
@@ -218,37 +215,35 @@ def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> Array:
             head = b"".join(raw.readline() for _ in range(skip))
             if len(head.splitlines()) == skip:  # else lines end in a way of their own
                 return read_decimals(raw, len(header), use)
-    except (OSError, EOFError, zlib.error) as error:
-        raise _broken_gzip(path, error) from None
     except ValueError:
         pass
     try:
         with _open(path) as file:
-            values = _loadtxt(io.StringIO(_BLANK.sub("nan", file.read())), skip, header, use)
+            text = file.read()
+        values = _loadtxt(text, skip, header, use)
     except ValueError:
         values = _parse_cells(path, header, use)
     return np.ascontiguousarray(values.T)
 
 
-def _loadtxt(source: io.StringIO, skip: int, header: list[str], use: list[int]) -> Array:
-    # Without usecols NumPy checks that no row is longer than the others; with it, only that none is too short.
-    everything = len(use) == len(header)
+def _loadtxt(text: str, skip: int, header: list[str], use: list[int]) -> Array:
+    # With usecols NumPy checks only that no row is too short for those.
+    for line in text.splitlines()[skip:]:
+        cells = line.partition("#")[0].strip()
+        if cells and cells.count(",") != len(header) - 1:
+            raise ValueError("rows and header differ in length")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # no rows: said by the caller
         values = np.loadtxt(
-            source,
+            io.StringIO(_BLANK.sub("nan", text)),
             delimiter=",",
             comments="#",
             skiprows=skip,
-            usecols=None if everything else use,
+            usecols=use,
             ndmin=2,
             encoding="utf-8",
         )
-    if not everything or not len(values):
-        return values.reshape(-1, len(use))
-    if values.shape[1] != len(header):
-        raise ValueError("rows and header differ in length")
-    return values[:, use]
+    return values.reshape(-1, len(use))
 
 
 def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -276,7 +271,7 @@ def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
             for column in use:
                 cell = cells[column].strip('"')
                 try:
-                    row.append(float(cell) if cell else np.nan)
+                    row.append(parse_number(cell) if cell else np.nan)
                 except ValueError:
                     raise RecordingError(
                         f"{path}, line {number}, column '{header[column]}': '{cell[:40]}' is not a number"
@@ -284,12 +279,4 @@ def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
             rows.append(row)
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: is not UTF-8 text") from None
-    except (OSError, EOFError, zlib.error) as error:
-        raise _broken_gzip(path, error) from None
     return np.array(rows, dtype=float).reshape(-1, len(use))
-
-
-def _broken_gzip(path: Path, error: Exception) -> RecordingError:
-    if isinstance(error, EOFError):
-        return RecordingError(f"{path}: the compressed file is cut off; copy it again")
-    return RecordingError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})")

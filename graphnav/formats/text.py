@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import gzip
 from pathlib import Path
 
 import numpy as np
 
 from graphnav.errors import RecordingError
+from graphnav.files import parse_number, read_bytes
 from graphnav.rotation import Array
 
 Rows = list[tuple[int, str]]  # line number in the file (from 1) and text
 
 
 def text_lines(path: Path) -> list[str]:
-    try:
-        data = path.read_bytes()
-        if data[:2] == b"\x1f\x8b":
-            data = gzip.decompress(data)
-    except (OSError, EOFError) as error:
-        raise RecordingError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    data = read_bytes(path)
     if b"\0" in data[:4096]:
         raise RecordingError(f"{path}: a binary file; expected text")
     try:
@@ -57,10 +52,10 @@ def number_table(
             raise RecordingError(f"{path}, line {number}: {len(fields)} fields where {len(names)} were expected")
         for k in use:
             try:
-                float(fields[k].strip() or "nan")
+                parse_number(fields[k].strip() or "nan")
             except ValueError:
                 raise RecordingError(
-                    f"{path}, line {number}, {names[k]}: '{fields[k].strip()}' is not a number"
+                    f"{path}, line {number}, {names[k]}: '{fields[k].strip()[:40]}' is not a number"
                 ) from None
     raise RecordingError(f"{path}: cannot be read as a table of numbers")
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from graphnav import rotation
 from graphnav.errors import RecordingError
+from graphnav.formats.repair import LATEST
 from graphnav.formats.text import number_table, text_lines
 from graphnav.rotation import Array
 from graphnav.trajectory import Trajectory
@@ -82,8 +83,8 @@ def _build(
 ) -> Trajectory:
     """Check time and position, leave out what cannot be used, and say so."""
     numbers = np.array([number for number, _ in rows])
-    if (bad := ~np.isfinite(t)).any():
-        raise RecordingError(f"{path}, line {numbers[bad][0]}, t: not a finite number")
+    if (bad := ~(np.abs(t) <= LATEST)).any():
+        raise RecordingError(f"{path}, line {numbers[bad][0]}, t: {t[bad][0]:g} is no time in s")
     if (bad := np.diff(t) < 0).any():
         k = int(np.flatnonzero(bad)[0])
         raise RecordingError(
@@ -96,6 +97,9 @@ def _build(
             raise RecordingError(
                 f"{path}, line {numbers[k]}, {('lat', 'lon')[axis]}: {position[k, axis] / _DEG:.6f} deg is out of range"
             )
+    if np.isinf(position).any():
+        k = int(np.flatnonzero(np.isinf(position).any(axis=1))[0])
+        raise RecordingError(f"{path}, line {numbers[k]}: a position that is infinite")
     usable = np.isfinite(position[:, :2]).all(1) if local else np.isfinite(position).all(1)
     fresh = np.concatenate([[True], np.diff(t) > 0])
     if not usable.all():
@@ -129,7 +133,7 @@ def _csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     local = "lat" not in columns and {"x", "y"} <= columns.keys()
     needed = ("t", "x", "y") if local else ("t", "lat", "lon", "h")
     if missing := [name for name in needed if name not in columns]:
-        raise RecordingError(f"{path}, line 1: no column '{missing[0]}'; found {', '.join(names)}")
+        raise RecordingError(f"{path}, line 1: no column '{missing[0]}'; found {', '.join(names)[:300]}")
     wanted = {names[k] for name, k in columns.items() if name in _KNOWN}
     table = number_table(path, rows, names, ",", wanted)
 
@@ -168,7 +172,7 @@ def _tum(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     names = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
     table = number_table(path, rows, names, None)
     norm = np.linalg.norm(table[:, 4:8], axis=1)
-    if (bad := np.abs(norm - 1.0) > 1e-2).any():
+    if (bad := ~(np.abs(norm - 1.0) <= 1e-2)).any():
         k = int(np.flatnonzero(bad)[0])
         raise RecordingError(
             f"{path}, line {rows[k][0]}, qx qy qz qw: a norm of {norm[k]:.4f}; expected a unit quaternion"
@@ -243,7 +247,7 @@ def _rtklib_times(
                 np.datetime64(stamp, "us")
             except ValueError:
                 raise RecordingError(
-                    f"{path}, line {number}: '{stamp.replace('T', ' ')}' is not a date and time"
+                    f"{path}, line {number}: '{stamp.replace('T', ' ')[:60]}' is not a date and time"
                 ) from None
         raise
     seconds = (when - _GPS_EPOCH) / np.timedelta64(1, "us") * 1e-6

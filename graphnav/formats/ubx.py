@@ -7,6 +7,7 @@ week); ESF data types 14, 13, 5 are gyro x, y, z (deg/s 2^-12), 16, 17, 18 accel
 
 from __future__ import annotations
 
+import datetime
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.errors import RecordingError
+from graphnav.files import open_file
 from graphnav.formats.registry import Log, first_bytes, log_format
 from graphnav.formats.repair import Remarks
 from graphnav.recording import Gnss, Imu, Odometer, fix_types
@@ -61,7 +63,10 @@ def load(path: Path) -> Log:
     if not fixes and not content.samples:
         what = f"{len(content.pvt)} NAV-PVT messages without a fix" if content.pvt else "no NAV-PVT and no ESF messages"
         raise RecordingError(f"{path}: {what} in {path.stat().st_size} bytes; nothing to use")
-    zero = _week_start(fixes[0]) if fixes else None
+    dated = [start for start in map(_week_start, fixes) if start is not None]
+    zero = dated[0] if dated else None
+    if fixes and zero is None:
+        remarks.add("clock: no NAV-PVT has a date, so the GPS week is not known")
     gnss = _gnss(fixes, content, remarks) if fixes else None
     imu, odometer = _sensors(path, content, remarks)
     if zero is not None:
@@ -77,7 +82,7 @@ def _messages(path: Path) -> _Content:
 
     content = _Content()
     tag: int | None = None
-    with path.open("rb") as stream:
+    with open_file(path, text=False) as stream:
         reader = pyubx2.UBXReader(stream, protfilter=pyubx2.UBX_PROTOCOL, quitonerror=0, parsing=0)
         while True:
             try:
@@ -131,9 +136,14 @@ def _note(content: _Content, message: Any, is_raw: bool) -> int | None:
             content.samples.setdefault(kind, []).append((tag, signed * _SCALE[kind]))
 
 
-def _week_start(message: Any) -> float:
-    """Where the GPS week of a NAV-PVT began, s since the GPS epoch."""
-    date = f"{message.year:04d}-{message.month:02d}-{message.day:02d}T00:00:00"
+def _week_start(message: Any) -> float | None:
+    """Where the GPS week of a NAV-PVT began, s since the GPS epoch; None without a date."""
+    try:
+        date = datetime.date(message.year, message.month, message.day)
+    except ValueError:  # 0/0/0 of a receiver that does not know it yet
+        return None
+    if date.year < 1980:
+        return None
     midnight = utc_to_gps(np.array([date], dtype="datetime64[us]"))[0]
     gps = midnight + message.hour * 3600 + message.min * 60 + message.second
     return float(WEEK * np.round((gps - message.iTOW * 1e-3) / WEEK))

@@ -32,6 +32,7 @@ from graphnav.constraints.gnss import ERRORS, OFFSETS, STAMP_ERROR, STAMPS, TIME
 from graphnav.constraints.raw_gnss import CODE_ERRORS, RATE_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.errors import ConfigError
+from graphnav.files import parse_json, read_text
 from graphnav.noise_model import Figure, NoiseModel, RowWeights
 from graphnav.preintegration import NOISE_FIGURES
 from graphnav.recording import FIX_TYPES
@@ -94,13 +95,11 @@ def read_noise_and_mode(path: str | Path) -> tuple[NoiseModel, str]:
     path = Path(path)
     what = "name a file that holds a noise model, or the summary.json of a run"
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); {what}") from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text; {what}") from None
+        values = parse_json(read_text(path, ConfigError))
     except json.JSONDecodeError as error:
         raise ConfigError(f"{path}, line {error.lineno}: not valid JSON ({error.msg}); {what}") from None
+    except ValueError as error:
+        raise ConfigError(f"{path}: not valid JSON ({error}); {what}") from None
     if not isinstance(values, Mapping) or not isinstance(values.get("noise"), Mapping):
         raise ConfigError(f"{path}: holds no table 'noise'; {what}")
     return _Reader(path).model(values["noise"])

@@ -4,7 +4,7 @@ from graphnav.online.ahead import Live
 from graphnav.online.rows import Fix, ImuSample, WheelSpeed, live_setup, live_trajectory
 from graphnav.online.sensors import Row, Sensors, rows_of, without_rows
 from graphnav.online.session import Session
-from graphnav.online.smoother import Online
+from graphnav.online.steady import Online
 from graphnav.online.tracker import Tracker
 
 __all__ = [

@@ -11,14 +11,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from graphnav.complaints import complaint
 from graphnav.errors import RecordingError
+from graphnav.files import parse_json, parse_number
+from graphnav.formats.schema import Noise, NotNegative, Positive, Vector
 from graphnav.online.sensors import Row, rows_of
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
 
@@ -33,19 +35,19 @@ class _Part(BaseModel):
 
 
 class _Imu(_Part):
-    noise: dict[str, float] = Field(default_factory=dict)
+    noise: Noise = Noise()  # type: ignore[valid-type]
 
 
 class _Gnss(_Part):
-    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lever_arm: Vector = (0.0, 0.0, 0.0)
 
 
 class _Odometer(_Part):
-    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    scale_sigma: float = Field(0.02, gt=0)
+    lever_arm: Vector = (0.0, 0.0, 0.0)
+    scale_sigma: Positive = 0.02
     signed: bool = True
-    speed_sigma: float | None = Field(None, gt=0)
-    delay_sigma: float = Field(0.0, ge=0)
+    speed_sigma: Positive | None = None
+    delay_sigma: NotNegative = 0.0
 
 
 class _Setup(_Part):
@@ -68,17 +70,12 @@ def setup_of(line: str) -> Recording:
     if word != HEAD:
         raise RecordingError(f"line 1: a live source begins with '{HEAD}' and a setup as JSON, not with '{line[:40]}'")
     try:
-        found = _Setup.model_validate(json.loads(text or "{}"))
-    except json.JSONDecodeError as error:
-        raise RecordingError(f"line 1: the setup is not JSON ({error.msg} at character {error.pos})") from None
+        found = _Setup.model_validate(parse_json(text or "{}"))
     except ValidationError as error:
         raise RecordingError(complaint("line 1: setup", error, _Setup)) from None
-    known = {f.name for f in fields(ImuNoise)}
-    unknown = sorted(set(found.imu.noise) - known)
-    if unknown:
-        raise RecordingError(
-            f"line 1: setup: unknown key 'imu.noise.{unknown[0]}'; known keys: {', '.join(sorted(known))}"
-        )
+    except ValueError as error:
+        raise RecordingError(f"line 1: the setup is not JSON ({error})") from None
+    stated = found.imu.noise.model_dump(exclude_none=True)  # type: ignore[attr-defined]
     gnss = odometer = None
     if found.gnss is not None:
         gnss = Gnss(_NONE, _ROWS, _ROWS, lever_arm=np.array(found.gnss.lever_arm))
@@ -87,7 +84,7 @@ def setup_of(line: str) -> Recording:
             _NONE, _NONE, np.array(o.lever_arm), o.scale_sigma,
             signed=o.signed, speed_sigma=o.speed_sigma, delay_sigma=o.delay_sigma,
         )  # fmt: skip
-    imu = Imu(_NONE, _ROWS, _ROWS, ImuNoise(**found.imu.noise), noise_assumed=not found.imu.noise)
+    imu = Imu(_NONE, _ROWS, _ROWS, ImuNoise(**stated), noise_assumed=not stated)
     return Recording(found.name, found.platform, imu, gnss, odometer)
 
 
@@ -104,7 +101,7 @@ def row_of(line: str) -> Row | None:
         return None
     kind, *cells = line.split(",")
     try:
-        numbers = [float(cell) if cell.strip() else float("nan") for cell in cells]
+        numbers = [parse_number(cell) if cell.strip() else float("nan") for cell in cells]
     except ValueError:
         raise ValueError(f"'{line[:40]}' holds something that is no number") from None
     if kind == "I" and len(numbers) == 7:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.errors import RecordingError
-from graphnav.online.smoother import Online
+from graphnav.online.steady import Online
 from graphnav.plausibility import ACCEL_RANGE, GYRO_RANGE
 from graphnav.plausibility_gnss import FASTEST
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording

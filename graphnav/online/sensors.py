@@ -8,7 +8,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from graphnav.formats.repair import LATEST
 from graphnav.online.buffers import SAME, Buffer
+from graphnav.online.sanity import Clock, Reach, Row, fix_odds, imu_reads, odometer_reads, with_sane_velocity
 from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.rotation import Array
 
@@ -16,8 +18,6 @@ AHEAD = 60.0  # s; stamps of other sensors further than this before the IMU's ar
 _WIDTH = {"imu": 6, "gnss": 18, "odometer": 6}  # the last six of a fix: usual sigmas of place and velocity
 _USUAL = 60.0  # s over which the usual sigma of fixes is averaged
 _NAN = float("nan")
-
-Row = tuple[str, float, tuple[float, ...]]  # sensor, time (s), values
 
 
 @dataclass
@@ -40,6 +40,11 @@ class Sensors:
     _unit: Array | None = None  # `unit`, once asked for
     _means: dict[str, tuple[float, tuple[float, ...]]] = field(default_factory=dict)  # usual sigmas, and since when
     _suspect: tuple[float, tuple[float, ...]] | None = None  # an IMU row far ahead of the one before
+    set_back: list[Row] = field(default_factory=list)  # the first rows of a clock that was set back
+    moved: tuple[float, int] | None = None  # since when (s), and how many fixes are elsewhere than all before
+    released: list[Row] = field(default_factory=list)  # rows that were held and are to be taken in now
+    _clock: Clock = field(default_factory=Clock)
+    _reach: Reach = field(default_factory=Reach)
 
     def add(self, sensor: str, t: float, values: tuple[float, ...]) -> bool:
         """Take in a row; False if it is of no use (`counts` says why).
@@ -48,19 +53,38 @@ class Sensors:
         velocity and its sigmas (NaN where there is none) of a fix; speed, way counted and four wheels of an odometer.
         """
         known = values[: 6 if sensor != "odometer" else 1]
-        if not math.isfinite(t + sum(known)) or (sensor == "gnss" and min(values[3:6]) <= 0.0):
+        if not math.isfinite(sum(known)) or not abs(t) <= LATEST or (sensor == "gnss" and min(values[3:6]) <= 0.0):
             self.counts[f"{sensor}: not a number"] += 1
             return False
-        if t <= self.oldest:
-            self.counts[f"{sensor}: too late"] += 1
+        if (odd := self._odd(sensor, values)) is not None:
+            self.counts[f"{sensor}: {odd}"] += 1
             return False
         buffer: Buffer = getattr(self, sensor)
         if sensor == "imu":
             return self._add_imu(t, values)
+        if self._clock.behind and t < self.imu.newest - self.longest_gap:
+            self._clock.hold((sensor, t, values))  # until it shows what the IMU's rows before it are
+            return False
+        if t <= self.oldest:
+            self.counts[f"{sensor}: too late"] += 1
+            return False
         if len(self.imu) and t > self.imu.newest + AHEAD:
             self.counts[f"{sensor}: stamp in the future"] += 1
             return False
         if sensor == "gnss":
+            values, without = with_sane_velocity(values)
+            if without:
+                self.counts["gnss: a velocity that no vehicle has"] += 1
+            others = self._reach.take(t, values)
+            if others is None:
+                self.counts["gnss: out of reach"] += 1
+                return False
+            if others:  # they are where the vehicle is, and those before were not
+                self.counts["gnss"] -= len(self.gnss)
+                self.counts["gnss: out of reach"] += len(self.gnss) - len(others) + 1
+                self.gnss.drop_before(np.inf)
+                self._means, self.moved, self.released = {}, (others[0][1], len(others)), others
+                return False
             values = (*values, *self._usually("position", t, values[3:6]), *self._usually("velocity", t, values[9:12]))
         if not buffer.add(t, values):
             self.counts[f"{sensor}: repeated"] += 1
@@ -72,8 +96,9 @@ class Sensors:
         """Take in an IMU row if nothing is odd about it; False leaves it to `add`. `newest` is the time before it."""
         if self._suspect is not None or not newest + SAME < t <= newest + self.longest_gap or t <= self.oldest:
             return False
-        if len(values) != _WIDTH["imu"] or not math.isfinite(sum(values)):
+        if len(values) != _WIDTH["imu"] or not imu_reads(values) or self._clock.behind:
             return False
+        self._clock.remember(t, values)
         self.imu.append(t, values)
         self.counts["imu"] += 1
         return True
@@ -102,7 +127,26 @@ class Sensors:
         self._means[kind] = max(t, last), mean
         return mean
 
+    def forget_time(self) -> None:
+        """Another clock: what was noted of the times of rows holds no more."""
+        self._means, self._suspect, self._reach = {}, None, Reach()
+
+    def _odd(self, sensor: str, values: tuple[float, ...]) -> str | None:
+        """What is wrong with a row by itself, as it is counted."""
+        if sensor == "gnss":
+            return fix_odds(values)
+        reads = imu_reads(values[:6]) if sensor == "imu" else odometer_reads(values)
+        return None if reads else "beyond any sensor"
+
     def _add_imu(self, t: float, values: tuple[float, ...]) -> bool:
+        if t <= self.oldest or (t < self.imu.newest - SAME and not self._clock.fits(t, self.imu.t)):
+            repeated = t > self.oldest and bool(np.any(np.abs(self.imu.t - t) <= SAME))
+            self.counts["imu: repeated" if repeated else "imu: too late"] += 1
+            if self._clock.hold(("imu", t, values)):
+                self.set_back = self._clock.set_back()
+            return False
+        if t > self.imu.newest:
+            self.released += self._clock.go_on()
         if len(self.imu) and t > self.imu.newest + self.longest_gap:
             # the next row tells whether this stamp was wrong or the IMU away
             before, self._suspect = self._suspect, (t, values)
@@ -114,6 +158,8 @@ class Sensors:
         elif self._suspect is not None:
             self.counts["imu: stamp in the future"] += 1
         self._suspect = None
+        if t > self.imu.newest:
+            self._clock.remember(t, values)
         if not self.imu.add(t, values):
             self.counts["imu: repeated"] += 1
             return False

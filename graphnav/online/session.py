@@ -9,9 +9,10 @@ from pathlib import Path
 from graphnav.config import Settings
 from graphnav.online.lines import END, row_of, setup_of
 from graphnav.online.sensors import Row, rows_of, without_rows
-from graphnav.online.smoother import Online
+from graphnav.online.steady import Online
 from graphnav.online.store import Store
 from graphnav.recording import Recording
+from graphnav.trajectory import Trajectory
 
 CHECKPOINTS = 60.0  # s of IMU time between checkpoints while nothing settles
 _FEW = 5  # bad lines that are told
@@ -103,6 +104,8 @@ class Session:
             "rows": dict(online.sensors.counts),
             "late_and_used": dict(online.late),
             "bad_lines": self.bad,
+            "clocks": online.clocks,
+            "failures": online.failures,
             "first_bad_lines": self.complaints,
             "excluded": [
                 {"kind": f.kind, "from_s": f.t_start, "to_s": f.t_end, "count": f.count} for f in online.excluded
@@ -110,6 +113,15 @@ class Session:
             "notes": online.notes,
             "lag_s": self.settings.solver.lag,
         }
+
+    def _begin_piece(self, store: Store, online: Online, tracks: list[Trajectory]) -> None:
+        """What has settled so far is of a clock that is no more; what follows goes into a file of its own."""
+        self.rows_settled += sum(len(track) for track in tracks)
+        if tracks:
+            store.append(tracks)
+        store.begin_piece(online.clocks)
+        store.checkpoint(online, self._counts())
+        self._kept = online.sensors.imu.newest
 
     def _take_pending(self, store: Store, asked: Callable[[], bool] = bool) -> None:
         while store.pending and not asked():
@@ -146,6 +158,9 @@ class Session:
     def _save(self, last: bool = False) -> None:
         assert self.online is not None
         tracks = self.online.settled()
+        if self.store is not None and self.online.clocks > self.store.piece:
+            self._begin_piece(self.store, self.online, tracks)
+            return
         self.rows_settled += sum(len(track) for track in tracks)
         if self.store is None:
             return

@@ -45,8 +45,8 @@ _JUDGED_UNTIL = 900.0  # s of rows, where fixes are so rare that these are still
 _PATIENCE = 300.0  # s of rows kept while there is no motion to align with
 
 
-class Online:
-    """Smooths while the drive happens.
+class Smoother:
+    """Smooths while the drive happens; `graphnav.online.Online` is one that nothing ends.
 
     Parameters
     ----------
@@ -92,12 +92,11 @@ class Online:
         """Take in one row: sensor, time and values as in `graphnav.online.sensors.Sensors.add`."""
         sensor, t, values = row
         sensors = self.sensors
-        before = sensors.imu.newest
+        before, previous = sensors.imu.newest, sensors.odometer.newest
         if sensor == "imu" and sensors.add_next(t, values, before):  # as all but a few do
             if t >= self._awake:
                 self._look()
             return
-        previous = sensors.odometer.newest
         if not sensors.add(sensor, t, values):
             return
         if sensor == "imu":
@@ -258,7 +257,7 @@ class Online:
         self._judgement = None
         try:
             found = judgement.answer()
-        except EstimationError as error:
+        except Exception as error:
             self.notes.append(f"not judged again: {error}")
             self._tentative = False
             return
@@ -301,17 +300,22 @@ class Online:
             self.tracker.settle(sensors)
             self._collect(self.tracker)
             self._faults += self.tracker.excluded + self._left_out
-        self.tracker = self._found = self._judgement = self._again = None
-        self._tentative, self._times, self._left_out = False, [], ()
-        sensors.drop_before(np.inf)
+        self._begin_anew(before)
         for row in after:
             sensors.imu.add(float(row[0]), tuple(row[1:]))
         for name, rows in later.items():
             for row in rows[rows[:, 0] > before]:
                 getattr(sensors, name).add(float(row[0]), tuple(row[1:]))
-        sensors.oldest = before
-        self._fixes, self._dirty, self._due = [], np.inf, sensors.imu.newest + _TRY
-        self._awake = self._due
+        self._due = self._awake = sensors.imu.newest + _TRY
+
+    def _begin_anew(self, oldest: float) -> None:
+        """Forget all rows and what was made of them; those up to a time (s) come too late from now on."""
+        self.tracker = self._found = self._judgement = self._again = None
+        self._tentative, self._times, self._left_out = False, [], ()
+        self.sensors.drop_before(np.inf)
+        self.sensors.oldest = oldest
+        self._fixes, self._dirty = [], np.inf
+        self._due = self._awake = oldest + _TRY
 
     # --------------------------------------------------------------------------------------------------- running
     def _advance(self, tracker: Tracker, last: bool = False) -> None:
@@ -378,6 +382,9 @@ class Online:
             if rows.any():
                 assert self.frame is not None
                 track = to_trajectory("online", self.frame, part.t[rows], part.states[rows], part.covariance[rows])
+                known = (track.llh, track.v, track.rph, track.sd_p, track.sd_v, track.sd_rph)
+                if not all(x is None or np.isfinite(x).all() for x in known):
+                    raise FloatingPointError("states that are not finite")
                 self._settled.append(track)
                 self._last_settled = float(part.t[-1])
         tracker.settled.clear()

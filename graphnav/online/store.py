@@ -2,6 +2,7 @@
 
     trajectory.csv    grows as keyframes settle, by whole rows, each time made sure of (fsync)
     checkpoint        the smoother as it was when it grew last, and how far the source was read; replaced in one step
+    trajectory-2.csv  the same after the clock of the IMU was set back, whose times go over the same again
     journal-N         of a live source: the lines taken in since that checkpoint
 
 To resume is to cut trajectory.csv to the length that the checkpoint knows and to go on from there: the same rows in
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import os
 import pickle
 from collections import deque
@@ -22,11 +24,26 @@ from typing import Any
 
 from graphnav.errors import ConfigError, GraphnavError
 from graphnav.exporters import csv
-from graphnav.online.smoother import Online
+from graphnav.online.steady import Online
 from graphnav.trajectory import Trajectory
 
 TRAJECTORY, CHECKPOINT = "trajectory.csv", "checkpoint"
-_MAGIC = b"graphnav checkpoint 1\n"
+_MAGIC = b"graphnav checkpoint 2\n"
+
+
+_PLAIN = {
+    "array": ("_array_reconstructor", "array"),
+    "builtins": ("complex", "frozenset", "range", "set", "slice"),
+    "collections": ("Counter", "OrderedDict", "deque"),
+    "numpy": ("dtype", "ndarray"),
+    "numpy._core.multiarray": ("_reconstruct", "scalar"),
+    "numpy._core.numeric": ("_frombuffer",),
+    "numpy.core.multiarray": ("_reconstruct", "scalar"),
+    "numpy.core.numeric": ("_frombuffer",),
+    "pathlib": ("Path", "PosixPath", "PurePosixPath", "WindowsPath"),
+}
+# which open files when they are made
+_ACTING = {("graphnav.online.store", "Store"), ("graphnav.online.session", "Session")}
 
 
 @dataclass(frozen=True)
@@ -39,6 +56,7 @@ class Checkpoint:
     length: int  # bytes of trajectory.csv
     journal: int  # number of the journal with what came since
     done: bool  # nothing more will come
+    piece: int = 1  # number of the clock that the times are of
 
 
 class Store:
@@ -54,7 +72,7 @@ class Store:
         self.folder, self.source, self.live = folder, source, live
         self.pending: deque[bytes] = deque()  # lines in the journal that were not taken in yet
         self._journal: FileIO | None = None
-        self._number = 0
+        self._number, self.piece = 0, 1
         path = folder / CHECKPOINT
         self.resumed: Checkpoint | None = None
         if resume:
@@ -64,21 +82,42 @@ class Store:
             if self.resumed.source != source:
                 raise ConfigError(f"--resume: {folder} was made from '{self.resumed.source}', not from '{source}'")
             self._length = self.resumed.length
-            self._number = self.resumed.journal
+            self._number, self.piece = self.resumed.journal, self.resumed.piece
         elif path.exists():
             raise ConfigError(f"-o {folder}: holds a run already; go on with --resume or name another folder")
         folder.mkdir(parents=True, exist_ok=True)
-        self._file = (folder / TRAJECTORY).open("r+b" if (folder / TRAJECTORY).exists() else "w+b", buffering=0)
+        for later in folder.glob("trajectory-*.csv"):  # than the checkpoint, or of a run before
+            if self.resumed is None or _piece_of(later) > self.piece:
+                later.unlink()
+        path = self.trajectory
         if self.resumed is None:
-            head = (csv.HEADER + "\n").encode()
-            self._file.truncate(0)
-            self._guarded(lambda: self._file.write(head))
-            self._length = len(head)
+            self._file = self._fresh()
         else:
+            self._file = path.open("r+b" if path.exists() else "w+b", buffering=0)
             if self._file.seek(0, os.SEEK_END) < self._length:
-                raise ConfigError(f"--resume: {folder / TRAJECTORY} is shorter than its checkpoint knows it")
+                raise ConfigError(f"--resume: {path} is shorter than its checkpoint knows it")
             self._file.truncate(self._length)
             self._file.seek(self._length)
+
+    @property
+    def trajectory(self) -> Path:
+        """The file that grows."""
+        return self.folder / (TRAJECTORY if self.piece == 1 else f"trajectory-{self.piece}.csv")
+
+    def begin_piece(self, number: int) -> None:
+        """Go on in another file."""
+        self._file.close()
+        self.piece = number
+        self._file = self._fresh()
+
+    def _fresh(self) -> FileIO:
+        """The file that grows, with nothing but its header in it."""
+        head = (csv.HEADER + "\n").encode()
+        self._length = 0
+        self._file = self.trajectory.open("w+b", buffering=0)
+        self._guarded(lambda: self._file.write(head))
+        self._length = len(head)
+        return self._file
 
     def recall(self) -> None:
         """Make the whole lines that came after the checkpoint resumed from pending again."""
@@ -115,7 +154,7 @@ class Store:
     def checkpoint(self, online: Online, counts: dict[str, int], done: bool = False) -> None:
         """Remember the smoother as it is now; what the journal held before is done with."""
         number = self._number + 1
-        body = pickle.dumps(Checkpoint(online, self.source, counts, self._length, number, done), protocol=5)
+        body = pickle.dumps(Checkpoint(online, self.source, counts, self._length, number, done, self.piece), protocol=5)
         path, fresh = self.folder / CHECKPOINT, self.folder / (CHECKPOINT + ".new")
 
         def write() -> None:
@@ -164,9 +203,31 @@ def _read(path: Path) -> Checkpoint:
     body = data[start:]
     if not data.startswith(_MAGIC) or hashlib.sha256(body).digest() != data[len(_MAGIC) : start]:
         raise ConfigError(f"--resume: {path} is no checkpoint of this version, or damaged")
-    found = pickle.loads(body)  # our own, by its digest; like any program, do not run what others hand you
-    assert isinstance(found, Checkpoint)
+    try:
+        found = _Unpickler(io.BytesIO(body)).load()
+    except Exception:  # whatever a pickle made by somebody else stumbles over
+        found = None
+    if not isinstance(found, Checkpoint):
+        raise ConfigError(f"--resume: {path} is no checkpoint of this version, or damaged")
     return found
+
+
+class _Unpickler(pickle.Unpickler):
+    """Makes graphnav's own objects and arrays, and calls nothing else, whoever wrote the file."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if module.startswith("graphnav.") and "." not in name and (module, name) not in _ACTING:
+            found = super().find_class(module, name)
+            if isinstance(found, type) and found.__module__ == module:
+                return found
+        elif name in _PLAIN.get(module, ()):
+            return super().find_class(module, name)
+        raise pickle.UnpicklingError(f"{module}.{name}")
+
+
+def _piece_of(path: Path) -> int:
+    number = path.stem.partition("-")[2]
+    return int(number) if number.isdigit() else 0
 
 
 def _sync(folder: Path) -> None:

@@ -57,6 +57,8 @@ def view(session: Session, silent: float = 0.0) -> list[tuple[str, str]]:
         said += [f"{wrong} wrong fixes left out"] * bool(wrong)
         said += [f"{session.bad} bad lines ({session.complaints[0]})"] if session.complaints else []
         lines.append(("odd", ", ".join(said)))
+    if online.failures:
+        lines.append(("failed", f"{len(online.failures)} pieces, the last {online.failures[-1]}"))
     if online.notes:
         lines.append(("note", online.notes[-1]))
     return lines

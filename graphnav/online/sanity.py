@@ -1,0 +1,166 @@
+"""Which rows of a live source cannot be right: beyond any sensor, out of reach, or of a clock that was set back.
+
+The judgements are those of a recording (`graphnav.plausibility`, `graphnav.formats.repair`), made row by row: a row is
+left out as if it had never come, and counted. Rows that every sensor can have sent pass untouched.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graphnav.earth import llh_to_ecef
+from graphnav.formats.repair import VAGUEST, VAGUEST_V, on_earth
+from graphnav.plausibility import ACCEL_RANGE, GYRO_RANGE
+from graphnav.plausibility_gnss import FASTEST, MISLED
+from graphnav.rotation import Array
+
+Row = tuple[str, float, tuple[float, ...]]  # sensor, time (s), values
+
+_BLANK = (math.nan,) * 6
+_SUREST = 1e-4  # m, m/s; a tenth of what the phase of a carrier can be measured to
+_MOST = 600  # fixes: what contradicts so many that agreed is believed when there are more of it
+_SET_BACK = 20  # IMU rows one after the other at times that have passed: not some that came late, but another clock
+_LASTING = 1.2  # s, that these last: more than a second, so that one stands at a second that is remembered
+_REMEMBERED = 36_000  # s, ten hours
+_SLOWEST = 0.5  # s between rows of an IMU (as in `graphnav.formats.repair`)
+_HELD = 200  # rows of other sensors
+_OVERTAKING = 10.0  # periods; rows that merely overtake each other are closer (as in `graphnav.formats.repair`)
+_HOLE = 1.5  # periods between two rows in which another may have been
+
+
+def imu_reads(values: tuple[float, ...]) -> bool:
+    """Whether a sensor can have read this: rates (rad/s) and forces (m/s^2)."""
+    gx, gy, gz, ax, ay, az = values
+    return (
+        -GYRO_RANGE <= gx <= GYRO_RANGE
+        and -GYRO_RANGE <= gy <= GYRO_RANGE
+        and -GYRO_RANGE <= gz <= GYRO_RANGE
+        and -ACCEL_RANGE <= ax <= ACCEL_RANGE
+        and -ACCEL_RANGE <= ay <= ACCEL_RANGE
+        and -ACCEL_RANGE <= az <= ACCEL_RANGE
+    )
+
+
+def odometer_reads(values: tuple[float, ...]) -> bool:
+    """Whether a vehicle can be as fast (m/s)."""
+    return -FASTEST <= values[0] <= FASTEST
+
+
+def fix_odds(values: tuple[float, ...]) -> str | None:
+    """What is wrong with a fix by itself, as it is counted; None if nothing is."""
+    lat, lon, h = (np.array([x]) for x in values[:3])
+    if not on_earth(lat, lon, h)[0]:
+        return "nowhere on Earth"
+    if not all(_SUREST <= sd <= VAGUEST for sd in values[3:6]):
+        return "a sigma that says nothing"
+    return None
+
+
+def with_sane_velocity(values: tuple[float, ...]) -> tuple[tuple[float, ...], bool]:
+    """A fix without a velocity that no vehicle has, and whether it had one."""
+    v, sd = values[6:9], values[9:12]
+    if not math.isfinite(sum(v) + sum(sd)):
+        return values, False
+    if math.hypot(*v) <= FASTEST and all(_SUREST <= one <= VAGUEST_V for one in sd):
+        return values, False
+    return (*values[:6], *_BLANK), True
+
+
+@dataclass
+class Reach:
+    """Which fixes can be reached from those before; where many agree that cannot, they are the ones to go on from."""
+
+    _t: float = -math.inf
+    _p: Array | None = None  # (3,) m, Earth-fixed, of the newest that was taken
+    _count: int = 0  # in a row, up to `_MOST`
+    _others: list[Row] = field(default_factory=list)  # out of reach of these, one after the other within reach
+    _last: tuple[float, Array] | None = None  # the newest of the others
+
+    def take(self, t: float, values: tuple[float, ...]) -> list[Row] | None:
+        """Whether a fix is taken: [] if so, None if not, and the others in its place if they outnumber all before."""
+        p = llh_to_ecef(np.array(values[:3]))
+        if self._p is None or _near(t - self._t, p - self._p):
+            if t > self._t:
+                self._t, self._p = t, p
+            self._count = min(self._count + 1, _MOST)
+            self._others.clear()
+            return []
+        if self._last is None or not self._others or not _near(t - self._last[0], p - self._last[1]):
+            self._others.clear()
+        self._others.append(("gnss", t, values))
+        self._last = t, p
+        if len(self._others) <= self._count:
+            return None
+        rows, self._others = self._others, []
+        self._t, self._p, self._count = t, p, min(len(rows), _MOST)
+        return rows
+
+
+def _near(dt: float, dp: Array) -> bool:
+    return float(np.linalg.norm(dp)) <= FASTEST * abs(dt) + MISLED
+
+
+@dataclass
+class Clock:
+    """Notices that the clock of the IMU was set back.
+
+    Rows at times that have passed are late, or sent again, or of a clock that was set back. Late ones fill a hole,
+    those sent again are as they were (a row of every second is remembered), and neither goes on and on.
+    """
+
+    _seconds: dict[int, tuple[float, ...]] = field(default_factory=dict)  # the first row of each second
+    _second: int = -(2**62)
+    behind: list[Row] = field(default_factory=list)  # rows at times that have passed, held until it shows what they are
+    _again: bool = False  # whether these are known
+
+    def remember(self, t: float, values: tuple[float, ...]) -> None:
+        """Note a row that was taken, the newest so far."""
+        second = int(t)
+        if second != self._second:
+            self._second = second
+            self._seconds[second] = (t, *values)
+            if len(self._seconds) > _REMEMBERED:
+                del self._seconds[next(iter(self._seconds))]
+
+    def fits(self, t: float, times: Array) -> bool:
+        """Whether a row at a time that has passed may have been missed there; `times` (N,) are those of the rows."""
+        near = np.diff(times[-400:])
+        period = float(np.median(near)) if len(near) else math.inf
+        if period > _SLOWEST:
+            return False  # one of these two is no time of an IMU
+        if t > times[-1] - _OVERTAKING * period:
+            return True
+        k = int(np.searchsorted(times, t))
+        return 0 < k < len(times) and bool(times[k] - times[k - 1] > _HOLE * period)
+
+    def hold(self, row: Row) -> bool:
+        """Hold a row at a time that has passed; True once these are of a clock that was set back."""
+        sensor, t, values = row
+        times = [one[1] for one in self.behind if one[0] == "imu"]
+        if sensor == "imu":
+            if t in times:
+                return False  # sent twice
+            if times and t < max(times) - _LASTING:  # behind these, too
+                self.behind, self._again, times = [one for one in self.behind if one[0] != "imu"][-_HELD:], False, []
+            self._again |= self._seconds.get(int(t), ()) == (t, *values)
+            times.append(t)
+        self.behind.append(row)
+        if self._again:
+            self.behind = [row] if sensor == "imu" else []
+            return False
+        return len(times) >= _SET_BACK and max(times) - min(times) >= _LASTING
+
+    def go_on(self) -> list[Row]:
+        """Time goes on as before: the fixes and readings that were held, to be taken in now."""
+        held = [row for row in self.behind if row[0] != "imu"]
+        self.behind, self._again = [], False
+        return held
+
+    def set_back(self) -> list[Row]:
+        """The rows of the new clock; what is remembered is of the old one."""
+        held, self.behind, self._again = self.behind, [], False
+        self._seconds, self._second = {}, -(2**62)
+        return held

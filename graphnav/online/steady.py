@@ -1,0 +1,95 @@
+"""A smoother that goes on whatever comes: a clock that is set back, fixes that are elsewhere, a piece that fails."""
+
+from __future__ import annotations
+
+import traceback
+from pathlib import Path
+
+from graphnav.config import Settings
+from graphnav.online.sensors import Row
+from graphnav.online.smoother import Smoother
+from graphnav.recording import Recording
+
+_MOST = 100  # failures that are remembered
+
+
+class Online(Smoother):
+    """Smooths while the drive happens.
+
+    Parameters
+    ----------
+    setup : a recording without rows (`graphnav.online.without_rows`): platform, noise figures, lever arms.
+    settings : as for a recording; `solver.lag` says how much future a settled state has seen.
+    """
+
+    def __init__(self, setup: Recording, settings: Settings | None = None) -> None:
+        super().__init__(setup, settings)
+        self.clocks = 1  # how many there have been: the times of each go on by themselves
+        self.failures: list[str] = []  # why pieces were given up
+
+    def add(self, row: Row) -> None:
+        """Take in one row: sensor, time and values as in `graphnav.online.sensors.Sensors.add`."""
+        sensors, rows = self.sensors, [row]
+        while rows:
+            one = rows.pop(0)
+            try:
+                super().add(one)
+            except Exception as error:  # whatever it is, rows go on coming
+                self._give_up(error)
+            if sensors.set_back:
+                rows += self._go_back()
+            elif sensors.moved is not None:
+                self._go_elsewhere(*sensors.moved)
+            if sensors.released:
+                rows, sensors.released = [*rows, *sensors.released], []
+
+    def finish(self) -> None:
+        """Nothing more will come: settle all."""
+        try:
+            super().finish()
+        except Exception as error:
+            self._give_up(error)
+
+    def _give_up(self, error: Exception) -> None:
+        """Drop the piece that is being smoothed, and begin anew with what comes."""
+        now = self.sensors.imu.newest
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        said = f"at {now:.3f} s: {type(error).__name__}: {error} in {Path(at.filename).name}:{at.lineno}"
+        self.failures = [*self.failures[-_MOST:], said]
+        since = self._last_settled
+        self.notes.append(
+            f"at {now:.3f} s the smoother failed ({type(error).__name__}); what had not settled"
+            f"{f' since {since:.3f} s' if since > -1e300 else ''} is lost: aligning anew"
+        )
+        self.tracker = None
+        self._begin_anew(now)
+
+    def _go_back(self) -> list[Row]:
+        """End the piece of the old clock; returns the rows of the new one, which are to be taken in."""
+        sensors = self.sensors
+        rows, sensors.set_back = sensors.set_back, []
+        first = next(t for sensor, t, _ in rows if sensor == "imu")
+        before = sensors.imu.newest
+        try:
+            self._restart(before, f"the clock of the IMU was set back from {before:.3f} to {first:.3f} s")
+        except Exception as error:
+            self._give_up(error)
+        self.clocks += 1
+        self._begin_anew(float("-inf"))
+        sensors.forget_time()
+        self.late.clear()
+        self._last_settled = float("-inf")
+        return rows
+
+    def _go_elsewhere(self, since: float, count: int) -> None:
+        """End the piece whose fixes cannot be reached from those that outnumber them by now."""
+        sensors = self.sensors
+        sensors.moved = None
+        if self.tracker is None:
+            return
+        now = sensors.imu.newest
+        try:
+            self._restart(now, f"{count} fixes since {since:.3f} s are out of reach of all before")
+        except Exception as error:
+            self._give_up(error)
+        self.frame = None

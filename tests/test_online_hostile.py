@@ -1,0 +1,298 @@
+"""Live sessions that nothing ends: absurd rows, clocks that are set back, setups that cannot be, failures within."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+import runpy
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import oracle
+import pytest
+from test_online import SCRIPT, off, played, same
+
+import graphnav
+from graphnav.config import settings_from
+from graphnav.errors import ConfigError, RecordingError
+from graphnav.formats.trajectories import read_trajectory
+from graphnav.online import Online, Row, Session, rows_of, smoother, without_rows
+from graphnav.online.lines import HEAD, line_of, lines_of, setup_of
+from graphnav.online.store import _MAGIC, Store
+from graphnav.online.tracker import Tracker
+from graphnav.recording import Recording
+from graphnav.trajectory import Trajectory
+
+QUICK = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
+NAN = (float("nan"),) * 6
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[Recording, Trajectory]:
+    recording, truth = oracle.drive(oracle.vehicle_path(130.0, 25.0), seed=3, odometer_rate=5.0)
+    return recording.crop(20.0, 64.0), truth
+
+
+@pytest.fixture(scope="module")
+def rows(drive: tuple[Recording, Trajectory]) -> list[Row]:
+    return rows_of(drive[0])[1]
+
+
+@pytest.fixture(scope="module")
+def plain(drive: tuple[Recording, Trajectory], rows: list[Row]) -> Trajectory:
+    return played(drive[0], rows, QUICK)[1]
+
+
+def between(rows: list[Row], more: list[Row]) -> list[Row]:
+    """Rows in order of time, those of `more` where they belong."""
+    return sorted([*rows, *more], key=lambda row: row[1])
+
+
+# ------------------------------------------------------------------------------------------------- absurd rows
+def test_rows_that_nothing_can_have_sent_change_nothing(
+    drive: tuple[Recording, Trajectory], rows: list[Row], plain: Trajectory
+) -> None:
+    fix = next(values for sensor, t, values in rows if sensor == "gnss" and t > 40.0)
+    wild: list[Row] = []
+    for k in range(36):  # every second, from before there is any state
+        t = 22.513 + k
+        imu = (1e6, 1e300, -1e300, 71.0)[k % 4]
+        wild += [("imu", t, (0.0, 0.0, imu, 0.0, 0.0, 9.8)), ("imu", t + 1e-3, (0.0, 0.0, 0.0, 0.0, 1e3 * imu, 9.8))]
+        wild.append(("odometer", t, ((1e300, -1e300, 151.0)[k % 3], *NAN[:5])))
+        sd = ((1e-9, 1.0, 1.0), (1e300, 1.0, 1.0), (1e-320, 1e-320, 1e-320))[k % 3]
+        wild.append(("gnss", t, (*fix[:3], *sd, *NAN)))
+        far = ((fix[0] + 0.01, fix[1], fix[2]), (9.0, fix[1], fix[2]), (fix[0], fix[1], 1e300), (0.0, 0.0, 0.0))[k % 4]
+        wild.append(("gnss", t, (*far, 1.0, 1.0, 1.0, *NAN)))
+    online, track = played(drive[0], between(rows, wild), QUICK)
+    same(track, plain)
+    counts = online.sensors.counts
+    assert counts["imu: beyond any sensor"] + counts["imu: not a number"] == 72
+    assert counts["odometer: beyond any sensor"] == 36
+    assert sum(n for key, n in counts.items() if key.startswith("gnss: ")) == 72
+    assert online.failures == []
+
+
+def test_a_velocity_that_no_vehicle_has_leaves_its_fix(
+    drive: tuple[Recording, Trajectory], rows: list[Row], plain: Trajectory
+) -> None:
+    bad = (1e300, 0.0, 0.0, 0.1, 0.1, 0.1)
+    wild = [(s, t, v if s != "gnss" else (*v[:6], *bad)) for s, t, v in rows]
+    online, track = played(drive[0], wild, QUICK)
+    same(track, plain)
+    assert online.sensors.counts["gnss"] == sum(row[0] == "gnss" for row in rows)
+
+
+@pytest.mark.parametrize("k", [0, 30])
+def test_a_fix_far_off_is_left_out_wherever_it_comes(
+    drive: tuple[Recording, Trajectory], rows: list[Row], k: int
+) -> None:
+    number = [n for n, row in enumerate(rows) if row[0] == "gnss"][k]
+    sensor, t, values = rows[number]
+    far = (sensor, t, (values[0] + 0.1, *values[1:]))
+    missed = [*rows[:number], *rows[number + 1 :]]
+    online, track = played(drive[0], [*rows[:number], far, *rows[number + 1 :]], QUICK)
+    same(track, played(drive[0], missed, QUICK)[1])
+    assert online.sensors.counts["gnss: out of reach"] == 1
+    assert online.sensors.counts["gnss"] == sum(row[0] == "gnss" for row in missed)
+
+
+# ------------------------------------------------------------------------------------------------------- clocks
+def test_a_clock_that_is_set_back_begins_a_piece(
+    drive: tuple[Recording, Trajectory], rows: list[Row], plain: Trajectory, tmp_path: Path
+) -> None:
+    """By an hour in the middle, and the drive from its start follows: both are as they would be alone."""
+    lines = [line for _, line in lines_of(drive[0])]
+    first = next(k for k, row in enumerate(rows) if row[0] == "imu")  # what comes before it is of no clock yet
+    back = [(sensor, t - 3600.0, values) for sensor, t, values in rows[first:]]
+    later = [line_of(row) for row in [*back[:3], back[2], *back[3:]]]  # one of them comes twice
+    session = Session(QUICK, "-", tmp_path / "out")
+    session.add_lines([*lines[:-1], *later])
+    session.finish()
+    session.close()
+    assert session.online.clocks == 2
+    assert any("3600" in note or "set back" in note for note in session.online.notes)
+    one, two = (read_trajectory(tmp_path / "out" / name) for name in ("trajectory.csv", "trajectory-2.csv"))
+    alone = played(drive[0], back, QUICK)[1]
+    for track, other in ((one, plain), (two, alone)):
+        np.testing.assert_allclose(track.t, other.t, atol=1e-6)
+        np.testing.assert_allclose((track.llh - other.llh) * [6.4e6, 6.4e6, 1.0], 0.0, atol=1e-3)
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["clocks"] == 2
+
+
+def test_a_clock_set_back_by_seconds_is_noticed_before_it_spoils_anything(
+    drive: tuple[Recording, Trajectory], rows: list[Row]
+) -> None:
+    """Rows of another moment between those that are there would be read as one motion."""
+    back = [(sensor, t - 20.0, values) for sensor, t, values in rows if t > 55.0]
+    online, track = played(drive[0], [*(row for row in rows if row[1] <= 55.0), *back], QUICK)
+    assert online.clocks == 2
+    assert online.failures == []
+    old = track.t[: int(np.argmax(np.diff(track.t) < 0)) + 1] if np.any(np.diff(track.t) < 0) else track.t
+    error, sd = off(track.take(np.arange(len(old))), drive[1], drive[0])
+    assert old[-1] == pytest.approx(55.0, abs=0.05)
+    assert np.abs(error / sd).max() < 6.0
+
+
+def test_a_source_that_begins_again_is_no_other_clock(
+    drive: tuple[Recording, Trajectory], rows: list[Row], plain: Trajectory
+) -> None:
+    """A sender that was cut off sends all from its start, or from ten seconds before."""
+    half, more = len(rows) // 2, len(rows) * 3 // 4
+    online, track = played(drive[0], [*rows[:half], *rows[:more], *rows[more - 300 :]], QUICK)
+    assert online.clocks == 1
+    same(track, plain)
+
+
+def test_a_first_stamp_far_ahead_does_not_stop_the_clock(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    wild: Row = ("imu", 1e9, rows[0][2][:6])
+    online, track = played(drive[0], [wild, *rows], QUICK)
+    assert track.t[-1] == pytest.approx(drive[0].end)
+    assert online.failures == []
+
+
+# ----------------------------------------------------------------------------------------------------- failures
+def failing(monkeypatch: pytest.MonkeyPatch, at: float) -> None:
+    """A smoother whose algebra fails in the first keyframe after a time."""
+    real = Tracker.update
+
+    def update(self: Tracker, sensors: object, new: np.ndarray, dirty: float = np.inf) -> float:
+        if len(new) and new[0] > at and self.head < at:
+            raise np.linalg.LinAlgError("Singular matrix")
+        return real(self, sensors, new, dirty)
+
+    monkeypatch.setattr(Tracker, "update", update)
+
+
+def test_a_failure_within_costs_a_piece_and_not_the_session(
+    drive: tuple[Recording, Trajectory], rows: list[Row], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what was killed after it is resumed as if nothing had been."""
+    failing(monkeypatch, 52.0)
+    recording, truth = drive
+    lines = [line for _, line in lines_of(recording)]
+    texts = []
+    for name, cuts in (("whole", []), ("parts", [len(lines) // 2 + 20, len(lines) * 3 // 4])):
+        session = Session(QUICK, "-", tmp_path / name)
+        for begin, end in zip([0, *cuts], [*cuts, len(lines)], strict=True):
+            if begin:
+                session.close()  # as a kill would: no checkpoint of its own
+                session = Session(QUICK, "-", tmp_path / name, resume=True)
+            session.add_lines(lines[begin:end])
+        session.close()
+        assert len(session.online.failures) == 1
+        assert "LinAlgError" in session.online.failures[0]
+        texts.append((tmp_path / name / "trajectory.csv").read_text())
+    assert texts[0] == texts[1]
+    track = read_trajectory(tmp_path / "whole" / "trajectory.csv")
+    assert track.t[-1] == pytest.approx(recording.end, abs=1e-3)
+    error, sd = off(track, truth, recording)
+    assert np.abs(error / sd).max() < 6.0
+
+
+def test_states_that_are_no_numbers_are_never_written(
+    drive: tuple[Recording, Trajectory], rows: list[Row], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = smoother.to_trajectory
+
+    def blank(name: str, frame: object, t: np.ndarray, *more: object) -> Trajectory:
+        track = real(name, frame, t, *more)
+        return replace(track, llh=np.full_like(track.llh, np.nan)) if t[0] < 42.0 else track
+
+    monkeypatch.setattr(smoother, "to_trajectory", blank)
+    online, parts = Online(without_rows(drive[0]), QUICK), []
+    for row in rows:
+        online.add(row)
+        parts += online.settled()
+    online.finish()
+    parts += online.settled()
+    assert online.failures
+    assert all(np.isfinite(part.llh).all() for part in parts)
+    assert pickle.loads(pickle.dumps(online)).failures == online.failures
+
+
+# -------------------------------------------------------------------------------------------------------- setups
+@pytest.mark.parametrize(
+    ("setup", "field"),
+    [
+        ('{"imu": {"noise": {"gyro_noise_density": NaN}}}', "gyro_noise_density"),
+        ('{"imu": {"noise": {"gyro_noise_density": -1e-4}}}', "gyro_noise_density"),
+        ('{"imu": {"noise": {"accel_bias_walk": 0.0}}}', "accel_bias_walk"),
+        ('{"imu": {"noise": {"accel_bias_walk": 1e-320}}}', "accel_bias_walk"),
+        ('{"imu": {"noise": {"accel_bias_walk": 1e300}}}', "accel_bias_walk"),
+        ('{"gnss": {"lever_arm": [0.0, NaN, 0.0]}}', "lever_arm"),
+        ('{"gnss": {"lever_arm": [0.0, 1e300, 0.0]}}', "lever_arm"),
+        ('{"gnss": {"lever_arm": [0.0]}}', "lever_arm"),
+        ('{"odometer": {"scale_sigma": Infinity}}', "scale_sigma"),
+        ('{"odometer": {"delay_sigma": -1.0}}', "delay_sigma"),
+        ('{"odometer": {"speed_sigma": ' + "1" * 400 + "}}", "JSON"),
+        ("[" * 100_000, "JSON"),
+        ('{"name": ' * 5000 + "1" + "}" * 5000, "JSON"),
+        ("1" * 10_000, "JSON"),
+        ("[1]", "setup"),
+        ('{"name": "' + "x" * 2_000_000 + '", "more": 1}', "more"),
+    ],
+)
+def test_a_setup_is_checked_as_a_recording_is(setup: str, field: str) -> None:
+    with pytest.raises(RecordingError, match=field) as caught:
+        setup_of(f"{HEAD} {setup}")
+    assert len(str(caught.value)) < 1000
+
+
+def test_rows_are_numbers_in_ascii_digits(drive: tuple[Recording, Trajectory]) -> None:
+    session = Session(QUICK, "-")
+    session.add_lines([next(lines_of(drive[0]))[1], "I,1_0,0,0,0,0,0,9.8", "O,1,\uff11", "I,1,0,0,0,0,0,9.8"])
+    assert session.bad == 2
+
+
+class _Call:
+    """What a pickle of a stranger calls when it is read."""
+
+    def __init__(self, what: object, *arguments: object) -> None:
+        self.what, self.arguments = what, arguments
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return self.what, self.arguments
+
+
+def test_a_checkpoint_of_a_stranger_runs_nothing(drive: tuple[Recording, Trajectory], tmp_path: Path) -> None:
+    """With the right digest, calling what is not graphnav's own data."""
+    lines = [line for _, line in lines_of(drive[0])]
+    session = Session(QUICK, "-", tmp_path / "out")
+    session.add_lines(lines[: len(lines) * 9 // 10])
+    session.stop()
+    session.close()
+    Session(QUICK, "-", tmp_path / "out", resume=True).close()  # as it was written it can be read
+    for call in (
+        _Call(os.system, f"touch {tmp_path / 'owned'}"),
+        _Call(Path.touch, tmp_path / "owned"),
+        _Call(Store, tmp_path / "owned", "-", False, True),
+        _Call(eval, f"open({str(tmp_path / 'owned')!r}, 'w')"),
+        _Call(graphnav.__getattr__, "run"),
+    ):
+        body = pickle.dumps(call)
+        (tmp_path / "out" / "checkpoint").write_bytes(_MAGIC + hashlib.sha256(body).digest() + body)
+        with pytest.raises(ConfigError, match="checkpoint"):
+            Session(QUICK, "-", tmp_path / "out", resume=True)
+        assert not (tmp_path / "owned").exists()
+
+
+def test_a_line_that_never_ends_is_one_bad_line(drive: tuple[Recording, Trajectory]) -> None:
+    """Sixteen megabytes of it, and then the drive."""
+    online = runpy.run_path(str(SCRIPT))
+    session, held = Session(QUICK, "-"), []
+
+    class Quiet:
+        def now_and_then(self, silent: float = 0.0) -> None:
+            held.append(tracemalloc.get_traced_memory()[1])
+
+    head, *lines = [line.encode() + b"\n" for _, line in lines_of(drive[0])][:200]
+    tracemalloc.start()
+    online["follow"](session, iter([head, *[b"1" * (1 << 20)] * 16, b"\n", b"".join(lines)]), Quiet(), False)
+    tracemalloc.stop()
+    assert session.bad == 1
+    assert session.taken == len(lines)
+    assert max(held) < 8 << 20
