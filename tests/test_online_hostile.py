@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import pickle
-import runpy
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +13,10 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from test_online import SCRIPT, off, played, same
+from test_online import off, played, same
 
 import graphnav
+from graphnav.cli_online import Asked, follow
 from graphnav.config import settings_from
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.formats.trajectories import read_trajectory
@@ -282,7 +282,6 @@ def test_a_checkpoint_of_a_stranger_runs_nothing(drive: tuple[Recording, Traject
 
 def test_a_line_that_never_ends_is_one_bad_line(drive: tuple[Recording, Trajectory]) -> None:
     """Sixteen megabytes of it, and then the drive."""
-    online = runpy.run_path(str(SCRIPT))
     session, held = Session(QUICK, "-"), []
 
     class Quiet:
@@ -291,7 +290,7 @@ def test_a_line_that_never_ends_is_one_bad_line(drive: tuple[Recording, Trajecto
 
     head, *lines = [line.encode() + b"\n" for _, line in lines_of(drive[0])][:200]
     tracemalloc.start()
-    online["follow"](session, iter([head, *[b"1" * (1 << 20)] * 16, b"\n", b"".join(lines)]), Quiet(), False)
+    follow(session, iter([head, *[b"1" * (1 << 20)] * 16, b"\n", b"".join(lines)]), Quiet(), Asked())
     tracemalloc.stop()
     assert session.bad == 1
     assert session.taken == len(lines)

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Callable, Sequence
 
 import logs
-from test_formats_binary import frame
+from logs import frame
 
 NUMBERS = (
     "nan", "inf", "-inf", "1e308", "-1e308", "1e300", "1e-320", "-0", "0", "1_000", "\uff11\uff12", "0x1f", "1e", "",
