@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -23,7 +24,7 @@ DOTS = "  ..."
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "data").symlink_to(ROOT / "data")
+        shutil.copytree(ROOT / "data", Path(folder) / "data")
         for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
             text = page.read_text(encoding="utf-8")
             page.write_text(SHOWN.sub(lambda found: renewed(found, folder), text), encoding="utf-8")
