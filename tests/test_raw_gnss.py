@@ -359,7 +359,7 @@ def changed(tmp_path):
                 (tmp_path / file.name).symlink_to(file)
         assert old in TOML
         (tmp_path / "changed.toml").write_text(TOML.replace(old, new), encoding="utf-8")
-        return read(tmp_path / "changed.toml")
+        return read(tmp_path / "changed.toml", allow_outside=True)
 
     return read_with
 

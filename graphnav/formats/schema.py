@@ -31,7 +31,7 @@ from graphnav.rotation import Array
 from graphnav.timescales import parse_clock
 
 _SMALLEST, _LARGEST = 1e-15, 1e9  # of a figure: squares of it are numbers
-_LONGEST = 1e6  # of the components of a vector: m, or of a direction
+_LONGEST = 1e7  # of the components of a vector: m, from the Earth's centre at most, or of a direction
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 
