@@ -25,12 +25,11 @@ from graphnav.recording import Gnss, Recording
 from graphnav.rotation import Array
 from graphnav.solution import Solution
 from graphnav.state import DIM, States
-from graphnav.timescales import NEAR, between_clocks
+from graphnav.timescales import LEAP, NEAR, between_clocks
 from graphnav.trajectory import Trajectory
 
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
 _APPLIED = 1.0  # s; a larger shift is of the clock
-_LEAP = 18.0  # s, GPS time ahead of UTC since 2017
 _FEWEST = 10  # rows in common
 
 
@@ -148,8 +147,8 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
     if abs(late) < _APPLIED and shift != own_start:
         return shift, [*notes, f"{path.name}: its speed is {-late:+.3f} s late against ours: left as it is"]
     leap = ""
-    if abs(abs(late) - _LEAP) < 0.1:
-        late, leap = float(np.copysign(_LEAP, late)), ": the leap seconds between UTC and GPS time"
+    if abs(abs(late) - LEAP) < 0.1:
+        late, leap = float(np.copysign(LEAP, late)), ": the leap seconds between UTC and GPS time"
     return shift + late, [*notes, f"{path.name}: {late:+.3f} s more, by which its speed fits ours{leap}"]
 
 

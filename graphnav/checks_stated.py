@@ -14,6 +14,7 @@ from graphnav.earth import LocalFrame
 from graphnav.findings import Finding
 from graphnav.recording import Gnss, ImuNoise, Recording, Truth
 from graphnav.rotation import Array
+from graphnav.timescales import LEAP
 
 _LONG = 15.0  # m; no lever arm on a road vehicle is that long
 _RUN = 8.0  # m/s, that nobody walks
@@ -27,7 +28,6 @@ _IMPOSSIBLE = {
 _SPEEDS = {1 / 3.6: "km/h", 0.44704: "mph", 1852 / 3600: "knots", 3.6: "m/s already"}
 _MENDED = 0.3  # of what is off is left by a change that mends it
 _FOOT = 0.3048  # m
-_LEAP = 18.0  # s, GPS time ahead of UTC since 2017
 
 
 def stated_noise(noise: ImuNoise) -> Iterator[Finding]:
@@ -191,7 +191,7 @@ def truth_findings(recording: Recording) -> Iterator[Finding]:
     if off is None:
         return
     shifted = {
-        shift: found for shift in (-_LEAP, _LEAP) if (found := _apart(truth, true, gnss, fixes, shift)) is not None
+        shift: found for shift in (-LEAP, LEAP) if (found := _apart(truth, true, gnss, fixes, shift)) is not None
     }
     best = min(shifted, key=lambda shift: shifted[shift], default=0.0)
     if shifted and off > 5.0 and shifted[best] < 0.2 * off:

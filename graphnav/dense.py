@@ -21,6 +21,13 @@ from graphnav.samples import Samples
 from graphnav.state import States
 
 
+def times_between(start: float, end: float, rate: float) -> Array:
+    """Multiples of 1/rate between two times (s), with both ends."""
+    steps = np.arange(np.ceil(start * rate), np.floor(end * rate) + 1) / rate
+    inner = steps[(steps > start + 1e-6) & (steps < end - 1e-6)]
+    return np.concatenate([[start], inner, [end]])
+
+
 @dataclass(frozen=True)
 class Dense:
     """Callable for `Solution.between`."""
@@ -46,9 +53,7 @@ class Dense:
 
     def times(self, rate: float) -> Array:
         """Multiples of 1/rate on the recording's clock, with both ends."""
-        steps = np.arange(np.ceil(self.start * rate), np.floor(self.end * rate) + 1) / rate
-        inner = steps[(steps > self.start + 1e-6) & (steps < self.end - 1e-6)]
-        return np.concatenate([[self.start], inner, [self.end]])
+        return times_between(self.start, self.end, rate)
 
     def __call__(self, t: Array) -> tuple[States, Array]:
         """States and covariances (M, 15, 15) at ascending times from `start` to `end`."""

@@ -34,6 +34,7 @@ from graphnav.metrics import (
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.scoring import MAX_GAP, closure, errors, ranges
+from graphnav.timescales import GPS_TO_UNIX, LEAP
 from graphnav.trajectory import Trajectory
 
 __all__ = [
@@ -41,9 +42,6 @@ __all__ = [
     "closure", "comparison_rows", "ensemble_nees", "errors", "evaluate", "evaluate_recording", "measure", "summary",
     "text", "truth_of", "withheld_truth", "write_comparison_csv",
 ]  # fmt: skip
-
-_GPS_TO_UNIX = 315964800.0  # s between the two epochs, leap seconds aside
-_LEAP = 18.0  # s, GPS time ahead of UTC since 2017
 
 
 def truth_of(recording: Recording) -> tuple[Trajectory, Array | None] | None:
@@ -184,9 +182,9 @@ def _shift_hint(trajectory: Trajectory, truth: Trajectory) -> str:
     """'; ...' naming a shift of clocks that would make the two overlap, when a usual one does."""
     middle = 0.5 * (truth.t[0] + truth.t[-1] - trajectory.t[0] - trajectory.t[-1])
     half = 0.5 * (truth.t[-1] - truth.t[0] + trajectory.t[-1] - trajectory.t[0])
-    unix = _GPS_TO_UNIX - _LEAP
+    unix = GPS_TO_UNIX - LEAP
     usual = [
-        (_LEAP, "one may be in UTC and the other in GPS time, 18 s ahead"),
+        (LEAP, "one may be in UTC and the other in GPS time, 18 s ahead"),
         (WEEK * round(middle / WEEK), "one may count GPS seconds of the week and the other continuously"),
         (unix + WEEK * round((abs(middle) - unix) / WEEK), "one may be in Unix time and the other in GPS time"),
         (86400.0 * round(middle / 86400.0), "one may count seconds of the day"),
@@ -207,7 +205,7 @@ def _leap_hint(
     before = float(np.sqrt(np.nanmean(found.horizontal**2)))
     if before < 1.0:
         return ()
-    for shift in (_LEAP, -_LEAP):
+    for shift in (LEAP, -LEAP):
         try:
             moved = errors(replace(trajectory, t=trajectory.t + shift), truth, lever_arm=lever_arm, max_gap=max_gap)
         except RecordingError:

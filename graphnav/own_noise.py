@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv  # scipy.stats would take half a second to import
 
 from graphnav.config import Settings
 from graphnav.detectors.windows import running
@@ -70,4 +70,4 @@ def quietest_density(t: Array, x: Array) -> float:
     bend = np.sum((mean[2:] - 2.0 * mean[1:-1] + mean[:-2]) ** 2, axis=1) / (3.0 * 6.0) * (size * period)
     degrees = 3.0 * (stretch - 2) * _INDEPENDENT
     quietest = float(running(bend[:, None]).means(stretch - 2).min())
-    return float(np.sqrt(quietest * degrees / chi2.ppf(_CHANCE, degrees)))
+    return float(np.sqrt(quietest * degrees / (2.0 * gammaincinv(0.5 * degrees, _CHANCE))))

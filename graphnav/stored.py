@@ -22,6 +22,7 @@ from graphnav import rotation
 from graphnav.checks import inspect
 from graphnav.checks_stated import truth_apart
 from graphnav.config import Settings
+from graphnav.dense import times_between
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.recording import Recording
 from graphnav.rotation import Array
@@ -53,8 +54,8 @@ class Straight:
         return float(self.t[-1])
 
     def times(self, rate: float) -> Array:
-        """Times at a rate, ends included."""
-        return np.union1d(np.arange(self.start, self.end, 1.0 / rate), [self.end])
+        """As those of the solution that was stored."""
+        return times_between(self.start, self.end, rate)
 
     def __call__(self, t: Array) -> tuple[States, Array]:
         """States and covariances at times inside."""
@@ -70,7 +71,7 @@ class Straight:
 def write_outcome(outcome: Outcome, provenance: Mapping[str, Any], path: Path) -> None:
     """Keep all of an outcome but its recording, with the provenance of the run."""
     arrays: list[Array] = []
-    plain = json.dumps({"form": _FORM, "outcome": _packed(outcome, arrays), "provenance": _packed(provenance, arrays)})
+    plain = json.dumps({"form": _FORM, "outcome": _pack(outcome, arrays), "provenance": _pack(provenance, arrays)})
     text = np.frombuffer(plain.encode(), dtype=np.uint8)
     named: dict[str, Any] = {f"a{k}": a for k, a in enumerate(arrays)}
     np.savez_compressed(path, text=text, **named)
@@ -125,12 +126,12 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _packed(value: Any, arrays: list[Array]) -> Any:
+def _pack(value: Any, arrays: list[Array]) -> Any:
     """A value as JSON holds it, one key telling what it is; arrays go into the list."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.generic):
-        return _packed(value.item(), arrays)
+        return _pack(value.item(), arrays)
     if isinstance(value, np.ndarray):
         known = next((k for k, one in enumerate(arrays) if one is value), None)  # solvers share detections
         if known is None:
@@ -143,20 +144,20 @@ def _packed(value: Any, arrays: list[Array]) -> Any:
     if isinstance(value, Recording):
         return None
     if isinstance(value, Mapping):
-        return {"map": [[_packed(k, arrays), _packed(v, arrays)] for k, v in value.items()]}
+        return {"map": [[_pack(k, arrays), _pack(v, arrays)] for k, v in value.items()]}
     if isinstance(value, tuple | list):
-        return {"tuple" if isinstance(value, tuple) else "list": [_packed(one, arrays) for one in value]}
+        return {"tuple" if isinstance(value, tuple) else "list": [_pack(one, arrays) for one in value]}
     if not is_dataclass(value):
         raise TypeError(f"{type(value).__name__} cannot be kept")
     kept = {f.name: getattr(value, f.name) for f in fields(value) if f.init and f.name != "between"}
-    out = {"class": f"{type(value).__module__}.{type(value).__qualname__}", "of": _packed(kept, arrays)}
+    out = {"class": f"{type(value).__module__}.{type(value).__qualname__}", "of": _pack(kept, arrays)}
     if isinstance(value, Solution):
         out["pieces"] = [[piece.start, piece.end] for piece in value.between]
     return out
 
 
 def _unpacked(value: Any, arrays: list[Array]) -> Any:
-    """The opposite of `_packed`."""
+    """The opposite of `_pack`."""
     if not isinstance(value, dict):
         return value
     if "array" in value:

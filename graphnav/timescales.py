@@ -29,6 +29,9 @@ _LEAPS = np.array(
 )  # fmt: skip
 
 
+LEAP = float(len(_LEAPS))  # s, GPS time ahead of UTC since the last of them
+
+
 def leap_seconds(utc: Array) -> Array:
     """GPS minus UTC (s) at dates of type datetime64."""
     return np.searchsorted(_LEAPS, utc, side="right").astype(float)

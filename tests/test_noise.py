@@ -521,6 +521,11 @@ def test_of_a_second_the_best_fix_is_used() -> None:
     assert spaced is not None
     assert spaced.t == pytest.approx(t[1::5])  # of two as good the first
     assert space_fixes(fast, 0.3) is fast
+    v = np.where((np.arange(50) % 5 == 3)[:, None], 1.0, np.nan) * np.ones(3)  # velocities once a second
+    sometimes = replace(fast, gnss=replace(fast.gnss, v=v, sd_v=np.ones((50, 3))))
+    both = space_fixes(sometimes, 1.0).gnss
+    assert both is not None
+    assert both.t == pytest.approx(np.sort(np.r_[t[1::5], t[3::5]]))
 
 
 @pytest.fixture(scope="module")

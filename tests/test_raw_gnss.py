@@ -100,7 +100,7 @@ def test_glonass_and_geostationary_satellites_are_where_rtklib_has_them(rt, shar
             # of one ephemeris, at a true time: the clock is added, which is taken off again inside
             own = np.flatnonzero(ours.glonass["satellite"] == satellite)
             own = own[np.abs(ours.glonass["toe"][own] - 2130 * 604800.0 - toe) < 1.0]
-            found = ours._integrated(own, np.full(1, toe + ahead + dts[0]), 2130 * 604800.0)
+            found = ours._integrate(own, np.full(1, toe + ahead + dts[0]), 2130 * 604800.0)
             assert found["p"][0] == pytest.approx([rs[i] for i in range(3)], abs=1e-3)
             assert found["clock"][0] == pytest.approx(dts[0], abs=1e-12)
     nav = f"{3.04:9.2f}           N: GNSS NAV DATA    C: BeiDou           RINEX VERSION / TYPE\n{'':60}END OF HEADER\n"

@@ -60,7 +60,7 @@ _LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have 
 _CLASSES = ("strong", "fair", "weak", "faint")
 
 
-def _selected(recording: Recording, settings: Settings) -> RawGnss | None:
+def _select(recording: Recording, settings: Settings) -> RawGnss | None:
     """The rows to be used: of one signal for each satellite, strong enough, where the IMU is."""
     s, raw = settings.raw_gnss, recording.raw_gnss
     if raw is None or not recording.tight(s.coupling) or not len(raw):
@@ -105,13 +105,13 @@ class _Prepared:
 
 def _prepare(scene: Scene) -> _Prepared | None:
     if "raw_gnss" not in scene.made:
-        scene.made["raw_gnss"] = _prepared(scene)
+        scene.made["raw_gnss"] = _prepare_rows(scene)
     found: _Prepared | None = scene.made["raw_gnss"]
     return found
 
 
-def _prepared(scene: Scene) -> _Prepared | None:
-    raw = _selected(scene.recording, scene.settings)
+def _prepare_rows(scene: Scene) -> _Prepared | None:
+    raw = _select(scene.recording, scene.settings)
     if raw is None:
         return None
     keyframe = scene.keyframe_at(raw.t)
@@ -219,7 +219,7 @@ class GnssCode(_Satellites):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        raw = _selected(recording, settings) if settings.raw_gnss.code else None
+        raw = _select(recording, settings) if settings.raw_gnss.code else None
         return np.empty(0) if raw is None else np.unique(raw.t)
 
     @classmethod
@@ -324,7 +324,7 @@ class GnssDoppler(_Satellites):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        raw = _selected(recording, settings) if settings.raw_gnss.doppler else None
+        raw = _select(recording, settings) if settings.raw_gnss.doppler else None
         return np.empty(0) if raw is None else np.unique(raw.t[np.isfinite(raw.range_rate)])
 
     @classmethod

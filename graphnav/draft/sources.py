@@ -114,7 +114,7 @@ def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> Found:
             every.setdefault(sensor, []).append(source)
     if nothing:
         left.append(f"{', '.join(nothing)}: no sensor is recognised in the columns")
-    sensors = {sensor: chosen for sensor, some in every.items() if (chosen := _chosen(sensor, some, left)) is not None}
+    sensors = {sensor: chosen for sensor, some in every.items() if (chosen := _choose(sensor, some, left)) is not None}
     if "imu" not in sensors and "gyro" in sensors:
         if "accel" not in sensors and "accel" in every and "gravity" in sensors:
             sensors["accel"] = _with_gravity(every["accel"][0], sensors["gravity"], left)
@@ -142,19 +142,19 @@ def _files(path: Path) -> list[Path]:
         return [path]
     made = {JOINED, "recording.toml"}  # by an earlier draft
     inside = sorted(p for p in path.iterdir() if not p.name.startswith(".") and p.name not in made)
-    logs = [p for p in inside if p.name.endswith((".csv", ".csv.gz")) or _known(p)]
+    logs = [p for p in inside if p.name.endswith((".csv", ".csv.gz")) or _is_known(p)]
     if not logs:
         raise RecordingError(f"{path}: no log in this folder: no CSV file, and none of a kind that is known")
     return logs
 
 
-def _known(path: Path) -> bool:
+def _is_known(path: Path) -> bool:
     return path.suffix != ".toml" and any(
         known.load is not None and known.recognises(path) for known in formats().values()
     )
 
 
-def _chosen(sensor: str, some: list[Source], left: list[str]) -> Source | None:
+def _choose(sensor: str, some: list[Source], left: list[str]) -> Source | None:
     """The log to use of several of one sensor; what is left out, and why, is put into words."""
     if sensor == "accel":
         with_gravity = [s for s in some if _has_gravity(s)]

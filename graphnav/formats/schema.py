@@ -265,7 +265,7 @@ class RawGnssTable(_Section):
         return columns
 
     @model_validator(mode="after")
-    def _placed(self) -> RawGnssTable:
+    def _check_place(self) -> RawGnssTable:
         if self.clk is not None and self.sp3 is None:
             raise ValueError("clk says nothing without sp3")
         return self

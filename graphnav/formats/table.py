@@ -107,7 +107,7 @@ def read_table(
             file_names[name] = theirs
         elif name in required or name in renamed:
             hint = "" if name in renamed else f'; if it has another name, say columns = {{ {name} = "..." }}'
-            raise RecordingError(f"{path}: no column '{theirs}' (there are: {_listed(header)}){hint}")
+            raise RecordingError(f"{path}: no column '{theirs}' (there are: {_list_names(header)}){hint}")
     use = [header.index(theirs) for theirs in file_names.values()]
     values = _parse(path, skip, header, use)
     if not values.shape[1]:
@@ -115,7 +115,7 @@ def read_table(
     return Table(path, dict(zip(file_names, values, strict=True)), file_names, np.arange(values.shape[1]))
 
 
-def _listed(header: list[str]) -> str:
+def _list_names(header: list[str]) -> str:
     """The names of columns, as many as people look at."""
     names = [name[:40] for name in header[:30]]
     return ", ".join(names if len(names) == len(header) else [*names, "..."])

@@ -45,7 +45,7 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
             there &= base.signal == (some[0] if len(some) else -1)
         if there.sum() < 2:
             continue
-        difference[own] = _between(rover.t[own], base.t[there], error[there])
+        difference[own] = _interpolate(rover.t[own], base.t[there], error[there])
     missing = np.isnan(difference) & np.isfinite(rover.code) & np.isfinite(rover.p[:, 0])
     said: tuple[str, ...] = ()
     if missing.any():
@@ -53,7 +53,7 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     return replace(rover, difference=difference), said
 
 
-def _between(t: Array, at: Array, value: Array) -> Array:
+def _interpolate(t: Array, at: Array, value: Array) -> Array:
     """(N,) values on lines between times that are near enough, NaN elsewhere."""
     k = np.clip(np.searchsorted(at, t), 1, len(at) - 1)
     out = np.interp(t, at, value)

@@ -173,7 +173,7 @@ class Ephemerides:
         M = len(self.kepler["toe"])
         for own, number, solve in (
             (np.flatnonzero((which >= 0) & (which < M)), which, self._orbit),
-            (np.flatnonzero(which >= M), which - M, self._integrated),
+            (np.flatnonzero(which >= M), which - M, self._integrate),
         ):
             if len(own):
                 for name, value in solve(number[own], t[own], zero).items():
@@ -259,7 +259,7 @@ class Ephemerides:
             "drift": eph["clock"][:, 1] + 2.0 * eph["clock"][:, 2] * since + relative * cos_e * E_dot,
         }
 
-    def _integrated(self, k: NDArray[np.intp], t: Array, zero: float) -> dict[str, Array]:
+    def _integrate(self, k: NDArray[np.intp], t: Array, zero: float) -> dict[str, Array]:
         eph = {name: value[k] for name, value in self.glonass.items()}
         since = t - (eph["toe"] - zero)
         for _ in range(2):

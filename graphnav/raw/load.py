@@ -109,7 +109,7 @@ def load_raw(
         )
     raw, fixes = _at_true_times(raw, fixes)
     if sources.base:
-        raw, more = _differenced(raw, sources, nav, precise)
+        raw, more = _difference(raw, sources, nav, precise)
         said += more
         one = primary(raw) & np.isfinite(raw.difference)
         if one.any():
@@ -118,7 +118,7 @@ def load_raw(
     return raw, fixes, tuple(said)
 
 
-def _differenced(
+def _difference(
     raw: RawGnss, sources: Sources, nav: Ephemerides | None, precise: Orbits | None
 ) -> tuple[RawGnss, list[str]]:
     """The series with differences by the base station, and remarks."""

@@ -44,11 +44,11 @@ class Orbits:
             nodes, clocks = self.orbit[int(one)], self.clock[int(one)]
             true = t[own]
             for _ in range(2):
-                true = t[own] - np.nan_to_num(_between(clocks, true, zero)[0])
+                true = t[own] - np.nan_to_num(_interpolate_clocks(clocks, true, zero)[0])
             p = _polynomial(nodes, true, zero)
             ahead, behind = (_polynomial(nodes, true + h, zero) for h in (_HALF, -_HALF))
             v = (ahead - behind) / (2.0 * _HALF)
-            clock, drift = _between(clocks, true, zero)
+            clock, drift = _interpolate_clocks(clocks, true, zero)
             out.p[own], out.v[own], out.drift[own] = p, v, drift
             out.clock[own] = clock - 2.0 * np.sum(p * v, axis=1) / C**2
         return out
@@ -179,7 +179,7 @@ def _polynomial(nodes: tuple[Array, Array], t: Array, zero: float) -> Array:
     return np.asarray(out)
 
 
-def _between(clocks: tuple[Array, Array], t: Array, zero: float) -> tuple[Array, Array]:
+def _interpolate_clocks(clocks: tuple[Array, Array], t: Array, zero: float) -> tuple[Array, Array]:
     """Clocks and their drifts (N,) on lines between nodes; NaN outside them and in gaps."""
     at, value = clocks[0] - zero, clocks[1]
     if len(at) < 2:

@@ -87,7 +87,7 @@ def parse_observations(data: bytes, path: Path) -> Observations:
         value[value == 0.0] = np.nan  # absent (RINEX 2.11, table A2)
         lli = block[:, :, 14].astype(np.intp) - 48
         lli[(lli < 0) | (lli > 9)] = 0
-        named = [_named(name, system, header.version) for name in types]
+        named = [_translate_name(name, system, header.version) for name in types]
         filled = np.asarray(np.isfinite(value).any(axis=0))
         unknown |= {
             f"{SYSTEMS[system]} {name}"
@@ -178,7 +178,7 @@ def _header(lines: Lines, path: Path) -> Header:
     return out
 
 
-def _named(name: str, system: int, version: float) -> str:
+def _translate_name(name: str, system: int, version: float) -> str:
     """A type by its name of version 3.05."""
     if version >= 3.0:
         if system == BEIDOU and name[1:2] == "1" and version < 3.035 and name[2:3] in "IQX":

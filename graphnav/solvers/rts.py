@@ -56,7 +56,7 @@ def backward(problem: Problem, forward: Forward, progress: Progress | None = Non
             ahead = forward.P_predicted[end]
             _, inverse, info = dposv(ahead, np.eye(D))
             if info:
-                raise _broken_down(problem, end)
+                raise _breakdown(problem, end)
             r[end], N[end] = inverse @ away, inverse @ (ahead - P[end]) @ inverse
         _find_disturbances(forward, end, r, N, progress)
         ahead = forward.P_predicted[:end]
@@ -81,7 +81,7 @@ def _smooth_filtered(
             Pp, at, ahead = forward.P_predicted[k + 1], slice(k, k + 1), slice(k + 1, k + 2)
             _, gain, info = dposv(Pp, forward.F[k] @ forward.P[k])
             if info:
-                raise _broken_down(problem, k)
+                raise _breakdown(problem, k)
             C = gain.T
             d = C @ np.concatenate([state.minus(before.states[ahead])[0], values - before.values[k + 1]])
             state, values = forward.states[at].plus(d[None, :DIM]), forward.values[k] + d[DIM:]
@@ -113,7 +113,7 @@ def _find_disturbances(forward: Forward, end: int, r: Array, N: Array, progress:
             progress("smoother", 1.0 - k / K)
 
 
-def _broken_down(problem: Problem, k: int) -> EstimationError:
+def _breakdown(problem: Problem, k: int) -> EstimationError:
     return EstimationError(f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas")
 
 
