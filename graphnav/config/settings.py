@@ -75,10 +75,13 @@ class NoiseSettings(Section):
 
 
 class SolverSettings(Section):
-    """The outer loop of the batch solver, and how long the incremental one waits."""
+    """The outer loop of the batch solver, and how long the incremental ones wait."""
 
     lag: float = Field(
         120.0, ge=1, description="s of future that a state has seen when the incremental solver lets it settle"
+    )
+    isam2_lag: float = Field(
+        float("inf"), ge=1, description="s as `lag`, of the solver isam2; inf smooths the whole drive"
     )
     max_iterations: int = Field(30, ge=1, description="Levenberg-Marquardt iterations")
     tolerance: float = Field(

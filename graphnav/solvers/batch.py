@@ -20,12 +20,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.dense import dense
-from graphnav.dynamics import as_biases
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
 from graphnav.solvers.graph import Eliminated, LinearGraph
-from graphnav.solvers.passes import Progress, residual_record
+from graphnav.solvers.passes import Progress, integrated_again, residual_record
 from graphnav.solvers.robust import REDESCENDING, weight_and_cost
 from graphnav.solvers.rows import Layout, Point, Rows, Values, column_norms, cost, promised, whitened
 from graphnav.state import DIM, States
@@ -129,7 +128,7 @@ def _minimise(
         settings = settings.model_copy(update={"max_iterations": iterations})
     renewed = refused = 0
     if reintegrate:
-        problem, renewed = _renew(problem, point)
+        problem, renewed = integrated_again(problem, point.states, point.scale)
     layout = Layout(problem)
     now = cost(problem, point, layout)
     damping, gentlest = 0.0, _MIN_DAMPING
@@ -178,7 +177,7 @@ def _minimise(
             gentlest /= 10.0  # more would have been possible: a long valley is not crept along
         damping = 0.0 if damping <= _MIN_DAMPING or gain < settings.tolerance else damping / 10.0
         if reintegrate:
-            problem, again = _renew(problem, point)
+            problem, again = integrated_again(problem, point.states, point.scale)
             if again:
                 layout = Layout(problem)
                 now = cost(problem, point, layout)
@@ -203,18 +202,6 @@ def _eliminate(rows: Rows, layout: Layout, damping: float) -> Eliminated:
             keys = np.array([k for k in layout.keys if layout.width[k] == width])
             graph.add([(keys, size[keys, :width, None] * np.eye(width))], np.zeros((len(keys), width)))
     return graph.eliminate(layout.order)
-
-
-def _renew(problem: Problem, point: Point) -> tuple[Problem, int]:
-    """Integrate again about the present biases where the first-order correction no longer holds."""
-    ba, bg = point.states.ba[:-1], point.states.bg[:-1]
-    if point.scale is not None:
-        of_accel, of_gyro = as_biases(point.scale, problem.intervals.force, problem.intervals.rate)
-        ba, bg = ba + of_accel, bg + of_gyro
-    far = problem.intervals.out_of_range(bg)
-    if not far.any():
-        return problem, 0
-    return problem.reintegrated(ba, bg), int(far.sum())
 
 
 def _estimates(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.constraints.base import Constraint
-from graphnav.dynamics import SCALE
+from graphnav.dynamics import SCALE, as_biases
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
@@ -130,6 +130,25 @@ def residual_record(
     if rows.weight is not None:
         weight = weight * rows.weight
     return ConstraintRecord("residual", problem.t[at], linear.residual, linear.sigma, nis, weight, rows.axes, rows.unit)
+
+
+def integrated_again(problem: Problem, states: States, scale: Array | None, first: int = 0) -> tuple[Problem, int]:
+    """The problem integrated about the present biases where the first-order correction no longer holds, and how often.
+
+    Parameters
+    ----------
+    states : of keyframes from `first` on; intervals before stay as they are, of those behind the last is the guess.
+    scale : (k,) scale errors of the IMU, where they are parameters.
+    """
+    rows = slice(first, None)
+    ba, bg = problem.intervals.ba.copy(), problem.intervals.bg.copy()
+    at = np.minimum(np.arange(len(ba) - first), max(len(states) - 2, 0))
+    ba[rows], bg[rows] = states.ba[at], states.bg[at]
+    if scale is not None:
+        of_accel, of_gyro = as_biases(scale, problem.intervals.force[rows], problem.intervals.rate[rows])
+        ba[rows], bg[rows] = ba[rows] + of_accel, bg[rows] + of_gyro
+    far = problem.intervals.out_of_range(bg)
+    return (problem.reintegrated(ba, bg), int(far.sum())) if far.any() else (problem, 0)
 
 
 def values_of(problem: Problem, points: Points) -> dict[str, Array]:
