@@ -167,7 +167,7 @@ def _solve(
     if "incremental" in solvers:
         out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
     if "isam2" in solvers:
-        out["isam2"] = isam2(problem, settings.solver.isam2_lag, progress, begin).settled
+        out["isam2"] = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin).settled
     timings = {"detection": detection, **found.timings}
     return {
         name: replace(

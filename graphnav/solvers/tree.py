@@ -28,6 +28,7 @@ from graphnav.dynamics import SCALE
 from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array
+from graphnav.solvers.graph import jacobian_factor
 from graphnav.solvers.passes import integrated_again, shift
 from graphnav.solvers.revision import Renewed
 from graphnav.solvers.robust import PASSES
@@ -181,7 +182,7 @@ class Tree:
         _file(keyframe, made, list(result.getNewFactorsIndices())[begin:])
         self._read([x, *(node for node, _ in nodes.values())])
         for _ in range(PASSES - 1 if any(one.kernel != "none" for one in rows) else 0):
-            self._again([len(self.keyframes) - 1])
+            self.again([len(self.keyframes) - 1])
             self._read([x, *(node for node, _ in nodes.values())])
         return float(np.linalg.norm(x.delta[:3]))
 
@@ -330,6 +331,32 @@ class Tree:
             x.delta = x.unit * flat[begin:end]
             begin = end
 
+    def estimates(self, first: int = 0) -> list[tuple[States, Array]]:
+        """State and parameter values of each keyframe from one on, as last read."""
+        return [(k.estimate, k.values) for k in self.keyframes[first:]]
+
+    def root(self, columns: Columns) -> Array:
+        """(D, D) R, not triangular: R e are the whitened errors of the newest keyframe and its parameters."""
+        last = self.keyframes[-1]
+        D = DIM + len(last.values)
+        variables = list({x.key: x for x in (last.state, *(n for n, _ in last.nodes.values()))}.values())
+        joint = self.isam.jointMarginalCovariance([x.key for x in variables])
+        into = {x.key: np.zeros((D, len(x.unit))) for x in variables}
+        J = rotation.right_jacobian(last.state.delta[None, :3])[0]
+        into[last.state.key][:DIM] = np.eye(DIM)
+        into[last.state.key][:3, :3] = J
+        for name, at in columns.items():
+            node, own = last.nodes[name]
+            into[node.key][at, own] = np.eye(at.stop - at.start)
+        P = np.zeros((D, D))
+        for a in variables:
+            for b in variables:
+                A, B = into[a.key] * a.unit, into[b.key] * b.unit
+                P += A @ joint.at(a.key, b.key) @ B.T
+        sd = np.sqrt(np.diag(P))
+        w, V = np.linalg.eigh(P / sd[:, None] / sd)
+        return np.asarray((V / np.sqrt(np.maximum(w, np.finfo(float).eps))).T / sd)
+
     def moved(self, share: float = 1.0) -> Array:
         """Which keyframes' estimates are further from where their rows were linearised than a share of the limits."""
         if not self.keyframes:
@@ -350,7 +377,7 @@ class Tree:
         if not len(self.moved(share)):
             return 0
         which = self.moved(_ALMOST * share)
-        self._again(which, renewed)
+        self.again(which, renewed)
         self.read()
         return len(which)
 
@@ -367,10 +394,10 @@ class Tree:
         if count:
             for k in own:
                 k.place = replace(k.place, problem=problem)
-            self._again(range(len(self)))
+            self.again(range(len(self)))
         return problem, count > 0
 
-    def _again(self, which: Iterable[int], renewed: Renewed | None = None) -> None:
+    def again(self, which: Iterable[int], renewed: Renewed | None = None) -> None:
         """Linearise keyframes, and the intervals on either side, where they are now."""
         rows = {i for i in map(int, which) if i >= self._held}
         links = {k for i in rows for k in (i, i + 1) if k < len(self) and _LINK in self.keyframes[k].slots}
@@ -428,9 +455,9 @@ class Tree:
             yield run
 
     # ---------------------------------------------------------------------------------------------------- leaving
-    def settled(self, count: int) -> Smoothed:
-        """The first keyframes as they are known now."""
-        own = self.keyframes[:count]
+    def settled(self, count: int, first: int = 0) -> Smoothed:
+        """The first `count` keyframes as they are known now, or those of them from `first` on."""
+        own = self.keyframes[first:count]
         marginal: dict[int, Array] = {}
         for k in own:
             for x in (k.state, *(node for node, _ in k.nodes.values())):
@@ -551,11 +578,7 @@ def _isam() -> gtsam.ISAM2:
 
 def _factor(blocks: Sequence[tuple[_Variable, Array]], b: Array) -> Any:
     """Whitened rows A e = b as a factor of the tree."""
-    if len(blocks) > 3:
-        raise ValueError(f"a row may touch one to three variables, not {len(blocks)}")
-    make: Any = gtsam.JacobianFactor
-    flat = [part for x, A in blocks for part in (x.key, np.asfortranarray(A * x.unit))]
-    return gtsam.LinearContainerFactor(make(*flat, b, gtsam.noiseModel.Unit.Create(len(b))))
+    return gtsam.LinearContainerFactor(jacobian_factor([(x.key, A * x.unit) for x, A in blocks], b))
 
 
 def _turned(A: Array, d: Array) -> Array:
