@@ -82,8 +82,7 @@ def test_a_start_that_is_off_by_sixty_degrees_is_mended_by_relinearisation(posed
     assert np.abs(found.states.p - best.states.p).max() < 1e-3
 
 
-def test_within_a_lag_it_is_the_window(posed: Problem, solved: Solution, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("graphnav.solvers.isam._PORTIONS", 8)  # to settle when the window does
+def test_within_a_lag_it_is_the_window(posed: Problem, solved: Solution) -> None:
     # about the right biases: the window does not integrate again
     problem = posed.reintegrated(solved.states.ba[:-1], solved.states.bg[:-1])
     tree, window = isam2(problem, lag=30.0), incremental(problem, lag=30.0)

@@ -25,7 +25,7 @@ from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
 from graphnav.solvers.graph import Eliminated, LinearGraph
 from graphnav.solvers.passes import Progress, integrated_again, residual_record
-from graphnav.solvers.robust import REDESCENDING, weight_and_cost
+from graphnav.solvers.robust import REDESCENDING
 from graphnav.solvers.rows import Layout, Point, Rows, Values, column_norms, cost, promised, whitened
 from graphnav.state import DIM, States
 
@@ -67,13 +67,10 @@ def batch(
     unknown = np.full((DIM, DIM), np.nan)
     covariance = np.stack([marginal.get(k, unknown) for k in range(layout.K)])
     done = time.perf_counter()
-    at_keyframes = point.at_keyframes(problem)
-    records = {}
+    points, records = point.points(problem), {}
     for constraint in problem.constraints:
-        s = np.sqrt(residual_record(problem, constraint, point.states, at_keyframes).nis)
-        weight, _ = weight_and_cost(constraint.robust, s, constraint.robust_scale)
-        records[constraint.name] = residual_record(problem, constraint, point.states, at_keyframes, weight)
-        if np.mean(weight < 0.1) > 0.5:
+        record = records[constraint.name] = residual_record(problem, constraint, points, robust=True)
+        if constraint.robust != "none" and np.mean(record.weight < 0.1) > 0.5:
             notes.append(f"most rows of {constraint.name} were given up as outliers: do not trust this solution")
     return Solution(
         solver="batch",
@@ -108,10 +105,10 @@ class _Minimum:
 def _graduated(problem: Problem, point: Point) -> Iterator[Problem]:
     """The problem with its "gnc" kernels convex at first and then ever less so, for a step each."""
     mu: dict[str, float] = {}
-    at_keyframes = point.at_keyframes(problem)
+    points = point.points(problem)
     for c in problem.constraints:
         if c.robust == "gnc":
-            s2 = residual_record(problem, c, point.states, at_keyframes).nis * (1.0 if c.weight is None else c.weight)
+            s2 = residual_record(problem, c, points).nis * (1.0 if c.weight is None else c.weight)
             if np.max(s2) > c.robust_scale**2:
                 mu[c.name] = float(1.0 / (2.0 * float(np.max(s2)) / c.robust_scale**2 - 1.0))
     while mu and min(mu.values()) < _SHARP:

@@ -37,16 +37,15 @@ from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import Solution
+from graphnav.solvers.linearise import Points, scale_at
 from graphnav.solvers.passes import (
     Filtered,
     Forward,
     Gain,
-    Points,
     Progress,
     joined,
     moved,
     parameters_of,
-    scale_of,
 )
 from graphnav.solvers.points import AtEstimate, AtPoints, Estimate, about_own
 from graphnav.solvers.robust import PASSES, softened, weight_and_cost
@@ -99,7 +98,7 @@ def ekf(
         stopped="one pass forward over all keyframes",
         timings={"filter": seconds},
         notes=problem.notes,
-        between=(dense(problem, filtered, P, scale_of(problem, one.values), smooth=False),),
+        between=(dense(problem, filtered, P, scale_at(problem.columns, one.values), smooth=False),),
     )
     return Filtered(**vars(one), solution=solution)
 

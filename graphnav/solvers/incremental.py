@@ -17,8 +17,8 @@ from graphnav.dynamics import SCALE
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
+from graphnav.solvers.linearise import Points
 from graphnav.solvers.passes import Progress, residual_record
-from graphnav.solvers.robust import weight_and_cost
 from graphnav.solvers.stages import Place, Step
 from graphnav.solvers.window import Smoothed, Window, first_message, turn_limit
 from graphnav.state import DIM, States
@@ -140,12 +140,9 @@ def replayed(
     sigma = np.array([row for part in parts for row in part.sigma])
     covariance = np.concatenate([part.covariance for part in parts])
     at = {name: slice(s.start - DIM, s.stop - DIM) for name, s in columns.items()}
-    chains = {name: values[:, s] for name, s in at.items()}
-    records = {}
-    for rows in problem.constraints:
-        r = residual_record(problem, rows, states, chains)
-        robust, _ = weight_and_cost(rows.robust, np.sqrt(r.nis), rows.robust_scale)
-        records[rows.name] = replace(r, weight=robust * r.weight)
+    order = [values[:, at[c.parameter.name]] for c in problem.chains]
+    points = Points(states, np.concatenate([np.empty((K, 0)), *order], axis=1))
+    records = {rows.name: residual_record(problem, rows, points, robust=True) for rows in problem.constraints}
     whole = "all there was" if np.isinf(lag) else f"{lag:g} s of the future, or all there was"
     settled = Solution(
         solver=solver,

@@ -20,7 +20,7 @@ from graphnav.solvers.window import Smoothed, first_message, turn_limit
 from graphnav.state import DIM, States
 
 _SKIP = 10  # keyframes between two looks at what has moved, as GTSAM's relinearizeSkip
-_PORTIONS = 1  # of the lag: keyframes settle in groups this long, as the first covariance of one costs a pass
+_PORTIONS = 8  # of the lag: keyframes settle in groups this long, as in the window
 _FINE = 0.02  # of the usual limits, within which the whole drive is converged
 _ROUNDS = 30
 

@@ -29,7 +29,8 @@ from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solvers.graph import jacobian_factor
-from graphnav.solvers.passes import integrated_again, shift
+from graphnav.solvers.linearise import shift
+from graphnav.solvers.passes import integrated_again
 from graphnav.solvers.revision import Renewed
 from graphnav.solvers.robust import PASSES
 from graphnav.solvers.stages import Columns, Measured, Message, Place, Step, at_points, extended, measured, predicted
