@@ -13,7 +13,6 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
-from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.constraints.standstill import PLACE
 from graphnav.noise.apply import row_weights
 from graphnav.noise_model import STATED, NoiseModel
@@ -103,7 +102,7 @@ class Chain:
         """Have the fixes watched for errors that last, as soon as some tell how often they come."""
         if self.window.newest.tests is not None or self.settings.gnss.faults == "off" or len(sensors.gnss) < _FIXES:
             return
-        watched = [c for c in problem.constraints if c.watched and isinstance(c, GnssPosition | GnssVelocity)]
+        watched = [c for c in problem.constraints if c.watched and c.fix_of]
         if watched:
             period = float(np.median(np.diff(sensors.gnss.t)))
             self.window.watch(Watch(watched, period, len(self.window.newest.z)))
