@@ -29,10 +29,12 @@ from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf
 from graphnav.solvers.incremental import incremental
 from graphnav.solvers.isam import isam2
+from graphnav.solvers.rows import cost_at
 from graphnav.solvers.rts import backward, rts
 
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
+_CLEARLY = 10.0  # half chi-square; a likelihood ratio of 22,000
 _SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
 
 
@@ -167,7 +169,14 @@ def _solve(
     if "incremental" in solvers:
         out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
     if "isam2" in solvers:
-        out["isam2"] = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin).settled
+        out["isam2"] = one = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin).settled
+        best = cost_at(problem, smoothed)
+        if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY:
+            note = (
+                f"isam2 ended in an optimum that explains the data worse than rts does: half chi-square {one.cost:.0f}"
+            )
+            note += f" against {best:.0f}; do not trust it"
+            out["isam2"] = replace(one, notes=(note, *one.notes))
     timings = {"detection": detection, **found.timings}
     return {
         name: replace(

@@ -36,6 +36,7 @@ class Predicted:
     state: States
     values: Array
     columns: Columns
+    link: Array | None  # whitened rows of the interval
     top: Array  # (D, D + 1 + tests) R z of a message without those rows, and what tests have beside it
     G: Array
     g: Array
@@ -126,7 +127,7 @@ def predict(
     if np.any(apart):
         G[:DIM] = turned(G[:DIM], rotation.right_jacobian_inverse(apart[None, :3])[0])
         g[:DIM] += apart
-    return Predicted(before, place, state, values, columns, top, G, g, lost, root @ root.T, tuple(rows))
+    return Predicted(before, place, state, values, columns, link, top, G, g, lost, root @ root.T, tuple(rows))
 
 
 def update(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -> tuple[Stage, Array]:

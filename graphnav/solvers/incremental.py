@@ -19,6 +19,7 @@ from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
 from graphnav.solvers.linearise import Points
 from graphnav.solvers.passes import Progress, residual_record
+from graphnav.solvers.rows import cost_at
 from graphnav.solvers.stages import Place, Step
 from graphnav.solvers.window import Smoothed, Window, first_message, turn_limit
 from graphnav.state import DIM, States
@@ -154,6 +155,7 @@ def replayed(
         records=records,
         counts={"initial_prior": 1, "imu": K - 1, **{c.name: len(c) for c in problem.constraints}},
         iterations=1,
+        cost=cost_at(problem, points),
         stopped=f"every keyframe settled with {whole}",
         timings={solver: spent},
         notes=(*problem.notes, f"lag {lag:g} s: {said(seconds)}"),

@@ -147,6 +147,11 @@ def cost(problem: Problem, point: Point, layout: Layout) -> float:
     return total
 
 
+def cost_at(problem: Problem, points: Points) -> float:
+    """`cost` at points of all keyframes."""
+    return cost(problem, Point(points.states, points.nodes(problem)), Layout(problem))
+
+
 def promised(rows: Rows, layout: Layout, step: Step) -> float:
     """How much the quadratic model falls by a step."""
     flat = layout.flat(step)

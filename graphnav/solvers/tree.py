@@ -28,6 +28,7 @@ from graphnav.dynamics import SCALE
 from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array
+from graphnav.solvers.elimination import Predicted
 from graphnav.solvers.graph import jacobian_factor
 from graphnav.solvers.linearise import shift
 from graphnav.solvers.passes import integrated_again
@@ -142,12 +143,20 @@ class Tree:
             ) from None
         return np.asarray(x.unit[:, None] * found * x.unit)
 
-    def add(self, place: Place) -> float:
-        """Take in one more keyframe with its rows; returns by how much they turned it, rad."""
+    def add(self, place: Place, ahead: Predicted | None = None, rows: Sequence[Measured] = ()) -> float:
+        """Take in one more keyframe; returns by how much its rows turned it, rad.
+
+        Parameters
+        ----------
+        ahead, rows : what it is predicted to be from `newest`, and its rows there, where that is known already.
+        """
         if not self.keyframes and place.linked:
             self._begin(place)
-        before = self.newest
-        state, values, columns, link = predicted(before, place)
+        if ahead is None:
+            state, values, columns, link = predicted(self.newest, place)
+            rows = measured(place, state, values, columns).measured
+        else:
+            state, values, columns, link = ahead.state, ahead.values, ahead.columns, ahead.link
         graph, new = gtsam.NonlinearFactorGraph(), gtsam.Values()
         x = self._variable(np.zeros(DIM), _UNIT, place.t)
         nodes = self._open(place, graph, new)
@@ -168,7 +177,6 @@ class Tree:
             last = self.keyframes[-1]
             blocks = [(last.state, _turned(link[:, :DIM], last.state.delta)), (x, link[:, DIM : 2 * DIM])]
             made.append((_LINK, self._about(link[:, DIM:-1], link[:, -1], blocks, last.columns, last.nodes)))
-        rows = measured(place, state, values, columns).measured
         made += [(one.name, self._rows(keyframe, one, weighted=False)) for one in rows]
         self.keyframes.append(keyframe)
         begin = graph.size()
@@ -178,7 +186,7 @@ class Tree:
         if self._number > 3:  # along time, where the order is free
             for variable in self._recent():
                 groups.insert2(variable.key, variable.last - self._number + 3)
-        result = self.isam.update(graph, new, [], groups)
+        result = _updated(self.isam, place.t, graph, new, [], groups)
         self._number += 1
         _file(keyframe, made, list(result.getNewFactorsIndices())[begin:])
         self._read([x, *(node for node, _ in nodes.values())])
@@ -207,7 +215,7 @@ class Tree:
                 self._constant.add(name)
                 self._first_sigma[name] = p.sigma
                 node.unit[nodes[name][1]] = 1.0
-        self.isam.update(graph, new)
+        _updated(self.isam, place.t, graph, new)
         self._in_force = nodes
         before = Place(place.t, None)
         self.keyframes.append(_Keyframe(self._number, before, x, prior.state, prior.columns, nodes, {}))
@@ -311,7 +319,8 @@ class Tree:
         groups = gtsam.KeyGroupMap()
         for variable in late:
             groups.insert2(variable.key, variable.last - first)
-        result = self.isam.update(graph, gtsam.Values(), gone, groups, None, every)
+        t = self.keyframes[-1].place.t
+        result = _updated(self.isam, t, graph, gtsam.Values(), gone, groups, None, every)
         for (keyframe, name, _), index in zip(made, result.getNewFactorsIndices(), strict=True):
             keyframe.slots.setdefault(name, []).append(index)
 
@@ -575,6 +584,13 @@ def _isam() -> gtsam.ISAM2:
     parameters.findUnusedFactorSlots = True
     parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(_WILDFIRE))
     return gtsam.ISAM2(parameters)
+
+
+def _updated(isam: gtsam.ISAM2, t: float, *change: Any) -> Any:
+    try:
+        return isam.update(*change)
+    except RuntimeError as error:  # GTSAM's for a variable that nothing determines
+        raise EstimationError(f"the smoother's information broke down at {t:.3f} s: check sigmas and units") from error
 
 
 def _factor(blocks: Sequence[tuple[_Variable, Array]], b: Array) -> Any:

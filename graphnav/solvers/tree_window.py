@@ -36,8 +36,9 @@ class TreeWindow(Window):
         """As of `Window`; the newest message is about the tree's estimate."""
         if self.tree is None:
             self.tree, self._before = Tree(self.head, self.turn), int(place.linked)
+        ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
         turn = super().push(place, ahead)
-        self.tree.add(place)
+        self.tree.add(place, ahead, self.stages[-1].measured)
         self._adopt(full=False)
         return turn
 
