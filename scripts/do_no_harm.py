@@ -12,7 +12,6 @@ already are not solved again. Exit code 1 where a bound of `BOUNDS` is broken.
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import math
 import multiprocessing
@@ -114,42 +113,41 @@ def placed(drive: Drive, folder: Path) -> str:
     return drive.source if drive.source == "kitti" else str(folder / drive.source)
 
 
-def windows(recording: Recording, source: str, count: int, seed: int, whole: bool) -> Iterator[tuple[str, Span]]:
+def windows(recording: Recording, source: str, options: argparse.Namespace) -> Iterator[tuple[str, Span]]:
     """Names and spans: the drive as far as it has fixes, unless only parts are wanted, and windows in it.
 
     The first starts anywhere, each of the others further by the golden ratio of all there is: so many or few lie spread
-    evenly, and the first of many are those of few. Fewer than `count` where the drive is shorter than two windows.
+    evenly, and the first of many are those of few. Fewer than asked for where the drive is shorter than two windows.
     """
     gnss = recording.gnss
     assert gnss is not None
     first, last = max(gnss.t[0] - recording.start, 0.0), min(gnss.t[-1] - recording.start, recording.duration)
     length = last - first
-    if whole or length < SHORT:
+    if options.whole or length < SHORT:
         yield "whole", (0.0, last)
     if length < SHORT:
         return
-    size = min(WINDOW, 0.5 * length)
-    place = random.Random(f"{seed} {Path(source).name}").random()
-    for k in range(math.ceil(count * min(1.0, length / (2.0 * WINDOW)))):
+    size = min(options.length, 0.5 * length)
+    place = random.Random(f"{options.seed} {Path(source).name}").random()
+    for k in range(math.ceil(options.windows * min(1.0, length / (2.0 * options.length)))):
         start = round(first + (place + k * GOLDEN) % 1.0 * (length - size), 1)
         end = round(start + size, 1)
         yield f"{start:g}-{end:g}", (start, end)
 
 
 def plan(options: argparse.Namespace) -> list[Job]:
-    """Every job asked for, by drive, window by window."""
-    jobs: list[list[Job]] = []
+    """Every job asked for, by drive, window by window; a share of them is drawn cell by cell, to see more drives."""
+    cells: list[list[Job]] = []
     for name in options.drives:
         source = placed(DRIVES[name], options.data)
         recording = load(source)
-        for window, span in windows(recording, DRIVES[name].source, options.windows, options.seed, options.whole):
+        for window, span in windows(recording, DRIVES[name].source, options):
             sets = SENSORS if recording.odometer is not None else SENSORS[:2]
-            cells = itertools.product(sets, VARIANTS)
-            jobs.append([Job(name, source, window, span, sensors, variant) for sensors, variant in cells])
+            cells += [[Job(name, source, window, span, sensors, variant) for variant in VARIANTS] for sensors in sets]
     if options.share < 1.0:
-        picked = random.Random(options.seed).sample(range(len(jobs)), max(1, round(options.share * len(jobs))))
-        jobs = [jobs[k] for k in sorted(picked)]
-    return [job for window in jobs for job in window]
+        picked = random.Random(options.seed).sample(range(len(cells)), max(1, round(options.share * len(cells))))
+        cells = [cells[k] for k in sorted(picked)]
+    return [job for cell in cells for job in cell]
 
 
 def withheld_of(part: Recording, length: float) -> tuple[Withheld, ...]:
@@ -248,8 +246,9 @@ def options_of(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--data", type=Path, default=os.environ.get("GRAPHNAV_DATA", HERE.parent / "shared" / "data"))
     parser.add_argument("--drives", default=",".join(DRIVES), help="some of %(default)s")
     parser.add_argument("--windows", type=int, default=8, help="of each drive that is long enough")
+    parser.add_argument("--length", type=float, default=WINDOW, help="of a window, s (%(default)g)")
     parser.add_argument("--whole", action=argparse.BooleanOptionalAction, default=True, help="whole drives as well")
-    parser.add_argument("--share", type=float, default=1.0, help="of all windows, drawn by the seed")
+    parser.add_argument("--share", type=float, default=1.0, help="of all cells, drawn by the seed")
     parser.add_argument("--seed", type=int, default=1, help="of where windows start, and of the share")
     parser.add_argument("--only", choices=VARIANTS, help="solve with one noise only")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
@@ -294,9 +293,9 @@ def main(arguments: list[str] | None = None) -> int:
         print("\n".join(["", *compared(rows, old)]))
     found = broken(rows)
     for name, bound in BOUNDS.items():
-        own = [said for which, said in found if which == name]
+        own = [one for one in found if one.bound == name]
         print(f"\n{name} ({bound:g}): " + (f"broken {len(own)} times" if own else "holds"))
-        print("".join(f"  {said}\n" for said in own), end="")
+        print("".join(f"  {one}\n" for one in own), end="")
     return int(bool(found))
 
 

@@ -88,11 +88,11 @@ def counted(pairs: list[Pair]) -> list[Pair]:
 
 
 def against_filter(groups: dict[Group, list[Pair]], group: Group, axis: str) -> float:
-    """A solver's pooled error over its filter's, estimated; NaN where not known."""
+    """A solver's pooled error over its filter's, estimated; NaN where not known or neither is large enough."""
     own, of_filter = (
         pooled((p.estimated for p in counted(groups.get(g, []))), axis) for g in (group, (*group[:2], "ekf"))
     )
-    return own / of_filter if of_filter > 0 else math.nan
+    return own / of_filter if of_filter > 0 and max(own, of_filter) > FLOOR else math.nan
 
 
 def slower(pairs: list[Pair]) -> float:
@@ -101,31 +101,47 @@ def slower(pairs: list[Pair]) -> float:
     return sum(p.estimated["seconds"] for p in pairs if p.solved) / stated if stated > 0 else math.nan
 
 
-def broken(rows: list[Row]) -> list[tuple[str, str]]:
-    """(bound, what breaks it) for every bound of `BOUNDS` and window or group that breaks it."""
-    groups, out, ratios = pairs_of(rows), [], []
+@dataclass(frozen=True)
+class Breach:
+    """A bound of `BOUNDS` and what breaks it."""
+
+    bound: str
+    name: str  # of the window or group; empty for a bound on all
+    value: float  # that the bound is for; NaN where a window is not solved
+    detail: str
+
+    def __str__(self) -> str:
+        value = f"{self.value:.3g}" if math.isfinite(self.value) else ""
+        return f"{self.name}: {value} {self.detail}" if self.name else f"{value} {self.detail}"
+
+
+def broken(rows: list[Row]) -> list[Breach]:
+    """Every breach of a bound."""
+    groups, ratios = pairs_of(rows), []
+    out: list[Breach] = []
     for group, pairs in groups.items():
         name, (drive, sensors, solver) = " ".join(group), group
         for p in pairs:
             if p.stated is not None and "error" not in p.stated and "error" in p.estimated:
-                out.append(("solved", f"{p.name}: {p.estimated['error']}"))
+                out.append(Breach("solved", p.name, math.nan, p.estimated["error"]))
             for axis in ("h", "up"):
                 ratio = p.ratio(axis)
                 if ratio is not None and p.stated is not None and ratio > BOUNDS["worst"]:
-                    said = f"{metres(p.stated[axis])} -> {metres(p.estimated[axis])} m"
-                    out.append(("worst", f"{p.name}, {axis}: {ratio:.2f} ({said})"))
+                    detail = f"({metres(p.stated[axis])} -> {metres(p.estimated[axis])} m)"
+                    out.append(Breach("worst", f"{p.name}, {axis}", ratio, detail))
             if p.lost is not None and p.lost > BOUNDS["confirmed"]:
-                of = f"{p.estimated['confirmed_left_out']} of {p.estimated['confirmed']}"
-                out.append(("confirmed", f"{p.name}: {100 * p.lost:.1f} % ({of})"))
+                detail = f"({p.estimated['confirmed_left_out']} of {p.estimated['confirmed']})"
+                out.append(Breach("confirmed", p.name, p.lost, detail))
         if not pairs[0].estimated["simulated"]:
             ratios += [r for p in pairs if (r := p.ratio("h")) is not None]
         for axis in ("h", "up"):
             if (ratio := against_filter(groups, group, axis)) > BOUNDS["smoother"]:
-                out.append(("smoother", f"{name}, {axis}: {ratio:.2f} of its filter's"))
+                out.append(Breach("smoother", f"{name}, {axis}", ratio, "of its filter's"))
         if solver == SOLVERS[0] and (ratio := slower(pairs)) > BOUNDS["time"]:
-            out.append(("time", f"{drive} {sensors}: {ratio:.1f} times"))
+            out.append(Breach("time", f"{drive} {sensors}", ratio, "times"))
     if ratios and np.median(ratios) >= BOUNDS["median"]:
-        out.append(("median", f"{np.median(ratios):.3f} over {len(ratios)} horizontal errors of real drives"))
+        detail = f"over {len(ratios)} horizontal errors of real drives"
+        out.append(Breach("median", "", float(np.median(ratios)), detail))
     return out
 
 

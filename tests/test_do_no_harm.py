@@ -77,9 +77,9 @@ def test_nothing_is_broken_by_what_is_better(verdict):
 def test_every_bound_can_be_broken(verdict, name):
     changes, said = BREAKS[name]
     rows = made_up(changes)
-    own = [sentence for bound, sentence in verdict.broken(rows) if bound == name.split()[0]]
-    assert any(said in sentence for sentence in own)
-    others = {bound for bound, _ in verdict.broken(rows)} - {name.split()[0]}
+    found = verdict.broken(rows)
+    assert any(said in str(one) for one in found if one.bound == name.split()[0])
+    others = {one.bound for one in found} - {name.split()[0]}
     assert others <= ({"smoother"} if name.startswith("worst") else set())
 
 
@@ -87,10 +87,11 @@ def test_every_bound_can_be_broken(verdict, name):
     "changes",
     [
         lambda row: dict.fromkeys(("h", "up"), 0.02 if row["variant"] == "stated" else 0.049),
+        lambda row: dict.fromkeys(("h", "up"), 0.02 if row["solver"] == "ekf" else 0.049),
         only({"error": "cannot be aligned"}, window="0-300"),
         only({"error": "cannot be aligned"}, window="0-300", variant="stated"),
     ],
-    ids=["below the floor", "not solved either way", "not solved as stated"],
+    ids=["below the floor", "a smoother below the floor", "not solved either way", "not solved as stated"],
 )  # fmt: skip
 def test_what_is_not_counted(verdict, changes):
     rows = made_up(changes)
@@ -125,7 +126,8 @@ def test_an_older_run_beside_this_one(verdict):
 # -------------------------------------------------------------------------------------------------------------- windows
 def test_windows_lie_within_the_fixes_and_come_with_the_seed(script, tokyo):
     def found(count, seed, whole=False):
-        return list(script.windows(tokyo, "somewhere/recording.toml", count, seed, whole))
+        options = SimpleNamespace(windows=count, seed=seed, whole=whole, length=script.WINDOW)
+        return list(script.windows(tokyo, "somewhere/recording.toml", options))
 
     many = found(40, 1)
     assert found(20, 1) == many[: len(found(20, 1))]
@@ -137,7 +139,22 @@ def test_windows_lie_within_the_fixes_and_come_with_the_seed(script, tokyo):
 
 
 def test_a_short_drive_is_solved_whole(script, tokyo):
-    assert [name for name, _ in script.windows(tokyo.crop(0, 100), "x", 8, 1, False)] == ["whole"]
+    options = SimpleNamespace(windows=8, seed=1, whole=False, length=script.WINDOW)
+    assert [name for name, _ in script.windows(tokyo.crop(0, 100), "x", options)] == ["whole"]
+
+
+def test_a_share_is_drawn_cell_by_cell(script, tmp_path):
+    def cells(*more):
+        asked = ["-o", str(tmp_path / "x.json"), "--drives", "tokyo_clone", "--length", "30", "--no-whole", *more]
+        jobs = script.plan(script.options_of(asked))
+        assert [job.variant for job in jobs] == list(script.VARIANTS) * (len(jobs) // 2)
+        return [(job.window, job.sensors) for job in jobs[::2]]
+
+    everything, part = cells(), cells("--share", "0.25")
+    assert len(everything) == 8 * 3
+    assert len(part) == len(set(part)) == 6
+    assert set(part) < set(everything)
+    assert part == cells("--share", "0.25") != cells("--share", "0.25", "--seed", "2")
 
 
 @pytest.mark.parametrize("doppler", [True, False])
@@ -197,8 +214,7 @@ def test_without_truth_nothing_is_confirmed(script, tokyo):
 # ----------------------------------------------------------------------------------------------------------- end to end
 def test_a_window_of_a_real_drive(script, tmp_path, capsys, monkeypatch):
     path = tmp_path / "harm.json"
-    monkeypatch.setattr(script, "WINDOW", 30.0)
-    arguments = ["-o", str(path), "--drives", "tokyo_clone", "--windows", "8", "--no-whole", "--share", "0.125"]
+    arguments = ["-o", str(path), "--drives", "tokyo_clone", "--windows", "1", "--no-whole", "--length", "30"]
     code = script.main(arguments)
     rows = json.loads(path.read_text(encoding="utf-8"))
     assert len({row["window"] for row in rows}) == 1
@@ -259,3 +275,43 @@ def test_a_file_of_something_else_is_left_alone(script, tmp_path, capsys):
     assert script.main(["-o", str(path), "--drives", "tokyo_clone"]) == 2
     assert "harm.json" in capsys.readouterr().err
     assert path.read_text(encoding="utf-8") == '{"a": 1}'
+
+
+# A quarter of the cells of three windows a drive, at half their length and by the seed: a minute of processor time on a
+# busy machine. Not the rover, whose 20 fixes a second take as long as all the rest, nor the clone, a part of the first.
+QUARTER = ["--windows", "3", "--length", "150", "--no-whole", "--share", "0.25", "--drives", ",".join((
+    "tokyo_no_doppler", "tokyo", "tokyo_spp", "boulder", "kitti", "comma", "dresden", "circles_2024", "circles_2025",
+    "motorbike", "oracle", "oracle_spp",
+))]  # fmt: skip
+# breaches that are there, by name; none may be worse by more than a tenth
+KNOWN = {
+    ("worst", "tokyo_spp 326.7-476.7 gnss rts, h"): 1.59,
+    ("worst", "tokyo_spp 326.7-476.7 gnss rts, up"): 1.40,
+    ("worst", "tokyo_spp 326.7-476.7 gnss batch, h"): 1.59,
+    ("worst", "tokyo_spp 326.7-476.7 gnss batch, up"): 1.40,
+    ("worst", "tokyo_spp 326.7-476.7 +odometer ekf, h"): 3.65,
+    ("worst", "boulder 370.4-520.4 gnss ekf, h"): 1.94,
+    ("worst", "boulder 68-218 gnss ekf, h"): 3.00,
+    ("worst", "boulder 68-218 gnss ekf, up"): 1.34,
+    ("worst", "boulder 370.4-520.4 gnss rts, up"): 1.50,
+    ("worst", "boulder 370.4-520.4 gnss batch, up"): 1.56,
+    ("worst", "motorbike whole +nhc ekf, h"): 1.77,
+    ("worst", "oracle_spp 387.7-537.7 gnss ekf, h"): 1.47,
+    ("median", ""): 0.98,
+    ("confirmed", "tokyo_spp 326.7-476.7 gnss ekf"): 0.056,
+    ("confirmed", "tokyo_spp 326.7-476.7 gnss rts"): 0.056,
+    ("confirmed", "tokyo_spp 326.7-476.7 gnss batch"): 0.056,
+    ("confirmed", "tokyo_spp 326.7-476.7 +odometer ekf"): 0.032,
+    ("confirmed", "tokyo_spp 326.7-476.7 +odometer rts"): 0.032,
+    ("confirmed", "tokyo_spp 326.7-476.7 +odometer batch"): 0.032,
+}
+
+
+def test_estimated_noise_does_no_harm(script, verdict, shared_data, tmp_path):
+    jobs = script.plan(script.options_of([*QUARTER, "--data", str(shared_data), "-o", str(tmp_path / "harm.json")]))
+    rows = [row for job in jobs for row in script.solve(job)]
+    found = [one for one in verdict.broken(rows) if one.bound != "time"]
+    new = [one for one in found if not one.value <= 1.1 * KNOWN.get((one.bound, one.name), 0.0)]
+    assert not new, "\n".join(map(str, new))
+    if found:
+        pytest.xfail("; ".join(f"{one.bound}: {one}" for one in found))
