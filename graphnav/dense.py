@@ -83,7 +83,12 @@ class Dense:
     def _predicted(self, t: Array) -> States:
         """Prediction from the keyframe before each time."""
         k = np.searchsorted(self.t, t, side="left") - 1
-        dR, dV, dP = within(self.samples, self.t, t, self.ba, self.bg)
+        if not len(t):
+            return self.states[k]
+        # of the intervals touched alone: whoever asks for a few times pays for a few
+        first, last = int(k[0]), int(k[-1]) + 1
+        samples, used = self.samples.between(self.t[first], self.t[last]), slice(first, last)
+        dR, dV, dP = within(samples, self.t[first : last + 1], t, self.ba[used], self.bg[used])
         n = len(t)
         none = np.zeros((n, 3, 3))
         start = self.states[k]

@@ -10,7 +10,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -161,8 +160,7 @@ def write_solver(
 
     solution = outcome.solutions[name]
     began = time.perf_counter()
-    trajectory = solution.trajectory(outcome.request.rate)
-    write_all(replace(trajectory, name=f"{outcome.recording.name}, {name}"), folder)
+    write_all(solution.blocks(outcome.request.rate), folder, f"{outcome.recording.name}, {name}")
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
     (folder / "detections.csv").write_text(intervals_text(solution.detections), encoding="utf-8")
     written = time.perf_counter()
@@ -353,7 +351,7 @@ def json_text(values: Any) -> str:
 
 def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) -> None:
     """evaluation.json, and errors.csv with a row per compared epoch where there are any."""
-    from graphnav.exporters.csv import rows_text
+    from graphnav.exporters.digits import rows_text
 
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "evaluation.json", values)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -15,6 +15,8 @@ from graphnav.noise_model import STATED, NoiseModel, RowWeights
 from graphnav.rotation import Array
 from graphnav.state import States
 from graphnav.trajectory import Trajectory
+
+_ROWS = 4096  # of a block: 25 MB while it is worked on
 
 
 class Between(Protocol):
@@ -115,6 +117,17 @@ class Solution:
         if rate is not None:
             t, states, covariance = self.at(np.concatenate([b.times(rate) for b in self.between]))
         return to_trajectory(self.solver, self.frame, t, states, covariance)
+
+    def blocks(self, rate: float | None = None) -> Iterator[Trajectory]:
+        """`trajectory` in parts, one behind the other, so that only one of them need be in memory."""
+        if rate is None:
+            yield self.trajectory()
+            return
+        for piece in self.between:
+            times = piece.times(rate)
+            for k in range(0, len(times), _ROWS):
+                t = times[k : k + _ROWS]
+                yield to_trajectory(self.solver, self.frame, t, *piece(t))
 
     def at(self, t: Array) -> tuple[Array, States, Array]:
         """Times (M,), states and covariances (M, 15, 15) at ascending times; those in no piece are left out."""
