@@ -35,6 +35,9 @@ Without = Annotated[
     ),
 ]
 Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Output rate; default: at the keyframes.")]
+Pages = Annotated[
+    bool, typer.Option("--report/--no-report", help="Draw the report; 'graphnav report OUT' does it later.")
+]
 Start = Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from the recording's start.")]
 End = Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from the recording's start.")]
 Noise = Annotated[

@@ -74,31 +74,38 @@ def output_folder(path: str | Path, files: Sequence[str] = (), folders: Sequence
     return folder
 
 
-def write_run(outcome: Outcome, folder: Path) -> list[Path]:
-    """Everything of the only solver of a run, straight into `folder`; returns the files to look at first."""
+def write_run(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
+    """Everything of the only solver of a run, straight into `folder`; returns the files to look at first.
+
+    Without `pages` none is drawn; `draw_again` can do that later.
+    """
     (name,) = own(outcome.solutions)
     provenance = _provenance(outcome)
-    failed = write_solver(outcome, name, folder, provenance)
+    failed = write_solver(outcome, name, folder, provenance, pages=pages)
     write_outcome(outcome, provenance, folder / stored.NAME)
     _insist(failed)
-    return [folder / "report.html", folder / "trajectory.csv", folder / "summary.json"]
+    return [*([folder / "report.html"] if pages else []), folder / "trajectory.csv", folder / "summary.json"]
 
 
-def write_comparison(outcome: Outcome, folder: Path) -> list[Path]:
-    """Everything per solver under its own name, and the table and page that compare them."""
-    from graphnav import report
+def write_comparison(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
+    """Everything per solver under its own name, and the table and page that compare them; `pages` as in `write_run`."""
     from graphnav.metrics import write_comparison_csv
 
     provenance = _provenance(outcome)
-    detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
+    detectors = None
+    if pages:
+        from graphnav import report
+
+        detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
     failed = []
     for name in own(outcome.solutions):
-        failed += write_solver(outcome, name, folder / name, provenance, detectors)
+        failed += write_solver(outcome, name, folder / name, provenance, detectors, pages)
     write_comparison_csv(folder / "comparison.csv", comparison(outcome))
-    failed += _attempt(lambda path: _draw_comparison(outcome, path.parent, provenance), folder / "comparison.html")
+    if pages:
+        failed += _attempt(lambda path: _draw_comparison(outcome, path.parent, provenance), folder / "comparison.html")
     write_outcome(outcome, provenance, folder / stored.NAME)
     _insist(failed)
-    return [folder / "comparison.html", folder / "comparison.csv"]
+    return [*([folder / "comparison.html"] if pages else []), folder / "comparison.csv"]
 
 
 def draw_again(folder: Path, part: Path) -> list[Path]:
@@ -147,7 +154,12 @@ def _draw_comparison(outcome: Outcome, folder: Path, provenance: Mapping[str, An
 
 
 def write_solver(
-    outcome: Outcome, name: str, folder: Path, provenance: Mapping[str, Any], detectors: Sequence[Raw] | None = None
+    outcome: Outcome,
+    name: str,
+    folder: Path,
+    provenance: Mapping[str, Any],
+    detectors: Sequence[Raw] | None = None,
+    pages: bool = True,
 ) -> list[str]:
     """The files of one solver; a folder that holds older ones keeps none of them under the same names.
 
@@ -164,9 +176,11 @@ def write_solver(
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
     (folder / "detections.csv").write_text(intervals_text(solution.detections), encoding="utf-8")
     written = time.perf_counter()
-    failed = _attempt(
-        lambda path: _draw_solver(outcome, name, path.parent, provenance, detectors), folder / "report.html"
-    )
+    failed = []
+    if pages:
+        failed = _attempt(
+            lambda path: _draw_solver(outcome, name, path.parent, provenance, detectors), folder / "report.html"
+        )
     spent = {"writing": written - began, "report": time.perf_counter() - written}
     write_json(folder / "summary.json", solver_summary(outcome, name, spent, provenance))
     return failed

@@ -13,9 +13,10 @@ from graphnav.detectors.base import Detection
 from graphnav.earth import LocalFrame
 from graphnav.noise_model import STATED, NoiseModel, RowWeights
 from graphnav.rotation import Array
-from graphnav.state import States
+from graphnav.state import DIM, States
 from graphnav.trajectory import Trajectory
 
+_OUT = 9  # errors of attitude, position, velocity, which are those of a trajectory
 _ROWS = 4096  # of a block: 25 MB while it is worked on
 
 
@@ -36,8 +37,8 @@ class Between(Protocol):
         """Times at a rate, ends included."""
         ...
 
-    def __call__(self, t: Array) -> tuple[States, Array]:
-        """States and covariances at times inside."""
+    def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
+        """States and covariances (M, size, size), of the first errors, at times inside."""
         ...
 
 
@@ -127,7 +128,7 @@ class Solution:
             times = piece.times(rate)
             for k in range(0, len(times), _ROWS):
                 t = times[k : k + _ROWS]
-                yield to_trajectory(self.solver, self.frame, t, *piece(t))
+                yield to_trajectory(self.solver, self.frame, t, *piece(t, _OUT))
 
     def at(self, t: Array) -> tuple[Array, States, Array]:
         """Times (M,), states and covariances (M, 15, 15) at ascending times; those in no piece are left out."""
@@ -149,7 +150,7 @@ def to_trajectory(name: str, frame: LocalFrame, t: Array, states: States, covari
     J[:, 0:3, 3:6] = R_ln
     J[:, 3:6, 6:9] = R_ln
     J[:, 6:9, 0:3] = rotation.rph_jacobian(rph)
-    cov = J @ covariance[:, :9, :9] @ np.swapaxes(J, -1, -2)
+    cov = J @ covariance[:, :_OUT, :_OUT] @ np.swapaxes(J, -1, -2)
     sd = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
     return Trajectory(
         t=t,

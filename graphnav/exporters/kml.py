@@ -81,7 +81,7 @@ class _Thinned:
         along = begin + np.cumsum(steps)
         new = np.column_stack([block.t, block.llh, along])
         self._last, self._end = p[-1:], new[-1]
-        self._kept = np.concatenate([self._kept, self._at_least(new, _SPACING)])
+        self._kept = np.concatenate([self._kept, new])
         if len(self._kept) > _SPARE * _MAX_POINTS:
             self._kept = self._at_least(self._kept, along[-1] / (_SPARE / 2 * _MAX_POINTS))
 
