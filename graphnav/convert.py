@@ -11,7 +11,6 @@ import numpy as np
 
 from graphnav.against import antenna_lever_arm, own
 from graphnav.complaints import listed, nearest
-from graphnav.draft.guesses import noise_density
 from graphnav.errors import ConfigError, RecordingError
 from graphnav.exporters import NAMES, written
 from graphnav.files import parse_json, read_text
@@ -83,6 +82,8 @@ def _with_measured_noise(log: Log) -> Log:
     imu = log.imu
     if imu is None or not imu.noise_assumed:
         return log
+    from graphnav.draft.guesses import noise_density
+
     found = {
         f"{name}_noise_density": float(f"{value:.2g}")
         for name, x in (("gyro", imu.gyro), ("accel", imu.accel))

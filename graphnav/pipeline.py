@@ -25,10 +25,7 @@ from graphnav.preparation import prepare, start_sigma
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
 from graphnav.solution import Solution, joined
-from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf
-from graphnav.solvers.incremental import incremental
-from graphnav.solvers.isam import isam2
 from graphnav.solvers.rts import backward, rts
 
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
@@ -159,14 +156,21 @@ def _solve(
     out = {"ekf": forward.solution}
     if "rts" in solvers:
         out["rts"] = rts(problem, forward, smoothed)
+    # what a run does not need is not imported: GTSAM least of all
     if "batch" in solvers:
+        from graphnav.solvers.batch import batch
+
         out["batch"] = batch(problem, start.states, start.nodes(problem), progress=progress)
         # what it took to get there is part of it
         out["batch"] = replace(out["batch"], timings={**forward.solution.timings, **out["batch"].timings})
     if "incremental" in solvers:
+        from graphnav.solvers.incremental import incremental
+
         begin = found.aligned.state if found.astray else None
         out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
     if "isam2" in solvers:
+        from graphnav.solvers.isam import isam2
+
         out["isam2"] = isam2(problem, progress).settled
     timings = {"detection": detection, **found.timings}
     return {
