@@ -22,8 +22,8 @@ ROOMS = [
     "interpolation", "metrics", "sigmas", "gates", "fitted", "scoring", "strides", "evaluation", "against", "exporters",
     "online",
     "panels", "page", "plots", "report_tables", "report_words", "report_pictures", "report_provenance", "report",
-    "workflow", "stored", "staging", "outputs", "convert", "terminal", "detection_report",
-    "talk", "cli_options", "cli_logs", "cli_online", "cli_solve", "cli", "__main__",
+    "workflow", "stored", "staging", "outputs", "convert", "fleet", "terminal", "detection_report",
+    "talk", "cli_options", "cli_fleet", "cli_logs", "cli_online", "cli_solve", "cli", "__main__",
 ]  # fmt: skip
 
 GTSAM_ROOMS = {"solvers"}

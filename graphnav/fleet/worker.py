@@ -1,0 +1,27 @@
+"""A process that solves drives: a task in JSON on every line of its input, a row on every line of its output."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+
+from graphnav.fleet.drive import solve_drive
+from graphnav.fleet.manifest import Task
+from graphnav.outputs import json_text
+
+
+def main() -> None:
+    """Solve until there is nothing more to solve."""
+    # whatever prints, also in compiled code, must not mix with the rows
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    for line in sys.stdin:
+        values = json.loads(line)
+        row = solve_drive(Task(**{**values, "without": tuple(values["without"])}))
+        out.write(json.dumps(json.loads(json_text(row))) + "\n")
+        out.flush()
+
+
+if __name__ == "__main__":
+    main()
