@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import time
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -153,7 +154,7 @@ def spans(recording: Recording, length: float, zero: float = 0.0) -> list[tuple[
     """
     if recording.gnss is None:
         return []
-    starts = np.arange(_FIRST, recording.duration - length - _BETWEEN, 2.0 * length + _BETWEEN)
+    starts = np.arange(_FIRST, recording.duration - length - _BETWEEN + 1e-9, 2.0 * length + _BETWEEN)
     return [(float(zero + s), float(zero + s + length)) for s in starts]
 
 
@@ -174,19 +175,32 @@ def _figures(outcome: Outcome) -> Row:
         "keyframes": len(solution.t),
         "against": outcome.against,
         **{key: measured.get(key) for key in MEASURED},
-        **outputs.stated(solution),
+        **{key: _short(value) for key, value in outputs.stated(solution).items()},
         "spans": len(ends),
-        "span_end_h_median_m": float(np.median(ends)) if ends else None,
+        "span_end_h_median_m": _short(float(np.median(ends))) if ends else None,
         "span_end_h_max_m": max(ends, default=None),
         "left_out": _left_out(solution),
         "warnings": len(outcome.warnings),
-        **{f"noise.{group}": figure.get("variance_factor") for group, figure in summary["noise"]["figures"].items()},
+        **{
+            f"noise.{group}": _short(figure.get("variance_factor"))
+            for group, figure in summary["noise"]["figures"].items()
+        },
         "track": _track(outcome, solution),
         "version": graphnav.__version__,
     }
 
 
-MEASURED = ("h_rms_m", "h_p95_m", "h_max_m", "up_rms_m", "3d_rms_m", "heading_rms_deg", "nees_p", "nees_p_inside_95")
+MEASURED = (
+    "h_rms_m",
+    "h_p95_m",
+    "h_max_m",
+    "up_rms_m",
+    "3d_rms_m",
+    "heading_rms_deg",
+    "nees_p",
+    "nees_p_inside_95",
+    "closure_h_m",
+)
 
 
 def _left_out(solution: Solution) -> float | None:
@@ -204,6 +218,11 @@ def _track(outcome: Outcome, solution: Solution) -> list[list[float]] | None:
     few = np.unique(np.linspace(0, len(solution.t) - 1, _POINTS).round().astype(int))
     degrees = np.rad2deg(solution.frame.to_llh(solution.states.p[few])[:, [1, 0]])
     return [[round(float(x), 6) for x in point] for point in degrees]
+
+
+def _short(x: float | None) -> float | None:
+    """Five digits, as a summary has."""
+    return None if x is None or not math.isfinite(x) else float(f"{x:.5g}")
 
 
 def _forget_peak() -> None:

@@ -39,7 +39,7 @@ body{margin:0 auto;padding:20px 16px 64px;max-width:1180px;background:var(--page
 font:16px/1.5 system-ui,"Segoe UI",Roboto,sans-serif}
 h1{font-size:1.6rem}h2{font-size:1.25rem;margin-top:2em}figure{margin:0}
 figcaption,.soft{color:var(--soft);font-size:.875rem}
-.figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,340px),1fr));gap:24px}
+.figures{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,340px),1fr));gap:24px}
 .wide{overflow-x:auto}table{border-collapse:collapse;font-size:.875rem;font-variant-numeric:tabular-nums}
 th,td{padding:5px 14px 5px 0;text-align:right;border-bottom:1px solid var(--edge);vertical-align:top}
 th:first-child,td:first-child,td.words,th.words{text-align:left}td.words{min-width:18em}
