@@ -8,7 +8,20 @@ from typing import Annotated, Any
 
 import typer
 
-from graphnav.cli_options import AllowOutside, Config, End, Json, Noise, Out, Pages, Profile, Quiet, Rate, Start
+from graphnav.cli_options import (
+    AllowOutside,
+    Config,
+    End,
+    Json,
+    Noise,
+    Out,
+    Pages,
+    Profile,
+    Quiet,
+    Rate,
+    Start,
+    Without,
+)
 from graphnav.errors import ConfigError
 from graphnav.talk import Interrupted, say, show
 
@@ -30,6 +43,7 @@ def fleet(
     withhold: Annotated[
         float | None, typer.Option("--withhold", metavar="S", help="Withhold GNSS for S s again and again; score that.")
     ] = None,
+    without: Without = None,
     rate: Rate = None,
     start: Start = None,
     end: End = None,
@@ -58,7 +72,14 @@ def fleet(
     if withhold is not None and not withhold > 0.0:
         raise ConfigError(f"--withhold {withhold:g}: must be a number of seconds above 0")
     asked = manifest.Asked(
-        solver, profile, None if config is None else str(config), None, noise and _full(noise), None, start, end
+        solver,
+        profile,
+        None if config is None else str(config),
+        None,
+        noise and _full(noise),
+        " ".join(without or ()) or None,
+        start,
+        end,
     )
     folder = outputs.output_folder(out, ("fleet.csv", "fleet.parquet", "fleet.html"), ("drives",)).resolve()
     drives = manifest.read_drives(source.resolve(), asked)
@@ -90,9 +111,9 @@ def fleet(
         page.write_page(rows, part / "fleet.html", f"{source.name}: {len(rows)} drives")
         files.insert(0, part / "fleet.html")
     files = moved(files, part, folder)
-    without = "" if len(files) > 2 else "\nno fleet.parquet: pyarrow is not installed"
+    lacking = "" if len(files) > 2 else "\nno fleet.parquet: pyarrow is not installed"
     show(
-        lambda: "\n".join([tables.text(rows) + without, "look at", *(f"  {file}" for file in files)]),
+        lambda: "\n".join([tables.text(rows) + lacking, "look at", *(f"  {file}" for file in files)]),
         lambda: {
             **tables.totals(rows),
             "rows": [{k: v for k, v in r.items() if k != "track"} for r in rows],

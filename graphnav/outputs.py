@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import platform
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +20,7 @@ from graphnav.against import antenna_lever_arm, own
 from graphnav.detectors.base import intervals_text
 from graphnav.errors import ConfigError, PartlyWrittenError
 from graphnav.files import exists
+from graphnav.plain import peak_memory_mb, write_json
 from graphnav.solution import ParameterEstimate, Solution
 from graphnav.stored import read_again, sha256, write_outcome
 from graphnav.workflow import Outcome, outages
@@ -338,31 +337,6 @@ def stated(solution: Solution) -> dict[str, float]:
     return out
 
 
-def peak_memory_mb() -> float:
-    """The most memory this process ever held, MB of 2^20 bytes."""
-    try:
-        # where there is one: ru_maxrss of a process that was forked counts its parent's memory as well
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith("VmHWM:"):
-                return round(int(line.split()[1]) / 1024.0, 1)
-    except (OSError, ValueError):
-        pass
-    import resource  # not on Windows
-
-    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(size / (1024.0**2 if sys.platform == "darwin" else 1024.0), 1)
-
-
-def write_json(path: Path, values: Any) -> None:
-    """Plain JSON: arrays as lists, whatever is not finite as null."""
-    path.write_text(json_text(values) + "\n", encoding="utf-8")
-
-
-def json_text(values: Any) -> str:
-    """Values as indented JSON, as `write_json` writes them."""
-    return json.dumps(_plain(values), indent=2, ensure_ascii=False)
-
-
 def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) -> None:
     """evaluation.json, and errors.csv with a row per compared epoch where there are any."""
     from graphnav.exporters.digits import rows_text
@@ -376,21 +350,6 @@ def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) 
     head = "t,east,north,up,along,across,ve,vn,vu,roll,pitch,heading,sd_e,sd_n,sd_u\n"
     body = rows_text(np.concatenate(columns, axis=1), "%.6f" + 14 * ",%.6g")
     (folder / "errors.csv").write_text(head + body, encoding="utf-8")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, np.ndarray):
-        plain = value.dtype.kind in "bi" or (value.dtype.kind == "f" and bool(np.isfinite(value).all()))
-        return value.tolist() if plain else _plain(value.tolist())
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(one) for one in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value if value is None or isinstance(value, str | int | float | bool) else str(value)
 
 
 def _calibration(p: ParameterEstimate) -> dict[str, Any]:

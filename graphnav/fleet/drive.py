@@ -22,6 +22,7 @@ from graphnav.errors import GraphnavError
 from graphnav.files import check_regular, outside_allowed, parse_json, read_text
 from graphnav.fleet.manifest import Task
 from graphnav.noise.apply import row_weights
+from graphnav.plain import peak_memory_mb, write_json
 from graphnav.recording import Recording
 from graphnav.solution import Solution
 from graphnav.staging import staged
@@ -62,7 +63,7 @@ def solve_drive(task: Task) -> Row:
         row["error"] = f"{error.filename or 'input or output'}: {error.strerror or error}"
     except Exception as error:
         row["error"] = f"internal error: {type(error).__name__}: {error}"
-    row |= {"time_s": round(time.perf_counter() - began, 3), "memory_mb": outputs.peak_memory_mb()}
+    row |= {"time_s": round(time.perf_counter() - began, 3), "memory_mb": peak_memory_mb()}
     keep_row(folder, key, row)
     return row
 
@@ -78,7 +79,7 @@ def lost_row(task: Task, status: str, error: str, seconds: float) -> Row:
 def keep_row(folder: Path, key: str, row: Mapping[str, Any]) -> None:
     """Write the row beside the drive's results; a folder that cannot be written to has no other place to say so."""
     with suppress(GraphnavError), staged(folder) as part:
-        outputs.write_json(part / NAME, {"key": key, "row": row})
+        write_json(part / NAME, {"key": key, "row": row})
 
 
 def stored_row(folder: Path, key: str | None = None) -> Row | None:

@@ -131,7 +131,8 @@ def _recordings(folder: Path) -> list[Path]:
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for file in sorted(files):
             path = Path(place) / file
-            if file.endswith(".toml") and path.is_file() and (file == "recording.toml" or _FORM in _begin(path)):
+            # one that cannot be read has its name, and a row that says so
+            if file == "recording.toml" or (file.endswith(".toml") and path.is_file() and _FORM in _begin(path)):
                 found.append(path)
     return found
 

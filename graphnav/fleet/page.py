@@ -97,6 +97,8 @@ def _short(value: object) -> str:
 
 def _histogram(x: Array, label: str) -> str:
     """Bars over decades where values are spread over more than one, else over even steps."""
+    if x.min() == x.max():
+        return f"<figure><figcaption>{escape(label)}: {x[0]:.4g} of all</figcaption></figure>"
     log = bool(x.min() > 0.0 and x.max() > 10.0 * x.min())
     at = np.log10(x) if log else x
     count, edges = np.histogram(at, bins=min(40, max(8, math.ceil(2.0 * len(x) ** (1 / 3)))))  # Rice's rule

@@ -8,7 +8,7 @@ import sys
 
 from graphnav.fleet.drive import solve_drive
 from graphnav.fleet.manifest import Task
-from graphnav.outputs import json_text
+from graphnav.plain import json_text
 
 
 def main() -> None:
