@@ -93,11 +93,11 @@ def fleet(
     if scheduler is not None:
         found = workers.solve_on_cluster(tasks, scheduler, limit)
     else:
-        found = workers.solve_here(tasks, processes or len(os.sched_getaffinity(0)), limit)
+        found = workers.solve_here(tasks, processes or _processors(), limit)
     done: dict[str, Row] = {}
     try:
         for row in found:
-            done[row["drive"]] = row
+            done[row["drive"]] = row if len(done) < page.DRAWN else {**row, "track": None}
             if not (quiet or json):
                 say(f"[{len(done)}/{len(tasks)}] {row['drive']}: {_said(row)}")
     except KeyboardInterrupt:
@@ -124,6 +124,11 @@ def fleet(
     )
     if not any(row["status"] == DONE for row in rows):
         raise ConfigError(f"{source}: none of {len(rows)} drives could be solved; {folder / 'fleet.csv'} says why")
+
+
+def _processors() -> int:
+    """Those that this process may use, where the system says so."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _full(noise: str) -> str:

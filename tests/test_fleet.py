@@ -171,7 +171,8 @@ def test_withheld_spans_are_outages_by_themselves() -> None:
 
 def test_the_page_has_the_worst_first_and_takes_no_markup_from_names(tmp_path: Path) -> None:
     track = [[8.0, 49.0], [8.001, 49.0]]
-    good = {"drive": "good", "status": DONE, "verdict": "sound", "h_rms_m": 0.5, "track": track, "report": "good.html"}
+    good = {"drive": "good", "status": DONE, "verdict": "sound", "h_rms_m": 0.5, "track": track, "placed": True}
+    good["report"] = "good.html"
     bad = {**good, "drive": "bad", "h_rms_m": 5.0, "report": "bad.html"}
     doubted = {**good, "drive": "doubted", "verdict": "doubtful", "track": [[139.0, 35.0], [139.1, 35.0]]}
     lost = {"drive": "<b>lost", "status": HUNG, "error": "<script>"}
@@ -182,4 +183,7 @@ def test_the_page_has_the_worst_first_and_takes_no_markup_from_names(tmp_path: P
     assert "<script>" not in text
     assert "<b>" not in text
     assert text.count("<polyline") == 3
+    assert "not drawn" not in text
+    page.write_page([*rows, {**good, "drive": "more", "track": None, "placed": True}], tmp_path / "a.html", "fleet")
+    assert "1 more tracks" in (tmp_path / "a.html").read_text()
     assert text.index("&lt;b&gt;lost</td>") < text.index('href="bad.html">bad<') < text.index('href="good.html">good<')

@@ -186,6 +186,7 @@ def _figures(outcome: Outcome) -> Row:
             f"noise.{group}": _short(figure.get("variance_factor"))
             for group, figure in summary["noise"]["figures"].items()
         },
+        "placed": outcome.recording.gnss is not None,
         "track": _track(outcome, solution),
         "version": graphnav.__version__,
     }

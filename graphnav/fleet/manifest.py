@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from graphnav.complaints import nearest, read_toml
-from graphnav.config import Settings, read_settings
+from graphnav.config import read_settings
 from graphnav.config.files import settings_from
 from graphnav.errors import ConfigError
 from graphnav.files import exists, read_text
@@ -92,7 +92,7 @@ def read_drives(source: Path, asked: Asked) -> list[tuple[str, str, Asked, str]]
     return _distinct(drives)
 
 
-def task_of(drive: tuple[str, str, Asked, str], out: Path, known: dict[Any, Settings], **common: Any) -> Task:
+def task_of(drive: tuple[str, str, Asked, str], out: Path, known: dict[Any, dict[str, Any]], **common: Any) -> Task:
     """A drive with its settings read and checked; `known` keeps those that many share.
 
     Raises
@@ -112,14 +112,14 @@ def task_of(drive: tuple[str, str, Asked, str], out: Path, known: dict[Any, Sett
             settings = read_settings(asked.config, asked.profile)
             if asked.settings:
                 settings = settings_from(_over(settings.model_dump(exclude_unset=True), _toml(asked.settings)))
-            known[key] = parse_noise(asked.noise, settings)[0]
+            known[key] = parse_noise(asked.noise, settings)[0].model_dump(mode="json")
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
     if asked.start is not None and asked.end is not None and not asked.start < asked.end:
         raise ConfigError(f"{where}: end {asked.end:g} must be later than start {asked.start:g}")
     given = asked.noise if asked.noise is not None and Path(asked.noise).is_file() else None
     return Task(
-        name, source, str(out / "drives" / name), asked.solver, known[key].model_dump(mode="json"), given, without,
+        name, source, str(out / "drives" / name), asked.solver, known[key], given, without,
         start=asked.start, end=asked.end, **common,
     )  # fmt: skip
 

@@ -14,7 +14,7 @@ from graphnav.fleet.tables import numbers, totals, worst_first
 from graphnav.rotation import Array
 
 _LISTED = 1000  # drives in the table of the page; the files have all
-_DRAWN = 2000  # tracks on the maps
+DRAWN = 2000  # tracks on the maps, of the drives that were done first
 _APART = 0.5  # deg; tracks further apart are on another map
 _MAPS = 12
 _SPREAD = {
@@ -126,7 +126,7 @@ def _maps(rows: Sequence[Row]) -> str:
     """All tracks, those near each other on one map."""
     placed = [(np.array(row["track"], dtype=float), row) for row in rows if row.get("track")]
     groups: list[list[tuple[Array, Row]]] = []
-    for track, row in placed[:_DRAWN]:
+    for track, row in placed[:DRAWN]:
         near = next((g for g in groups if np.abs(g[0][0][0] - track[0]).max() < _APART), None)
         if near is None:
             groups.append([(track, row)])
@@ -136,8 +136,8 @@ def _maps(rows: Sequence[Row]) -> str:
     if not groups:
         return ""
     figures = "".join(_map(group) for group in groups[:_MAPS])
-    left = len(placed) - sum(map(len, groups[:_MAPS]))
-    more = f'<p class="soft">{left} tracks elsewhere are not drawn.</p>' if left else ""
+    left = sum(bool(row.get("placed")) for row in rows) - sum(map(len, groups[:_MAPS]))
+    more = f'<p class="soft">{left} more tracks are not drawn.</p>' if left > 0 else ""
     return f'<h2>Where they drove</h2><div class="figures">{figures}</div>{more}'
 
 

@@ -17,12 +17,16 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import asdict
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import graphnav
 from graphnav.errors import ConfigError
 from graphnav.fleet.drive import CRASHED, HUNG, Row, lost_row
 from graphnav.fleet.manifest import Task
+
+_AHEAD = 10  # drives that a scheduler is told of, for each thread of its workers
 
 
 class Worker:
@@ -145,15 +149,25 @@ def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limit: float) -> Ite
     except (OSError, ValueError, TimeoutError) as error:
         raise ConfigError(f"--scheduler {scheduler}: no cluster answers there ({error or 'too late'})") from None
     with client:
-        futures = client.map(solve_apart, tasks, limit=limit, pure=False)
-        of = {future.key: task for future, task in zip(futures, tasks, strict=True)}
+        waiting = iter(tasks)
+        of: dict[str, Task] = {}
+
+        def next_few(count: int) -> list[Any]:
+            few = list(islice(waiting, count))
+            futures = client.map(solve_apart, few, limit=limit, pure=False)
+            of.update((future.key, task) for future, task in zip(futures, few, strict=True))
+            return list(futures)
+
+        # a scheduler that is told of all drives at once holds them all
+        under_way = completed(next_few(max(_AHEAD, _AHEAD * sum(client.nthreads().values()))))
         try:
-            for future in completed(futures):
+            for future in under_way:
+                task = of.pop(future.key)
                 if future.status == "finished":
                     yield future.result()
                 else:
                     why = future.exception() if future.status == "error" else future.status
-                    yield lost_row(of[future.key], CRASHED, f"the cluster: {type(why).__name__}: {why}", 0.0)
-                future.release()
+                    yield lost_row(task, CRASHED, f"the cluster: {type(why).__name__}: {why}", 0.0)
+                under_way.update(next_few(1))
         finally:
-            client.cancel(futures)
+            client.cancel([*under_way.futures])
