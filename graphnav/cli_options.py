@@ -14,7 +14,8 @@ Source = Annotated[
 ]
 SEVERAL = {"allow_extra_args": True}  # of which `only` has more to say than the parser
 Export = Annotated[
-    str | None, typer.Option("--export", metavar="NAMES", help="Formats to write: some of gpx,nav,nmea,csv,tum,kml.")
+    str | None,
+    typer.Option("--export", metavar="NAMES", help="Formats to write: some of gpx,nav,nmea,csv,tum,kml,parquet."),
 ]
 Point = Annotated[
     str | None, typer.Option("--point", metavar="POINT", help="Of --export: imu, antenna or x,y,z (m; RFU).")
