@@ -23,6 +23,7 @@ from graphnav.cli_options import (
     Without,
 )
 from graphnav.errors import ConfigError
+from graphnav.files import outside_allowed
 from graphnav.talk import Interrupted, say, show
 
 commands = typer.Typer()
@@ -53,6 +54,12 @@ def fleet(
     limit: Annotated[
         float, typer.Option("--limit", metavar="S", min=1.0, help="What one drive may take before it is ended.")
     ] = 3600.0,
+    memory: Annotated[
+        float | None,
+        typer.Option(
+            "--memory", metavar="MB", min=1.0, help="What one drive may hold; default: its share of the machine."
+        ),
+    ] = None,
     scheduler: Annotated[
         str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster that sees the same files.")
     ] = None,
@@ -82,7 +89,8 @@ def fleet(
         end,
     )
     folder = outputs.output_folder(out, ("fleet.csv", "fleet.parquet", "fleet.html"), ("drives",)).resolve()
-    drives = manifest.read_drives(source.resolve(), asked)
+    with outside_allowed(allow_outside):
+        drives = manifest.read_drives(source.resolve(), asked)
     known: dict[Any, Any] = {}
     tasks = [
         manifest.task_of(
@@ -91,9 +99,10 @@ def fleet(
         for drive in drives
     ]
     if scheduler is not None:
-        found = workers.solve_on_cluster(tasks, scheduler, limit)
+        found = workers.solve_on_cluster(tasks, scheduler, workers.Limits(limit, memory))
     else:
-        found = workers.solve_here(tasks, processes or _processors(), limit)
+        count = processes or _processors()
+        found = workers.solve_here(tasks, count, workers.Limits(limit, memory or workers.share_of_memory(count)))
     done: dict[str, Row] = {}
     try:
         for row in found:

@@ -19,7 +19,7 @@ from graphnav.errors import ConfigError
 from graphnav.fleet import page, tables
 from graphnav.fleet.drive import CRASHED, DONE, HUNG, REFUSED, key_of, spans, stored_row
 from graphnav.fleet.manifest import Asked, Task, read_drives, task_of
-from graphnav.fleet.workers import Worker
+from graphnav.fleet.workers import Limits, Worker
 
 RUNS = ("run02", "run30", "run31")
 
@@ -70,7 +70,7 @@ def test_a_bad_drive_costs_itself_alone_and_what_is_done_stays(
 
 def test_a_killed_process_and_one_that_takes_too_long_are_said_and_replaced(tmp_path: Path) -> None:
     tasks = [Task(name, "nowhere", str(tmp_path / name), "ekf", {}) for name in ("killed", "late", "next")]
-    worker = Worker()
+    worker, hasty = Worker(Limits(100.0)), Worker(Limits(0.001))
 
     def kill() -> None:
         while worker._process is None:
@@ -80,11 +80,12 @@ def test_a_killed_process_and_one_that_takes_too_long_are_said_and_replaced(tmp_
     try:
         # either comes long before the process has imported what it needs to answer
         threading.Thread(target=kill).start()
-        killed = worker.solve(tasks[0], 100.0)
-        late = worker.solve(tasks[1], 0.001)
-        following = worker.solve(tasks[2], 100.0)
+        killed = worker.solve(tasks[0])
+        late = hasty.solve(tasks[1])
+        following = worker.solve(tasks[2])
     finally:
         worker.close()
+        hasty.close()
     assert [row["status"] for row in (killed, late, following)] == [CRASHED, HUNG, REFUSED]
     assert "SIGKILL" in killed["error"]
     for row in (killed, late):  # and both would be tried again
@@ -146,6 +147,8 @@ def test_a_manifest_gives_each_drive_its_own_settings(tmp_path: Path) -> None:
         ("recording,settings\nkitti,keyframes rate\n", ("line 2", "settings")),
         ("recording,end\nkitti\n", ("line 2", "2 cells")),
         ("recording\n", ("no recording",)),
+        ("recording\n../elsewhere\n", ("line 2", "--allow-outside")),
+        ("recording,config\nkitti,/etc/settings.toml\n", ("line 2", "config", "--allow-outside")),
     ],
 )
 def test_a_manifest_that_cannot_be_is_refused_where_it_says_so(tmp_path: Path, text: str, words: tuple[str]) -> None:

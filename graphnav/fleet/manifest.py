@@ -17,7 +17,9 @@ from graphnav.complaints import nearest, read_toml
 from graphnav.config import read_settings
 from graphnav.config.files import settings_from
 from graphnav.errors import ConfigError
-from graphnav.files import exists, read_text
+from graphnav.files import exists, inside, read_text
+from graphnav.formats import formats
+from graphnav.noise.files import MODES
 from graphnav.pipeline import KNOWN
 from graphnav.workflow import parse_noise, parse_withheld
 
@@ -222,21 +224,33 @@ def _drive(source: Path, where: str, row: Mapping[str, Any], asked: Asked) -> tu
         elif key == "without" and isinstance(value, list):
             said[key] = " ".join(map(str, value))
         elif isinstance(value, str):
-            said[key] = str(source.parent / value) if key == "config" else value
+            said[key] = value
         else:
             raise ConfigError(f"{where}, '{key}': {value!r} is not a text")
     recording = row.get("recording")
     if not isinstance(recording, str) or not recording:
         raise ConfigError(f"{where}, 'recording': names no recording")
-    beside = source.parent / recording
-    path = str(beside) if exists(beside, ConfigError) else recording
     noise = said.get("noise")
-    if noise is not None and (source.parent / noise).is_file():
-        said["noise"] = str(source.parent / noise)
+    if noise is not None and noise not in MODES:
+        said["noise"] = str(_beside(source, noise, where, "noise"))
+    if "config" in said:
+        said["config"] = str(_beside(source, said["config"], where, "config"))
+    builtin = recording in formats() and formats()[recording].builtin
+    path = recording if builtin else str(_beside(source, recording, where, "recording"))
     name = row.get("name") or Path(recording.removesuffix("/recording.toml")).name.removesuffix(".toml")
     if not isinstance(name, str):
         raise ConfigError(f"{where}, 'name': {name!r} is not a text")
     return _plain(name), path, replace(asked, **said), where
+
+
+def _beside(source: Path, name: str, where: str, key: str) -> Path:
+    """What a manifest names; as elsewhere, that lies in its folder or below unless the command says otherwise."""
+    path = source.parent / name
+    if not inside(path, source.parent, ConfigError):
+        raise ConfigError(
+            f"{where}, '{key}': {name} lies outside its folder; say --allow-outside if you trust who wrote it"
+        )
+    return path
 
 
 def _toml(text: str) -> dict[str, Any]:

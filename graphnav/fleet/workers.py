@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -29,14 +29,31 @@ from graphnav.fleet.manifest import Task
 _AHEAD = 10  # drives that a scheduler is told of, for each thread of its workers
 
 
+@dataclass(frozen=True)
+class Limits:
+    """What one drive may take."""
+
+    seconds: float
+    memory_mb: float | None = None
+
+
+def share_of_memory(processes: int) -> float | None:
+    """This machine's memory in MB, shared by so many processes; None where it is not known."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20 / processes
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
 class Worker:
     """A process that solves drives, started when there is one to solve."""
 
-    def __init__(self) -> None:
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
         self._process: subprocess.Popen[str] | None = None
 
-    def solve(self, task: Task, limit: float) -> Row:
-        """The row of a drive, whatever becomes of the process; `limit` s are what it may take."""
+    def solve(self, task: Task) -> Row:
+        """The row of a drive, whatever becomes of the process."""
         began = time.monotonic()
         process = self._running()
         assert process.stdin is not None
@@ -47,7 +64,7 @@ class Worker:
             late.set()
             process.kill()
 
-        timer = threading.Timer(limit, end)
+        timer = threading.Timer(self._limits.seconds, end)
         timer.start()
         try:
             process.stdin.write(json.dumps(asdict(task)) + "\n")
@@ -63,7 +80,9 @@ class Worker:
         self._process = None
         spent = time.monotonic() - began
         if late.is_set():
-            return lost_row(task, HUNG, f"not done in {limit:g} s, and ended; --limit gives it longer", spent)
+            return lost_row(
+                task, HUNG, f"not done in {self._limits.seconds:g} s, and ended; --limit gives it longer", spent
+            )
         return lost_row(task, CRASHED, f"the process that solved it {_end_of(code)}", spent)
 
     def close(self) -> None:
@@ -78,7 +97,7 @@ class Worker:
             package = str(Path(graphnav.__file__).parents[1])
             path = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "graphnav.fleet.worker"],
+                [sys.executable, "-m", "graphnav.fleet.worker", f"{self._limits.memory_mb or 0:.0f}"],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
                 # a signal of the terminal is for the program, which ends its workers
                 start_new_session=True, env={**os.environ, "PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1"},
@@ -96,16 +115,16 @@ def _end_of(code: int) -> str:
     return f"was ended by {name}{' (out of memory, perhaps)' if name == 'SIGKILL' else ''}"
 
 
-def solve_here(tasks: Sequence[Task], processes: int, limit: float) -> Iterator[Row]:
+def solve_here(tasks: Sequence[Task], processes: int, limits: Limits) -> Iterator[Row]:
     """Rows of drives as they are done, by so many processes."""
     own = threading.local()
     workers: list[Worker] = []
 
     def solve(task: Task) -> Row:
         if not hasattr(own, "worker"):
-            own.worker = Worker()
+            own.worker = Worker(limits)
             workers.append(own.worker)
-        return own.worker.solve(task, limit)
+        return own.worker.solve(task)
 
     pool = ThreadPoolExecutor(processes)
     futures: list[Future[Row]] = []
@@ -124,14 +143,14 @@ def solve_here(tasks: Sequence[Task], processes: int, limit: float) -> Iterator[
 _OF_THREAD = threading.local()  # a worker for each thread of a worker of Dask's
 
 
-def solve_apart(task: Task, limit: float) -> Row:
+def solve_apart(task: Task, limits: Limits) -> Row:
     """The row of a drive, solved by a process of this thread's own."""
-    if not hasattr(_OF_THREAD, "worker"):
-        _OF_THREAD.worker = Worker()
-    return _OF_THREAD.worker.solve(task, limit)
+    if getattr(_OF_THREAD, "limits", None) != limits:
+        _OF_THREAD.worker, _OF_THREAD.limits = Worker(limits), limits
+    return _OF_THREAD.worker.solve(task)
 
 
-def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limit: float) -> Iterator[Row]:
+def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limits: Limits) -> Iterator[Row]:
     """Rows of drives as they are done, by the workers of a Dask cluster that see the same files.
 
     Raises
@@ -154,7 +173,7 @@ def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limit: float) -> Ite
 
         def next_few(count: int) -> list[Any]:
             few = list(islice(waiting, count))
-            futures = client.map(solve_apart, few, limit=limit, pure=False)
+            futures = client.map(solve_apart, few, limits=limits, pure=False)
             of.update((future.key, task) for future, task in zip(futures, few, strict=True))
             return list(futures)
 
