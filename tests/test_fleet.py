@@ -5,10 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import sys
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -19,7 +23,7 @@ from graphnav.errors import ConfigError
 from graphnav.fleet import page, tables
 from graphnav.fleet.drive import CRASHED, DONE, HUNG, REFUSED, key_of, spans, stored_row
 from graphnav.fleet.manifest import Asked, Task, read_drives, task_of
-from graphnav.fleet.workers import Limits, Worker
+from graphnav.fleet.workers import Limits, Worker, solve_on_cluster
 
 RUNS = ("run02", "run30", "run31")
 
@@ -92,6 +96,74 @@ def test_a_killed_process_and_one_that_takes_too_long_are_said_and_replaced(tmp_
         folder = tmp_path / str(row["drive"])
         assert stored_row(folder) is not None
         assert stored_row(folder, "") is None
+
+
+class Cluster:
+    """What is used of a Dask client: every third drive loses its worker for good."""
+
+    waiting: ClassVar[list[SimpleNamespace]] = []
+    most = 0
+
+    def __init__(self, address: str, timeout: float) -> None:
+        if "nobody" in address:
+            raise OSError("refused")
+
+    def __enter__(self) -> Cluster:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert not self.waiting
+
+    def nthreads(self) -> dict[str, int]:
+        return {"tcp://a": 1}
+
+    def map(self, solve: object, tasks: list[Task], limits: Limits, pure: bool) -> list[SimpleNamespace]:
+        assert not pure  # else the same drive, asked for twice, would be solved once
+        return [self.future(task) for task in tasks]
+
+    def cancel(self, futures: list[SimpleNamespace]) -> None:
+        self.waiting.clear()
+
+    @staticmethod
+    def future(task: Task) -> SimpleNamespace:
+        lost = int(task.name) % 3 == 0
+        row = {"drive": task.name, "status": DONE}
+        return SimpleNamespace(
+            key=f"k{task.name}", status="error" if lost else "finished", result=lambda: row,
+            exception=lambda: RuntimeError("worker lost"),
+        )  # fmt: skip
+
+    @classmethod
+    def completed(cls, futures: list[SimpleNamespace]) -> Iterator[SimpleNamespace]:
+        cls.waiting = list(futures)
+
+        class Queue:
+            futures = cls.waiting
+
+            def update(self, more: list[SimpleNamespace]) -> None:
+                cls.waiting.extend(more)
+
+            def __iter__(self) -> Iterator[SimpleNamespace]:
+                while cls.waiting:
+                    cls.most = max(cls.most, len(cls.waiting))
+                    yield cls.waiting.pop()
+
+        return Queue()  # type: ignore[return-value]
+
+
+def test_a_scheduler_is_told_of_a_few_drives_and_those_it_loses_are_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", SimpleNamespace(Client=Cluster, as_completed=Cluster.completed))
+    tasks = [Task(str(k), "kitti", str(tmp_path / str(k)), "ekf", {}) for k in range(30)]
+    rows = {row["drive"]: row for row in solve_on_cluster(tasks, "tcp://a:1", Limits(1.0))}
+    assert {name: row["status"] for name, row in rows.items()} == {
+        str(k): CRASHED if k % 3 == 0 else DONE for k in range(30)
+    }
+    assert "worker lost" in rows["3"]["error"]
+    assert Cluster.most <= 10
+    with pytest.raises(ConfigError, match="tcp://nobody:1"):
+        next(solve_on_cluster(tasks, "tcp://nobody:1", Limits(1.0)))
 
 
 def test_a_result_depends_on_input_settings_and_what_is_asked(tmp_path: Path) -> None:
