@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -147,6 +148,16 @@ def test_parts_of_a_trajectory_make_the_files_of_the_whole(tmp_path: Path) -> No
         exporters.written(parts, targets, "a", lambda t: gps_to_utc(t + 1.3e9))
     for name in names:
         assert (tmp_path / "whole" / f"a.{name}").read_bytes() == (tmp_path / "parts" / f"a.{name}").read_bytes(), name
+
+
+def test_what_a_format_cannot_hold_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("before")
+    with pytest.raises(RecordingError, match=re.escape(f"{path}: ")):
+        write_as("csv", replace(made(), frame="local"), path)
+    with pytest.raises(RecordingError, match=re.escape(f"{path}: ")):  # of several, one
+        exporters.written([replace(made(), rph=None)], {"csv": tmp_path / "b.csv", "tum": path})
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {"a.csv": "before"}
 
 
 def test_parquet_holds_the_columns_of_the_csv_with_all_digits(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from importlib import import_module
@@ -64,15 +65,28 @@ def written(
     RecordingError
         If a format cannot hold this trajectory.
     """
-    with ExitStack() as stack:
-        adders = []
-        for one, path in targets.items():
-            module = import_module(f"graphnav.exporters.{one}")
-            adders.append(stack.enter_context(module.writing(Path(path), name)))
-        for block in blocks:
-            stamps = None if utc is None else utc(block.t)
-            for add in adders:
-                add(block, stamps)
+    # under another name until all is there: what cannot be written leaves what was there before
+    parts = {path: path.with_name(f".{path.name}.part") for path in map(Path, targets.values())}
+    try:
+        with ExitStack() as stack:
+            adders = []
+            for one, part in zip(targets, parts.values(), strict=True):
+                module = import_module(f"graphnav.exporters.{one}")
+                adders.append(stack.enter_context(module.writing(part, name)))
+            for block in blocks:
+                stamps = None if utc is None else utc(block.t)
+                for add in adders:
+                    add(block, stamps)
+        for path, part in parts.items():
+            os.replace(part, path)
+    except RecordingError as error:
+        sentence = str(error)
+        for path, part in parts.items():
+            sentence = sentence.replace(str(part), str(path))
+        raise RecordingError(sentence) from None
+    finally:
+        for part in parts.values():
+            part.unlink(missing_ok=True)
 
 
 def check_names(names: Sequence[str], gps_zero: float | None) -> None:
