@@ -254,6 +254,8 @@ def _solve(
         with staged(folder) as part:
             files = (outputs.write_run if alone else outputs.write_comparison)(outcome, part, asked.pages)
         files = moved(files, part, folder)
+        if not asked.pages:
+            outputs.remove_pages(folder, () if alone else chosen)
         if exported:  # by itself, so that one that fails takes nothing with it
             with staged(folder) as part:
                 more = convert.export_run(outcome, part, exported, point, alone)

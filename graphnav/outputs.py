@@ -107,6 +107,13 @@ def write_comparison(outcome: Outcome, folder: Path, pages: bool = True) -> list
     return [*([folder / "comparison.html"] if pages else []), folder / "comparison.csv"]
 
 
+def remove_pages(folder: Path, solvers: Sequence[str] = ()) -> None:
+    """Take away the pages of a run before, of which the results have been replaced without new ones."""
+    for place in (folder, *(folder / name for name in solvers)):
+        (place / "report.html").unlink(missing_ok=True)
+    (folder / "comparison.html").unlink(missing_ok=True)
+
+
 def draw_again(folder: Path, part: Path) -> list[Path]:
     """The pages of a run that was written into `folder`, drawn again into `part` without solving.
 
@@ -175,11 +182,8 @@ def write_solver(
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
     (folder / "detections.csv").write_text(intervals_text(solution.detections), encoding="utf-8")
     written = time.perf_counter()
-    failed = []
-    if pages:
-        failed = _attempt(
-            lambda path: _draw_solver(outcome, name, path.parent, provenance, detectors), folder / "report.html"
-        )
+    report = folder / "report.html"
+    failed = _attempt(lambda _: _draw_solver(outcome, name, folder, provenance, detectors), report) if pages else []
     spent = {"writing": written - began, "report": time.perf_counter() - written}
     write_json(folder / "summary.json", solver_summary(outcome, name, spent, provenance))
     return failed

@@ -66,7 +66,9 @@ def test_a_bad_drive_costs_itself_alone_and_what_is_done_stays(
     (out / "drives" / "run30" / "drive.json").unlink()
     text = (walks / "run31.toml").read_text()
     (walks / "run31.toml").write_text(text.replace("gyro_noise_density = 0.001", "gyro_noise_density = 0.002"))
+    (out / "drives" / "run31" / "report.html").write_text("of a result that is replaced without a new one")
     again = run(capsys, walks, out)
+    assert not (out / "drives" / "run31" / "report.html").exists()
     assert {name for name, row in again.items() if row.get("skipped")} == {"run02", "worse"}
     assert again["run30"]["sd_h_median_m"] == rows["run30"]["sd_h_median_m"]
     assert again["run31"]["sd_h_median_m"] != rows["run31"]["sd_h_median_m"]

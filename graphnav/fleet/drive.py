@@ -53,6 +53,8 @@ def solve_drive(task: Task) -> Row:
             outcome = run_request(_request(task))
             with staged(folder) as part:
                 outputs.write_run(outcome, part, task.pages)
+            if not task.pages:
+                outputs.remove_pages(folder)
         row |= {"status": DONE, **_figures(outcome)}
         row["report"] = str(Path("drives") / task.name / "report.html") if task.pages else None
     except GraphnavError as error:
