@@ -109,9 +109,8 @@ def write_comparison(outcome: Outcome, folder: Path, pages: bool = True) -> list
 
 def remove_pages(folder: Path, solvers: Sequence[str] = ()) -> None:
     """Take away the pages of a run before, of which the results have been replaced without new ones."""
-    for place in (folder, *(folder / name for name in solvers)):
-        (place / "report.html").unlink(missing_ok=True)
-    (folder / "comparison.html").unlink(missing_ok=True)
+    for page in ("comparison.html", "report.html", *(f"{name}/report.html" for name in solvers)):
+        (folder / page).unlink(missing_ok=True)
 
 
 def draw_again(folder: Path, part: Path) -> list[Path]:
