@@ -48,6 +48,9 @@ def online(
     lag: Annotated[
         float | None, typer.Option("--lag", metavar="S", help="How much of the future a settled state has seen.")
     ] = None,
+    engine: Annotated[
+        str | None, typer.Option("--engine", metavar="NAME", help="What smooths: window, or isam2 (GTSAM's).")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in OUT.")] = False,
     send: Annotated[bool, typer.Option("--send", help="Print the recording as lines instead of smoothing it.")] = False,
     profile: Profile = None,
@@ -65,7 +68,7 @@ def online(
     if send:
         _send(source, topic or [], allow_outside, speed)
         return
-    settings = _with_lag(read_settings(config, profile), lag)
+    settings = _changed(read_settings(config, profile), lag, engine)
     if resume and out is None:
         raise ConfigError("--resume: say which folder to go on in: -o OUT")
     folder = None if out is None else output_folder(out)
@@ -90,12 +93,16 @@ def online(
         raise Interrupted("interrupted" + (f"; go on with --resume -o {folder}" if folder else ""))
 
 
-def _with_lag(settings: Settings, lag: float | None) -> Settings:
-    if lag is None:
-        return settings
-    if not lag >= 1.0:
+def _changed(settings: Settings, lag: float | None, engine: str | None) -> Settings:
+    """The settings with what was typed in the place of theirs."""
+    from graphnav.config import settings_from
+
+    if lag is not None and not lag >= 1.0:
         raise ConfigError(f"--lag {lag:g}: must be at least 1 s")
-    return settings.model_copy(update={"solver": settings.solver.model_copy(update={"lag": lag})})
+    if engine is not None and engine not in ("window", "isam2"):
+        raise ConfigError(f"--engine {engine}: must be window or isam2")
+    typed = {key: value for key, value in (("lag", lag), ("engine", engine)) if value is not None}
+    return settings_from(settings.model_dump() | {"solver": settings.solver.model_dump() | typed})
 
 
 def _send(source: str, topics: list[str], allow_outside: bool, speed: float) -> None:

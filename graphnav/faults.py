@@ -10,7 +10,7 @@ import numpy as np
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import Fault
-from graphnav.solvers.passes import Smoothed, residual_record, values_of
+from graphnav.solvers.passes import Smoothed, residual_record
 
 
 def spans(problem: Problem, smoothed: Smoothed | None = None) -> tuple[Fault, ...]:
@@ -23,7 +23,7 @@ def spans(problem: Problem, smoothed: Smoothed | None = None) -> tuple[Fault, ..
         t = problem.t[rows.keyframe]
         off = None
         if smoothed is not None:
-            record = residual_record(problem, rows, smoothed.states, values_of(problem, smoothed))
+            record = residual_record(problem, rows, smoothed)
             off = np.linalg.norm(record.residual, axis=1)
         for run in np.split(lost, np.flatnonzero(np.diff(lost) > 1) + 1):
             reason = ""

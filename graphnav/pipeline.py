@@ -163,15 +163,15 @@ def _solve(
         out["batch"] = batch(problem, start.states, start.nodes(problem), progress=progress)
         # what it took to get there is part of it
         out["batch"] = replace(out["batch"], timings={**forward.solution.timings, **out["batch"].timings})
+    begin = found.aligned.state if found.astray else None
     if "incremental" in solvers:
         from graphnav.solvers.incremental import incremental
 
-        begin = found.aligned.state if found.astray else None
         out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
     if "isam2" in solvers:
         from graphnav.solvers.isam import isam2
 
-        out["isam2"] = isam2(problem, progress).settled
+        out["isam2"] = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin).settled
     timings = {"detection": detection, **found.timings}
     return {
         name: replace(

@@ -33,8 +33,9 @@ from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import Solution
 from graphnav.solvers.ekf import ekf, refilter
+from graphnav.solvers.linearise import Points
 from graphnav.solvers.near import near
-from graphnav.solvers.passes import Filtered, Points, Smoothed, about_solved, near_to, points_of, values_of
+from graphnav.solvers.passes import Filtered, Smoothed, about_solved, near_to, points_of, values_of
 from graphnav.solvers.rts import backward
 from graphnav.state import BLOCKS, States
 

@@ -190,7 +190,7 @@ _WORK = {
     "ekf": (*_BEFORE, "evaluation", "writing"), "rts": (*_BEFORE, "evaluation", "writing"),
     "batch": (*_BEFORE, "batch", "covariances", "evaluation", "writing"),
     "incremental": (*_BEFORE, "incremental", "evaluation", "writing"),
-    "isam2": (*_BEFORE, "isam2", "batch", "covariances", "evaluation", "writing"),
+    "isam2": (*_BEFORE, "isam2", "evaluation", "writing"),
 }  # fmt: skip
 
 

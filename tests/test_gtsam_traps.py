@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers import Array
 
-from graphnav.solvers.graph import LinearGraph
+from graphnav.solvers.graph import LinearGraph, jacobian_factor
 
 N = 40
 
@@ -154,11 +154,21 @@ def test_a_long_chain_does_not_exhaust_the_stack() -> None:
     assert x[0] < -0.5
 
 
-def test_rows_may_touch_three_variables_and_not_four() -> None:
+def test_rows_may_touch_more_variables_than_the_constructors_know() -> None:
+    rng = np.random.default_rng(4)
+    widths = {1: 15, 2: 4, 3: 6, 4: 1, 5: 3, 6: 2}
+    blocks = [(key, rng.standard_normal((3, w))) for key, w in widths.items()]
+    b = rng.standard_normal(3)
+    for count in (1, 3, 4, 6):
+        factor = jacobian_factor(blocks[:count], b)
+        A = np.concatenate([dict(blocks)[key] for key in list(factor.keys())], axis=1)
+        np.testing.assert_allclose(factor.getA().T @ factor.getA(), A.T @ A, atol=1e-12)
+        np.testing.assert_allclose(factor.getA().T @ factor.getb(), A.T @ b, atol=1e-12)
     graph = LinearGraph()
-    block = (np.zeros(1, dtype=int), np.eye(2)[None])
-    with pytest.raises(ValueError, match="one to three variables"):
-        graph.add([block] * 4, np.zeros((1, 2)))
+    graph.add([(np.array([key]), np.eye(2)[None]) for key in range(5)], np.array([[1.0, -1.0]]))
+    for key in range(5):
+        graph.add([(np.array([key]), 1e-3 * np.eye(2)[None])], np.zeros((1, 2)))
+    np.testing.assert_allclose(sum(graph.eliminate(range(5)).solve(range(5))), [1.0, -1.0], atol=1e-6)
 
 
 def test_keys_may_stand_in_any_order_and_matrices_in_any_layout() -> None:

@@ -24,7 +24,6 @@ from graphnav.solution import Solution
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf
 from graphnav.solvers.incremental import Incremental, incremental, node_steps
-from graphnav.solvers.isam import isam2
 from graphnav.solvers.rts import backward
 from graphnav.solvers.stages import Message, Place, Step, turned
 from graphnav.solvers.window import Window, first_message
@@ -118,18 +117,6 @@ def test_the_live_estimate_is_the_end_of_a_batch_solution_so_far(posed: Problem)
         assert posed.t[k] == pytest.approx(part.t[-1], abs=1e-6)
         assert np.abs((live.states[k : k + 1].minus(so_far.states[-1:])) / sigmas(so_far)[-1]).max() < 0.1
         np.testing.assert_allclose(sigmas(live)[k], sigmas(so_far)[-1], rtol=0.01)
-
-
-def test_isam2_holds_the_same_as_the_window(posed: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two eliminations of the same rows, one of them GTSAM's, over the first motion and all parameters."""
-    part = pose(posed.recording.crop(0.0, 60.0), posed.settings, posed.frame, posed.prior.mean, posed.prior.sigma[0])
-    part = with_noise(part, LASTING)
-    monkeypatch.setattr("graphnav.solvers.incremental.turn_limit", lambda noise: 1e9)  # as the tree: only at the end
-    tree, window = isam2(part), incremental(part, lag=EVERYTHING)
-    assert np.abs(apart(tree.live, window.live)).max() < 0.05
-    # the first fixes turn the state by degrees, and only the window's message turns with it
-    late = part.t > part.t[0] + 10.0
-    np.testing.assert_allclose(sigmas(tree.live)[late], sigmas(window.live)[late], rtol=2e-3)
 
 
 def test_a_lag_over_the_outage_gives_the_batch_solution_to_a_centimetre(drive: tuple[Recording, Trajectory]) -> None:

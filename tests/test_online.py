@@ -64,6 +64,44 @@ def played(recording: Recording, rows: Iterable[Row], how: Settings = QUICK) -> 
     return online, joined([*parts, *online.settled()])
 
 
+def test_isam2_smooths_online_as_the_window_does(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    """With fixes half a second late, which take keyframes back."""
+    recording, _ = drive
+    rows = [row for row in rows if row[1] < 60.0]
+    late = [row for row in rows if row[0] != "gnss" or round(row[1]) % 7 != 3]
+    for row in (row for row in rows if row[0] == "gnss" and round(row[1]) % 7 == 3):
+        late.insert(next((k for k, other in enumerate(late) if other[1] > row[1] + 0.5), len(late)), row)
+    long = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 1000.0}})
+    tracks = []
+    for engine in ("window", "isam2"):
+        online = Online(without_rows(recording), long, engine)
+        for row in late:
+            online.add(row)
+        online.finish()
+        assert not online.failures
+        tracks.append(joined(online.settled()))
+    window, tree = tracks
+    np.testing.assert_array_equal(tree.t, window.t)
+    apart = (tree.llh - window.llh) * np.array([6.37e6, 6.37e6 * np.cos(tree.llh[0, 0]), 1.0])
+    assert np.abs(apart[:, [1, 0, 2]] / window.sd_p).max() < 0.02
+    np.testing.assert_allclose(tree.sd_p, window.sd_p, rtol=0.01)
+
+
+def test_isam2_goes_on_from_its_checkpoint(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    rows, tracks = [row for row in rows if row[1] < 60.0], []
+    for every in (len(rows), 900):
+        online, parts = Online(without_rows(drive[0]), QUICK, "isam2"), []
+        for k, row in enumerate(rows):
+            online.add(row)
+            parts += online.settled()
+            if k % every == every - 1:
+                online = pickle.loads(pickle.dumps(online))
+        online.finish()
+        tracks.append(joined([*parts, *online.settled()]))
+    np.testing.assert_allclose(tracks[1].llh, tracks[0].llh, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(tracks[1].sd_p, tracks[0].sd_p, rtol=1e-6)
+
+
 def joined(parts: list[Trajectory]) -> Trajectory:
     def column(name: str) -> Array:
         return np.concatenate([getattr(part, name) for part in parts])

@@ -22,8 +22,8 @@ from graphnav.problem import Problem, pose
 from graphnav.rotation import Array
 from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf, refilter
+from graphnav.solvers.linearise import Points
 from graphnav.solvers.near import near
-from graphnav.solvers.passes import Points
 from graphnav.solvers.points import AtEstimate, AtPoints, Estimate
 from graphnav.solvers.rts import backward
 from graphnav.solvers.stack import Stack

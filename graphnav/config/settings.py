@@ -75,10 +75,14 @@ class NoiseSettings(Section):
 
 
 class SolverSettings(Section):
-    """The outer loop of the batch solver, and how long the incremental one waits."""
+    """The outer loop of the batch solver, and how long the incremental ones wait."""
 
     lag: float = Field(
         120.0, ge=1, description="s of future that a state has seen when the incremental solver lets it settle"
+    )
+    isam2_lag: float = Field(0.0, ge=0, description="s as `lag`, of the solver isam2; 0 smooths the whole drive")
+    engine: Literal["window", "isam2"] = Field(
+        "window", description="what smooths online: the window's own elimination, or GTSAM's iSAM2 with the same lag"
     )
     max_iterations: int = Field(30, ge=1, description="Levenberg-Marquardt iterations")
     tolerance: float = Field(

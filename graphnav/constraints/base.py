@@ -74,6 +74,8 @@ class Constraint(ABC):
     passes: ClassVar[int] = 1  # of a filter's update; more for rows that are far from linear over its uncertainty
     noise_axes: ClassVar[tuple[str, ...]] = ()  # variance component of each axis; none: its sigmas are taken as stated
 
+    fix_of: ClassVar[str] = ""  # of a receiver's fixes: the block of the state that each gives, "p" or "v"
+
     keyframe: Array  # (N,) int, ascending
     parameters: tuple[Parameter, ...] = ()
     processes: tuple[Parameter, ...] = ()  # of its errors; parameters where a noise model has them (`graphnav.noise`)
@@ -94,6 +96,10 @@ class Constraint(ABC):
         names = tuple(dict.fromkeys(self.noise_axes))
         index = [names.index(axis) for axis in self.noise_axes] or [-1] * len(self.axes)
         return tuple(f"{self.name}.{name}" for name in names), np.tile(index, (len(self), 1))
+
+    def typical_error(self) -> Array:
+        """(m,) typical 1-sigma of a whole error, white part and what lasts, of rows that are watched."""
+        raise NotImplementedError(f"{self.name}: rows that are watched say what their errors usually are")
 
     def scale_of(self, rows: slice | Array) -> float | Array:
         """Scale of the kernel for some rows."""

@@ -99,6 +99,7 @@ class GnssPosition(Constraint):
     axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
     noise_axes: ClassVar[tuple[str, ...]] = ("horizontal", "horizontal", "up")
     unit: ClassVar[str] = "m"
+    fix_of: ClassVar[str] = "p"
 
     p_n: Array = field(default_factory=lambda: _empty(0, 3))  # fixes in the navigation frame
     R_ln: Array = field(default_factory=lambda: _empty(0, 3, 3))
@@ -167,6 +168,9 @@ class GnssPosition(Constraint):
         )
         return names, 2 * which[:, None] + np.array([0, 0, 1])
 
+    def typical_error(self) -> Array:
+        return _typical_error(self)
+
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         C, R = self.R_ln[rows], states.R_nb
         lever = parameters.get(LEVER_ARM, self.lever_arm)
@@ -208,6 +212,7 @@ class GnssVelocity(Constraint):
     axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
     noise_axes: ClassVar[tuple[str, ...]] = ("horizontal", "horizontal", "up")
     unit: ClassVar[str] = "m/s"
+    fix_of: ClassVar[str] = "v"
 
     v_l: Array = field(default_factory=lambda: _empty(0, 3))
     R_ln: Array = field(default_factory=lambda: _empty(0, 3, 3))
@@ -259,6 +264,9 @@ class GnssVelocity(Constraint):
             **_common(scene, VELOCITY_TIME_OFFSET),
         )
 
+    def typical_error(self) -> Array:
+        return _typical_error(self)
+
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         C = self.R_ln[rows]
         lever = parameters.get(LEVER_ARM, self.lever_arm)
@@ -281,11 +289,8 @@ class GnssVelocity(Constraint):
         return Linearized(residual, jacobians, self.sigma[rows])
 
 
-def whole_sigma(rows: GnssPosition | GnssVelocity) -> Array:
-    """(3,) typical 1-sigma of a whole error, white part and what lasts; at least what the receiver claims.
-
-    A fix that keeps to what its receiver claims is no wrong one, however much better the others are.
-    """
+def _typical_error(rows: GnssPosition | GnssVelocity) -> Array:
+    """At least what the receiver claims: a fix that keeps to that is no wrong one, however good the others are."""
     lasting = sum((p.sigma**2 for p in rows.parameters if p.name.startswith((*ERRORS, VELOCITY_ERROR))), np.zeros(3))
     whole = np.sqrt(rows.sigma**2 + lasting * rows.unit_error**2)
     return np.asarray(np.median(np.maximum(whole, rows.unit_error), axis=0))

@@ -34,7 +34,8 @@ from graphnav.preintegration import NOISE_FIGURES
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array
 from graphnav.solvers.ekf import ekf, refilter
-from graphnav.solvers.passes import Forward, Points, Smoothed, points_of, values_of
+from graphnav.solvers.linearise import Points
+from graphnav.solvers.passes import Forward, Smoothed, points_of, values_of
 from graphnav.solvers.rts import backward
 
 _CHANCE = 1e-3  # below which a squared residual is taken for an outlier

@@ -37,7 +37,8 @@ from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import Fault
 from graphnav.solvers.ekf import refilter
-from graphnav.solvers.passes import Points, points_of, values_of
+from graphnav.solvers.linearise import Points
+from graphnav.solvers.passes import points_of, values_of
 from graphnav.solvers.watch import FALSE_ALARM
 from graphnav.state import Parameter, States
 

@@ -20,9 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav.constraints.base import Constraint, assemble
+from graphnav.constraints.base import Constraint
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array
+from graphnav.solvers.linearise import linearise
 from graphnav.solvers.passes import Forward, Smoothed, values_of
 from graphnav.state import DIM
 
@@ -64,17 +65,17 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: Smoothed, n: int) 
     """Of the first n rows of a constraint."""
     at, which = rows.keyframe[:n], slice(0, n)
     values = values_of(problem, smoothed)
-    linear = rows.linearize(smoothed.states[at], {p.name: values[p.name][at] for p in rows.parameters}, which)
-    H = assemble(linear, problem.columns, smoothed.P.shape[-1])
+    linear = linearise(rows, smoothed, problem.columns, which)
+    H = linear.H
     HPH = np.einsum("nij,nij->ni", H @ smoothed.P[at], H)
     w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
-    R = linear.sigma**2
+    R = linear.stated**2
     B = np.clip(1.0 - w * HPH / R, 1e-6, 1.0)
     left_out = (linear.residual / B) ** 2 / (R + HPH / B)
     error, variance = linear.residual, R
     for p in rows.parameters:
         if p.correlation_time is not None:
-            J = linear.jacobians[p.name]
+            J = linear.H[:, :, problem.columns[p.name]]
             error = error - np.einsum("nij,nj->ni", J, values[p.name][at])
             variance = variance + J**2 @ p.sigma**2
     # of the component that a factor scales

@@ -7,7 +7,7 @@ import numpy as np
 from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
 from graphnav.noise_model import NoiseModel
 from graphnav.problem import Problem
-from graphnav.solvers.passes import Points, shift
+from graphnav.solvers.linearise import Points, shift
 
 _IMU = {
     "imu.gyro_noise_density": "gyro noise",

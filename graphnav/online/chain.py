@@ -13,7 +13,6 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
-from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.constraints.standstill import PLACE
 from graphnav.noise.apply import row_weights
 from graphnav.noise_model import STATED, NoiseModel
@@ -25,12 +24,14 @@ from graphnav.rotation import Array
 from graphnav.solution import Fault
 from graphnav.solvers.elimination import Predicted
 from graphnav.solvers.stages import Place, Step
+from graphnav.solvers.tree_window import TreeWindow
 from graphnav.solvers.watch import Verdicts, Watch
 from graphnav.solvers.window import Message, Smoothed, Window
 from graphnav.state import Parameter
 
 _PLACE_SIGMA = 1000.0  # m, of where a stop may be
 _FIXES = 5  # that tell how often they come
+_ENGINES: dict[str, type[Window]] = {"window": Window, "isam2": TreeWindow}
 
 
 class Chain:
@@ -47,7 +48,7 @@ class Chain:
         self, settings: Settings, message: Message, t0: float, turn: float, noise: NoiseModel = STATED
     ) -> None:
         self.settings, self.noise = settings, noise
-        self.window = Window(message, turn)
+        self.window = _ENGINES[settings.solver.engine](message, turn)
         self.head = t0  # time of the message before the window, or of the first keyframe as long as it is in it
         self.opened = False  # whether the first keyframe has left the window
         self.verdicts = Verdicts({}, {})  # which fixes are used
@@ -101,7 +102,7 @@ class Chain:
         """Have the fixes watched for errors that last, as soon as some tell how often they come."""
         if self.window.newest.tests is not None or self.settings.gnss.faults == "off" or len(sensors.gnss) < _FIXES:
             return
-        watched = [c for c in problem.constraints if c.watched and isinstance(c, GnssPosition | GnssVelocity)]
+        watched = [c for c in problem.constraints if c.watched and c.fix_of]
         if watched:
             period = float(np.median(np.diff(sensors.gnss.t)))
             self.window.watch(Watch(watched, period, len(self.window.newest.z)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import traceback
 from pathlib import Path
 
-from graphnav.config import Settings
+from graphnav.config import Settings, settings_from
 from graphnav.online.sensors import Row
 from graphnav.online.smoother import Smoother
 from graphnav.recording import Recording
@@ -20,9 +20,15 @@ class Online(Smoother):
     ----------
     setup : a recording without rows (`graphnav.online.without_rows`): platform, noise figures, lever arms.
     settings : as for a recording; `solver.lag` says how much future a settled state has seen.
+    engine : "window" or "isam2", what smooths; `solver.engine` of the settings when None.
     """
 
-    def __init__(self, setup: Recording, settings: Settings | None = None) -> None:
+    def __init__(self, setup: Recording, settings: Settings | None = None, engine: str | None = None) -> None:
+        settings = settings or Settings()
+        if engine is not None:
+            settings = settings_from(
+                settings.model_dump() | {"solver": settings.solver.model_dump() | {"engine": engine}}
+            )
         super().__init__(setup, settings)
         self.clocks = 1  # how many there have been: the times of each go on by themselves
         self.failures: list[str] = []  # why pieces were given up

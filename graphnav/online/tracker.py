@@ -39,7 +39,7 @@ from graphnav.rotation import Array
 from graphnav.samples import GAP, bridge_gaps
 from graphnav.solvers.elimination import Predicted
 from graphnav.solvers.stages import Place
-from graphnav.solvers.window import Message, Smoothed, Window, turn_limit
+from graphnav.solvers.window import Message, Smoothed, turn_limit
 from graphnav.state import DIM, States
 from graphnav.wheels import MeanSpeed
 
@@ -273,7 +273,7 @@ class Tracker(Chain):
         """One with another noise model that has settled what this one has, and has no keyframes since."""
         other, head = copy.copy(self), self.window.head
         other.noise, other._parameters, other.verdicts = noise, {}, copy.deepcopy(self.verdicts)
-        other.window = Window(head.moved(head.estimate), _turn(setup, noise))
+        other.window = type(self.window)(head.moved(head.estimate), _turn(setup, noise))
         other._nodes, other._motions, other.settled, other._ahead = [], {}, [], None
         other._settling = False
         other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)

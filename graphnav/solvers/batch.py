@@ -20,13 +20,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.dense import dense
-from graphnav.dynamics import as_biases
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
 from graphnav.solvers.graph import Eliminated, LinearGraph
-from graphnav.solvers.passes import Progress, residual_record
-from graphnav.solvers.robust import REDESCENDING, weight_and_cost
+from graphnav.solvers.passes import Progress, integrated_again, residual_record
+from graphnav.solvers.robust import REDESCENDING
 from graphnav.solvers.rows import Layout, Point, Rows, Values, column_norms, cost, promised, whitened
 from graphnav.state import DIM, States
 
@@ -68,13 +67,10 @@ def batch(
     unknown = np.full((DIM, DIM), np.nan)
     covariance = np.stack([marginal.get(k, unknown) for k in range(layout.K)])
     done = time.perf_counter()
-    at_keyframes = point.at_keyframes(problem)
-    records = {}
+    points, records = point.points(problem), {}
     for constraint in problem.constraints:
-        s = np.sqrt(residual_record(problem, constraint, point.states, at_keyframes).nis)
-        weight, _ = weight_and_cost(constraint.robust, s, constraint.robust_scale)
-        records[constraint.name] = residual_record(problem, constraint, point.states, at_keyframes, weight)
-        if np.mean(weight < 0.1) > 0.5:
+        record = records[constraint.name] = residual_record(problem, constraint, points, robust=True)
+        if constraint.robust != "none" and np.mean(record.weight < 0.1) > 0.5:
             notes.append(f"most rows of {constraint.name} were given up as outliers: do not trust this solution")
     return Solution(
         solver="batch",
@@ -109,10 +105,10 @@ class _Minimum:
 def _graduated(problem: Problem, point: Point) -> Iterator[Problem]:
     """The problem with its "gnc" kernels convex at first and then ever less so, for a step each."""
     mu: dict[str, float] = {}
-    at_keyframes = point.at_keyframes(problem)
+    points = point.points(problem)
     for c in problem.constraints:
         if c.robust == "gnc":
-            s2 = residual_record(problem, c, point.states, at_keyframes).nis * (1.0 if c.weight is None else c.weight)
+            s2 = residual_record(problem, c, points).nis * (1.0 if c.weight is None else c.weight)
             if np.max(s2) > c.robust_scale**2:
                 mu[c.name] = float(1.0 / (2.0 * float(np.max(s2)) / c.robust_scale**2 - 1.0))
     while mu and min(mu.values()) < _SHARP:
@@ -129,7 +125,7 @@ def _minimise(
         settings = settings.model_copy(update={"max_iterations": iterations})
     renewed = refused = 0
     if reintegrate:
-        problem, renewed = _renew(problem, point)
+        problem, renewed = integrated_again(problem, point.states, point.scale)
     layout = Layout(problem)
     now = cost(problem, point, layout)
     damping, gentlest = 0.0, _MIN_DAMPING
@@ -178,7 +174,7 @@ def _minimise(
             gentlest /= 10.0  # more would have been possible: a long valley is not crept along
         damping = 0.0 if damping <= _MIN_DAMPING or gain < settings.tolerance else damping / 10.0
         if reintegrate:
-            problem, again = _renew(problem, point)
+            problem, again = integrated_again(problem, point.states, point.scale)
             if again:
                 layout = Layout(problem)
                 now = cost(problem, point, layout)
@@ -203,18 +199,6 @@ def _eliminate(rows: Rows, layout: Layout, damping: float) -> Eliminated:
             keys = np.array([k for k in layout.keys if layout.width[k] == width])
             graph.add([(keys, size[keys, :width, None] * np.eye(width))], np.zeros((len(keys), width)))
     return graph.eliminate(layout.order)
-
-
-def _renew(problem: Problem, point: Point) -> tuple[Problem, int]:
-    """Integrate again about the present biases where the first-order correction no longer holds."""
-    ba, bg = point.states.ba[:-1], point.states.bg[:-1]
-    if point.scale is not None:
-        of_accel, of_gyro = as_biases(point.scale, problem.intervals.force, problem.intervals.rate)
-        ba, bg = ba + of_accel, bg + of_gyro
-    far = problem.intervals.out_of_range(bg)
-    if not far.any():
-        return problem, 0
-    return problem.reintegrated(ba, bg), int(far.sum())
 
 
 def _estimates(

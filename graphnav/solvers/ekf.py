@@ -31,22 +31,20 @@ from typing import Any
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from graphnav.constraints.gnss import GnssPosition, GnssVelocity
 from graphnav.dense import dense
 from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import Solution
+from graphnav.solvers.linearise import Points, scale_at
 from graphnav.solvers.passes import (
     Filtered,
     Forward,
     Gain,
-    Points,
     Progress,
     joined,
     moved,
     parameters_of,
-    scale_of,
 )
 from graphnav.solvers.points import AtEstimate, AtPoints, Estimate, about_own
 from graphnav.solvers.robust import PASSES, softened, weight_and_cost
@@ -99,7 +97,7 @@ def ekf(
         stopped="one pass forward over all keyframes",
         timings={"filter": seconds},
         notes=problem.notes,
-        between=(dense(problem, filtered, P, scale_of(problem, one.values), smooth=False),),
+        between=(dense(problem, filtered, P, scale_at(problem.columns, one.values), smooth=False),),
     )
     return Filtered(**vars(one), solution=solution)
 
@@ -135,7 +133,7 @@ def _forward(
         x = own.minus(x, _one(about, 0))
     P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
     records = stack.records
-    fixes = [c for c in problem.constraints if watch and isinstance(c, GnssPosition | GnssVelocity)]
+    fixes = [c for c in problem.constraints if watch and c.fix_of]
     watched = [c for c in fixes if c.watched]
     alone = [c.gate is not None or c.robust != "none" or any(c is one for one in fixes) for c in problem.constraints]
     one_by_one = [True] * len(alone)  # each linearised where those before it have led
@@ -168,7 +166,7 @@ def _forward(
                 P.flat[:: D + 1] += added
         for kind in watched if verdicts.anew else ():
             if (kind.name, problem.t[k]) in verdicts.anew:
-                P = _anywhere(P, "p" if isinstance(kind, GnssPosition) else "v")
+                P = _anywhere(P, kind.fix_of)
         ahead[k], all_Pp[k] = x, P
         back: int | None = None
         taken: list[Gain] | None = None
@@ -221,7 +219,7 @@ def _forward(
 
 def _placed(P: Array, records: dict[str, Innovations]) -> Array:
     """What is known at the start, but for the place where the first fix, which tells it, is not used."""
-    first = [one.used[0] for one in records.values() if isinstance(one.rows, GnssPosition) and len(one.used)]
+    first = [one.used[0] for one in records.values() if one.rows.fix_of == "p" and len(one.used)]
     return _anywhere(P, "p") if first and first[0] == 0.0 else P
 
 

@@ -18,7 +18,7 @@ from scipy.linalg.lapack import dgeqrf, dtpmqrt, dtpqrt, dtrtri, dtrtrs
 from graphnav import rotation
 from graphnav.errors import EstimationError
 from graphnav.rotation import Array
-from graphnav.solvers.passes import shift
+from graphnav.solvers.linearise import shift
 from graphnav.solvers.robust import PASSES
 from graphnav.solvers.stages import Columns, Measured, Message, Place, Stage, turned, width
 from graphnav.solvers.watch import Watch

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -18,7 +19,33 @@ from scipy.linalg.lapack import dtrtri
 from graphnav.errors import EstimationError
 from graphnav.rotation import Array
 
+_SUMS = 1 << 60  # keys of variables that are eliminated before anybody sees them
 Blocks = Sequence[tuple[Array, Array]]  # (keys (N,), A (N, m, k)) per variable a factor touches
+
+
+def jacobian_factor(blocks: Sequence[tuple[int, Array]], b: Array) -> gtsam.JacobianFactor:
+    """Whitened rows: the sum of A d[key] over the blocks (key, A) is b.
+
+    GTSAM's constructors know up to three variables. More come in as sums of two: variables s with A d + B e = s
+    exactly, which are eliminated at once.
+    """
+    rest = [(key, np.asfortranarray(A)) for key, A in blocks]
+    sums: list[int] = []
+    make: Any = gtsam.JacobianFactor
+    graph, ordering, one = gtsam.GaussianFactorGraph(), gtsam.Ordering(), np.eye(len(b))
+    while len(rest) > 3:
+        (k0, A0), (k1, A1) = rest.pop(), rest.pop()
+        key = _SUMS + len(sums)
+        graph.push_back(make(k0, A0, k1, A1, key, -one, np.zeros(len(b)), gtsam.noiseModel.Constrained.All(len(b))))
+        rest.insert(0, (key, one))
+        sums.append(key)
+        ordering.push_back(key)
+    factor = make(*(part for block in rest for part in block), b, gtsam.noiseModel.Unit.Create(len(b)))
+    if not sums:
+        return factor
+    graph.push_back(factor)
+    _, left = graph.eliminatePartialSequential(ordering)
+    return gtsam.JacobianFactor(left.at(0)).whiten()
 
 
 class LinearGraph:
@@ -49,7 +76,8 @@ class LinearGraph:
             for i in range(n):
                 push(factor(k0[i], A0[i], k1[i], A1[i], k2[i], A2[i], b[i], unit))
         else:
-            raise ValueError(f"a row may touch one to three variables, not {len(blocks)}")
+            for i in range(n):
+                push(jacobian_factor([(k[i], A[i]) for k, A in zip(keys, columns, strict=True)], b[i]))
 
     def eliminate(self, order: Sequence[int]) -> Eliminated:
         """Eliminate the variables in this order."""

@@ -17,8 +17,8 @@ from graphnav.dynamics import SCALE
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import ParameterEstimate, Solution
+from graphnav.solvers.linearise import Points
 from graphnav.solvers.passes import Progress, residual_record
-from graphnav.solvers.robust import weight_and_cost
 from graphnav.solvers.stages import Place, Step
 from graphnav.solvers.window import Smoothed, Window, first_message, turn_limit
 from graphnav.state import DIM, States
@@ -108,20 +108,44 @@ def incremental(
             progress("incremental", k / K)
     solver.finish()
     spent = time.perf_counter() - began
-    columns = solver.settled[-1].columns[-1]
-    states = States.stack([part.states for part in solver.settled])
-    values = np.array([row for part in solver.settled for row in part.values])
-    sigma = np.array([row for part in solver.settled for row in part.sigma])
-    covariance = np.concatenate([part.covariance for part in solver.settled])
+    live_states, values = States.stack(live), np.array(live_values)
+    found = replayed(problem, "incremental", solver.settled, live_states, live_P, values, seconds, spent, lag)
+    notes = (*found.settled.notes, f"{solver.window.relinearized} were linearised again")
+    return replace(found, settled=replace(found.settled, notes=notes))
+
+
+def replayed(
+    problem: Problem,
+    solver: str,
+    parts: list[Smoothed],
+    live: States,
+    live_P: Array,
+    live_values: Array,
+    seconds: Array,
+    spent: float,
+    lag: float,
+) -> Replayed:
+    """What an incremental solver has found, as solutions.
+
+    Parameters
+    ----------
+    parts : what settled, in turn.
+    live, live_P, live_values : (K,), (K, 15, 15) and (K, D-15) as known when each keyframe had come.
+    seconds, spent : (K,) s of process time, and s in all.
+    lag : s
+    """
+    columns, K = parts[-1].columns[-1], len(problem.t)
+    states = States.stack([part.states for part in parts])
+    values = np.array([row for part in parts for row in part.values])
+    sigma = np.array([row for part in parts for row in part.sigma])
+    covariance = np.concatenate([part.covariance for part in parts])
     at = {name: slice(s.start - DIM, s.stop - DIM) for name, s in columns.items()}
-    chains = {name: values[:, s] for name, s in at.items()}
-    records = {}
-    for rows in problem.constraints:
-        r = residual_record(problem, rows, states, chains)
-        robust, _ = weight_and_cost(rows.robust, np.sqrt(r.nis), rows.robust_scale)
-        records[rows.name] = replace(r, weight=robust * r.weight)
+    order = [values[:, at[c.parameter.name]] for c in problem.chains]
+    points = Points(states, np.concatenate([np.empty((K, 0)), *order], axis=1))
+    records = {rows.name: residual_record(problem, rows, points, robust=True) for rows in problem.constraints}
+    whole = "all there was" if np.isinf(lag) else f"{lag:g} s of the future, or all there was"
     settled = Solution(
-        solver="incremental",
+        solver=solver,
         frame=problem.frame,
         t=problem.t,
         states=states,
@@ -130,21 +154,20 @@ def incremental(
         records=records,
         counts={"initial_prior": 1, "imu": K - 1, **{c.name: len(c) for c in problem.constraints}},
         iterations=1,
-        stopped=f"every keyframe settled with {lag:g} s of the future, or all there was",
-        timings={"incremental": spent},
-        notes=(*problem.notes, f"lag {lag:g} s: {said(seconds)}; {solver.window.relinearized} were linearised again"),
+        stopped=f"every keyframe settled with {whole}",
+        timings={solver: spent},
+        notes=(*problem.notes, f"lag {lag:g} s: {said(seconds)}"),
         between=(dense(problem, states, covariance, _scale(at, values), smooth=True),),
     )
-    live_states = States.stack(live)
     now = replace(
         settled,
         solver="live",
-        states=live_states,
+        states=live,
         covariance=live_P,
         parameters={},
         records={},
         stopped="each keyframe as it was known when it came",
-        between=(dense(problem, live_states, live_P, _scale(at, np.array(live_values)), smooth=False),),
+        between=(dense(problem, live, live_P, _scale(at, live_values), smooth=False),),
     )
     return Replayed(settled, now, seconds)
 

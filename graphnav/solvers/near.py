@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from graphnav.problem import Problem
 from graphnav.solvers.ekf import ekf, refilter
-from graphnav.solvers.passes import Forward, Points, Progress, Smoothed, near_to
+from graphnav.solvers.linearise import Points
+from graphnav.solvers.passes import Forward, Progress, Smoothed, near_to
 from graphnav.solvers.rts import backward
 
 _PASSES = 4

@@ -8,33 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.constraints.base import Constraint
-from graphnav.dynamics import SCALE
-from graphnav.problem import ParameterChain, Problem
+from graphnav.dynamics import as_biases
+from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.solvers.linearise import Points, last_of, linearise, shift
+from graphnav.solvers.robust import weight_and_cost
 from graphnav.solvers.stack import Innovations
 from graphnav.state import DIM, States
 
 _TURN = 0.02  # rad; what is linear in an error of attitude is wrong by half its square
 Progress = Callable[[str, float], None]
 Gain = tuple[Array, Array, Array, Array]  # of an update: K (D, m), H (m, D), S^-1 nu (m,) and S^-1 H (m, D)
-
-
-@dataclass(frozen=True)
-class Points:
-    """Where the rows of the first K keyframes are linearised."""
-
-    states: States
-    values: Array  # (K, D-15) of the parameters
-
-    def first(self, n: int) -> Points:
-        return Points(self.states[:n], self.values[:n])
-
-    def nodes(self, problem: Problem) -> dict[str, Array]:
-        """(n, k) per parameter: the value of each node after the last keyframe that it governs."""
-        return {
-            c.parameter.name: self.values[last_of(c), shift(problem.columns[c.parameter.name])] for c in problem.chains
-        }
 
 
 @dataclass(frozen=True)
@@ -119,38 +104,39 @@ def points_of(problem: Problem, states: States, known: dict[str, Array]) -> Poin
     return Points(states, np.concatenate([np.empty((len(states), 0)), *values], axis=1))
 
 
-def residual_record(
-    problem: Problem, rows: Constraint, states: States, values: dict[str, Array], weight: Array | None = None
-) -> ConstraintRecord:
-    """What is left of a constraint at the solution; `values` holds (K, k) per parameter."""
-    at = rows.keyframe
-    linear = rows.linearize(states[at], {p.name: values[p.name][at] for p in rows.parameters}, slice(None))
-    nis = np.sum((linear.residual / linear.sigma) ** 2, axis=-1)
-    weight = np.ones(len(rows)) if weight is None else weight
-    if rows.weight is not None:
-        weight = weight * rows.weight
-    return ConstraintRecord("residual", problem.t[at], linear.residual, linear.sigma, nis, weight, rows.axes, rows.unit)
+def residual_record(problem: Problem, rows: Constraint, points: Points, robust: bool = False) -> ConstraintRecord:
+    """What is left of a constraint at the solution; `robust` has the kernel's weights in the rows'."""
+    linear = linearise(rows, points, problem.columns)
+    nis = np.sum((linear.residual / linear.stated) ** 2, axis=-1)
+    weight = np.ones(len(rows)) if rows.weight is None else rows.weight
+    if robust:
+        weight = weight * weight_and_cost(rows.robust, np.sqrt(nis), rows.robust_scale)[0]
+    t = problem.t[rows.keyframe]
+    return ConstraintRecord("residual", t, linear.residual, linear.stated, nis, weight, rows.axes, rows.unit)
+
+
+def integrated_again(problem: Problem, states: States, scale: Array | None, first: int = 0) -> tuple[Problem, int]:
+    """The problem integrated about the present biases where the first-order correction no longer holds, and how often.
+
+    Parameters
+    ----------
+    states : of keyframes from `first` on; intervals before stay as they are, of those behind the last is the guess.
+    scale : (k,) scale errors of the IMU, where they are parameters.
+    """
+    rows = slice(first, None)
+    ba, bg = problem.intervals.ba.copy(), problem.intervals.bg.copy()
+    at = np.minimum(np.arange(len(ba) - first), max(len(states) - 2, 0))
+    ba[rows], bg[rows] = states.ba[at], states.bg[at]
+    if scale is not None:
+        of_accel, of_gyro = as_biases(scale, problem.intervals.force[rows], problem.intervals.rate[rows])
+        ba[rows], bg[rows] = ba[rows] + of_accel, bg[rows] + of_gyro
+    far = problem.intervals.out_of_range(bg)
+    return (problem.reintegrated(ba, bg), int(far.sum())) if far.any() else (problem, 0)
 
 
 def values_of(problem: Problem, points: Points) -> dict[str, Array]:
     """(K, k) per parameter."""
     return {name: points.values[:, shift(at)] for name, at in problem.columns.items()}
-
-
-def scale_of(problem: Problem, values: Array) -> Array | None:
-    """(K, 6) scale errors of the IMU at each keyframe."""
-    at = problem.columns.get(SCALE)
-    return None if at is None else values[:, shift(at)]
-
-
-def shift(columns: slice) -> slice:
-    """Where columns of an error state stand among the parameters' values."""
-    return slice(columns.start - DIM, columns.stop - DIM)
-
-
-def last_of(chain: ParameterChain) -> Array:
-    """(n,) the last keyframe that each node governs."""
-    return np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
 
 
 def parameters_of(problem: Problem, values: Array, P: Array) -> dict[str, ParameterEstimate]:

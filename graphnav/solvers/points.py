@@ -18,11 +18,10 @@ from functools import cached_property
 import numpy as np
 
 from graphnav import rotation
-from graphnav.constraints.base import assemble
 from graphnav.dynamics import SCALE
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array
-from graphnav.solvers.passes import Points, shift
+from graphnav.solvers.linearise import Points, linearise, shift, stepping
 from graphnav.solvers.stack import Stack, Together
 from graphnav.state import DIM, States
 
@@ -51,7 +50,7 @@ class AtEstimate:
         out: dict[int, list[tuple[slice, ParameterChain, int]]] = {}
         for chain in self._problem.chains:
             at = self._columns[chain.parameter.name]
-            for k in _stepping(chain).tolist():
+            for k in stepping(chain).tolist():
                 out.setdefault(k, []).append((at, chain, int(chain.node[k])))
         return out
 
@@ -76,14 +75,9 @@ class AtEstimate:
     def rows(self, some: Together, at: Estimate) -> Rows:
         """Rows of one constraint linearised at an estimate."""
         ((rows, lo, hi),) = some.parts
-        n = hi - lo
-        here = at.state if n == 1 else at.state[np.zeros(n, dtype=int)]
-        given = {p.name: at.values[None, shift(self._columns[p.name])] for p in rows.parameters}
-        if n > 1:
-            given = {name: np.repeat(value, n, axis=0) for name, value in given.items()}
-        linear = rows.linearize(here, given, slice(lo, hi))
-        H = assemble(linear, self._columns, self._width).reshape(-1, self._width)
-        return linear.residual.ravel(), H, linear.sigma.ravel()
+        here = Points(at.state, at.values[None])
+        linear = linearise(rows, here, self._columns, slice(lo, hi), np.zeros(hi - lo, dtype=int))
+        return linear.residual.ravel(), linear.H.reshape(-1, self._width), linear.stated.ravel()
 
     @staticmethod
     def about(x: Estimate) -> tuple[Estimate, None]:
@@ -134,7 +128,7 @@ class AtPoints:
         values = points.values[: n - 1].copy()
         self._added = np.zeros((n, D))
         for chain in problem.chains:
-            column, k = columns[chain.parameter.name], _stepping(chain, n)
+            column, k = columns[chain.parameter.name], stepping(chain, n)
             j, own, each = chain.node[k], shift(column), np.arange(column.start, column.stop)
             self.F[k[:, None] - 1, each, each] *= chain.decay[j, None]
             values[k - 1, own] = chain.mean[j] + chain.decay[j, None] * (values[k - 1, own] - chain.mean[j - 1])
@@ -152,11 +146,10 @@ class AtPoints:
         for rows in problem.constraints:
             at_k = rows.keyframe[: int(np.searchsorted(rows.keyframe, n))]
             if len(at_k):
-                given = {p.name: points.values[at_k, shift(columns[p.name])] for p in rows.parameters}
-                linear = rows.linearize(points.states[at_k], given, slice(0, len(at_k)))
+                linear = linearise(rows, points, columns, slice(0, len(at_k)))
                 place = at_k[:, None], stack.places[rows.name][1][: len(at_k)]
-                self._r[place], self._sigma[place] = linear.residual, linear.sigma
-                self._H[place] = assemble(linear, columns, D)
+                self._r[place], self._sigma[place] = linear.residual, linear.stated
+                self._H[place] = linear.H
 
     def step(self, k: int, x: Array) -> tuple[Array, Array, Array, Array | None]:
         """As `AtEstimate.step`, of error states (D,)."""
@@ -198,8 +191,3 @@ def about_own(P: Array, e: Array) -> Array:
     P[..., :3, :] = J @ P[..., :3, :]
     P[..., :3] = P[..., :3] @ np.swapaxes(J, -1, -2)
     return P
-
-
-def _stepping(chain: ParameterChain, n: int | None = None) -> Array:
-    """Which of the first n keyframes a parameter moves on to its next node at."""
-    return np.flatnonzero(np.diff(chain.node[:n])) + 1

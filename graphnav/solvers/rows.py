@@ -10,11 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav.constraints.base import Constraint, assemble, weighted_sigma
 from graphnav.dynamics import SCALE
 from graphnav.problem import ParameterChain, Problem
 from graphnav.rotation import Array, mv
-from graphnav.solvers.robust import weight_and_cost
+from graphnav.solvers.linearise import Points, linearise, linearise_links
 from graphnav.state import DIM, States
 
 Values = dict[str, Array]  # parameter name -> (nodes, k)
@@ -38,9 +37,10 @@ class Point:
         """Move by a step."""
         return Point(self.states.plus(step[0]), {name: v + step[1][name] for name, v in self.values.items()})
 
-    def at_keyframes(self, problem: Problem) -> Values:
-        """(K, k) per parameter."""
-        return {c.parameter.name: self.values[c.parameter.name][c.node] for c in problem.chains}
+    def points(self, problem: Problem) -> Points:
+        """The same with the parameters' values at every keyframe."""
+        values = [self.values[c.parameter.name][c.node] for c in problem.chains]
+        return Points(self.states, np.concatenate([np.empty((len(self.states), 0)), *values], axis=1))
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,6 @@ class Layout:
                 after.setdefault(int(last), []).append(int(keys[j]))
         self.keys = range(len(self.width))
         self.order = [key for k in range(K) for key in (k, *after.get(k, ()))]
-        # the root of an interval's information does not depend on the states
-        self.whitener = problem.motion.whitener
 
     def unpack(self, vectors: list[Array]) -> Step:
         """Steps per state and parameter from one vector per key."""
@@ -118,20 +116,19 @@ class Layout:
 
 def whitened(problem: Problem, point: Point, layout: Layout) -> Rows:
     """All factors at a point."""
-    x, at_keyframes = point.states, point.at_keyframes(problem)
-    r, Ji, Jj, Js = problem.motion.linearize(x, point.scale)
-    W, first = layout.whitener, np.arange(layout.K - 1)
-    links = [(first, W @ Ji), (first + 1, W @ Jj)]
+    first = np.arange(layout.K - 1)
+    start, end, S, b = linearise_links(problem.motion, point.states, point.scale)
+    links = [(first, start), (first + 1, end)]
     if point.scale is not None:
-        links += layout.parameter_blocks(first, {SCALE: W @ Js})
-    out: Rows = [(links, -mv(W, r))]
+        links += layout.parameter_blocks(first, {SCALE: S})
+    out: Rows = [(links, b)]
+    points = point.points(problem)
     for rows in (problem.prior, *problem.constraints):
-        linear = rows.linearize(x[rows.keyframe], _of_rows(rows, at_keyframes), slice(None))
-        sigma = weighted_sigma(rows, linear.sigma)
-        weight, _ = weight_and_cost(rows.robust, norms(linear.residual, sigma), rows.robust_scale, rows.graduation)
-        scale = np.sqrt(weight)[:, None] / sigma
-        weighted = {p.name: scale[..., None] * linear.jacobians[p.name] for p in rows.parameters}
-        blocks = [(rows.keyframe, scale[..., None] * assemble(linear))]
+        linear = linearise(rows, points, problem.columns)
+        scale = np.sqrt(linear.kernel()[0])[:, None] / linear.sigma
+        H = scale[..., None] * linear.H
+        weighted = {p.name: H[:, :, problem.columns[p.name]] for p in rows.parameters}
+        blocks = [(rows.keyframe, H[:, :, :DIM])]
         out.append((blocks + layout.parameter_blocks(rows.keyframe, weighted), -scale * linear.residual))
     for chain in problem.chains:
         out += _chain_rows(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name])
@@ -140,12 +137,10 @@ def whitened(problem: Problem, point: Point, layout: Layout) -> Rows:
 
 def cost(problem: Problem, point: Point, layout: Layout) -> float:
     """Half the squared whitened residuals of everything, through the robust kernels."""
-    x, at_keyframes = point.states, point.at_keyframes(problem)
-    total = 0.5 * float(np.sum(mv(layout.whitener, problem.motion.residual(x, point.scale)) ** 2))
+    points, r = point.points(problem), problem.motion.residual(point.states, point.scale)
+    total = 0.5 * float(np.sum(mv(problem.motion.whitener, r) ** 2))
     for rows in (problem.prior, *problem.constraints):
-        linear = rows.linearize(x[rows.keyframe], _of_rows(rows, at_keyframes), slice(None))
-        s = norms(linear.residual, weighted_sigma(rows, linear.sigma))
-        total += float(np.sum(weight_and_cost(rows.robust, s, rows.robust_scale, rows.graduation)[1]))
+        total += float(np.sum(linearise(rows, points, problem.columns).kernel()[1]))
     for chain in problem.chains:
         for _, b in _chain_rows(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name]):
             total += 0.5 * float(np.sum(b * b))
@@ -169,15 +164,6 @@ def column_norms(rows: Rows, layout: Layout) -> Array:
         for keys, A in blocks:
             np.add.at(total[:, : A.shape[-1]], keys, np.sum(A * A, axis=1))
     return np.sqrt(total)
-
-
-def norms(residual: Array, sigma: Array) -> Array:
-    """Whitened norm (N,) of whole measurements."""
-    return np.linalg.norm(residual / sigma, axis=-1)
-
-
-def _of_rows(rows: Constraint, at_keyframes: Values) -> Values:
-    return {p.name: at_keyframes[p.name][rows.keyframe] for p in rows.parameters}
 
 
 def _chain_rows(chain: ParameterChain, group: _Group, value: Array) -> Rows:

@@ -25,6 +25,7 @@ from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solution import Solution
+from graphnav.solvers.linearise import scale_at
 from graphnav.solvers.passes import (
     Filtered,
     Forward,
@@ -33,8 +34,6 @@ from graphnav.solvers.passes import (
     moved,
     parameters_of,
     residual_record,
-    scale_of,
-    shift,
 )
 from graphnav.state import DIM, States
 
@@ -122,8 +121,7 @@ def rts(problem: Problem, forward: Filtered, found: Smoothed | None = None) -> S
     began = time.perf_counter()
     found = found or backward(problem, forward)
     smoothed, all_values, all_P = found.states, found.values, found.P
-    chains = {c.parameter.name: all_values[:, shift(problem.columns[c.parameter.name])] for c in problem.chains}
-    records = {rows.name: residual_record(problem, rows, smoothed, chains) for rows in problem.constraints}
+    records = {rows.name: residual_record(problem, rows, found) for rows in problem.constraints}
     seconds = time.perf_counter() - began
     return Solution(
         solver="rts",
@@ -138,5 +136,5 @@ def rts(problem: Problem, forward: Filtered, found: Smoothed | None = None) -> S
         stopped="one pass forward and one back",
         timings={**forward.solution.timings, "smoother": seconds},
         notes=problem.notes,
-        between=(dense(problem, smoothed, all_P[:, :DIM, :DIM], scale_of(problem, all_values), smooth=True),),
+        between=(dense(problem, smoothed, all_P[:, :DIM, :DIM], scale_at(problem.columns, all_values), smooth=True),),
     )

@@ -25,17 +25,16 @@ import numpy as np
 from scipy.linalg.lapack import dgesv
 
 from graphnav import rotation
-from graphnav.constraints.base import Constraint, assemble, weighted_sigma
+from graphnav.constraints.base import Constraint
 from graphnav.dynamics import SCALE, Motion
 from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array, mv
-from graphnav.solvers.passes import shift
+from graphnav.solvers.linearise import Columns, Points, linearise, linearise_links, scale_at, shift
 from graphnav.solvers.robust import softened, weight_and_cost
 from graphnav.solvers.watch import Watch
 from graphnav.state import DIM, States
 
-Columns = dict[str, slice]
 _I = np.eye(DIM)
 
 
@@ -246,15 +245,13 @@ def at_points(
     D, skip = width(columns), int(linked)
     links: list[Array | None] = [None] * n
     if linked:
-        scale = values[0, shift(columns[SCALE])] if SCALE in columns else None
+        scale = scale_at(columns, values[0])
         motion = Motion(problem.intervals[slice(first - 1, first - 1 + n)], problem.frame)
-        r, Ji, Jj, Js = motion.linearize(states, scale)
-        W = motion.whitener
         link = np.zeros((n, DIM, DIM + D + 1))
-        link[:, :, :DIM], link[:, :, DIM : 2 * DIM], link[:, :, -1] = W @ Ji, W @ Jj, -mv(W, r)
+        link[:, :, :DIM], link[:, :, DIM : 2 * DIM], S, link[:, :, -1] = linearise_links(motion, states, scale)
         if scale is not None:
             here = columns[SCALE]
-            link[:, :, DIM + here.start : DIM + here.stop] = W @ Js
+            link[:, :, DIM + here.start : DIM + here.stop] = S
         links = list(link)
     parts: list[list[Measured]] = [[] for _ in places]
     for constraint in problem.constraints if rows is None else rows:
@@ -262,12 +259,9 @@ def at_points(
         if lo == hi or any(p.name not in columns for p in constraint.parameters):
             continue  # none here, or of parameters that have not begun
         at = constraint.keyframe[lo:hi] - first + skip
-        given = {p.name: values[at, shift(columns[p.name])] for p in constraint.parameters}
-        where = states if len(at) == len(states) == 1 else states[at]
-        linear = constraint.linearize(where, given, slice(lo, hi))
-        sigma = weighted_sigma(constraint, linear.sigma, slice(lo, hi))
-        H = assemble(linear, columns, D) / sigma[..., None]
-        b = -linear.residual / sigma
+        linear = linearise(constraint, Points(states, values), columns, slice(lo, hi), at)
+        sigma = linear.sigma
+        H, b = linear.H / sigma[..., None], -linear.residual / sigma
         edge = np.searchsorted(at, np.arange(n + 1) + skip)
         for i in np.flatnonzero(np.diff(edge)):
             own = slice(edge[i], edge[i + 1])

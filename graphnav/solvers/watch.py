@@ -26,7 +26,7 @@ import numpy as np
 from scipy.linalg.lapack import dtrtrs
 from scipy.special import chdtri, gammaincinv
 
-from graphnav.constraints.gnss import GnssPosition, GnssVelocity, whole_sigma
+from graphnav.constraints.base import Constraint
 from graphnav.rotation import Array
 from graphnav.solution import Fault
 
@@ -97,7 +97,7 @@ class _Slots:
         return float(self.first[worst]) if T[worst] > self.usual.factor else None
 
 
-def _slots(constraints: Iterable[GnssPosition | GnssVelocity], t: Array | None, period: float) -> dict[str, _Slots]:
+def _slots(constraints: Iterable[Constraint], t: Array | None, period: float) -> dict[str, _Slots]:
     """Slots of each constraint, their columns behind each other; t (K,) of the keyframes, s, tells the period."""
     out: dict[str, _Slots] = {}
     end = 0
@@ -107,7 +107,7 @@ def _slots(constraints: Iterable[GnssPosition | GnssVelocity], t: Array | None, 
             period = float(np.median(np.diff(t[rows.keyframe])))
         L = 1 + int(np.clip(np.log2(LONGEST / max(period, 1e-3)), 0, 12))
         columns = slice(end, end + L * m)
-        out[rows.name] = _Slots(columns, L, m, whole_sigma(rows), isinstance(rows, GnssPosition))
+        out[rows.name] = _Slots(columns, L, m, rows.typical_error(), rows.fix_of == "p")
         end += L * m
     return out
 
@@ -149,7 +149,7 @@ class Bank:
     width : of the error state.
     """
 
-    def __init__(self, constraints: Iterable[GnssPosition | GnssVelocity], t: Array, width: int) -> None:
+    def __init__(self, constraints: Iterable[Constraint], t: Array, width: int) -> None:
         self._slots, self._t = _slots(constraints, t, LONGEST), t
         self.X = np.zeros((width, sum(s.L * s.m for s in self._slots.values())))
 
@@ -227,7 +227,7 @@ class Watch:
     width : of the error state.
     """
 
-    def __init__(self, constraints: Iterable[GnssPosition | GnssVelocity], period: float, width: int) -> None:
+    def __init__(self, constraints: Iterable[Constraint], period: float, width: int) -> None:
         self._slots = _slots(constraints, None, period)
         self._X: Array | None = np.zeros((width, sum(s.L * s.m for s in self._slots.values())))
         self._stands: tuple[Array, Array] | None = None  # R and R X

@@ -84,7 +84,7 @@ class Window:
         self.head = prior  # all that is known before the first stage
         self.stages: list[Stage] = []
         self.relinearized = 0  # stages made anew
-        self._limit = _limits(prior.columns, {})
+        self._limit = limits(prior.columns, {})
         self._gone = 0  # stages that have left
         self._spans: list[_Span] = []
         self._means: list[Array] | None = None
@@ -130,7 +130,7 @@ class Window:
         self._means = None
         if columns != self._limit[0]:
             assert place.problem is not None
-            self._limit = _limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})
+            self._limit = limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})
         return float(np.linalg.norm(e[:3]))
 
     def watch(self, tests: Watch) -> None:
@@ -325,7 +325,7 @@ def first_message(state: States, sigma: Array) -> Message:
     return Message(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM))
 
 
-def _limits(columns: Columns, units: dict[str, str]) -> tuple[Columns, Array]:
+def limits(columns: Columns, units: dict[str, str]) -> tuple[Columns, Array]:
     """How far each parameter may move before rows are linearised anew."""
     limit = np.full(width(columns) - DIM, np.inf)
     for name, at in columns.items():

@@ -1,0 +1,602 @@
+"""GTSAM's iSAM2 (Kaess et al. 2012) over error states: keyframes come, are linearised again, and leave.
+
+Each variable is the error e of a state or of parameters about an anchor X0 that stays: X = X0 [+] e. Rows linearised
+where the errors are d, A (X [-] (X0 [+] d)) = b, are rows of e to first order,
+
+    A J (e - d) = b      J = J_r(d) in the columns of the attitude, else the identity
+
+so that GTSAM has a linear problem, and no factor of it calls back into Python. Relinearisation is fluid as there: a
+variable that has moved beyond a threshold from where its rows were linearised has them linearised anew, in NumPy and
+all at once, and they take the place of the old ones in the tree by their indices.
+
+Constants are chains with a node every half minute: what is the same all through the drive would tie every update to
+all of it. Keyframes older than a lag are marginalised: variables are ordered along time, so they are leaves of the
+tree, and what is known of them becomes a factor on what they touched. It stays as it is, linear about the anchors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphnav import rotation
+from graphnav.dynamics import SCALE
+from graphnav.errors import EstimationError
+from graphnav.problem import Problem
+from graphnav.rotation import Array
+from graphnav.solvers.graph import jacobian_factor
+from graphnav.solvers.linearise import shift
+from graphnav.solvers.passes import integrated_again
+from graphnav.solvers.revision import Renewed
+from graphnav.solvers.robust import PASSES
+from graphnav.solvers.stages import Columns, Measured, Message, Place, Step, at_points, extended, measured, predicted
+from graphnav.solvers.window import Smoothed, limits
+from graphnav.state import DIM, States
+
+NODE_EVERY = 30.0  # s from one node of a constant to the next
+_TIED = 1e-5  # of its prior sigma, by which a constant may differ from node to node: 0.03 % of it in ten hours
+_UNIT = np.repeat([1e-3, 1.0, 0.1, 1e-3, 1e-5], 3)  # of a state's errors, so that one threshold fits them all
+_WILDFIRE = 1e-3  # of these units: less is not passed on to older variables
+_ALMOST = 0.3  # what has moved almost as far goes with what has: it would be next
+_LINK = "imu"
+
+
+@dataclass(eq=False)
+class _Variable:
+    """A node of the tree: errors about an anchor."""
+
+    key: int
+    unit: Array  # (w,) of its numbers in the tree
+    point: Array  # (w,) where its rows are linearised
+    delta: Array  # (w,) as it is known now
+    first: int  # number of the first keyframe that touches it
+    last: int  # and of the last
+    t: float  # s, when it began
+    anchor: Array = field(default_factory=lambda: np.zeros(0))  # of parameters
+    limit: Array = field(default_factory=lambda: np.zeros(0))  # how far they may move
+
+    @property
+    def value(self) -> Array:
+        """Parameters as they are known now."""
+        return self.anchor + self.delta
+
+
+@dataclass(eq=False)
+class _Keyframe:
+    number: int
+    place: Place
+    state: _Variable
+    anchor: States  # one
+    columns: Columns
+    nodes: dict[str, tuple[_Variable, slice]]  # the node of each parameter in force
+    slots: dict[str, list[int]]  # indices of its factors, by constraint
+
+    @property
+    def estimate(self) -> States:
+        """The state as it is known now."""
+        return self.anchor.plus(self.state.delta[None])
+
+    @property
+    def values(self) -> Array:
+        """(D-15,) parameters as they are known now."""
+        out = np.zeros(max((at.stop for at in self.columns.values()), default=DIM) - DIM)
+        for name, at in self.columns.items():
+            node, own = self.nodes[name]
+            out[shift(at)] = node.anchor[own] + node.delta[own]
+        return out
+
+
+class Tree:
+    """Keyframes in an iSAM2.
+
+    Parameters
+    ----------
+    prior : message on the first keyframe before any measurement.
+    turn : rad that an attitude may move before its rows are linearised anew.
+    """
+
+    def __init__(self, prior: Message, turn: float) -> None:
+        self.isam = _isam()
+        self.turn = turn
+        self.keyframes: list[_Keyframe] = []
+        self.relinearised = 0  # keyframes
+        self._prior = prior
+        self._number = self._key = 0
+        self._in_force: dict[str, tuple[_Variable, slice]] = {}
+        self._variables: dict[int, _Variable] = {}
+        self._first_sigma: dict[str, Array] = {}
+        self._constant: set[str] = set()
+        self._held = 0  # keyframes at the front that stay as they are: 1 where the first is behind the window
+
+    def __len__(self) -> int:
+        return len(self.keyframes)
+
+    # --------------------------------------------------------------------------------------------------- entering
+    @property
+    def newest(self) -> Message:
+        """State and parameter values of the newest keyframe as they are known now, without what is known of them."""
+        if not self.keyframes:
+            return self._prior
+        last, none = self.keyframes[-1], np.empty((0, 0))
+        return Message(last.estimate, last.values, last.columns, none, none[0:0])
+
+    @property
+    def covariance(self) -> Array:
+        """(15, 15) of the newest state."""
+        last = self.keyframes[-1]
+        P, J = self._marginal(last.state, last.place.t), rotation.right_jacobian(last.state.delta[None, :3])[0]
+        P[:3] = J @ P[:3]
+        P[:, :3] = P[:, :3] @ J.T
+        return P
+
+    def _marginal(self, x: _Variable, t: float) -> Array:
+        try:
+            found = self.isam.marginalCovariance(x.key)
+        except RuntimeError:
+            raise EstimationError(
+                f"the data leave something undetermined at {t:.3f} s: there is no covariance"
+            ) from None
+        return np.asarray(x.unit[:, None] * found * x.unit)
+
+    def add(self, place: Place) -> float:
+        """Take in one more keyframe with its rows; returns by how much they turned it, rad."""
+        if not self.keyframes and place.linked:
+            self._begin(place)
+        before = self.newest
+        state, values, columns, link = predicted(before, place)
+        graph, new = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        x = self._variable(np.zeros(DIM), _UNIT, place.t)
+        nodes = self._open(place, graph, new)
+        keyframe = _Keyframe(self._number, place, x, state, columns, nodes, {})
+        new.insert(x.key, np.zeros(DIM))
+        for node, _ in nodes.values():
+            node.last = self._number
+        for name, at in columns.items():
+            node, own = nodes[name]
+            node.delta[own] = values[shift(at)] - node.anchor[own]
+            if node.t == place.t:
+                node.point[own] = node.delta[own]
+        if link is None:
+            prior = self._prior
+            graph.push_back(_factor([(x, prior.R[:, :DIM])], prior.z))
+        made: list[tuple[str, Any]] = []
+        if link is not None:
+            last = self.keyframes[-1]
+            blocks = [(last.state, _turned(link[:, :DIM], last.state.delta)), (x, link[:, DIM : 2 * DIM])]
+            made.append((_LINK, self._about(link[:, DIM:-1], link[:, -1], blocks, last.columns, last.nodes)))
+        rows = measured(place, state, values, columns).measured
+        made += [(one.name, self._rows(keyframe, one, weighted=False)) for one in rows]
+        self.keyframes.append(keyframe)
+        begin = graph.size()
+        for _, factor in made:
+            graph.push_back(factor)
+        groups = gtsam.KeyGroupMap()
+        if self._number > 3:  # along time, where the order is free
+            for variable in self._recent():
+                groups.insert2(variable.key, variable.last - self._number + 3)
+        result = self.isam.update(graph, new, [], groups)
+        self._number += 1
+        _file(keyframe, made, list(result.getNewFactorsIndices())[begin:])
+        self._read([x, *(node for node, _ in nodes.values())])
+        for _ in range(PASSES - 1 if any(one.kernel != "none" for one in rows) else 0):
+            self.again([len(self.keyframes) - 1])
+            self._read([x, *(node for node, _ in nodes.values())])
+        return float(np.linalg.norm(x.delta[:3]))
+
+    def _begin(self, place: Place) -> None:
+        """Have the message that all goes on from as a keyframe before the first."""
+        prior = self._prior
+        x = self._variable(np.zeros(DIM), _UNIT, place.t)
+        new, graph, nodes = gtsam.Values(), gtsam.NonlinearFactorGraph(), {}
+        new.insert(x.key, np.zeros(DIM))
+        blocks = [(x, prior.R[:, :DIM])]
+        if prior.columns:
+            node = self._variable(prior.values, np.ones(len(prior.values)), place.t)
+            new.insert(node.key, np.zeros(len(prior.values)))
+            node.limit = limits(prior.columns, _units(place))[1]
+            nodes = {name: (node, shift(at)) for name, at in prior.columns.items()}
+            blocks.append((node, prior.R[:, DIM:]))
+        graph.push_back(_factor(blocks, prior.z))
+        assert place.problem is not None
+        for name, p in place.problem.parameters.items():
+            if name in prior.columns and p.constant:
+                self._constant.add(name)
+                self._first_sigma[name] = p.sigma
+                node.unit[nodes[name][1]] = 1.0
+        self.isam.update(graph, new)
+        self._in_force = nodes
+        before = Place(place.t, None)
+        self.keyframes.append(_Keyframe(self._number, before, x, prior.state, prior.columns, nodes, {}))
+        self._number += 1
+        self._held = 1
+        self._read([x, *(node for node, _ in nodes.values())])
+
+    def _recent(self) -> Iterable[_Variable]:
+        for keyframe in self.keyframes[-3:]:
+            yield keyframe.state
+        yield from {id(n): n for k in self.keyframes[-3:] for n, _ in k.nodes.values()
+                    if n.last >= self._number - 2}.values()  # fmt: skip
+
+    def _variable(self, anchor: Array, unit: Array, t: float) -> _Variable:
+        none = np.zeros(len(unit))
+        out = _Variable(self._key, unit, none.copy(), none, self._number, self._number, t, anchor)
+        self._variables[self._key] = out
+        self._key += 1
+        return out
+
+    def _open(self, place: Place, graph: Any, new: Any) -> dict[str, tuple[_Variable, slice]]:
+        """Begin the nodes of parameters that step at a keyframe, and the next ones of constants; which are in force."""
+        steps = list(place.steps)
+        self._constant |= {s.name for s in steps if _is_constant(place, s.name)}
+        named = {s.name for s in steps}
+        for name in self._constant - named:
+            node, own = self._in_force[name]
+            if place.t - node.t >= NODE_EVERY:
+                value = node.anchor[own]
+                steps.append(Step(name, value, _TIED * self._first_sigma[name], 1.0, value))
+        if not steps:
+            return self._in_force
+        together: dict[int, list[Step]] = {}
+        for step in steps:
+            before = self._in_force.get(step.name)
+            together.setdefault(-1 if before is None else before[0].key, []).append(step)
+        in_force = dict(self._in_force)
+        for old_key, own_steps in together.items():
+            widths = [len(s.mean) for s in own_steps]
+            edge = np.concatenate([[0], np.cumsum(widths)])
+            node = self._variable(np.zeros(edge[-1]), np.ones(edge[-1]), place.t)
+            node.limit = limits(extended({}, own_steps), _units(place))[1]
+            old = self._variables.get(old_key)
+            own_A, old_A = np.zeros((edge[-1], edge[-1])), np.zeros((edge[-1], 0 if old is None else len(old.unit)))
+            for step, lo, hi in zip(own_steps, edge[:-1], edge[1:], strict=True):
+                at = slice(int(lo), int(hi))
+                unit = self._first_sigma.setdefault(step.name, np.asarray(step.sigma, dtype=float))
+                node.unit[at] = unit
+                node.anchor[at] = step.mean
+                own_A[at, at] = np.diag(1.0 / step.sigma)
+                if old is not None and step.decay:
+                    was = self._in_force[step.name][1]
+                    node.anchor[at] += step.decay * (old.anchor[was] - step.mean_before)
+                    old_A[at, was] = -step.decay * own_A[at, at]
+                in_force[step.name] = node, at
+            new.insert(node.key, np.zeros(len(node.unit)))
+            blocks = [(node, own_A)] + ([(old, old_A)] if old is not None and old_A.any() else [])
+            graph.push_back(_factor(blocks, np.zeros(edge[-1])))
+        self._in_force = in_force
+        return in_force
+
+    def _about(
+        self,
+        H: Array,
+        b: Array,
+        blocks: list[tuple[_Variable, Array]],
+        columns: Columns,
+        nodes: dict[str, tuple[_Variable, slice]],
+    ) -> Any:
+        """A factor of rows over states, `blocks`, and parameters, H (m, D), linearised where they are now."""
+        b = b + sum(A @ x.delta for x, A in blocks)
+        touched: dict[int, tuple[_Variable, Array]] = {}
+        for name, at in columns.items():
+            if not H[:, at].any():
+                continue
+            node, own = nodes[name]
+            _, A = touched.setdefault(node.key, (node, np.zeros((len(b), len(node.unit)))))
+            A[:, own] = H[:, at]
+            b = b + H[:, at] @ node.delta[own]
+        return _factor([*blocks, *touched.values()], b)
+
+    def _rows(self, keyframe: _Keyframe, one: Measured, weighted: bool) -> Any:
+        """A factor of measurements linearised where keyframe and parameters are now."""
+        H, b, _ = one.weighted(np.zeros(one.H.shape[-1]), int(weighted))
+        H, x = H.reshape(-1, H.shape[-1]), keyframe.state
+        return self._about(H, b.ravel(), [(x, _turned(H[:, :DIM], x.delta))], keyframe.columns, keyframe.nodes)
+
+    def _update(self, made: Sequence[tuple[_Keyframe, str, Any]], gone: list[int], first: int) -> None:
+        """Have factors in place of others, on keyframes from one on."""
+        graph = gtsam.NonlinearFactorGraph()
+        for _, _, factor in made:
+            graph.push_back(factor)
+        # the order stays that of time; once it has much to do, GTSAM makes the whole tree anew
+        late = [v for v in self._variables.values() if v.last >= first]
+        every = None
+        if 2 * len(late) > len(self._variables):
+            late, first = list(self._variables.values()), self.keyframes[0].number
+            every = gtsam.KeyList()
+            for variable in late:
+                every.push_back(variable.key)
+        groups = gtsam.KeyGroupMap()
+        for variable in late:
+            groups.insert2(variable.key, variable.last - first)
+        result = self.isam.update(graph, gtsam.Values(), gone, groups, None, every)
+        for (keyframe, name, _), index in zip(made, result.getNewFactorsIndices(), strict=True):
+            keyframe.slots.setdefault(name, []).append(index)
+
+    # ------------------------------------------------------------------------------------------ linearising again
+    def read(self) -> None:
+        """Bring all estimates up to date."""
+        self._read(list(self._variables.values()), all_at_once=True)
+
+    def _read(self, variables: Sequence[_Variable], all_at_once: bool = False) -> None:
+        if not all_at_once:
+            for x in variables:
+                x.delta = x.unit * self.isam.calculateEstimateVector(x.key)
+            return
+        flat = np.asarray(self.isam.getDelta().vector([x.key for x in variables])).ravel()
+        begin = 0
+        for x in variables:
+            end = begin + len(x.unit)
+            x.delta = x.unit * flat[begin:end]
+            begin = end
+
+    def estimates(self, first: int = 0) -> list[tuple[States, Array]]:
+        """State and parameter values of each keyframe from one on, as last read."""
+        return [(k.estimate, k.values) for k in self.keyframes[first:]]
+
+    def root(self, columns: Columns) -> Array:
+        """(D, D) R, not triangular: R e are the whitened errors of the newest keyframe and its parameters."""
+        last = self.keyframes[-1]
+        D = DIM + len(last.values)
+        variables = list({x.key: x for x in (last.state, *(n for n, _ in last.nodes.values()))}.values())
+        joint = self.isam.jointMarginalCovariance([x.key for x in variables])
+        into = {x.key: np.zeros((D, len(x.unit))) for x in variables}
+        J = rotation.right_jacobian(last.state.delta[None, :3])[0]
+        into[last.state.key][:DIM] = np.eye(DIM)
+        into[last.state.key][:3, :3] = J
+        for name, at in columns.items():
+            node, own = last.nodes[name]
+            into[node.key][at, own] = np.eye(at.stop - at.start)
+        P = np.zeros((D, D))
+        for a in variables:
+            for b in variables:
+                A, B = into[a.key] * a.unit, into[b.key] * b.unit
+                P += A @ joint.at(a.key, b.key) @ B.T
+        sd = np.sqrt(np.diag(P))
+        w, V = np.linalg.eigh(P / sd[:, None] / sd)
+        return np.asarray((V / np.sqrt(np.maximum(w, np.finfo(float).eps))).T / sd)
+
+    def moved(self, share: float = 1.0) -> Array:
+        """Which keyframes' estimates are further from where their rows were linearised than a share of the limits."""
+        if not self.keyframes:
+            return np.empty(0, dtype=int)
+        off = np.array([k.state.delta[:3] - k.state.point[:3] for k in self.keyframes])
+        far = np.einsum("ki,ki->k", off, off) > (share * self.turn) ** 2
+        own = self.keyframes[self._held :]
+        nodes = {id(n): n for k in own for n, _ in k.nodes.values() if np.isfinite(n.limit).any()}
+        gone = {i for i, n in nodes.items() if np.any(np.abs(n.delta - n.point) > share * n.limit)}
+        if gone:
+            far |= np.array([any(id(n) in gone for n, _ in k.nodes.values()) for k in self.keyframes])
+        far[: self._held] = False
+        return np.flatnonzero(far)
+
+    def relinearise(self, share: float = 1.0, renewed: Renewed | None = None) -> int:
+        """Linearise anew what has moved beyond a share of the limits; returns how many keyframes that are."""
+        self.read()
+        if not len(self.moved(share)):
+            return 0
+        which = self.moved(_ALMOST * share)
+        self.again(which, renewed)
+        self.read()
+        return len(which)
+
+    def integrate_again(self, problem: Problem) -> tuple[Problem, bool]:
+        """Where biases have moved too far, have their intervals integrated about them; all are of one problem."""
+        self.read()
+        own = self.keyframes
+        states = States.stack([k.anchor for k in own]).plus(np.array([k.state.delta for k in own]))
+        scale = None
+        if SCALE in own[-1].nodes:
+            node, at = own[-1].nodes[SCALE]
+            scale = node.value[at]
+        problem, count = integrated_again(problem, states, scale, own[0].place.k)
+        if count:
+            for k in own:
+                k.place = replace(k.place, problem=problem)
+            self.again(range(len(self)))
+        return problem, count > 0
+
+    def again(self, which: Iterable[int], renewed: Renewed | None = None) -> None:
+        """Linearise keyframes, and the intervals on either side, where they are now."""
+        rows = {i for i in map(int, which) if i >= self._held}
+        links = {k for i in rows for k in (i, i + 1) if k < len(self) and _LINK in self.keyframes[k].slots}
+        made: list[tuple[_Keyframe, str, Any]] = []
+        gone: list[int] = []
+        for run in list(self._runs(sorted(rows | links))):
+            own = self.keyframes[run[0] : run[-1] + 1]
+            places = [k.place for k in own]
+            if renewed is not None:
+                places = list(renewed(run[0] - self._held, run[-1] + 1 - self._held))
+            linked = run[0] in links
+            around = self.keyframes[run[0] - 1 : run[-1] + 1] if linked else own
+            columns = own[-1].columns
+            values = np.zeros((len(around), sum(at.stop - at.start for at in columns.values())))
+            for row, keyframe in zip(values, around, strict=True):
+                known = keyframe.values
+                row[: len(known)] = known
+            states = States.stack([k.anchor for k in around]).plus(np.array([k.state.delta for k in around]))
+            for i, linear in zip(run, at_points(places, states, values, columns, linked), strict=True):
+                keyframe = self.keyframes[i]
+                if i in links:
+                    assert linear.link is not None
+                    last, link = self.keyframes[i - 1], linear.link
+                    blocks = [(last.state, _turned(link[:, :DIM], last.state.delta)),
+                              (keyframe.state, _turned(link[:, DIM : 2 * DIM], keyframe.state.delta))]  # fmt: skip
+                    made.append((keyframe, _LINK, self._about(
+                        link[:, DIM:-1], link[:, -1], blocks, last.columns, last.nodes)))  # fmt: skip
+                    gone += keyframe.slots.pop(_LINK)
+                if i in rows:
+                    for one in linear.measured:
+                        if one.name in keyframe.slots:
+                            made.append((keyframe, one.name, self._rows(keyframe, one, weighted=True)))
+                            gone += keyframe.slots.pop(one.name)
+        for i in rows:
+            x = self.keyframes[i].state
+            x.point = x.delta.copy()
+            for node, _ in self.keyframes[i].nodes.values():
+                node.point = node.delta.copy()
+        self.relinearised += len(rows)
+        self._update(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
+
+    def _runs(self, which: Sequence[int]) -> Iterable[list[int]]:
+        """Indices that can be linearised together: keyframe after keyframe of one problem, the same columns."""
+        run: list[int] = []
+        for i in which:
+            k = self.keyframes[i]
+            if run:
+                last = self.keyframes[run[-1]]
+                alike = i == run[-1] + 1 and k.columns == last.columns and k.place.problem is last.place.problem
+                if not alike or k.place.k != last.place.k + 1 or not (_LINK in k.slots and _LINK in last.slots):
+                    yield run
+                    run = []
+            run.append(i)
+        if run:
+            yield run
+
+    # ---------------------------------------------------------------------------------------------------- leaving
+    def settled(self, count: int, first: int = 0) -> Smoothed:
+        """The first `count` keyframes as they are known now, or those of them from `first` on."""
+        own = self.keyframes[first:count]
+        marginal: dict[int, Array] = {}
+        for k in own:
+            for x in (k.state, *(node for node, _ in k.nodes.values())):
+                if x.key not in marginal:
+                    marginal[x.key] = self._marginal(x, k.place.t)
+        covariance = np.stack([marginal[k.state.key] for k in own]) if own else np.empty((0, DIM, DIM))
+        delta = np.array([k.state.delta for k in own]).reshape(-1, DIM)
+        J = rotation.right_jacobian(delta[:, :3])
+        covariance[:, :3] = J @ covariance[:, :3]  # of errors about the estimate, as everywhere else
+        covariance[:, :, :3] = covariance[:, :, :3] @ np.swapaxes(J, -1, -2)
+        sigma = []
+        for k in own:
+            out = np.zeros(len(k.values))
+            for name, at in k.columns.items():
+                node, part = k.nodes[name]
+                out[shift(at)] = np.sqrt(np.maximum(np.diag(marginal[node.key])[part], 0.0))
+            sigma.append(out)
+        anchors = States.stack([k.anchor for k in own]) if own else self._prior.state[:0]
+        return Smoothed(
+            t=np.array([k.place.t for k in own]),
+            states=anchors.plus(delta),
+            covariance=covariance,
+            columns=tuple(k.columns for k in own),
+            values=tuple(k.values for k in own),
+            sigma=tuple(sigma),
+        )
+
+    def truncate(self, keep: int) -> None:
+        """Forget all but the first keyframes: something before what follows has changed."""
+        gone = self.keyframes[keep:]
+        if not gone:
+            return
+        del self.keyframes[keep:]
+        last = self.keyframes[-1]
+        self._number, self._in_force = last.number + 1, last.nodes
+        # whatever touches a variable that began later goes with it
+        late = {x.key for x in self._variables.values() if x.first > last.number}
+        factors = self.isam.getFactorsUnsafe()
+        own = [
+            i for i in range(factors.size()) if factors.at(i) is not None and not late.isdisjoint(factors.at(i).keys())
+        ]
+        for key in late:
+            del self._variables[key]
+        for x in self._variables.values():
+            x.last = min(x.last, last.number)
+        self._update([], own, self.keyframes[max(keep - 2, 0)].number)
+        self._read([last.state, *(node for node, _ in last.nodes.values())])
+
+    def hold(self) -> None:
+        """The first keyframe is behind the window from now on, and stays as it is."""
+        self._held = 1
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the tree itself, and its factors in order."""
+        out, factors, none = dict(self.__dict__), self.isam.getFactorsUnsafe(), gtsam.Values()
+        for x in self._variables.values():
+            none.insert(x.key, np.zeros(len(x.unit)))
+        rows = []
+        for i in range(factors.size()):
+            if factors.at(i) is not None:
+                rows.append((i, gtsam.JacobianFactor(factors.at(i).linearize(none)).serialize()))
+        out["isam"] = rows
+        return out
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        rows = state.pop("isam")
+        self.__dict__.update(state)
+        self.isam = _isam()
+        graph, new, groups = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.KeyGroupMap()
+        first = min((x.last for x in self._variables.values()), default=0)
+        for x in self._variables.values():
+            new.insert(x.key, np.zeros(len(x.unit)))
+            groups.insert2(x.key, x.last - first)
+        for _, text in rows:
+            factor = gtsam.JacobianFactor()
+            factor.deserialize(text)
+            graph.push_back(gtsam.LinearContainerFactor(factor))
+        if not rows:
+            return
+        indices = self.isam.update(graph, new, [], groups).getNewFactorsIndices()
+        now = dict(zip((i for i, _ in rows), indices, strict=True))
+        for k in self.keyframes:
+            k.slots = {name: [now[i] for i in own] for name, own in k.slots.items()}
+
+    def marginalise(self, count: int) -> None:
+        """Let the first keyframes go, and the parameters' nodes that only they touch."""
+        first = self.keyframes[count].number
+        keys = gtsam.KeyList()
+        gone = [x for x in self._variables.values() if x.last < first]
+        for x in gone:
+            keys.push_back(x.key)
+        _, indices = self.isam.marginalizeLeavesWithIndices(keys)
+        left = set(indices)
+        for x in gone:
+            del self._variables[x.key]
+        del self.keyframes[:count]
+        for keyframe in self.keyframes:
+            if not any(left.intersection(own) for own in keyframe.slots.values()):
+                continue
+            kept = {name: [i for i in own if i not in left] for name, own in keyframe.slots.items()}
+            keyframe.slots = {name: own for name, own in kept.items() if own}
+
+
+def _file(keyframe: _Keyframe, made: Sequence[tuple[str, Any]], indices: Sequence[int]) -> None:
+    """Note where a keyframe's factors are."""
+    for (name, _), index in zip(made, indices, strict=True):
+        keyframe.slots.setdefault(name, []).append(index)
+
+
+def _isam() -> gtsam.ISAM2:
+    parameters = gtsam.ISAM2Params()
+    parameters.setFactorization("QR")
+    parameters.enableRelinearization = False  # by GTSAM: it has a linear problem
+    parameters.findUnusedFactorSlots = True
+    parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(_WILDFIRE))
+    return gtsam.ISAM2(parameters)
+
+
+def _factor(blocks: Sequence[tuple[_Variable, Array]], b: Array) -> Any:
+    """Whitened rows A e = b as a factor of the tree."""
+    return gtsam.LinearContainerFactor(jacobian_factor([(x.key, A * x.unit) for x, A in blocks], b))
+
+
+def _turned(A: Array, d: Array) -> Array:
+    """Columns of rows about the anchor moved by d, as columns of the errors about the anchor itself."""
+    if not d[:3].any():
+        return A
+    out = A.copy()
+    out[:, :3] = A[:, :3] @ rotation.right_jacobian(d[None, :3])[0]
+    return out
+
+
+def _is_constant(place: Place, name: str) -> bool:
+    assert place.problem is not None
+    p = place.problem.parameters.get(name)
+    return p is not None and p.constant
+
+
+def _units(place: Place) -> dict[str, str]:
+    assert place.problem is not None
+    return {name: p.unit for name, p in place.problem.parameters.items()}

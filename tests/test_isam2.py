@@ -1,0 +1,161 @@
+"""GTSAM's iSAM2 with fluid relinearisation: the batch solution over the whole drive, the window's within a lag."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import oracle
+import pytest
+from helpers import Array, truth_states
+
+from graphnav.config import settings_from
+from graphnav.earth import LocalFrame
+from graphnav.noise.apply import with_noise
+from graphnav.noise_model import Figure, NoiseModel
+from graphnav.problem import Problem, pose
+from graphnav.rotation import exp
+from graphnav.solution import Solution
+from graphnav.solvers.batch import batch
+from graphnav.solvers.ekf import ekf
+from graphnav.solvers.incremental import incremental, node_steps
+from graphnav.solvers.isam import isam2
+from graphnav.solvers.rts import backward
+from graphnav.solvers.stages import Place
+from graphnav.solvers.tree import Tree
+from graphnav.solvers.window import first_message, turn_limit
+from graphnav.state import States
+
+LASTING = NoiseModel(
+    {f"gnss_position.{axis}": Figure(float(np.log(0.6))) for axis in ("horizontal", "up")}
+    | {f"gnss_position.minutes.{axis}": Figure(float(np.log(0.2))) for axis in ("horizontal", "up")}
+    | {f"nhc.seconds.{axis}": Figure(0.0) for axis in ("right", "up")}
+)
+
+
+def sigmas(solution: Solution) -> Array:
+    return np.sqrt(np.diagonal(solution.covariance, axis1=1, axis2=2))
+
+
+def apart(a: Solution, b: Solution) -> Array:
+    """(K, 15) in sigmas of b."""
+    return np.abs(a.states.minus(b.states)) / sigmas(b)
+
+
+@pytest.fixture(scope="module")
+def posed() -> Problem:
+    """Two and a half minutes with all constraints, lasting errors and a stop; from a start a few degrees wrong."""
+    recording, truth = oracle.drive(oracle.vehicle_path(150.0), seed=7, outages=[(80.0, 100.0)], odometer_rate=20.0)
+    frame = LocalFrame(recording.gnss.llh[0])
+    start = truth_states(truth, np.zeros(1), frame)
+    start = replace(start, R_nb=start.R_nb @ exp(np.array([[0.01, -0.01, 0.06]])), ba=0 * start.ba, bg=0 * start.bg)
+    settings = settings_from({"gnss": {"lever_arm_sigma": 0.2}})
+    sigma = np.repeat([0.1, 1.0, 0.5, 0.05, 5e-3], 3)
+    return with_noise(pose(recording, settings, frame, start, sigma, np.array([[0.0, 8.0]])), LASTING)
+
+
+@pytest.fixture(scope="module")
+def solved(posed: Problem) -> Solution:
+    smoothed = backward(posed, ekf(posed))
+    return batch(posed, smoothed.states, smoothed.nodes(posed))
+
+
+def test_over_the_whole_drive_it_is_the_batch_solution(posed: Problem, solved: Solution) -> None:
+    found = isam2(posed).settled
+    assert apart(found, solved).max() < 5e-3
+    np.testing.assert_allclose(sigmas(found), sigmas(solved), rtol=1e-3)
+    for name, p in solved.parameters.items():
+        own, last = found.parameters[name], -1
+        np.testing.assert_allclose((own.value - p.value)[last] / p.sigma[last], 0.0, atol=5e-3, err_msg=name)
+        np.testing.assert_allclose(own.sigma[last], p.sigma[last], rtol=2e-3, err_msg=name)
+
+
+def test_a_start_that_is_off_by_sixty_degrees_is_mended_by_relinearisation(posed: Problem, solved: Solution) -> None:
+    mean, sigma = posed.prior.mean, posed.prior.sigma.copy()
+    assert mean is not None
+    wrong = replace(mean, R_nb=exp(np.array([[0.0, 0.0, np.pi / 3.0]])) @ mean.R_nb)
+    sigma[0, 2] = 1.0
+    problem = replace(posed, prior=replace(posed.prior, mean=wrong, sigma=sigma))
+    best = batch(problem, solved.states)
+    found = isam2(problem).settled
+    assert apart(found, best).max() < 0.02
+    assert np.abs(found.states.p - best.states.p).max() < 1e-3
+
+
+def test_within_a_lag_it_is_the_window(posed: Problem, solved: Solution) -> None:
+    # about the right biases: the window does not integrate again
+    problem = posed.reintegrated(solved.states.ba[:-1], solved.states.bg[:-1])
+    tree, window = isam2(problem, lag=30.0), incremental(problem, lag=30.0)
+    assert apart(tree.settled, window.settled).max() < 0.05
+    np.testing.assert_allclose(sigmas(tree.settled), sigmas(window.settled), rtol=0.01)
+    late = (
+        problem.t > problem.t[0] + 20.0
+    )  # before, the first fixes turn the state by degrees, each about its own point
+    assert apart(tree.live, window.live)[late].max() < 0.05
+    np.testing.assert_allclose(sigmas(tree.live)[late], sigmas(window.live)[late], rtol=0.01)
+
+
+def _played(problem: Problem, until: int, lag: float = np.inf, every: int = 5) -> tuple[Tree, list[int]]:
+    mean = problem.prior.mean
+    assert mean is not None
+    tree, steps = Tree(first_message(mean, problem.prior.sigma[0]), turn_limit(problem.imu_noise)), node_steps(problem)
+    slots = []
+    for k in range(until):
+        tree.add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
+        if k % every == every - 1:
+            tree.relinearise(0.02)
+        while problem.t[k] - tree.keyframes[0].place.t > lag:
+            tree.marginalise(1)
+        slots.append(tree.isam.getFactorsUnsafe().size())
+    return tree, slots
+
+
+def test_marginalised_keyframes_leave_nothing_behind(posed: Problem) -> None:
+    """Factors and variables of a fixed lag stay as many as they were, however long it goes on."""
+    tree, slots = _played(posed, len(posed.t), lag=20.0)
+    assert max(slots[-40:]) <= 1.2 * max(slots[30:70])
+    assert tree.isam.getLinearizationPoint().size() == len(tree._variables)
+
+
+def test_relinearised_rows_take_the_place_of_the_old(posed: Problem) -> None:
+    """Whatever was linearised again, the tree holds each row once: as many as if nothing had been."""
+    tree, _ = _played(posed, 40)
+    assert tree.relinearised > 0
+    never, _ = _played(posed, 40, every=1000)
+    assert never.relinearised == 0
+    factors = tree.isam.getFactorsUnsafe()
+    alive = [i for i in range(factors.size()) if factors.at(i) is not None]
+    filed = [i for k in tree.keyframes for own in k.slots.values() for i in own]
+    assert len(filed) == len(set(filed))
+    assert set(filed) <= set(alive)
+    assert len(alive) == sum(
+        never.isam.getFactorsUnsafe().at(i) is not None for i in range(never.isam.getFactorsUnsafe().size())
+    )
+
+
+def test_taken_back_keyframes_are_as_if_they_had_never_come(posed: Problem) -> None:
+    tree, _ = _played(posed, 60)
+    other, _ = _played(posed, 50)
+    tree.truncate(50)
+    tree.read(), other.read()
+    a, b = tree.newest, other.newest
+    np.testing.assert_allclose(a.state.minus(b.state)[0] / np.sqrt(np.diag(other.covariance)), 0.0, atol=0.02)
+    np.testing.assert_allclose(np.diag(tree.covariance), np.diag(other.covariance), rtol=0.02)
+    assert tree.isam.getLinearizationPoint().size() == other.isam.getLinearizationPoint().size()
+
+
+def test_a_tree_made_again_from_its_rows_goes_on_as_before(posed: Problem) -> None:
+    """What a checkpoint keeps of it, in the middle of a lag, with keyframes already marginalised."""
+    import pickle
+
+    tree, _ = _played(posed, 60, lag=20.0)
+    again = pickle.loads(pickle.dumps(tree))
+    steps = node_steps(posed)
+    for k in range(60, 80):
+        for one in (tree, again):
+            one.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=True))
+            one.relinearise()
+    a, b = tree.settled(len(tree)), again.settled(len(again))
+    np.testing.assert_allclose(a.states.p, b.states.p, atol=1e-6)
+    np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-4, atol=1e-14)
+    assert isinstance(a.states, States)
