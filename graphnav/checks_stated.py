@@ -9,7 +9,6 @@ import numpy as np
 
 from graphnav import crosschecks
 from graphnav.crosschecks import Track
-from graphnav.draft.guesses import fix_numbers
 from graphnav.earth import LocalFrame
 from graphnav.findings import Finding
 from graphnav.recording import Gnss, ImuNoise, Recording, Truth
@@ -81,7 +80,11 @@ def rounded_positions(gnss: Gnss) -> Iterator[Finding]:
 
 def fix_types(gnss: Gnss) -> Iterator[Finding]:
     """Types in the numbers of GGA's quality, which differ."""
-    if gnss.type is not None and gnss.type_assumed and (guess := fix_numbers(gnss.type, gnss.sd[:, 0])).value == "nmea":
+    if gnss.type is None or not gnss.type_assumed:
+        return
+    from graphnav.draft.guesses import fix_numbers
+
+    if (guess := fix_numbers(gnss.type, gnss.sd[:, 0])).value == "nmea":
         sentence = (
             f'types of the fixes look like GGA\'s qualities: {guess.why}; say units = {{ type = "nmea" }} in [gnss]'
         )

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from graphnav import __version__, cli_logs, cli_online, cli_solve
+from graphnav import __version__, cli_fleet, cli_logs, cli_online, cli_solve
 from graphnav.cli_options import (
     SEVERAL,
     AllowOutside,
@@ -200,6 +200,7 @@ def settings(
 app.add_typer(cli_solve.commands)
 app.add_typer(cli_logs.commands)
 app.add_typer(cli_online.commands)
+app.add_typer(cli_fleet.commands)
 
 
 def main() -> None:

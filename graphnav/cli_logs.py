@@ -39,7 +39,7 @@ def convert(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Turn another program's log into a recording folder, or a trajectory into gpx, nav, nmea, tum, kml or csv."""
+    """Turn another program's log into a recording folder, or a trajectory into another format of trajectories."""
     from graphnav import convert as conversion
     from graphnav.outputs import output_folder
     from graphnav.staging import moved, staged

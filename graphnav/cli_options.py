@@ -14,7 +14,8 @@ Source = Annotated[
 ]
 SEVERAL = {"allow_extra_args": True}  # of which `only` has more to say than the parser
 Export = Annotated[
-    str | None, typer.Option("--export", metavar="NAMES", help="Formats to write: some of gpx,nav,nmea,csv,tum,kml.")
+    str | None,
+    typer.Option("--export", metavar="NAMES", help="Formats to write: some of gpx,nav,nmea,csv,tum,kml,parquet."),
 ]
 Point = Annotated[
     str | None, typer.Option("--point", metavar="POINT", help="Of --export: imu, antenna or x,y,z (m; RFU).")
@@ -35,6 +36,9 @@ Without = Annotated[
     ),
 ]
 Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Output rate; default: at the keyframes.")]
+Pages = Annotated[
+    bool, typer.Option("--report/--no-report", help="Draw the report; 'graphnav report OUT' does it later.")
+]
 Start = Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from the recording's start.")]
 End = Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from the recording's start.")]
 Noise = Annotated[

@@ -18,6 +18,7 @@ from graphnav.cli_options import (
     Json,
     Noise,
     Out,
+    Pages,
     Point,
     Profile,
     Quiet,
@@ -55,6 +56,7 @@ def smooth(
     end: End = None,
     export: Export = None,
     point: Point = None,
+    pages: Pages = True,
     require: Require = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
@@ -63,7 +65,20 @@ def smooth(
 ) -> None:
     """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
     asked = _Asked(
-        only(context, recording), out, profile, config, noise, without, rate, start, end, require, topic, quiet, json
+        only(context, recording),
+        out,
+        profile,
+        config,
+        noise,
+        without,
+        rate,
+        start,
+        end,
+        require,
+        topic,
+        quiet,
+        json,
+        pages,
     )
     with outside_allowed(allow_outside):
         _solve(asked, solver, "--solver", export, point)
@@ -108,6 +123,7 @@ def compare(
     ] = None,
     export: Export = None,
     point: Point = None,
+    pages: Pages = True,
     require: Require = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
@@ -116,7 +132,20 @@ def compare(
 ) -> None:
     """Put the same recording through several solvers and compare them, against the truth where there is one."""
     asked = _Asked(
-        only(context, recording), out, profile, config, noise, without, rate, start, end, require, topic, quiet, json
+        only(context, recording),
+        out,
+        profile,
+        config,
+        noise,
+        without,
+        rate,
+        start,
+        end,
+        require,
+        topic,
+        quiet,
+        json,
+        pages,
     )
     beside = _Beside(against or [], against_point or [], against_shift or [])
     for option, values in (("--against-point", beside.points), ("--against-shift", beside.shifts)):
@@ -163,6 +192,7 @@ class _Asked:
     topic: list[str] | None
     quiet: bool
     json: bool
+    pages: bool
 
 
 @dataclass(frozen=True)
@@ -222,8 +252,10 @@ def _solve(
         outcome = workflow.run_request(request, progress)
         tell("writing")
         with staged(folder) as part:
-            files = (outputs.write_run if alone else outputs.write_comparison)(outcome, part)
+            files = (outputs.write_run if alone else outputs.write_comparison)(outcome, part, asked.pages)
         files = moved(files, part, folder)
+        if not asked.pages:
+            outputs.remove_pages(folder, () if alone else chosen)
         if exported:  # by itself, so that one that fails takes nothing with it
             with staged(folder) as part:
                 more = convert.export_run(outcome, part, exported, point, alone)

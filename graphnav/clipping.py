@@ -20,7 +20,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from graphnav.recording import Imu
 from graphnav.rotation import Array
@@ -75,6 +74,8 @@ def _flat(t: Array, x: Array, least: float, band: float, highest: Array) -> list
             half = 0.5 * (last - first) * step
             if min(up, down) * half**2 < _TOO_FLAT * 2.0 * (half + 1.5 * step) * band * top:
                 continue
+            from scipy.interpolate import CubicHermiteSpline  # which few recordings need, and takes long to import
+
             curve = CubicHermiteSpline(t[[first - 1, last]], y[[first - 1, last]], [up, -down])
             found.append(Peak(first, last, sign * np.maximum(curve(t[first:last]), y[first:last])))
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,8 @@ import numpy as np
 
 from graphnav.against import antenna_lever_arm, own
 from graphnav.complaints import listed, nearest
-from graphnav.draft.guesses import noise_density
 from graphnav.errors import ConfigError, RecordingError
-from graphnav.exporters import NAMES, write_as
+from graphnav.exporters import NAMES, written
 from graphnav.files import parse_json, read_text
 from graphnav.formats import formats, load
 from graphnav.formats.registry import Log
@@ -21,6 +20,7 @@ from graphnav.formats.trajectories import read_trajectory
 from graphnav.formats.writer import write_recording
 from graphnav.interpolation import interpolate
 from graphnav.rotation import Array
+from graphnav.solution import Solution, to_trajectory
 from graphnav.staging import moved, staged
 from graphnav.timescales import gps_to_utc, parse_clock
 from graphnav.trajectory import Trajectory
@@ -28,6 +28,7 @@ from graphnav.workflow import Outcome
 
 SUMMARY = "summary.json"  # of the run that wrote a trajectory: its clock and its points
 _DENSE = 20.0  # Hz
+_ROWS = 4096  # of these, handled at once
 _MOST_ROWS = 2e7
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
 
@@ -81,6 +82,8 @@ def _with_measured_noise(log: Log) -> Log:
     imu = log.imu
     if imu is None or not imu.noise_assumed:
         return log
+    from graphnav.draft.guesses import noise_density
+
     found = {
         f"{name}_noise_density": float(f"{value:.2g}")
         for name, x in (("gyro", imu.gyro), ("accel", imu.accel))
@@ -188,11 +191,7 @@ def at_point(trajectory: Trajectory, arm: Array | None, rate: float | None = Non
 
 def write_formats(trajectory: Trajectory, targets: dict[str, Path], gps_zero: float | None) -> list[Path]:
     """Write the formats, each to its path; `gps_zero` (s) is when t = 0 was, where it is known."""
-    utc = None if gps_zero is None else gps_to_utc(trajectory.t + gps_zero)
-    for name, path in targets.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_as(name, trajectory, path, utc)
-    return list(targets.values())
+    return _write([trajectory], targets, gps_zero, trajectory.name)
 
 
 def export_run(
@@ -210,23 +209,44 @@ def export_run(
     rate = outcome.request.rate
     arm = parse_point(point)
     name = "trajectory" if point in (None, "imu") else "antenna" if point == "antenna" else "point"
-    written: list[Path] = []
+    files: list[Path] = []
     for solver, solution in own(outcome.solutions).items():
-        trajectory, lever_arm = solution.trajectory(rate), arm
+        lever_arm = arm
         if isinstance(arm, str) and arm == "antenna":
             found = antenna_lever_arm(outcome.recording, solution)
             if found is None:
                 raise ConfigError("--point antenna: the recording has no GNSS")
             lever_arm = found
+        blocks = solution.blocks(rate)
         if not isinstance(lever_arm, str) and np.any(lever_arm):
-            # between keyframes a second apart the turn rate, and with it the point's velocity, would be guessed
-            dense = solution.trajectory(max(rate or 0.0, _DENSE))
-            trajectory, _ = interpolate(dense, trajectory.t, max_gap=_MAX_GAP, lever_arm=lever_arm)
+            blocks = _of_point(solution, rate, lever_arm)
         title = f"{outcome.recording.name}, {solver}" + (f", {name}" if name != "trajectory" else "")
         place = folder if alone else folder / solver
-        targets = {one: place / f"{name}.{one}" for one in names}
-        written += write_formats(replace(trajectory, name=title), targets, outcome.recording.gps_zero)
-    return written
+        files += _write(blocks, {one: place / f"{name}.{one}" for one in names}, outcome.recording.gps_zero, title)
+    return files
+
+
+def _of_point(solution: Solution, rate: float | None, arm: Array) -> Iterator[Trajectory]:
+    """The trajectory of the point at the end of a lever arm, in parts."""
+    # between keyframes a second apart the turn rate, and with it the point's velocity, would be guessed
+    dense = max(rate or 0.0, _DENSE)
+    there = [piece.times(dense) for piece in solution.between]
+    wanted = solution.t if rate is None else np.concatenate([piece.times(rate) for piece in solution.between])
+    for t in np.split(wanted, np.flatnonzero(np.diff(np.floor(wanted * (dense / _ROWS)))) + 1):
+        # a row on each side for the place, two for the turn rate, and one to spare
+        around = [
+            times[max(np.searchsorted(times, t[0]) - 3, 0) : np.searchsorted(times, t[-1], side="right") + 3]
+            for times in there
+        ]
+        rows = to_trajectory(solution.solver, solution.frame, *solution.at(np.concatenate(around)))
+        yield interpolate(rows, t, max_gap=_MAX_GAP, lever_arm=arm)[0]
+
+
+def _write(blocks: Iterable[Trajectory], targets: dict[str, Path], gps_zero: float | None, name: str) -> list[Path]:
+    for path in targets.values():
+        path.parent.mkdir(parents=True, exist_ok=True)
+    written(blocks, targets, name, None if gps_zero is None else lambda t: gps_to_utc(t + gps_zero))
+    return list(targets.values())
 
 
 def _run(source: Path) -> dict[str, Any]:

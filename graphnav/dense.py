@@ -18,7 +18,7 @@ from graphnav.preintegration import Intervals, within
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.samples import Samples
-from graphnav.state import States
+from graphnav.state import DIM, States
 
 
 def times_between(start: float, end: float, rate: float) -> Array:
@@ -55,8 +55,8 @@ class Dense:
         """Multiples of 1/rate on the recording's clock, with both ends."""
         return times_between(self.start, self.end, rate)
 
-    def __call__(self, t: Array) -> tuple[States, Array]:
-        """States and covariances (M, 15, 15) at ascending times from `start` to `end`."""
+    def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
+        """States and covariances (M, size, size), of the first errors, at ascending times from `start` to `end`."""
         k = np.clip(np.searchsorted(self.t, t, side="left") - 1, 0, len(self.t) - 2)
         T = np.diff(self.t)[k]
         s = (t - self.t[k]) / T
@@ -65,7 +65,7 @@ class Dense:
         ends = self.t[touched + 1] if self.smooth else self.t[:0]
         targets = np.unique(np.concatenate([t[t > self.t[0]], ends]))
         ahead = self._predicted(targets)
-        states = self.states[k].plus(np.zeros((len(t), 15)))
+        states = self.states[k]
         moved = t > self.t[0]
         at = np.searchsorted(targets, t[moved])
         reached = ahead[at]
@@ -78,21 +78,27 @@ class Dense:
             reached = _choose(exact, self.states[k[moved] + 1], reached)
         states = _choose(moved, _spread(reached, moved, states), states)
         w = s[:, None, None]
-        return states, (1.0 - w) * self.covariance[k] + w * self.covariance[k + 1]
+        before, after = self.covariance[k, :size, :size], self.covariance[k + 1, :size, :size]
+        return states, (1.0 - w) * before + w * after
 
     def _predicted(self, t: Array) -> States:
         """Prediction from the keyframe before each time."""
         k = np.searchsorted(self.t, t, side="left") - 1
-        dR, dV, dP = within(self.samples, self.t, t, self.ba, self.bg)
+        if not len(t):
+            return self.states[k]
+        # of the intervals touched alone: whoever asks for a few times pays for a few
+        first, last = int(k[0]), int(k[-1]) + 1
+        samples, used = self.samples.between(self.t[first], self.t[last]), slice(first, last)
+        dR, dV, dP = within(samples, self.t[first : last + 1], t, self.ba[used], self.bg[used])
         n = len(t)
         none = np.zeros((n, 3, 3))
         start = self.states[k]
         intervals = Intervals(
             self.t[k], t, dR, dV, dP, none, none, none, none, none, start.ba, start.bg,
-            np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 15, 15)), np.zeros((n, 0, 15, 15)), none, none,
+            np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 0, 0)), np.zeros((n, 0, 0, 0)), none, none,
             np.zeros((n, 3)), none,
         )  # fmt: skip
-        return Motion(intervals, self.frame).propagate(slice(None), start)[0]
+        return Motion(intervals, self.frame).propagate(slice(None), start, linear=False)[0]
 
 
 def _laid(miss: Array, s: Array, T: Array) -> Array:

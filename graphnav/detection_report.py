@@ -11,7 +11,7 @@ import numpy as np
 from graphnav import page, plots, report_pictures
 from graphnav.detectors import Detections
 from graphnav.detectors.base import intervals_text
-from graphnav.exporters.csv import rows_text
+from graphnav.exporters.digits import rows_text
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 

@@ -121,10 +121,12 @@ class Motion:
         """
         return np.linalg.inv(np.linalg.cholesky(self.intervals.covariance))
 
-    def propagate(self, rows: slice, start: States, scale: Array | None = None) -> tuple[States, Array]:
+    def propagate(
+        self, rows: slice, start: States, scale: Array | None = None, linear: bool = True
+    ) -> tuple[States, Array]:
         """The states at the ends of intervals `rows` and F (n, 15, 15) there, from the states at their starts.
 
-        `scale` is (k,), (n, k) or None, k 6 or 18.
+        `scale` is (k,), (n, k) or None, k 6 or 18. Without `linear` F is not made, and empty.
         """
         iv, R = self.intervals, start.R_nb
         n = len(R)
@@ -139,6 +141,8 @@ class Motion:
         G = self.frame.gravity_n(start.p) + start.p @ self.W2.T
         pv = mv(self.coast[rows], np.concatenate([start.p, start.v], -1)) + mv(turned, moved) + mv(self.pushed[rows], G)
         end = States(self.back[rows] @ R @ dR, pv[:, :3], pv[:, 3:], start.ba, start.bg)
+        if not linear:
+            return end, np.empty((0, DIM, DIM))
 
         F = np.zeros((n, DIM, DIM))
         F[:, 0:3, 0:3] = np.swapaxes(dR, -1, -2)

@@ -24,7 +24,6 @@ from graphnav.problem import pose
 from graphnav.progress import tell
 from graphnav.recording import Recording, rows_of
 from graphnav.rotation import Array
-from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf
 from graphnav.solvers.rts import backward, rts
 
@@ -131,6 +130,8 @@ def _most_turning(recording: Recording) -> Recording:
 
 def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array] | None]:
     """The antenna, and how far ahead the point is that does not slip, (1,) m each: stated, found, sigma."""
+    from graphnav.solvers.batch import batch
+
     if recording.gnss is None or not len(recording.gnss.t):
         raise EstimationError(f"'{recording.name}': there is no GNSS whose antenna could be found")
     settings, frame = Settings(), LocalFrame(origin(recording))

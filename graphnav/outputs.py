@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import platform
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +20,7 @@ from graphnav.against import antenna_lever_arm, own
 from graphnav.detectors.base import intervals_text
 from graphnav.errors import ConfigError, PartlyWrittenError
 from graphnav.files import exists
+from graphnav.plain import peak_memory_mb, write_json
 from graphnav.solution import ParameterEstimate, Solution
 from graphnav.stored import read_again, sha256, write_outcome
 from graphnav.workflow import Outcome, outages
@@ -75,31 +73,44 @@ def output_folder(path: str | Path, files: Sequence[str] = (), folders: Sequence
     return folder
 
 
-def write_run(outcome: Outcome, folder: Path) -> list[Path]:
-    """Everything of the only solver of a run, straight into `folder`; returns the files to look at first."""
+def write_run(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
+    """Everything of the only solver of a run, straight into `folder`; returns the files to look at first.
+
+    Without `pages` none is drawn; `draw_again` can do that later.
+    """
     (name,) = own(outcome.solutions)
     provenance = _provenance(outcome)
-    failed = write_solver(outcome, name, folder, provenance)
+    failed = write_solver(outcome, name, folder, provenance, pages=pages)
     write_outcome(outcome, provenance, folder / stored.NAME)
     _insist(failed)
-    return [folder / "report.html", folder / "trajectory.csv", folder / "summary.json"]
+    return [*([folder / "report.html"] if pages else []), folder / "trajectory.csv", folder / "summary.json"]
 
 
-def write_comparison(outcome: Outcome, folder: Path) -> list[Path]:
-    """Everything per solver under its own name, and the table and page that compare them."""
-    from graphnav import report
+def write_comparison(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
+    """Everything per solver under its own name, and the table and page that compare them; `pages` as in `write_run`."""
     from graphnav.metrics import write_comparison_csv
 
     provenance = _provenance(outcome)
-    detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
+    detectors = None
+    if pages:
+        from graphnav import report
+
+        detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
     failed = []
     for name in own(outcome.solutions):
-        failed += write_solver(outcome, name, folder / name, provenance, detectors)
+        failed += write_solver(outcome, name, folder / name, provenance, detectors, pages)
     write_comparison_csv(folder / "comparison.csv", comparison(outcome))
-    failed += _attempt(lambda path: _draw_comparison(outcome, path.parent, provenance), folder / "comparison.html")
+    if pages:
+        failed += _attempt(lambda path: _draw_comparison(outcome, path.parent, provenance), folder / "comparison.html")
     write_outcome(outcome, provenance, folder / stored.NAME)
     _insist(failed)
-    return [folder / "comparison.html", folder / "comparison.csv"]
+    return [*([folder / "comparison.html"] if pages else []), folder / "comparison.csv"]
+
+
+def remove_pages(folder: Path, solvers: Sequence[str] = ()) -> None:
+    """Take away the pages of a run before, of which the results have been replaced without new ones."""
+    for page in ("comparison.html", "report.html", *(f"{name}/report.html" for name in solvers)):
+        (folder / page).unlink(missing_ok=True)
 
 
 def draw_again(folder: Path, part: Path) -> list[Path]:
@@ -148,7 +159,12 @@ def _draw_comparison(outcome: Outcome, folder: Path, provenance: Mapping[str, An
 
 
 def write_solver(
-    outcome: Outcome, name: str, folder: Path, provenance: Mapping[str, Any], detectors: Sequence[Raw] | None = None
+    outcome: Outcome,
+    name: str,
+    folder: Path,
+    provenance: Mapping[str, Any],
+    detectors: Sequence[Raw] | None = None,
+    pages: bool = True,
 ) -> list[str]:
     """The files of one solver; a folder that holds older ones keeps none of them under the same names.
 
@@ -161,14 +177,12 @@ def write_solver(
 
     solution = outcome.solutions[name]
     began = time.perf_counter()
-    trajectory = solution.trajectory(outcome.request.rate)
-    write_all(replace(trajectory, name=f"{outcome.recording.name}, {name}"), folder)
+    write_all(solution.blocks(outcome.request.rate), folder, f"{outcome.recording.name}, {name}")
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
     (folder / "detections.csv").write_text(intervals_text(solution.detections), encoding="utf-8")
     written = time.perf_counter()
-    failed = _attempt(
-        lambda path: _draw_solver(outcome, name, path.parent, provenance, detectors), folder / "report.html"
-    )
+    report = folder / "report.html"
+    failed = _attempt(lambda _: _draw_solver(outcome, name, folder, provenance, detectors), report) if pages else []
     spent = {"writing": written - began, "report": time.perf_counter() - written}
     write_json(folder / "summary.json", solver_summary(outcome, name, spent, provenance))
     return failed
@@ -326,34 +340,9 @@ def stated(solution: Solution) -> dict[str, float]:
     return out
 
 
-def peak_memory_mb() -> float:
-    """The most memory this process ever held, MB of 2^20 bytes."""
-    try:
-        # where there is one: ru_maxrss of a process that was forked counts its parent's memory as well
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith("VmHWM:"):
-                return round(int(line.split()[1]) / 1024.0, 1)
-    except (OSError, ValueError):
-        pass
-    import resource  # not on Windows
-
-    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(size / (1024.0**2 if sys.platform == "darwin" else 1024.0), 1)
-
-
-def write_json(path: Path, values: Any) -> None:
-    """Plain JSON: arrays as lists, whatever is not finite as null."""
-    path.write_text(json_text(values) + "\n", encoding="utf-8")
-
-
-def json_text(values: Any) -> str:
-    """Values as indented JSON, as `write_json` writes them."""
-    return json.dumps(_plain(values), indent=2, ensure_ascii=False)
-
-
 def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) -> None:
     """evaluation.json, and errors.csv with a row per compared epoch where there are any."""
-    from graphnav.exporters.csv import rows_text
+    from graphnav.exporters.digits import rows_text
 
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "evaluation.json", values)
@@ -364,21 +353,6 @@ def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) 
     head = "t,east,north,up,along,across,ve,vn,vu,roll,pitch,heading,sd_e,sd_n,sd_u\n"
     body = rows_text(np.concatenate(columns, axis=1), "%.6f" + 14 * ",%.6g")
     (folder / "errors.csv").write_text(head + body, encoding="utf-8")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, np.ndarray):
-        plain = value.dtype.kind in "bi" or (value.dtype.kind == "f" and bool(np.isfinite(value).all()))
-        return value.tolist() if plain else _plain(value.tolist())
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(one) for one in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value if value is None or isinstance(value, str | int | float | bool) else str(value)
 
 
 def _calibration(p: ParameterEstimate) -> dict[str, Any]:

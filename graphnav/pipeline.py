@@ -25,11 +25,7 @@ from graphnav.preparation import prepare, start_sigma
 from graphnav.progress import Progress, listening, tell
 from graphnav.recording import Recording
 from graphnav.solution import Solution, joined
-from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf
-from graphnav.solvers.incremental import incremental
-from graphnav.solvers.isam import isam2
-from graphnav.solvers.rows import cost_at
 from graphnav.solvers.rts import backward, rts
 
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
@@ -161,22 +157,27 @@ def _solve(
     out = {"ekf": forward.solution}
     if "rts" in solvers:
         out["rts"] = rts(problem, forward, smoothed)
+    # what a run does not need is not imported: GTSAM least of all
     if "batch" in solvers:
+        from graphnav.solvers.batch import batch
+
         out["batch"] = batch(problem, start.states, start.nodes(problem), progress=progress)
         # what it took to get there is part of it
         out["batch"] = replace(out["batch"], timings={**forward.solution.timings, **out["batch"].timings})
     begin = found.aligned.state if found.astray else None
     if "incremental" in solvers:
+        from graphnav.solvers.incremental import incremental
+
         out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
     if "isam2" in solvers:
+        from graphnav.solvers.isam import isam2
+        from graphnav.solvers.rows import cost_at
+
         out["isam2"] = one = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin).settled
         best = cost_at(problem, smoothed)
         if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY:
-            note = (
-                f"isam2 ended in an optimum that explains the data worse than rts does: half chi-square {one.cost:.0f}"
-            )
-            note += f" against {best:.0f}; do not trust it"
-            out["isam2"] = replace(one, notes=(note, *one.notes))
+            note = "isam2 ended in an optimum that explains the data worse than rts does: do not trust it"
+            out["isam2"] = replace(one, notes=(f"{note} (half chi-square {one.cost:.0f}, not {best:.0f})", *one.notes))
     timings = {"detection": detection, **found.timings}
     return {
         name: replace(

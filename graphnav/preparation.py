@@ -32,7 +32,6 @@ from graphnav.progress import Progress, tell
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import Solution
-from graphnav.solvers.batch import batch
 from graphnav.solvers.ekf import ekf, refilter
 from graphnav.solvers.linearise import Points
 from graphnav.solvers.near import near
@@ -250,6 +249,8 @@ def _find_way(
         smoothed = backward(problem, refilter(problem, known, progress), progress)
         if near_to(smoothed, known, _LOST):
             return ekf(problem, progress, aligned.until, known=smoothed), smoothed
+    from graphnav.solvers.batch import batch  # and GTSAM with it, which few runs of a filter need
+
     states = smoothed.states
     if any(isinstance(c, _WHEELS) for c in problem.constraints):
         free = replace(problem, constraints=tuple(c for c in problem.constraints if not isinstance(c, _WHEELS)))
@@ -276,6 +277,8 @@ def _differ(a: Array, b: Array) -> bool:
 
 
 def _smooth(problem: Problem, start: States) -> Solution:
+    from graphnav.solvers.batch import batch
+
     return batch(problem, start, wanted=(0,), reintegrate=False)
 
 

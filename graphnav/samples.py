@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,12 @@ class Samples:
     extra_accel: Array  # (N,)
     start: float  # start of the first period
     bridged: Array  # (g, 2) start and end of every bridged gap, s
+
+    def between(self, begin: float, end: float) -> Samples:
+        """Those whose periods lie, all or in part, between two times (s); views."""
+        k = slice(np.searchsorted(self.t, begin, side="left"), np.searchsorted(self.t, end, side="left") + 1)
+        rows = {name: getattr(self, name)[k] for name in ("t", "gyro", "accel", "extra_gyro", "extra_accel")}
+        return replace(self, **rows)
 
 
 def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -13,8 +13,11 @@ from graphnav.detectors.base import Detection
 from graphnav.earth import LocalFrame
 from graphnav.noise_model import STATED, NoiseModel, RowWeights
 from graphnav.rotation import Array
-from graphnav.state import States
+from graphnav.state import DIM, States
 from graphnav.trajectory import Trajectory
+
+_OUT = 9  # errors of attitude, position, velocity, which are those of a trajectory
+_ROWS = 4096  # of a block: 25 MB while it is worked on
 
 
 class Between(Protocol):
@@ -34,8 +37,8 @@ class Between(Protocol):
         """Times at a rate, ends included."""
         ...
 
-    def __call__(self, t: Array) -> tuple[States, Array]:
-        """States and covariances at times inside."""
+    def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
+        """States and covariances (M, size, size), of the first errors, at times inside."""
         ...
 
 
@@ -116,6 +119,17 @@ class Solution:
             t, states, covariance = self.at(np.concatenate([b.times(rate) for b in self.between]))
         return to_trajectory(self.solver, self.frame, t, states, covariance)
 
+    def blocks(self, rate: float | None = None) -> Iterator[Trajectory]:
+        """`trajectory` in parts, one behind the other, so that only one of them need be in memory."""
+        if rate is None:
+            yield self.trajectory()
+            return
+        for piece in self.between:
+            times = piece.times(rate)
+            for k in range(0, len(times), _ROWS):
+                t = times[k : k + _ROWS]
+                yield to_trajectory(self.solver, self.frame, t, *piece(t, _OUT))
+
     def at(self, t: Array) -> tuple[Array, States, Array]:
         """Times (M,), states and covariances (M, 15, 15) at ascending times; those in no piece are left out."""
         parts = []
@@ -136,7 +150,7 @@ def to_trajectory(name: str, frame: LocalFrame, t: Array, states: States, covari
     J[:, 0:3, 3:6] = R_ln
     J[:, 3:6, 6:9] = R_ln
     J[:, 6:9, 0:3] = rotation.rph_jacobian(rph)
-    cov = J @ covariance[:, :9, :9] @ np.swapaxes(J, -1, -2)
+    cov = J @ covariance[:, :_OUT, :_OUT] @ np.swapaxes(J, -1, -2)
     sd = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
     return Trajectory(
         t=t,

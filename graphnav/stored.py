@@ -27,7 +27,7 @@ from graphnav.errors import ConfigError, RecordingError
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import Solution
-from graphnav.state import States
+from graphnav.state import DIM, States
 from graphnav.workflow import Outcome, read_part
 
 NAME = "run.npz"
@@ -57,14 +57,14 @@ class Straight:
         """As those of the solution that was stored."""
         return times_between(self.start, self.end, rate)
 
-    def __call__(self, t: Array) -> tuple[States, Array]:
-        """States and covariances at times inside."""
+    def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
+        """States and covariances, of the first errors, at times inside."""
         k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
         s = ((t - self.t[k]) / (self.t[k + 1] - self.t[k]))[:, None]
         a, b = self.states[k], self.states[k + 1]
         turn = rotation.exp(s * rotation.log(np.swapaxes(a.R_nb, -1, -2) @ b.R_nb))
         p, v, ba, bg = (x + s * (y - x) for x, y in ((a.p, b.p), (a.v, b.v), (a.ba, b.ba), (a.bg, b.bg)))
-        P, Q = self.covariance[k], self.covariance[k + 1]
+        P, Q = self.covariance[k, :size, :size], self.covariance[k + 1, :size, :size]
         return States(a.R_nb @ turn, p, v, ba, bg), P + s[:, :, None] * (Q - P)
 
 

@@ -36,7 +36,7 @@ def insist(verdicts: Sequence[Verdict]) -> None:
 def show(text: Callable[[], str], values: Callable[[], Any], quiet: bool, json: bool) -> None:
     """Print what came of a command: for people, for programs, or not at all."""
     if json:
-        from graphnav.outputs import json_text
+        from graphnav.plain import json_text
 
         say(json_text(values()))
     elif not quiet:

@@ -188,7 +188,6 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     if truth_apart(recording):
         recording = replace(recording, truth=None)
 
-    from graphnav.lever_arm import reversed_arms
     from graphnav.pipeline import run
     from graphnav.report_words import doubts
 
@@ -209,6 +208,8 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
     checks = inspection.findings
     if doubts(solutions, errors):  # which costs too much to be asked where nothing is wrong
+        from graphnav.lever_arm import reversed_arms
+
         checks = (*reversed_arms(used), *checks)
         findings = [*(f.sentence for f in checks), *findings]
     return Outcome(

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from graphnav import evaluation, rotation
 from graphnav.earth import LocalFrame
 from graphnav.errors import RecordingError
-from graphnav.exporters import csv, tum
+from graphnav.exporters import write_as
 from graphnav.interpolation import fit_yaw, interpolate
 from graphnav.recording import Gnss, Imu, Recording, Truth
 from graphnav.trajectory import Trajectory
@@ -430,9 +430,9 @@ def test_truth_of_a_recording() -> None:
 
 def test_files_in_numbers_out(tmp_path: Path) -> None:
     truth = circle(TIMES)
-    csv.write(truth, tmp_path / "truth.csv")
-    csv.write(moved(truth, np.array([3.0, 4.0, 0.0])), tmp_path / "a.csv")
-    tum.write(truth, tmp_path / "b.tum")
+    write_as("csv", truth, tmp_path / "truth.csv")
+    write_as("csv", moved(truth, np.array([3.0, 4.0, 0.0])), tmp_path / "a.csv")
+    write_as("tum", truth, tmp_path / "b.tum")
     metrics = evaluation.evaluate(tmp_path / "a.csv", tmp_path / "truth.csv", spans=[(10.0, 20.0)])
     assert metrics.components["h"].rms == pytest.approx(5.0, abs=2e-5)
     assert metrics.name == "a"
@@ -461,8 +461,8 @@ def test_files_in_numbers_out(tmp_path: Path) -> None:
 )
 def test_times_that_do_not_overlap_are_said_with_the_likely_reason(tmp_path: Path, shift: float, hint: str) -> None:
     truth = circle(TIMES)
-    csv.write(truth, tmp_path / "a.csv")
-    csv.write(replace(truth, t=truth.t + shift), tmp_path / "truth.csv")
+    write_as("csv", truth, tmp_path / "a.csv")
+    write_as("csv", replace(truth, t=truth.t + shift), tmp_path / "truth.csv")
     with pytest.raises(RecordingError, match="do not overlap") as caught:
         evaluation.evaluate(tmp_path / "a.csv", tmp_path / "truth.csv")
     assert hint in str(caught.value)
@@ -471,12 +471,12 @@ def test_times_that_do_not_overlap_are_said_with_the_likely_reason(tmp_path: Pat
 
 def test_eighteen_seconds_of_utc_are_recognised(tmp_path: Path) -> None:
     t = np.arange(0.0, 100.0, 0.1)
-    csv.write(circle(t), tmp_path / "truth.csv")
-    csv.write(replace(circle(t), t=t - 18.0), tmp_path / "a.csv")
+    write_as("csv", circle(t), tmp_path / "truth.csv")
+    write_as("csv", replace(circle(t), t=t - 18.0), tmp_path / "a.csv")
     notes = evaluation.evaluate(tmp_path / "a.csv", tmp_path / "truth.csv").notes
     assert any("+18 s" in note and "UTC" in note for note in notes)
-    csv.write(circle(t[:100]), tmp_path / "short.csv")
-    csv.write(replace(circle(t[:100]), t=t[:100] + 18.0), tmp_path / "far.csv")
+    write_as("csv", circle(t[:100]), tmp_path / "short.csv")
+    write_as("csv", replace(circle(t[:100]), t=t[:100] + 18.0), tmp_path / "far.csv")
     with pytest.raises(RecordingError, match=r"UTC .* 18 s ahead"):
         evaluation.evaluate(tmp_path / "short.csv", tmp_path / "far.csv")
 
@@ -487,7 +487,7 @@ def test_the_oracle_drive_against_a_perturbed_copy(shared_data: Path, tmp_path: 
     rng = np.random.default_rng(1)
     sd = np.tile([0.5, 1.0, 2.0], (len(truth), 1))
     estimate = replace(moved(truth, rng.normal(size=sd.shape) * sd), sd_p=sd)
-    csv.write(estimate, tmp_path / "a.csv")
+    write_as("csv", estimate, tmp_path / "a.csv")
     metrics = evaluation.evaluate(tmp_path / "a.csv", file)
     assert metrics.n == len(truth)
     assert metrics.nees["p"].low < metrics.nees["p"].mean < metrics.nees["p"].high
@@ -497,7 +497,7 @@ def test_the_oracle_drive_against_a_perturbed_copy(shared_data: Path, tmp_path: 
 
 def test_a_recording_is_a_truth_with_its_lever_arm(shared_data: Path, tmp_path: Path) -> None:
     folder = shared_data / "oracle_drive"
-    csv.write(evaluation.read_trajectory(folder / "truth.csv.gz"), tmp_path / "a.csv")
+    write_as("csv", evaluation.read_trajectory(folder / "truth.csv.gz"), tmp_path / "a.csv")
     assert evaluation.evaluate(tmp_path / "a.csv", folder).components["3d"].max < 2e-5
     metrics = evaluation.evaluate(tmp_path / "a.csv", shared_data / "openshoe_loops" / "run02.toml")
     assert metrics.closure is not None

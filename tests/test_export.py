@@ -17,7 +17,7 @@ from test_exporters import DEG, made
 from graphnav import cli, convert, rotation
 from graphnav.earth import LocalFrame
 from graphnav.errors import ConfigError, RecordingError
-from graphnav.exporters import csv, gpx, nav, nmea, write_as
+from graphnav.exporters import write_as
 from graphnav.formats import load
 from graphnav.formats.trajectories import read_trajectory
 from graphnav.timescales import gps_to_utc
@@ -32,7 +32,7 @@ def utc_of(track: Trajectory):
 
 def test_gpx_is_read_by_gpxpy_and_keeps_the_schema(tmp_path: Path) -> None:
     track = made()
-    gpx.write(track, tmp_path / "a.gpx", utc_of(track))
+    write_as("gpx", track, tmp_path / "a.gpx", utc_of(track))
     text = (tmp_path / "a.gpx").read_text()
     points = gpxpy.parse(text).tracks[0].segments[0].points
     assert [p.latitude for p in points] == pytest.approx(track.llh[:, 0] / DEG, abs=1e-10)
@@ -50,7 +50,7 @@ def test_gpx_is_read_by_gpxpy_and_keeps_the_schema(tmp_path: Path) -> None:
 
 
 def test_gpx_without_a_clock_has_no_times_and_says_so(tmp_path: Path) -> None:
-    gpx.write(made(), tmp_path / "a.gpx")
+    write_as("gpx", made(), tmp_path / "a.gpx")
     track = gpxpy.parse((tmp_path / "a.gpx").read_text()).tracks[0]
     assert track.segments[0].points[0].time is None
     assert "the clock is not known" in track.description
@@ -58,22 +58,22 @@ def test_gpx_without_a_clock_has_no_times_and_says_so(tmp_path: Path) -> None:
 
 def test_nav_reads_back(tmp_path: Path) -> None:
     track = made()
-    nav.write(track, tmp_path / "a.nav", utc_of(track))
+    write_as("nav", track, tmp_path / "a.nav", utc_of(track))
     back = read_trajectory(tmp_path / "a.nav")
     assert np.loadtxt(tmp_path / "a.nav")[0, :2] == pytest.approx([WEEK, 432000.0])
     assert back.t == pytest.approx(track.t, abs=2e-6)
     assert back.llh[:, :2] == pytest.approx(track.llh[:, :2], abs=1e-12)
     assert back.v == pytest.approx(track.v, abs=1e-5)
     assert rotation.wrap(back.rph - track.rph) == pytest.approx(0.0, abs=1e-8)
-    nav.write(track, tmp_path / "b.nav")
+    write_as("nav", track, tmp_path / "b.nav")
     assert np.loadtxt(tmp_path / "b.nav")[0, :2].tolist() == [0.0, 432000.0]  # as KF-GINS itself
     with pytest.raises(RecordingError, match="needs velocity and attitude"):
-        nav.write(Trajectory(track.t, track.llh), tmp_path / "c.nav")
+        write_as("nav", Trajectory(track.t, track.llh), tmp_path / "c.nav")
 
 
 def test_nmea_sentences_are_sound_and_read_back(tmp_path: Path) -> None:
     track = made()
-    nmea.write(track, tmp_path / "a.nmea", utc_of(track))
+    write_as("nmea", track, tmp_path / "a.nmea", utc_of(track))
     lines = (tmp_path / "a.nmea").read_bytes().splitlines(keepends=True)
     assert len(lines) == 3 * len(track)
     messages = [pynmeagps.NMEAReader.parse(line, validate=pynmeagps.VALCKSUM) for line in lines]
@@ -87,12 +87,12 @@ def test_nmea_sentences_are_sound_and_read_back(tmp_path: Path) -> None:
     assert log.gnss.llh[:, 2] == pytest.approx(track.llh[:, 2], abs=1e-4)
     assert log.gnss.sd == pytest.approx(track.sd_p, abs=1e-4)
     with pytest.raises(RecordingError, match="time of day"):
-        nmea.write(track, tmp_path / "b.nmea")
+        write_as("nmea", track, tmp_path / "b.nmea")
 
 
 def test_minutes_that_round_up_to_sixty_carry_over(tmp_path: Path) -> None:
     llh = np.array([[47.99999999999 * DEG, -8.0 * DEG, 0.0]])
-    nmea.write(Trajectory(np.array([0.0]), llh), tmp_path / "a.nmea", gps_to_utc(np.array([1.3e9])))
+    write_as("nmea", Trajectory(np.array([0.0]), llh), tmp_path / "a.nmea", gps_to_utc(np.array([1.3e9])))
     message = pynmeagps.NMEAReader.parse((tmp_path / "a.nmea").read_bytes().splitlines()[0])
     assert message.lat == pytest.approx(48.0)
     assert message.lon == pytest.approx(-8.0)
@@ -205,7 +205,7 @@ def test_bad_exports_are_one_line_and_exit_code_2(run, tmp_path, capsys, argumen
 
 
 def test_a_csv_trajectory_without_a_summary_has_no_antenna(tmp_path, capsys) -> None:
-    csv.write(made(), tmp_path / "a.csv")
+    write_as("csv", made(), tmp_path / "a.csv")
     assert cli.run(["convert", str(tmp_path / "a.csv"), "-o", str(tmp_path / "a.gpx"), "--point", "antenna"]) == 2
     assert "no summary.json beside a.csv" in capsys.readouterr().err
 

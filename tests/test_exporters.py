@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +14,10 @@ import pytest
 
 from graphnav import exporters, rotation
 from graphnav.errors import RecordingError
-from graphnav.exporters import csv, kml, tum
+from graphnav.exporters import write_as
+from graphnav.exporters.digits import rows_text
 from graphnav.formats.trajectories import read_trajectory
+from graphnav.timescales import gps_to_utc
 from graphnav.trajectory import Trajectory
 
 DEG = np.pi / 180
@@ -34,7 +37,7 @@ def made(n: int = 200, seed: int = 0) -> Trajectory:
 
 def test_csv_has_the_fixed_header_and_reads_back(tmp_path: Path) -> None:
     source = made()
-    csv.write(source, tmp_path / "trajectory.csv")
+    write_as("csv", source, tmp_path / "trajectory.csv")
     head = (tmp_path / "trajectory.csv").read_text().splitlines()[0]
     assert head == (
         "t,lat,lon,h,ve,vn,vu,roll,pitch,heading,sd_e,sd_n,sd_u,sd_ve,sd_vn,sd_vu,sd_roll,sd_pitch,sd_heading,"
@@ -56,7 +59,7 @@ def test_csv_units_are_those_of_the_page(tmp_path: Path) -> None:
         np.array([1.5]), np.array([[0.5, -1.0, 7.0]]), v=np.array([[1.0, 2.0, 3.0]]), rph=np.array([[0.1, -0.2, 3.0]]),
         sd_rph=np.array([[0.01, 0.02, 0.03]]), gyro_bias=np.array([[1e-6, -2e-6, 0.0]]),
     )  # fmt: skip
-    csv.write(one, tmp_path / "a.csv")
+    write_as("csv", one, tmp_path / "a.csv")
     head, row = (line.split(",") for line in (tmp_path / "a.csv").read_text().splitlines())
     value = dict(zip(head, row, strict=True))
     assert float(value["lat"]) == pytest.approx(28.64788975654)
@@ -71,21 +74,21 @@ def test_csv_units_are_those_of_the_page(tmp_path: Path) -> None:
 def test_a_missing_value_is_blank_and_comes_back_as_missing(tmp_path: Path) -> None:
     v = np.array([[1.0, 2.0, 3.0], [np.nan, np.nan, np.nan]])
     pair = Trajectory(np.array([0.0, 1.0]), np.zeros((2, 3)), v=v)
-    csv.write(pair, tmp_path / "a.csv")
+    write_as("csv", pair, tmp_path / "a.csv")
     assert "nan" not in (tmp_path / "a.csv").read_text()
     np.testing.assert_array_equal(read_trajectory(tmp_path / "a.csv").v, v)
 
 
 def test_tum_is_enu_about_the_first_point_with_the_body_quaternion(tmp_path: Path) -> None:
     source = made()
-    tum.write(source, tmp_path / "a.tum")
+    write_as("tum", source, tmp_path / "a.tum")
     table = np.loadtxt(tmp_path / "a.tum")
     lat, lon, h = source.llh[:, 0] / DEG, source.llh[:, 1] / DEG, source.llh[:, 2]
     expected = np.column_stack(pymap3d.geodetic2enu(lat, lon, h, lat[0], lon[0], h[0]))
     np.testing.assert_allclose(table[:, 1:4], expected, atol=6e-6)
     # Forward is +y of the body: heading 90 deg points it east, and the quaternion is about up by -90 deg.
     east = Trajectory(np.array([0.0]), source.llh[:1], rph=np.array([[0.0, 0.0, np.pi / 2]]))
-    tum.write(east, tmp_path / "b.tum")
+    write_as("tum", east, tmp_path / "b.tum")
     q = np.loadtxt(tmp_path / "b.tum")[4:]
     np.testing.assert_allclose(q, [0, 0, -np.sqrt(0.5), np.sqrt(0.5)], atol=1e-9)
 
@@ -99,7 +102,7 @@ def test_tum_is_enu_about_the_first_point_with_the_body_quaternion(tmp_path: Pat
 
 def test_tum_without_attitude_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="attitude"):
-        tum.write(replace(made(), rph=None), tmp_path / "a.tum")
+        write_as("tum", replace(made(), rph=None), tmp_path / "a.tum")
 
 
 def test_kml_is_a_thinned_path_with_both_ends(tmp_path: Path) -> None:
@@ -108,7 +111,7 @@ def test_kml_is_a_thinned_path_with_both_ends(tmp_path: Path) -> None:
     source = Trajectory(
         np.arange(n) * 0.01, np.column_stack([0.8 + x * DEG, np.full(n, 0.2), np.full(n, 100.0)]), name="a<b"
     )
-    kml.write(source, tmp_path / "a.kml")
+    write_as("kml", source, tmp_path / "a.kml")
     root = ET.parse(tmp_path / "a.kml").getroot()
     ns = {"k": "http://www.opengis.net/kml/2.2"}
     names = [e.text for e in root.findall(".//k:Placemark/k:name", ns)]
@@ -121,6 +124,52 @@ def test_kml_is_a_thinned_path_with_both_ends(tmp_path: Path) -> None:
     gaps = np.diff(points[:, 1]) * 111e3
     assert gaps.max() < 0.2  # m: evenly spread over the drive
     assert (points[:, 1] == points[0, 1]).sum() < 5  # the half that stands costs nothing
+
+
+@pytest.mark.parametrize("form", ["%.6f", "%.11f", "%.5f", "%.0f", "%.2f", "%.6g"])
+def test_digits_are_those_of_c(form: str) -> None:
+    rng = np.random.default_rng(3)
+    half = (rng.integers(0, 10**6, 400) + 0.5) * 10.0 ** rng.integers(-12, 1, 400)  # a digit's rounding decides
+    decimals = rng.integers(-(10**6), 10**6, 400) * 10.0 ** rng.integers(-12, 3, 400)
+    edges = [0.0, 9.9999949e-5, 9.999995e-5, 1e-4, 0.9999995, 99999.95, 999999.5, 1e-17, 5e-324, 1e300, np.nan, np.inf]
+    spread = rng.normal(size=400) * 10.0 ** rng.uniform(-20, 14, 400)
+    for x in (half, decimals, spread, 1.7e9 + rng.uniform(size=400), *([e] for e in edges), *([-e] for e in edges)):
+        wanted = ["" if np.isnan(one) else form % one for one in x]
+        assert rows_text(np.array(x)[:, None], form).split("\n")[:-1] == wanted
+
+
+def test_parts_of_a_trajectory_make_the_files_of_the_whole(tmp_path: Path) -> None:
+    whole = made()
+    rows = [slice(0, 1), slice(1, 90), slice(90, 200)]
+    names = [name for name in exporters.NAMES if name != "parquet"]
+    for folder, parts in (("whole", [whole]), ("parts", [whole.take(k) for k in rows])):
+        targets = {name: tmp_path / folder / f"a.{name}" for name in names}
+        (tmp_path / folder).mkdir()
+        exporters.written(parts, targets, "a", lambda t: gps_to_utc(t + 1.3e9))
+    for name in names:
+        assert (tmp_path / "whole" / f"a.{name}").read_bytes() == (tmp_path / "parts" / f"a.{name}").read_bytes(), name
+
+
+def test_what_a_format_cannot_hold_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("before")
+    with pytest.raises(RecordingError, match=re.escape(f"{path}: ")):
+        write_as("csv", replace(made(), frame="local"), path)
+    with pytest.raises(RecordingError, match=re.escape(f"{path}: ")):  # of several, one
+        exporters.written([replace(made(), rph=None)], {"csv": tmp_path / "b.csv", "tum": path})
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {"a.csv": "before"}
+
+
+def test_parquet_holds_the_columns_of_the_csv_with_all_digits(tmp_path: Path) -> None:
+    pq = pytest.importorskip("pyarrow.parquet")
+    track = replace(made(), sd_v=None)
+    write_as("parquet", track, tmp_path / "a.parquet")
+    write_as("csv", track, tmp_path / "a.csv")
+    table = pq.read_table(tmp_path / "a.parquet")
+    assert ",".join(table.column_names) == (tmp_path / "a.csv").read_text().splitlines()[0]
+    np.testing.assert_array_equal(table["lat"].to_numpy(), np.rad2deg(track.llh[:, 0]))
+    np.testing.assert_array_equal(table["sd_heading"].to_numpy(), np.rad2deg(track.sd_rph[:, 2]))
+    assert table["sd_ve"].null_count == len(track)
 
 
 def test_write_all(tmp_path: Path) -> None:
@@ -319,7 +368,7 @@ def test_repeated_stamps_and_rows_without_position_are_left_out_and_counted(tmp_
 def test_tum_attitude_is_in_the_frame_of_the_positions(tmp_path: Path) -> None:
     """A level body 100 km east of the start is not level in the start's frame; its up axis must say so."""
     llh = np.array([[0.0, 0.0, 0.0], [0.0, 100e3 / 6378137.0, 0.0]])
-    tum.write(Trajectory(np.array([0.0, 1.0]), llh, rph=np.zeros((2, 3))), tmp_path / "a.tum")
+    write_as("tum", Trajectory(np.array([0.0, 1.0]), llh, rph=np.zeros((2, 3))), tmp_path / "a.tum")
     q = np.loadtxt(tmp_path / "a.tum")[1, 4:]
     up = rotation.from_quaternion(q[[3, 0, 1, 2]])[:, 2]
     angle = 100e3 / 6378137.0  # along the equator

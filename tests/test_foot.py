@@ -367,9 +367,9 @@ class _Rows:
     def times(self, rate: float) -> Array:
         return self.t
 
-    def __call__(self, t: Array) -> tuple[States, Array]:
+    def __call__(self, t: Array, size: int = 15) -> tuple[States, Array]:
         k = np.searchsorted(self.t, t)
-        return self.states[k], self.P[k]
+        return self.states[k], self.P[k, :size, :size]
 
 
 def test_strides_and_shape_of_a_walk() -> None:

@@ -430,7 +430,7 @@ def test_what_was_solved_is_kept_if_one_file_fails(
         raise OSError(28, "No space left on device")
 
     if what == "export":
-        monkeypatch.setattr(convert, "write_as", failing)
+        monkeypatch.setattr(convert, "written", failing)
     else:
         monkeypatch.setattr(report, "write_report", failing)
     out = tmp_path / "out"

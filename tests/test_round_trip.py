@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as arrays
 
 from graphnav.config import read_settings, settings_from, settings_text
 from graphnav.config.gnss import GnssSettings
-from graphnav.exporters import csv
+from graphnav.exporters import write_as
 from graphnav.formats import read
 from graphnav.formats.table import read_table
 from graphnav.formats.trajectories import read_trajectory
@@ -94,9 +94,9 @@ def test_trajectories_to_the_digits_that_are_written(values: Array, first: float
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "x.csv"
-        csv.write(track, path)
+        write_as("csv", track, path)
         once = read_trajectory(path)
-        csv.write(once, path)
+        write_as("csv", once, path)
         twice = read_trajectory(path)
     np.testing.assert_allclose(once.llh, values[:, :3], atol=1e-4)
     for name in ("t", "llh", "v", "rph", "sd_p", "sd_v", "sd_rph"):

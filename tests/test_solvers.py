@@ -332,6 +332,21 @@ def test_huber_is_pulled_by_a_burst_and_redescending_kernels_are_not(lap: tuple[
 
 
 # --------------------------------------------------------------------------------------------------- convergence
+def test_states_between_keyframes_come_in_parts_just_the_same(
+    solved_lap: tuple[Problem, Solution], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A part is integrated from the samples of its own intervals alone: a day's output takes a part's memory."""
+    _, solution = solved_lap
+    whole = solution.trajectory(50.0)
+    assert len(whole) > 1000
+    monkeypatch.setattr("graphnav.solution._ROWS", 37)
+    parts = list(solution.blocks(50.0))
+    assert max(len(part) for part in parts) == 37
+    for name in ("t", "llh", "v", "rph", "sd_p", "sd_v", "sd_rph", "gyro_bias", "accel_bias"):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_allclose(joined, getattr(whole, name), rtol=1e-12, atol=1e-13, err_msg=name)
+
+
 @pytest.fixture(scope="module")
 def shipped(shared_data: Path) -> Recording:
     return read(shared_data / "oracle_drive")

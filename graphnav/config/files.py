@@ -79,7 +79,7 @@ def settings_text(settings: Settings) -> str:
             if isinstance(value, BaseModel):
                 nested[name] = value
                 continue
-            said = f"# {name} =" if value is None else f"{name} = {_toml(value)}"
+            said = f"# {name} =" if value is None else f"{name} = {toml_value(value)}"
             lines.append(f"{said:<30} # {field.description}")
         for name, inner in nested.items():
             place = f"{at}.{name}" if at else name
@@ -91,8 +91,8 @@ def settings_text(settings: Settings) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _toml(value: Any) -> str:
+def toml_value(value: Any) -> str:
     """A value of a setting; JSON's numbers, texts and lists are TOML's as well."""
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{key} = {_toml(one)}" for key, one in value.items()) + " }"
+        return "{ " + ", ".join(f"{key} = {toml_value(one)}" for key, one in value.items()) + " }"
     return json.dumps(value)

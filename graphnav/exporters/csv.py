@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from graphnav.exporters import require_geodetic
+from graphnav.exporters import Add, require_geodetic
+from graphnav.exporters.digits import rows_bytes
 from graphnav.rotation import Array
 from graphnav.trajectory import Trajectory
 
@@ -14,13 +17,19 @@ HEADER = (
     "t,lat,lon,h,ve,vn,vu,roll,pitch,heading,sd_e,sd_n,sd_u,sd_ve,sd_vn,sd_vu,sd_roll,sd_pitch,sd_heading,"
     "bgx,bgy,bgz,bax,bay,baz"
 )
-_CHUNK = 2000  # rows formatted by one %: long enough to be fast, short enough to stay in cache
 
 
-def write(trajectory: Trajectory, path: Path) -> None:
-    """Write `trajectory` to `path`; digits as in `rows`."""
-    require_geodetic(trajectory, path)
-    Path(path).write_text(HEADER + "\n" + rows(trajectory), "utf-8")
+@contextmanager
+def writing(path: Path, name: str = "") -> Iterator[Add]:
+    """A file that trajectories are added to, one behind the other; digits as in `rows`."""
+    with path.open("wb") as file:
+        file.write(HEADER.encode() + b"\n")
+
+        def add(block: Trajectory, utc: Array | None = None) -> None:
+            require_geodetic(block, path)
+            file.write(_rows(block))
+
+        yield add
 
 
 def rows(trajectory: Trajectory) -> str:
@@ -29,35 +38,32 @@ def rows(trajectory: Trajectory) -> str:
     Digits: a microsecond, a micrometre on the ground (1e-11 deg), 0.01 mm in height, 0.01 mm/s, 1e-7 deg;
     sigmas and biases six significant.
     """
+    return _rows(trajectory).decode("ascii")
+
+
+def columns(trajectory: Trajectory) -> list[tuple[Array | None, str]]:
+    """The columns of the file in its units, (K, n) each or None for three blanks, and the format of their numbers."""
     deg = np.rad2deg(1.0)
-    columns: list[Array] = [trajectory.t[:, None]]
-    formats = ["%.6f"]
 
-    def add(values: Array | None, scale: Array | float, form: str) -> None:
-        """Three columns, or three blanks."""
-        if values is None:
-            formats.extend([""] * 3)
-            return
-        columns.append(values * scale)
-        formats.extend([form] * 3)
+    def scaled(values: Array | None, scale: float = 1.0) -> Array | None:
+        return None if values is None else values * scale
 
-    columns.append(trajectory.llh * np.array([deg, deg, 1.0]))
-    formats.extend(["%.11f", "%.11f", "%.5f"])
-    add(trajectory.v, 1.0, "%.5f")
-    add(trajectory.rph, deg, "%.7f")
-    add(trajectory.sd_p, 1.0, "%.6g")
-    add(trajectory.sd_v, 1.0, "%.6g")
-    add(trajectory.sd_rph, deg, "%.6g")
-    add(trajectory.gyro_bias, 1.0, "%.6g")
-    add(trajectory.accel_bias, 1.0, "%.6g")
-    return rows_text(np.concatenate(columns, axis=1), ",".join(formats))
+    return [
+        (trajectory.t[:, None], "%.6f"),
+        (trajectory.llh[:, :2] * deg, "%.11f"),
+        (trajectory.llh[:, 2:], "%.5f"),
+        (trajectory.v, "%.5f"),
+        (scaled(trajectory.rph, deg), "%.7f"),
+        (trajectory.sd_p, "%.6g"),
+        (trajectory.sd_v, "%.6g"),
+        (scaled(trajectory.sd_rph, deg), "%.6g"),
+        (trajectory.gyro_bias, "%.6g"),
+        (trajectory.accel_bias, "%.6g"),
+    ]
 
 
-def rows_text(table: Array, row_format: str) -> str:
-    """The rows of `table` (K, n) through one ``%`` format with n places; NaN becomes blank."""
-    parts = []
-    for start in range(0, len(table), _CHUNK):
-        rows = table[start : start + _CHUNK]
-        parts.append((row_format + "\n") * len(rows) % tuple(rows.ravel().tolist()))
-    text = "".join(parts)
-    return text.replace("nan", "") if np.isnan(table).any() else text
+def _rows(trajectory: Trajectory) -> bytes:
+    parts = columns(trajectory)
+    table = np.concatenate([values for values, _ in parts if values is not None], axis=1)
+    forms = [form for values, one in parts for form in ([one] * values.shape[1] if values is not None else [""] * 3)]
+    return rows_bytes(table, ",".join(forms))

@@ -7,12 +7,14 @@ description says so.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from xml.sax.saxutils import escape
 
 import numpy as np
 
-from graphnav.exporters import require_geodetic
+from graphnav.exporters import Add, require_geodetic
 from graphnav.rotation import Array
 from graphnav.trajectory import Trajectory
 
@@ -23,16 +25,25 @@ _HEAD = """<?xml version="1.0" encoding="UTF-8"?>
 _TAIL = "</trkseg></trk>\n</gpx>\n"
 
 
-def write(trajectory: Trajectory, path: Path, utc: Array | None = None) -> None:
-    """Write `trajectory` to `path`, with times where `utc` (K,), datetime64, is known."""
-    require_geodetic(trajectory, path)
-    about = "heights above the WGS-84 ellipsoid" + ("" if utc is not None else "; no times: the clock is not known")
-    text = [_HEAD.format(name=escape(trajectory.name or "trajectory"), about=about)]
-    degrees = np.rad2deg(trajectory.llh[:, :2])
-    stamps = [""] * len(trajectory) if utc is None else np.datetime_as_string(utc, unit="ms").tolist()
-    rows = zip(degrees.tolist(), trajectory.llh[:, 2].tolist(), stamps, strict=True)
-    for (lat, lon), h, stamp in rows:
-        time = f"<time>{stamp}Z</time>" if stamp else ""
-        text.append(f'<trkpt lat="{lat:.10f}" lon="{lon:.10f}"><ele>{h:.4f}</ele>{time}</trkpt>\n')
-    text.append(_TAIL)
-    Path(path).write_text("".join(text), "utf-8")
+@contextmanager
+def writing(path: Path, name: str = "") -> Iterator[Add]:
+    """A file, with times where UTC is known."""
+    begun = False
+    with path.open("w", encoding="utf-8") as file:
+
+        def add(block: Trajectory, utc: Array | None = None) -> None:
+            nonlocal begun
+            require_geodetic(block, path)
+            if not begun:
+                times = "" if utc is not None else "; no times: the clock is not known"
+                about = f"heights above the WGS-84 ellipsoid{times}"
+                file.write(_HEAD.format(name=escape(name or "trajectory"), about=about))
+                begun = True
+            degrees = np.rad2deg(block.llh[:, :2])
+            stamps = [""] * len(block) if utc is None else np.datetime_as_string(utc, unit="ms").tolist()
+            for (lat, lon), h, stamp in zip(degrees.tolist(), block.llh[:, 2].tolist(), stamps, strict=True):
+                time = f"<time>{stamp}Z</time>" if stamp else ""
+                file.write(f'<trkpt lat="{lat:.10f}" lon="{lon:.10f}"><ele>{h:.4f}</ele>{time}</trkpt>\n')
+
+        yield add
+        file.write(_TAIL)

@@ -6,35 +6,39 @@ forward-right-down body in north-east-down axes, which are graphnav's roll, pitc
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from graphnav.errors import RecordingError
-from graphnav.exporters import require_geodetic
-from graphnav.exporters.csv import rows_text
+from graphnav.exporters import Add, require_geodetic
+from graphnav.exporters.digits import rows_bytes
 from graphnav.rotation import Array
 from graphnav.timescales import WEEK, utc_to_gps
 from graphnav.trajectory import Trajectory
 
 
-def write(trajectory: Trajectory, path: Path, utc: Array | None = None) -> None:
-    """Write `trajectory`; without `utc` its own times are the seconds and the week is 0, as KF-GINS itself writes.
+@contextmanager
+def writing(path: Path, name: str = "") -> Iterator[Add]:
+    """A file; without UTC the trajectory's own times are the seconds and the week is 0, as KF-GINS itself writes."""
+    with path.open("wb") as file:
 
-    Raises
-    ------
-    RecordingError
-        If the trajectory has no velocity or no attitude: the format cannot say so.
-    """
-    require_geodetic(trajectory, path)
-    if trajectory.v is None or trajectory.rph is None:
-        raise RecordingError(f"{path}: a .nav file needs velocity and attitude, and this trajectory lacks one of them")
-    week, t = np.zeros(len(trajectory)), trajectory.t
-    if utc is not None:
-        gps = utc_to_gps(utc)
-        week = np.floor(gps / WEEK)
-        t = gps - WEEK * week
-    deg = np.rad2deg(1.0)
-    v, llh = trajectory.v, trajectory.llh
-    table = np.column_stack([week, t, llh[:, :2] * deg, llh[:, 2], v[:, 1], v[:, 0], -v[:, 2], trajectory.rph * deg])
-    Path(path).write_text(rows_text(table, "%d %.6f %.11f %.11f %.5f" + 3 * " %.5f" + 3 * " %.7f"), "utf-8")
+        def add(block: Trajectory, utc: Array | None = None) -> None:
+            require_geodetic(block, path)
+            if block.v is None or block.rph is None:
+                raise RecordingError(
+                    f"{path}: a .nav file needs velocity and attitude, and this trajectory lacks one of them"
+                )
+            week, t = np.zeros(len(block)), block.t
+            if utc is not None:
+                gps = utc_to_gps(utc)
+                week = np.floor(gps / WEEK)
+                t = gps - WEEK * week
+            deg = np.rad2deg(1.0)
+            v, llh = block.v, block.llh
+            table = np.column_stack([week, t, llh[:, :2] * deg, llh[:, 2], v[:, 1], v[:, 0], -v[:, 2], block.rph * deg])
+            file.write(rows_bytes(table, "%d %.6f %.11f %.11f %.5f" + 3 * " %.5f" + 3 * " %.7f"))
+
+        yield add

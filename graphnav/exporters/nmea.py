@@ -6,6 +6,8 @@ field holds the height above the ellipsoid with a geoid separation of 0, so that
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import reduce
 from operator import xor
 from pathlib import Path
@@ -13,24 +15,30 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.errors import RecordingError
-from graphnav.exporters import require_geodetic
+from graphnav.exporters import Add, require_geodetic
 from graphnav.rotation import Array
 from graphnav.trajectory import Trajectory
 
 _KNOTS = 3600 / 1852
 
 
-def write(trajectory: Trajectory, path: Path, utc: Array | None = None) -> None:
-    """Write `trajectory` to `path`.
+@contextmanager
+def writing(path: Path, name: str = "") -> Iterator[Add]:
+    """A file; every sentence begins with the time of day, so that UTC is needed."""
+    with path.open("w", encoding="ascii", newline="") as file:
 
-    Raises
-    ------
-    RecordingError
-        Without `utc`: every sentence begins with the time of day.
-    """
-    require_geodetic(trajectory, path)
-    if utc is None:
-        raise RecordingError(f"{path}: NMEA needs the time of day, and what t counts from is not known; give --clock")
+        def add(block: Trajectory, utc: Array | None = None) -> None:
+            require_geodetic(block, path)
+            if utc is None:
+                raise RecordingError(
+                    f"{path}: NMEA needs the time of day, and what t counts from is not known; give --clock"
+                )
+            file.write("".join(_sentences(block, utc)))
+
+        yield add
+
+
+def _sentences(trajectory: Trajectory, utc: Array) -> list[str]:
     day = utc.astype("datetime64[D]")
     of_day = (utc - day) / np.timedelta64(1, "us") * 1e-6
     dates = [f"{d[8:10]}{d[5:7]}{d[2:4]}" for d in np.datetime_as_string(day).tolist()]
@@ -44,7 +52,7 @@ def write(trajectory: Trajectory, path: Path, utc: Array | None = None) -> None:
         if trajectory.sd_p is not None and np.isfinite(trajectory.sd_p[k]).all():
             east, north, up = trajectory.sd_p[k].tolist()
             text.append(sentence(f"GNGST,{clock},,,,,{north:.4f},{east:.4f},{up:.4f}"))
-    Path(path).write_text("".join(text), "ascii", newline="")
+    return text
 
 
 def sentence(body: str) -> str:

@@ -29,9 +29,6 @@ from graphnav.formats.repair import (
 )
 from graphnav.formats.table import Table, read_table
 from graphnav.formats.trajectories import read_trajectory
-from graphnav.raw import columns
-from graphnav.raw.load import Sources, load_raw
-from graphnav.raw.placing import Corrected
 from graphnav.raw.series import RawGnss
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording, Truth
 from graphnav.rotation import Array
@@ -189,6 +186,10 @@ def _raw_gnss(
         raise RecordingError(
             f"{path}: 'clock': [raw_gnss] needs to know what t = 0 is: say clock = \"gps week 2130\" or a UTC date"
         )
+    from graphnav.raw import columns
+    from graphnav.raw.load import Sources, load_raw
+    from graphnav.raw.placing import Corrected
+
     some = {name: tuple(path.parent / file for file in getattr(d, name) or ()) for name in _RAW_FILES}
     corrected = Corrected(clock="clock" in d.corrected, troposphere="troposphere" in d.corrected)
     sources = Sources(
