@@ -131,7 +131,7 @@ def test_running_sums_keep_their_digits_over_hours():
     assert len(means) == len(rows) - 49
 
 
-def test_noise_alone_makes_of_the_sway_statistic_what_it_says():
+def test_noise_alone_makes_of_the_low_band_statistic_what_it_says():
     # density, low-pass gain and window against each other: S is near 1 less what the window's own mean takes
     rng = np.random.default_rng(3)
     rate, n = 200.0, 400_000
@@ -310,7 +310,7 @@ def test_a_recording_at_rest_is_one_stop():
 def test_a_passenger_is_bridged_and_a_hop_forward_is_not():
     shaken, t, _ = made(14, [(60, 0)], shakes=((25.0, 4.0, 0.3),))
     found = detect(shaken)
-    assert (found["sway"].statistic > found["sway"].threshold).any()
+    assert (found["low_band_glrt"].statistic > found["low_band_glrt"].threshold).any()
     np.testing.assert_allclose(found.stationary, [[t[0], t[-1]]], atol=0.02)
     assert len(found["fused"].details["disturbed"]) == 1
     hop, t, v = made(14, [(25, 0), (2, 0.5), (2, 0), (31, 0)])
@@ -447,7 +447,7 @@ def test_the_command_writes_what_it_promises(tmp_path, capsys):
     np.testing.assert_allclose(fused, [[0.0, 30.0], [56.0, 75.0]], atol=0.6)
     with gzip.open(out / "statistics.csv.gz", "rt") as file:
         table = list(csv.DictReader(file))
-    assert {"t", "sway", "glrt_threshold", "fft_stationary", "fused"} <= set(table[0])
+    assert {"t", "low_band_glrt", "glrt_threshold", "fft_stationary", "fused"} <= set(table[0])
     told = [(float(r["t"]), r["fused_stationary"] == "1") for r in table if r["fused_stationary"]]
     t, called = (np.array(column) for column in zip(*told, strict=True))
     assert len(t) > 700

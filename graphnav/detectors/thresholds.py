@@ -10,8 +10,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphnav.detectors.base import within
+from graphnav.detectors.scene import Scene
 from graphnav.rotation import Array
 
+_TINY = 1e-300
+FEWEST = 1.0  # s of a population that the data may tell of
+MISLABELLED = 0.2  # of the moving windows that other sensors may be wrong about
+MOVING = 30.0  # s of certain motion that say where the threshold must not be
+MISTAKEN = 0.05  # of the moving windows that may be mislabelled
 _BIN = 0.1  # decades
 _SPREAD = np.array([0.05, 0.25, 0.4, 0.25, 0.05])  # smoothing, bins
 _DEPTH = 4.0  # how many times lower than both sides a valley is
@@ -50,3 +57,36 @@ def valley(log_values: Array, low: float, high: float, fewest: int) -> float | N
     if smaller < _FEW * fewest and len(lowest) < _APART:
         return None
     return float(middle[bottom])
+
+
+def log_statistic(statistic: Array) -> Array:
+    """log10, where populations of a statistic are told apart; zero becomes very small, NaN stays."""
+    return np.log10(np.maximum(statistic, _TINY))
+
+
+def own_threshold(
+    scene: Scene, name: str, t: Array, values: Array, least: float, most: float
+) -> tuple[float, tuple[str, ...]]:
+    """Threshold of a statistic that decides alone, and what there is to be said of it.
+
+    The valley between standing and moving windows if there is one. Else, where odometer or GNSS tell what moves,
+    half of what the quietest twentieth of the moving windows has, and `most` where they tell that nothing does. An
+    IMU by itself leaves `least`: an engine that idles in all of the recording then hides the rest that it is.
+
+    Parameters
+    ----------
+    t, values : (W,) centres of the windows, s, and the statistic.
+    least : what noise alone may make of it.
+    most : what an engine may make of it that idles as strongly as engines do.
+    """
+    x = log_statistic(values)
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
+    moves = within(t, scene.certain, 0.5 * step) & np.isfinite(x)
+    split = valley(x, float(np.log10(least)), float(np.log10(most)), max(2, round(FEWEST / step)))
+    if split is not None and not (moves.any() and np.mean(x[moves] < split) > MISLABELLED):
+        return max(least, float(10.0**split)), ()
+    if moves.sum() * step >= MOVING:
+        return float(np.clip(0.5 * 10.0 ** np.quantile(x[moves], MISTAKEN), least, most)), ()
+    if scene.known and not moves.any():
+        return most, ()
+    return least, (f"{name}: nothing tells standing from moving windows, so only its sensors' noise counts as rest",)
