@@ -20,10 +20,10 @@ import numpy as np
 import graphnav
 from graphnav import stored
 from graphnav.against import antenna_lever_arm, own
-from graphnav.detectors.base import intervals_text
 from graphnav.errors import ConfigError, PartlyWrittenError
 from graphnav.files import exists
 from graphnav.solution import ParameterEstimate, Solution
+from graphnav.stops import detections_text, stops_of_solution
 from graphnav.stored import read_again, sha256, write_outcome
 from graphnav.workflow import Outcome, outages
 
@@ -164,7 +164,8 @@ def write_solver(
     trajectory = solution.trajectory(outcome.request.rate)
     write_all(replace(trajectory, name=f"{outcome.recording.name}, {name}"), folder)
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
-    (folder / "detections.csv").write_text(intervals_text(solution.detections), encoding="utf-8")
+    text = detections_text(solution.detections, solution.records)
+    (folder / "detections.csv").write_text(text, encoding="utf-8")
     written = time.perf_counter()
     failed = _attempt(
         lambda path: _draw_solver(outcome, name, path.parent, provenance, detectors), folder / "report.html"
@@ -237,7 +238,11 @@ def solver_summary(
         "keyframes": len(solution.t),
         "counts": solution.counts,
         "rejected": rejected,
-        "stationary": {"stops": len(solution.stationary), "seconds": float(np.diff(solution.stationary).sum())},
+        "stationary": {
+            "stops": len(solution.stationary),
+            "seconds": float(np.diff(solution.stationary).sum()),
+            "each": [stop.values() for stop in stops_of_solution(solution)],
+        },
         "iterations": solution.iterations,
         "passes": {"filter": 0, "smoother": 0, **solution.passes, "eliminations": solution.iterations},
         "noise": noise_summary(outcome, solution),

@@ -442,7 +442,7 @@ def test_the_command_writes_what_it_promises(tmp_path, capsys):
     assert "2 stops" in said
     with (out / "detections.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ["start", "end", "detector"]
+    assert list(rows[0]) == ["start", "end", "detector", "fired", "rows"]
     fused = np.array([[float(r["start"]), float(r["end"])] for r in rows if r["detector"] == "fused"])
     np.testing.assert_allclose(fused, [[0.0, 30.0], [56.0, 75.0]], atol=0.6)
     with gzip.open(out / "statistics.csv.gz", "rt") as file:
