@@ -21,7 +21,7 @@ import numpy as np
 
 from graphnav.detectors.base import NONE, Detection, spans_of, within
 from graphnav.detectors.scene import MG, Detector, Labels, Scene
-from graphnav.detectors.thresholds import log_statistic, own_threshold
+from graphnav.detectors.thresholds import fewest_errors, own_threshold
 from graphnav.detectors.windows import Blocks, running, unbroken, window_times
 from graphnav.rotation import Array
 
@@ -122,7 +122,9 @@ def window_means(b: Blocks, length: float) -> Means | None:
     window = max(2, round(length / (group * b.period)))
     if count < window:
         return None
-    return Means(window_times(middle, window), 0.5 * length, running(rows).means(window), unbroken(whole, window))
+    return Means(
+        window_times(middle, window), 0.5 * length, running(rows).means(window), unbroken(whole, window, first=0)
+    )
 
 
 class _Windowed(Detector):
@@ -158,10 +160,10 @@ class _Windowed(Detector):
             threshold = settings.threshold
         elif labels is None:
             most = least + float(STATISTICS[name](_idling(scene, g), sigma_a, sigma_w, g)[0])
-            threshold, notes = own_threshold(scene, name, m.t, values, least, most)
+            threshold, notes = own_threshold(scene, name, m.t, m.half, values, least, most)
         elif at_rest:
             in_motion = within(m.t, labels.moving, m.half)
-            threshold = fewest_errors(values[reference & m.whole], values[in_motion & m.whole], least)
+            threshold, _ = fewest_errors(values[reference & m.whole], values[in_motion & m.whole], least)
         mask = values < threshold
         return Detection(name, m.t, values, threshold, mask, spans_of(mask, m.t, m.half), notes)
 
@@ -222,19 +224,3 @@ def _idling(scene: Scene, g: float) -> Array:
     # along gravity the lines change the size of the force: its mean is g + A^2/g, about which it scatters by A
     size = g + force**2 / g
     return np.array([[0.0, 0.0, g, 0.0, 0.0, 0.0, size, g**2 + 3.0 * force**2, 3.0 * rate**2]])
-
-
-def fewest_errors(still: Array, moving: Array, least: float) -> float:
-    """Threshold that calls the smallest share of still windows moving plus of moving windows still, at least `least`.
-
-    Of several that do equally well, the middle one by their logarithm.
-    """
-    if not len(still):
-        return least
-    x, y = np.sort(log_statistic(still)), np.sort(log_statistic(moving))
-    if not len(y):
-        return max(least, float(10.0 ** x[-1]) * 2.0)
-    grid = np.linspace(min(x[0], y[0]), max(x[-1], y[-1]), 400)
-    wrong = 1.0 - np.searchsorted(x, grid) / len(x) + np.searchsorted(y, grid) / len(y)
-    best = np.flatnonzero(wrong <= wrong.min() + 1e-12)
-    return max(least, float(10.0 ** grid[best[len(best) // 2]]))

@@ -20,13 +20,14 @@ import numpy as np
 from graphnav.config.detectors import LowBandSettings
 from graphnav.detectors.base import NONE, Detection, longer_than, spans_of, within
 from graphnav.detectors.scene import Detector, Labels, Scene
-from graphnav.detectors.thresholds import FEWEST, MISLABELLED, MISTAKEN, MOVING, log_statistic, valley
+from graphnav.detectors.thresholds import FEWEST, MISLABELLED, MISTAKEN, log_statistic, valley
 from graphnav.detectors.windows import LowPassed, running, unbroken, window_times
 from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 
 NAME = "low_band_glrt"
 _DOWN, _UP = 1.5, 0.7  # decades that the data may move the threshold down and up
+_MOVING = 30.0  # s of certain motion that say where the threshold must not be
 _QUIETEST = 1.0  # s that say how much noise there can be at most
 _TRUSTED = 0.05  # of the stated noise is the least that is believed
 _OVERSTATED = 2.0  # times what the quietest windows allow
@@ -136,7 +137,7 @@ def _threshold(
         # noise that hides so much is not believed, and no population stands out: what is left is 3 sigma of the sway
         start = min(start, float(np.log10(9.0 * swaying)))
         notes = ("the IMU's stated noise is too large to tell stops by it: only the stillest stretches count",)
-    if label.sum() * period >= MOVING:
+    if label.sum() * period >= _MOVING:
         # some of these windows may be mislabelled; the threshold keeps clear of the others
         start = min(start, max(float(np.quantile(x[label], MISTAKEN)) - np.log10(2.0), start - _DOWN))
     return float(10.0**start), notes
