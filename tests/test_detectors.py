@@ -410,6 +410,9 @@ def test_the_command_writes_what_it_promises(tmp_path, capsys):
         (["detect", "kitti", "-o", "out", "--start", "50", "--end", "40"], "--end 40"),
         (["detect", "kitti", "-o", "out", "--without", "odometer"], "has none"),
         (["detect", "kitti"], "-o"),
+        (["detect", "kitti", "-o", "out", "--detectors", "fft,sway"], "no detector 'sway'"),
+        (["detect", "kitti", "-o", "out", "--detectors", "fft,fused"], "name it alone"),
+        (["smooth", "kitti", "-o", "out", "--detectors", ""], "names no detector"),
     ],
 )
 def test_bad_input_is_one_line(arguments, reason, tmp_path, monkeypatch, capsys):

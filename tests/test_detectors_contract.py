@@ -8,12 +8,17 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from helpers import random_states
 from road import made, with_gnss
 
 from graphnav.config import Settings, settings_from
 from graphnav.config.detectors import FUSED, DetectorName
 from graphnav.detectors import base, detect, registered, stops
+from graphnav.earth import LocalFrame
+from graphnav.pipeline import run
+from graphnav.problem import pose
 from graphnav.recording import Imu, Recording
+from graphnav.stops import stops_of_solution
 
 NAMES = (FUSED, *registered())
 LEGS = [(40, 0), (6, 12), (30, 12), (6, 0), (40, 0), (5, 10), (20, 10)]
@@ -130,3 +135,32 @@ def test_the_old_name_of_a_table_is_read_and_said() -> None:
     assert old.detectors.low_band_glrt.threshold == 4.5
     assert any("low_band_glrt" in note for note in detect(drive(), old).notes)
     assert Settings.model_validate(old.model_dump()).detectors.low_band_glrt.threshold == 4.5
+
+
+@pytest.mark.parametrize("name", sorted(registered()))
+def test_each_alone_puts_rows_into_the_problem_of_all_solvers(name: str) -> None:
+    recording, settings = drive().crop(70.0, 130.0), firing(name)
+    assert recording.gnss is not None
+    frame = LocalFrame(recording.gnss.llh[0])
+    spans = detect(recording, settings).stationary
+    posed = pose(recording, settings, frame, random_states(np.random.default_rng(0), 1), np.ones(15), spans)
+    rows = {c.name: posed.t[c.keyframe] for c in posed.constraints if c.of_stops}
+    assert set(rows) == {"zero_velocity", "zero_rate", "held_position"}
+    for t in rows.values():
+        assert ((t > spans[0, 0] - 0.02) & (t < spans[0, 1] + 0.02)).all()
+        assert len(t) >= np.sum((posed.t > spans[0, 0] + 0.02) & (posed.t < spans[0, 1] - 0.02))
+
+
+def test_filter_isam2_and_batch_use_the_rows_of_one_detector() -> None:
+    recording = drive().crop(70.0, 130.0)
+    assert recording.gnss is not None
+    every = {k: getattr(recording.gnss, k)[::5] for k in ("t", "llh", "sd", "v", "sd_v")}
+    settings = firing("fft").model_copy(update={"noise": Settings().noise.model_copy(update={"mode": "stated"})})
+    used = replace(recording, gnss=replace(recording.gnss, **every))
+    for solution in run(used, settings, ("ekf", "isam2", "batch")).values():
+        (stop,) = stops_of_solution(solution)
+        assert set(stop.fired) == {"fft"}
+        assert set(stop.rows) == {"zero_velocity", "zero_rate", "held_position"}
+        still = (solution.t > stop.start) & (solution.t < stop.end)
+        assert np.sum(still) <= stop.rows["zero_velocity"] <= np.sum(still) + 1
+        assert np.abs(solution.states.v[still]).max() < 0.02
