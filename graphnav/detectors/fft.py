@@ -66,7 +66,8 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
         return Detection("fft", t, np.full(len(t), np.nan), 1.0, t < t, NONE, (f"no FFT detection: {reason}",))
     whole = t_last - t_first < (1.0 + _STRETCH) * length * period
     half = 0.5 * length * period
-    inner = whole & (_calm(w, t, half, scene) if labels is None else within(t, labels.still, half))
+    calm = np.zeros(w.count) if labels is not None else _calm(w, settings)
+    inner = whole & (within(t, labels.still, half) if labels else (calm < 1.0) & ~within(t, scene.certain, half))
     line = idle_line(w, np.flatnonzero(inner)) if settings.find_line else None
     notes: list[str] = []
     if settings.find_line and line is None:
@@ -96,7 +97,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     found = np.full(w.count, np.nan)
     if usable:
         found = np.where(whole, np.nanmax(np.where(asked, quotient, np.nan), axis=1), np.nan)
-        found = np.maximum(found, _speed_quotient(t, settings, scene.known))
+        found = np.maximum(np.maximum(found, calm), _speed_quotient(t, settings, scene.known))
     mask = found < 1.0
     details = {"peak_frequency": where, "peak_amplitude": height, "bands": np.array(bands), **picture}
     if line is not None:
@@ -105,17 +106,16 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     return Detection("fft", t, found, 1.0, mask, spans, tuple(notes), details)
 
 
-def _calm(w: Windows, t: Array, half: float, scene: Scene) -> Mask:
-    """Windows in which the engine may idle, where nothing else says so: the line is looked for in them.
+def _calm(w: Windows, settings: FftSettings) -> Array:
+    """(W,) below 1 where the engine may idle, for a detector that nobody tells what stands.
 
-    Below the lowest idle line no peak may rise above the paper's limits, and where windows fall into two populations
-    by what they have there, it is the lower one. What odometer or GNSS know to move does not count.
+    Below the lowest idle line no peak may rise above the paper's limits, nor, where windows fall into two populations
+    by what they have there, above the lower one.
     """
     height = _measure(w, [(0.0, LOWEST)])[0][:, :, 0]
-    x = log_statistic((height / _limits(scene.settings.fft)).max(axis=1))
-    calm = (x < 0.0) & ~within(t, scene.certain, half)
+    x = log_statistic((height / _limits(settings)).max(axis=1))
     split = valley(x, float(np.nanmin(x)), 0.0, FEWEST_WINDOWS)
-    return np.asarray(calm if split is None else calm & (x < split))
+    return np.asarray(10.0 ** (x - (0.0 if split is None else split)))
 
 
 def _shows(height: Array, where: Array, line: IdleLine) -> Mask:
