@@ -129,6 +129,9 @@ def test_spans_are_sets():
     np.testing.assert_array_equal(covered(grid, joined), in_one)
     np.testing.assert_array_equal(covered(grid, base.without(joined, taken)), in_one & ~in_other)
     assert len(base.without(joined, np.array([[-1.0, 200.0]]))) == 0
+    shared = [np.sum(in_one & (grid >= a) & (grid <= b)) * 0.013 for a, b in taken]
+    np.testing.assert_allclose(base.seconds_in(joined, taken), shared, atol=0.013 * 2 * len(joined))
+    np.testing.assert_allclose(base.seconds_in(joined, joined), np.diff(joined).ravel())
     runs = base.spans_of(in_one, grid)
     assert len(runs) == len(joined)
     assert np.abs(runs - joined).max() < 0.013

@@ -8,8 +8,9 @@ amplitudes from 0 to 10, 10 to 20 and 20 to 30 Hz. A window is stationary if
     1.5 Peak-1 > Peak-0 and 1.5 Peak-2 > Peak-0 of both forces, and Peak-1 >= 7 Peak-0 of the pitch rate.
 
 The statistic is the largest of these quotients, so that it is below 1 where all hold. The paper's bands belong to an
-idle line at 12.5 Hz. Here the line is found in what else is known to be still, and the bands move with it. A ratio
-that this engine does not meet while it idles (no second harmonic, no pitch) is not asked for.
+idle line at 12.5 Hz. Here the line is found in what else is known to be still, or alone in what is calm below any idle
+line, and the bands move with it. A ratio that this engine does not meet while it idles (no second harmonic, no pitch)
+is not asked for. Alone, every window has to be as calm, because an engine idles while a vehicle rolls as well.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
         return Detection("fft", t, np.full(len(t), np.nan), 1.0, t < t, NONE, (f"no FFT detection: {reason}",))
     whole = t_last - t_first < (1.0 + _STRETCH) * length * period
     half = 0.5 * length * period
-    calm = np.zeros(w.count) if labels is not None else _calm(w, settings)
+    calm = _calm(w, settings) if labels is None and settings.find_line else np.zeros(w.count)
     inner = whole & (within(t, labels.still, half) if labels else (calm < 1.0) & ~within(t, scene.certain, half))
     line = idle_line(w, np.flatnonzero(inner)) if settings.find_line else None
     notes: list[str] = []
