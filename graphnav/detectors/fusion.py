@@ -83,6 +83,22 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
     return float(t[max(stop - 1, begin)])
 
 
+def _without_speed(b: Blocks, spans: Array, settings: FusionSettings) -> Array:
+    """The spans cut where the force, integrated from `_LOOK` s inside, leads to a speed: braking that looked still."""
+    limit = 0.5 * settings.bridge_speed
+    out = spans.copy()
+    for k, (start, end) in enumerate(spans):
+        inside = min(_LOOK, 0.5 * (end - start - _INNER))
+        if inside <= 0.0:
+            continue
+        first, last = (
+            at_rest_until(b, np.array([start + inside, end]), -1, inside, limit),
+            at_rest_until(b, np.array([start, end - inside]), 1, inside, limit),
+        )
+        out[k] = max(start, first), min(end, last)
+    return out[out[:, 1] > out[:, 0]]
+
+
 def candidates(scene: Scene, found: Detection, limit: float) -> tuple[Array, Array, tuple[str, ...]]:
     """Still stretches with their edges found, without those that move; what of certain motion is; and sentences.
 
@@ -93,6 +109,8 @@ def candidates(scene: Scene, found: Detection, limit: float) -> tuple[Array, Arr
     """
     b, speeds, certain = scene.blocks, scene.known, scene.certain
     spans = edges(b, found.intervals, low_band(scene)[1], limit)
+    if found.name != LOW_BAND:  # whose windows end where these rows do
+        spans = _without_speed(b, spans, scene.settings.fusion)
     spans = merged(longer_than(spans, 3.0 * b.period))
     if not len(spans):
         return NONE, certain, ()
@@ -113,7 +131,10 @@ def candidates(scene: Scene, found: Detection, limit: float) -> tuple[Array, Arr
             f"{100.0 * share:.0f} % of the seconds in certain motion are as still as a stop (a simulation without "
             f"road?): a stop needs a measured speed as well, which {_count(int(unseen.sum()))} without"
         )
-    return without(spans[~moves], certain), certain, tuple(notes)
+    spans = without(spans[~moves], certain)
+    if found.name != LOW_BAND and len(certain):  # ends that certain motion has made are no better than it is timed
+        spans = _without_speed(b, spans, scene.settings.fusion)
+    return spans, certain, tuple(notes)
 
 
 def _felt(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array) -> Array:
