@@ -55,8 +55,9 @@ def drives(folder: Path, names: list[str]) -> Iterator[Drive]:
         recording = load(folder / name)
         meta = folder / name / "meta.json"
         stated = json.loads(meta.read_text(encoding="utf-8")).get("stops_s") if meta.exists() else None
-        if stated is not None:
-            stops, t = np.array(stated), np.array([recording.start, recording.end])
+        if stated is not None:  # told from the fixes, too
+            assert recording.gnss is not None
+            stops, t = np.array(stated), recording.gnss.t
         else:
             of = recording.truth or recording.gnss
             assert of is not None
