@@ -99,17 +99,14 @@ def _without_speed(b: Blocks, spans: Array, settings: FusionSettings) -> Array:
     return out[out[:, 1] > out[:, 0]]
 
 
-def candidates(scene: Scene, found: Detection, limit: float) -> tuple[Array, Array, tuple[str, ...]]:
-    """Still stretches with their edges found, without those that move; what of certain motion is; and sentences.
-
-    Parameters
-    ----------
-    found : by a detector.
-    limit : of S of a single low-passed row, beyond which it is no longer still.
-    """
+def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str, ...]]:
+    """What a detector found as stretches with edges, without those that move; what of certain motion is; sentences."""
     b, speeds, certain = scene.blocks, scene.known, scene.certain
+    by_rows = found.name == LOW_BAND  # its windows are of the rows in which edges are sought
+    # a threshold that the data moved up is for windows; an edge is where the noise and sway of a row end
+    limit = min(float(np.max(found.threshold)), _EDGE) if by_rows else _EDGE
     spans = edges(b, found.intervals, low_band(scene)[1], limit)
-    if found.name != LOW_BAND:  # whose windows end where these rows do
+    if not by_rows:
         spans = _without_speed(b, spans, scene.settings.fusion)
     spans = merged(longer_than(spans, 3.0 * b.period))
     if not len(spans):
@@ -132,7 +129,7 @@ def candidates(scene: Scene, found: Detection, limit: float) -> tuple[Array, Arr
             f"road?): a stop needs a measured speed as well, which {_count(int(unseen.sum()))} without"
         )
     spans = without(spans[~moves], certain)
-    if found.name != LOW_BAND and len(certain):  # ends that certain motion has made are no better than it is timed
+    if not by_rows and len(certain):  # ends that certain motion has made are no better than it is timed
         spans = _without_speed(b, spans, scene.settings.fusion)
     return spans, certain, tuple(notes)
 
@@ -244,8 +241,7 @@ class Decision:
 def decide(scene: Scene, detector: type[Detector], shown: bool) -> Decision:
     """What one detector comes to by itself: its intervals, held against measured speeds and the force between them."""
     found = detector.detect(scene, None, shown)
-    limit = min(float(np.max(found.threshold)), _EDGE) if detector.name == LOW_BAND else _EDGE
-    still, certain, notes = candidates(scene, found, limit)
+    still, certain, notes = candidates(scene, found)
     spans, disturbed = fuse(scene.blocks, still, NONE, certain, scene.settings.fusion)
     return Decision(spans, disturbed, (*found.notes, *notes), (found,))
 
@@ -270,8 +266,7 @@ def decide_fused(scene: Scene, detectors: Mapping[str, type[Detector]], shown: b
     shown : whether the answers of those that decide nothing are wanted.
     """
     low, _ = low_band(scene)
-    # a threshold that the data moved up is for windows; an edge is where the noise and sway of a row end
-    still, certain, notes = candidates(scene, low, min(float(np.max(low.threshold)), _EDGE))
+    still, certain, notes = candidates(scene, low)
     half = 0.5 * scene.settings.low_band_glrt.window
     labels = Labels(still, spans_of(low.statistic > _CLEARLY * low.threshold, low.t, half))
     notes = (*low.notes, *notes)
