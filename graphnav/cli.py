@@ -20,6 +20,7 @@ from graphnav.cli_options import (
     AllowOutside,
     Config,
     End,
+    Fire,
     Json,
     Out,
     Profile,
@@ -29,6 +30,7 @@ from graphnav.cli_options import (
     Start,
     Topic,
     Without,
+    firing,
     only,
     withheld_of,
 )
@@ -114,6 +116,7 @@ def detect(
     recording: Source,
     out: Out,
     config: Config = None,
+    detectors: Fire = None,
     without: Without = None,
     start: Start = None,
     end: End = None,
@@ -130,7 +133,7 @@ def detect(
     from graphnav.staging import moved, staged
 
     withheld = withheld_of(without, start, end)
-    settings = read_settings(config)
+    settings = firing(read_settings(config), detectors)
     folder = outputs.output_folder(out)
     with bar(quiet, "detect"), outside_allowed(allow_outside):
         tell("reading")

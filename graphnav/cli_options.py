@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from graphnav.errors import ConfigError
+
+if TYPE_CHECKING:
+    from graphnav.config import Settings
 
 Source = Annotated[
     str, typer.Argument(metavar="RECORDING", help="A folder, a .toml, a known log, or a built-in name such as kitti.")
@@ -47,6 +50,15 @@ Noise = Annotated[
         "--noise",
         metavar="stated|estimated|FILE",
         help="How good the sensors are: as stated, estimated, or as in a file or the summary.json of a run.",
+    ),
+]
+Fire = Annotated[
+    str | None,
+    typer.Option(
+        "--detectors",
+        metavar="NAMES",
+        help="Who decides where it stands: fused (default), or some of fft,glrt,low_band_glrt,acceleration_variance,"
+        "acceleration_magnitude,angular_rate_energy, each of which then suffices.",
     ),
 ]
 Topic = Annotated[
@@ -89,3 +101,24 @@ def withheld_of(without: list[str] | None, start: float | None, end: float | Non
     if start is not None and end is not None and not start < end:
         raise ConfigError(f"--end {end:g}: must be later than --start {start:g}")
     return tuple(workflow.parse_withheld(one) for one in without or ())
+
+
+def firing(settings: Settings, names: str | None) -> Settings:
+    """The settings with the detectors of --detectors; as they are without.
+
+    Raises
+    ------
+    ConfigError
+        If one is not known.
+    """
+    if names is None:
+        return settings
+    from typing import get_args
+
+    from graphnav.complaints import listed
+    from graphnav.config.detectors import FUSED, DetectorName
+
+    fire = listed(names, get_args(DetectorName), "--detectors", "detector")
+    if FUSED in fire and len(fire) > 1:
+        raise ConfigError(f"--detectors {names}: '{FUSED}' is all detectors together: name it alone, or name detectors")
+    return settings.model_copy(update={"detectors": settings.detectors.model_copy(update={"fire": fire})})

@@ -15,6 +15,7 @@ from graphnav.cli_options import (
     Config,
     End,
     Export,
+    Fire,
     Json,
     Noise,
     Out,
@@ -28,6 +29,7 @@ from graphnav.cli_options import (
     Start,
     Topic,
     Without,
+    firing,
     only,
     withheld_of,
 )
@@ -50,6 +52,7 @@ def smooth(
     profile: Profile = None,
     config: Config = None,
     noise: Noise = None,
+    detectors: Fire = None,
     without: Without = None,
     rate: Rate = None,
     start: Start = None,
@@ -65,21 +68,9 @@ def smooth(
 ) -> None:
     """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
     asked = _Asked(
-        only(context, recording),
-        out,
-        profile,
-        config,
-        noise,
-        without,
-        rate,
-        start,
-        end,
-        require,
-        topic,
-        quiet,
-        json,
-        pages,
-    )
+        only(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
+        quiet, json, pages,
+    )  # fmt: skip
     with outside_allowed(allow_outside):
         _solve(asked, solver, "--solver", export, point)
 
@@ -103,6 +94,7 @@ def compare(
     profile: Profile = None,
     config: Config = None,
     noise: Noise = None,
+    detectors: Fire = None,
     without: Without = None,
     rate: Rate = None,
     start: Start = None,
@@ -132,21 +124,9 @@ def compare(
 ) -> None:
     """Put the same recording through several solvers and compare them, against the truth where there is one."""
     asked = _Asked(
-        only(context, recording),
-        out,
-        profile,
-        config,
-        noise,
-        without,
-        rate,
-        start,
-        end,
-        require,
-        topic,
-        quiet,
-        json,
-        pages,
-    )
+        only(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
+        quiet, json, pages,
+    )  # fmt: skip
     beside = _Beside(against or [], against_point or [], against_shift or [])
     for option, values in (("--against-point", beside.points), ("--against-shift", beside.shifts)):
         if values and len(values) != len(beside.files):
@@ -184,6 +164,7 @@ class _Asked:
     profile: str | None
     config: Path | None
     noise: str | None
+    detectors: str | None
     without: list[str] | None
     rate: float | None
     start: float | None
@@ -226,8 +207,8 @@ def _solve(
     requirements = [gates.parse_requirement(one, chosen) for one in asked.require or ()]
     given: dict[str, Any] = {
         "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
-        "config": asked.config and str(asked.config), "noise": asked.noise, "without": asked.without,
-        "rate": asked.rate, "start": asked.start, "end": asked.end, "topic": asked.topic,
+        "config": asked.config and str(asked.config), "noise": asked.noise, "detectors": asked.detectors,
+        "without": asked.without, "rate": asked.rate, "start": asked.start, "end": asked.end, "topic": asked.topic,
         "against": (beside and [str(file) for file in beside.files]) or None,
     }  # fmt: skip
     folder = outputs.output_folder(asked.out, outputs.FILES, () if alone else chosen)
@@ -242,7 +223,8 @@ def _solve(
             raise ConfigError(f"--against {file}: no such file")
         of = convert.parse_point(beside.points[k] if beside.points else None, "--against-point")
         against.append(workflow.Against(file, of, beside.shifts[k] if beside.shifts else None))
-    settings, noise = workflow.parse_noise(asked.noise, read_settings(asked.config, asked.profile))
+    settings = firing(read_settings(asked.config, asked.profile), asked.detectors)
+    settings, noise = workflow.parse_noise(asked.noise, settings)
     request = workflow.Request(
         asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
         {k: v for k, v in given.items() if v is not None}, noise, exported=exported, point=point,

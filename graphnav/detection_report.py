@@ -10,10 +10,10 @@ import numpy as np
 
 from graphnav import page, plots, report_pictures
 from graphnav.detectors import Detections
-from graphnav.detectors.base import intervals_text
 from graphnav.exporters.digits import rows_text
 from graphnav.recording import Recording
 from graphnav.rotation import Array
+from graphnav.stops import Stop, detections_text, stops_of
 
 _LISTED = 30  # stops
 _WIDTH = 720.0  # points, of the PNG
@@ -23,7 +23,7 @@ def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
     """All files; times are on the recording's clock, as in trajectory.csv."""
     folder.mkdir(parents=True, exist_ok=True)
     intervals, statistics, plot = (folder / n for n in ("detections.csv", "statistics.csv.gz", "detections.png"))
-    intervals.write_text(intervals_text(found.all), encoding="utf-8")
+    intervals.write_text(detections_text(found.all), encoding="utf-8")
     # no name and no time in the header: the same recording gives the same bytes
     with statistics.open("wb") as raw, gzip.GzipFile("", "wb", 5, raw, mtime=0) as file:
         file.write(statistics_text(found).encode())
@@ -35,14 +35,22 @@ def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
 
 def _page(recording: Recording, found: Detections) -> str:
     spans = found.stationary - recording.start
-    rows = [[page.Raw(f"{a:.2f} s"), page.Raw(f"{b:.2f} s"), page.Raw(f"{b - a:.2f} s")] for a, b in spans]
+    rows = [
+        [page.Raw(f"{a:.2f} s"), page.Raw(f"{b:.2f} s"), page.Raw(f"{b - a:.2f} s"), fired_text(stop)]
+        for (a, b), stop in zip(spans, stops_of(found.all), strict=True)
+    ]
     lead = [page.paragraph(line) for line in _words(recording, found)]
     sections = [
         ("What they saw", [page.gallery(report_pictures.detection_pictures(recording, found.all))]),
-        ("Where it stands", [page.table(["from", "to", "for"], rows)] if rows else []),
+        ("Where it stands", [page.table(["from", "to", "for", "share by detector"], rows)] if rows else []),
         ("Notes", [page.bullets(found.notes)] if found.notes else []),
     ]
     return page.page(f"{recording.name}: detectors", lead, sections)
+
+
+def fired_text(stop: Stop) -> str:
+    """Who found a stop, and which share of it."""
+    return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in stop.fired.items())
 
 
 def statistics_text(found: Detections) -> str:
@@ -77,6 +85,7 @@ def values(recording: Recording, found: Detections) -> dict[str, Any]:
         "recording": recording.name,
         "duration_s": recording.duration,
         "stationary": found.stationary,
+        "stops": [{key: x for key, x in stop.values().items() if key != "rows"} for stop in stops_of(found.all)],
         "seconds_by_detector": {d.name: float(np.diff(d.intervals).sum()) for d in found.all},
         "notes": found.notes,
     }

@@ -17,11 +17,11 @@ import numpy as np
 import graphnav
 from graphnav import stored
 from graphnav.against import antenna_lever_arm, own
-from graphnav.detectors.base import intervals_text
 from graphnav.errors import ConfigError, PartlyWrittenError
 from graphnav.files import exists
 from graphnav.plain import peak_memory_mb, write_json
 from graphnav.solution import ParameterEstimate, Solution
+from graphnav.stops import detections_text, stops_of_solution
 from graphnav.stored import read_again, sha256, write_outcome
 from graphnav.workflow import Outcome, outages
 
@@ -179,7 +179,8 @@ def write_solver(
     began = time.perf_counter()
     write_all(solution.blocks(outcome.request.rate), folder, f"{outcome.recording.name}, {name}")
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
-    (folder / "detections.csv").write_text(intervals_text(solution.detections), encoding="utf-8")
+    text = detections_text(solution.detections, solution.records)
+    (folder / "detections.csv").write_text(text, encoding="utf-8")
     written = time.perf_counter()
     report = folder / "report.html"
     failed = _attempt(lambda _: _draw_solver(outcome, name, folder, provenance, detectors), report) if pages else []
@@ -251,7 +252,11 @@ def solver_summary(
         "keyframes": len(solution.t),
         "counts": solution.counts,
         "rejected": rejected,
-        "stationary": {"stops": len(solution.stationary), "seconds": float(np.diff(solution.stationary).sum())},
+        "stationary": {
+            "stops": len(solution.stationary),
+            "seconds": float(np.diff(solution.stationary).sum()),
+            "each": [stop.values() for stop in stops_of_solution(solution)],
+        },
         "iterations": solution.iterations,
         "passes": {"filter": 0, "smoother": 0, **solution.passes, "eliminations": solution.iterations},
         "noise": noise_summary(outcome, solution),

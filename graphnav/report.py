@@ -81,7 +81,7 @@ def write_report(
             ],
         ),
         ("Noise model", [*tables.noise_tables(noise, solution), *tables.excluded_table(solution, start)]),
-        ("Detectors", _gallery(detectors)),
+        ("Detectors", [*_gallery(detectors), *tables.stop_table(solution, start)]),
         ("What was odd", tables.odd(recording, findings)),
         ("How it ran", tables.run_table(only)),
         ("Provenance", provenance_tables(settings, provenance)),

@@ -15,6 +15,7 @@ from graphnav.panels.drawing import Spans
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.stops import stops_of_solution
 
 if TYPE_CHECKING:
     from graphnav.metrics import Errors
@@ -344,6 +345,26 @@ def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Raw
     if isinstance(spans, Sequence) and spans and isinstance(spans[0], Mapping):
         inner = Raw(inner + page.table(list(spans[0]), [[s.get(k) for k in spans[0]] for s in spans]))
     return [page.folded(f"All measures{' of ' if name else ''}{name}", inner)]
+
+
+def stop_table(solution: Solution, start: float) -> list[Raw]:
+    """Every stop: who found which share of it, and how many rows of which constraint came of it."""
+    stops = stops_of_solution(solution)
+    if not stops:
+        return []
+    rows = [
+        [
+            Raw(f"{stop.start - start:.2f} s"),
+            Raw(f"{stop.end - stop.start:.2f} s"),
+            ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in stop.fired.items()),
+            ", ".join(f"{count} {name}" for name, count in stop.rows.items()) or "none",
+        ]
+        for stop in stops[:_LISTED]
+    ]
+    note = "Share: of the stop that a detector by itself calls stationary."
+    if len(stops) > _LISTED:
+        note += f" {len(stops) - _LISTED} more are in detections.csv."
+    return [page.table(["stands from", "for", "share by detector", "rows"], rows), page.paragraph(note, "soft")]
 
 
 def odd(recording: Recording, findings: Sequence[str]) -> list[Raw]:

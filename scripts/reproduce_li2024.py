@@ -1,11 +1,13 @@
 """Li 2024 on simulated drives: the idling engine's lines, stops found by FFT, and zero velocity through them.
 
     python scripts/reproduce_li2024.py --seeds 5 -o build/li2024
+    python scripts/reproduce_li2024.py --seeds 5 --fire fused,fft
 
 Prints the paper's Tables 4, 5 and 6 beside ours, and what the paper does not give: false alarms while moving, and how
 early or late stops begin and end. Each seed has an engine speed of its own. As in the paper every stop is run by
 itself, from the start of the drive to the end of the stop, with GNSS gone from its first second. The paper's figures
-are of a real drive with sensors of the same grade; ours are simulated.
+are of a real drive with sensors of the same grade; ours are simulated. With `--fire` the same for other detectors,
+each of which then decides by itself.
 """
 
 from __future__ import annotations
@@ -68,27 +70,31 @@ def share(spans: Array, seconds: Array) -> Array:
     return np.any([(seconds >= a) & (seconds <= b) for a, b in spans], axis=0) if len(spans) else seconds < -np.inf
 
 
-def detection(made: Simulated) -> dict[str, list[float]]:
-    """Per detector: % of the seconds of each long stop, of all three, false alarms, start and end against truth."""
+def firing(fire: str) -> Settings:
+    return settings_from({"detectors": {"fire": [fire]}})
+
+
+def detection(made: Simulated, fires: list[str]) -> dict[str, list[float]]:
+    """Per detector, and per what decides: % of the seconds of each long stop, of all, false alarms, late by (s)."""
     # as in the paper the speed comes from GNSS or the filter, not from the wheels; GNSS is gone in the stops
     recording = without_gnss(made.recording, stops_of(made))
     truth, out = made.stops, {}
     t = np.arange(recording.start + 0.5, recording.end, 1.0)
     standing = share(truth, t)
     edge = share(np.stack([truth[:, 0] - 1.0, truth[:, 1] + 1.0], -1), t) & ~standing
-    for one in detect(recording, Settings()).all:
-        if one.name not in ("fft", "glrt", "fused"):
-            continue
-        said = share(one.intervals, t)
+    answers = {fire: detect(recording, firing(fire)) for fire in fires}
+    spans = {one.name: one.intervals for one in answers["fused"].all if one.name in ("fft", "glrt")}
+    for name, found in [*spans.items(), *((f"{fire} decides", one.stationary) for fire, one in answers.items())]:
+        said = share(found, t)
         rates = [100.0 * np.mean(said[(t >= a) & (t <= b)]) for a, b in stops_of(made)]
         inside = share(np.array(stops_of(made)), t)
         begin, end = [], []
         for a, b in stops_of(made):
-            own = one.intervals[(one.intervals[:, 1] > a) & (one.intervals[:, 0] < b)]
+            own = found[(found[:, 1] > a) & (found[:, 0] < b)]
             if len(own):
                 begin.append(own[0, 0] - a)
                 end.append(own[-1, 1] - b)
-        out[one.name] = [*rates, 100.0 * np.mean(said[inside]), 100.0 * np.mean(said[~standing & ~edge]),
+        out[name] = [*rates, 100.0 * np.mean(said[inside]), 100.0 * np.mean(said[~standing & ~edge]),
                          float(np.mean(begin)), float(np.mean(end))]  # fmt: skip
     return out
 
@@ -107,16 +113,17 @@ def variation(solution: Solution, stop: tuple[float, float]) -> Array:
     return np.stack([np.sqrt(np.mean(d**2, axis=0)), d.std(axis=0), np.abs(d).max(axis=0)])
 
 
-def drifts(made: Simulated) -> tuple[dict[str, Array], float]:
+def drifts(made: Simulated, fires: list[str]) -> tuple[dict[str, Array], float]:
     """Solver -> (3 stops, 3, 3) variations, and how far the unconstrained filter is away (km) after the first."""
-    out: dict[str, list[Array]] = {name: [] for name in SOLVERS}
+    out: dict[str, list[Array]] = {f"{name}, {fire} decides": [] for fire in fires for name in SOLVERS}
     whole = made.recording
     far = 0.0
     for number, stop in enumerate(stops_of(made)):
         # a keyframe after the last motion, none after the stop: nothing later may help
         part = without_gnss(whole.crop(0.0, stop[1] - whole.start), [(stop[0] - 0.5, stop[1] + 1.0)])
-        for name, solution in run(replace(part, truth=None)).items():
-            out[name].append(variation(solution, stop))
+        for fire in fires:
+            for name, solution in run(replace(part, truth=None), firing(fire)).items():
+                out[f"{name}, {fire} decides"].append(variation(solution, stop))
         if number == 0:
             free = settings_from({"standstill": OFF, "vehicle": {"nhc": False, "odometer": False}})
             far = float(variation(run(part, free, ("ekf",))["ekf"], stop)[2].max() / 1e5)
@@ -127,8 +134,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--short", action="store_true", help="stops of 60 to 120 s instead of 16 to 22 min")
+    parser.add_argument("--fire", default="fused", help="fused, and detectors that decide alone, with commas between")
     parser.add_argument("-o", "--out", type=Path, default=Path("build/li2024"))
     options = parser.parse_args()
+    fires = list(dict.fromkeys(["fused", *options.fire.split(",")]))
     rates: dict[str, list[list[float]]] = {}
     drift: dict[str, list[Array]] = {}
     free = []
@@ -136,9 +145,9 @@ def main() -> None:
         made = simulate("li2024", seed, short=options.short, engine_hz=ENGINES[seed % len(ENGINES)])
         if seed == 0:
             spectrum(made)
-        for name, row in detection(made).items():
+        for name, row in detection(made, fires).items():
             rates.setdefault(name, []).append(row)
-        found, far = drifts(made)
+        found, far = drifts(made, fires)
         free.append(far)
         for name, rows in found.items():
             drift.setdefault(name, []).append(rows)

@@ -94,7 +94,13 @@ def test_compare_writes_what_it_promises(compared):
         assert {p.name for p in (out / solver).iterdir()} == FILES
         assert (out / solver / "trajectory.csv").read_text().splitlines()[0] == TRAJECTORY_COLUMNS
         found = rows(out / solver / "detections.csv")
-        assert [list(found[0]), found[-1]["detector"]] == [["start", "end", "detector"], "fused"]
+        assert [list(found[0]), found[-1]["detector"]] == [["start", "end", "detector", "fired", "rows"], "fused"]
+        each = summary(out / solver)["stationary"]["each"]
+        assert [row["fired"].split(":")[0] for row in found if row["fired"]] == [next(iter(s["fired"])) for s in each]
+        for row, stop in zip([row for row in found if row["rows"]], each, strict=True):
+            assert row["rows"] == " ".join(f"{name}:{count}" for name, count in stop["rows"].items())
+            assert set(stop["rows"]) == {"zero_velocity", "zero_rate", "held_position"}
+            assert stop["rows"]["held_position"] == stop["rows"]["zero_velocity"] + 1  # one where the stop begins
         assert "<html" in (out / solver / "report.html").read_text(encoding="utf-8")
 
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import signal
+from road import MG, made, with_gnss
 
 from graphnav import cli
 from graphnav.config import Settings
@@ -18,63 +18,8 @@ from graphnav.config.detectors import FftSettings, FusionSettings
 from graphnav.detectors import base, detect, fft, glrt, motion, spectrum, stops, thresholds, windows
 from graphnav.formats import read
 from graphnav.formats.writing import write_folder
-from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
+from graphnav.recording import Imu, ImuNoise, Odometer, Recording
 from graphnav.simulation import simulate
-
-NOISE = ImuNoise(gyro_noise_density=1.7e-5, accel_noise_density=5.9e-4)
-MG = 9.80665e-3
-
-
-# ---- a drive of our own making: legs on a straight road, independent of graphnav.simulation
-
-
-def made(seed, legs, *, rate=200.0, engine=12.5, road=1.0, shakes=()):
-    """(recording, t, speed): legs are (seconds, speed at their end); shakes are (start, seconds, m/s^2) at rest."""
-    rng = np.random.default_rng(seed)
-    n = int(sum(seconds for seconds, _ in legs) * rate)
-    t = np.arange(1, n + 1) / rate
-    knots = np.cumsum([0.0, *(seconds for seconds, _ in legs)])
-    v = np.interp(t - 0.5 / rate, knots, [legs[0][1], *(speed for _, speed in legs)])
-    soft = np.hanning(int(0.5 * rate) + 2)[1:-1]
-    v = signal.convolve(np.pad(v, len(soft), mode="edge"), soft / soft.sum(), "same")[len(soft) : -len(soft)]
-    accel, gyro = np.zeros((n, 3)), np.zeros((n, 3))
-    accel[:, 1], accel[:, 2] = np.gradient(v, 1.0 / rate), 9.8
-
-    def coloured(low, high, size):
-        x = signal.lfilter(*signal.butter(2, [low, high], "bandpass", fs=rate), rng.standard_normal(n))
-        return size * x / x.std()
-
-    strength = road * np.sqrt(np.abs(v) / 14.0) * np.abs(v) / (np.abs(v) + 2.0)
-    for axis, force, turn in ((0, 0.15, 0.8), (1, 0.12, 0.8), (2, 0.35, 0.3)):
-        accel[:, axis] += strength * (coloured(0.8, 3.0, force) + coloured(5.0, 14.0, force))
-        gyro[:, axis] += strength * np.radians(coloured(0.6, 3.0, turn))
-    if engine:
-        phase = 2.0 * np.pi * np.cumsum(np.where(v < 0.3, engine, 1.6 * engine + 1.2 * v)) / rate
-        for axis, size in ((0, 0.4), (1, 0.7), (2, 1.0)):
-            accel[:, axis] += 4.0 * MG * size * (np.sin(phase + axis) + 0.6 * np.sin(2.0 * phase + axis))
-        gyro[:, 0] += np.radians(0.3) * np.sin(phase)
-    for start, seconds, size in shakes:
-        x = (t - start) / seconds
-        inside = (x > 0.0) & (x < 1.0)
-        # whole periods within a smooth envelope: it comes back to where it was
-        wave = size * np.sin(2.0 * np.pi * x * round(1.5 * seconds)) * np.sin(np.pi * x) ** 2
-        accel[inside, 0] += wave[inside]
-        gyro[inside, 1] += np.radians(2.0) * wave[inside]
-    accel += NOISE.accel_noise_density * np.sqrt(rate) * rng.standard_normal((n, 3)) + rng.normal(0.0, 0.02, 3)
-    gyro += NOISE.gyro_noise_density * np.sqrt(rate) * rng.standard_normal((n, 3)) + rng.normal(0.0, 2e-3, 3)
-    return Recording("made", "vehicle", Imu(t, gyro, accel, NOISE)), t, v
-
-
-def with_gnss(recording, t, v, outage=(np.inf, np.inf)):
-    """Fixes at 5 Hz on the way east, with velocities, but for an outage."""
-    at = np.arange(t[0], t[-1], 0.2)
-    at = at[(at < outage[0]) | (at > outage[1])]
-    speed = np.interp(at, t, v)
-    way = np.interp(at, t, np.cumsum(v) * (t[1] - t[0]))
-    llh = np.column_stack([np.full(len(at), 0.6), 2.4 + way / (6378137.0 * np.cos(0.6)), np.zeros(len(at))])
-    rng = np.random.default_rng(9)
-    velocity = np.column_stack([speed, 0.0 * speed, 0.0 * speed]) + 0.03 * rng.standard_normal((len(at), 3))
-    return replace(recording, gnss=Gnss(at, llh, np.full_like(llh, 0.02), velocity, np.full_like(llh, 0.03)))
 
 
 def covered(t, spans):
@@ -131,7 +76,7 @@ def test_running_sums_keep_their_digits_over_hours():
     assert len(means) == len(rows) - 49
 
 
-def test_noise_alone_makes_of_the_sway_statistic_what_it_says():
+def test_noise_alone_makes_of_the_low_band_statistic_what_it_says():
     # density, low-pass gain and window against each other: S is near 1 less what the window's own mean takes
     rng = np.random.default_rng(3)
     rate, n = 200.0, 400_000
@@ -184,6 +129,9 @@ def test_spans_are_sets():
     np.testing.assert_array_equal(covered(grid, joined), in_one)
     np.testing.assert_array_equal(covered(grid, base.without(joined, taken)), in_one & ~in_other)
     assert len(base.without(joined, np.array([[-1.0, 200.0]]))) == 0
+    shared = [np.sum(in_one & (grid >= a) & (grid <= b)) * 0.013 for a, b in taken]
+    np.testing.assert_allclose(base.seconds_in(joined, taken), shared, atol=0.013 * 2 * len(joined))
+    np.testing.assert_allclose(base.seconds_in(joined, joined), np.diff(joined).ravel())
     runs = base.spans_of(in_one, grid)
     assert len(runs) == len(joined)
     assert np.abs(runs - joined).max() < 0.013
@@ -310,7 +258,7 @@ def test_a_recording_at_rest_is_one_stop():
 def test_a_passenger_is_bridged_and_a_hop_forward_is_not():
     shaken, t, _ = made(14, [(60, 0)], shakes=((25.0, 4.0, 0.3),))
     found = detect(shaken)
-    assert (found["sway"].statistic > found["sway"].threshold).any()
+    assert (found["low_band_glrt"].statistic > found["low_band_glrt"].threshold).any()
     np.testing.assert_allclose(found.stationary, [[t[0], t[-1]]], atol=0.02)
     assert len(found["fused"].details["disturbed"]) == 1
     hop, t, v = made(14, [(25, 0), (2, 0.5), (2, 0), (31, 0)])
@@ -442,12 +390,12 @@ def test_the_command_writes_what_it_promises(tmp_path, capsys):
     assert "2 stops" in said
     with (out / "detections.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ["start", "end", "detector"]
+    assert list(rows[0]) == ["start", "end", "detector", "fired", "rows"]
     fused = np.array([[float(r["start"]), float(r["end"])] for r in rows if r["detector"] == "fused"])
     np.testing.assert_allclose(fused, [[0.0, 30.0], [56.0, 75.0]], atol=0.6)
     with gzip.open(out / "statistics.csv.gz", "rt") as file:
         table = list(csv.DictReader(file))
-    assert {"t", "sway", "glrt_threshold", "fft_stationary", "fused"} <= set(table[0])
+    assert {"t", "low_band_glrt", "glrt_threshold", "fft_stationary", "fused"} <= set(table[0])
     told = [(float(r["t"]), r["fused_stationary"] == "1") for r in table if r["fused_stationary"]]
     t, called = (np.array(column) for column in zip(*told, strict=True))
     assert len(t) > 700
@@ -465,6 +413,9 @@ def test_the_command_writes_what_it_promises(tmp_path, capsys):
         (["detect", "kitti", "-o", "out", "--start", "50", "--end", "40"], "--end 40"),
         (["detect", "kitti", "-o", "out", "--without", "odometer"], "has none"),
         (["detect", "kitti"], "-o"),
+        (["detect", "kitti", "-o", "out", "--detectors", "fft,sway"], "no detector 'sway'"),
+        (["detect", "kitti", "-o", "out", "--detectors", "fft,fused"], "name it alone"),
+        (["smooth", "kitti", "-o", "out", "--detectors", ""], "names no detector"),
     ],
 )
 def test_bad_input_is_one_line(arguments, reason, tmp_path, monkeypatch, capsys):

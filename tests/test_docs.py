@@ -19,8 +19,7 @@ from helpers import STEPS, difference, random_states
 from graphnav.config import Settings, read_settings
 from graphnav.constraints import registered
 from graphnav.constraints.base import Scene, assemble
-from graphnav.detectors.windows import blocks as blocks_of
-from graphnav.detectors.windows import low_pass
+from graphnav.detectors import registered as known_detectors
 from graphnav.earth import LocalFrame
 from graphnav.formats import read
 from graphnav.pipeline import SOLVERS
@@ -172,7 +171,7 @@ def test_the_example_of_a_detector_finds_the_stops(clone, monkeypatch, capsys):
     found, known = names["found"], names["detect"](names["recording"]).stationary
     assert len(found.t) == len(found.statistic) == len(found.mask)
     assert found.intervals == pytest.approx(known, abs=0.5)
-    nothing = module.detect_jerk(low_pass(blocks_of(names["recording"].crop(0.0, 1.0).imu, 0.02)))
+    nothing = module.Jerk.detect(names["Scene"](names["recording"].crop(0.0, 1.0), Settings().detectors))
     assert len(nothing.intervals) == 0
 
 
@@ -213,11 +212,14 @@ def test_toml_examples_are_valid(tmp_path):
             assert found.gnss.lever_arm == pytest.approx([0.3, 0.5, 1.2])
 
 
-def test_every_constraint_and_every_solver_has_its_line():
+def test_every_constraint_detector_and_solver_has_its_line():
     constraints = (ROOT / "docs" / "constraints.md").read_text(encoding="utf-8")
     solvers = (ROOT / "docs" / "solvers.md").read_text(encoding="utf-8")
     for cls in registered():
         assert re.search(rf"^\| `{cls.name}` \|", constraints, re.MULTILINE), f"docs/constraints.md: no row {cls.name}"
+    detectors = (ROOT / "docs" / "detectors.md").read_text(encoding="utf-8")
+    for name in known_detectors():
+        assert re.search(rf"^\| `{name}` \|", detectors, re.MULTILINE), f"docs/detectors.md: no row {name}"
     for name in SOLVERS:
         assert re.search(rf"^\| `{name}` \|", solvers, re.MULTILINE)
 

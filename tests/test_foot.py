@@ -105,7 +105,7 @@ def test_a_lull_in_a_swing_is_left_out() -> None:
     gyro[inside] = [1.2, 0.0, 0.0]
     accel[inside] = [0.0, 0.0, 9.8]
     lull = detect(replace(walk, imu=replace(walk.imu, gyro=gyro, accel=accel)))
-    raw = lull["stance"].intervals
+    raw = lull["glrt"].intervals
     assert np.any((raw[:, 0] < middle) & (raw[:, 1] > middle))
     assert not np.any((lull.stationary[:, 0] < middle) & (lull.stationary[:, 1] > middle))
     assert "1 short lulls" in lull.notes[0]
@@ -122,7 +122,7 @@ def test_a_foot_that_slides_level_is_not_in_stance() -> None:
     gyro[slides] = [0.5, 0.0, 0.0]
     accel[slides] = [0.0, -3.0, 9.8]  # from 0.9 m/s
     found = detect(replace(walk, imu=replace(walk.imu, gyro=gyro, accel=accel)))
-    raw = found["stance"].intervals
+    raw = found["glrt"].intervals
     of_raw = raw[np.argmin(np.abs(raw[:, 1] - spans[k, 1]))]
     of_answer = found.stationary[np.argmin(np.abs(found.stationary[:, 1] - spans[k, 1]))]
     assert of_raw[0] < begin - 0.2  # what force and rate alone say

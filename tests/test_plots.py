@@ -61,9 +61,9 @@ def detected():
         "idle_line": np.array([26.0, 25.0, 27.0]),
     }
     spans = START + np.array([[100.0, 150.0], [300.0, 320.0]])
-    sway = Detection("sway", at, rng.uniform(0.1, 100.0, len(at)), 3.0, at > 0, spans)
-    fft = replace(sway, name="fft", threshold=1.0, details=spectrum)
-    return Recording("drive", "vehicle", imu), (sway, fft, replace(sway, name="fused"))
+    low_band = Detection("low_band_glrt", at, rng.uniform(0.1, 100.0, len(at)), 3.0, at > 0, spans)
+    fft = replace(low_band, name="fft", threshold=1.0, details=spectrum)
+    return Recording("drive", "vehicle", imu), (low_band, fft, replace(low_band, name="fused"))
 
 
 T = np.arange(COUNT, dtype=float)

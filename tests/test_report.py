@@ -246,7 +246,7 @@ def test_rejected_measurements_are_listed_with_their_times(tmp_path, recording):
 def test_stops_and_outages_are_told(tmp_path, recording):
     spans = START + np.array([[100.0, 130.0], [400.0, 412.0]])
     t = START + np.arange(0.5, COUNT)
-    still = Detection("sway", t, np.full(len(t), 0.5), 3.0, t > 0, spans)
+    still = Detection("low_band_glrt", t, np.full(len(t), 0.5), 3.0, t > 0, spans)
     found = replace(solution(), detections=(still, replace(still, name="fused")))
     parser, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}, outages=[(200.0, 230.0)]))
     assert "2 stops were found, 42 s in all" in text

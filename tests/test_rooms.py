@@ -17,7 +17,7 @@ ROOMS = [
     "recording", "trajectory", "findings", "sample_size", "formats", "allan", "lags", "crosschecks", "clock", "draft",
     "simulation", "wheels", "checks_imu", "checks_stated", "checks_aiding", "checks_raw", "plausibility_gnss",
     "plausibility_odometer", "plausibility", "checks", "detectors", "samples", "noise_model",
-    "preintegration", "own_noise", "unresolved", "clipping", "dynamics", "constraints", "problem", "solution",
+    "preintegration", "own_noise", "unresolved", "clipping", "dynamics", "constraints", "problem", "solution", "stops",
     "alignment", "dense", "solvers", "faults", "noise", "onboard_offset", "preparation", "pipeline", "lever_arm",
     "interpolation", "metrics", "sigmas", "gates", "fitted", "scoring", "strides", "evaluation", "against", "exporters",
     "online",

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from collections.abc import Mapping
+from typing import Any, Final, Literal
+
+from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, field_validator, model_validator
 
 from graphnav.config.section import Section
 
@@ -17,8 +20,8 @@ class StanceSettings(Section):
     bridge: float = Field(0.03, ge=0, description="s, the longest disturbance within a stance")
 
 
-class SwaySettings(Section):
-    """The stillness detector: the GLRT below the engine's frequencies."""
+class LowBandSettings(Section):
+    """The GLRT with unknown means, below the engine's band."""
 
     window: float = Field(2.0, gt=0.3, le=30, description="s, length of a window")
     threshold: float = Field(3.0, gt=0, description="of the statistic; 1 is the sensor's noise and a body that sways")
@@ -63,11 +66,48 @@ class FusionSettings(Section):
     odometer_delay: float = Field(0.7, ge=0, description="s, by which an odometer may be late")
 
 
+FUSED: Final = "fused"
+DetectorName = Literal[
+    "fused", "fft", "glrt", "acceleration_variance", "acceleration_magnitude", "angular_rate_energy", "low_band_glrt"
+]
+_OLD = {"sway": "low_band_glrt"}  # tables that are called otherwise now
+
+
 class DetectorSettings(Section):
     """Where the vehicle stands."""
 
-    sway: SwaySettings = SwaySettings()
+    fire: tuple[DetectorName, ...] = Field(
+        (FUSED,), min_length=1, description="who decides: fused, or names of detectors, each of which then suffices"
+    )
+    low_band_glrt: LowBandSettings = LowBandSettings()
     glrt: GlrtSettings = GlrtSettings()
     fft: FftSettings = FftSettings()
     fusion: FusionSettings = FusionSettings()
     stance: StanceSettings = StanceSettings()
+
+    _notes: tuple[str, ...] = PrivateAttr(())
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is to be said of how they were given."""
+        return self._notes
+
+    @field_validator("fire")
+    @classmethod
+    def _fused_alone(cls, fire: tuple[str, ...]) -> tuple[str, ...]:
+        if FUSED in fire and len(fire) > 1:
+            raise ValueError("'fused' is all detectors together: name it alone, or name detectors")
+        return tuple(dict.fromkeys(fire))
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _renamed(cls, values: Any, handler: ModelWrapValidatorHandler[DetectorSettings]) -> DetectorSettings:
+        """Tables under the names that they had before."""
+        old = [name for name in _OLD if isinstance(values, Mapping) and name in values]
+        for name in old:
+            if _OLD[name] in values:
+                raise ValueError(f"[detectors.{name}] is [detectors.{_OLD[name]}] now: give one of them")
+            values = {_OLD.get(key, key): value for key, value in values.items()}
+        found = handler(values)
+        found._notes = tuple(f"settings: [detectors.{name}] is called [detectors.{_OLD[name]}] now" for name in old)
+        return found

@@ -71,6 +71,7 @@ class Constraint(ABC):
     axes: ClassVar[tuple[str, ...]]
     unit: ClassVar[str]
     looks_ahead: ClassVar[bool] = True  # False: once the intervals and the odometer are there, rows can be built
+    of_stops: ClassVar[bool] = False  # True: its rows are there because the platform stands
     passes: ClassVar[int] = 1  # of a filter's update; more for rows that are far from linear over its uncertainty
     noise_axes: ClassVar[tuple[str, ...]] = ()  # variance component of each axis; none: its sigmas are taken as stated
 

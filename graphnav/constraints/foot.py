@@ -62,6 +62,7 @@ class Stance(Constraint):
     """Where the shoe touches the floor it does not move."""
 
     name: ClassVar[str] = "stance"
+    of_stops: ClassVar[bool] = True
     axes: ClassVar[tuple[str, ...]] = ("right", "forward", "up")
     unit: ClassVar[str] = "m/s"
     # velocity in the body turns with the attitude by as much as there is of it, and at a landing a filter expects a

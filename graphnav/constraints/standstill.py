@@ -113,6 +113,7 @@ class _Standing(Constraint):
     """Rows at the ends of the intervals in which the platform stands."""
 
     looks_ahead: ClassVar[bool] = False
+    of_stops: ClassVar[bool] = True
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:

@@ -1,63 +1,74 @@
 """Where the vehicle stands, or a foot is on the floor.
 
-`detect` runs every detector on a recording and fuses their answers.
+`detect` runs the detectors on a recording, and those of `detectors.fire` decide. One file per detector; every concrete
+`Detector` in this folder is found by itself.
 """
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import pkgutil
+from functools import cache
+
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, spans_of, without
-from graphnav.detectors.fft import detect_fft
-from graphnav.detectors.fusion import candidates, fuse
-from graphnav.detectors.glrt import detect_windows, glrt_statistic
-from graphnav.detectors.motion import moving, speeds
+from graphnav.config.detectors import FUSED
+from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, without
+from graphnav.detectors.fusion import Decision, decide, decide_fused, merge_decisions
+from graphnav.detectors.glrt import STATISTICS, glrt_statistic
+from graphnav.detectors.scene import Detector, Scene
 from graphnav.detectors.stance import detect_stances
-from graphnav.detectors.sway import detect_sway
-from graphnav.detectors.windows import blocks, low_pass
-from graphnav.earth import gravity
-from graphnav.findings import period_of
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 
-__all__ = ["Detection", "Detections", "detect", "glrt_statistic", "stops"]
+__all__ = ["Detection", "Detections", "Detector", "detect", "glrt_statistic", "registered", "stops"]
 
 _SHORTEST = 3.0  # s, of a recording in which anything can be told
-_CLEARLY = 10.0  # times its threshold a statistic is where the vehicle clearly moves
-_STANDARD_GRAVITY = 9.80665
+
+
+@cache
+def registered() -> dict[str, type[Detector]]:
+    """All detector classes by their names, in the order of these."""
+    found = {}
+    for module in pkgutil.iter_modules(__path__):
+        for member in vars(importlib.import_module(f"{__name__}.{module.name}")).values():
+            named = isinstance(member, type) and issubclass(member, Detector) and hasattr(member, "name")
+            if named and not inspect.isabstract(member):
+                found[member.name] = member
+    return dict(sorted(found.items()))
 
 
 def detect(recording: Recording, settings: Settings | None = None) -> Detections:
     """Stationary intervals and the statistics they come from; never fails, and says what could not be done."""
     d = (settings or Settings()).detectors
-    imu, period = recording.imu, period_of(recording.imu.t)
-    if recording.platform == "foot" and period > 0.0:
-        return detect_stances(imu, period, d.stance)
-    if not recording.duration >= _SHORTEST or not period > 0.0:
-        return Detections(NONE, (), (f"no detection: the recording is shorter than {_SHORTEST:g} s",))
-    b = blocks(imu, period)
-    low = low_pass(b)
-    if not len(low.t):
-        return Detections(NONE, (), (f"no detection: an IMU at {1.0 / period:.3g} Hz is too slow",))
-    known = speeds(recording, d.fusion)
-    certain = moving(known)
-    sway, s = detect_sway(low, imu.noise, d.sway, certain)
-    still, certain, notes = candidates(b, sway, s, known, certain)
-    in_motion = spans_of(sway.statistic > _CLEARLY * sway.threshold, sway.t, 0.5 * d.sway.window)
-    notes = (*sway.notes, *notes)
-    found = [sway, *detect_windows(b, imu.noise, d.glrt, still, in_motion, _gravity(recording))]
-    idling = NONE
-    if recording.platform == "vehicle":
-        found.append(detect_fft(imu, period, d.fft, still, known))
-        notes += found[-1].notes
-        idling = found[-1].intervals
-    spans, disturbed = fuse(b, still, idling, certain, d.fusion)
-    mask = inside(sway.t, spans)
-    found.append(
-        Detection("fused", sway.t, sway.statistic, sway.threshold, mask, spans, notes, {"disturbed": disturbed})
-    )
-    return Detections(spans, tuple(found), notes)
+    scene = Scene(recording, d)
+    if recording.platform == "foot" and scene.period > 0.0:
+        fire = [name for name in (("glrt",) if d.fire == (FUSED,) else d.fire) if name in STATISTICS]
+        idle = [name for name in d.fire if name not in fire and name != FUSED]
+        stances = detect_stances(recording.imu, scene.period, d.stance, fire)
+        more = (f"{', '.join(idle)}: of vehicles only, finds no stance",) if idle else ()
+        return Detections(stances.stationary, stances.all, (*d.notes, *more, *stances.notes))
+    if not recording.duration >= _SHORTEST or not scene.period > 0.0:
+        return Detections(NONE, (), (*d.notes, f"no detection: the recording is shorter than {_SHORTEST:g} s"))
+    if not len(scene.low.t):
+        return Detections(NONE, (), (*d.notes, f"no detection: an IMU at {1.0 / scene.period:.3g} Hz is too slow"))
+    found = _decided(scene)
+    reference = found.found[0]
+    mask = inside(reference.t, found.spans)
+    answer = Detection(
+        FUSED, reference.t, reference.statistic, reference.threshold, mask, found.spans, found.notes,
+        {"disturbed": found.disturbed},
+    )  # fmt: skip
+    return Detections(found.spans, (*found.found, answer), (*d.notes, *found.notes))
+
+
+def _decided(scene: Scene, shown: bool = True) -> Decision:
+    """What the detectors that fire come to."""
+    if scene.settings.fire == (FUSED,):
+        return decide_fused(scene, registered(), shown)
+    return merge_decisions([decide(scene, registered()[name], shown) for name in scene.settings.fire])
 
 
 def stops(
@@ -70,39 +81,20 @@ def stops(
     was not said then. Where positions alone tell speeds, nothing is said of the seconds over which they were last
     compared, if they show motion: a smooth drive would pass for a stop there.
     """
-    d, imu = settings.detectors, recording.imu
-    period = period_of(imu.t)
-    if not recording.duration >= _SHORTEST or not period > 0.0:
+    d = settings.detectors
+    scene = Scene(recording, d)
+    if not recording.duration >= _SHORTEST or not scene.period > 0.0:
         return NONE
-    known = speeds(recording, d.fusion)
-    certain = moving(known)
+    certain = scene.certain
     left = longer_than(without(np.array([[recording.start, recording.end]]), certain), d.fusion.min_duration)
     before = np.clip(before, since, until)
     doubted = any(((certain[:, 0] < b) & (certain[:, 1] > a)).any() for a, b in before if b > a)
     if not doubted and not ((left[:, 0] < until) & (left[:, 1] > new)).any():
         return None
-    for one in known:
+    for one in scene.known:
         if one.half > 0.0 and one.speed[-1] > one.limit[-1]:
             until = max(min(until, float(one.t[-1]) - one.half), since)
-    b = blocks(imu, period)
-    low = low_pass(b)
-    if not len(low.t):
+    if not len(scene.low.t):
         return NONE
-    sway, s = detect_sway(low, imu.noise, d.sway, certain)
-    still, certain, _ = candidates(b, sway, s, known, certain)
-    if not len(still):
-        return NONE
-    idling = NONE
-    if recording.platform == "vehicle":
-        idling = detect_fft(imu, period, d.fft, still, known, shown=False).intervals
-    spans = np.clip(fuse(b, still, idling, certain, d.fusion)[0], since, until)
+    spans = np.clip(_decided(scene, shown=False).spans, since, until)
     return np.asarray(spans[spans[:, 1] > spans[:, 0]])
-
-
-def _gravity(recording: Recording) -> float:
-    """Gravity at the first fix, m/s^2."""
-    if recording.gnss is not None:
-        there = np.flatnonzero(np.isfinite(recording.gnss.llh).all(axis=1))
-        if len(there):
-            return float(gravity(*recording.gnss.llh[there[0], [0, 2]]))
-    return _STANDARD_GRAVITY

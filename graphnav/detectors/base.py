@@ -50,12 +50,6 @@ class Detections:
         raise KeyError(name)
 
 
-def intervals_text(detections: Sequence[Detection]) -> str:
-    """What detections.csv holds: a row per interval and detector, the fused answer last."""
-    rows = [f"{start:.4f},{end:.4f},{d.name}" for d in detections for start, end in d.intervals]
-    return "\n".join(["start,end,detector", *rows]) + "\n"
-
-
 def spans_of(mask: Mask, t: Array, half: float = 0.0) -> Array:
     """(M, 2) spans covered by the runs of True, each row of t standing for `half` seconds on either side of it."""
     padded = np.zeros(len(mask) + 2, dtype=bool)
@@ -114,6 +108,16 @@ def within(t: Array, spans: Array, half: float) -> Mask:
         return np.zeros(len(t), dtype=bool)
     k = np.searchsorted(spans[:, 0], t - half, side="right") - 1
     return np.asarray((k >= 0) & (t + half <= spans[np.maximum(k, 0), 1]))
+
+
+def seconds_in(spans: Array, of: Array) -> Array:
+    """(M,) s of each span of `of` (M, 2) that lie in `spans` (in order, without overlap)."""
+    if not len(spans) or not len(of):
+        return np.zeros(len(of))
+    edge, total = spans.ravel(), np.cumsum(np.diff(spans).ravel())
+    before = np.column_stack([np.r_[0.0, total[:-1]], total]).ravel()  # seconds in spans up to each edge
+    upto = np.interp(of, edge, before)
+    return np.asarray(upto[:, 1] - upto[:, 0])
 
 
 def union(parts: Sequence[Array]) -> Array:

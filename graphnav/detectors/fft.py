@@ -8,8 +8,9 @@ amplitudes from 0 to 10, 10 to 20 and 20 to 30 Hz. A window is stationary if
     1.5 Peak-1 > Peak-0 and 1.5 Peak-2 > Peak-0 of both forces, and Peak-1 >= 7 Peak-0 of the pitch rate.
 
 The statistic is the largest of these quotients, so that it is below 1 where all hold. The paper's bands belong to an
-idle line at 12.5 Hz. Here the line is found in what else is known to be still, and the bands move with it. A ratio
-that this engine does not meet while it idles (no second harmonic, no pitch) is not asked for.
+idle line at 12.5 Hz. Here the line is found in what else is known to be still, or alone in what is calm below any idle
+line, and the bands move with it. A ratio that this engine does not meet while it idles (no second harmonic, no pitch)
+is not asked for. Alone, every window has to be as calm, because an engine idles while a vehicle rolls as well.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ import numpy as np
 from graphnav.config.detectors import FftSettings
 from graphnav.detectors.base import NONE, Detection, Mask, spans_of, within
 from graphnav.detectors.motion import Speeds
-from graphnav.detectors.spectrum import IdleLine, Windows, idle_line, peaks
-from graphnav.recording import Imu
+from graphnav.detectors.scene import MG, Detector, Labels, Scene
+from graphnav.detectors.spectrum import FEWEST_WINDOWS, LOWEST, IdleLine, Windows, idle_line, peaks
+from graphnav.detectors.thresholds import log_statistic, valley
 from graphnav.rotation import Array
 
-MG = 9.80665e-3  # m/s^2
 LINE_OF_THE_PAPER = 12.495  # Hz, to which its bands belong
 _MET = 0.7  # share of still windows that meet a ratio for it to be asked for
 _STRETCH = 0.05  # by which a window may last longer than its rows should: then its frequencies are wrong
@@ -38,19 +39,22 @@ CONDITIONS = (
     "forward limit", "up limit", "pitch limit",
     "forward Peak-1", "forward Peak-2", "up Peak-1", "up Peak-2", "pitch Peak-1",
 )  # fmt: skip
+_ALWAYS = ("forward limit", "up limit")  # asked for alone: what rises above them shakes as a drive does
 
 
-def detect_fft(
-    imu: Imu, period: float, settings: FftSettings, still: Array, speeds: Sequence[Speeds], shown: bool = True
-) -> Detection:
-    """Windows ruled by the idle line.
+class IdleFft(Detector):
+    """Windows ruled by the idle line."""
 
-    Parameters
-    ----------
-    still : spans (M, 2), s, in which another detector finds the vehicle still: where the line is looked for.
-    speeds : of odometer and GNSS, for the speed condition.
-    shown : whether its peaks are wanted where they decide nothing.
-    """
+    name = "fft"
+    edge = 4.0  # s: windows of 3 s begin at other seconds in a part of a recording than in all of it
+
+    @classmethod
+    def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
+        return _detect(scene, labels, shown)
+
+
+def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
+    imu, period, settings = scene.recording.imu, scene.period, scene.settings.fft
     rate = 1.0 / period
     length, step = round(settings.window * rate), max(1, round(settings.step * rate))
     columns = (imu.accel[:, 1], imu.accel[:, 2], imu.gyro[:, 0])
@@ -63,11 +67,12 @@ def detect_fft(
         return Detection("fft", t, np.full(len(t), np.nan), 1.0, t < t, NONE, (f"no FFT detection: {reason}",))
     whole = t_last - t_first < (1.0 + _STRETCH) * length * period
     half = 0.5 * length * period
-    inner = within(t, still, half) & whole
+    calm = _calm(w, settings) if labels is None and settings.find_line else np.zeros(w.count)
+    inner = whole & (within(t, labels.still, half) if labels else (calm < 1.0) & ~within(t, scene.certain, half))
     line = idle_line(w, np.flatnonzero(inner)) if settings.find_line else None
     notes: list[str] = []
     if settings.find_line and line is None:
-        notes.append(_no_line(int(inner.sum()), settings))
+        notes.append(_no_line(int(inner.sum()), settings, labels is None))
         if not shown:
             return Detection("fft", t, np.full(w.count, np.nan), 1.0, t < t, NONE, tuple(notes))
     factor = 1.0 if line is None else line.frequency / LINE_OF_THE_PAPER
@@ -81,6 +86,8 @@ def detect_fft(
         notes.append(_found(line))
         idling = inner & _shows(height, where, line)
         met = np.asarray((quotient[idling] < 1.0).mean(axis=0) >= _MET) if idling.any() else asked
+        if labels is None:
+            met = met | np.isin(CONDITIONS, _ALWAYS)
         left_out = [name for name, ok, seen in zip(CONDITIONS, met, asked, strict=True) if seen and not ok]
         asked = asked & met
         quotient = np.column_stack([quotient, _off_line(where, asked, line)])
@@ -91,13 +98,25 @@ def detect_fft(
     found = np.full(w.count, np.nan)
     if usable:
         found = np.where(whole, np.nanmax(np.where(asked, quotient, np.nan), axis=1), np.nan)
-        found = np.maximum(found, _speed_quotient(t, settings, speeds))
+        found = np.maximum(np.maximum(found, calm), _speed_quotient(t, settings, scene.known))
     mask = found < 1.0
     details = {"peak_frequency": where, "peak_amplitude": height, "bands": np.array(bands), **picture}
     if line is not None:
         details["idle_line"] = np.array([line.frequency, line.lowest, line.highest])
     spans = spans_of(mask, t, half)
     return Detection("fft", t, found, 1.0, mask, spans, tuple(notes), details)
+
+
+def _calm(w: Windows, settings: FftSettings) -> Array:
+    """(W,) below 1 where the engine may idle, for a detector that nobody tells what stands.
+
+    Below the lowest idle line no peak may rise above the paper's limits, nor, where windows fall into two populations
+    by what they have there, above the lower one.
+    """
+    height = _measure(w, [(0.0, LOWEST)])[0][:, :, 0]
+    x = log_statistic((height / _limits(settings)).max(axis=1))
+    split = valley(x, float(np.nanmin(x)), 0.0, FEWEST_WINDOWS)
+    return np.asarray(10.0 ** (x - (0.0 if split is None else split)))
 
 
 def _shows(height: Array, where: Array, line: IdleLine) -> Mask:
@@ -151,13 +170,18 @@ def _measure(w: Windows, bands: Sequence[tuple[float, float]]) -> tuple[Array, A
 
 def _quotients(height: Array, settings: FftSettings) -> Array:
     """(W, 8) as in `CONDITIONS`: all below 1 is stationary, NaN what cannot be seen."""
-    limit = np.array([settings.force_limit * MG, settings.force_limit * MG, np.radians(settings.rate_limit)])
+    limit = _limits(settings)
     # fmax leaves out a peak that cannot be seen
     size = np.fmax(np.fmax(height[..., 0], height[..., 1]), height[..., 2]) / limit
     peak0 = height[:, :, 0]
     ratios = [peak0[:, c] / (settings.force_ratio * np.maximum(height[:, c, k], 1e-12)) for c in (0, 1) for k in (1, 2)]
     ratios.append(settings.rate_ratio * peak0[:, 2] / np.maximum(height[:, 2, 1], 1e-12))
     return np.column_stack([size, *ratios])
+
+
+def _limits(settings: FftSettings) -> Array:
+    """(3,) m/s^2, m/s^2, rad/s: what no peak of forward force, up force and pitch rate may exceed."""
+    return np.array([settings.force_limit * MG, settings.force_limit * MG, np.radians(settings.rate_limit)])
 
 
 def _speed_quotient(t: Array, settings: FftSettings, speeds: Sequence[Speeds]) -> Array:
@@ -184,10 +208,10 @@ def _found(line: IdleLine) -> str:
     return f"idle line at {line.frequency:.2f} Hz{drift}, {second}{rest}"
 
 
-def _no_line(windows: int, settings: FftSettings) -> str:
-    if windows < 3:
+def _no_line(windows: int, settings: FftSettings, alone: bool) -> str:
+    if windows < FEWEST_WINDOWS:
         return f"no idle line: no {settings.window + 2 * settings.step:.3g} s are still enough to look for one"
     return (
         "no idle line from 8 to 50 Hz where the vehicle stands: engine off, electric, or out of the IMU's sight; "
-        "the other detectors do without"
+        + ("so no stop is found by it" if alone else "the other detectors do without")
     )

@@ -1,28 +1,33 @@
 """From the detectors' answers to stationary intervals: candidates, vetoes, bridges and honest edges.
 
-1. Stretches that the sway detector calls still are candidates; their ends are moved to where the low-passed force
-   and rate leave what they are inside (never outwards past a disturbance).
+1. Stretches that a detector calls still are candidates: in the fusion the low-band GLRT, a likelihood ratio test, else
+   whoever decides alone. Their ends are moved to where the low-passed force and rate leave what they are inside (never
+   outwards past a disturbance).
 2. Nothing changed in a candidate, so neither did its speed: if the speeds known inside say motion, all of it moves,
    and so does what the force links to it (`graphnav.detectors.chain`).
 3. Two candidates are one stop if the force between them, integrated, leads from rest to rest without reaching a
-   speed in between: a passenger moved, not the vehicle. What the FFT detector calls stationary next to a stop
-   joins it under the same condition.
+   speed in between: a passenger moved, not the vehicle. In the fusion what the FFT detector calls stationary next to
+   a stop joins it under the same condition.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from graphnav.config.detectors import FusionSettings
-from graphnav.detectors.base import NONE, Detection, longer_than, merged, within, without
+from graphnav.detectors.base import NONE, Detection, longer_than, merged, spans_of, union, within, without
 from graphnav.detectors.chain import Link, at_rest_until, link, moving_by_chain
+from graphnav.detectors.low_band import Scale, low_band
 from graphnav.detectors.motion import Speeds
-from graphnav.detectors.sway import Scale
+from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.windows import Blocks, kernel, share_of, smooth
 from graphnav.rotation import Array
 
+LOW_BAND, FFT = "low_band_glrt", "fft"
 _LOOK = 3.0  # s about an end in which the edge is sought
 _INNER = 1.5  # s inside a candidate that say what is normal in it
 _EDGE = 3.0  # of S of a single row
@@ -32,6 +37,7 @@ _AWAY = 0.3  # of the speed that a disturbance may reach, on average over it
 _BLIND = 0.2  # of the moving windows that may look still before stillness means little
 _AROUND = 60.0  # s about a stretch in which an odometer must have moved for its zero to count
 _ENOUGH = 20.0  # s of certain motion from which that share is known
+_CLEARLY = 10.0  # times its threshold the low-band GLRT is where the vehicle clearly moves
 _REACH = 0.3  # s, of the low-pass: nearer to the recording's ends no edge can be seen
 
 
@@ -77,18 +83,31 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
     return float(t[max(stop - 1, begin)])
 
 
-def candidates(
-    b: Blocks, sway: Detection, s: Scale, speeds: list[Speeds], certain: Array
-) -> tuple[Array, Array, tuple[str, ...]]:
-    """Still stretches with their edges found, without those that move; what of `certain` is; and sentences.
+def _without_speed(b: Blocks, spans: Array, settings: FusionSettings) -> Array:
+    """The spans cut where the force, integrated from `_LOOK` s inside, leads to a speed: braking that looked still."""
+    limit = 0.5 * settings.bridge_speed
+    out = spans.copy()
+    for k, (start, end) in enumerate(spans):
+        inside = min(_LOOK, 0.5 * (end - start - _INNER))
+        if inside <= 0.0:
+            continue
+        first, last = (
+            at_rest_until(b, np.array([start + inside, end]), -1, inside, limit),
+            at_rest_until(b, np.array([start, end - inside]), 1, inside, limit),
+        )
+        out[k] = max(start, first), min(end, last)
+    return out[out[:, 1] > out[:, 0]]
 
-    Parameters
-    ----------
-    s : of the sway detector.
-    certain : (L, 2) s, spans of certain motion.
-    """
+
+def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str, ...]]:
+    """What a detector found as stretches with edges, without those that move; what of certain motion is; sentences."""
+    b, speeds, certain = scene.blocks, scene.known, scene.certain
+    by_rows = found.name == LOW_BAND  # its windows are of the rows in which edges are sought
     # a threshold that the data moved up is for windows; an edge is where the noise and sway of a row end
-    spans = edges(b, sway.intervals, s, min(float(np.max(sway.threshold)), _EDGE))
+    limit = min(float(np.max(found.threshold)), _EDGE) if by_rows else _EDGE
+    spans = edges(b, found.intervals, low_band(scene)[1], limit)
+    if not by_rows:
+        spans = _without_speed(b, spans, scene.settings.fusion)
     spans = merged(longer_than(spans, 3.0 * b.period))
     if not len(spans):
         return NONE, certain, ()
@@ -101,7 +120,7 @@ def candidates(
         notes.append(f"{_count(measured)} smooth but no stop: odometer or GNSS say that the vehicle moved")
     if moves.sum() > measured:
         notes.append(f"{_count(int(moves.sum()) - measured)} smooth but no stop: the force before or after shows speed")
-    share = _still_in_motion(sway, certain)
+    share = _still_in_motion(found, certain)
     if share > _BLIND:
         unseen = ~moves & np.isnan(known) & np.array([not _zero(speeds, span) for span in spans])
         moves |= unseen
@@ -109,7 +128,10 @@ def candidates(
             f"{100.0 * share:.0f} % of the seconds in certain motion are as still as a stop (a simulation without "
             f"road?): a stop needs a measured speed as well, which {_count(int(unseen.sum()))} without"
         )
-    return without(spans[~moves], certain), certain, tuple(notes)
+    spans = without(spans[~moves], certain)
+    if not by_rows and len(certain):  # ends that certain motion has made are no better than it is timed
+        spans = _without_speed(b, spans, scene.settings.fusion)
+    return spans, certain, tuple(notes)
 
 
 def _felt(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array) -> Array:
@@ -126,11 +148,11 @@ def _felt(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array) -> Arra
     return certain[keep]
 
 
-def _still_in_motion(sway: Detection, certain: Array) -> float:
+def _still_in_motion(found: Detection, certain: Array) -> float:
     """Share of the windows in certain motion that look still; 0 where there are too few to tell."""
-    half = 0.5 * (sway.t[1] - sway.t[0]) if len(sway.t) > 1 else 0.0
-    moving = within(sway.t, certain, _INNER) & np.isfinite(sway.statistic)
-    return float(sway.mask[moving].mean()) if moving.sum() * 2.0 * half > _ENOUGH else 0.0
+    step = float(found.t[1] - found.t[0]) if len(found.t) > 1 else 0.0
+    moving = within(found.t, certain, _INNER) & np.isfinite(found.statistic)
+    return float(found.mask[moving].mean()) if moving.sum() * step > _ENOUGH else 0.0
 
 
 def _zero(speeds: list[Speeds], span: Array) -> bool:
@@ -204,3 +226,56 @@ def fuse(b: Blocks, spans: Array, idling: Array, certain: Array, settings: Fusio
         spans = np.stack([first, last], -1)
     spans = longer_than(spans, settings.min_duration)
     return spans, longer_than(without(spans, still), settings.margin + _REACH)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What detectors come to."""
+
+    spans: Array  # (M, 2) s, stationary
+    disturbed: Array  # (L, 2) s, of these what was bridged
+    notes: tuple[str, ...]
+    found: tuple[Detection, ...]  # by each
+
+
+def decide(scene: Scene, detector: type[Detector], shown: bool) -> Decision:
+    """What one detector comes to by itself: its intervals, held against measured speeds and the force between them."""
+    found = detector.detect(scene, None, shown)
+    still, certain, notes = candidates(scene, found)
+    spans, disturbed = fuse(scene.blocks, still, NONE, certain, scene.settings.fusion)
+    return Decision(spans, disturbed, (*found.notes, *notes), (found,))
+
+
+def merge_decisions(parts: Sequence[Decision]) -> Decision:
+    """Several that decide by themselves: it stands where one of them says so."""
+    notes = dict.fromkeys(note for part in parts for note in part.notes)
+    return Decision(
+        union([part.spans for part in parts]),
+        union([part.disturbed for part in parts]),
+        tuple(notes),
+        tuple(one for part in parts for one in part.found),
+    )
+
+
+def decide_fused(scene: Scene, detectors: Mapping[str, type[Detector]], shown: bool) -> Decision:
+    """The fusion: the low-band GLRT proposes, speeds and forces refuse, the FFT adds what lies next to a stop.
+
+    Parameters
+    ----------
+    detectors : all, by their names; the others learn from these what standing looks like here.
+    shown : whether the answers of those that decide nothing are wanted.
+    """
+    low, _ = low_band(scene)
+    still, certain, notes = candidates(scene, low)
+    half = 0.5 * scene.settings.low_band_glrt.window
+    labels = Labels(still, spans_of(low.statistic > _CLEARLY * low.threshold, low.t, half))
+    notes = (*low.notes, *notes)
+    found, idling = [low], NONE
+    if shown:
+        found += [d.detect(scene, labels) for name, d in detectors.items() if name not in (LOW_BAND, FFT)]
+    if scene.recording.platform == "vehicle" and (shown or len(still)):
+        found.append(detectors[FFT].detect(scene, labels, shown))
+        notes += found[-1].notes
+        idling = found[-1].intervals
+    spans, disturbed = fuse(scene.blocks, still, idling, certain, scene.settings.fusion)
+    return Decision(spans, disturbed, notes, tuple(found))

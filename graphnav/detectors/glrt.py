@@ -15,13 +15,14 @@ Multiplied out, all of them need no more than the window's means of f, |f|, |f|^
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav.config.detectors import GlrtSettings
-from graphnav.detectors.base import Detection, spans_of, within
+from graphnav.detectors.base import NONE, Detection, spans_of, within
+from graphnav.detectors.scene import MG, Detector, Labels, Scene
+from graphnav.detectors.thresholds import fewest_errors, own_threshold
 from graphnav.detectors.windows import Blocks, running, unbroken, window_times
-from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 
 _TINY = 1e-300
@@ -100,71 +101,126 @@ def stance_mask(statistic: Array, threshold: float, window: int) -> np.ndarray:
     return np.asarray(below[last] > below[first])
 
 
-def detect_windows(
-    b: Blocks, noise: ImuNoise, settings: GlrtSettings, still: Array, moving: Array, g: float
-) -> list[Detection]:
-    """Every statistic of the recording with a threshold of its own.
+@dataclass(frozen=True)
+class Means:
+    """Means over the windows of a recording."""
 
-    The threshold lies where the fewest windows are called wrongly, of those that another detector finds still and
-    those that it finds moving: an idling engine may lift the statistic far above the sensors' noise. Without any
-    still ones it is twice what the sensors' noise makes of the statistic.
+    t: Array  # (W,) s, centre
+    half: float  # s, of a window
+    rows: Array  # (W, 9) as in `rows_for`
+    whole: Array  # (W,) bool, False where a gap crosses
 
-    Parameters
-    ----------
-    still, moving : (M, 2) s, spans that are clearly one or the other.
-    g : m/s^2, gravity at the place; replaced by the mean force of what is still, which holds the sensor's scale.
-    """
-    # windows begin a tenth of a second apart: the blocks between are summed once, for all of them
-    group = max(1, min(round(_STEP / b.period), round(0.5 * settings.window / b.period)))
+
+def window_means(b: Blocks, length: float) -> Means | None:
+    """Means over windows of `length` s that begin a tenth of a second apart; None where there is no window."""
+    # the blocks between two windows are summed once, for all of them
+    group = max(1, min(round(_STEP / b.period), round(0.5 * length / b.period)))
     count = len(b.t) // group
     rows = b.mean[: count * group].reshape(count, group, -1).mean(axis=1)
     middle = b.t[: count * group].reshape(count, group).mean(axis=1)
-    unbroken_rows = np.asarray(b.whole[: count * group].reshape(count, group).all(axis=1))
-    window = max(2, round(settings.window / (group * b.period)))
+    whole = np.asarray(b.whole[: count * group].reshape(count, group).all(axis=1))
+    window = max(2, round(length / (group * b.period)))
     if count < window:
-        return []
-    t = window_times(middle, window)
-    means = running(rows).means(window)
-    half = 0.5 * settings.window
-    at_rest, in_motion = within(t, still, half), within(t, moving, half)
-    reference = at_rest if at_rest.any() else np.ones(len(t), dtype=bool)
+        return None
+    return Means(
+        window_times(middle, window), 0.5 * length, running(rows).means(window), unbroken(whole, window, first=0)
+    )
+
+
+class _Windowed(Detector):
+    """One statistic of the recording, with a threshold of its own.
+
+    The threshold lies where the fewest windows are called wrongly, of those that another detector finds still and
+    those that it finds moving: an idling engine may lift the statistic far above the sensors' noise. Without any
+    still ones it is twice what the sensors' noise makes of the statistic. Alone it looks for the valley between two
+    populations of its own (`own_threshold`).
+    """
+
+    edge = 0.3  # s: three steps between windows
+
+    @classmethod
+    def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
+        name, settings, noise = cls.name, scene.settings.glrt, scene.recording.imu.noise
+        if "means" not in scene.made:
+            scene.made["means"] = window_means(scene.blocks, settings.window)
+        m: Means | None = scene.made["means"]
+        least = _AT_NOISE[name]
+        if m is None:
+            none = np.zeros(0)
+            return Detection(name, none, none, least, none > 0, NONE, (f"{name}: shorter than a window",))
+        per_row = 1.0 / np.sqrt(scene.blocks.row_period)
+        sigma_a, sigma_w = noise.accel_noise_density * per_row, noise.gyro_noise_density * per_row
+        reference = _quietest(m) if labels is None else within(m.t, labels.still, m.half)
+        at_rest = bool(reference.any())
+        means, g = _centred(m.rows, reference if at_rest else np.ones(len(m.t), dtype=bool), scene.gravity, at_rest)
+        values = np.where(m.whole, STATISTICS[name](means, sigma_a, sigma_w, g), np.nan)
+        threshold = least
+        notes: tuple[str, ...] = ()
+        if name == "glrt" and settings.threshold is not None:
+            threshold = settings.threshold
+        elif labels is None:
+            most = least + float(STATISTICS[name](_idling(scene, g), sigma_a, sigma_w, g)[0])
+            threshold, notes = own_threshold(scene, name, m.t, m.half, values, least, most)
+        elif at_rest:
+            in_motion = within(m.t, labels.moving, m.half)
+            threshold, _ = fewest_errors(values[reference & m.whole], values[in_motion & m.whole], least)
+        mask = values < threshold
+        return Detection(name, m.t, values, threshold, mask, spans_of(mask, m.t, m.half), notes)
+
+
+class Glrt(_Windowed):
+    """Skog et al. 2010, eq. 9."""
+
+    name = "glrt"
+
+
+class AccelerationVariance(_Windowed):
+    """Skog et al. 2010, eq. 13."""
+
+    name = "acceleration_variance"
+
+
+class AccelerationMagnitude(_Windowed):
+    """Skog et al. 2010, eq. 15."""
+
+    name = "acceleration_magnitude"
+
+
+class AngularRateEnergy(_Windowed):
+    """Skog et al. 2010, eq. 18."""
+
+    name = "angular_rate_energy"
+
+
+def _centred(rows: Array, reference: Array, g: float, at_rest: bool) -> tuple[Array, float]:
+    """The means without the rate that `reference` windows have, and gravity as these read it if they are at rest."""
+    means = rows.copy()
     bias = np.median(means[reference, 3:6], axis=0)
     means[:, 8] += bias @ bias - 2.0 * means[:, 3:6] @ bias
     measured = float(np.median(np.linalg.norm(means[reference, :3], axis=1)))
-    if at_rest.any() and abs(measured / g - 1.0) < _SCALE:
-        g = measured
-    per_row = 1.0 / np.sqrt(b.row_period)
-    sigma_a, sigma_w = noise.accel_noise_density * per_row, noise.gyro_noise_density * per_row
-    whole = unbroken(unbroken_rows, window)
-    out = []
-    for name, statistic in STATISTICS.items():
-        values = np.where(whole, statistic(means, sigma_a, sigma_w, g), np.nan)
-        threshold = _AT_NOISE[name]
-        if name == "glrt" and settings.threshold is not None:
-            threshold = settings.threshold
-        elif at_rest.any():
-            threshold = fewest_errors(values[at_rest & whole], values[in_motion & whole], threshold)
-        mask = values < threshold
-        out.append(Detection(name, t, values, threshold, mask, spans_of(mask, t, half)))
-    return out
+    return means, measured if at_rest and abs(measured / g - 1.0) < _SCALE else g
 
 
-def fewest_errors(still: Array, moving: Array, least: float) -> float:
-    """Threshold that calls the smallest share of still windows moving plus of moving windows still, at least `least`.
+def _quietest(m: Means) -> Array:
+    """(W,) bool, the second of windows in which force and rate scatter least: whatever moves, it is the likeliest rest.
 
-    Of several that do equally well, the middle one by their logarithm.
+    Each against its own typical scatter, so that neither unit decides.
     """
-    if not len(still):
-        return least
-    x, y = np.sort(log_statistic(still)), np.sort(log_statistic(moving))
-    if not len(y):
-        return max(least, float(10.0 ** x[-1]) * 2.0)
-    grid = np.linspace(min(x[0], y[0]), max(x[-1], y[-1]), 400)
-    wrong = 1.0 - np.searchsorted(x, grid) / len(x) + np.searchsorted(y, grid) / len(y)
-    best = np.flatnonzero(wrong <= wrong.min() + 1e-12)
-    return max(least, float(10.0 ** grid[best[len(best) // 2]]))
+    force = m.rows[:, 7] - np.einsum("wj,wj->w", m.rows[:, :3], m.rows[:, :3])
+    rate = m.rows[:, 8] - np.einsum("wj,wj->w", m.rows[:, 3:6], m.rows[:, 3:6])
+    scatter = force / max(float(np.median(force)), _TINY) + rate / max(float(np.median(rate)), _TINY)
+    scatter = np.where(m.whole, scatter, np.inf)
+    few = min(round(1.0 / _STEP), len(scatter)) - 1
+    return np.asarray(scatter <= np.partition(scatter, few)[few])
 
 
-def log_statistic(statistic: Array) -> Array:
-    """log10, where populations of a statistic are told apart; zero becomes very small, NaN stays."""
-    return np.log10(np.maximum(statistic, _TINY))
+def _idling(scene: Scene, g: float) -> Array:
+    """(1, 9) means of a window with an engine that idles at the limits of Li 2024: Peak-1 and Peak-2 of every axis.
+
+    A line of amplitude A has the mean square A^2 / 2, so every axis has the mean square A^2.
+    """
+    fft = scene.settings.fft
+    force, rate = fft.force_limit * MG, np.radians(fft.rate_limit)
+    # along gravity the lines change the size of the force: its mean is g + A^2/g, about which it scatters by A
+    size = g + force**2 / g
+    return np.array([[0.0, 0.0, g, 0.0, 0.0, 0.0, size, g**2 + 3.0 * force**2, 3.0 * rate**2]])

@@ -22,10 +22,10 @@ from graphnav.rotation import Array
 
 CHANNELS = ("force y", "force z", "rate x")  # forward, up, pitch
 _CHUNK = 256  # windows at a time: a few MB whatever the length of the recording
-_LOWEST, _HIGHEST = 8.0, 50.0  # Hz, where idle lines are looked for
+LOWEST, _HIGHEST = 8.0, 50.0  # Hz, where idle lines are looked for
 _FLOOR = 3.0  # Hz on either side of a bin that say what the spectrum is around a line
 _CLEAR = 2.0  # natural logarithm of power over what is around it at which a line is there
-_FEWEST = 3  # windows
+FEWEST_WINDOWS = 3
 _LOOKED_AT = 200  # windows at most
 
 
@@ -121,7 +121,7 @@ def idle_line(windows: Windows, still: Array) -> IdleLine | None:
 
     A quarter of the windows is enough: an engine may be switched off for the rest.
     """
-    if len(still) < _FEWEST:
+    if len(still) < FEWEST_WINDOWS:
         return None
     some = still[np.unique(np.linspace(0, len(still) - 1, _LOOKED_AT).astype(int))]
     f = windows.frequencies
@@ -133,7 +133,7 @@ def idle_line(windows: Windows, still: Array) -> IdleLine | None:
     line = np.sort(clear, axis=0)[-quarter:].mean(axis=0)
     # noise alone reaches something too; a line lies above what half the bins do
     line = np.maximum(line - np.median(line), 0.0)
-    inside = np.flatnonzero((f > _LOWEST - f[1]) & (f <= min(_HIGHEST, f[-1] - 2.0 * f[1])))
+    inside = np.flatnonzero((f > LOWEST - f[1]) & (f <= min(_HIGHEST, f[-1] - 2.0 * f[1])))
     peak = [int(k) for k in inside if line[k] >= line[k - 1] and line[k] >= line[k + 1] and line[k] > _CLEAR]
     if not peak:
         return None

@@ -24,11 +24,13 @@ integrated; the span ends where that velocity exceeds the threshold times `_REAC
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from graphnav import rotation
-from graphnav.config.detectors import StanceSettings
-from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, merged, spans_of
+from graphnav.config.detectors import FUSED, StanceSettings
+from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, merged, spans_of, union
 from graphnav.detectors.glrt import glrt_statistic
 from graphnav.detectors.windows import running, unbroken
 from graphnav.recording import Imu
@@ -42,18 +44,41 @@ _NEAR = 0.8  # s from an end of a span within which its quietest moment is looke
 _REACH = 0.2  # m, from an IMU on a shoe to where the shoe touches the floor, at most
 
 
-def detect_stances(imu: Imu, period: float, settings: StanceSettings) -> Detections:
+def detect_stances(imu: Imu, period: float, settings: StanceSettings, which: Sequence[str] = ("glrt",)) -> Detections:
     """Stances of a foot, and e with the threshold they come from.
 
     Parameters
     ----------
     period : s between rows.
+    which : of Skog's four statistics, all in the units of e; a stance is one if any of them says so.
     """
     window = max(3, round(settings.window / period))
     if len(imu.t) < window:
         return Detections(NONE, (), ("no detection: the recording is shorter than a window",))
     bias, g = _quietest(imu, period)
-    e = np.sqrt(glrt_statistic(imu.accel, imu.gyro - bias, window, settings.force_per_rate, 1.0, g))
+    found: list[Detection] = []
+    kept, notes = [], []
+    for name in which:
+        e = np.sqrt(glrt_statistic(imu.accel, imu.gyro - bias, window, settings.force_per_rate, 1.0, g, name))
+        found.append(_below(name, e, imu, period, window, settings))
+        one = found[-1]
+        deep = one.intervals[_as_deep_as_others(one.intervals, one.t, one.statistic, settings.threshold)]
+        if len(deep) < len(one.intervals):
+            notes.append(
+                f"{len(one.intervals) - len(deep)} short lulls that do not reach as deep as the stances were left out"
+            )
+        kept.append(_without_sliding(deep, imu, one.t, one.statistic, bias, settings.threshold * _REACH))
+    if not found:
+        return Detections(NONE, (), ())
+    spans = union(kept) if len(kept) > 1 else kept[0]
+    first = found[0]
+    mask = inside(first.t, spans)
+    found.append(Detection(FUSED, first.t, first.statistic, settings.threshold, mask, spans, tuple(notes)))
+    return Detections(spans, tuple(found), tuple(notes))
+
+
+def _below(name: str, e: Array, imu: Imu, period: float, window: int, settings: StanceSettings) -> Detection:
+    """Spans in which e is below its threshold."""
     t = 0.5 * (imu.t[: len(e)] + imu.t[window - 1 :]) - 0.5 * period  # a row speaks for the period before it
     whole = unbroken(np.r_[True, np.diff(imu.t) < period + settings.bridge], window)
     e = np.where(whole, e, np.nan)
@@ -65,15 +90,7 @@ def detect_stances(imu: Imu, period: float, settings: StanceSettings) -> Detecti
         spans[0, 0] = imu.t[0] - period
     if len(spans) and spans[-1, 1] > imu.t[-1] - half - period:
         spans[-1, 1] = imu.t[-1]
-    kept = spans[_as_deep_as_others(spans, t, e, settings.threshold)]
-    notes = (
-        () if len(kept) == len(spans)
-        else (f"{len(spans) - len(kept)} short lulls that do not reach as deep as the stances were left out",)
-    )  # fmt: skip
-    kept = _without_sliding(kept, imu, t, e, bias, settings.threshold * _REACH)
-    found = Detection("stance", t, e, settings.threshold, below, spans)
-    answer = Detection("fused", t, e, settings.threshold, inside(t, kept), kept, notes)
-    return Detections(kept, (found, answer), notes)
+    return Detection(name, t, e, settings.threshold, below, spans)
 
 
 def _quietest(imu: Imu, period: float) -> tuple[Array, float]:

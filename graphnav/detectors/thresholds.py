@@ -10,8 +10,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphnav.detectors.base import within
+from graphnav.detectors.scene import Scene
 from graphnav.rotation import Array
 
+_TINY = 1e-300
+FEWEST = 1.0  # s of a population that the data may tell of
+MISLABELLED = 0.2  # of the moving windows that other sensors may be wrong about
+_TELLS = 0.5  # of the shares of either kind called wrongly; 1 is a statistic that says nothing
+MISTAKEN = 0.05  # of the moving windows that may be mislabelled
 _BIN = 0.1  # decades
 _SPREAD = np.array([0.05, 0.25, 0.4, 0.25, 0.05])  # smoothing, bins
 _DEPTH = 4.0  # how many times lower than both sides a valley is
@@ -50,3 +57,58 @@ def valley(log_values: Array, low: float, high: float, fewest: int) -> float | N
     if smaller < _FEW * fewest and len(lowest) < _APART:
         return None
     return float(middle[bottom])
+
+
+def log_statistic(statistic: Array) -> Array:
+    """log10, where populations of a statistic are told apart; zero becomes very small, NaN stays."""
+    return np.log10(np.maximum(statistic, _TINY))
+
+
+def own_threshold(
+    scene: Scene, name: str, t: Array, half: float, values: Array, least: float, most: float
+) -> tuple[float, tuple[str, ...]]:
+    """Threshold of a statistic that decides alone, and what there is to be said of it.
+
+    The valley between standing and moving windows if there is one. Else, where odometer or GNSS tell what moves, what
+    tells that best from the rest (which may move unseen, so it has to tell it well), or half of what the quietest
+    twentieth of it has; and `most` where nothing moves. An IMU by itself leaves `least`: an engine that idles in all
+    of the recording then hides the rest that it is.
+
+    Parameters
+    ----------
+    t, values : (W,) centres of the windows, s, and the statistic; half : s of a window on either side.
+    least : what noise alone may make of it.
+    most : what an engine may make of it that idles as strongly as engines do.
+    """
+    x = log_statistic(values)
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
+    moves = within(t, scene.certain, half) & np.isfinite(x)
+    split = valley(x, float(np.log10(least)), float(np.log10(most)), max(2, round(FEWEST / step)))
+    if split is not None and not (moves.any() and np.mean(x[moves] < split) > MISLABELLED):
+        return max(least, float(10.0**split)), ()
+    rests = ~within(t, scene.certain, -half) & np.isfinite(x)  # no part of them is certain to move
+    if moves.any() and rests.any():
+        found, wrong = fewest_errors(values[rests], values[moves], least)
+        if wrong < _TELLS:
+            return min(found, most), ()
+    if moves.any():
+        return float(np.clip(0.5 * 10.0 ** np.quantile(x[moves], MISTAKEN), least, most)), ()
+    if scene.known:
+        return most, ()
+    return least, (f"{name}: nothing tells standing from moving windows, so only its sensors' noise counts as rest",)
+
+
+def fewest_errors(still: Array, moving: Array, least: float) -> tuple[float, float]:
+    """Threshold that calls the smallest share of still windows moving plus of moving windows still, at least `least`.
+
+    Of several that do equally well, the middle one by their logarithm. The second number is that sum of shares.
+    """
+    if not len(still):
+        return least, 1.0
+    x, y = np.sort(log_statistic(still)), np.sort(log_statistic(moving))
+    if not len(y):
+        return max(least, float(10.0 ** x[-1]) * 2.0), 0.0
+    grid = np.linspace(min(x[0], y[0]), max(x[-1], y[-1]), 400)
+    wrong = 1.0 - np.searchsorted(x, grid) / len(x) + np.searchsorted(y, grid) / len(y)
+    best = np.flatnonzero(wrong <= wrong.min() + 1e-12)
+    return max(least, float(10.0 ** grid[best[len(best) // 2]])), float(wrong.min())

@@ -89,12 +89,15 @@ def window_times(t: Array, length: int, step: int = 1) -> Array:
     return np.asarray(0.5 * (first + t[length - 1 :: step]))
 
 
-def unbroken(whole: Array, length: int, step: int = 1) -> Array:
-    """Which of those windows no gap crosses; `whole` as in `Blocks`."""
+def unbroken(whole: Array, length: int, step: int = 1, first: int = 1) -> Array:
+    """Which of those windows no gap crosses; `whole` as in `Blocks`.
+
+    A gap before the first row of a window does not matter to it; with `first` 0 it does, where rows are means in which
+    it may lie.
+    """
     broken = np.r_[0, np.cumsum(~whole)]
     begin = np.arange(0, len(whole) - length + 1, step)
-    # a gap before the first row of a window does not matter to it
-    return np.asarray(broken[begin + length] - broken[begin + 1] == 0)
+    return np.asarray(broken[begin + length] - broken[begin + first] == 0)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from graphnav.rotation import Array
 _DYNAMIC = 2.5  # decades of amplitude in the spectrogram
 _FLOOR = 1e-6  # of a statistic, on its logarithmic axis
 _FUSED = "fused"
-_SHOWN = ("stance", "sway", "glrt", "fft")  # what votes on standing; the others are in statistics.csv.gz
+_SHOWN = ("low_band_glrt", "glrt", "fft")  # of more than `_MOST`; the others are in statistics.csv.gz
+_MOST = 4
 
 
 def detections(recording: Recording, found: Sequence[Detection], *, width: float = WIDTH) -> Drawing:
@@ -28,8 +29,10 @@ def detections(recording: Recording, found: Sequence[Detection], *, width: float
     stands = [(float(a) - t0, float(b) - t0) for d in found if d.name == _FUSED for a, b in d.intervals]
     by_name: dict[str, list[Detection]] = {}
     for d in found:
-        if d.name in _SHOWN and np.isfinite(d.statistic).any():
+        if d.name != _FUSED and np.isfinite(d.statistic).any():
             by_name.setdefault(d.name, []).append(d)
+    if len(by_name) > _MOST:
+        by_name = {name: every for name, every in by_name.items() if name in _SHOWN}
     t = imu.t - t0
     force, rate = np.linalg.norm(imu.accel, axis=1), np.degrees(np.linalg.norm(imu.gyro, axis=1))
     speeds = _speeds(recording)

@@ -1,9 +1,10 @@
-"""Stillness below the engine's frequencies: what a standing body with a running engine still does not do.
+"""The low-band GLRT: likelihood ratio with unknown means, of force and rate below the engine's band.
 
 Whatever the engine, it shakes the body above 8 Hz. Motion shows below: a road tilts, turns and heaves a vehicle at
-0 to 3 Hz. So the IMU is low-passed there and the GLRT taken of what is left, with the biases unknown (the window's
-own mean takes the place of g f_bar/|f_bar| and of zero rate; Skog et al. 2010, section III, with the mean rate
-estimated too):
+0 to 3 Hz. So the IMU is low-passed there, and of what is left the hypothesis "constant force and rate, both unknown,
+in white noise" is tested against "anything else" (Skog et al. 2010, section III, with the mean force and the mean rate
+as the nuisance parameters: their maximum likelihood estimates are the window's means, which take the place of
+g f_bar/|f_bar| and of zero rate):
 
     S = 1/2 [ var(f)/(3 s_f^2) + var(omega)/(3 s_w^2) ],     s^2 = noise density^2 / s * gain^2 + sway^2
 
@@ -16,21 +17,41 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav.config.detectors import SwaySettings
+from graphnav.config.detectors import LowBandSettings
 from graphnav.detectors.base import NONE, Detection, longer_than, spans_of, within
-from graphnav.detectors.glrt import log_statistic
-from graphnav.detectors.thresholds import valley
+from graphnav.detectors.scene import Detector, Labels, Scene
+from graphnav.detectors.thresholds import FEWEST, MISLABELLED, MISTAKEN, log_statistic, valley
 from graphnav.detectors.windows import LowPassed, running, unbroken, window_times
 from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 
+NAME = "low_band_glrt"
 _DOWN, _UP = 1.5, 0.7  # decades that the data may move the threshold down and up
-_MISLABELLED = 0.2  # of the moving windows that other sensors may be wrong about
-_FEWEST = 1.0  # s of a population that the data may tell of
+_MOVING = 30.0  # s of certain motion that say where the threshold must not be
 _QUIETEST = 1.0  # s that say how much noise there can be at most
 _TRUSTED = 0.05  # of the stated noise is the least that is believed
 _OVERSTATED = 2.0  # times what the quietest windows allow
-_MOVING = 30.0  # s of certain motion that say where the threshold must not be
+
+
+class LowBandGlrt(Detector):
+    """The detector, by its name; it needs no labels."""
+
+    name = NAME
+    edge = 0.3  # what its windows begin with moves the quantiles that edges are set by
+
+    @classmethod
+    def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
+        return low_band(scene)[0]
+
+
+def low_band(scene: Scene) -> tuple[Detection, Scale]:
+    """Its answer, and the scale of a low-passed row at rest, which edges are found by; made once."""
+    if NAME not in scene.made:
+        scene.made[NAME] = detect_low_band(
+            scene.low, scene.recording.imu.noise, scene.settings.low_band_glrt, scene.certain
+        )
+    found: tuple[Detection, Scale] = scene.made[NAME]
+    return found
 
 
 @dataclass(frozen=True)
@@ -52,7 +73,7 @@ def spreads(low: LowPassed, window: int) -> Array:
     return np.where(unbroken(low.whole, window)[:, None], each, np.nan)
 
 
-def scale(low: LowPassed, noise: ImuNoise, settings: SwaySettings, spread: Array) -> Scale:
+def scale(low: LowPassed, noise: ImuNoise, settings: LowBandSettings, spread: Array) -> Scale:
     """What sensor noise and sway make of a low-passed row of a standing vehicle.
 
     Noise is in every window, so the quietest ones bound it from above: figures stated too large must not hide motion.
@@ -75,7 +96,9 @@ def statistic(spread: Array, s: Scale) -> Array:
     return np.asarray(0.5 * (spread[:, 0] / s.force**2 + spread[:, 1] / s.rate**2))
 
 
-def detect_sway(low: LowPassed, noise: ImuNoise, settings: SwaySettings, moving: Array) -> tuple[Detection, Scale]:
+def detect_low_band(
+    low: LowPassed, noise: ImuNoise, settings: LowBandSettings, moving: Array
+) -> tuple[Detection, Scale]:
     """Windows in which nothing but noise and sway is left below the engine's frequencies, and the scale used.
 
     Parameters
@@ -85,7 +108,7 @@ def detect_sway(low: LowPassed, noise: ImuNoise, settings: SwaySettings, moving:
     window = max(3, round(settings.window / low.period))
     if len(low.t) < window:
         empty = np.zeros(0)
-        nothing = Detection("sway", empty, empty, settings.threshold, empty > 0, NONE)
+        nothing = Detection(NAME, empty, empty, settings.threshold, empty > 0, NONE)
         return nothing, scale(low, noise, settings, np.zeros((0, 2)))
     t = window_times(low.t, window)
     spread = spreads(low, window)
@@ -95,19 +118,19 @@ def detect_sway(low: LowPassed, noise: ImuNoise, settings: SwaySettings, moving:
     mask = found < threshold
     # a window says nothing of where in it motion began: only what all windows over it call still is
     spans = spans_of(mask, t, 0.5 * settings.window)
-    return Detection("sway", t, found, threshold, mask, longer_than(spans, settings.window), notes), s
+    return Detection(NAME, t, found, threshold, mask, longer_than(spans, settings.window), notes), s
 
 
 def _threshold(
-    t: Array, found: Array, settings: SwaySettings, moving: Array, period: float, s: Scale
+    t: Array, found: Array, settings: LowBandSettings, moving: Array, period: float, s: Scale
 ) -> tuple[float, tuple[str, ...]]:
     if not settings.from_data:
         return settings.threshold, ()
     x, start = log_statistic(found), float(np.log10(settings.threshold))
     swaying = 0.5 * ((settings.force / s.force) ** 2 + (settings.rate / s.rate) ** 2)
     label = within(t, moving, settings.window) & np.isfinite(x)
-    split = valley(x, start - _DOWN, start + _UP + float(np.log10(s.stated)), round(_FEWEST / period))
-    if split is not None and not (label.any() and np.mean(x[label] < split) > _MISLABELLED):
+    split = valley(x, start - _DOWN, start + _UP + float(np.log10(s.stated)), round(FEWEST / period))
+    if split is not None and not (label.any() and np.mean(x[label] < split) > MISLABELLED):
         return float(10.0**split), ()
     notes: tuple[str, ...] = ()
     if s.overstated and np.mean(found < settings.threshold) < 0.5:
@@ -116,5 +139,5 @@ def _threshold(
         notes = ("the IMU's stated noise is too large to tell stops by it: only the stillest stretches count",)
     if label.sum() * period >= _MOVING:
         # some of these windows may be mislabelled; the threshold keeps clear of the others
-        start = min(start, max(float(np.quantile(x[label], 0.05)) - np.log10(2.0), start - _DOWN))
+        start = min(start, max(float(np.quantile(x[label], MISTAKEN)) - np.log10(2.0), start - _DOWN))
     return float(10.0**start), notes

@@ -1,0 +1,99 @@
+"""What detectors look at, each part made once, and the contract that all of them keep."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from graphnav.config.detectors import DetectorSettings
+from graphnav.detectors.base import Detection
+from graphnav.detectors.motion import Speeds, moving, speeds
+from graphnav.detectors.windows import Blocks, LowPassed, blocks, low_pass
+from graphnav.earth import gravity
+from graphnav.findings import period_of
+from graphnav.recording import Recording
+from graphnav.rotation import Array
+
+_STANDARD_GRAVITY = 9.80665
+MG = 9.80665e-3  # m/s^2
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A recording, or a window of one, and what several detectors need of it."""
+
+    recording: Recording
+    settings: DetectorSettings
+
+    @cached_property
+    def period(self) -> float:
+        """s between rows of the IMU; not above 0 where there are too few."""
+        return period_of(self.recording.imu.t)
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        """Means over blocks of rows."""
+        return blocks(self.recording.imu, self.period)
+
+    @cached_property
+    def low(self) -> LowPassed:
+        """The IMU below about 2 Hz."""
+        return low_pass(self.blocks)
+
+    @cached_property
+    def known(self) -> list[Speeds]:
+        """Speeds by odometer and GNSS."""
+        return speeds(self.recording, self.settings.fusion)
+
+    @cached_property
+    def certain(self) -> Array:
+        """(M, 2) s, spans in which odometer or GNSS are certain of motion."""
+        return moving(self.known)
+
+    @cached_property
+    def gravity(self) -> float:
+        """Gravity at the first fix, m/s^2."""
+        gnss = self.recording.gnss
+        if gnss is not None:
+            there = np.flatnonzero(np.isfinite(gnss.llh).all(axis=1))
+            if len(there):
+                return float(gravity(*gnss.llh[there[0], [0, 2]]))
+        return _STANDARD_GRAVITY
+
+    @cached_property
+    def made(self) -> dict[str, Any]:
+        """What several detectors need and one of them has made."""
+        return {}
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Spans that others find still and moving, each (M, 2) s."""
+
+    still: Array
+    moving: Array
+
+
+class Detector(ABC):
+    """Looks for stationary windows. Subclasses in this folder are found by themselves.
+
+    A detector never fails: what it cannot look at gives a `Detection` without windows and a note.
+    """
+
+    name: ClassVar[str]
+    edge: ClassVar[float]  # s by which the ends of a stop may differ between a recording and a window of it
+
+    @classmethod
+    @abstractmethod
+    def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
+        """Its answer.
+
+        Parameters
+        ----------
+        labels : what the others find still and moving, to learn from; a detector that decides alone has none.
+        shown : whether its statistic is wanted where it decides nothing.
+        """
