@@ -194,6 +194,7 @@ def _draw_solver(
         provenance=provenance,
         detectors=detectors,
         noise=noise_rows(outcome, solution),
+        beside=[f"trajectory.{name}" for name in dict.fromkeys(("kml", *outcome.request.exported, "csv"))],
     )
 
 
