@@ -204,9 +204,9 @@ def test_trajectory_is_to_scale_and_marks_what_happened():
 def test_scale_bar_is_as_long_as_it_says():
     figure = plots.trajectory({"batch": (T, np.stack([3 * T, T], -1))})
     words = next(note["text"] for note in figure.annotations if note["text"].endswith((" m", " km")))
-    bar = next(trace for trace in figure.data if trace["mode"] == "lines" and not trace["name"])
+    (bar,) = [shape for shape in figure.shapes if shape["type"] == "line"]
     metres = float(words.split()[0]) * (1000 if words.endswith("km") else 1)
-    assert np.ptp(x_of(bar)) == pytest.approx(metres, rel=1e-5)
+    assert bar["x1"] - bar["x0"] == pytest.approx(metres, rel=1e-9)
 
 
 def test_residuals_mark_what_was_rejected_and_weakened():

@@ -329,7 +329,9 @@ def test_each_block_is_judged_by_itself():
     assert re.findall(r'class="verdict (\w*)"><b>(\w+)', verdicts(solution(), e)) == [
         ("bad", "Position"), ("", "Velocity"), ("", "Attitude"),
     ]  # fmt: skip
-    velocities = replace(solution(), records={"gnss_position": record(), "gnss_velocity": record(3.0)})
+    off = record()
+    off.nis[60:63], off.weight[60:63] = 1e6, 1e-6  # rows that weigh next to nothing do not speak against the others
+    velocities = replace(solution(), records={"gnss_position": off, "gnss_velocity": record(3.0)})
     assert re.findall(r'class="verdict (\w*)"><b>(\w+)', verdicts(velocities, None)) == [
         ("good", "Position"), ("bad", "Velocity"), ("", "Attitude"),
     ]  # fmt: skip

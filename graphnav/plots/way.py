@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav.plots.figure import SHADES, Figure, Panel, Spans, limits
+from graphnav.plots.figure import SHADES, Figure, Panel, Spans, colour, limits
 from graphnav.rotation import Array
 
 _FEW = 60  # stops that get a large mark each
@@ -76,7 +76,7 @@ def trajectory(
             _stops(panel, t, en, stops, standing)
     if tracks:
         _ends(panel, next(iter(tracks.values()))[1], scale)
-    _scale_bar(panel, scale)
+    _scale_bar(figure, panel)
     return figure
 
 
@@ -140,12 +140,17 @@ def _ends(panel: Panel, en: Array, scale: float) -> None:
             )
 
 
-def _scale_bar(panel: Panel, scale: float) -> None:
-    """A bar of a round number of metres, about a fifth of the width, in the lower right of a map."""
-    reach = panel.xlim[1] - panel.xlim[0]
+def _scale_bar(figure: Figure, panel: Panel) -> None:
+    """A bar of a round number of metres, about a fifth of the width, at the lower edge of a map."""
+    west, east = panel.xlim
+    reach = east - west
     metres = 10.0 ** math.floor(math.log10(reach / 5))
     metres *= max(m for m in (1, 2, 5) if m * metres <= reach / 4)
-    x, y = panel.xlim[1] - 10 * scale, panel.ylim[0] + 12 * scale
-    panel.line(np.array([x - metres, x]), np.array([y, y]), "truth", width=3.5, quiet=True)
+    x = east - 0.01 * reach
+    figure.shapes.append({
+        "type": "line", "xref": "x", "yref": "paper", "x0": x - metres, "x1": x, "y0": 0.02, "y1": 0.02,
+        "line": {"color": colour("truth"), "width": 3.5},
+    })  # fmt: skip
     words = f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
-    panel.words(x - metres / 2, y, words, "center", (0, 3))
+    panel.words(x - metres / 2, 0.02, words, "center", (0, 2))
+    figure.annotations[-1]["yref"] = "paper"
