@@ -14,14 +14,15 @@
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const config = {responsive: true, displaylogo: false, displayModeBar: touch ? true : "hover",
     modeBarButtons: [["zoom2d", "pan2d", "autoScale2d", "resetScale2d"]]};
-  let shared = null;  // range of the time axis of all figures, null as they come
+  const clock = document.getElementById("clock");
+  let shared = null;  // range of the time axis of all figures, s from the start, null as they come
   const timed = place => place.dataset.time !== undefined;
 
   const draw = place => {
     const style = getComputedStyle(document.documentElement);
     const figure = JSON.parse(texts[places.indexOf(place)].replace(/var\((--[\w-]+)\)/g, (_, name) => style.getPropertyValue(name).trim()));
     figure.layout.dragmode = touch ? false : "zoom";
-    if (timed(place) && shared) figure.layout.xaxis.range = shared;
+    if (timed(place)) time(figure);
     const first = !place.data;
     const drawn = Plotly.react(place, figure.data, figure.layout, config);
     if (first && timed(place)) {
@@ -29,8 +30,32 @@
       place.on("plotly_hover", event => point(event.xvals?.[0]));
       place.on("plotly_unhover", () => point(null));
     }
+    // zoomed only now: the house leads back to all of it
+    if (timed(place) && shared) Plotly.relayout(place, {"xaxis.range": shared.map(onClock)});
     return drawn;
   };
+
+  // a figure over s from the start as one over the clock that was chosen, a date where it is one of the day
+  const date = () => clock?.value && clock.selectedOptions[0].dataset.date !== undefined;
+  const zero = () => Number(clock?.value || 0);
+  const onClock = s => date() ? 1000 * (zero() + s) : zero() + s;
+  const fromStart = x => (date() ? x / 1000 : x) - zero();
+  const time = ({data, layout}) => {
+    layout.xaxis.range = layout.xaxis.range.map(onClock);
+    if (!clock?.value) return;
+    for (const trace of data) {
+      const packed = trace.x.bdata && Uint8Array.from(atob(trace.x.bdata), c => c.charCodeAt(0));
+      trace.x = Array.from(packed ? new Float32Array(packed.buffer) : trace.x, s => Number.isFinite(s) ? onClock(s) : null);
+    }
+    for (const one of layout.shapes) Object.assign(one, {x0: onClock(one.x0), x1: onClock(one.x1)});
+    for (const one of layout.annotations) if (one.xref === "x") one.x = onClock(one.x);
+    Object.assign(layout.xaxis, date() ? {type: "date", hoverformat: "%H:%M:%S.%2f"} : {tickformat: ".10~f"});
+    layout.xaxis.title.text = clock.selectedOptions[0].text;
+  };
+  clock?.addEventListener("change", () => places.filter(place => place.data && timed(place)).forEach(place => {
+    Plotly.purge(place);
+    draw(place);
+  }));
 
   // what is in a figure, beside its tints; a click hides it
   const legend = (place, traces) => {
@@ -53,11 +78,11 @@
 
   const others = place => places.filter(one => one !== place && one.data && timed(one));
   const together = (place, change) => {
-    const range = place.layout.xaxis.range.slice();
+    const axis = place._fullLayout.xaxis, range = axis.range.map(x => fromStart(axis.r2l(x)));
     const moved = Object.keys(change).some(key => key.startsWith("xaxis."));
-    if (!moved || (shared && range[0] === shared[0] && range[1] === shared[1])) return;
+    if (!moved || (shared && Math.max(...range.map((x, k) => Math.abs(x - shared[k]))) < 1e-3)) return;
     shared = range;
-    for (const one of others(place)) Plotly.relayout(one, {"xaxis.range": range.slice()});
+    for (const one of others(place)) Plotly.relayout(one, {"xaxis.range": range.map(onClock)});
   };
 
   const point = x => {

@@ -12,12 +12,13 @@ import json
 import math
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from html import escape
 from pathlib import Path
 from typing import Any
 
-from graphnav.plots import PALETTE, Figure, css_colours
+from graphnav.plots import PALETTE, TIME, Figure, css_colours
 
 _HERE = Path(__file__).parent
 _PACKED = "application/octet-stream"
@@ -190,16 +191,36 @@ def folded(title: str, content: str) -> Raw:
     return Raw(f"<details><summary>{text(title)}</summary>{content}</details>")
 
 
-def page(title: str, lead: Sequence[str], sections: Sequence[tuple[str, Sequence[str]]]) -> str:
+@dataclass(frozen=True)
+class Clock:
+    """A clock that figures over time can be read on: what it is called, and what it reads at the start, s.
+
+    `date`: the seconds are of a day of the calendar, since 1970.
+    """
+
+    words: str
+    start: float
+    date: bool = False
+
+
+def page(
+    title: str, lead: Sequence[str], sections: Sequence[tuple[str, Sequence[str]]], clocks: Sequence[Clock] = ()
+) -> str:
     """The whole page.
 
     Parameters
     ----------
     lead : HTML between the title and the first section.
     sections : heading and HTML parts; sections without parts are left out.
+    clocks : to choose from, beside seconds from the start.
     """
     sections = [(head, parts) for head, parts in sections if any(parts)]
-    links = "".join(f'<a href="#s{k}">{escape(head)}</a>' for k, (head, _) in enumerate(sections))
+    choice = "".join(
+        f'<option value="{one.start!r}"{" data-date" if one.date else ""}>{text(one.words)}</option>' for one in clocks
+    )
+    if choice:
+        choice = f'<select id="clock" aria-label="time axis"><option value="">{TIME}</option>{choice}</select>'
+    links = choice + "".join(f'<a href="#s{k}">{escape(head)}</a>' for k, (head, _) in enumerate(sections))
     body = "".join(
         f'<section id="s{k}"><h2>{escape(head)}</h2>{"".join(parts)}</section>'
         for k, (head, parts) in enumerate(sections)

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from graphnav import page
 from graphnav import report_pictures as pictures
 from graphnav import report_summary as summary
@@ -17,6 +19,7 @@ from graphnav.report_names import named
 from graphnav.report_provenance import provenance_tables
 from graphnav.report_tables import Withheld
 from graphnav.solution import Solution
+from graphnav.timescales import GPS_TO_UNIX, gps_to_utc
 
 if TYPE_CHECKING:
     from graphnav.metrics import Errors
@@ -131,7 +134,7 @@ def write_report(
         *summary.fix_table(recording, solution, withheld),
         page.columns(["".join(summary.sigma_table(solution)), "".join(summary.left_out(solution, start))]),
     ]
-    return _write(path, page.page(f"{recording.name}: {name}", lead, sections))
+    return _write(path, page.page(f"{recording.name}: {name}", lead, sections, _clocks(recording)))
 
 
 def write_comparison(
@@ -196,12 +199,22 @@ def write_comparison(
         *(note for name, values in metrics_of.items() for note in words.closure_note(name, values)),
         words.tiles(recording, solutions, every),
     ]
-    return _write(path, page.page(f"{recording.name}: comparison", lead, sections))
+    return _write(path, page.page(f"{recording.name}: comparison", lead, sections, _clocks(recording)))
 
 
 def detector_pictures(recording: Recording, solution: Solution) -> list[page.Raw]:
     """What the detectors saw, for `write_report`: the same for every solver of a recording."""
     return pictures.detection_pictures(recording, solution.detections)
+
+
+def _clocks(recording: Recording) -> list[page.Clock]:
+    """The recording's own clock, and where it is known which one that is GPS time and UTC."""
+    out = [page.Clock("time on the recording's clock [s]", recording.start)]
+    if recording.gps_zero is not None:
+        gps = recording.gps_zero + recording.start
+        utc = (gps_to_utc(np.array([gps]))[0] - np.datetime64(0, "us")) / np.timedelta64(1, "s")
+        out += [page.Clock("UTC", float(utc), date=True), page.Clock("GPS time", gps + GPS_TO_UNIX, date=True)]
+    return out
 
 
 def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans) -> Shades:

@@ -109,6 +109,14 @@ def test_hovering_zooming_and_hiding(tab, pages):
     assert tab.run(f"{limits}({other})") == pytest.approx(tab.run(f"{limits}({place})"))
     tab.run(f"void Plotly.relayout({other}.querySelector('.plot'), {{'xaxis.range': [10, 20]}})")
     tab.wait(f"{limits}({place})[0] === 10")
+    # the same on the recording's clock, and back
+    choose = "(k => (k.selectedIndex = {}, k.dispatchEvent(new Event('change'))))(document.getElementById('clock'))"
+    start = tab.run("Number(document.getElementById('clock').options[1].value)")
+    tab.run(choose.format(1))
+    assert tab.run(f"{limits}({place})") == pytest.approx([start + 10.0, start + 20.0])
+    assert tab.run(f"{limits}({other})") == pytest.approx([start + 10.0, start + 20.0])
+    tab.run(choose.format(0))
+    assert tab.run(f"{limits}({place})") == pytest.approx([10.0, 20.0])
     shown = f"{place}.querySelector('.plot').data.filter(t => t.legendgroup === 'ekf').map(t => t.visible !== false)"
     assert tab.run(shown) == [True] * 3
     tab.run(f"[...{place}.querySelectorAll('button')].find(b => b.innerText === 'ekf').click()")

@@ -318,6 +318,20 @@ def test_all_figures_over_time_have_one_axis(tmp_path, recording):
     assert {tuple(x) for x in over_time} == {(0.0, recording.duration)}
 
 
+def test_the_time_axis_can_be_read_on_every_clock_that_is_known(tmp_path, recording):
+    def clocks(path):
+        return re.findall(r'<option value="([\d.]+)"( data-date)?>', path.read_text(encoding="utf-8"))
+
+    assert clocks(write(tmp_path, recording)) == [(str(recording.start), "")]
+    # GPS week 2200 began on 2022-03-06, 18 s before midnight UTC
+    dated = clocks(write(tmp_path, replace(recording, gps_zero=2200 * 604800.0)))
+    midnight = np.datetime64("2022-03-06") - np.datetime64("1970-01-01")
+    unix = midnight / np.timedelta64(1, "s") - 18.0
+    assert [(float(start), mark) for start, mark in dated[1:]] == [
+        (unix + recording.start, " data-date"), (unix + 18.0 + recording.start, " data-date"),
+    ]  # fmt: skip
+
+
 def test_quantiles_of_sigma_are_those_of_the_keyframes():
     rows = {row[0]: row[1:] for row in cells(sigma_table(solution())[1])}
     assert [float(x) for x in rows["position, horizontal [m]"]] == pytest.approx([0.2 * np.sqrt(2.0)] * 3, rel=1e-3)

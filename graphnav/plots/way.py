@@ -103,7 +103,8 @@ def draw_fixes(panel: Panel, fixes: Fixes, k: int | None = None) -> None:
         rows = of_it & ~fixes.excluded & np.isfinite(y)
         if rows.any():
             name = FIX_COLOURS.get(kind, "ink")
-            panel.dots(x[rows], y[rows], name, kind, 3.0, alpha=0.6, t=fixes.t[rows], way=k is None)
+            size = 5.0 if k is None else 3.0
+            panel.dots(x[rows], y[rows], name, kind, size, alpha=0.6, t=fixes.t[rows], way=k is None)
     out = fixes.excluded & np.isfinite(y)
     if out.any():
         panel.dots(x[out], y[out], "alert", "excluded fix", 7.0, "x", t=fixes.t[out], way=k is None)
