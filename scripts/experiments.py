@@ -18,7 +18,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "experiments"
-RUN = re.compile(r"^```sh\npython (?P<command>.+)\n```\n(?P<printed>.*?)(?=^## |\Z)", re.MULTILINE | re.DOTALL)
+RUN = re.compile(r"^```sh\npython (?P<command>[^\n]+)\n```\n(?P<printed>.*?)(?=^## |\Z)", re.MULTILINE | re.DOTALL)
 
 
 def main() -> None:
