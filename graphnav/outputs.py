@@ -25,6 +25,7 @@ from graphnav.errors import ConfigError, PartlyWrittenError
 from graphnav.files import exists
 from graphnav.solution import ParameterEstimate, Solution
 from graphnav.stored import read_again, sha256, write_outcome
+from graphnav.timescales import gps_to_utc
 from graphnav.workflow import Outcome, outages
 
 if TYPE_CHECKING:
@@ -34,8 +35,8 @@ if TYPE_CHECKING:
 
 
 FILES = (
-    "trajectory.csv", "trajectory.kml", "trajectory.tum", "calibration.json", "detections.csv", "summary.json",
-    "report.html", "comparison.csv", "comparison.html",
+    "trajectory.csv", "trajectory.kml", "trajectory.gpx", "trajectory.tum", "calibration.json", "detections.csv",
+    "summary.json", "report.html", "comparison.csv", "comparison.html",
 )  # fmt: skip
 
 
@@ -157,12 +158,15 @@ def write_solver(
     list of str
         What could not be written, and why: a picture that fails takes no number with it.
     """
-    from graphnav.exporters import write_all
+    from graphnav.exporters import write_all, write_as
 
     solution = outcome.solutions[name]
     began = time.perf_counter()
     trajectory = solution.trajectory(outcome.request.rate)
-    write_all(replace(trajectory, name=f"{outcome.recording.name}, {name}"), folder)
+    trajectory = replace(trajectory, name=f"{outcome.recording.name}, {name}")
+    write_all(trajectory, folder)
+    zero = outcome.recording.gps_zero
+    write_as("gpx", trajectory, folder / "trajectory.gpx", None if zero is None else gps_to_utc(trajectory.t + zero))
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
     (folder / "detections.csv").write_text(intervals_text(solution.detections), encoding="utf-8")
     written = time.perf_counter()
@@ -194,7 +198,7 @@ def _draw_solver(
         provenance=provenance,
         detectors=detectors,
         noise=noise_rows(outcome, solution),
-        beside=[f"trajectory.{name}" for name in dict.fromkeys(("kml", *outcome.request.exported, "csv"))],
+        beside=("trajectory.kml", "trajectory.gpx", "trajectory.csv"),
     )
 
 
