@@ -242,8 +242,9 @@ def page(
 @lru_cache(maxsize=1)
 def _library() -> str:
     found = importlib.util.find_spec("plotly")
-    (folder,) = found.submodule_search_locations or [] if found else []
-    return _deflated((Path(folder) / "package_data" / "plotly.min.js").read_bytes())
+    if found is None or found.origin is None:
+        raise ModuleNotFoundError("plotly is not installed")
+    return _deflated((Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes())
 
 
 def _deflated(content: bytes) -> str:
