@@ -13,8 +13,9 @@ from graphnav.noise.apply import row_weights
 from graphnav.page import Raw
 from graphnav.recording import Recording
 from graphnav.report_pictures import fixes_of
-from graphnav.report_tables import Withheld, consistency, rms
+from graphnav.report_tables import Withheld, consistency
 from graphnav.rotation import Array
+from graphnav.segments import relative_errors, rms
 from graphnav.solution import Solution
 
 if TYPE_CHECKING:
@@ -177,8 +178,6 @@ def links(files: Sequence[str]) -> list[Raw]:
 
 def relative_tables(errors: Mapping[str, Errors]) -> list[Raw]:
     """Relative errors by the length of segments, where there is a truth."""
-    from graphnav.segments import relative_errors
-
     rows = [
         [page.solver(name), Raw(f"{r.length:g}"), r.count, r.rms, r.percent, r.p95, r.largest, r.heading_rms]
         for name, e in errors.items()

@@ -15,6 +15,7 @@ from graphnav.plots import Spans
 from graphnav.recording import Recording
 from graphnav.report_names import components
 from graphnav.rotation import Array
+from graphnav.segments import rms
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
 
 if TYPE_CHECKING:
@@ -98,11 +99,6 @@ def constraint_table(solution: Solution) -> list[Raw]:
         counted = page.and_list([f"{count} {kind}" for kind, count in solution.counts.items()])
         out.append(page.paragraph(f"Factors or updates by kind: {counted}.", "soft"))
     return out
-
-
-def rms(x: Array) -> float:
-    """Root mean square of what is finite."""
-    return float(np.sqrt(_mean(x * x)))
 
 
 def _largest(x: Array) -> float:

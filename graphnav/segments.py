@@ -51,7 +51,7 @@ def relative_errors(errors: Errors) -> tuple[Relative, ...]:
             off = np.hypot(*(e[last] - e[first]).T)
             turned = np.degrees(np.angle(np.exp(1j * (heading[last] - heading[first]))))
             p95, largest = np.quantile(off, 0.95), off.max()
-            out.append(Relative(length, len(first), _rms(off), float(p95), float(largest), _rms(turned)))
+            out.append(Relative(length, len(first), rms(off), float(p95), float(largest), rms(turned)))
     return tuple(out)
 
 
@@ -64,6 +64,7 @@ def _segments(way: Array, length: float) -> tuple[np.ndarray, np.ndarray]:
     return first, last[first]
 
 
-def _rms(x: Array) -> float:
+def rms(x: Array) -> float:
+    """Root mean square of what is finite."""
     x = x[np.isfinite(x)]
     return float(np.sqrt(np.mean(x * x))) if len(x) else float("nan")

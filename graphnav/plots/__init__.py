@@ -4,7 +4,7 @@ Times are seconds from the recording's start, as on the command line.
 """
 
 from graphnav.plots.colours import PALETTE, css_colours
-from graphnav.plots.consistency import chi2_quantile, nees, residuals, timeline
+from graphnav.plots.consistency import nees, residuals, timeline
 from graphnav.plots.detections import detections
 from graphnav.plots.figure import SHADES, TIME, Figure, Panel, Spans, limits
 from graphnav.plots.series import Series, Shades, bands, sigmas, span_zoom
@@ -13,6 +13,6 @@ from graphnav.plots.way import FIX_COLOURS, Fixes, profile, trajectory
 
 __all__ = [
     "BINS", "FIX_COLOURS", "PALETTE", "SHADES", "TIME", "Figure", "Fixes", "Panel", "Series", "Shades", "Spans",
-    "bands", "chi2_quantile", "chosen_rows", "css_colours", "detections", "limits", "nees", "profile", "residuals",
+    "bands", "chosen_rows", "css_colours", "detections", "limits", "nees", "profile", "residuals",
     "sigmas", "span_zoom", "thin", "timeline", "trajectory", "with_breaks",
 ]  # fmt: skip

@@ -10,16 +10,10 @@ import numpy as np
 from graphnav.plots.figure import Figure, Panel, limits
 from graphnav.plots.series import Series, Shades
 from graphnav.rotation import Array
+from graphnav.sample_size import chi_square_quantile
 from graphnav.solution import ConstraintRecord
 
 _CHI2 = "99 % of chi-square"
-
-
-def chi2_quantile(probability: float, dof: float) -> float:
-    """Where the chi-square distribution function is `probability` (scipy.stats would take 0.7 s to import)."""
-    from scipy import special
-
-    return float(special.chdtri(dof, 1.0 - probability))
 
 
 def residuals(record: ConstraintRecord, start: float, end: float, solver: str = "", *, spans: Shades) -> Figure:
@@ -36,7 +30,7 @@ def residuals(record: ConstraintRecord, start: float, end: float, solver: str = 
     tops = [float(np.clip(np.nanmax(np.abs(white[:, k]), initial=3.5) * 1.06, 4.0, 12.0)) for k in range(m)]
     nis = record.nis
     # beyond this an epoch is in the outermost 1 % of the distribution
-    lo, hi = chi2_quantile(0.005, m), chi2_quantile(0.995, m)
+    lo, hi = chi_square_quantile(0.005, m), chi_square_quantile(0.995, m)
     bottom, top = math.log10(0.1 * lo), math.log10(max(10.0 * hi, min(np.nanmax(nis, initial=hi), 1000.0 * hi)))
     figure = Figure(
         [*(f"{axis}, residual / sigma" for axis in record.axes), "NIS"],
@@ -82,7 +76,7 @@ def nees(
     dofs : k degrees of freedom.
     """
     scaled = {key: np.where(s.value > 0, s.value / np.array(dofs, float), np.nan) for key, s in series.items()}
-    edges = [(chi2_quantile(0.005, dof) / dof, chi2_quantile(0.995, dof) / dof) for dof in dofs]
+    edges = [(chi_square_quantile(0.005, dof) / dof, chi_square_quantile(0.995, dof) / dof) for dof in dofs]
     # errors cross zero: how near to it they came is nothing to look at
     ylims = []
     for k, (low, high) in enumerate(edges):
