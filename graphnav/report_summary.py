@@ -136,7 +136,9 @@ def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> l
         rows.append([*cells, len(used), gap, largest, over])
     head = ["fixes", "count", "withheld", "left out", "used", "longest gap [s]", "largest residual [m]", "over sigma"]
     out = [page.heading("Fixes"), page.table(head, rows)]
-    if any(row[4] < row[1] - row[3] for row in rows):
+    if "gnss_code" in solution.records:
+        out.append(page.paragraph("Raw observations are used in place of the fixes.", "soft"))
+    elif any(row[4] < row[1] - row[3] for row in rows):
         out.append(page.paragraph("Of fixes that come more often than noise.spacing, the best one is used.", "soft"))
     return out
 
