@@ -191,7 +191,9 @@ def test_every_table_of_an_experiment_names_its_command_and_commit():
     for page in sorted((ROOT / "docs" / "experiments").glob("*.md")):
         text = page.read_text(encoding="utf-8")
         runs = re.findall(
-            r"^```sh\npython (scripts/\w+\.py)\b.*\n```\n\nPrinted by commit `[0-9a-f]{7,}`", text, re.MULTILINE
+            r"^```sh\npython (scripts/\w+\.py)\b.*\n```\n\n(?:Printed|Entered) by commits? `[0-9a-f]{7,}`",
+            text,
+            re.MULTILINE,
         )
         assert len(runs) == text.count("```sh") > 0, page.name
         assert all((ROOT / script).exists() for script in runs), page.name
