@@ -27,7 +27,7 @@ docs: $(VENV)/installed-dev
 $(VENV)/installed: pyproject.toml
 	@echo "installing graphnav and what it needs into $(VENV), once: about 600 MB, a minute or two"
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet -e '.[plots]'
+	$(BIN)/pip install --quiet -e .
 	@touch $@
 
 $(VENV)/installed-dev: pyproject.toml

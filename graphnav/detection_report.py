@@ -1,4 +1,4 @@
-"""What `graphnav detect` leaves on disk and says: detections.csv, statistics.csv.gz, detections.png, a summary."""
+"""What `graphnav detect` leaves on disk and says: detections.csv, statistics.csv.gz, detections.html, a summary."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from graphnav import page, plots, report_pictures
+from graphnav import page, report_pictures
 from graphnav.detectors import Detections
 from graphnav.exporters.digits import rows_text
 from graphnav.recording import Recording
@@ -16,21 +16,19 @@ from graphnav.rotation import Array
 from graphnav.stops import Stop, detections_text, stops_of
 
 _LISTED = 30  # stops
-_WIDTH = 720.0  # points, of the PNG
 
 
 def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
     """All files; times are on the recording's clock, as in trajectory.csv."""
     folder.mkdir(parents=True, exist_ok=True)
-    intervals, statistics, plot = (folder / n for n in ("detections.csv", "statistics.csv.gz", "detections.png"))
+    intervals, statistics = (folder / n for n in ("detections.csv", "statistics.csv.gz"))
     intervals.write_text(detections_text(found.all), encoding="utf-8")
     # no name and no time in the header: the same recording gives the same bytes
     with statistics.open("wb") as raw, gzip.GzipFile("", "wb", 5, raw, mtime=0) as file:
         file.write(statistics_text(found).encode())
-    plots.detections(recording, found.all, width=_WIDTH).savefig(plot, dpi=110, metadata={"Software": None})
     html = folder / "detections.html"
     html.write_text(_page(recording, found), encoding="utf-8")
-    return [html, plot, intervals, statistics]
+    return [html, intervals, statistics]
 
 
 def _page(recording: Recording, found: Detections) -> str:

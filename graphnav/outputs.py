@@ -23,6 +23,7 @@ from graphnav.plain import peak_memory_mb, write_json
 from graphnav.solution import ParameterEstimate, Solution
 from graphnav.stops import detections_text, stops_of_solution
 from graphnav.stored import read_again, sha256, write_outcome
+from graphnav.timescales import gps_to_utc
 from graphnav.workflow import Outcome, outages
 
 if TYPE_CHECKING:
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
 
 
 FILES = (
-    "trajectory.csv", "trajectory.kml", "trajectory.tum", "calibration.json", "detections.csv", "summary.json",
-    "report.html", "comparison.csv", "comparison.html",
+    "trajectory.csv", "trajectory.kml", "trajectory.gpx", "trajectory.tum", "calibration.json", "detections.csv",
+    "summary.json", "report.html", "comparison.csv", "comparison.html",
 )  # fmt: skip
 
 
@@ -173,18 +174,22 @@ def write_solver(
     list of str
         What could not be written, and why: a picture that fails takes no number with it.
     """
-    from graphnav.exporters import write_all
+    from graphnav.exporters import written
 
     solution = outcome.solutions[name]
     began = time.perf_counter()
-    write_all(solution.blocks(outcome.request.rate), folder, f"{outcome.recording.name}, {name}")
+    targets = {one: folder / f"trajectory.{one}" for one in ("csv", "kml", "tum", "gpx")}
+    zero, title = outcome.recording.gps_zero, f"{outcome.recording.name}, {name}"
+    folder.mkdir(parents=True, exist_ok=True)
+    utc = None if zero is None else lambda t: gps_to_utc(t + zero)
+    written(solution.blocks(outcome.request.rate), targets, title, utc)
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
     text = detections_text(solution.detections, solution.records)
     (folder / "detections.csv").write_text(text, encoding="utf-8")
-    written = time.perf_counter()
+    done = time.perf_counter()
     report = folder / "report.html"
     failed = _attempt(lambda _: _draw_solver(outcome, name, folder, provenance, detectors), report) if pages else []
-    spent = {"writing": written - began, "report": time.perf_counter() - written}
+    spent = {"writing": done - began, "report": time.perf_counter() - done}
     write_json(folder / "summary.json", solver_summary(outcome, name, spent, provenance))
     return failed
 
@@ -209,6 +214,7 @@ def _draw_solver(
         provenance=provenance,
         detectors=detectors,
         noise=noise_rows(outcome, solution),
+        beside=("trajectory.kml", "trajectory.gpx", "trajectory.csv"),
     )
 
 

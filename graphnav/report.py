@@ -6,16 +6,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from graphnav import page
 from graphnav import report_pictures as pictures
+from graphnav import report_summary as summary
 from graphnav import report_tables as tables
 from graphnav import report_words as words
-from graphnav.panels.drawing import Spans
+from graphnav.plots import Shades, Spans
 from graphnav.recording import Recording
-from graphnav.report_pictures import Shades
+from graphnav.report_names import named
 from graphnav.report_provenance import provenance_tables
 from graphnav.report_tables import Withheld
 from graphnav.solution import Solution
+from graphnav.timescales import GPS_TO_UNIX, gps_to_utc
 
 if TYPE_CHECKING:
     from graphnav.metrics import Errors
@@ -38,6 +42,7 @@ def write_report(
     provenance: Mapping[str, Any] | None = None,
     detectors: Sequence[page.Raw] | None = None,
     noise: Sequence[FigureRow] = (),
+    beside: Sequence[str] = (),
 ) -> Path:
     """One solver's report as one self-contained HTML file.
 
@@ -51,25 +56,45 @@ def write_report(
     provenance : version, input hashes and the like, plain values; `options` are those of the command.
     detectors : of `detector_pictures`, for who writes several reports of one recording; drawn here if None.
     noise : figures of the noise model, of `graphnav.noise.table.figure_rows`.
+    beside : names of files in the same folder to link to.
     """
-    name, start, track = solution.solver, recording.start, solution.trajectory()
+    name, start, end = solution.solver, recording.start, recording.duration
     only, every = {name: solution}, {} if errors is None else {name: errors}
     spans = _shades(solution, start, withheld, outages)
     if detectors is None:
         detectors = detector_pictures(recording, solution)
-    moving = pictures.motion_pictures(track, name, start, spans)
+    own, others = ({k: p for k, p in solution.parameters.items() if named(k) == of_it} for of_it in (True, False))
     sections: Sections = [
-        ("Trajectory", [page.gallery([pictures.trajectory_picture(recording, only, spans)])]),
-        ("Accuracy", [*tables.accuracy_tables(every, withheld, start, outages), *tables.metric_tables(metrics)]),
-        ("Errors against truth", _gallery(pictures.error_pictures(every, start, spans))),
-        ("Can sigma be believed?", _consistency(every, start, spans)),
-        ("Uncertainty", _gallery(pictures.sigma_pictures({name: track}, start, spans))),
-        ("Velocity and attitude", _gallery(moving)),
-        ("Biases", _gallery(pictures.bias_pictures(solution, start, spans))),
+        (
+            "Trajectory",
+            [
+                page.gallery([pictures.trajectory_picture(recording, only, spans)]),
+                page.gallery([pictures.profile_picture(recording, only)]),
+                *_gallery(pictures.motion_pictures(recording, only, spans)),
+            ],
+        ),
+        (
+            "Accuracy",
+            [
+                *tables.accuracy_tables(every, withheld, start, outages),
+                *summary.relative_tables(every),
+                *tables.metric_tables(metrics),
+                *_gallery(pictures.error_pictures(every, start, end, spans)),
+            ],
+        ),
+        ("Can sigma be believed?", [*_verdicts(only, every), *_consistency(every, start, end, spans)]),
+        ("Uncertainty", _gallery(pictures.sigma_pictures({name: solution.trajectory()}, start, end, spans))),
         (
             "Calibration",
-            [*tables.parameter_table(solution.parameters),
-             *_gallery(pictures.parameter_pictures(solution, start, spans))],
+            [
+                *tables.parameter_table(own),
+                *_gallery(
+                    [
+                        *pictures.bias_pictures(solution, start, end, spans),
+                        *pictures.parameter_pictures(own, name, start, end, spans),
+                    ]
+                ),
+            ],
         ),
         (
             "Constraints",
@@ -77,22 +102,39 @@ def write_report(
                 *_gallery(pictures.timeline_picture(solution, recording, spans)),
                 *tables.constraint_table(solution),
                 *tables.rejected_table(solution, start),
-                *_gallery(pictures.record_pictures(solution, start, spans)),
+                *_folded("Residuals of each", _gallery(pictures.record_pictures(solution, start, end, spans))),
             ],
         ),
-        ("Noise model", [*tables.noise_tables(noise, solution), *tables.excluded_table(solution, start)]),
+        (
+            "Noise model",
+            [
+                *tables.noise_tables(noise, solution),
+                *tables.excluded_table(solution, start),
+                *_folded(
+                    "Noise processes, node by node",
+                    [
+                        *tables.parameter_table(others),
+                        *_gallery(pictures.parameter_pictures(others, name, start, end, spans)),
+                    ],
+                ),
+            ],
+        ),
         ("Detectors", [*_gallery(detectors), *tables.stop_table(solution, start)]),
         ("What was odd", tables.odd(recording, findings)),
         ("How it ran", tables.run_table(only)),
         ("Provenance", provenance_tables(settings, provenance)),
-    ]  # fmt: skip
+    ]
     lead = [
         *_doubts(only, every),
         page.paragraph(words.what_was_done(recording, only, withheld, outages)),
-        *_verdicts(only, every, {} if metrics is None else {name: metrics}),
+        summary.verdicts(solution, errors),
+        *words.closure_note(name, metrics),
         words.tiles(recording, only, every),
+        *summary.links(beside),
+        *summary.fix_table(recording, solution, withheld),
+        page.columns(["".join(summary.sigma_table(solution)), "".join(summary.left_out(solution, start))]),
     ]
-    return _write(path, page.page(f"{recording.name}: {name}", lead, sections))
+    return _write(path, page.page(f"{recording.name}: {name}", lead, sections, _clocks(recording)))
 
 
 def write_comparison(
@@ -110,7 +152,8 @@ def write_comparison(
     noise: Sequence[FigureRow] = (),
 ) -> Path:
     """Several solvers on one recording as one self-contained HTML file; arguments as in `write_report`, per solver."""
-    start, every, metrics_of = recording.start, errors or {}, metrics or {}
+    start, end = recording.start, recording.duration
+    every, metrics_of = errors or {}, metrics or {}
     first = next(iter(solutions.values()))
     spans = _shades(first, start, withheld, outages)
     gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
@@ -126,13 +169,23 @@ def write_comparison(
     measured = [table for name, values in metrics_of.items() for table in tables.metric_tables(values, name)]
     tracks = {name: s.trajectory() for name, s in solutions.items()}
     sections: Sections = [
-        ("Accuracy", [*tables.accuracy_tables(every, withheld, start, outages), *measured]),
+        (
+            "Accuracy",
+            [*tables.accuracy_tables(every, withheld, start, outages), *summary.relative_tables(every), *measured],
+        ),
         ("Spans without GNSS" if not gone else "Withheld spans", _gallery(zooms)),
-        ("Trajectory", [page.gallery([pictures.trajectory_picture(recording, solutions, spans)])]),
-        ("Errors against truth", _gallery(pictures.error_pictures(every, start, spans))),
-        ("Where they differ", _gallery(pictures.difference_pictures(solutions, start, spans))),
-        ("Can sigma be believed?", _consistency(every, start, spans)),
-        ("Uncertainty", _gallery(pictures.sigma_pictures(tracks, start, spans))),
+        (
+            "Trajectory",
+            [
+                page.gallery([pictures.trajectory_picture(recording, solutions, spans)]),
+                page.gallery([pictures.profile_picture(recording, solutions)]),
+                *_gallery(pictures.motion_pictures(recording, solutions, spans)),
+            ],
+        ),
+        ("Errors against truth", _gallery(pictures.error_pictures(every, start, end, spans))),
+        ("Where they differ", _gallery(pictures.difference_pictures(solutions, start, end, spans))),
+        ("Can sigma be believed?", _consistency(every, start, end, spans)),
+        ("Uncertainty", _gallery(pictures.sigma_pictures(tracks, start, end, spans))),
         ("Constraints", [page.table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
         ("Noise model", [*tables.noise_tables(noise, first), *tables.excluded_table(first, start)]),
         ("What was odd", tables.odd(recording, findings)),
@@ -142,15 +195,26 @@ def write_comparison(
     lead = [
         *_doubts(solutions, every),
         page.paragraph(words.what_was_done(recording, solutions, withheld, outages)),
-        *_verdicts(solutions, every, metrics_of),
+        *_verdicts(solutions, every),
+        *(note for name, values in metrics_of.items() for note in words.closure_note(name, values)),
         words.tiles(recording, solutions, every),
     ]
-    return _write(path, page.page(f"{recording.name}: comparison", lead, sections))
+    return _write(path, page.page(f"{recording.name}: comparison", lead, sections, _clocks(recording)))
 
 
 def detector_pictures(recording: Recording, solution: Solution) -> list[page.Raw]:
     """What the detectors saw, for `write_report`: the same for every solver of a recording."""
     return pictures.detection_pictures(recording, solution.detections)
+
+
+def _clocks(recording: Recording) -> list[page.Clock]:
+    """The recording's own clock, and where it is known which one that is GPS time and UTC."""
+    out = [page.Clock("time on the recording's clock [s]", recording.start)]
+    if recording.gps_zero is not None:
+        gps = recording.gps_zero + recording.start
+        utc = (gps_to_utc(np.array([gps]))[0] - np.datetime64(0, "us")) / np.timedelta64(1, "s")
+        out += [page.Clock("UTC", float(utc), date=True), page.Clock("GPS time", gps + GPS_TO_UNIX, date=True)]
+    return out
 
 
 def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans) -> Shades:
@@ -165,28 +229,29 @@ def _doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> 
     return [page.paragraph(said, "verdict bad") for said in words.doubts(solutions, errors)]
 
 
-def _verdicts(
-    solutions: Mapping[str, Solution], errors: Mapping[str, Errors], metrics: Mapping[str, Mapping[str, Any]]
-) -> list[page.Raw]:
-    """Per solver, whether its sigma can be believed and, of a loop, how well it closes."""
+def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[page.Raw]:
+    """Per solver, whether its sigma can be believed."""
+    if errors:
+        return [words.believe(name, e) for name, e in errors.items()]
     # where there is no truth a filter's innovations judge the model that all share better than any residuals
     met = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
-    said = [words.believe(name, e) for name, e in errors.items()]
-    if not errors:
-        said = [words.believe_without_truth(solution) for solution in met or solutions.values()]
-    return [*said, *(note for name, values in metrics.items() for note in words.closure_note(name, values))]
+    return [words.believe_without_truth(solution) for solution in met or solutions.values()]
 
 
-def _consistency(errors: Mapping[str, Errors], start: float, spans: Shades) -> list[str]:
+def _consistency(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[str]:
     table = tables.nees_table(errors)
     if not table:
         return []
     note = "Errors of one drive are alike for seconds to minutes, so a true sigma scatters about 1 as well."
-    return [*table, page.paragraph(note, "soft"), *_gallery(pictures.nees_pictures(errors, start, spans))]
+    return [*table, page.paragraph(note, "soft"), *_gallery(pictures.nees_pictures(errors, start, end, spans))]
 
 
 def _gallery(images: Sequence[page.Raw]) -> list[str]:
     return [page.gallery(images)] if images else []
+
+
+def _folded(title: str, parts: Sequence[str]) -> list[str]:
+    return [page.folded(title, "".join(parts))] if parts else []
 
 
 def _write(path: str | Path, html: str) -> Path:

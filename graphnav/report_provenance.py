@@ -30,7 +30,8 @@ def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any]
         out.append(page.folded("Settings as resolved", link + page.code(toml, "settings")))
     inputs = provenance.pop("inputs", {})
     if provenance:
-        out += [page.heading("Versions"), page.pairs(page.flat(provenance))]
+        listed = [f"{key} {page.text(value)}" for key, value in page.flat(provenance).items()]
+        out += [page.heading("Versions"), page.paragraph(page.and_list(listed))]
     if inputs:
         rows = [[name, Raw(f"<code>{page.text(digest)}</code>")] for name, digest in inputs.items()]
         out += [page.heading("Inputs"), page.table(["file", "sha256"], rows)]

@@ -11,9 +11,11 @@ import numpy as np
 from graphnav import page
 from graphnav.against import own
 from graphnav.page import Raw
-from graphnav.panels.drawing import Spans
+from graphnav.plots import Spans
 from graphnav.recording import Recording
+from graphnav.report_names import components
 from graphnav.rotation import Array
+from graphnav.segments import rms
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.stops import stops_of_solution
 
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from graphnav.noise.table import FigureRow
 
 _LISTED = 40  # rejected measurements
+_SHOWN = 10  # excluded spans; the others open on demand
 Withheld = Sequence[tuple[str, tuple[float, float] | None]]
 
 
@@ -97,11 +100,6 @@ def constraint_table(solution: Solution) -> list[Raw]:
         counted = page.and_list([f"{count} {kind}" for kind, count in solution.counts.items()])
         out.append(page.paragraph(f"Factors or updates by kind: {counted}.", "soft"))
     return out
-
-
-def rms(x: Array) -> float:
-    """Root mean square of what is finite."""
-    return float(np.sqrt(_mean(x * x)))
 
 
 def _largest(x: Array) -> float:
@@ -242,7 +240,10 @@ def excluded_table(solution: Solution, start: float) -> list[Raw]:
         return []
     rows = [[Raw(f"{p.t_start - start:.1f} to {p.t_end - start:.1f} s"), p.kind, int(p.count), p.reason] for p in parts]
     head = ["when", "what", "rows", "why"]
-    return [page.heading("What was excluded"), page.table(head, rows)]
+    out = [page.heading("What was excluded"), page.table(head, rows[:_SHOWN])]
+    if len(rows) > _SHOWN:
+        out.append(page.folded(f"{len(rows) - _SHOWN} more", page.table(head, rows[_SHOWN:])))
+    return out
 
 
 def rejected_table(solution: Solution, start: float) -> list[Raw]:
@@ -296,20 +297,15 @@ def nees_table(errors: Mapping[str, Errors]) -> list[Raw]:
 
 def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Raw]:
     """What was estimated once or slowly: last value and sigma, and what was known before."""
-    rows = [
-        [
-            name if p.value.shape[1] == 1 else f"{name} [{k}]",
-            Raw(page.measured(float(p.value[-1, k]), float(p.sigma[-1, k]))),
-            Raw(page.measured(float(p.sigma[-1, k]), float(p.sigma[-1, k]))),
-            float(p.prior_sigma[k]),
-            len(p.t),
-            "yes" if p.observable[k] else "no: mostly the prior",
-            p.unit or "-",
-        ]
-        for name, p in parameters.items()
-        for k in range(p.value.shape[1])
-    ]
-    head = ["parameter", "value", "sigma", "sigma before", "nodes", "seen by the data", "unit"]
+    rows = []
+    for name, p in parameters.items():
+        for k, one in enumerate(components(name, p)):
+            value, sigma = one.scale * float(p.value[-1, k]), one.scale * float(p.sigma[-1, k])
+            known = "yes" if p.observable[k] else "no: mostly the prior"
+            before = one.scale * float(p.prior_sigma[k])
+            said = [Raw(page.measured(value, sigma)), Raw(page.measured(sigma, sigma)), before]
+            rows.append([one.words, *said, one.unit, known])
+    head = ["parameter", "value", "sigma", "sigma before", "unit", "seen by the data"]
     return [page.table(head, rows)] if rows else []
 
 
@@ -332,7 +328,8 @@ def run_table(solutions: Mapping[str, Solution]) -> list[Raw]:
     shared = [note for note in next(iter(solutions.values())).notes if all(note in s.notes for s in solutions.values())]
     theirs = [f"{name}: {note}" for name, s in every.items() for note in s.notes if note not in shared]
     table = page.table(["stage", *(page.solver(name) for name in solutions)], rows)
-    return [table, page.bullets([*notes, *shared, *theirs]) if notes or shared or theirs else Raw("")]
+    said = [*notes, *shared, *theirs]
+    return [page.columns([table, page.bullets(said)]) if said else table]
 
 
 def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Raw]:

@@ -11,9 +11,10 @@ from graphnav import page
 from graphnav.against import own
 from graphnav.noise.apply import row_weights
 from graphnav.page import Raw
-from graphnav.panels.drawing import Spans
+from graphnav.plots import Spans
 from graphnav.recording import Recording
-from graphnav.report_tables import Withheld, consistency, rms
+from graphnav.report_tables import Withheld, consistency
+from graphnav.segments import rms
 from graphnav.solution import Solution
 
 if TYPE_CHECKING:

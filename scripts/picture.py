@@ -19,7 +19,7 @@ import numpy as np
 
 from graphnav.config import Settings, settings_from
 from graphnav.evaluation import truth_of
-from graphnav.panels import PALETTE
+from graphnav.plots import PALETTE
 from graphnav.workflow import Request, parse_withheld, run_request
 
 AROUND = 15.0  # s drawn before and after the span

@@ -1,4 +1,4 @@
-"""The tables of docs/results.md: `graphnav compare` on drives with a minute of GNSS withheld.
+"""The table of docs/experiments/outage.md: `graphnav compare` on drives with a minute of GNSS withheld.
 
 python scripts/results.py ../shared/data
 """

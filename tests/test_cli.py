@@ -31,8 +31,8 @@ TRAJECTORY_COLUMNS = (
 )
 WITHHELD = (30.0, 45.0)  # s from the start, long before the drive's own outage
 FILES = {
-    "trajectory.csv", "trajectory.kml", "trajectory.tum", "calibration.json", "detections.csv", "summary.json",
-    "report.html",
+    "trajectory.csv", "trajectory.kml", "trajectory.gpx", "trajectory.tum", "calibration.json", "detections.csv",
+    "summary.json", "report.html",
 }  # fmt: skip
 
 

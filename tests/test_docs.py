@@ -27,7 +27,7 @@ from graphnav.preintegration import preintegrate
 from graphnav.samples import bridge_gaps
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "data").rglob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "data").rglob("*.md"))]
 # a fence may be indented, as in a list
 FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 
@@ -184,6 +184,20 @@ def test_the_site_builds_and_every_link_in_it_leads_somewhere(tmp_path):
     for name in ("graphnav.pipeline.run", "graphnav.recording.Imu.gyro", "graphnav.errors.GraphnavError"):
         assert f'id="{name}"' in reference
     assert "(K, 3) latitude, longitude (rad), ellipsoidal height (m)" in reference  # units of the fields
+
+
+def test_every_table_of_an_experiment_names_its_command_and_commit():
+    for page in sorted((ROOT / "docs" / "experiments").glob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        runs = re.findall(
+            r"^```sh\npython (scripts/\w+\.py)\b.*\n```\n\n(?:Printed|Entered) by commits? `[0-9a-f]{7,}`",
+            text,
+            re.MULTILINE,
+        )
+        assert len(runs) == text.count("```sh") > 0, page.name
+        assert all((ROOT / script).exists() for script in runs), page.name
+        before, _, _ = text.partition("```sh")
+        assert "| --- " not in before, f"{page.name}: a table that no command printed"
 
 
 def test_toml_examples_are_valid(tmp_path):

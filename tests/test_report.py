@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import re
 import tomllib
+import zlib
 from dataclasses import dataclass, replace
 from html.parser import HTMLParser
 
@@ -12,17 +15,23 @@ import pytest
 
 from graphnav import page, report_pictures, rotation
 from graphnav.config import Settings
+from graphnav.constraints.foot import FOOT_AXIS, PATTERN, PIVOT, TRAVEL
+from graphnav.constraints.gnss import LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET
+from graphnav.constraints.vehicle import AXLE, BODY, MOUNTING, ODOMETER_DELAY, ODOMETER_SCALE
 from graphnav.detectors.base import Detection
+from graphnav.dynamics import SCALE
 from graphnav.earth import LocalFrame
 from graphnav.metrics import Errors
 from graphnav.noise.table import figure_rows
 from graphnav.noise_model import Figure, NoiseModel, RowWeights
-from graphnav.panels import interactive
 from graphnav.recording import Gnss, Imu, Recording, Truth
 from graphnav.report import write_comparison, write_report
+from graphnav.report_names import components, named
 from graphnav.report_provenance import command, toml_text
-from graphnav.report_tables import accuracy_row, consistency, span_row
+from graphnav.report_summary import fix_table, left_out, sigma_table, verdicts
+from graphnav.report_tables import accuracy_row, consistency, excluded_table, span_row
 from graphnav.report_words import doubts
+from graphnav.segments import relative_errors
 from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution, joined
 from graphnav.state import States
 
@@ -136,31 +145,42 @@ class Strict(HTMLParser):
             self.words.append(data)
 
 
+def unpacked(text):
+    """What `page.js` unpacks of a script element."""
+    return zlib.decompress(base64.b64decode(text)).decode()
+
+
+def figures_of(path):
+    """Title -> the figure that plotly is given, of everything on a page."""
+    found = re.findall(
+        r'<figcaption>([^<]*)</figcaption><div class="plot"[^>]*></div><script type="[\w/-]*">([^<]*)<',
+        path.read_text(encoding="utf-8"),
+    )
+    return {title: json.loads(unpacked(packed)) for title, packed in found}
+
+
 def checked(path):
-    """Parse a page and assert what holds for every page; returns the parser and its text."""
+    """Parse a page and assert what holds for every page; returns the parser and its text, with that of its figures."""
     html = path.read_text(encoding="utf-8")
     parser = Strict(html)
     assert len(parser.ids) == len(set(parser.ids))
     assert parser.references
     assert all(r[1:] in parser.ids for r in parser.references if r.startswith("#"))
-    assert all(r.startswith(("#", "data:")) for r in parser.references)
+    assert all(r.startswith(("#", "data:", "trajectory.")) for r in parser.references)
     own = re.sub(r'id="plotly-library">[^<]*<', "<", html)
-    assert not re.search(r"url\((?!#)|@import", own)
-    assert set(re.findall(r"url\(#([^)]*)\)", own)) <= set(parser.ids)
-    # two elements of the library and its use, and the data of every picture
-    assert parser.tags.count("script") == (len(parser.figures) + 2 if "plotly-library" in parser.ids else 0)
-    assert set(re.findall(r"var\(--([\w-]+)\)", html)) <= set(re.findall(r"--([\w-]+):", html))
-    text = " ".join(parser.words)
+    assert not re.search(r"url\(|@import", own)
+    drawn = figures_of(path)
+    assert len(drawn) == len(parser.figures)
+    assert "Plotly" in unpacked(re.search(r'id="plotly-library">([^<]*)<', html)[1])
+    # two elements of the library and its use, and the data of every figure
+    assert parser.tags.count("script") == len(parser.figures) + 2
+    said = json.dumps(list(drawn.values()))
+    assert set(re.findall(r"var\(--([\w-]+)\)", html + said)) <= set(re.findall(r"--([\w-]+):", html))
+    assert "NaN" not in said
+    assert "Infinity" not in said
+    text = " ".join([*parser.words, said])
     assert NAME in text
     return parser, text
-
-
-@pytest.fixture(autouse=True, params=["zoom", "still"])
-def library(request, monkeypatch):
-    """Every page, with plotly and without."""
-    if request.param == "still":
-        monkeypatch.setattr(interactive, "library", lambda: None)
-    return request.param
 
 
 def write(tmp_path, recording, **kw):
@@ -177,7 +197,7 @@ def test_report_holds_what_it_was_given(tmp_path, recording):
     _, text = checked(write(tmp_path, recording, metrics={"h_rms_m": 0.8765}, errors=errors_of()))
     for words in (
         "539 GNSS fixes", "gnss 99.5 to 160.5 s", "all of odometer",
-        "1.0123", "0.0004", "599 gnss_position", "0.321", "1.821", "1237",
+        "101.23", "0.04", "599 gnss_position", "0.321", "1.821", "1237",
         "the IMU clock drifts by 12 ppm", "3 rows < NaN were left out", "9.8.7", "deadbeef", "[gnss]",
         "robust_scale = 3.25", "0.8765", "6000 IMU rows at 10 Hz", "Spans without", "99.5 to 160.5 s",
     ):  # fmt: skip
@@ -189,8 +209,8 @@ def test_report_without_truth_shows_sigma_instead(tmp_path, recording):
     assert "Accuracy" not in text
     assert "1 sigma as stated" in text
     assert "there is no truth to compare with" in text
-    # way, three sigmas, velocity and attitude, two biases, what was used when, one constraint
-    assert len(parser.figures) == 10
+    # way, heights, position, velocity and attitude, three sigmas, two biases, what was used when, one constraint
+    assert len(parser.figures) == 12
 
 
 def test_report_of_next_to_nothing(tmp_path, recording):
@@ -199,12 +219,6 @@ def test_report_of_next_to_nothing(tmp_path, recording):
     small = Solution("batch", bare.frame, bare.t[two], bare.states[two], bare.covariance[two])
     path = write_report(tmp_path / "r.html", recording, small, settings={})
     checked(path)
-
-
-def test_pages_say_how_to_zoom_only_where_they_cannot(tmp_path, recording, library):
-    parser, text = checked(write(tmp_path, recording))
-    assert ("pip install -e '.[plots]'" in text) == (library == "still")
-    assert ("button" in parser.tags) == (library == "zoom")
 
 
 @dataclass(frozen=True)
@@ -228,11 +242,140 @@ def test_what_was_excluded_is_listed_and_marked(tmp_path, recording):
     for words in ("200.0 to 219.5 s", "jumped by 31 m <sideways>", "20 measurements were excluded", "excluded fix"):
         assert words in text, words
     # seconds 200 to 219, and the one that the record says was rejected
-    fixes = report_pictures._fixes(recording, found)
+    fixes = report_pictures.fixes_of(recording, found)
     np.testing.assert_allclose(fixes.t[fixes.excluded], [51.0, *np.arange(200.0, 220.0)])
     assert "excluded fix" in checked(write(tmp_path, recording))[1]
     kept = replace(solution(), records={})
     assert "excluded" not in checked(write_report(tmp_path / "r.html", recording, kept, settings={}))[1]
+
+
+def test_of_many_exclusions_ten_are_shown_and_three_lines_say_what_was_left_out(tmp_path, recording):
+    parts = tuple(Excluded(START + 20.0 * k, START + 20.0 * k + 4.0, "gnss_position", 5 + k, "") for k in range(14))
+    found = Excluding(**{**vars(solution()), "excluded": parts})
+    (shown, folded) = excluded_table(found, START)[1:]
+    assert shown.count("<tr>") == 11
+    assert "<details>" in folded
+    assert folded.count("<tr>") == 5
+    lines = left_out(found, START)[1]
+    assert lines.count("<li>") <= 3
+    assert "18 rows from 260.0 to 264.0 s" in lines
+    assert f"{sum(range(5, 17))} rows in 12 more spans" in lines
+    assert "Nothing" in left_out(replace(solution(), records={}), START)[1]
+
+
+def cells(table):
+    return [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", table)[1:]]
+
+
+def test_fixes_are_counted_and_coloured_by_type(tmp_path, recording):
+    kinds = np.ones(COUNT, int)
+    kinds[100:150] = 2
+    typed = replace(recording, gnss=replace(recording.gnss, type=kinds))
+    found = replace(solution(), t=solution().t)
+    rows = {row[0]: row for row in cells(fix_table(typed, found, [("gnss", (200.5, 230.5))])[1])}
+    # row 50 was rejected, and 30 are withheld; every row has a record, of which the largest is what the fit left there
+    assert [rows[k][1:5] for k in ("fixed", "float", "all")] == [
+        ["520", "30", "1", "519"], ["50", "0", "0", "50"], ["570", "30", "1", "569"],
+    ]  # fmt: skip
+    assert float(rows["all"][5]) == 31.0
+    used = np.delete(np.arange(COUNT), [50, *range(200, 230)])
+    size = np.linalg.norm(record().residual[used], axis=1).max()
+    assert float(rows["all"][6]) == pytest.approx(size, rel=1e-3)
+    path = write_report(tmp_path / "r.html", typed, found, settings={})
+    way_of_it = figures_of(path)["Seen from above"]["data"]
+    shown = {trace["name"]: trace for trace in way_of_it}
+    colours = {name: shown[name]["marker"]["color"] for name in ("fixed", "float", "excluded fix")}
+    assert len(set(colours.values())) == 3
+    stated = np.where(np.arange(COUNT) < 9, 5.0, 0.01)[:, None] * np.ones(3)
+    unknown = replace(recording, gnss=replace(recording.gnss, sd=stated))
+    assert {name: rows.sum() for name, rows in report_pictures.fixes_of(unknown, found).kinds.items()} == {
+        "sigma below 0.1 m": COUNT - 9, "sigma 1 m and more": 9,
+    }  # fmt: skip
+
+
+def test_the_heading_is_drawn_without_a_jump(tmp_path, recording):
+    turning = replace(solution(), states=replace(solution().states, R_nb=turned(np.arange(COUNT) / 20.0)))
+    path = write_report(tmp_path / "r.html", recording, turning, settings={})
+    attitude = figures_of(path)["Attitude and 3 sigma"]
+    (line,) = [t for t in attitude["data"] if t["yaxis"] == "y3" and t["name"] == "ekf" and t["mode"] == "lines"]
+    y = np.frombuffer(base64.b64decode(line["y"]["bdata"]), "<f4")
+    assert np.abs(np.diff(y)).max() < 4.0
+    assert np.ptp(y) == pytest.approx(np.degrees((COUNT - 1) / 20.0), rel=1e-3)
+    assert attitude["layout"]["yaxis3"]["range"][1] > y.max()
+
+
+def turned(heading):
+    """Attitudes (N, 3, 3) of a level body."""
+    zero = np.zeros_like(heading)
+    return rotation.exp(np.stack([zero, zero, -heading], -1))
+
+
+def test_all_figures_over_time_have_one_axis(tmp_path, recording):
+    drawn = figures_of(write(tmp_path, recording, errors=errors_of()))
+    over_time = [f["layout"]["xaxis"]["range"] for f in drawn.values()
+                 if "time" in json.dumps(f["layout"]["xaxis"]) or f["layout"]["hovermode"] == "x"]  # fmt: skip
+    assert len(over_time) > 8
+    assert {tuple(x) for x in over_time} == {(0.0, recording.duration)}
+
+
+def test_the_time_axis_can_be_read_on_every_clock_that_is_known(tmp_path, recording):
+    def clocks(path):
+        return re.findall(r'<option value="([\d.]+)"( data-date)?>', path.read_text(encoding="utf-8"))
+
+    assert clocks(write(tmp_path, recording)) == [(str(recording.start), "")]
+    # GPS week 2200 began on 2022-03-06, 18 s before midnight UTC
+    dated = clocks(write(tmp_path, replace(recording, gps_zero=2200 * 604800.0)))
+    midnight = np.datetime64("2022-03-06") - np.datetime64("1970-01-01")
+    unix = midnight / np.timedelta64(1, "s") - 18.0
+    assert [(float(start), mark) for start, mark in dated[1:]] == [
+        (unix + recording.start, " data-date"), (unix + 18.0 + recording.start, " data-date"),
+    ]  # fmt: skip
+
+
+def test_quantiles_of_sigma_are_those_of_the_keyframes():
+    rows = {row[0]: row[1:] for row in cells(sigma_table(solution())[1])}
+    assert [float(x) for x in rows["position, horizontal [m]"]] == pytest.approx([0.2 * np.sqrt(2.0)] * 3, rel=1e-3)
+    assert float(rows["heading [deg]"][2]) == pytest.approx(np.degrees(1e-3), rel=1e-2)
+
+
+def test_each_block_is_judged_by_itself():
+    e = errors_of(sd=0.02)
+    assert re.findall(r'class="verdict (\w*)"><b>(\w+)', verdicts(solution(), e)) == [
+        ("bad", "Position"), ("", "Velocity"), ("", "Attitude"),
+    ]  # fmt: skip
+    off = record()
+    off.nis[60:63], off.weight[60:63] = 1e6, 1e-6  # rows that weigh next to nothing do not speak against the others
+    velocities = replace(solution(), records={"gnss_position": off, "gnss_velocity": record(3.0)})
+    assert re.findall(r'class="verdict (\w*)"><b>(\w+)', verdicts(velocities, None)) == [
+        ("good", "Position"), ("bad", "Velocity"), ("", "Attitude"),
+    ]  # fmt: skip
+
+
+def test_a_calibration_has_names_and_no_index():
+    sizes = {SCALE: 6, MOUNTING: 2, AXLE: 1, BODY: 2, ODOMETER_SCALE: 1, ODOMETER_DELAY: 1, LEVER_ARM: 3,
+             TIME_OFFSET: 1, VELOCITY_TIME_OFFSET: 1, PIVOT: 3, TRAVEL: 2, FOOT_AXIS: 2}  # fmt: skip
+    for name, size in (*sizes.items(), (SCALE, 18)):
+        one = np.ones((1, size))
+        found = components(name, ParameterEstimate(np.zeros(1), one, one, one[0], "u"))
+        assert named(name)
+        assert len({c.words for c in found}) == size
+        assert not any("[" in c.words for c in found)
+    one = np.ones((1, 15))
+    assert not named(PATTERN)
+    assert len(components(PATTERN, ParameterEstimate(np.zeros(1), one, one, one[0], "m/s"))) == 15
+
+
+def test_relative_errors_are_those_of_displacements():
+    n = 2001
+    e, way = errors_of(), np.linspace(0.0, 10_000.0, n)
+    off = np.column_stack([0.01 * way + 7.0, np.zeros(n), np.zeros(n)])  # 1 % of the way, and an offset that is in none
+    drifting = replace(e, t=np.arange(n) * 1.0, p=off, distance=way, rph=np.radians(way / 1000.0)[:, None] * np.ones(3))
+    found = relative_errors(drifting)
+    assert [r.length for r in found] == [10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0]
+    for r in found:
+        assert r.percent == pytest.approx(1.0, rel=1e-6)
+        assert r.heading_rms == pytest.approx(r.length / 1000.0, rel=1e-6)
+    assert relative_errors(replace(e, distance=np.full(COUNT, np.nan))) == ()
 
 
 def test_rejected_measurements_are_listed_with_their_times(tmp_path, recording):
@@ -253,7 +396,7 @@ def test_stops_and_outages_are_told(tmp_path, recording):
     assert "no GNSS fixes from 200 to 230 s" in text
     assert "What the detectors saw" in text
     assert "threshold: below it stands" in text
-    assert len(parser.figures) == 11
+    assert len(parser.figures) == 13
 
 
 @pytest.mark.parametrize(

@@ -21,13 +21,14 @@ ROOMS = [
     "alignment", "dense", "solvers", "faults", "noise", "onboard_offset", "preparation", "pipeline", "lever_arm",
     "interpolation", "metrics", "sigmas", "gates", "fitted", "scoring", "strides", "evaluation", "against", "exporters",
     "online",
-    "panels", "page", "plots", "report_tables", "report_words", "report_pictures", "report_provenance", "report",
+    "plots", "page", "report_names", "segments", "report_tables", "report_words", "report_pictures", "report_summary",
+    "report_provenance", "report",
     "workflow", "stored", "staging", "outputs", "convert", "fleet", "terminal", "detection_report",
     "talk", "cli_options", "cli_fleet", "cli_logs", "cli_online", "cli_solve", "cli", "__main__",
 ]  # fmt: skip
 
 GTSAM_ROOMS = {"solvers"}
-MATPLOTLIB_ROOMS = {"allan", "panels"}
+MATPLOTLIB_ROOMS = {"allan"}
 PRINTING_ROOMS = {"talk"}
 
 FILES = sorted(PACKAGE.rglob("*.py"))

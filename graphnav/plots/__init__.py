@@ -1,14 +1,18 @@
-"""Drawings of trajectories, errors, biases, residuals and detections: data in, `graphnav.panels.Drawing` out.
+"""Figures of trajectories, errors, biases, residuals and detections: data in, `Figure` out, for plotly to draw.
 
-Times are seconds from the recording's start, as on the command line. `drawing.savefig("way.png")` writes any format.
+Times are seconds from the recording's start, as on the command line.
 """
 
-from graphnav.plots.consistency import chi2_quantile, nees, residuals, timeline
+from graphnav.plots.colours import PALETTE, css_colours
+from graphnav.plots.consistency import nees, residuals, timeline
 from graphnav.plots.detections import detections
-from graphnav.plots.series import Series, bands, sigmas, span_zoom
-from graphnav.plots.way import Fixes, trajectory
+from graphnav.plots.figure import SHADES, TIME, Figure, Panel, Spans, limits
+from graphnav.plots.series import Series, Shades, bands, sigmas, span_zoom
+from graphnav.plots.thinning import BINS, chosen_rows, thin, with_breaks
+from graphnav.plots.way import FIX_COLOURS, Fixes, profile, trajectory
 
 __all__ = [
-    "Fixes", "Series", "bands", "chi2_quantile", "detections", "nees", "residuals", "sigmas", "span_zoom", "timeline",
-    "trajectory",
+    "BINS", "FIX_COLOURS", "PALETTE", "SHADES", "TIME", "Figure", "Fixes", "Panel", "Series", "Shades", "Spans",
+    "bands", "chosen_rows", "css_colours", "detections", "limits", "nees", "profile", "residuals",
+    "sigmas", "span_zoom", "thin", "timeline", "trajectory", "with_breaks",
 ]  # fmt: skip

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from graphnav.detectors.base import Detection
-from graphnav.panels import WIDTH, Drawing, Panel, limits
+from graphnav.plots.figure import Figure, Panel, limits
+from graphnav.plots.thinning import BINS
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 
@@ -18,7 +19,7 @@ _SHOWN = ("low_band_glrt", "glrt", "fft")  # of more than `_MOST`; the others ar
 _MOST = 4
 
 
-def detections(recording: Recording, found: Sequence[Detection], *, width: float = WIDTH) -> Drawing:
+def detections(recording: Recording, found: Sequence[Detection]) -> Figure:
     """Stationary intervals tinted over the signals and statistics they come from; times from the recording's start.
 
     Parameters
@@ -47,28 +48,28 @@ def detections(recording: Recording, found: Sequence[Detection], *, width: float
     if pictured:
         f = pictured[0].details["spectrogram_frequency"]
         rows.append(("spectrogram of the force along z [Hz]", "Hz", (float(f[0]), float(f[-1])), False))
-    drawing = Drawing.stack(
+    figure = Figure(
         [title for title, _, _, _ in rows], (0.0, recording.duration), [ylim for _, _, ylim, _ in rows],
-        units=[unit for _, unit, _, _ in rows], log=[log for _, _, _, log in rows], height=66.0, width=width,
+        units=[unit for _, unit, _, _ in rows], log=[log for _, _, _, log in rows], height=76,
     )  # fmt: skip
-    panels = iter(drawing.panels)
+    stood = {"stands": stands}
+    for panel in figure.panels[: len(rows) - bool(pictured)]:
+        panel.shade(stood)
+    panels = iter(figure.panels)
     for y in (force, rate):
         panel = next(panels)
-        panel.shade({"stands": stands})
-        panel.line(t, y, "truth", size=0.8)
+        panel.line(t, y, "truth", width=1.0)
     if speeds:
         panel = next(panels)
-        panel.shade({"stands": stands})
         for words, at, y, name in speeds:
-            panel.line(at, y, name, label=words)
+            panel.line(at, y, name, words)
     for every in by_name.values():
         panel = next(panels)
-        panel.shade({"stands": stands})
         for d in every:
             _statistic(panel, d, t0)
     if pictured:
-        _spectrogram(next(panels), pictured, t0, stands)
-    return drawing
+        _spectrogram(next(panels), pictured, t0)
+    return figure
 
 
 def _speeds(recording: Recording) -> list[tuple[str, Array, Array, str]]:
@@ -84,34 +85,30 @@ def _speeds(recording: Recording) -> list[tuple[str, Array, Array, str]]:
 
 def _statistic_limits(every: Sequence[Detection]) -> tuple[float, float]:
     values = [np.log10(np.maximum(v, _FLOOR)) for d in every for v in (d.statistic, np.atleast_1d(d.threshold))]
-    return limits(values, floor=0.5)
+    return limits(values, floor=0.5, always=values[1::2])
 
 
 def _statistic(panel: Panel, d: Detection, t0: float) -> None:
-    panel.line(d.t - t0, np.maximum(d.statistic, _FLOOR), "batch", label="statistic", size=0.9)
+    panel.line(d.t - t0, np.maximum(d.statistic, _FLOOR), "batch", "statistic", width=1.1)
     threshold = np.broadcast_to(d.threshold, d.t.shape)
-    panel.line(d.t - t0, threshold, "alert", label="threshold: below it stands", dash=True)
+    panel.line(d.t - t0, threshold, "alert", "threshold: below it stands", dash=True)
 
 
-def _spectrogram(panel: Panel, pictured: Sequence[Detection], t0: float, stands: list[tuple[float, float]]) -> None:
+def _spectrogram(panel: Panel, pictured: Sequence[Detection], t0: float) -> None:
     for d in pictured:
         rows, f = d.details["spectrogram_rows"], d.details["spectrogram_frequency"]
         t = d.t[rows] - t0
         level = np.log10(np.maximum(d.details["spectrogram"], 1e-9)).T
         top = float(np.nanquantile(level, 0.999))
-        even = np.linspace(t[0], t[-1], len(t))
-        nearest = np.abs(np.subtract.outer(even, t)).argmin(axis=1)
+        even = np.linspace(t[0], t[-1], min(len(t), BINS))
+        after = np.clip(np.searchsorted(t, even), 1, len(t) - 1)
+        nearest = after - (even - t[after - 1] < t[after] - even)
         panel.map(even, f, np.clip(np.nan_to_num(level[:, nearest], nan=top - _DYNAMIC), top - _DYNAMIC, top))
         if "idle_line" in d.details:
             line = float(d.details["idle_line"][0])
             for k, words in ((1, f"idle line {line:.1f} Hz"), (2, "")):
                 if k * line < f[-1]:
-                    panel.line(t[[0, -1]], np.full(2, k * line), "paper", size=0.9, dash=True, quiet=True)
-                    under = k * line > 0.8 * f[-1]
-                    panel.label(float(t[0]), k * line, words, name="paper", dx=3, dy=-14 if under else 1)
-    # a strip along the lower edge: tinting the whole would change the colours
-    low = np.array([panel.ylim[0], panel.ylim[0] + 0.04 * (panel.ylim[1] - panel.ylim[0])])
-    if stands:
-        x = np.array([(a, b, b) for a, b in stands]).ravel()
-        edge = np.tile([1.0, 1.0, np.nan], len(stands))
-        panel.band(x, low[0] * edge, low[1] * edge, "paper", alpha=0.9, z=4.0, way=True)
+                    panel.line(t[[0, -1]], np.full(2, k * line), "paper", width=1.1, dash=True, quiet=True)
+                    if words:
+                        shift = (3, -16 if k * line > 0.8 * f[-1] else 1)
+                        panel.words(float(t[0]), k * line, words, shift=shift, name="paper")

@@ -1,26 +1,39 @@
-"""The way from above."""
+"""The way from above and from the side, with the fixes as good as each is."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav.panels import LEFT, RIGHT, WIDTH, Drawing, Panel
-from graphnav.panels.drawing import BOTTOM, SHADES, Spans, scale_bar
+from graphnav.plots.figure import SHADES, Figure, Panel, Spans, colour, limits
 from graphnav.rotation import Array
 
 _FEW = 60  # stops that get a large mark each
+_WIDE, _HIGH = 1080.0, 560  # pixels of the map on a desk; narrower pages show more of the north
 
 
 @dataclass(frozen=True)
 class Fixes:
-    """GNSS fixes: times (M,) in s from the start, east and north (M, 2) in m, and which were excluded (M,)."""
+    """GNSS fixes: times (M,) in s from the start, east, north, up (M, 3) in m, and which were excluded (M,).
+
+    `kinds` are the rows (M,) bool of each kind of fix, by its name: a type, or how exact it says it is.
+    """
 
     t: Array
-    en: Array
+    enu: Array
     excluded: np.ndarray
+    kinds: Mapping[str, np.ndarray]
+
+
+# kind of a fix -> colour; others as they come
+FIX_COLOURS = {
+    "fixed": "fixed", "float": "float", "ppp": "ppp", "differential": "differential", "sbas": "sbas",
+    "single": "single", "unknown": "ink", "GNSS fix": "ink",
+    "sigma below 0.1 m": "fixed", "sigma 0.1 to 1 m": "float", "sigma 1 m and more": "single",
+}  # fmt: skip
 
 
 def trajectory(
@@ -31,7 +44,7 @@ def trajectory(
     spans: Mapping[str, Spans] | None = None,
     stops: Spans = (),
     standing: str = "stop",
-) -> Drawing:
+) -> Figure:
     """Where it went, to scale, north up.
 
     Parameters
@@ -42,61 +55,68 @@ def trajectory(
     stops : s, marked where the first track was then; `standing` is what they are called.
     """
     parts = [np.zeros((0, 2)), *(en for _, en in tracks.values())]
-    parts += [] if fixes is None else [fixes.en]
+    parts += [] if fixes is None else [fixes.enu[:, :2]]
     parts += [] if truth is None else [truth]
     both = np.concatenate(parts)
     both = both[np.isfinite(both).all(axis=1)]
-    lo, hi = (both.min(axis=0), both.max(axis=0)) if len(both) else (np.zeros(2), np.ones(2))
-    w = WIDTH - LEFT - RIGHT
-    size = np.maximum(hi - lo, 1e-3) * 1.1
-    h = float(np.clip(w * size[1] / size[0], 0.5 * w, 0.95 * w))
-    scale = max(size[0] / w, size[1] / h)  # m per point, the same on both axes
-    mid = (lo + hi) / 2
-    drawing = Drawing(h + BOTTOM + 19.0)
-    panel = drawing.panel(
-        (LEFT, BOTTOM, w, h),
-        (mid[0] - scale * w / 2, mid[0] + scale * w / 2),
-        (mid[1] - scale * h / 2, mid[1] + scale * h / 2),
-        title="north [m]",
-        xlabel="east [m]",
-        unit="m",
-        yticks=max(3, int(h / 45)),
-        equal=True,
-    )
-    if fixes is not None and len(fixes.t):
-        _fixes(panel, fixes)
+    (west, east), (south, north) = (limits([both[:, k]], floor=1.0, always=[en[:, k] for _, en in tracks.values()])
+                                    for k in (0, 1))  # fmt: skip
+    scale = max((east - west) / _WIDE, (north - south) / _HIGH)  # m per pixel, the same on both axes
+    figure = Figure(["north [m]"], (west, east), [(south, north)], units=["m"], height=_HIGH, x="east [m]", equal=True)
+    (panel,) = figure.panels
+    if fixes is not None:
+        draw_fixes(panel, fixes)
     if truth is not None and len(truth):
-        panel.line(truth[:, 0], truth[:, 1], "truth", label="truth", size=2.6, alpha=0.5, z=2, way=True)
+        panel.way(truth, "truth", "truth", width=3.5, alpha=0.5)
     for number, (name, (t, en)) in enumerate(tracks.items()):
         if number == 0:
             _underlaid(panel, t, en, spans or {})
+        panel.way(en, name, name, t)
+        if number == 0:
             _stops(panel, t, en, stops, standing)
-        panel.line(en[:, 0], en[:, 1], name, label=name, size=1.4, way=True, hover=t)
     if tracks:
         _ends(panel, next(iter(tracks.values()))[1], scale)
-    scale_bar(panel)
-    return drawing
+    _scale_bar(figure, panel)
+    return figure
 
 
-def _fixes(panel: Panel, fixes: Fixes) -> None:
-    kept = np.flatnonzero(~fixes.excluded)
-    kept = kept[:: max(1, len(kept) // 1500)]
-    en = fixes.en[kept]
-    panel.dots(en[:, 0], en[:, 1], "ink", label="GNSS fix", alpha=0.45, z=1.2, way=True, hover=fixes.t[kept])
-    out = fixes.excluded
+def profile(lines: Mapping[str, tuple[Array, Array]], points: Mapping[str, tuple[Array, Array]]) -> Figure:
+    """Heights (m) over the distance travelled (m): `lines` of solvers and truth, `points` of fixes by their kind."""
+    reach = max((float(x[-1]) for x, _ in lines.values() if len(x)), default=1.0)
+    kilo, unit = (1e-3, "km") if reach >= 2000.0 else (1.0, "m")
+    values = [y for _, y in (*lines.values(), *points.values())]
+    ylim = limits(values, floor=1.0, always=[y for name, (_, y) in lines.items() if name != "truth"])
+    x = f"distance travelled [{unit}]"
+    figure = Figure(["height [m]"], (0.0, kilo * max(reach, 1e-3)), [ylim], units=["m"], height=150, x=x)
+    (panel,) = figure.panels
+    for kind, (x_, y) in points.items():
+        panel.dots(kilo * x_, y, FIX_COLOURS.get(kind, "ink"), kind, 3.0, alpha=0.6)
+    for name, (x_, y) in lines.items():
+        panel.way(np.column_stack([kilo * x_, y]), name, name)
+    return figure
+
+
+def draw_fixes(panel: Panel, fixes: Fixes, k: int | None = None) -> None:
+    """Each kind in its colour, what was excluded as a cross: on a map, or component k over time."""
+    x, y = (fixes.enu[:, 0], fixes.enu[:, 1]) if k is None else (fixes.t, fixes.enu[:, k])
+    for kind, of_it in fixes.kinds.items():
+        rows = of_it & ~fixes.excluded & np.isfinite(y)
+        if rows.any():
+            name = FIX_COLOURS.get(kind, "ink")
+            size = 5.0 if k is None else 3.0
+            panel.dots(x[rows], y[rows], name, kind, size, alpha=0.6, t=fixes.t[rows], way=k is None)
+    out = fixes.excluded & np.isfinite(y)
     if out.any():
-        x, y = fixes.en[out].T
-        panel.marks(x, y, "alert", "x", label="excluded fix", way=True, hover=fixes.t[out])
+        panel.dots(x[out], y[out], "alert", "excluded fix", 7.0, "x", t=fixes.t[out], way=k is None)
 
 
 def _underlaid(panel: Panel, t: Array, en: Array, spans: Mapping[str, Spans]) -> None:
     for what, every in spans.items():
         pieces = [(t > a) & (t < b) for a, b in every]
-        pieces = [piece for piece in pieces if piece.any()]
-        if pieces:
-            row = np.full((1, 2), np.nan)
-            way = np.concatenate([part for piece in pieces for part in (en[piece], row)])
-            panel.line(way[:, 0], way[:, 1], SHADES[what], label=what, size=6.0, alpha=0.5, z=1.5, way=True, quiet=True)
+        gap = np.full((1, 2), np.nan)
+        way = [part for piece in pieces if piece.any() for part in (en[piece], gap)]
+        if way:
+            panel.way(np.concatenate(way), SHADES[what], what, width=8.0, alpha=0.5)
 
 
 def _stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) -> None:
@@ -104,23 +124,34 @@ def _stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) -> No
         return
     begin, end = np.array(stops).T
     x, y = (np.interp(0.5 * (begin + end), t, en[:, k]) for k in (0, 1))
-    size = 5.0 if len(stops) <= _FEW else 3.0
-    panel.marks(x, y, "stop", "D", label=standing, size=size, z=4.2, way=True, hover=begin)
+    panel.dots(x, y, "stop", standing, 8.0 if len(stops) <= _FEW else 5.0, "D", t=begin, way=True)
 
 
 def _ends(panel: Panel, en: Array, scale: float) -> None:
     """Where the track starts and ends, the words on the side where the track is not."""
-    few = max(1, len(en) // 30)
     together = bool(np.linalg.norm(en[-1] - en[0]) < 16.0 * scale)
-    _, _, w, h = panel.box
-    for row, inner, marker, words in ((0, few, "^", "start"), (-1, -1 - few, "s", "end")):
-        panel.marks(en[[row], 0], en[[row], 1], "truth", marker, size=6.5, quiet=True)
-        away = en[row] - en[min(inner, len(en) - 1) if inner > 0 else max(inner, -len(en))]
-        x, y = (en[row] - (panel.xlim[0], panel.ylim[0])) / scale
-        right = x < 0.1 * w or (away[0] >= 0 and x < 0.88 * w)
-        down = y > 0.05 * h and away[1] < 0
-        if together and row == 0:
-            continue
-        words = "start and end" if together else words
-        align, dx = ("left", 6) if right else ("right", -6)
-        panel.label(float(en[row, 0]), float(en[row, 1]), words, align=align, dx=dx, dy=-13 if down else 3)
+    few = max(1, len(en) // 30)
+    for row, inner, marker, words in ((0, few, "^", "start"), (-1, max(-1 - few, -len(en)), "s", "end")):
+        panel.dots(en[[row], 0], en[[row], 1], "truth", "", 10.0, marker)
+        left = en[row, 0] < en[min(inner, len(en) - 1), 0]
+        if not (together and row == 0):
+            words = "start and end" if together else words
+            panel.words(
+                float(en[row, 0]), float(en[row, 1]), words, "right" if left else "left", (-8 if left else 8, 0)
+            )
+
+
+def _scale_bar(figure: Figure, panel: Panel) -> None:
+    """A bar of a round number of metres, about a fifth of the width, at the lower edge of a map."""
+    west, east = panel.xlim
+    reach = east - west
+    metres = 10.0 ** math.floor(math.log10(reach / 5))
+    metres *= max(m for m in (1, 2, 5) if m * metres <= reach / 4)
+    x = east - 0.01 * reach
+    figure.shapes.append({
+        "type": "line", "xref": "x", "yref": "paper", "x0": x - metres, "x1": x, "y0": 0.02, "y1": 0.02,
+        "line": {"color": colour("truth"), "width": 3.5},
+    })  # fmt: skip
+    words = f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
+    panel.words(x - metres / 2, 0.02, words, "center", (0, 2))
+    figure.annotations[-1]["yref"] = "paper"

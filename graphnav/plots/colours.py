@@ -16,17 +16,19 @@ PALETTE = {
     "outage": ("#71809c", "#8da0c4"),
     "stop": ("#6f42a8", "#c3a1f0"),
     "ink": ("#6a6a6b", "#a9a9aa"),
-    "paper": ("#ffffff", "#ffffff"),  # on dark ground of its own, whatever the page
+    "paper": ("#ffffff", "#ffffff"),  # on the spectrogram, whatever the page
     "grid": ("#dededf", "#35373b"),
+    # of fixes, by their type (or how exact they say they are), the best first
+    "fixed": ("#2f8f4e", "#5fd28a"),
+    "float": ("#b7860b", "#f0c040"),
+    "ppp": ("#0b7d86", "#4fd0da"),
+    "differential": ("#4469c9", "#92aef5"),
+    "sbas": ("#9a4fb0", "#d49be6"),
+    "single": ("#c04a3a", "#f59080"),
 }
-
-
-def colour(name: str) -> str:
-    """Colour of a solver (or of another drawn thing) for light pages, `#rrggbb`."""
-    return PALETTE.get(name, PALETTE["other"])[0]
 
 
 def css_colours() -> str:
     """CSS variables of the palette, for light pages and, where preferred, dark ones."""
     light, dark = ("".join(f"--{name}:{pair[i]};" for name, pair in PALETTE.items()) for i in (0, 1))
-    return f":root{{{light}}}\n@media (prefers-color-scheme: dark){{:root{{{dark}}}}}"
+    return f":root{{{light}}}\n@media screen and (prefers-color-scheme: dark){{:root{{{dark}}}}}"

@@ -8,7 +8,7 @@ import numpy as np
 
 from graphnav.rotation import Array
 
-BINS = 450  # columns a line is thinned to: a little more than a panel has points
+BINS = 600  # columns a line is thinned to: half a wide panel's pixels, so that there is something to zoom into
 
 
 def thin(t: Array, y: Array, bins: int = BINS) -> np.ndarray:
@@ -51,7 +51,7 @@ def with_breaks(t: Array, rows: np.ndarray, *columns: Array) -> Any:
     return (np.insert(t[rows], at, t[long.astype(int)]), *(np.insert(c[rows], at, np.nan) for c in columns))
 
 
-def chosen_rows(x: Array, y: Array, bins: int) -> np.ndarray:
+def chosen_rows(x: Array, y: Array, bins: int = BINS) -> np.ndarray:
     """Indices (sorted) of the rows of a way (x, y) that is drawn with `bins` columns: extremes of both are kept."""
     k = np.arange(len(x), dtype=float)
     return np.union1d(thin(k, x, bins), thin(k, y, bins))
