@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import oracle
 
 from graphnav.alignment import align
-from graphnav.config import Settings
+from graphnav.config import Settings, settings_from
 from graphnav.detectors import detect
 from graphnav.earth import LocalFrame
 from graphnav.noise.apply import with_noise
@@ -48,9 +48,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hours", type=float, default=10.0)
     parser.add_argument("--lag", type=float, default=Settings().solver.lag, help="s (%(default)s)")
+    parser.add_argument("--engine", choices=["window", "isam2"], default=Settings().solver.engine)
     options = parser.parse_args()
-    settings = Settings()
-    settings = settings.model_copy(update={"solver": settings.solver.model_copy(update={"lag": options.lag})})
+    settings = settings_from({"solver": {"lag": options.lag, "engine": options.engine}})
     seconds = 3600.0 * options.hours
     laps = max(1, round(seconds / LAP))
     path = oracle.vehicle_path(seconds / laps, RATE).tiled(laps)
