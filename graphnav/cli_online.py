@@ -88,6 +88,7 @@ def online(
             shown.last()
     if asked and not session.done:
         raise Interrupted("interrupted" + (f"; go on with --resume -o {folder}" if folder else ""))
+    session.require_settled()
 
 
 def _with_lag(settings: Settings, lag: float | None) -> Settings:

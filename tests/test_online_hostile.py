@@ -123,6 +123,20 @@ def test_a_clock_that_is_set_back_begins_a_piece(
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["clocks"] == 2
 
 
+def test_a_clock_set_back_before_there_is_any_state(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    """What had come by then is smoothed as if nothing had followed."""
+    short = [row for row in rows if row[1] <= rows[0][1] + 14.0]
+    back = [(sensor, t - 3600.0, values) for sensor, t, values in rows if sensor == "imu" and t > 40.0]
+    online = Online(without_rows(drive[0]), QUICK)
+    for row in short:
+        online.add(row)
+    assert online.status == "aligning"
+    for row in back:
+        online.add(row)
+    assert online.clocks == 2
+    same(online.settled()[0], played(drive[0], short, QUICK)[1])
+
+
 def test_a_clock_set_back_by_seconds_is_noticed_before_it_spoils_anything(
     drive: tuple[Recording, Trajectory], rows: list[Row]
 ) -> None:
@@ -246,6 +260,27 @@ def test_rows_are_numbers_in_ascii_digits(drive: tuple[Recording, Trajectory]) -
     session = Session(QUICK, "-")
     session.add_lines([next(lines_of(drive[0]))[1], "I,1_0,0,0,0,0,0,9.8", "O,1,\uff11", "I,1,0,0,0,0,0,9.8"])
     assert session.bad == 2
+
+
+SETUP = f'{HEAD} {{"gnss": {{}}}}'
+NOTHING = {
+    "no line": ([], "ended before the line"),
+    "setup alone": ([SETUP], "no row of the IMU"),
+    "no IMU": ([SETUP, *(f"G,{k},30,114,20,1,1,1" for k in range(9))], "no row of the IMU"),
+    "no row of an IMU": ([SETUP, "I,1,0,0", "I,2,0,0,0,0,0,1e300"], "1 imu: beyond any sensor; 'I' needs 7 numbers"),
+    "too few": ([SETUP, "I,0.00,0,0,0,0,0,9.8", "I,0.01,0,0,0,0,0,9.8"], "too few"),
+}
+
+
+@pytest.mark.parametrize("case", NOTHING)
+def test_a_session_with_nothing_to_show_says_why(tmp_path: Path, case: str) -> None:
+    lines, why = NOTHING[case]
+    session = Session(QUICK, "-", tmp_path / "out")
+    session.add_lines(lines)
+    session.finish()
+    session.close()
+    with pytest.raises(RecordingError, match=why):
+        session.require_settled()
 
 
 class _Call:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from graphnav.config import Settings
+from graphnav.errors import RecordingError
 from graphnav.online.lines import END, row_of, setup_of
 from graphnav.online.sensors import Row, rows_of, without_rows
 from graphnav.online.steady import Online
@@ -83,6 +84,25 @@ class Session:
         self._save(last=True)
         if self.folder is not None:
             (self.folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n", encoding="utf-8")
+
+    def require_settled(self) -> None:
+        """Refuse a run that is over and has nothing to show.
+
+        Raises
+        ------
+        RecordingError
+            Saying why no state settled.
+        """
+        if self.rows_settled:
+            return
+        if self.online is None:
+            raise RecordingError("the source ended before the line that describes its sensors")
+        counts, notes = self.online.sensors.counts, self.online.notes
+        why = notes[-1] if notes else "too few rows to align with"
+        if not counts["imu"]:
+            odd = [f"{n} {key}" for key, n in counts.items() if key.startswith("imu:")]
+            why = "; ".join(["no row of the IMU was taken in", *odd, *self.complaints[:1]])
+        raise RecordingError(f"nothing could be smoothed: {why}")
 
     def stop(self) -> None:
         """Asked to end before the source does: remember where it was."""
