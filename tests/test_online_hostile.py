@@ -18,7 +18,7 @@ from test_online import off, played, same
 import graphnav
 from graphnav.cli_online import Asked, follow
 from graphnav.config import settings_from
-from graphnav.errors import ConfigError, RecordingError
+from graphnav.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.formats.trajectories import read_trajectory
 from graphnav.online import Online, Row, Session, rows_of, smoother, without_rows
 from graphnav.online.lines import HEAD, line_of, lines_of, setup_of
@@ -281,6 +281,47 @@ def test_a_session_with_nothing_to_show_says_why(tmp_path: Path, case: str) -> N
     session.close()
     with pytest.raises(RecordingError, match=why):
         session.require_settled()
+
+
+# --------------------------------------------------------------------------------------------------------- disks
+def test_a_disk_that_is_full_from_the_start(
+    drive: tuple[Recording, Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There is nothing to go on from: it says so, and what lies there does no harm to another run."""
+    lines, real = [line for _, line in lines_of(drive[0])][:400], os.replace
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    session = Session(QUICK, "-", tmp_path)
+    with pytest.raises(GraphnavError, match=r"No space left.*begin again"):
+        session.add_lines(lines)
+    session.close()
+    monkeypatch.setattr(os, "replace", real)
+    for number in range(3):
+        (tmp_path / f"journal-{number:06d}").write_text("\n".join(lines[1:]) + "\n")
+    Session(QUICK, "-", tmp_path).close()
+    session = Session(QUICK, "-", tmp_path)
+    session.add_lines(lines)
+    session.close()  # as a kill would
+    assert Session(QUICK, "-", tmp_path, resume=True).taken == len(lines) - 1
+
+
+def test_a_summary_that_could_not_be_written_is_written_when_resumed(
+    drive: tuple[Recording, Trajectory], tmp_path: Path
+) -> None:
+    session = Session(QUICK, "-", tmp_path)
+    session.add_lines([line for _, line in lines_of(drive[0])][:50])
+    (tmp_path / "summary.json").mkdir()
+    with pytest.raises(GraphnavError, match="--resume"):
+        session.finish()
+    session.close()
+    (tmp_path / "summary.json").rmdir()
+    again = Session(QUICK, "-", tmp_path, resume=True)
+    again.finish()
+    again.close()
+    assert json.loads((tmp_path / "summary.json").read_text())["settled"] == again.rows_settled
 
 
 class _Call:

@@ -77,13 +77,14 @@ class Session:
 
     def finish(self) -> None:
         """Nothing more will come: settle all and say what it was."""
-        if self.done or self.online is None:
+        if self.online is None:
             return
-        self.online.finish()
-        self.done = True
-        self._save(last=True)
-        if self.folder is not None:
-            (self.folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n", encoding="utf-8")
+        if not self.done:
+            self.online.finish()
+            self.done = True
+            self._save(last=True)
+        if self.store is not None:  # again where a run that was done is resumed: its summary may be what was missing
+            self.store.summarise(json.dumps(self.summary(), indent=2) + "\n")
 
     def require_settled(self) -> None:
         """Refuse a run that is over and has nothing to show.
