@@ -189,7 +189,9 @@ def _raw_gnss(
         raise RecordingError(
             f"{path}: 'clock': [raw_gnss] needs to know what t = 0 is: say clock = \"gps week 2130\" or a UTC date"
         )
-    some = {name: tuple(path.parent / file for file in getattr(d, name) or ()) for name in _RAW_FILES}
+    some = {
+        name: tuple(beside(path, file, f"raw_gnss.{name}") for file in getattr(d, name) or ()) for name in _RAW_FILES
+    }
     corrected = Corrected(clock="clock" in d.corrected, troposphere="troposphere" in d.corrected)
     sources = Sources(
         **some, base_position=d.base_position, corrected=corrected, nominal_stamps=d.stamps == "nominal",
