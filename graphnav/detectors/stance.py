@@ -145,8 +145,8 @@ def _without_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fa
     beyond = (R @ imu.accel[rows][..., None])[..., 0] - force[windows, None]
     v = np.cumsum(T[rows][:, :, None] * beyond, axis=1)
     over = np.einsum("wli,wli->wl", v, v) > fastest**2
-    for k in np.flatnonzero(over.any(axis=1)):
-        last = rows[k, over[k].argmax()]
-        if over[k, : counts[k]].any():
-            out[which[k], sides[k]] = imu.t[last] - (0.0 if sides[k] == 0 else T[last])
+    for w in np.flatnonzero(over.any(axis=1)):
+        if over[w, : counts[w]].any():
+            row = rows[w, over[w].argmax()]
+            out[which[w], sides[w]] = imu.t[row] - (0.0 if sides[w] == 0 else T[row])
     return out
