@@ -15,7 +15,7 @@ from graphnav.online.store import Store
 from graphnav.recording import Recording
 from graphnav.trajectory import Trajectory
 
-CHECKPOINTS = 60.0  # s of IMU time between checkpoints while nothing settles
+CHECKPOINTS = 60.0  # s of IMU time between checkpoints, each of tens of MB: as long as a resumed run has to redo
 _FEW = 5  # bad lines that are told
 
 
@@ -188,6 +188,6 @@ class Session:
         newest = self.online.sensors.imu.newest
         if tracks:
             self.store.append(tracks)
-        if tracks or last or newest - self._kept > CHECKPOINTS:
+        if last or newest - self._kept > CHECKPOINTS:  # rows settled since are cut off and made again on resume
             self.store.checkpoint(self.online, self._counts(), self.done)
             self._kept = newest

@@ -1,7 +1,7 @@
 """What an online run leaves on disk, so that nothing that has settled is lost whatever ends it.
 
     trajectory.csv    grows as keyframes settle, by whole rows, each time made sure of (fsync)
-    checkpoint        the smoother as it was when it grew last, and how far the source was read; replaced in one step
+    checkpoint        the smoother as it was at most a minute ago, and how far the source was read; replaced in one step
     trajectory-2.csv  the same after the clock of the IMU was set back, whose times go over the same again
     journal-N         of a live source: the lines taken in since that checkpoint
 
