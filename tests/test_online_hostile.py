@@ -161,6 +161,34 @@ def test_a_source_that_begins_again_is_no_other_clock(
     same(track, plain)
 
 
+def test_a_source_that_begins_again_before_its_clock_was_set_back(
+    drive: tuple[Recording, Trajectory], rows: list[Row]
+) -> None:
+    """Rows of the old clock, sent again, neither lie in the future of the new one nor in its past."""
+    old, again = [row for row in rows if row[1] <= 36.0], [row for row in rows if 33.3 < row[1] <= 36.0]
+    # sent again before the new clock reaches the times of the old one, and when it has passed them
+    for step, until in ((3600.0, 39.0), (5.25, 42.5)):
+        new = [(sensor, t - step, values) for sensor, t, values in rows if 36.0 < t <= 48.0]
+        seen = [row for row in new if row[1] <= until - step]
+        online, track = played(drive[0], [*old, *seen, *again, *new], QUICK)
+        plain, other = played(drive[0], [*old, *new], QUICK)
+        assert online.clocks == plain.clocks == 2
+        assert online.sensors.counts["imu"] == plain.sensors.counts["imu"]
+        same(track, other)
+
+
+def test_a_clock_that_goes_on_from_where_it_was_before(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    """Set back by an hour and ahead again by less: its times come twice, its rows do not."""
+    one = [row for row in rows if row[1] <= 46.0]
+    two = [(sensor, t - 3600.0, values) for sensor, t, values in rows if 46.0 < t <= 50.0]
+    three = [(sensor, t - 10.0, values) for sensor, t, values in rows if t > 50.0]
+    online, _ = played(drive[0], [*one, *two, *three], QUICK)
+    assert online.clocks == 2
+    assert online.sensors.counts["imu"] == sum(row[0] == "imu" for row in rows)
+    assert online.sensors.counts["imu: repeated"] == 0
+    assert online.sensors.imu.newest == pytest.approx(drive[0].end - 10.0)
+
+
 def test_a_first_stamp_far_ahead_does_not_stop_the_clock(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
     wild: Row = ("imu", 1e9, rows[0][2][:6])
     online, track = played(drive[0], [wild, *rows], QUICK)

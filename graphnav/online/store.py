@@ -28,7 +28,7 @@ from graphnav.online.steady import Online
 from graphnav.trajectory import Trajectory
 
 TRAJECTORY, CHECKPOINT, SUMMARY = "trajectory.csv", "checkpoint", "summary.json"
-_MAGIC = b"graphnav checkpoint 2\n"
+_MAGIC = b"graphnav checkpoint 3\n"
 
 
 _PLAIN = {
