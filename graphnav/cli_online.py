@@ -91,6 +91,7 @@ def online(
             shown.last()
     if asked and not session.done:
         raise Interrupted("interrupted" + (f"; go on with --resume -o {folder}" if folder else ""))
+    session.require_settled()
 
 
 def _changed(settings: Settings, lag: float | None, engine: str | None) -> Settings:

@@ -17,6 +17,7 @@ from graphnav.files import read_text
 _TABLE = re.compile(r"\[([^\[\]]+)\]")
 _NAMES = 30  # that a sentence lists
 _SHOWN = 60  # characters of a value in a sentence
+_WORD = re.compile(rf"\S{{{2 * _SHOWN},}}")  # that no sentence of ours has, but a value that it quotes
 _DEEPEST = 50  # tables in tables; what graphnav reads has four
 _KEY = re.compile(r"([\w\-.\"']+)\s*=")
 
@@ -64,20 +65,24 @@ def complaint(source: str | Path, error: ValidationError, model: type[BaseModel]
     """
     first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     loc = tuple(str(part) for part in first["loc"])
-    key = ".".join(loc)
     line = _line_of(text, loc)
     where = f"{source}, line {line}: " if line else f"{source}: "
+    return where + _WORD.sub(lambda word: f"{word[0][:_SHOWN]}...", _said_of(first, loc, model))
+
+
+def _said_of(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> str:
+    key = ".".join(loc)
     if first["type"] == "extra_forbidden":
-        return f"{where}unknown key '{key}'{_suggestion(loc, model)}"
+        return f"unknown key '{key}'{_suggestion(loc, model)}"
     if first["type"] == "missing":
-        return f"{where}'{key}' is missing"
+        return f"'{key}' is missing"
     if first["type"] == "value_error":  # our own sentence
         what = str(first["ctx"]["error"])
-        return f"{where}'{key}': {what}{_meaning(loc, model)}" if key else f"{where}{what}"
+        return f"'{key}': {what}{_meaning(loc, model)}" if key else what
     if first["type"] in ("model_type", "model_attributes_type"):
-        return f"{where}'{key}' must be a table: [{key}]"
+        return f"'{key}' must be a table: [{key}]"
     what = f"{first['msg'][0].lower()}{first['msg'][1:]}{_meaning(loc, model)}"
-    return f"{where}'{key}' = {shortened(first['input'])}: {what}"
+    return f"'{key}' = {shortened(first['input'])}: {what}"
 
 
 def shortened(value: Any) -> str:

@@ -173,6 +173,8 @@ def at_point(trajectory: Trajectory, arm: Array | None, rate: float | None = Non
     ------
     RecordingError
         If there is a lever arm and no attitude to turn it.
+    ConfigError
+        If the rate leaves no row, or too many.
     """
     if arm is not None and not np.any(arm):
         arm = None
@@ -186,6 +188,8 @@ def at_point(trajectory: Trajectory, arm: Array | None, rate: float | None = Non
             raise ConfigError(f"--rate {rate:g}: makes {(t[-1] - t[0]) * rate:.3g} rows, more than {_MOST_ROWS:g}")
         t = np.arange(np.ceil(t[0] * rate - 1e-6), np.floor(t[-1] * rate + 1e-6) + 1) / rate
     moved, _ = interpolate(trajectory, t, max_gap=_MAX_GAP, lever_arm=arm)
+    if not len(moved):
+        raise ConfigError(f"--rate {rate:g}: leaves no row of this trajectory; say a higher one")
     return moved
 
 

@@ -146,6 +146,18 @@ def read_bytes(path: Path, error: Kind = RecordingError, text: bool = True, limi
         return file.read()
 
 
+def check_size(path: Path, count: int, error: Kind = RecordingError) -> None:
+    """Refuse what another program has unpacked to more bytes than a file may hold.
+
+    Raises
+    ------
+    GraphnavError
+        Of the kind given.
+    """
+    if count > (most := _limit(MAX_FILE, 10**6)):
+        raise error(_too_large(path, most, packed=True))
+
+
 def read_text(path: Path, error: Kind = RecordingError) -> str:
     """The text of a file that is written as a whole: settings, a description.
 
@@ -202,6 +214,10 @@ def _limit(name: str, unit: int) -> int:
     return int(value * unit)
 
 
+def _too_large(path: Path, most: int, packed: bool) -> str:
+    return f"{path}: holds more than {most / 1e6:g} MB{' unpacked' if packed else ''}; if that is right, set {MAX_FILE}"
+
+
 def _shown(path: Path) -> str:
     text = str(path)
     return text if len(text) <= 200 else f"{text[:100]}...{text[-40:]}"
@@ -240,10 +256,7 @@ class _Bounded(io.RawIOBase):
             raise self.error(f"{self.path}: cannot be read ({cause.strerror})") from None
         self._count += len(chunk)
         if self._count > self._most:
-            raise self.error(
-                f"{self.path}: holds more than {self._most / 1e6:g} MB{' unpacked' if self._packed else ''}; "
-                f"if that is right, set {MAX_FILE}"
-            )
+            raise self.error(_too_large(self.path, self._most, self._packed))
         if self._packed and self._count > _SMALL and self._count > _RATIO * self._size and not os.environ.get(MAX_FILE):
             raise self.error(
                 f"{self.path}: unpacks to more than {_RATIO} times its size, which no log does; if that is right, "

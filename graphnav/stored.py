@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from graphnav.checks_stated import truth_apart
 from graphnav.config import Settings
 from graphnav.dense import times_between
 from graphnav.errors import ConfigError, RecordingError
+from graphnav.files import check_regular, check_size, exists, parse_json
 from graphnav.recording import Recording
 from graphnav.rotation import Array
 from graphnav.solution import Solution
@@ -85,19 +87,26 @@ def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
     ConfigError
         If there is no such file, or it is none of this version's.
     """
+    if not exists(path, ConfigError):
+        raise ConfigError(f"{path.parent}: holds no {path.name}: not the results of smooth or compare")
+    check_regular(path, ConfigError)
     try:
+        with ZipFile(path) as packed:
+            check_size(path, sum(one.file_size for one in packed.infolist()), ConfigError)
         with np.load(path, allow_pickle=False) as file:
-            values = json.loads(file["text"].tobytes())
+            values = parse_json(file["text"].tobytes().decode())
             arrays = [file[f"a{k}"] for k in range(len(file.files) - 1)]
-    except FileNotFoundError:
-        raise ConfigError(f"{path.parent}: holds no {path.name}: not the results of smooth or compare") from None
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
+    except (OSError, ValueError, KeyError, BadZipFile, zlib.error, EOFError, RuntimeError, MemoryError) as error:
         raise ConfigError(f"{path}: cannot be read ({error})") from None
-    if values.get("form") != _FORM:
+    if not isinstance(values, dict) or values.get("form") != _FORM:
         raise ConfigError(f"{path}: is of another version of graphnav; solve again")
     try:
-        return _unpacked(values["outcome"], arrays), _unpacked(values["provenance"], arrays)
-    except (AttributeError, ImportError, LookupError, TypeError) as error:
+        outcome, provenance = _unpacked(values["outcome"], arrays), _unpacked(values["provenance"], arrays)
+        names = [name for name in outcome.solutions if name != Path(name).name or name in ("", "..")]
+        if names or not isinstance(outcome, Outcome):
+            raise TypeError(f"a solver called '{names[0]}'" if names else "no outcome")
+        return outcome, dict(provenance)
+    except (AttributeError, ImportError, LookupError, TypeError, ValueError, RuntimeError) as error:
         raise ConfigError(f"{path}: is of another version of graphnav ({error}); solve again") from None
 
 

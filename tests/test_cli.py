@@ -173,12 +173,25 @@ def test_the_pages_are_drawn_again_without_solving(compared, drive, tmp_path, ca
     kept = np.load(out / "run.npz")["text"].tobytes().decode()
     digest = summary(out / "batch")["provenance"]["inputs"][str(drive / "gnss.csv")]
     text = np.frombuffer(kept.replace(digest, "0" * 64).encode(), dtype=np.uint8)
-    np.savez(out / "run.npz", text=text, **{k: v for k, v in np.load(compared[0] / "run.npz").items() if k != "text"})
+    arrays = {k: v for k, v in np.load(compared[0] / "run.npz").items() if k != "text"}
+    np.savez(out / "run.npz", text=text, **arrays)
     assert cli.run(["report", str(out)]) == 2
     assert "gnss.csv: has changed" in capsys.readouterr().err
-    (out / "run.npz").write_bytes(b"PK")
-    assert cli.run(["report", str(out)]) == 2
-    assert "run.npz" in capsys.readouterr().err
+    outside = kept.replace('["ekf", {"class"', '["../../ekf", {"class"').encode()
+    assert outside != kept.encode()
+    damaged = bytearray((compared[0] / "run.npz").read_bytes())
+    for k in range(1000, len(damaged), 997):
+        damaged[k] ^= 1 << k % 8
+    for text in (b"[1]", b"[" * 100_000, b"\xff", b"{}", outside):
+        np.savez(out / "run.npz", text=np.frombuffer(text, dtype=np.uint8), **arrays)
+        assert cli.run(["report", str(out)]) == 2
+        said = capsys.readouterr().err
+        assert "run.npz" in said
+    assert "../../ekf" in said
+    for data in (b"PK", bytes(damaged)):
+        (out / "run.npz").write_bytes(data)
+        assert cli.run(["report", str(out)]) == 2
+        assert "run.npz" in capsys.readouterr().err
 
 
 def test_solvers_differ_where_they_should(compared):

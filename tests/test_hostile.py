@@ -161,6 +161,8 @@ DESCRIPTIONS = {
     "400 digits": TOML.replace("scale", "scale").replace("[odometer]\n", f"[odometer]\nscale_sigma = {'1' * 400}\n"),
     "null": TOML.replace('"imu.csv"', '"a\\u0000b"'),
     "long": TOML.replace('"imu.csv"', f'"{"x" * 100_000}"'),
+    "long figure": TOML.replace("[gnss]", f'[imu.noise]\naccel_bias_sigma = "{"x" * 5000}"\n\n[gnss]'),
+    "long key": TOML.replace("[gnss]", f"[imu.noise]\n{'x' * 5000} = 1\n\n[gnss]"),
     "folder of its own": TOML.replace('"imu.csv"', '"."'),
 }
 
@@ -170,6 +172,9 @@ def test_descriptions_that_cannot_be_used(tmp_path: Path, capsys: pytest.Capture
     write_small(tmp_path)
     (tmp_path / "recording.toml").write_text(DESCRIPTIONS[case])
     refused(capsys, "info", tmp_path)
+    with pytest.raises(RecordingError) as caught:
+        read(tmp_path)
+    assert len(str(caught.value)) < 1000
 
 
 @pytest.mark.parametrize(
@@ -265,6 +270,15 @@ def test_rows_shorter_than_the_header_are_told_whichever_columns_are_used(tmp_pa
     (tmp_path / "truth.csv").write_text("\n".join([f"{lines[0]},ve0.1,62.0", *lines[1:], ""]))
     with pytest.raises(RecordingError, match=r"truth\.csv, line 2"):
         read(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["csv", "gpx", "kml", "nav", "nmea", "tum"])
+def test_a_rate_that_leaves_no_row(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    """No file without rows is written."""
+    (tmp_path / "x.csv").write_text("t,lat,lon,h,roll,pitch,heading\n1,30,114,20,0,0,0\n2,30,114,20,0,0,0\n")
+    out = tmp_path / f"y.{name}"
+    assert "--rate" in refused(capsys, "convert", tmp_path / "x.csv", "-o", out, "--rate", "1e-9", "--clock", "unix")
+    assert not out.exists()
 
 
 # ----------------------------------------------------------------------------------------- no hangs, little memory

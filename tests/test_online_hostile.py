@@ -18,7 +18,7 @@ from test_online import off, played, same
 import graphnav
 from graphnav.cli_online import Asked, follow
 from graphnav.config import settings_from
-from graphnav.errors import ConfigError, RecordingError
+from graphnav.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.formats.trajectories import read_trajectory
 from graphnav.online import Online, Row, Session, rows_of, smoother, without_rows
 from graphnav.online.lines import HEAD, line_of, lines_of, setup_of
@@ -123,6 +123,20 @@ def test_a_clock_that_is_set_back_begins_a_piece(
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["clocks"] == 2
 
 
+def test_a_clock_set_back_before_there_is_any_state(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    """What had come by then is smoothed as if nothing had followed."""
+    short = [row for row in rows if row[1] <= rows[0][1] + 14.0]
+    back = [(sensor, t - 3600.0, values) for sensor, t, values in rows if sensor == "imu" and t > 40.0]
+    online = Online(without_rows(drive[0]), QUICK)
+    for row in short:
+        online.add(row)
+    assert online.status == "aligning"
+    for row in back:
+        online.add(row)
+    assert online.clocks == 2
+    same(online.settled()[0], played(drive[0], short, QUICK)[1])
+
+
 def test_a_clock_set_back_by_seconds_is_noticed_before_it_spoils_anything(
     drive: tuple[Recording, Trajectory], rows: list[Row]
 ) -> None:
@@ -145,6 +159,34 @@ def test_a_source_that_begins_again_is_no_other_clock(
     online, track = played(drive[0], [*rows[:half], *rows[:more], *rows[more - 300 :]], QUICK)
     assert online.clocks == 1
     same(track, plain)
+
+
+def test_a_source_that_begins_again_before_its_clock_was_set_back(
+    drive: tuple[Recording, Trajectory], rows: list[Row]
+) -> None:
+    """Rows of the old clock, sent again, neither lie in the future of the new one nor in its past."""
+    old, again = [row for row in rows if row[1] <= 36.0], [row for row in rows if 33.3 < row[1] <= 36.0]
+    # sent again before the new clock reaches the times of the old one, and when it has passed them
+    for step, until in ((3600.0, 39.0), (5.25, 42.5)):
+        new = [(sensor, t - step, values) for sensor, t, values in rows if 36.0 < t <= 48.0]
+        seen = [row for row in new if row[1] <= until - step]
+        online, track = played(drive[0], [*old, *seen, *again, *new], QUICK)
+        plain, other = played(drive[0], [*old, *new], QUICK)
+        assert online.clocks == plain.clocks == 2
+        assert online.sensors.counts["imu"] == plain.sensors.counts["imu"]
+        same(track, other)
+
+
+def test_a_clock_that_goes_on_from_where_it_was_before(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    """Set back by an hour and ahead again by less: its times come twice, its rows do not."""
+    one = [row for row in rows if row[1] <= 46.0]
+    two = [(sensor, t - 3600.0, values) for sensor, t, values in rows if 46.0 < t <= 50.0]
+    three = [(sensor, t - 10.0, values) for sensor, t, values in rows if t > 50.0]
+    online, _ = played(drive[0], [*one, *two, *three], QUICK)
+    assert online.clocks == 2
+    assert online.sensors.counts["imu"] == sum(row[0] == "imu" for row in rows)
+    assert online.sensors.counts["imu: repeated"] == 0
+    assert online.sensors.imu.newest == pytest.approx(drive[0].end - 10.0)
 
 
 def test_a_first_stamp_far_ahead_does_not_stop_the_clock(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
@@ -246,6 +288,68 @@ def test_rows_are_numbers_in_ascii_digits(drive: tuple[Recording, Trajectory]) -
     session = Session(QUICK, "-")
     session.add_lines([next(lines_of(drive[0]))[1], "I,1_0,0,0,0,0,0,9.8", "O,1,\uff11", "I,1,0,0,0,0,0,9.8"])
     assert session.bad == 2
+
+
+SETUP = f'{HEAD} {{"gnss": {{}}}}'
+NOTHING = {
+    "no line": ([], "ended before the line"),
+    "setup alone": ([SETUP], "no row of the IMU"),
+    "no IMU": ([SETUP, *(f"G,{k},30,114,20,1,1,1" for k in range(9))], "no row of the IMU"),
+    "no row of an IMU": ([SETUP, "I,1,0,0", "I,2,0,0,0,0,0,1e300"], "1 imu: beyond any sensor; 'I' needs 7 numbers"),
+    "too few": ([SETUP, "I,0.00,0,0,0,0,0,9.8", "I,0.01,0,0,0,0,0,9.8"], "too few"),
+}
+
+
+@pytest.mark.parametrize("case", NOTHING)
+def test_a_session_with_nothing_to_show_says_why(tmp_path: Path, case: str) -> None:
+    lines, why = NOTHING[case]
+    session = Session(QUICK, "-", tmp_path / "out")
+    session.add_lines(lines)
+    session.finish()
+    session.close()
+    with pytest.raises(RecordingError, match=why):
+        session.require_settled()
+
+
+# --------------------------------------------------------------------------------------------------------- disks
+def test_a_disk_that_is_full_from_the_start(
+    drive: tuple[Recording, Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There is nothing to go on from: it says so, and what lies there does no harm to another run."""
+    lines, real = [line for _, line in lines_of(drive[0])][:400], os.replace
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    session = Session(QUICK, "-", tmp_path)
+    with pytest.raises(GraphnavError, match=r"No space left.*begin again"):
+        session.add_lines(lines)
+    session.close()
+    monkeypatch.setattr(os, "replace", real)
+    for number in range(3):
+        (tmp_path / f"journal-{number:06d}").write_text("\n".join(lines[1:]) + "\n")
+    Session(QUICK, "-", tmp_path).close()
+    session = Session(QUICK, "-", tmp_path)
+    session.add_lines(lines)
+    session.close()  # as a kill would
+    assert Session(QUICK, "-", tmp_path, resume=True).taken == len(lines) - 1
+
+
+def test_a_summary_that_could_not_be_written_is_written_when_resumed(
+    drive: tuple[Recording, Trajectory], tmp_path: Path
+) -> None:
+    session = Session(QUICK, "-", tmp_path)
+    session.add_lines([line for _, line in lines_of(drive[0])][:50])
+    (tmp_path / "summary.json").mkdir()
+    with pytest.raises(GraphnavError, match="--resume"):
+        session.finish()
+    session.close()
+    (tmp_path / "summary.json").rmdir()
+    again = Session(QUICK, "-", tmp_path, resume=True)
+    again.finish()
+    again.close()
+    assert json.loads((tmp_path / "summary.json").read_text())["settled"] == again.rows_settled
 
 
 class _Call:

@@ -134,6 +134,7 @@ def _without_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fa
     window = len(imu.t) - len(t) + 1
     force = running(imu.accel).means(window)
     T = np.diff(imu.t, prepend=2.0 * imu.t[0] - imu.t[1])
+    ways = []  # from a quiet moment outward: which span, which end of it, the window, the first row and how many
     for side, way in ((0, -1), (1, 1)):
         for n, (begin, end) in enumerate(spans):
             lo, hi = (begin, min(begin + _NEAR, end)) if side == 0 else (max(end - _NEAR, begin), end)
@@ -141,19 +142,28 @@ def _without_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fa
             if not np.isfinite(e[first:last]).any():
                 continue
             k = int(first + np.nanargmin(e[first:last]))
-            middle = int(np.searchsorted(imu.t, t[k]))
-            edge = int(np.searchsorted(imu.t, (begin, end)[side]))
-            # rows from the quiet moment outward; each speaks for the period before its time
-            rows = np.arange(middle, edge, -1) if side == 0 else np.arange(middle + 1, min(edge + 1, len(imu.t)))
-            if not len(rows):
-                continue
-            turn = rotation.exp(0.5 * way * T[rows, None] * (imu.gyro[rows] - bias))
-            R, v = np.eye(3), np.zeros(3)
-            for row, half in zip(rows, turn, strict=True):
-                R = R @ half
-                v = v + T[row] * (R @ imu.accel[row] - force[k])
-                R = R @ half
-                if v @ v > fastest**2:
-                    out[n, side] = imu.t[row] - (0.0 if side == 0 else T[row])
-                    break
+            row, edge = (int(x) + side for x in np.searchsorted(imu.t, [t[k], (begin, end)[side]]))
+            count = way * (min(edge, len(imu.t)) - row)
+            if count > 0:
+                ways.append((n, side, k, row, count))
+    if not ways:
+        return out
+    which, sides, windows, rows, counts = np.array(ways).T
+    longest = int(counts.max())
+    sign = 2 * sides[:, None] - 1
+    rows = rows[:, None] + sign * np.minimum(np.arange(longest), counts[:, None] - 1)  # (W, L), the last repeated
+    dt = sign * T[rows]  # a row speaks for the period before its time
+    R = rotation.exp(0.5 * dt[:, :, None] * (imu.gyro[rows] - bias))  # of half a period; products of these follow
+    R[:, 1:] = R[:, :-1] @ R[:, 1:]
+    step = 1
+    while step < longest:
+        R[:, step:] = R[:, :-step] @ R[:, step:]
+        step *= 2
+    beyond = (R @ imu.accel[rows][..., None])[..., 0] - force[windows, None]
+    v = np.cumsum(T[rows][:, :, None] * beyond, axis=1)
+    over = np.einsum("wli,wli->wl", v, v) > fastest**2
+    for w in np.flatnonzero(over.any(axis=1)):
+        if over[w, : counts[w]].any():
+            row = rows[w, over[w].argmax()]
+            out[which[w], sides[w]] = imu.t[row] - (0.0 if sides[w] == 0 else T[row])
     return out

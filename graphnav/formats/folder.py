@@ -190,7 +190,9 @@ def _raw_gnss(
     from graphnav.raw.load import Sources, load_raw
     from graphnav.raw.placing import Corrected
 
-    some = {name: tuple(path.parent / file for file in getattr(d, name) or ()) for name in _RAW_FILES}
+    some = {
+        name: tuple(beside(path, file, f"raw_gnss.{name}") for file in getattr(d, name) or ()) for name in _RAW_FILES
+    }
     corrected = Corrected(clock="clock" in d.corrected, troposphere="troposphere" in d.corrected)
     sources = Sources(
         **some, base_position=d.base_position, corrected=corrected, nominal_stamps=d.stamps == "nominal",

@@ -108,13 +108,18 @@ class Clock:
     """Notices that the clock of the IMU was set back.
 
     Rows at times that have passed are late, or sent again, or of a clock that was set back. Late ones fill a hole,
-    those sent again are as they were (a row of every second is remembered), and neither goes on and on.
+    those sent again are as they were (a row of every second is remembered), and neither goes on and on. A sender that
+    begins again before such a step sends rows of the clock before, too, which need not lie in the past of the new one.
     """
 
     _seconds: dict[int, tuple[float, ...]] = field(default_factory=dict)  # the first row of each second
     _second: int = -(2**62)
     behind: list[Row] = field(default_factory=list)  # rows at times that have passed, held until it shows what they are
     _again: bool = False  # whether these are known
+    _before: dict[int, tuple[float, ...]] = field(default_factory=dict)  # as `_seconds`, of the clocks before
+    _ahead: list[Row] = field(default_factory=list)  # rows far ahead at times of a clock before, held likewise
+    _sent_again: bool = False  # whether these are known
+    _new: bool = False  # whether they are known to be none of it
 
     def remember(self, t: float, values: tuple[float, ...]) -> None:
         """Note a row that was taken, the newest so far."""
@@ -122,6 +127,7 @@ class Clock:
         if second != self._second:
             self._second = second
             self._seconds[second] = (t, *values)
+            self._ahead, self._sent_again, self._new = [], False, False
             if len(self._seconds) > _REMEMBERED:
                 del self._seconds[next(iter(self._seconds))]
 
@@ -145,13 +151,27 @@ class Clock:
                 return False  # sent twice
             if times and t < max(times) - _LASTING:  # behind these, too
                 self.behind, self._again, times = [one for one in self.behind if one[0] != "imu"][-_HELD:], False, []
-            self._again |= self._seconds.get(int(t), ()) == (t, *values)
+            self._again |= (t, *values) in (self._seconds.get(int(t)), self._before.get(int(t)))
             times.append(t)
         self.behind.append(row)
         if self._again:
             self.behind = [row] if sensor == "imu" else []
             return False
         return len(times) >= _SET_BACK and max(times) - min(times) >= _LASTING
+
+    def hold_ahead(self, t: float, values: tuple[float, ...]) -> list[Row] | None:
+        """Hold an IMU row far ahead, if it may be one of a clock before that is sent again; None if not.
+
+        Returns those that were held, to be taken in, once they are shown to be new.
+        """
+        if self._new or int(t) not in self._before:
+            return None
+        self._sent_again |= self._before[int(t)] == (t, *values)
+        self._ahead = [] if self._sent_again else [*self._ahead, ("imu", t, values)]
+        if not self._ahead or t - self._ahead[0][1] < _LASTING:
+            return []
+        rows, self._ahead, self._new = self._ahead, [], True
+        return rows
 
     def go_on(self) -> list[Row]:
         """Time goes on as before: the fixes and readings that were held, to be taken in now."""
@@ -160,7 +180,10 @@ class Clock:
         return held
 
     def set_back(self) -> list[Row]:
-        """The rows of the new clock; what is remembered is of the old one."""
+        """The rows of the new clock; what is remembered is of the old one from now on."""
         held, self.behind, self._again = self.behind, [], False
+        self._before |= self._seconds
+        for second in list(self._before)[:-_REMEMBERED]:
+            del self._before[second]
         self._seconds, self._second = {}, -(2**62)
         return held

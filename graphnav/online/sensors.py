@@ -16,6 +16,7 @@ from graphnav.rotation import Array
 
 AHEAD = 60.0  # s; stamps of other sensors further than this before the IMU's are wrong
 _WIDTH = {"imu": 6, "gnss": 18, "odometer": 6}  # the last six of a fix: usual sigmas of place and velocity
+_TOLD = {"gnss": 3, "odometer": 1}  # values by which a row is known again
 _USUAL = 60.0  # s over which the usual sigma of fixes is averaged
 _NAN = float("nan")
 
@@ -45,6 +46,7 @@ class Sensors:
     released: list[Row] = field(default_factory=list)  # rows that were held and are to be taken in now
     _clock: Clock = field(default_factory=Clock)
     _reach: Reach = field(default_factory=Reach)
+    _before: set[tuple[str | float, ...]] = field(default_factory=set)  # fixes and readings of the clock before
 
     def add(self, sensor: str, t: float, values: tuple[float, ...]) -> bool:
         """Take in a row; False if it is of no use (`counts` says why).
@@ -62,6 +64,9 @@ class Sensors:
         buffer: Buffer = getattr(self, sensor)
         if sensor == "imu":
             return self._add_imu(t, values)
+        if (sensor, t, *values[: _TOLD[sensor]]) in self._before:  # a sender that begins again before that step
+            self.counts[f"{sensor}: repeated"] += 1
+            return False
         if self._clock.behind and t < self.imu.newest - self.longest_gap:
             self._clock.hold((sensor, t, values))  # until it shows what the IMU's rows before it are
             return False
@@ -144,7 +149,16 @@ class Sensors:
             self.counts["imu: repeated" if repeated else "imu: too late"] += 1
             if self._clock.hold(("imu", t, values)):
                 self.set_back = self._clock.set_back()
+                for name, width in _TOLD.items():
+                    rows = getattr(self, name).rows[:, : width + 1].tolist()
+                    self._before = {one for one in self._before if one[0] != name} | {(name, *row) for row in rows}
             return False
+        if len(self.imu) and t > self.imu.newest + self.longest_gap:
+            held = self._clock.hold_ahead(t, values)
+            if held is not None:
+                self.counts["imu: repeated"] += 1 - len(held)
+                self.released += held
+                return False
         if t > self.imu.newest:
             self.released += self._clock.go_on()
         if len(self.imu) and t > self.imu.newest + self.longest_gap:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from graphnav.config import Settings
+from graphnav.errors import RecordingError
 from graphnav.online.lines import END, row_of, setup_of
 from graphnav.online.sensors import Row, rows_of, without_rows
 from graphnav.online.steady import Online
@@ -14,7 +15,7 @@ from graphnav.online.store import Store
 from graphnav.recording import Recording
 from graphnav.trajectory import Trajectory
 
-CHECKPOINTS = 60.0  # s of IMU time between checkpoints while nothing settles
+CHECKPOINTS = 60.0  # s of IMU time between checkpoints, each of tens of MB: as long as a resumed run has to redo
 _FEW = 5  # bad lines that are told
 
 
@@ -76,13 +77,33 @@ class Session:
 
     def finish(self) -> None:
         """Nothing more will come: settle all and say what it was."""
-        if self.done or self.online is None:
+        if self.online is None:
             return
-        self.online.finish()
-        self.done = True
-        self._save(last=True)
-        if self.folder is not None:
-            (self.folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n", encoding="utf-8")
+        if not self.done:
+            self.online.finish()
+            self.done = True
+            self._save(last=True)
+        if self.store is not None:  # again where a run that was done is resumed: its summary may be what was missing
+            self.store.summarise(json.dumps(self.summary(), indent=2) + "\n")
+
+    def require_settled(self) -> None:
+        """Refuse a run that is over and has nothing to show.
+
+        Raises
+        ------
+        RecordingError
+            Saying why no state settled.
+        """
+        if self.rows_settled:
+            return
+        if self.online is None:
+            raise RecordingError("the source ended before the line that describes its sensors")
+        counts, notes = self.online.sensors.counts, self.online.notes
+        why = notes[-1] if notes else "too few rows to align with"
+        if not counts["imu"]:
+            odd = [f"{n} {key}" for key, n in counts.items() if key.startswith("imu:")]
+            why = "; ".join(["no row of the IMU was taken in", *odd, *self.complaints[:1]])
+        raise RecordingError(f"nothing could be smoothed: {why}")
 
     def stop(self) -> None:
         """Asked to end before the source does: remember where it was."""
@@ -167,6 +188,6 @@ class Session:
         newest = self.online.sensors.imu.newest
         if tracks:
             self.store.append(tracks)
-        if tracks or last or newest - self._kept > CHECKPOINTS:
+        if last or newest - self._kept > CHECKPOINTS:  # rows settled since are cut off and made again on resume
             self.store.checkpoint(self.online, self._counts(), self.done)
             self._kept = newest

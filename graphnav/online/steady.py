@@ -76,10 +76,9 @@ class Online(Smoother):
         rows, sensors.set_back = sensors.set_back, []
         first = next(t for sensor, t, _ in rows if sensor == "imu")
         before = sensors.imu.newest
-        try:
-            self._restart(before, f"the clock of the IMU was set back from {before:.3f} to {first:.3f} s")
-        except Exception as error:
-            self._give_up(error)
+        self.notes.append(f"the clock of the IMU was set back from {before:.3f} to {first:.3f} s: aligning anew")
+        self.finish()  # no more rows of the old clock will come
+        self._faults = self.excluded
         self.clocks += 1
         self._begin_anew(float("-inf"))
         sensors.forget_time()

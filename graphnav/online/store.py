@@ -1,7 +1,7 @@
 """What an online run leaves on disk, so that nothing that has settled is lost whatever ends it.
 
     trajectory.csv    grows as keyframes settle, by whole rows, each time made sure of (fsync)
-    checkpoint        the smoother as it was when it grew last, and how far the source was read; replaced in one step
+    checkpoint        the smoother as it was at most a minute ago, and how far the source was read; replaced in one step
     trajectory-2.csv  the same after the clock of the IMU was set back, whose times go over the same again
     journal-N         of a live source: the lines taken in since that checkpoint
 
@@ -27,8 +27,8 @@ from graphnav.exporters import csv
 from graphnav.online.steady import Online
 from graphnav.trajectory import Trajectory
 
-TRAJECTORY, CHECKPOINT = "trajectory.csv", "checkpoint"
-_MAGIC = b"graphnav checkpoint 2\n"
+TRAJECTORY, CHECKPOINT, SUMMARY = "trajectory.csv", "checkpoint", "summary.json"
+_MAGIC = b"graphnav checkpoint 3\n"
 
 
 _PLAIN = {
@@ -86,9 +86,12 @@ class Store:
         elif path.exists():
             raise ConfigError(f"-o {folder}: holds a run already; go on with --resume or name another folder")
         folder.mkdir(parents=True, exist_ok=True)
-        for later in folder.glob("trajectory-*.csv"):  # than the checkpoint, or of a run before
-            if self.resumed is None or _piece_of(later) > self.piece:
-                later.unlink()
+        for other in folder.glob("trajectory-*.csv"):  # later than the checkpoint, or of a run before
+            if self.resumed is None or _number_of(other) > self.piece:
+                other.unlink()
+        for other in folder.glob("journal-*"):
+            if self.resumed is None or _number_of(other) != self._number:
+                other.unlink()
         path = self.trajectory
         if self.resumed is None:
             self._file = self._fresh()
@@ -174,6 +177,10 @@ class Store:
         self._path(self._number).unlink(missing_ok=True)
         self._number = number
 
+    def summarise(self, text: str) -> None:
+        """Write what is said at the end."""
+        self._guarded(lambda: (self.folder / SUMMARY).write_text(text, encoding="utf-8"))
+
     def close(self) -> None:
         """Nothing more will be written."""
         self._file.close()
@@ -191,10 +198,11 @@ class Store:
             for mend in (lambda: self._file.truncate(self._length), lambda: self._file.seek(self._length)):
                 with contextlib.suppress(OSError):
                     mend()
-            raise GraphnavError(
-                f"{self.folder}: cannot be written ({error.strerror}); what had settled is safe, "
-                "mend that and go on with --resume"
-            ) from None
+            begun = (self.folder / CHECKPOINT).exists()
+            how = (
+                "what had settled is safe, mend that and go on with --resume" if begun else "mend that and begin again"
+            )
+            raise GraphnavError(f"{self.folder}: cannot be written ({error.strerror}); {how}") from None
 
 
 def _read(path: Path) -> Checkpoint:
@@ -225,7 +233,7 @@ class _Unpickler(pickle.Unpickler):
         raise pickle.UnpicklingError(f"{module}.{name}")
 
 
-def _piece_of(path: Path) -> int:
+def _number_of(path: Path) -> int:
     number = path.stem.partition("-")[2]
     return int(number) if number.isdigit() else 0
 

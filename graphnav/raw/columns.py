@@ -29,9 +29,11 @@ def observations(columns: Mapping[str, Array], zero: float, name: str) -> Observ
     doppler = columns.get("doppler", nothing)
     if "range_rate" in columns:
         doppler = np.where(np.isnan(doppler), -columns["range_rate"] * L1 / C, doppler)
-    whole = np.isfinite(t) & np.isfinite(columns["prn"]) & np.isfinite(columns["code"])
-    system = np.where(columns.get("qzss", np.zeros(n)) > 0, QZSS, GPS)
-    prn = np.nan_to_num(columns["prn"])
+    prn = columns["prn"]
+    with np.errstate(invalid="ignore"):
+        known = (prn >= 1) & (prn <= 99) & (prn == np.floor(prn))
+    whole = np.isfinite(t) & known & np.isfinite(columns["code"])
+    system, prn = np.where(columns.get("qzss", np.zeros(n)) > 0, QZSS, GPS), np.where(known, prn, 0.0)
     obs = Observations(
         zero=zero, t=t, satellite=(100 * system + prn).astype(np.int16),
         signal=np.full(n, signal_id("1C"), dtype=np.int16), code=columns["code"],
@@ -40,6 +42,7 @@ def observations(columns: Mapping[str, Array], zero: float, name: str) -> Observ
     )  # fmt: skip
     if not whole.all():
         obs = replace(
-            obs.take(whole), remarks=(f"{name}: {int((~whole).sum())} rows without time, prn or code left out",)
+            obs.take(whole),
+            remarks=(f"{name}: {int((~whole).sum())} rows without time, prn (1 to 99) or code left out",),
         )
     return once(obs)

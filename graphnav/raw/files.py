@@ -1,17 +1,18 @@
-"""Files as bytes, unpacked: gzip by Python, compress (.Z) and compressed RINEX (.crx, .21d) by hatanaka."""
+"""Files as bytes, unpacked, compress (.Z) and compressed RINEX (.crx, .21d) by hatanaka; their columns and dates."""
 
 from __future__ import annotations
 
-import gzip
 import importlib
-import zlib
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from graphnav import files
 from graphnav.errors import RecordingError
 from graphnav.rotation import Array
+
+_FIRST, _LAST = np.array([1980, 1, 1, 0, 0, 0.0]), np.array([2099, 12, 31, 24, 59, 61.0])  # of GPS; a leap second
 
 
 def read_bytes(path: Path) -> bytes:
@@ -22,16 +23,7 @@ def read_bytes(path: Path) -> bytes:
     RecordingError
         If it cannot be read or unpacked, or is empty.
     """
-    try:
-        data = path.read_bytes()
-        if data[:2] == b"\x1f\x8b":
-            data = gzip.decompress(data)
-    except FileNotFoundError:
-        raise RecordingError(f"{path}: no such file") from None
-    except EOFError:
-        raise RecordingError(f"{path}: the compressed file is cut off; copy it again") from None
-    except (OSError, zlib.error) as error:
-        raise RecordingError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    data = files.read_bytes(path, text=False)
     if data[:2] in (b"\x1f\x9d", b"PK", b"BZ") or b"COMPACT RINEX FORMAT" in data[:200]:
         try:
             hatanaka = importlib.import_module("hatanaka")
@@ -42,7 +34,8 @@ def read_bytes(path: Path) -> bytes:
         try:
             data = hatanaka.decompress(data)
         except Exception as error:  # its own kinds, and those of the packers it calls
-            raise RecordingError(f"{path}: cannot be unpacked ({str(error).splitlines()[0][:80]})") from None
+            raise RecordingError(f"{path}: cannot be unpacked ({str(error)[:80]})") from None
+        files.check_size(path, len(data))
     if not data.strip():
         raise RecordingError(f"{path}: is empty")
     return data
@@ -80,6 +73,17 @@ class Lines:
         return np.where(column < self.length[which][:, None], self.data[at], 32).astype(np.uint8)
 
 
+def moved(block: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(n, m) whether the decimal point of a field (n, m, width) stands elsewhere than in most of its column.
+
+    In a line that has lost a character or has one more, fields are parts of two numbers.
+    """
+    there = block == ord(".")
+    at, told = there.argmax(axis=-1), there.any(axis=-1)
+    usual = np.array([np.bincount(x[y]).argmax() if y.any() else 0 for x, y in zip(at.T, told.T, strict=True)])
+    return np.asarray(told & (at != usual))
+
+
 def numbers(block: NDArray[np.uint8], width: int) -> Array:
     """(n, m) numbers of n rows of m fields of `width` bytes each; NaN for blanks.
 
@@ -89,9 +93,24 @@ def numbers(block: NDArray[np.uint8], width: int) -> Array:
         If a field is no number.
     """
     n, total = block.shape
+    if (block == ord("_")).any():  # which Python reads over
+        raise ValueError
     cells = np.ascontiguousarray(block).view(f"S{width}").reshape(n, total // width)
     blank = np.all(block.reshape(n, -1, width) == 32, axis=-1)
     out = np.full(cells.shape, np.nan)
     if not blank.all():
         out[~blank] = cells[~blank].astype(float)
+        if not np.isfinite(out[~blank]).all():
+            raise ValueError
     return out
+
+
+def calendar_days(fields: Array) -> tuple[NDArray[np.datetime64], NDArray[np.bool_]]:
+    """(n,) days of dates (n, 6), year to second, and which of them are dates that a receiver may have had."""
+    with np.errstate(invalid="ignore"):
+        good = np.all((fields >= _FIRST) & (fields <= _LAST), axis=1)
+        good &= np.all(fields[:, :5] == np.floor(fields[:, :5]), axis=1)
+    year, month, day = np.where(good[:, None], fields, _FIRST).astype(int).T[:3]
+    months = (year - 1970).astype("datetime64[Y]").astype("datetime64[M]") + (month - 1)
+    days = months.astype("datetime64[D]") + (day - 1)
+    return days, good & (days.astype("datetime64[M]") == months)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from graphnav.errors import RecordingError
 from graphnav.raw.ephemeris import Placed, turned
-from graphnav.raw.files import Lines, numbers, read_bytes
+from graphnav.raw.files import Lines, calendar_days, numbers, read_bytes
 from graphnav.raw.signals import SYSTEMS, C, Ids, satellite_id
 from graphnav.rotation import Array
 from graphnav.timescales import utc_to_gps
@@ -96,16 +96,13 @@ def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
     own = np.flatnonzero(first == ord("P"))
     if not len(epoch) or not len(own):
         raise RecordingError(f"{path}: holds no positions")
-    try:
-        t = _stamps(lines, epoch, 3, scale)
-    except ValueError:
-        raise RecordingError(f"{path}: the date of an epoch cannot be read") from None
+    t = _stamps(lines, epoch, 3, scale, path)
     if not lines.whole and own[-1] == len(lines) - 1:
         own = own[:-1]
     try:
         value = numbers(lines.block(own, 4, 60), 14)
         names = [bytes(x).decode() for x in lines.block(own, 1, 4)]
-        ids = {name: satellite_id(name if name[0] in SYSTEMS else "G" + name[1:]) for name in set(names)}
+        ids = {name: _id_of(name) for name in set(names)}
     except ValueError:
         for k in own:
             try:
@@ -116,7 +113,7 @@ def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
         raise RecordingError(f"{path}: names a satellite of an unknown system") from None
     satellite = np.array([ids[name] for name in names], dtype=np.int16)
     of = np.searchsorted(epoch, own) - 1
-    whole = np.isfinite(value[:, :3]).all(axis=1) & (of >= 0)
+    whole = np.isfinite(value[:, :3]).all(axis=1) & (of >= 0) & (satellite >= 0)
     clock = np.nan_to_num(value[:, 3] * 1e-6, nan=1.0)
     return t[of[whole]], satellite[whole], value[whole, :3] * 1e3, clock[whole]
 
@@ -137,22 +134,45 @@ def _read_clk(path: Path) -> tuple[Array, Ids, Array]:
     names = [row[1].decode("latin-1") for row in rows]
     try:
         table = np.array([[*row[2:8], row[9]] for row in rows]).astype(float)
-        ids = {name: satellite_id(name) for name in set(names)}
+        ids = {name: _id_of(name) for name in set(names)}
+        t = _dates(table[:, :6], scale)
+        if not np.isfinite(table).all():
+            raise ValueError
     except ValueError:
         raise RecordingError(f"{path}: a record of a satellite's clock cannot be read") from None
-    return _dates(table[:, :6], scale), np.array([ids[name] for name in names], dtype=np.int16), table[:, 6]
+    satellite = np.array([ids[name] for name in names], dtype=np.int16)
+    return t[satellite >= 0], satellite[satellite >= 0], table[satellite >= 0, 6]
 
 
-def _stamps(lines: Lines, which: NDArray[np.intp], begin: int, scale: str) -> Array:
+def _id_of(name: str) -> int:
+    """The number of a satellite; -1 of one that no receiver observes, as those that carry a receiver."""
+    if name[0].isalpha() and name[0] not in SYSTEMS:
+        return -1
+    return satellite_id(name if name[0] != " " else "G" + name[1:])
+
+
+def _stamps(lines: Lines, which: NDArray[np.intp], begin: int, scale: str, path: Path) -> Array:
     """(n,) s since the GPS epoch of lines that hold a date from a column on."""
-    return _dates(np.array([lines.text(k)[begin:].split()[:6] for k in which], dtype=float), scale)
+    words = [lines.text(k)[begin:].split()[:6] for k in which]
+    try:
+        return _dates(np.array(words, dtype=float), scale)
+    except ValueError:
+        for k, some in zip(which, words, strict=True):
+            try:
+                _dates(np.array([some], dtype=float), scale)
+            except ValueError:
+                text = " ".join(some)[:40]
+                raise RecordingError(f"{path}, line {k + 1}: '{text}' is not the date of an epoch") from None
+        raise RecordingError(f"{path}: the date of an epoch cannot be read") from None
 
 
 def _dates(fields: Array, scale: str) -> Array:
-    """(n,) s since the GPS epoch of dates (n, 6)."""
-    year, month, day = (x.astype(int) for x in fields.T[:3])
-    days = (year - 1970).astype("datetime64[Y]").astype("datetime64[M]") + (month - 1)
-    days = days.astype("datetime64[D]") + (day - 1)
+    """(n,) s since the GPS epoch of dates (n, 6); ValueError if one is none."""
+    if fields.ndim != 2 or fields.shape[1] != 6:
+        raise ValueError
+    days, good = calendar_days(fields)
+    if not good.all():
+        raise ValueError
     since = (days - np.datetime64("1980-01-06", "D")).astype(np.int64) * 86400.0
     if scale in ("UTC", "GLO"):
         since = utc_to_gps(days.astype("datetime64[us]"))

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.errors import RecordingError
+from graphnav.files import parse_number
 from graphnav.raw.ephemeris import Ephemerides, Glonass, Kepler
-from graphnav.raw.files import read_bytes
+from graphnav.raw.files import calendar_days, read_bytes
 from graphnav.raw.signals import BEIDOU, GALILEO, GLONASS, GPS, NAVIC, QZSS, SBAS, SYSTEMS
 from graphnav.timescales import WEEK, utc_to_gps
 
@@ -21,6 +22,8 @@ _BDT = 14.0  # s, GPS minus BeiDou time
 _BDT_WEEKS = 1356  # from the GPS to the BeiDou epoch
 _LINES = {GLONASS: 4, SBAS: 4}  # of a record; 8 of all others
 _KNOWN = {"LNAV", "INAV", "FNAV", "D1", "D2", "FDMA"}
+_ROOTS = (2530.0, 8192.0)  # sqrt(m), of the semi-major axis: the range that IS-GPS-200N, table 20-III, gives it
+_WEEKS = 6262  # of the GPS until 2100
 _EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 
 
@@ -119,19 +122,23 @@ def _values(rows: list[tuple[str, int]]) -> list[float]:
     for number, (line, begin) in enumerate(rows):
         for i in range(3 if number == 0 else 4):
             text = line[begin + 19 * i : begin + 19 * (i + 1)].strip().replace("D", "E").replace("d", "e")
-            out.append(float(text) if text else np.nan)
+            out.append(parse_number(text) if text else np.nan)
+    if np.isinf(out).any():
+        raise ValueError
     return out
 
 
 def _date(text: str, short: bool) -> np.datetime64:
-    words = (text[2:22] if short else text[3:23]).split()
-    year = int(words[0])
+    fields = np.array([[parse_number(word) for word in (text[2:22] if short else text[3:23]).split()]])
+    if fields.shape != (1, 6):
+        raise ValueError
     if short:
-        year += 2000 if year < 80 else 1900
-    month, day, hour, minute = (int(w) for w in words[1:5])
-    base = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}T00:00:00", "us")
-    seconds = hour * 3600 + minute * 60 + float(words[5])
-    return base + np.timedelta64(round(seconds * 1e6), "us")
+        fields[:, 0] += 2000 if fields[0, 0] < 80 else 1900
+    days, good = calendar_days(fields)
+    if not good[0]:
+        raise ValueError
+    seconds = float(fields[0, 3:] @ (3600.0, 60.0, 1.0))
+    return days[0].astype("datetime64[us]") + np.timedelta64(round(seconds * 1e6), "us")
 
 
 def _add(found: _Found, system: int, number: int, date: np.datetime64, v: list[float], message: str) -> None:
@@ -160,7 +167,9 @@ def _add(found: _Found, system: int, number: int, date: np.datetime64, v: list[f
         week, shift = week + _BDT_WEEKS, _BDT
     toe = WEEK * week + toes + shift
     toc += shift
-    if not np.isfinite(v[:20]).all() or v[10] <= 0.0:
+    if not np.isfinite([*v[:20], week]).all() or not 0.0 <= v[8] < 1.0 or not 0.0 <= week < _WEEKS:
+        raise ValueError
+    if not _ROOTS[0] <= v[10] <= _ROOTS[1]:
         raise ValueError
     toe += WEEK * np.round((toc - toe) / WEEK)  # a week that rolled over or is that of the transmission
     source = int(v[20]) if np.isfinite(v[20]) else 0
@@ -186,16 +195,24 @@ def _header(lines: list[str], path: Path, found: _Found) -> int:
         label, body = line[60:].strip(), line[:60].replace("D", "E")
         try:
             if label == "ION ALPHA":
-                found.klobuchar["a"] = [float(body[2 + 12 * i : 14 + 12 * i]) for i in range(4)]
+                found.klobuchar["a"] = _coefficients(body[2:])
             elif label == "ION BETA":
-                found.klobuchar["b"] = [float(body[2 + 12 * i : 14 + 12 * i]) for i in range(4)]
+                found.klobuchar["b"] = _coefficients(body[2:])
             elif label == "IONOSPHERIC CORR" and line[:4] in ("GPSA", "GPSB"):
-                found.klobuchar[line[3].lower()] = [float(body[5 + 12 * i : 17 + 12 * i]) for i in range(4)]
+                found.klobuchar[line[3].lower()] = _coefficients(body[5:])
         except ValueError:
             raise RecordingError(f"{path}, line {k + 1}: the header's '{label}' cannot be read") from None
         if label == "END OF HEADER":
             return k + 1
     raise RecordingError(f"{path}: the header has no END OF HEADER; the file is cut off")
+
+
+def _coefficients(body: str) -> list[float]:
+    """Four numbers of twelve columns each."""
+    found = [parse_number(body[12 * i : 12 * (i + 1)]) for i in range(4)]
+    if not np.isfinite(found).all():
+        raise ValueError
+    return found
 
 
 def _ionosphere(lines: list[str], found: _Found) -> None:

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.errors import RecordingError
-from graphnav.raw.files import Lines, numbers, read_bytes
+from graphnav.files import parse_number
+from graphnav.raw.files import Lines, calendar_days, moved, numbers, read_bytes
 from graphnav.raw.series import Observations, once
-from graphnav.raw.signals import BEIDOU, GLONASS, GPS, QZSS, SYSTEMS, Ids, known_signal, signal_id
+from graphnav.raw.signals import BEIDOU, GLONASS, GPS, QZSS, SYSTEMS, Ids, known_signal, satellite_id, signal_id
 from graphnav.rotation import Array
 from graphnav.timescales import WEEK, utc_to_gps
 
@@ -25,6 +26,7 @@ _SYSTEM_OF = np.full(256, -1)
 for _k, _letter in enumerate(SYSTEMS):
     _SYSTEM_OF[ord(_letter)] = _k
 _KINDS = "CLDS"
+_MOST_TYPES = 200  # of a system; RINEX 4.01 has some 80
 _WIDTH = 16  # of a field: value F14.3, loss of lock I1, strength I1
 
 
@@ -79,11 +81,13 @@ def parse_observations(data: bytes, path: Path) -> Observations:
         own = np.flatnonzero(rows.satellite // 100 == system)
         if not len(own):
             continue
+        block = cells(own, len(types)).reshape(len(own), len(types), _WIDTH)
         try:
-            block = cells(own, len(types)).reshape(len(own), len(types), _WIDTH)
             value = numbers(block[:, :, :14].reshape(len(own), -1), 14)
+            if moved(block[:, :, :14]).any():
+                raise ValueError
         except ValueError:
-            raise _bad_field(lines, rows, own, types, cells, path) from None
+            raise _bad_field(rows, own, types, block[:, :, :14], path) from None
         value[value == 0.0] = np.nan  # absent (RINEX 2.11, table A2)
         lli = block[:, :, 14].astype(np.intp) - 48
         lli[(lli < 0) | (lli > 9)] = 0
@@ -139,14 +143,14 @@ def _header(lines: Lines, path: Path) -> Header:
                 if body[0] != " ":
                     system, many = SYSTEMS.find(body[0]), int(body[3:6])
                     out.types[system] = []
-                out.types[system] += body[6:].split()
+                out.types.setdefault(system, []).extend(body[6:].split())
             elif label == "# / TYPES OF OBSERV":
                 many = int(body[:6]) if body[:6].strip() else many
                 both = out.types.setdefault(-2, [])
                 both += body[6:].split()
             elif label == "APPROX POSITION XYZ":
                 place = np.array(body.split(), dtype=float)
-                out.marker = place if len(place) == 3 and np.linalg.norm(place) > 6e6 else None
+                out.marker = place if len(place) == 3 and 6e6 < np.linalg.norm(place) < 7e6 else None
             elif label == "TIME OF FIRST OBS":
                 out.scale = body[48:51].strip() or ("GLO" if out.system == "R" else "GPS")
             elif label == "GLONASS SLOT / FRQ #":
@@ -175,6 +179,8 @@ def _header(lines: Lines, path: Path) -> Header:
     out.types.pop(-1, None)
     if not any(out.types.values()):
         raise RecordingError(f"{path}: the header names no types of observations")
+    if (most := max(map(len, out.types.values()))) > _MOST_TYPES:
+        raise RecordingError(f"{path}: the header names {most} types of observations of a system, more than there are")
     return out
 
 
@@ -202,10 +208,8 @@ def _since_week(fields: Array, scale: str, used: NDArray[np.bool_]) -> tuple[Arr
 
     Days and seconds are kept apart: seconds since the epoch are good to 0.2 us only.
     """
-    fields = np.nan_to_num(fields, nan=1.0)
-    year, month, day, hour, minute, second = fields.T
-    days = (year.astype(int) - 1970).astype("datetime64[Y]").astype("datetime64[M]")
-    days = (days + (month.astype(int) - 1)).astype("datetime64[D]") + (day.astype(int) - 1)
+    days, good = calendar_days(fields)
+    hour, minute, second = np.where(good[:, None], fields, 0.0).T[3:]
     since = (days - np.datetime64("1980-01-06", "D")).astype(np.int64)
     week = int(since[used][0]) // 7
     ahead = 0.0
@@ -226,6 +230,9 @@ def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
         flag, count = numbers(lines.block(epoch, 29, 35), 3).T
     except ValueError:
         raise _bad_epoch(lines, epoch, path) from None
+    bad = (flag < 0) | (count < 0) | (~calendar_days(fields)[1] & ~(flag > 1))
+    if bad.any():
+        raise _bad_epoch(lines, epoch[bad], path)
     flag, count = np.nan_to_num(flag).astype(int), np.nan_to_num(count).astype(int)
     system = _SYSTEM_OF[first]
     own = np.flatnonzero(system >= 0)
@@ -235,9 +242,6 @@ def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
     _say_cut(lines, epoch, own, of, flag, count, path, remarks)
     if len(own) and own[-1] == len(lines) - 1 and not lines.whole:
         own, of = own[:-1], of[:-1]  # whether its last field is whole nobody knows
-    bad = ~np.isfinite(fields).all(axis=1) & (flag <= 1)
-    if bad.any():
-        raise _bad_epoch(lines, epoch[bad], path)
     if not (flag <= 1).any():
         raise RecordingError(f"{path}: holds a header and no observations")
     stamp, zero = _since_week(fields, header.scale, flag <= 1)
@@ -245,8 +249,9 @@ def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
         number = numbers(lines.block(own, 1, 3), 2)[:, 0]
     except ValueError:
         number = np.full(len(own), np.nan)
-    if np.isnan(number).any():
-        k = own[np.isnan(number)][0] if len(number) == len(own) else own[0]
+    wrong = ~(number >= 1)
+    if wrong.any():
+        k = own[wrong][0]
         raise RecordingError(f"{path}, line {k + 1}: '{lines.text(k)[:3]}' names no satellite")
     satellite = (100 * system[own] + number).astype(np.int16)
     rows = _Rows(own, of, satellite)
@@ -295,10 +300,12 @@ def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
             flag, count = int(text[26:29] or 0), int(text[29:32])
         except ValueError:
             raise RecordingError(f"{path}, line {k + 1}: expected the line of an epoch, found '{text[:32]}'") from None
+        if flag < 0 or count < 0:
+            raise RecordingError(f"{path}, line {k + 1}: an epoch of {count} satellites with the flag {flag}")
         if flag > 1:
             k += 1 + count
             continue
-        more = -(-count // 12)
+        more = max(1, -(-count // 12))
         names = "".join(lines.text(j)[32:68].ljust(36) for j in range(k, min(k + more, len(lines))))
         begin = k + more
         whole = min(count, max(0, (len(lines) - begin) // each))
@@ -309,7 +316,7 @@ def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
             name = names[3 * i : 3 * i + 3]
             number = SYSTEMS.find(name[:1] if name[:1].strip() else (header.system if header.system != "M" else "G"))
             try:
-                one = 100 * number + int(name[1:])
+                one = satellite_id(SYSTEMS[max(number, 0)] + name[1:])
             except ValueError:
                 raise RecordingError(f"{path}, line {k + 1}: '{name}' names no satellite") from None
             if number >= 0:
@@ -327,8 +334,10 @@ def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
     try:
         fields = _calendar(lines, epoch, 0, 3)
     except ValueError:
-        raise _bad_epoch(lines, epoch, path) from None
+        raise _bad_epoch(lines, epoch, path, 0) from None
     fields[:, 0] += np.where(fields[:, 0] < 80, 2000, 1900)
+    if (bad := ~calendar_days(fields)[1]).any():
+        raise _bad_epoch(lines, epoch[bad], path, 0)
     rows = _Rows(np.array(first_line, dtype=np.intp), np.array(of, dtype=np.intp), np.array(satellite, dtype=np.int16))
 
     def cells(which: NDArray[np.intp], types: int) -> NDArray[np.uint8]:
@@ -354,30 +363,36 @@ def _say_cut(
         )
 
 
-def _bad_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path) -> RecordingError:
-    """For the first epoch line that is none."""
+def _bad_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int = 2) -> RecordingError:
+    """For the first epoch line that is none; its date begins at a column, two digits of the year in version 2."""
+    end = begin + 27 if begin else 26
     for k in epoch:
+        text = lines.text(k)
         try:
-            text = lines.text(k)
-            if np.isfinite(np.array(text[2:29].split(), dtype=float)).all() and len(text[2:29].split()) == 6:
-                int(text[32:35] or 0)
+            date = np.array([[parse_number(word) for word in text[begin:end].split()]])
+            date[:, 0] += 0 if begin else np.where(date[:, 0] < 80, 2000, 1900)
+            flag, count = (int(text[at : at + 3].strip() or 0) for at in (end, end + 3))
+            if date.shape == (1, 6) and calendar_days(date)[1].all() and min(flag, count) >= 0:
                 continue
-        except ValueError:
+        except (ValueError, IndexError):
             pass
-        return RecordingError(f"{path}, line {k + 1}: '{lines.text(k)[:35]}' is not the date of an epoch")
-    return RecordingError(f"{path}: the date of an epoch cannot be read")
+        return RecordingError(f"{path}, line {k + 1}: '{text[:35]}' is not the line of an epoch")
+    return RecordingError(f"{path}: the line of an epoch cannot be read")
 
 
 def _bad_field(
-    lines: Lines, rows: _Rows, own: NDArray[np.intp], types: list[str], cells: Cells, path: Path
+    rows: _Rows, own: NDArray[np.intp], types: list[str], block: NDArray[np.uint8], path: Path
 ) -> RecordingError:
-    """For the first field that is no number."""
-    for k in own:
-        block = cells(np.array([k]), len(types)).reshape(len(types), _WIDTH)
-        for name, cell in zip(types, block, strict=True):
-            text = bytes(cell[:14]).decode("latin-1").strip()
+    """For the first field that is no number, of those (n, m, 14) of some rows."""
+    for k, cells, elsewhere in zip(own, block, moved(block), strict=True):
+        for name, cell, wrong in zip(types, cells, elsewhere, strict=True):
+            text = bytes(cell).decode("latin-1").strip()
+            where = f"{path}, line {rows.line[k] + 1}, {name}: '{text}'"
+            if wrong:
+                return RecordingError(f"{where} does not stand in its columns")
             try:
-                float(text or "nan")
+                if not np.isfinite(parse_number(text or "0")):
+                    raise ValueError
             except ValueError:
-                return RecordingError(f"{path}, line {rows.line[k] + 1}, {name}: '{text}' is not a number")
+                return RecordingError(f"{where} is not a number")
     return RecordingError(f"{path}: a field is not a number")

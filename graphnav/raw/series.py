@@ -7,8 +7,14 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from graphnav.errors import RecordingError
 from graphnav.raw.signals import C, Ids, frequencies
 from graphnav.rotation import Array
+
+_FARTHEST = 1e9  # m, of a code: satellites are 4.3e7 m away at most, and no clock of a receiver is seconds off
+_FASTEST = 1e6  # Hz, of a Doppler shift: satellites make 1e4, an oscillator off by 1e-4 makes 2e5
+_MOST_CYCLES = 1e11  # of a carrier: more than F14.3 holds
+_LONGEST = 3.15e7  # s, a year
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,17 @@ def joined(parts: list[Observations]) -> Observations:
 
 
 def once(obs: Observations) -> Observations:
-    """In order of time, satellite and signal, and each of these once: the row that was first."""
+    """In order of time, satellite and signal, and each of these once: the row that was first.
+
+    Raises
+    ------
+    RecordingError
+        If their times are years apart.
+    """
+    obs = _plausible(obs)
+    span = float(np.ptp(obs.t)) if len(obs) else 0.0
+    if not span <= _LONGEST:
+        raise RecordingError(f"{obs.files[0]}: its observations span {span / 86400.0:.3g} days; is a date wrong?")
     tick = np.round(obs.t * 1e4).astype(np.int64)
     key = (tick - tick.min(initial=0)) * 10**7 + obs.satellite.astype(np.int64) * 10**4 + obs.signal
     if np.all(np.diff(key) > 0):
@@ -90,6 +106,17 @@ def once(obs: Observations) -> Observations:
     if not twice:
         return out
     return replace(out, remarks=(*out.remarks, f"{twice} observations are there twice; the first of each is used"))
+
+
+def _plausible(obs: Observations) -> Observations:
+    """Without the values that no receiver can have measured."""
+    with np.errstate(invalid="ignore"):
+        bad = (np.abs(obs.code) > _FARTHEST) | (np.abs(obs.doppler) > _FASTEST) | (np.abs(obs.carrier) > _MOST_CYCLES)
+    if not bad.any():
+        return obs
+    code, carrier, doppler = (np.where(bad, np.nan, x) for x in (obs.code, obs.carrier, obs.doppler))
+    said = f"{bad.sum()} observations are beyond what a receiver can measure and are left out"
+    return replace(obs, code=code, carrier=carrier, doppler=doppler, remarks=(*obs.remarks, said))
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,10 @@ def satellite_id(name: str) -> int:
     ValueError
         If it is none.
     """
-    return 100 * SYSTEMS.index(name[0]) + int(name[1:3])
+    number = name[1:3].strip()
+    if not (number.isascii() and number.isdigit() and int(number)):
+        raise ValueError(f"'{name}' names no satellite")
+    return 100 * SYSTEMS.index(name[0]) + int(number)
 
 
 def satellite_name(satellite: int) -> str:

@@ -27,6 +27,7 @@ from typing import Any
 import logs
 import mutators
 import numpy as np
+import raw_cases
 import test_formats_binary as binary
 
 from graphnav import cli
@@ -338,6 +339,11 @@ def of_trajectory(folder: Path, chance: random.Random) -> None:
     stand_in(track.llh[:, :2] * scale, plain)
 
 
+def of_raw_gnss(folder: Path, chance: random.Random) -> None:
+    """RINEX, SP3, clocks and raw UBX: codes stand in the file, and places are numbers."""
+    raw_cases.of_raw(folder, chance, seeds(), insist, stand_in)
+
+
 def of_evaluation(folder: Path, chance: random.Random) -> None:
     path = Path(shutil.copy(seeds() / chance.choice(("t.csv", "t.tum", "t.nav")), folder))
     spoilt(path, mutators.TEXT, chance)
@@ -469,6 +475,7 @@ TARGETS: dict[str, tuple[Callable[[Path, random.Random], None], int]] = {
     "nmea": (of_nmea, 16), "ubx": (of_ubx, 16), "ubx sensors": (of_ubx_sensors, 1), "kitti-raw": (of_kitti, 8),
     "trajectory": (of_trajectory, 24), "evaluation": (of_evaluation, 8), "export": (of_export, 8),
     "draft": (of_draft, 2), "usage": (of_usage, 10), "solution": (of_solution, 1), "stream": (of_stream, 1),
+    "raw gnss": (of_raw_gnss, 16),
 }  # fmt: skip
 
 

@@ -246,6 +246,21 @@ def packed(data: bytes, chance: Chance) -> bytes:
     return chance.choice(BINARY)(out, chance) if chance.random() < 0.8 else out
 
 
+# ------------------------------------------------------------------------------------- files of fixed columns
+def field(data: bytes, chance: Chance) -> bytes:
+    """Numbers become something else that is as wide."""
+    text = data.decode("latin-1")
+    found = list(_NUMBER.finditer(text))
+    for one in chance.sample(found, min(len(found), chance.choice((1, 1, 1, 3, 20)))):
+        wide = one.end() - one.start()
+        other = chance.choice(("nan", "inf", "-inf", "1e300", "-1", "0", "9" * wide, "-" * wide, "1_0", "1D99", ""))
+        text = text[: one.start()] + other.rjust(wide)[:wide] + text[one.end() :]
+    return text.encode("latin-1")
+
+
+COLUMNS: tuple[Mutator, ...] = (field, field, field, field, *TEXT)
+
+
 # ---------------------------------------------------------------------------------------------- a live source
 def stream(lines: Sequence[str], chance: Chance) -> list[str]:
     """A few lines spoilt, doubled, late or absurd."""
