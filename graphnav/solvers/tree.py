@@ -241,7 +241,7 @@ class Tree:
         steps = list(place.steps)
         self._constant |= {s.name for s in steps if _is_constant(place, s.name)}
         named = {s.name for s in steps}
-        for name in self._constant - named:
+        for name in sorted(self._constant.intersection(self._in_force) - named):
             node, own = self._in_force[name]
             if place.t - node.t >= NODE_EVERY:
                 value = node.anchor[own]
@@ -410,10 +410,12 @@ class Tree:
     def again(self, which: Iterable[int], renewed: Renewed | None = None) -> None:
         """Linearise keyframes, and the intervals on either side, where they are now."""
         rows = {i for i in map(int, which) if i >= self._held}
+        if not rows:
+            return
         links = {k for i in rows for k in (i, i + 1) if k < len(self) and _LINK in self.keyframes[k].slots}
         made: list[tuple[_Keyframe, str, Any]] = []
         gone: list[int] = []
-        for run in list(self._runs(sorted(rows | links))):
+        for run in list(self._runs(sorted(rows | links), posed=renewed is not None)):
             own = self.keyframes[run[0] : run[-1] + 1]
             places = [k.place for k in own]
             if renewed is not None:
@@ -449,15 +451,19 @@ class Tree:
         self.relinearised += len(rows)
         self._update(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
 
-    def _runs(self, which: Sequence[int]) -> Iterable[list[int]]:
-        """Indices that can be linearised together: keyframe after keyframe of one problem, the same columns."""
+    def _runs(self, which: Sequence[int], posed: bool) -> Iterable[list[int]]:
+        """Indices that can be linearised together: keyframe after keyframe of one problem, the same columns.
+
+        `posed` are keyframes that will be posed again, together.
+        """
         run: list[int] = []
         for i in which:
             k = self.keyframes[i]
             if run:
                 last = self.keyframes[run[-1]]
-                alike = i == run[-1] + 1 and k.columns == last.columns and k.place.problem is last.place.problem
-                if not alike or k.place.k != last.place.k + 1 or not (_LINK in k.slots and _LINK in last.slots):
+                alike = i == run[-1] + 1 and k.columns == last.columns and _LINK in k.slots and _LINK in last.slots
+                same = posed or (k.place.problem is last.place.problem and k.place.k == last.place.k + 1)
+                if not (alike and same):
                     yield run
                     run = []
             run.append(i)
