@@ -17,7 +17,7 @@ tree, and what is known of them becomes a factor on what they touched. It stays 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -29,66 +29,32 @@ from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solvers.elimination import Predicted
-from graphnav.solvers.graph import jacobian_factor
 from graphnav.solvers.linearise import shift
 from graphnav.solvers.passes import integrated_again
 from graphnav.solvers.revision import Renewed
 from graphnav.solvers.robust import PASSES
 from graphnav.solvers.stages import Columns, Measured, Message, Place, Step, at_points, extended, measured, predicted
+from graphnav.solvers.tree_nodes import (
+    LINK,
+    Keyframe,
+    Variable,
+    factor,
+    file,
+    fresh_isam,
+    is_constant,
+    read_again,
+    turned,
+    units_of,
+    updated,
+    written,
+)
 from graphnav.solvers.window import Smoothed, limits
 from graphnav.state import DIM, States
 
 NODE_EVERY = 30.0  # s from one node of a constant to the next
 _TIED = 1e-5  # of its prior sigma, by which a constant may differ from node to node: 0.03 % of it in ten hours
 _UNIT = np.repeat([1e-3, 1.0, 0.1, 1e-3, 1e-5], 3)  # of a state's errors, so that one threshold fits them all
-_WILDFIRE = 1e-3  # of these units: less is not passed on to older variables
 _ALMOST = 0.3  # what has moved almost as far goes with what has: it would be next
-_LINK = "imu"
-
-
-@dataclass(eq=False)
-class _Variable:
-    """A node of the tree: errors about an anchor."""
-
-    key: int
-    unit: Array  # (w,) of its numbers in the tree
-    point: Array  # (w,) where its rows are linearised
-    delta: Array  # (w,) as it is known now
-    first: int  # number of the first keyframe that touches it
-    last: int  # and of the last
-    t: float  # s, when it began
-    anchor: Array = field(default_factory=lambda: np.zeros(0))  # of parameters
-    limit: Array = field(default_factory=lambda: np.zeros(0))  # how far they may move
-
-    @property
-    def value(self) -> Array:
-        """Parameters as they are known now."""
-        return self.anchor + self.delta
-
-
-@dataclass(eq=False)
-class _Keyframe:
-    number: int
-    place: Place
-    state: _Variable
-    anchor: States  # one
-    columns: Columns
-    nodes: dict[str, tuple[_Variable, slice]]  # the node of each parameter in force
-    slots: dict[str, list[int]]  # indices of its factors, by constraint
-
-    @property
-    def estimate(self) -> States:
-        """The state as it is known now."""
-        return self.anchor.plus(self.state.delta[None])
-
-    @property
-    def values(self) -> Array:
-        """(D-15,) parameters as they are known now."""
-        out = np.zeros(max((at.stop for at in self.columns.values()), default=DIM) - DIM)
-        for name, at in self.columns.items():
-            node, own = self.nodes[name]
-            out[shift(at)] = node.anchor[own] + node.delta[own]
-        return out
 
 
 class Tree:
@@ -101,14 +67,14 @@ class Tree:
     """
 
     def __init__(self, prior: Message, turn: float) -> None:
-        self.isam = _isam()
+        self.isam = fresh_isam()
         self.turn = turn
-        self.keyframes: list[_Keyframe] = []
+        self.keyframes: list[Keyframe] = []
         self.relinearised = 0  # keyframes
         self._prior = prior
         self._number = self._key = 0
-        self._in_force: dict[str, tuple[_Variable, slice]] = {}
-        self._variables: dict[int, _Variable] = {}
+        self._in_force: dict[str, tuple[Variable, slice]] = {}
+        self._variables: dict[int, Variable] = {}
         self._first_sigma: dict[str, Array] = {}
         self._constant: set[str] = set()
         self._held = 0  # keyframes at the front that stay as they are: 1 where the first is behind the window
@@ -134,7 +100,7 @@ class Tree:
         P[:, :3] = P[:, :3] @ J.T
         return P
 
-    def _marginal(self, x: _Variable, t: float) -> Array:
+    def _marginal(self, x: Variable, t: float) -> Array:
         try:
             found = self.isam.marginalCovariance(x.key)
         except RuntimeError:
@@ -160,7 +126,7 @@ class Tree:
         graph, new = gtsam.NonlinearFactorGraph(), gtsam.Values()
         x = self._variable(np.zeros(DIM), _UNIT, place.t)
         nodes = self._open(place, graph, new)
-        keyframe = _Keyframe(self._number, place, x, state, columns, nodes, {})
+        keyframe = Keyframe(self._number, place, x, state, columns, nodes, {})
         new.insert(x.key, np.zeros(DIM))
         for node, _ in nodes.values():
             node.last = self._number
@@ -171,24 +137,24 @@ class Tree:
                 node.point[own] = node.delta[own]
         if link is None:
             prior = self._prior
-            graph.push_back(_factor([(x, prior.R[:, :DIM])], prior.z))
+            graph.push_back(factor([(x, prior.R[:, :DIM])], prior.z))
         made: list[tuple[str, Any]] = []
         if link is not None:
             last = self.keyframes[-1]
-            blocks = [(last.state, _turned(link[:, :DIM], last.state.delta)), (x, link[:, DIM : 2 * DIM])]
-            made.append((_LINK, self._about(link[:, DIM:-1], link[:, -1], blocks, last.columns, last.nodes)))
+            blocks = [(last.state, turned(link[:, :DIM], last.state.delta)), (x, link[:, DIM : 2 * DIM])]
+            made.append((LINK, self._about(link[:, DIM:-1], link[:, -1], blocks, last.columns, last.nodes)))
         made += [(one.name, self._rows(keyframe, one, weighted=False)) for one in rows]
         self.keyframes.append(keyframe)
         begin = graph.size()
-        for _, factor in made:
-            graph.push_back(factor)
+        for _, one in made:
+            graph.push_back(one)
         groups = gtsam.KeyGroupMap()
         if self._number > 3:  # along time, where the order is free
             for variable in self._recent():
                 groups.insert2(variable.key, variable.last - self._number + 3)
-        result = _updated(self.isam, place.t, graph, new, [], groups)
+        result = updated(self.isam, place.t, graph, new, [], groups)
         self._number += 1
-        _file(keyframe, made, list(result.getNewFactorsIndices())[begin:])
+        file(keyframe, made, list(result.getNewFactorsIndices())[begin:])
         self._read([x, *(node for node, _ in nodes.values())])
         for _ in range(PASSES - 1 if any(one.kernel != "none" for one in rows) else 0):
             self.again([len(self.keyframes) - 1])
@@ -205,41 +171,41 @@ class Tree:
         if prior.columns:
             node = self._variable(prior.values, np.ones(len(prior.values)), place.t)
             new.insert(node.key, np.zeros(len(prior.values)))
-            node.limit = limits(prior.columns, _units(place))[1]
+            node.limit = limits(prior.columns, units_of(place))[1]
             nodes = {name: (node, shift(at)) for name, at in prior.columns.items()}
             blocks.append((node, prior.R[:, DIM:]))
-        graph.push_back(_factor(blocks, prior.z))
+        graph.push_back(factor(blocks, prior.z))
         assert place.problem is not None
         for name, p in place.problem.parameters.items():
             if name in prior.columns and p.constant:
                 self._constant.add(name)
                 self._first_sigma[name] = p.sigma
                 node.unit[nodes[name][1]] = 1.0
-        _updated(self.isam, place.t, graph, new)
+        updated(self.isam, place.t, graph, new)
         self._in_force = nodes
         before = Place(place.t, None)
-        self.keyframes.append(_Keyframe(self._number, before, x, prior.state, prior.columns, nodes, {}))
+        self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, {}))
         self._number += 1
         self._held = 1
         self._read([x, *(node for node, _ in nodes.values())])
 
-    def _recent(self) -> Iterable[_Variable]:
+    def _recent(self) -> Iterable[Variable]:
         for keyframe in self.keyframes[-3:]:
             yield keyframe.state
         yield from {id(n): n for k in self.keyframes[-3:] for n, _ in k.nodes.values()
                     if n.last >= self._number - 2}.values()  # fmt: skip
 
-    def _variable(self, anchor: Array, unit: Array, t: float) -> _Variable:
+    def _variable(self, anchor: Array, unit: Array, t: float) -> Variable:
         none = np.zeros(len(unit))
-        out = _Variable(self._key, unit, none.copy(), none, self._number, self._number, t, anchor)
+        out = Variable(self._key, unit, none.copy(), none, self._number, self._number, t, anchor)
         self._variables[self._key] = out
         self._key += 1
         return out
 
-    def _open(self, place: Place, graph: Any, new: Any) -> dict[str, tuple[_Variable, slice]]:
+    def _open(self, place: Place, graph: Any, new: Any) -> dict[str, tuple[Variable, slice]]:
         """Begin the nodes of parameters that step at a keyframe, and the next ones of constants; which are in force."""
         steps = list(place.steps)
-        self._constant |= {s.name for s in steps if _is_constant(place, s.name)}
+        self._constant |= {s.name for s in steps if is_constant(place, s.name)}
         named = {s.name for s in steps}
         for name in sorted(self._constant.intersection(self._in_force) - named):
             node, own = self._in_force[name]
@@ -257,7 +223,7 @@ class Tree:
             widths = [len(s.mean) for s in own_steps]
             edge = np.concatenate([[0], np.cumsum(widths)])
             node = self._variable(np.zeros(edge[-1]), np.ones(edge[-1]), place.t)
-            node.limit = limits(extended({}, own_steps), _units(place))[1]
+            node.limit = limits(extended({}, own_steps), units_of(place))[1]
             old = self._variables.get(old_key)
             own_A, old_A = np.zeros((edge[-1], edge[-1])), np.zeros((edge[-1], 0 if old is None else len(old.unit)))
             for step, lo, hi in zip(own_steps, edge[:-1], edge[1:], strict=True):
@@ -273,7 +239,7 @@ class Tree:
                 in_force[step.name] = node, at
             new.insert(node.key, np.zeros(len(node.unit)))
             blocks = [(node, own_A)] + ([(old, old_A)] if old is not None and old_A.any() else [])
-            graph.push_back(_factor(blocks, np.zeros(edge[-1])))
+            graph.push_back(factor(blocks, np.zeros(edge[-1])))
         self._in_force = in_force
         return in_force
 
@@ -281,13 +247,13 @@ class Tree:
         self,
         H: Array,
         b: Array,
-        blocks: list[tuple[_Variable, Array]],
+        blocks: list[tuple[Variable, Array]],
         columns: Columns,
-        nodes: dict[str, tuple[_Variable, slice]],
+        nodes: dict[str, tuple[Variable, slice]],
     ) -> Any:
         """A factor of rows over states, `blocks`, and parameters, H (m, D), linearised where they are now."""
         b = b + sum(A @ x.delta for x, A in blocks)
-        touched: dict[int, tuple[_Variable, Array]] = {}
+        touched: dict[int, tuple[Variable, Array]] = {}
         for name, at in columns.items():
             if not H[:, at].any():
                 continue
@@ -295,19 +261,19 @@ class Tree:
             _, A = touched.setdefault(node.key, (node, np.zeros((len(b), len(node.unit)))))
             A[:, own] = H[:, at]
             b = b + H[:, at] @ node.delta[own]
-        return _factor([*blocks, *touched.values()], b)
+        return factor([*blocks, *touched.values()], b)
 
-    def _rows(self, keyframe: _Keyframe, one: Measured, weighted: bool) -> Any:
+    def _rows(self, keyframe: Keyframe, one: Measured, weighted: bool) -> Any:
         """A factor of measurements linearised where keyframe and parameters are now."""
         H, b, _ = one.weighted(np.zeros(one.H.shape[-1]), int(weighted))
         H, x = H.reshape(-1, H.shape[-1]), keyframe.state
-        return self._about(H, b.ravel(), [(x, _turned(H[:, :DIM], x.delta))], keyframe.columns, keyframe.nodes)
+        return self._about(H, b.ravel(), [(x, turned(H[:, :DIM], x.delta))], keyframe.columns, keyframe.nodes)
 
-    def _update(self, made: Sequence[tuple[_Keyframe, str, Any]], gone: list[int], first: int) -> None:
+    def _update(self, made: Sequence[tuple[Keyframe, str, Any]], gone: list[int], first: int) -> None:
         """Have factors in place of others, on keyframes from one on."""
         graph = gtsam.NonlinearFactorGraph()
-        for _, _, factor in made:
-            graph.push_back(factor)
+        for _, _, one in made:
+            graph.push_back(one)
         # the order stays that of time; once it has much to do, GTSAM makes the whole tree anew
         late = [v for v in self._variables.values() if v.last >= first]
         every = None
@@ -320,7 +286,7 @@ class Tree:
         for variable in late:
             groups.insert2(variable.key, variable.last - first)
         t = self.keyframes[-1].place.t
-        result = _updated(self.isam, t, graph, gtsam.Values(), gone, groups, None, every)
+        result = updated(self.isam, t, graph, gtsam.Values(), gone, groups, None, every)
         for (keyframe, name, _), index in zip(made, result.getNewFactorsIndices(), strict=True):
             keyframe.slots.setdefault(name, []).append(index)
 
@@ -329,7 +295,7 @@ class Tree:
         """Bring all estimates up to date."""
         self._read(list(self._variables.values()), all_at_once=True)
 
-    def _read(self, variables: Sequence[_Variable], all_at_once: bool = False) -> None:
+    def _read(self, variables: Sequence[Variable], all_at_once: bool = False) -> None:
         if not all_at_once:
             for x in variables:
                 x.delta = x.unit * self.isam.calculateEstimateVector(x.key)
@@ -412,8 +378,8 @@ class Tree:
         rows = {i for i in map(int, which) if i >= self._held}
         if not rows:
             return
-        links = {k for i in rows for k in (i, i + 1) if k < len(self) and _LINK in self.keyframes[k].slots}
-        made: list[tuple[_Keyframe, str, Any]] = []
+        links = {k for i in rows for k in (i, i + 1) if k < len(self) and LINK in self.keyframes[k].slots}
+        made: list[tuple[Keyframe, str, Any]] = []
         gone: list[int] = []
         for run in list(self._runs(sorted(rows | links), posed=renewed is not None)):
             own = self.keyframes[run[0] : run[-1] + 1]
@@ -433,11 +399,11 @@ class Tree:
                 if i in links:
                     assert linear.link is not None
                     last, link = self.keyframes[i - 1], linear.link
-                    blocks = [(last.state, _turned(link[:, :DIM], last.state.delta)),
-                              (keyframe.state, _turned(link[:, DIM : 2 * DIM], keyframe.state.delta))]  # fmt: skip
-                    made.append((keyframe, _LINK, self._about(
+                    blocks = [(last.state, turned(link[:, :DIM], last.state.delta)),
+                              (keyframe.state, turned(link[:, DIM : 2 * DIM], keyframe.state.delta))]  # fmt: skip
+                    made.append((keyframe, LINK, self._about(
                         link[:, DIM:-1], link[:, -1], blocks, last.columns, last.nodes)))  # fmt: skip
-                    gone += keyframe.slots.pop(_LINK)
+                    gone += keyframe.slots.pop(LINK)
                 if i in rows:
                     for one in linear.measured:
                         if one.name in keyframe.slots:
@@ -461,7 +427,7 @@ class Tree:
             k = self.keyframes[i]
             if run:
                 last = self.keyframes[run[-1]]
-                alike = i == run[-1] + 1 and k.columns == last.columns and _LINK in k.slots and _LINK in last.slots
+                alike = i == run[-1] + 1 and k.columns == last.columns and LINK in k.slots and LINK in last.slots
                 same = posed or (k.place.problem is last.place.problem and k.place.k == last.place.k + 1)
                 if not (alike and same):
                     yield run
@@ -527,34 +493,13 @@ class Tree:
         self._held = 1
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the tree itself, and its factors in order."""
-        out, factors, none = dict(self.__dict__), self.isam.getFactorsUnsafe(), gtsam.Values()
-        for x in self._variables.values():
-            none.insert(x.key, np.zeros(len(x.unit)))
-        rows = []
-        for i in range(factors.size()):
-            if factors.at(i) is not None:
-                rows.append((i, gtsam.JacobianFactor(factors.at(i).linearize(none)).serialize()))
-        out["isam"] = rows
-        return out
+        """All but the tree itself, which is made again from its factors."""
+        return {**self.__dict__, "isam": written(self.isam, self._variables.values())}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         rows = state.pop("isam")
         self.__dict__.update(state)
-        self.isam = _isam()
-        graph, new, groups = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.KeyGroupMap()
-        first = min((x.last for x in self._variables.values()), default=0)
-        for x in self._variables.values():
-            new.insert(x.key, np.zeros(len(x.unit)))
-            groups.insert2(x.key, x.last - first)
-        for _, text in rows:
-            factor = gtsam.JacobianFactor()
-            factor.deserialize(text)
-            graph.push_back(gtsam.LinearContainerFactor(factor))
-        if not rows:
-            return
-        indices = self.isam.update(graph, new, [], groups).getNewFactorsIndices()
-        now = dict(zip((i for i, _ in rows), indices, strict=True))
+        self.isam, now = read_again(rows, {x: x.last for x in self._variables.values()})
         for k in self.keyframes:
             k.slots = {name: [now[i] for i in own] for name, own in k.slots.items()}
 
@@ -575,50 +520,3 @@ class Tree:
                 continue
             kept = {name: [i for i in own if i not in left] for name, own in keyframe.slots.items()}
             keyframe.slots = {name: own for name, own in kept.items() if own}
-
-
-def _file(keyframe: _Keyframe, made: Sequence[tuple[str, Any]], indices: Sequence[int]) -> None:
-    """Note where a keyframe's factors are."""
-    for (name, _), index in zip(made, indices, strict=True):
-        keyframe.slots.setdefault(name, []).append(index)
-
-
-def _isam() -> gtsam.ISAM2:
-    parameters = gtsam.ISAM2Params()
-    parameters.setFactorization("QR")
-    parameters.enableRelinearization = False  # by GTSAM: it has a linear problem
-    parameters.findUnusedFactorSlots = True
-    parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(_WILDFIRE))
-    return gtsam.ISAM2(parameters)
-
-
-def _updated(isam: gtsam.ISAM2, t: float, *change: Any) -> Any:
-    try:
-        return isam.update(*change)
-    except RuntimeError as error:  # GTSAM's for a variable that nothing determines
-        raise EstimationError(f"the smoother's information broke down at {t:.3f} s: check sigmas and units") from error
-
-
-def _factor(blocks: Sequence[tuple[_Variable, Array]], b: Array) -> Any:
-    """Whitened rows A e = b as a factor of the tree."""
-    return gtsam.LinearContainerFactor(jacobian_factor([(x.key, A * x.unit) for x, A in blocks], b))
-
-
-def _turned(A: Array, d: Array) -> Array:
-    """Columns of rows about the anchor moved by d, as columns of the errors about the anchor itself."""
-    if not d[:3].any():
-        return A
-    out = A.copy()
-    out[:, :3] = A[:, :3] @ rotation.right_jacobian(d[None, :3])[0]
-    return out
-
-
-def _is_constant(place: Place, name: str) -> bool:
-    assert place.problem is not None
-    p = place.problem.parameters.get(name)
-    return p is not None and p.constant
-
-
-def _units(place: Place) -> dict[str, str]:
-    assert place.problem is not None
-    return {name: p.unit for name, p in place.problem.parameters.items()}
