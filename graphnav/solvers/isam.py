@@ -16,6 +16,7 @@ from graphnav.solvers.incremental import Replayed, node_steps, replayed
 from graphnav.solvers.passes import Progress
 from graphnav.solvers.stages import Place
 from graphnav.solvers.tree import Tree
+from graphnav.solvers.tree_marginals import newest_covariance, smoothed
 from graphnav.solvers.window import Smoothed, first_message, turn_limit
 from graphnav.state import DIM, States
 
@@ -59,11 +60,11 @@ def isam2(
         if t - oldest > lag * (1.0 + 1.0 / _PORTIONS):
             count = int(np.searchsorted(problem.t[:k], t - lag)) - tree.keyframes[0].place.k
             problem, _ = tree.integrate_again(problem)
-            settled.append(tree.settled(count))
+            settled.append(smoothed(tree, count))
             tree.marginalise(count)
         newest = tree.newest
         live.append(newest.state)
-        P[k] = tree.covariance
+        P[k] = newest_covariance(tree)
         values.append(newest.values)
         seconds[k] = time.process_time() - before
         if progress is not None and k % 64 == 0:
@@ -72,7 +73,7 @@ def isam2(
         problem, again = tree.integrate_again(problem)
         if not tree.relinearise(_FINE) and not again:
             break
-    settled.append(tree.settled(len(tree)))
+    settled.append(smoothed(tree, len(tree)))
     spent = time.perf_counter() - began
     found = replayed(problem, "isam2", settled, States.stack(live), P, np.array(values), seconds, spent, lag)
     notes = (*found.settled.notes, f"{tree.relinearised} keyframes were linearised again")

@@ -23,9 +23,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from graphnav import rotation
 from graphnav.dynamics import SCALE
-from graphnav.errors import EstimationError
 from graphnav.problem import Problem
 from graphnav.rotation import Array
 from graphnav.solvers.elimination import Predicted
@@ -48,7 +46,7 @@ from graphnav.solvers.tree_nodes import (
     updated,
     written,
 )
-from graphnav.solvers.window import Smoothed, limits
+from graphnav.solvers.window import limits
 from graphnav.state import DIM, States
 
 NODE_EVERY = 30.0  # s from one node of a constant to the next
@@ -74,7 +72,7 @@ class Tree:
         self._prior = prior
         self._number = self._key = 0
         self._in_force: dict[str, tuple[Variable, slice]] = {}
-        self._variables: dict[int, Variable] = {}
+        self.variables: dict[int, Variable] = {}
         self._first_sigma: dict[str, Array] = {}
         self._constant: set[str] = set()
         self._held = 0  # keyframes at the front that stay as they are: 1 where the first is behind the window
@@ -90,24 +88,6 @@ class Tree:
             return self._prior
         last, none = self.keyframes[-1], np.empty((0, 0))
         return Message(last.estimate, last.values, last.columns, none, none[0:0])
-
-    @property
-    def covariance(self) -> Array:
-        """(15, 15) of the newest state."""
-        last = self.keyframes[-1]
-        P, J = self._marginal(last.state, last.place.t), rotation.right_jacobian(last.state.delta[None, :3])[0]
-        P[:3] = J @ P[:3]
-        P[:, :3] = P[:, :3] @ J.T
-        return P
-
-    def _marginal(self, x: Variable, t: float) -> Array:
-        try:
-            found = self.isam.marginalCovariance(x.key)
-        except RuntimeError:
-            raise EstimationError(
-                f"the data leave something undetermined at {t:.3f} s: there is no covariance"
-            ) from None
-        return np.asarray(x.unit[:, None] * found * x.unit)
 
     def add(self, place: Place, ahead: Predicted | None = None, rows: Sequence[Measured] = ()) -> float:
         """Take in one more keyframe; returns by how much its rows turned it, rad.
@@ -198,7 +178,7 @@ class Tree:
     def _variable(self, anchor: Array, unit: Array, t: float) -> Variable:
         none = np.zeros(len(unit))
         out = Variable(self._key, unit, none.copy(), none, self._number, self._number, t, anchor)
-        self._variables[self._key] = out
+        self.variables[self._key] = out
         self._key += 1
         return out
 
@@ -224,7 +204,7 @@ class Tree:
             edge = np.concatenate([[0], np.cumsum(widths)])
             node = self._variable(np.zeros(edge[-1]), np.ones(edge[-1]), place.t)
             node.limit = limits(extended({}, own_steps), units_of(place))[1]
-            old = self._variables.get(old_key)
+            old = self.variables.get(old_key)
             own_A, old_A = np.zeros((edge[-1], edge[-1])), np.zeros((edge[-1], 0 if old is None else len(old.unit)))
             for step, lo, hi in zip(own_steps, edge[:-1], edge[1:], strict=True):
                 at = slice(int(lo), int(hi))
@@ -275,10 +255,10 @@ class Tree:
         for _, _, one in made:
             graph.push_back(one)
         # the order stays that of time; once it has much to do, GTSAM makes the whole tree anew
-        late = [v for v in self._variables.values() if v.last >= first]
+        late = [v for v in self.variables.values() if v.last >= first]
         every = None
-        if 2 * len(late) > len(self._variables):
-            late, first = list(self._variables.values()), self.keyframes[0].number
+        if 2 * len(late) > len(self.variables):
+            late, first = list(self.variables.values()), self.keyframes[0].number
             every = gtsam.KeyList()
             for variable in late:
                 every.push_back(variable.key)
@@ -293,7 +273,7 @@ class Tree:
     # ------------------------------------------------------------------------------------------ linearising again
     def read(self) -> None:
         """Bring all estimates up to date."""
-        self._read(list(self._variables.values()), all_at_once=True)
+        self._read(list(self.variables.values()), all_at_once=True)
 
     def _read(self, variables: Sequence[Variable], all_at_once: bool = False) -> None:
         if not all_at_once:
@@ -310,28 +290,6 @@ class Tree:
     def estimates(self, first: int = 0) -> list[tuple[States, Array]]:
         """State and parameter values of each keyframe from one on, as last read."""
         return [(k.estimate, k.values) for k in self.keyframes[first:]]
-
-    def root(self, columns: Columns) -> Array:
-        """(D, D) R, not triangular: R e are the whitened errors of the newest keyframe and its parameters."""
-        last = self.keyframes[-1]
-        D = DIM + len(last.values)
-        variables = list({x.key: x for x in (last.state, *(n for n, _ in last.nodes.values()))}.values())
-        joint = self.isam.jointMarginalCovariance([x.key for x in variables])
-        into = {x.key: np.zeros((D, len(x.unit))) for x in variables}
-        J = rotation.right_jacobian(last.state.delta[None, :3])[0]
-        into[last.state.key][:DIM] = np.eye(DIM)
-        into[last.state.key][:3, :3] = J
-        for name, at in columns.items():
-            node, own = last.nodes[name]
-            into[node.key][at, own] = np.eye(at.stop - at.start)
-        P = np.zeros((D, D))
-        for a in variables:
-            for b in variables:
-                A, B = into[a.key] * a.unit, into[b.key] * b.unit
-                P += A @ joint.at(a.key, b.key) @ B.T
-        sd = np.sqrt(np.diag(P))
-        w, V = np.linalg.eigh(P / sd[:, None] / sd)
-        return np.asarray((V / np.sqrt(np.maximum(w, np.finfo(float).eps))).T / sd)
 
     def moved(self, share: float = 1.0) -> Array:
         """Which keyframes' estimates are further from where their rows were linearised than a share of the limits."""
@@ -437,36 +395,6 @@ class Tree:
             yield run
 
     # ---------------------------------------------------------------------------------------------------- leaving
-    def settled(self, count: int, first: int = 0) -> Smoothed:
-        """The first `count` keyframes as they are known now, or those of them from `first` on."""
-        own = self.keyframes[first:count]
-        marginal: dict[int, Array] = {}
-        for k in own:
-            for x in (k.state, *(node for node, _ in k.nodes.values())):
-                if x.key not in marginal:
-                    marginal[x.key] = self._marginal(x, k.place.t)
-        covariance = np.stack([marginal[k.state.key] for k in own]) if own else np.empty((0, DIM, DIM))
-        delta = np.array([k.state.delta for k in own]).reshape(-1, DIM)
-        J = rotation.right_jacobian(delta[:, :3])
-        covariance[:, :3] = J @ covariance[:, :3]  # of errors about the estimate, as everywhere else
-        covariance[:, :, :3] = covariance[:, :, :3] @ np.swapaxes(J, -1, -2)
-        sigma = []
-        for k in own:
-            out = np.zeros(len(k.values))
-            for name, at in k.columns.items():
-                node, part = k.nodes[name]
-                out[shift(at)] = np.sqrt(np.maximum(np.diag(marginal[node.key])[part], 0.0))
-            sigma.append(out)
-        anchors = States.stack([k.anchor for k in own]) if own else self._prior.state[:0]
-        return Smoothed(
-            t=np.array([k.place.t for k in own]),
-            states=anchors.plus(delta),
-            covariance=covariance,
-            columns=tuple(k.columns for k in own),
-            values=tuple(k.values for k in own),
-            sigma=tuple(sigma),
-        )
-
     def truncate(self, keep: int) -> None:
         """Forget all but the first keyframes: something before what follows has changed."""
         gone = self.keyframes[keep:]
@@ -476,14 +404,14 @@ class Tree:
         last = self.keyframes[-1]
         self._number, self._in_force = last.number + 1, last.nodes
         # whatever touches a variable that began later goes with it
-        late = {x.key for x in self._variables.values() if x.first > last.number}
+        late = {x.key for x in self.variables.values() if x.first > last.number}
         factors = self.isam.getFactorsUnsafe()
         own = [
             i for i in range(factors.size()) if factors.at(i) is not None and not late.isdisjoint(factors.at(i).keys())
         ]
         for key in late:
-            del self._variables[key]
-        for x in self._variables.values():
+            del self.variables[key]
+        for x in self.variables.values():
             x.last = min(x.last, last.number)
         self._update([], own, self.keyframes[max(keep - 2, 0)].number)
         self._read([last.state, *(node for node, _ in last.nodes.values())])
@@ -494,12 +422,12 @@ class Tree:
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the tree itself, which is made again from its factors."""
-        return {**self.__dict__, "isam": written(self.isam, self._variables.values())}
+        return {**self.__dict__, "isam": written(self.isam, self.variables.values())}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         rows = state.pop("isam")
         self.__dict__.update(state)
-        self.isam, now = read_again(rows, {x: x.last for x in self._variables.values()})
+        self.isam, now = read_again(rows, {x: x.last for x in self.variables.values()})
         for k in self.keyframes:
             k.slots = {name: [now[i] for i in own] for name, own in k.slots.items()}
 
@@ -507,13 +435,13 @@ class Tree:
         """Let the first keyframes go, and the parameters' nodes that only they touch."""
         first = self.keyframes[count].number
         keys = gtsam.KeyList()
-        gone = [x for x in self._variables.values() if x.last < first]
+        gone = [x for x in self.variables.values() if x.last < first]
         for x in gone:
             keys.push_back(x.key)
         _, indices = self.isam.marginalizeLeavesWithIndices(keys)
         left = set(indices)
         for x in gone:
-            del self._variables[x.key]
+            del self.variables[x.key]
         del self.keyframes[:count]
         for keyframe in self.keyframes:
             if not any(left.intersection(own) for own in keyframe.slots.values()):

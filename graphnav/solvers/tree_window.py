@@ -18,6 +18,7 @@ from graphnav.solvers.elimination import Predicted
 from graphnav.solvers.revision import Renewed
 from graphnav.solvers.stages import Message, Place
 from graphnav.solvers.tree import Tree
+from graphnav.solvers.tree_marginals import newest_root, smoothed
 from graphnav.solvers.window import Smoothed, Window
 
 _ROUNDS = 5
@@ -49,7 +50,7 @@ class TreeWindow(Window):
         e = np.concatenate([now.state.minus(stage.message.state)[0], now.values - stage.message.values])
         moved = stage.moved(e)
         message = moved.message
-        R = self.tree.root(message.columns) if full else message.R
+        R = newest_root(self.tree, message.columns) if full else message.R
         tests = message.tests
         self.stages[-1] = replace(moved, message=replace(message, R=R, z=np.zeros(len(R)), tests=tests))
         self._means = None
@@ -129,7 +130,7 @@ class TreeWindow(Window):
         if self.tree is None or not gone:
             return super().settle(0)
         self.tree.read()
-        out = self.tree.settled(self._before + count, self._before)
+        out = smoothed(self.tree, self._before + count, self._before)
         self.head = gone[-1].message
         del self.stages[:count]
         self._gone += count
