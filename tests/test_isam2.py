@@ -14,6 +14,7 @@ from graphnav.earth import LocalFrame
 from graphnav.noise.apply import with_noise
 from graphnav.noise_model import Figure, NoiseModel
 from graphnav.problem import Problem, pose
+from graphnav.recording import Recording
 from graphnav.rotation import exp
 from graphnav.solution import Solution
 from graphnav.solvers.batch import batch
@@ -27,6 +28,7 @@ from graphnav.solvers.tree_marginals import newest_covariance, smoothed
 from graphnav.solvers.window import first_message, turn_limit
 from graphnav.state import States
 
+Drive = tuple[Recording, States, Array]
 LASTING = NoiseModel(
     {f"gnss_position.{axis}": Figure(float(np.log(0.6))) for axis in ("horizontal", "up")}
     | {f"gnss_position.minutes.{axis}": Figure(float(np.log(0.2))) for axis in ("horizontal", "up")}
@@ -44,15 +46,21 @@ def apart(a: Solution, b: Solution) -> Array:
 
 
 @pytest.fixture(scope="module")
-def posed() -> Problem:
-    """Two and a half minutes with all constraints, lasting errors and a stop; from a start a few degrees wrong."""
+def drive() -> Drive:
+    """Two and a half minutes, a start that is a few degrees wrong, and a stop."""
     recording, truth = oracle.drive(oracle.vehicle_path(150.0), seed=7, outages=[(80.0, 100.0)], odometer_rate=20.0)
-    frame = LocalFrame(recording.gnss.llh[0])
-    start = truth_states(truth, np.zeros(1), frame)
+    start = truth_states(truth, np.zeros(1), LocalFrame(recording.gnss.llh[0]))
     start = replace(start, R_nb=start.R_nb @ exp(np.array([[0.01, -0.01, 0.06]])), ba=0 * start.ba, bg=0 * start.bg)
+    return recording, start, np.array([[0.0, 8.0]])
+
+
+@pytest.fixture(scope="module")
+def posed(drive: Drive) -> Problem:
+    """With all constraints and errors that last."""
+    recording, start, still = drive
     settings = settings_from({"gnss": {"lever_arm_sigma": 0.2}})
     sigma = np.repeat([0.1, 1.0, 0.5, 0.05, 5e-3], 3)
-    return with_noise(pose(recording, settings, frame, start, sigma, np.array([[0.0, 8.0]])), LASTING)
+    return with_noise(pose(recording, settings, LocalFrame(recording.gnss.llh[0]), start, sigma, still), LASTING)
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +151,28 @@ def test_taken_back_keyframes_are_as_if_they_had_never_come(posed: Problem) -> N
     np.testing.assert_allclose(a.state.minus(b.state)[0] / np.sqrt(np.diag(newest_covariance(other))), 0.0, atol=0.02)
     np.testing.assert_allclose(np.diag(newest_covariance(tree)), np.diag(newest_covariance(other)), rtol=0.02)
     assert tree.isam.getLinearizationPoint().size() == other.isam.getLinearizationPoint().size()
+
+
+def test_keyframes_come_again_after_others_were_taken_back(drive: Drive) -> None:
+    """Constants alone beside the states: next to nothing is left to be ordered when the newest leave."""
+    recording, start, still = drive
+    sigma = np.repeat([0.1, 1.0, 0.5, 0.05, 5e-3], 3)
+    frame = LocalFrame(recording.gnss.llh[0])
+    settings = settings_from({"keyframes": {"rate": 10.0}})
+    stated = pose(recording.crop(0.0, 4.0), settings, frame, start, sigma, still)
+    never, _ = _played(stated, 36)
+    tree, _ = _played(stated, 26, every=1000)
+    steps = node_steps(stated)
+    for back, until in ((24, 30), (29, 36)):
+        tree.truncate(back)
+        for k in range(back, until):
+            tree.add(Place(float(stated.t[k]), stated, k, steps.get(k, ()), linked=k > 0))
+    for one in (tree, never):
+        while one.relinearise(0.02):
+            pass
+    a, b = smoothed(tree, len(tree)), smoothed(never, len(never))
+    assert np.abs(a.states.minus(b.states) / np.sqrt(np.diagonal(b.covariance, axis1=1, axis2=2))).max() < 0.01
+    np.testing.assert_allclose(a.covariance[:, range(15), range(15)], b.covariance[:, range(15), range(15)], rtol=0.01)
 
 
 def test_a_tree_made_again_from_its_rows_goes_on_as_before(posed: Problem) -> None:

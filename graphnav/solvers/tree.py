@@ -128,10 +128,11 @@ class Tree:
         begin = graph.size()
         for _, one in made:
             graph.push_back(one)
+        # along time, where the order is free; CCOLAMD wants labels below the number of variables it is to order
+        most = min(3, len({key for _, one in made for key in list(one.keys())}) - 1)
         groups = gtsam.KeyGroupMap()
-        if self._number > 3:  # along time, where the order is free
-            for variable in self._recent():
-                groups.insert2(variable.key, variable.last - self._number + 3)
+        for variable in self._recent():
+            groups.insert2(variable.key, max(variable.last - self._number + most, 0))
         result = updated(self.isam, place.t, graph, new, [], groups)
         self._number += 1
         file(keyframe, made, list(result.getNewFactorsIndices())[begin:])
@@ -413,7 +414,7 @@ class Tree:
             del self.variables[key]
         for x in self.variables.values():
             x.last = min(x.last, last.number)
-        self._update([], own, self.keyframes[max(keep - 2, 0)].number)
+        self._update([], own, last.number)
         self._read([last.state, *(node for node, _ in last.nodes.values())])
 
     def hold(self) -> None:
