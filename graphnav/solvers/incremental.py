@@ -158,7 +158,7 @@ def replayed(
         cost=cost_at(problem, points),
         stopped=f"every keyframe settled with {whole}",
         timings={solver: spent},
-        notes=(*problem.notes, f"lag {lag:g} s: {said(seconds)}"),
+        notes=(*problem.notes, said(seconds) if np.isinf(lag) else f"lag {lag:g} s: {said(seconds)}"),
         between=(dense(problem, states, covariance, _scale(at, values), smooth=True),),
     )
     now = replace(

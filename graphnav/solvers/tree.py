@@ -161,7 +161,6 @@ class Tree:
             if name in prior.columns and p.constant:
                 self._constant.add(name)
                 self._first_sigma[name] = p.sigma
-                node.unit[nodes[name][1]] = 1.0
         updated(self.isam, place.t, graph, new)
         self._in_force = nodes
         before = Place(place.t, None)

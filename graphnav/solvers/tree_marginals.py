@@ -8,6 +8,7 @@ from graphnav import rotation
 from graphnav.errors import EstimationError
 from graphnav.rotation import Array
 from graphnav.solvers.linearise import Columns, shift
+from graphnav.solvers.points import about_own
 from graphnav.solvers.tree import Tree
 from graphnav.solvers.tree_nodes import Variable
 from graphnav.solvers.window import Smoothed
@@ -17,10 +18,7 @@ from graphnav.state import DIM, States
 def newest_covariance(tree: Tree) -> Array:
     """(15, 15) of the newest state."""
     last = tree.keyframes[-1]
-    P, J = _marginal(tree, last.state, last.place.t), rotation.right_jacobian(last.state.delta[None, :3])[0]
-    P[:3] = J @ P[:3]
-    P[:, :3] = P[:, :3] @ J.T
-    return P
+    return about_own(_marginal(tree, last.state, last.place.t), last.state.delta)
 
 
 def newest_root(tree: Tree, columns: Columns) -> Array:
@@ -54,11 +52,8 @@ def smoothed(tree: Tree, count: int, first: int = 0) -> Smoothed:
         for x in (k.state, *(node for node, _ in k.nodes.values())):
             if x.key not in marginal:
                 marginal[x.key] = _marginal(tree, x, k.place.t)
-    covariance = np.stack([marginal[k.state.key] for k in own])
     delta = np.array([k.state.delta for k in own])
-    J = rotation.right_jacobian(delta[:, :3])
-    covariance[:, :3] = J @ covariance[:, :3]
-    covariance[:, :, :3] = covariance[:, :, :3] @ np.swapaxes(J, -1, -2)
+    covariance = about_own(np.stack([marginal[k.state.key] for k in own]), delta)
     sigma = []
     for k in own:
         out = np.zeros(len(k.values))

@@ -15,6 +15,7 @@ from graphnav.rotation import Array
 from graphnav.solvers.graph import jacobian_factor
 from graphnav.solvers.linearise import Columns, shift
 from graphnav.solvers.stages import Place
+from graphnav.solvers.stages import turned as turned_by
 from graphnav.state import DIM, States
 
 LINK = "imu"  # among the constraints of a keyframe: the interval before it
@@ -95,11 +96,7 @@ def factor(blocks: Sequence[tuple[Variable, Array]], b: Array) -> Any:
 
 def turned(A: Array, d: Array) -> Array:
     """Columns of rows about the anchor moved by d, as columns of the errors about the anchor itself."""
-    if not d[:3].any():
-        return A
-    out = A.copy()
-    out[:, :3] = A[:, :3] @ rotation.right_jacobian(d[None, :3])[0]
-    return out
+    return turned_by(A, rotation.right_jacobian(d[None, :3])[0]) if d[:3].any() else A
 
 
 def is_constant(place: Place, name: str) -> bool:

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphnav import rotation
 from graphnav.recording import ImuNoise
 from graphnav.rotation import Array
 from graphnav.solvers.elimination import Predicted, predict, update
+from graphnav.solvers.points import about_own
 from graphnav.solvers.revision import Renewed, Revision
 from graphnav.solvers.stages import (
     Columns,
@@ -196,10 +196,7 @@ class Window:
         states = self.head.state[:0]
         if gone:
             moved = np.array([e[:DIM] for e in means])
-            states = States.stack(rows).plus(moved)
-            J = rotation.right_jacobian(moved[:, :3])
-            covariance[:, :3] = J @ covariance[:, :3]
-            covariance[:, :, :3] = covariance[:, :, :3] @ np.swapaxes(J, -1, -2)
+            states, covariance = States.stack(rows).plus(moved), about_own(covariance, moved)
             self.head = gone[-1].message
             del self.stages[:count]
             self._gone += count
