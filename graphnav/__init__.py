@@ -17,7 +17,7 @@ Attitude
 Units
     SI and seconds, on one clock; an IMU row is the mean over the sample period that ends at its time
 Error state
-    theta, p, v, b_a, b_g with R_nb <- R_nb Exp(theta), the rest additive (`graphnav.state`)
+    theta, p, v, b_a, b_g with R_nb <- R_nb Exp(theta), the rest additive (`graphnav.core.state`)
 Residuals
     predicted minus measured
 """
@@ -29,14 +29,14 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 _HOME = {
-    "load": ("graphnav.formats", "read"),
-    "run": ("graphnav.pipeline", "run"),
+    "load": ("graphnav.recording.formats", "read"),
+    "run": ("graphnav.estimation.pipeline", "run"),
     "Settings": ("graphnav.config", "Settings"),
     "read_settings": ("graphnav.config", "read_settings"),
     "Recording": ("graphnav.recording", "Recording"),
-    "Solution": ("graphnav.solution", "Solution"),
-    "Trajectory": ("graphnav.trajectory", "Trajectory"),
-    "GraphnavError": ("graphnav.errors", "GraphnavError"),
+    "Solution": ("graphnav.estimation.solution", "Solution"),
+    "Trajectory": ("graphnav.core.trajectory", "Trajectory"),
+    "GraphnavError": ("graphnav.core.errors", "GraphnavError"),
 }
 __all__ = [
     "GraphnavError",
@@ -52,12 +52,12 @@ __all__ = [
 
 if TYPE_CHECKING:
     from graphnav.config import Settings, read_settings
-    from graphnav.errors import GraphnavError
-    from graphnav.formats import read as load
-    from graphnav.pipeline import run
+    from graphnav.core.errors import GraphnavError
+    from graphnav.core.trajectory import Trajectory
+    from graphnav.estimation.pipeline import run
+    from graphnav.estimation.solution import Solution
     from graphnav.recording import Recording
-    from graphnav.solution import Solution
-    from graphnav.trajectory import Trajectory
+    from graphnav.recording.formats import read as load
 
 
 def __getattr__(name: str) -> object:

@@ -8,7 +8,7 @@ import sys
 def main() -> None:
     """Run the command line; Ctrl-C ends it in one line from the first import on."""
     try:
-        from graphnav.cli import main as program
+        from graphnav.app.cli import main as program
     except KeyboardInterrupt:
         sys.stderr.write("graphnav: interrupted\n")
         sys.exit(130)

@@ -25,18 +25,18 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import oracle
 
-from graphnav.alignment import align
 from graphnav.config import Settings, settings_from
+from graphnav.core.earth import LocalFrame
 from graphnav.detectors import detect
-from graphnav.earth import LocalFrame
-from graphnav.noise.apply import with_noise
-from graphnav.noise.estimate import estimate_noise
+from graphnav.estimation.alignment import align
+from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.estimate import estimate_noise
+from graphnav.estimation.pipeline import origin
+from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.solvers.ekf import ekf
 from graphnav.online import Online, Row, rows_of, without_rows
-from graphnav.pipeline import origin
-from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
-from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import ekf
 
 RATE, LAP = 200.0, 3600.0
 PARTS = ("posing", "solving")

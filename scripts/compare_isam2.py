@@ -22,10 +22,10 @@ import oracle
 from benchmark_online import posed
 
 from graphnav.config import Settings
-from graphnav.solution import Solution
-from graphnav.solvers.ekf import ekf
-from graphnav.solvers.incremental import Replayed, incremental
-from graphnav.solvers.isam import isam2
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.incremental import Replayed, incremental
+from graphnav.estimation.solvers.isam import isam2
 
 LAG = 120.0
 

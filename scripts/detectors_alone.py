@@ -20,14 +20,14 @@ import numpy as np
 from withheld_spans import runs_of
 
 from graphnav import load
+from graphnav.app.workflow import Withheld, _score
 from graphnav.config import Settings, settings_from
 from graphnav.detectors import detect, registered
 from graphnav.detectors.base import inside, longer_than, spans_of
-from graphnav.noise_model import NoiseModel
-from graphnav.pipeline import SOLVERS, run
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.pipeline import SOLVERS, run
 from graphnav.recording import Recording
 from graphnav.simulation import simulate
-from graphnav.workflow import Withheld, _score
 
 Array = np.ndarray
 NOBODY = "no stop is used"

@@ -30,15 +30,15 @@ from harm_verdict import BOUNDS, FLOOR, Row, broken, compared, failures, key_of,
 from scipy.stats import chi2
 
 import graphnav
+from graphnav.app.workflow import Span, Withheld, _score
 from graphnav.config import settings_from
-from graphnav.earth import LocalFrame
-from graphnav.evaluation import truth_of
-from graphnav.interpolation import interpolate
-from graphnav.metrics import summary
-from graphnav.pipeline import SOLVERS
+from graphnav.core.earth import LocalFrame
+from graphnav.core.interpolation import interpolate
+from graphnav.estimation.pipeline import SOLVERS
+from graphnav.estimation.solution import Solution
+from graphnav.evaluation.evaluate import truth_of
+from graphnav.evaluation.metrics import summary
 from graphnav.recording import Recording
-from graphnav.solution import Solution
-from graphnav.workflow import Span, Withheld, _score
 
 HERE = Path(__file__).resolve().parents[1]
 

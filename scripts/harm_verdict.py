@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.pipeline import SOLVERS
+from graphnav.estimation.pipeline import SOLVERS
 
 Row = dict[str, Any]
 Group = tuple[str, str, str]  # drive, sensor set, solver

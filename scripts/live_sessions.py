@@ -26,10 +26,10 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import oracle  # noqa: E402
 
-from graphnav.formats.trajectories import read_trajectory  # noqa: E402
 from graphnav.online import Row, rows_of  # noqa: E402
 from graphnav.online.lines import END, head_of, line_of  # noqa: E402
 from graphnav.recording import Recording  # noqa: E402
+from graphnav.recording.formats.trajectories import read_trajectory  # noqa: E402
 from graphnav.simulation import simulate  # noqa: E402
 
 RATE = {"car": 50.0, "foot": 100.0}  # Hz

@@ -17,10 +17,10 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from graphnav.app.workflow import Request, parse_withheld, run_request
 from graphnav.config import Settings, settings_from
-from graphnav.evaluation import truth_of
-from graphnav.plots import PALETTE
-from graphnav.workflow import Request, parse_withheld, run_request
+from graphnav.evaluation.evaluate import truth_of
+from graphnav.report.plots import PALETTE
 
 AROUND = 15.0  # s drawn before and after the span
 GAP = 2.5  # s; wider gaps of the truth break a line

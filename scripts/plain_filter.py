@@ -17,12 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav import load, rotation
-from graphnav.pipeline import run
+from graphnav import load
+from graphnav.core import rotation
+from graphnav.core.state import States
+from graphnav.estimation.pipeline import run
+from graphnav.estimation.solution import Solution
+from graphnav.evaluation.strides import fitted_point, shapes
 from graphnav.recording import Imu, Recording
-from graphnav.solution import Solution
-from graphnav.state import States
-from graphnav.strides import fitted_point, shapes
 
 FORCE, TURN, ZERO = 0.5, 0.03, 0.01  # m/s^2, rad/s of a row; m/s
 GRAVITY = 9.804  # m/s^2, where the trials were made

@@ -20,10 +20,10 @@ import numpy as np
 
 from graphnav.config import Settings, settings_from
 from graphnav.detectors import detect
-from graphnav.pipeline import SOLVERS, run
+from graphnav.estimation.pipeline import SOLVERS, run
+from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
 from graphnav.simulation import Simulated, simulate
-from graphnav.solution import Solution
 
 Array = np.ndarray
 ENGINES = (12.49585, 8.0, 20.0, 30.0, 40.0)  # Hz, by seed

@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav import rotation
 from graphnav.config import Settings, settings_from
-from graphnav.earth import LocalFrame
-from graphnav.pipeline import SOLVERS, run
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.estimation.pipeline import SOLVERS, run
+from graphnav.estimation.solution import Solution
 from graphnav.simulation import Simulated, simulate
-from graphnav.solution import Solution
 
 Array = np.ndarray
 CASES = {

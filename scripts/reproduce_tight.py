@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 
 from graphnav.config import settings_from
-from graphnav.formats import read
-from graphnav.pipeline import run
+from graphnav.estimation.pipeline import run
+from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
-from graphnav.solution import Solution
+from graphnav.recording.formats import read
 
 Array = np.ndarray
 LAST = 863.0  # s, where the raw observations end

@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 
 from graphnav.config import Settings, settings_from
-from graphnav.errors import EstimationError
-from graphnav.pipeline import run
+from graphnav.core.errors import EstimationError
+from graphnav.estimation.pipeline import run
+from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
 from graphnav.simulation import Simulated, simulate
 from graphnav.simulation.scenarios.ushaq import FAULTS
-from graphnav.solution import Solution
 
 Array = np.ndarray
 BACK = 50.0  # m, below which a solution has recovered

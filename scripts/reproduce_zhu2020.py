@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.config import Settings, settings_from
-from graphnav.earth import LocalFrame
-from graphnav.pipeline import SOLVERS, run
+from graphnav.core.earth import LocalFrame
+from graphnav.estimation.pipeline import SOLVERS, run
+from graphnav.estimation.solution import Solution
 from graphnav.simulation import Simulated, simulate
-from graphnav.solution import Solution
 
 Array = np.ndarray
 CASES = {"MIMU": (False, False), "M-C": (True, False), "MO": (False, True), "MO-C": (True, True)}  # NHC, odometer

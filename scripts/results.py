@@ -12,7 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from graphnav.terminal import short
+from graphnav.app.terminal import short
 
 # folder among the recordings (or built-in name), further options, which span of comparison.csv it is about
 DRIVES = (

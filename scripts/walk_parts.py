@@ -20,11 +20,12 @@ from unittest.mock import patch
 import numpy as np
 from walks import SETS
 
-from graphnav import dynamics, load
+from graphnav import load
 from graphnav.config import settings_from
-from graphnav.pipeline import run
+from graphnav.estimation.pipeline import run
+from graphnav.evaluation.strides import walk_errors
+from graphnav.imu import dynamics
 from graphnav.recording import Recording
-from graphnav.strides import walk_errors
 
 SAME = 0.01  # m: truths are no better
 _square = dynamics._scale_parameter
@@ -44,13 +45,13 @@ CASES: dict[str, tuple[Mapping[str, Any], dict[str, Any]]] = {
     "no zero rate": ({"standstill": {"zero_rate": False}}, {}),
     "noise as stated": ({"noise": {"mode": "stated"}}, {}),
     "offset as the unit left it": ({"imu": {"onboard_offset": False}}, {}),
-    "no noise of heel strikes": ({}, {"graphnav.problem.with_unresolved_motion": lambda samples, noise: samples}),
-    "axes taken as square": ({}, {"graphnav.dynamics._scale_parameter": lambda noise, _: _square(noise, 3)}),
-    "peaks left cut off": ({}, {"graphnav.problem.with_whole_peaks": lambda samples, *_: (samples, ())}),
+    "no noise of heel strikes": ({}, {"graphnav.estimation.problem.with_unresolved_motion": lambda samples, noise: samples}),
+    "axes taken as square": ({}, {"graphnav.imu.dynamics._scale_parameter": lambda noise, _: _square(noise, 3)}),
+    "peaks left cut off": ({}, {"graphnav.estimation.problem.with_whole_peaks": lambda samples, *_: (samples, ())}),
     "no coning": ({"imu": {"coning": False}}, {}),
     "no row doubted": ({"foot": {"robust": "none"}}, {}),
     "sliding taken for stance": ({}, {"graphnav.detectors.stance._without_sliding": lambda spans, *_: spans}),
-    "first steps filtered once": ({}, {"graphnav.alignment.rest._OPENING": 1}),
+    "first steps filtered once": ({}, {"graphnav.estimation.alignment.rest._OPENING": 1}),
 }  # fmt: skip
 
 

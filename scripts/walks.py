@@ -23,9 +23,9 @@ import numpy as np
 
 from graphnav import load
 from graphnav.config import settings_from
-from graphnav.pipeline import SOLVERS, run
+from graphnav.estimation.pipeline import SOLVERS, run
+from graphnav.evaluation.strides import WalkErrors, floor_sigma, walk_errors
 from graphnav.recording import Recording
-from graphnav.strides import WalkErrors, floor_sigma, walk_errors
 
 # m: how far a coordinate of the truth may be off. None: measured. Points taken by hand where the shoe stood, of a place
 # on it that is not stated; the footprint that a loop ends in

@@ -16,10 +16,10 @@ import json
 import numpy as np
 
 import graphnav
+from graphnav.app.workflow import Request, run_request
 from graphnav.config import settings_from
-from graphnav.earth import LocalFrame
-from graphnav.pipeline import SOLVERS
-from graphnav.workflow import Request, run_request
+from graphnav.core.earth import LocalFrame
+from graphnav.estimation.pipeline import SOLVERS
 
 STOPS = ("zero_velocity", "zero_rate", "held_position")
 SETS = {

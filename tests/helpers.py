@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from graphnav import rotation
-from graphnav.earth import LocalFrame
-from graphnav.problem import Problem
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.state import BLOCKS, DIM, States
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solution import Solution
 from graphnav.recording import Imu, ImuNoise, Recording
-from graphnav.solution import Solution
-from graphnav.state import BLOCKS, DIM, States
-from graphnav.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

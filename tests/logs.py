@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import oracle
 
+from graphnav.core.timescales import gps_to_utc
+from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Recording
-from graphnav.timescales import gps_to_utc
-from graphnav.trajectory import Trajectory
 
 WEEK, TOW = 2200, 345600.0  # Thursday, 10 March 2022, 0:00 GPS time
 UTC_MIDNIGHT = datetime.datetime(2022, 3, 9, 23, 59, 42)  # the same, 18 leap seconds behind

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav import cli
+from graphnav.app import cli
 
 ROOT = Path(__file__).resolve().parents[1]
 

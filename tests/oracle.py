@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from oracle_path import AXLE, Array, ExactPath, llh_rate, oracle_truth_path, straight_path, vehicle_path, winding_path
 
+from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording, Truth
-from graphnav.trajectory import Trajectory
 
 __all__ = [
     "AXLE", "LEVER_ARM", "MEMS", "RTK_SD", "SPP_SD", "ExactPath", "drive", "llh_rate", "moving_spans", "oracle_drive",

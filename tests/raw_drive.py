@@ -10,13 +10,13 @@ from dataclasses import replace
 import numpy as np
 from oracle_path import ExactPath
 
-from graphnav import earth
-from graphnav.raw.atmosphere import NIGHT, directions, klobuchar
-from graphnav.raw.ephemeris import EARTH_RATE
-from graphnav.raw.series import RawGnss
-from graphnav.raw.signals import L1, C, satellite_id, signal_id
+from graphnav.core import earth
+from graphnav.core.rotation import Array
+from graphnav.gnss.atmosphere import NIGHT, directions, klobuchar
+from graphnav.gnss.ephemeris import EARTH_RATE
+from graphnav.gnss.series import RawGnss
+from graphnav.gnss.signals import L1, C, satellite_id, signal_id
 from graphnav.recording import Recording
-from graphnav.rotation import Array
 
 RADIUS, MU = 2.656e7, 3.986004418e14
 SATELLITES = [f"G{k:02d}" for k in range(1, 8)] + [f"E{k:02d}" for k in range(1, 6)]

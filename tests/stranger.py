@@ -9,13 +9,13 @@ from pathlib import Path
 import logs
 import numpy as np
 
-from graphnav.earth import LocalFrame
-from graphnav.formats import read
-from graphnav.formats.schema import rotation_from_letters
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array, exp
+from graphnav.core.timescales import unix_to_gps
+from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Gnss, Recording, Truth
-from graphnav.rotation import Array, exp
-from graphnav.timescales import unix_to_gps
-from graphnav.trajectory import Trajectory
+from graphnav.recording.formats import read
+from graphnav.recording.formats.schema import rotation_from_letters
 
 UNIX = 1751990400.0  # s, 8 July 2025, 16:00 UTC, a second after the start of every cut
 G = 9.80665

@@ -10,13 +10,13 @@ import logs
 import numpy as np
 import pytest
 
-from graphnav import cli
-from graphnav.earth import LocalFrame
-from graphnav.exporters import write_as
-from graphnav.formats.writer import write_folder
-from graphnav.interpolation import placed
+from graphnav.app import cli
+from graphnav.core.earth import LocalFrame
+from graphnav.core.interpolation import placed
+from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Truth
-from graphnav.trajectory import Trajectory
+from graphnav.recording.exporters import write_as
+from graphnav.recording.formats.writer import write_folder
 
 RECORDING, TRUTH = logs.simulated(60.0)
 ZERO = logs.WEEK * 604800.0 + logs.TOW

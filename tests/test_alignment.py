@@ -9,13 +9,13 @@ import oracle
 import pytest
 from helpers import Array, truth_states
 
-from graphnav import rotation as ro
-from graphnav.alignment import Alignment, align, with_known_heading
 from graphnav.config import Settings, settings_from
-from graphnav.earth import LocalFrame
+from graphnav.core import rotation as ro
+from graphnav.core.earth import LocalFrame
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.alignment import Alignment, align, with_known_heading
+from graphnav.estimation.solvers.batch import batch
 from graphnav.recording import Recording
-from graphnav.solvers.batch import batch
-from graphnav.trajectory import Trajectory
 
 DEG = np.pi / 180.0
 

@@ -6,8 +6,9 @@ import allantools
 import numpy as np
 import pytest
 
-from graphnav import allan, cli
-from graphnav.errors import RecordingError
+from graphnav.app import cli
+from graphnav.core.errors import RecordingError
+from graphnav.recording import allan
 
 RATE = 50.0
 
@@ -75,7 +76,7 @@ def test_lines_can_be_pasted(tmp_path, capsys):
     (tmp_path / "recording.toml").write_text(
         'format = "graphnav-recording/1"\nplatform = "vehicle"\n[imu]\nfile = "rest.csv"\n' + text
     )
-    from graphnav.formats import read
+    from graphnav.recording.formats import read
 
     noise = read(tmp_path).imu.noise
     assert noise.gyro_noise_density == pytest.approx(2e-4, rel=0.05)

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphnav.errors import RecordingError
-from graphnav.formats import read
+from graphnav.core.errors import RecordingError
+from graphnav.recording.formats import read
 
 TOML = """\
 format = "graphnav-recording/1"

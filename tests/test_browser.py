@@ -7,7 +7,7 @@ import os
 import browser
 import pytest
 
-from graphnav import cli
+from graphnav.app import cli
 
 PAGES = ("comparison.html", "batch/report.html", "stops/detections.html")
 SPAN = "gnss:60-80"

@@ -12,11 +12,11 @@ import numpy as np
 import oracle
 import pytest
 
-from graphnav.checks import Inspection, inspect
-from graphnav.formats import read
-from graphnav.formats.schema import rotation_from_letters
-from graphnav.lever_arm import reversed_arms
+from graphnav.estimation.antenna import reversed_arms
 from graphnav.recording import Recording
+from graphnav.recording.checks.overview import Inspection, inspect
+from graphnav.recording.formats import read
+from graphnav.recording.formats.schema import rotation_from_letters
 
 TURNING = ["boulder_drive_20250708", "tokyo_20201105", "dresden_car_20140326", "oracle_drive", "kitti"]
 Change = Callable[[Recording], Recording]

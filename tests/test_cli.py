@@ -19,9 +19,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphnav import cli, load, workflow
-from graphnav.noise.files import write_noise
-from graphnav.noise_model import NoiseModel
+from graphnav import load
+from graphnav.app import cli, workflow
+from graphnav.estimation.noise.files import write_noise
+from graphnav.estimation.noise.model import NoiseModel
 
 PROGRAM = Path(sys.executable).with_name("graphnav")
 SOLVERS = ("ekf", "rts", "batch")

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphnav import crosschecks, lags
-from graphnav.clock import clock_of
-from graphnav.draft.agreement import compare
-from graphnav.formats import read
+from graphnav.recording.checks import crosschecks, lags
+from graphnav.recording.checks.clock import clock_of
+from graphnav.recording.draft.agreement import compare
+from graphnav.recording.formats import read
 
 
 def lasting(rng: np.random.Generator, n: int, steps: float) -> np.ndarray:

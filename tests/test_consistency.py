@@ -12,10 +12,10 @@ import pytest
 from helpers import Array, errors
 
 from graphnav.config import settings_from
-from graphnav.pipeline import SOLVERS, run
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.pipeline import SOLVERS, run
+from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
-from graphnav.solution import Solution
-from graphnav.trajectory import Trajectory
 
 SEEDS = 10
 # Wheels and stops hold exactly on these drives, which no sigma is made for; simulated ones that slip and sway are in

@@ -11,20 +11,20 @@ import pytest
 import raw_drive
 from helpers import STEPS, Array, difference, random_states, truth_states
 
-from graphnav import rotation as ro
 from graphnav.config import Settings, settings_from
 from graphnav.constraints import registered
 from graphnav.constraints.base import Constraint, Scene, assemble
 from graphnav.constraints.gnss import LEVER_ARM, GnssPosition
 from graphnav.constraints.prior import InitialPrior
-from graphnav.earth import LocalFrame
-from graphnav.preintegration import preintegrate
-from graphnav.problem import Problem, keyframe_times, pose
+from graphnav.core import rotation as ro
+from graphnav.core.earth import LocalFrame
+from graphnav.core.state import BLOCKS, DIM, States
+from graphnav.estimation.problem import Problem, keyframe_times, pose
+from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.graph import LinearGraph
+from graphnav.imu.preintegration import preintegrate
+from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Recording
-from graphnav.samples import bridge_gaps
-from graphnav.solvers.ekf import ekf
-from graphnav.solvers.graph import LinearGraph
-from graphnav.state import BLOCKS, DIM, States
 
 STANDING = np.array([[3.0, 14.0], [88.0, 104.0]])  # parts of two stops of the path below, s
 ON_FOOT = {"stance", "foot_lateral", "closed_loop"}  # constraints that only a foot has

@@ -7,8 +7,8 @@ import io
 import numpy as np
 import pytest
 
-from graphnav.formats import decimals
-from graphnav.formats.decimals import read_decimals
+from graphnav.recording.formats import decimals
+from graphnav.recording.formats.decimals import read_decimals
 
 WAYS = ("{!r}", "{:.3f}", "{:.12f}", "{:.0f}", "{:.9g}", "{:.16f}", "{:.20g}")
 

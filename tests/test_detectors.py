@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from road import MG, made, with_gnss
 
-from graphnav import cli
+from graphnav.app import cli
 from graphnav.config import Settings
 from graphnav.config.detectors import FftSettings, FusionSettings
 from graphnav.detectors import base, detect, fft, glrt, motion, spectrum, stops, thresholds, windows
-from graphnav.formats import read
-from graphnav.formats.writing import write_folder
 from graphnav.recording import Imu, ImuNoise, Odometer, Recording
+from graphnav.recording.formats import read
+from graphnav.recording.formats.writing import write_folder
 from graphnav.simulation import simulate
 
 

@@ -13,12 +13,12 @@ from road import made, with_gnss
 
 from graphnav.config import Settings, settings_from
 from graphnav.config.detectors import FUSED, DetectorName
+from graphnav.core.earth import LocalFrame
 from graphnav.detectors import base, detect, registered, stops
-from graphnav.earth import LocalFrame
-from graphnav.pipeline import run
-from graphnav.problem import pose
+from graphnav.estimation.pipeline import run
+from graphnav.estimation.problem import pose
+from graphnav.estimation.stops import stops_of_solution
 from graphnav.recording import Imu, Recording
-from graphnav.stops import stops_of_solution
 
 NAMES = (FUSED, *registered())
 LEGS = [(40, 0), (6, 12), (30, 12), (6, 0), (40, 0), (5, 10), (20, 10)]

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import graphnav
-from graphnav.earth import LocalFrame
-from graphnav.solution import Fault
+from graphnav.core.earth import LocalFrame
+from graphnav.estimation.solution import Fault
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 

@@ -19,12 +19,12 @@ from helpers import STEPS, difference, random_states
 from graphnav.config import Settings, read_settings
 from graphnav.constraints import registered
 from graphnav.constraints.base import Scene, assemble
+from graphnav.core.earth import LocalFrame
 from graphnav.detectors import registered as known_detectors
-from graphnav.earth import LocalFrame
-from graphnav.formats import read
-from graphnav.pipeline import SOLVERS
-from graphnav.preintegration import preintegrate
-from graphnav.samples import bridge_gaps
+from graphnav.estimation.pipeline import SOLVERS
+from graphnav.imu.preintegration import preintegrate
+from graphnav.imu.samples import bridge_gaps
+from graphnav.recording.formats import read
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "data").rglob("*.md"))]
@@ -181,7 +181,11 @@ def test_the_site_builds_and_every_link_in_it_leads_somewhere(tmp_path):
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert run.returncode == 0, run.stderr
     reference = (tmp_path / "site" / "api.html").read_text(encoding="utf-8")
-    for name in ("graphnav.pipeline.run", "graphnav.recording.Imu.gyro", "graphnav.errors.GraphnavError"):
+    for name in (
+        "graphnav.estimation.pipeline.run",
+        "graphnav.recording.Imu.gyro",
+        "graphnav.core.errors.GraphnavError",
+    ):
         assert f'id="{name}"' in reference
     assert "(K, 3) latitude, longitude (rad), ellipsoidal height (m)" in reference  # units of the fields
 

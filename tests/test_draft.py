@@ -9,13 +9,13 @@ import numpy as np
 import oracle
 import pytest
 
-from graphnav import cli
-from graphnav.draft import columns, draft, guesses, motion
-from graphnav.draft.agreement import level_axes
-from graphnav.errors import RecordingError
-from graphnav.formats import read
-from graphnav.formats.schema import rotation_from_letters
-from graphnav.rotation import exp
+from graphnav.app import cli
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import exp
+from graphnav.recording.draft import columns, draft, guesses, motion
+from graphnav.recording.draft.agreement import level_axes
+from graphnav.recording.formats import read
+from graphnav.recording.formats.schema import rotation_from_letters
 
 DRIVE, _ = oracle.drive(
     oracle.vehicle_path(240.0, 50.0), seed=3, gnss_rate=5.0, gnss_velocity_sd=(0.05, 0.05, 0.1), odometer_rate=20.0

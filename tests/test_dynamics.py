@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from helpers import FRAME, STEPS, Array, difference, random_imu, random_states
 
-from graphnav import rotation as ro
-from graphnav.dynamics import SCALE, Motion, as_biases, scale_parameter
-from graphnav.preintegration import preintegrate
+from graphnav.core import rotation as ro
+from graphnav.core.state import DIM, Parameter, States
+from graphnav.imu.dynamics import SCALE, Motion, as_biases, scale_parameter
+from graphnav.imu.preintegration import preintegrate
+from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu, ImuNoise, Recording
-from graphnav.samples import bridge_gaps
-from graphnav.state import DIM, Parameter, States
 
 N = 6
 

@@ -7,7 +7,7 @@ import pymap3d
 import pytest
 from pyins import earth as pyins_earth
 
-from graphnav import earth
+from graphnav.core import earth
 
 LAT, LON, H = (
     a.ravel()

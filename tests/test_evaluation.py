@@ -11,13 +11,14 @@ import pytest
 from pymap3d.vincenty import vdist
 from scipy.stats import chi2
 
-from graphnav import evaluation, rotation
-from graphnav.earth import LocalFrame
-from graphnav.errors import RecordingError
-from graphnav.exporters import write_as
-from graphnav.interpolation import fit_yaw, interpolate
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import RecordingError
+from graphnav.core.interpolation import fit_yaw, interpolate
+from graphnav.core.trajectory import Trajectory
+from graphnav.evaluation import evaluate as evaluation
 from graphnav.recording import Gnss, Imu, Recording, Truth
-from graphnav.trajectory import Trajectory
+from graphnav.recording.exporters import write_as
 
 ORIGIN = np.array([0.62, 2.44, 30.0])
 FRAME = LocalFrame(ORIGIN)

@@ -14,14 +14,15 @@ import pynmeagps
 import pytest
 from test_exporters import DEG, made
 
-from graphnav import cli, convert, rotation
-from graphnav.earth import LocalFrame
-from graphnav.errors import ConfigError, RecordingError
-from graphnav.exporters import write_as
-from graphnav.formats import load
-from graphnav.formats.trajectories import read_trajectory
-from graphnav.timescales import gps_to_utc
-from graphnav.trajectory import Trajectory
+from graphnav.app import cli, convert
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import ConfigError, RecordingError
+from graphnav.core.timescales import gps_to_utc
+from graphnav.core.trajectory import Trajectory
+from graphnav.recording.exporters import write_as
+from graphnav.recording.formats import load
+from graphnav.recording.formats.trajectories import read_trajectory
 
 WEEK = 2200
 

@@ -12,13 +12,14 @@ import numpy as np
 import pymap3d
 import pytest
 
-from graphnav import exporters, rotation
-from graphnav.errors import RecordingError
-from graphnav.exporters import write_as
-from graphnav.exporters.digits import rows_text
-from graphnav.formats.trajectories import read_trajectory
-from graphnav.timescales import gps_to_utc
-from graphnav.trajectory import Trajectory
+from graphnav.core import rotation
+from graphnav.core.errors import RecordingError
+from graphnav.core.timescales import gps_to_utc
+from graphnav.core.trajectory import Trajectory
+from graphnav.recording import exporters
+from graphnav.recording.exporters import write_as
+from graphnav.recording.exporters.digits import rows_text
+from graphnav.recording.formats.trajectories import read_trajectory
 
 DEG = np.pi / 180
 

@@ -8,24 +8,24 @@ import numpy as np
 import oracle
 import pytest
 
-from graphnav import faults
-from graphnav.alignment import align
 from graphnav.config import Settings, settings_from
+from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import ConfigError
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
-from graphnav.earth import LocalFrame
-from graphnav.errors import ConfigError
-from graphnav.pipeline import origin, run
-from graphnav.problem import Problem, pose
+from graphnav.estimation import faults
+from graphnav.estimation.alignment import align
+from graphnav.estimation.pipeline import origin, run
+from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.rows import Layout, Point, whitened
+from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.watch import Bank, Verdicts
+from graphnav.evaluation.scoring import errors
 from graphnav.recording import Recording
-from graphnav.rotation import Array
-from graphnav.scoring import errors
-from graphnav.solution import Solution
-from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import ekf
-from graphnav.solvers.rows import Layout, Point, whitened
-from graphnav.solvers.rts import backward
-from graphnav.solvers.watch import Bank, Verdicts
-from graphnav.trajectory import Trajectory
 
 # nothing is looked for: everything is what it is stated to be
 OFF = settings_from({"gnss": {"faults": "off"}, "noise": {"mode": "stated"}})

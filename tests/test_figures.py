@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from test_recording import describe
 
-from graphnav.errors import RecordingError
-from graphnav.formats import read
-from graphnav.formats.figures import EXAMPLES, UNITS, parse_figure
-from graphnav.formats.imu_models import MODELS, find_model
-from graphnav.formats.schema import NOISE_FIGURES
+from graphnav.core.errors import RecordingError
+from graphnav.recording.formats import read
+from graphnav.recording.formats.figures import EXAMPLES, UNITS, parse_figure
+from graphnav.recording.formats.imu_models import MODELS, find_model
+from graphnav.recording.formats.schema import NOISE_FIGURES
 
 ROOT = Path(__file__).resolve().parents[1]
 

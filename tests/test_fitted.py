@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphnav.fitted import after_fit
-from graphnav.interpolation import fit_yaw
-from graphnav.scoring import errors
-from graphnav.trajectory import Trajectory
+from graphnav.core.interpolation import fit_yaw
+from graphnav.core.trajectory import Trajectory
+from graphnav.evaluation.fitted import after_fit
+from graphnav.evaluation.scoring import errors
 
 N, RUNS = 60, 1500
 POSITION, HEADING, SPEED = 0.02, 0.004, 0.05  # m and rad a step, m/s: 1-sigma of what is added

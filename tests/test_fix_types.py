@@ -13,13 +13,13 @@ from test_bad_input import write_small
 from test_draft import DRIVE, drafted, write_logs
 from test_formats_binary import nav_pvt, write_bag
 
-from graphnav import convert
-from graphnav.alignment.first import some
-from graphnav.checks import inspect
-from graphnav.errors import RecordingError
-from graphnav.formats import load, read
-from graphnav.formats.writing import rounded, write_folder
+from graphnav.app import convert
+from graphnav.core.errors import RecordingError
+from graphnav.estimation.alignment.first import some
 from graphnav.recording import Recording
+from graphnav.recording.checks.overview import inspect
+from graphnav.recording.formats import load, read
+from graphnav.recording.formats.writing import rounded, write_folder
 
 RECORDING, _ = logs.simulated()
 

@@ -17,13 +17,14 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from graphnav import cli, load
+from graphnav import load
+from graphnav.app import cli
+from graphnav.app.fleet import page, tables
+from graphnav.app.fleet.drive import CRASHED, DONE, HUNG, REFUSED, key_of, spans, stored_row
+from graphnav.app.fleet.manifest import Asked, Task, read_drives, task_of
+from graphnav.app.fleet.workers import Limits, Worker, solve_on_cluster
 from graphnav.config import Settings
-from graphnav.errors import ConfigError
-from graphnav.fleet import page, tables
-from graphnav.fleet.drive import CRASHED, DONE, HUNG, REFUSED, key_of, spans, stored_row
-from graphnav.fleet.manifest import Asked, Task, read_drives, task_of
-from graphnav.fleet.workers import Limits, Worker, solve_on_cluster
+from graphnav.core.errors import ConfigError
 
 RUNS = ("run02", "run30", "run31")
 

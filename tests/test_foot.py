@@ -10,26 +10,26 @@ import numpy as np
 import pytest
 from helpers import Array
 
-from graphnav import rotation as ro
+from graphnav.app.workflow import Request, run_request
 from graphnav.config import Settings, settings_from
 from graphnav.constraints.base import Scene
 from graphnav.constraints.foot import FOOT_AXIS, PATTERN, PIVOT, TRAVEL, FootLateral, Stance
 from graphnav.constraints.standstill import ZeroRate, _swaying
+from graphnav.core import rotation as ro
+from graphnav.core.earth import LocalFrame
+from graphnav.core.interpolation import interpolate
+from graphnav.core.state import States
 from graphnav.detectors import detect
 from graphnav.detectors.base import Detection
-from graphnav.earth import LocalFrame
-from graphnav.formats import read
-from graphnav.interpolation import interpolate
-from graphnav.pipeline import run
-from graphnav.preintegration import preintegrate
-from graphnav.problem import keyframe_times
+from graphnav.estimation.pipeline import run
+from graphnav.estimation.problem import keyframe_times
+from graphnav.estimation.solution import Solution
+from graphnav.evaluation.strides import floor_sigma, shapes, walk_errors
+from graphnav.imu.preintegration import preintegrate
+from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu, Recording, Truth
-from graphnav.samples import bridge_gaps
+from graphnav.recording.formats import read
 from graphnav.simulation import Simulated, simulate
-from graphnav.solution import Solution
-from graphnav.state import States
-from graphnav.strides import floor_sigma, shapes, walk_errors
-from graphnav.workflow import Request, run_request
 
 PACES = ("slow", "normal", "fast")
 

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from graphnav import rotation as ro
-from graphnav.clipping import cut_peaks, with_whole_peaks
 from graphnav.config import Settings, settings_from
+from graphnav.core import rotation as ro
+from graphnav.core.rotation import Array
 from graphnav.detectors import detect
-from graphnav.formats import read
-from graphnav.onboard_offset import evidence, offset_learnt, without_onboard_offset
-from graphnav.own_noise import quietest_density, with_own_noise
-from graphnav.preintegration import preintegrate
+from graphnav.estimation.noise.imu_floor import quietest_density, with_own_noise
+from graphnav.imu.clipping import cut_peaks, with_whole_peaks
+from graphnav.imu.onboard_offset import evidence, offset_learnt, without_onboard_offset
+from graphnav.imu.preintegration import preintegrate
+from graphnav.imu.samples import Samples, bridge_gaps
+from graphnav.imu.unresolved import with_coning, with_unresolved_motion
 from graphnav.recording import Imu, ImuNoise
-from graphnav.rotation import Array
-from graphnav.samples import Samples, bridge_gaps
+from graphnav.recording.formats import read
 from graphnav.simulation import Simulated, simulate
-from graphnav.unresolved import with_coning, with_unresolved_motion
 
 
 @lru_cache(maxsize=8)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from helpers import same_recording
 
-from graphnav import convert
-from graphnav.errors import ConfigError, RecordingError
-from graphnav.formats import load, read
-from graphnav.formats.writer import degrees, write_recording
-from graphnav.timescales import clock_words, gps_to_utc, leap_seconds, parse_clock, unix_to_gps, utc_to_gps
+from graphnav.app import convert
+from graphnav.core.errors import ConfigError, RecordingError
+from graphnav.core.timescales import clock_words, gps_to_utc, leap_seconds, parse_clock, unix_to_gps, utc_to_gps
+from graphnav.recording.formats import load, read
+from graphnav.recording.formats.writer import degrees, write_recording
 
 RECORDING, TRUTH = logs.simulated()
 

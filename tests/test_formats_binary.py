@@ -9,9 +9,9 @@ import logs
 import numpy as np
 import pytest
 
-from graphnav.draft import draft
-from graphnav.errors import RecordingError
-from graphnav.formats import load, read
+from graphnav.core.errors import RecordingError
+from graphnav.recording.draft import draft
+from graphnav.recording.formats import load, read
 
 RECORDING, _ = logs.simulated(60.0)
 UNIX = 1646870382.0  # 9 March 2022, 23:59:42 UTC: midnight of GPS time

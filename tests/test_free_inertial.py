@@ -9,16 +9,16 @@ import oracle
 import pytest
 from helpers import Array, truth_states
 
-from graphnav import rotation as ro
 from graphnav.config import settings_from
-from graphnav.dynamics import Motion
-from graphnav.earth import LocalFrame
-from graphnav.pipeline import run
-from graphnav.preintegration import prefix, preintegrate
+from graphnav.core import rotation as ro
+from graphnav.core.earth import LocalFrame
+from graphnav.core.state import States
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.pipeline import run
+from graphnav.imu.dynamics import Motion
+from graphnav.imu.preintegration import prefix, preintegrate
+from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Recording
-from graphnav.samples import bridge_gaps
-from graphnav.state import States
-from graphnav.trajectory import Trajectory
 
 LATITUDES = (30.0, -45.0, 70.0)
 DEG = np.pi / 180.0

@@ -14,20 +14,20 @@ import pytest
 from helpers import Array, truth_states
 from pyins import strapdown, transform, util
 
-from graphnav import rotation as ro
-from graphnav.checks import inspect
-from graphnav.dynamics import Motion as Mechanisation
-from graphnav.earth import LocalFrame, gravity
-from graphnav.errors import ConfigError
-from graphnav.formats import read
-from graphnav.preintegration import preintegrate
+from graphnav.core import rotation as ro
+from graphnav.core.earth import LocalFrame, gravity
+from graphnav.core.errors import ConfigError
+from graphnav.core.state import States
+from graphnav.imu.dynamics import Motion as Mechanisation
+from graphnav.imu.preintegration import preintegrate
+from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu
-from graphnav.samples import bridge_gaps
+from graphnav.recording.checks.overview import inspect
+from graphnav.recording.formats import read
 from graphnav.simulation import Simulated, simulate
 from graphnav.simulation.footsteps import rectangle, way
 from graphnav.simulation.gait import Sole
 from graphnav.simulation.scenarios.ren2021 import WALKS
-from graphnav.state import States
 
 pytestmark = pytest.mark.filterwarnings("ignore:The copy keyword")  # of pandas, about pyins
 

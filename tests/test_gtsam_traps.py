@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers import Array
 
-from graphnav.solvers.graph import LinearGraph, jacobian_factor
+from graphnav.estimation.solvers.graph import LinearGraph, jacobian_factor
 
 N = 40
 

@@ -18,12 +18,14 @@ from logs import frame
 from test_bad_input import TOML, content, line, toml, write_small
 from test_formats_binary import nav_pvt
 
-from graphnav import cli, convert, pipeline, report
+from graphnav.app import cli, convert
 from graphnav.config import read_settings
-from graphnav.errors import ConfigError, GraphnavError, RecordingError
-from graphnav.files import MAX_FILE, MAX_LINE, open_file
-from graphnav.formats import load, read
-from graphnav.formats.trajectories import read_trajectory
+from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
+from graphnav.core.files import MAX_FILE, MAX_LINE, open_file
+from graphnav.estimation import pipeline
+from graphnav.recording.formats import load, read
+from graphnav.recording.formats.trajectories import read_trajectory
+from graphnav.report import documents as report
 
 TRAJECTORY = b"t,lat,lon,h\n" + b"".join(b"%d,30.0,114.0,20.0\n" % k for k in range(400))
 

@@ -16,12 +16,12 @@ import pytest
 sys.path.append(str(Path(__file__).resolve().parent / "fuzz"))
 import raw_cases
 
-from graphnav.errors import RecordingError
-from graphnav.formats import read
-from graphnav.raw.columns import observations
-from graphnav.raw.precise import read_precise
-from graphnav.raw.rinex_nav import read_navigation
-from graphnav.raw.rinex_obs import read_observations
+from graphnav.core.errors import RecordingError
+from graphnav.gnss.columns import observations
+from graphnav.gnss.precise import read_precise
+from graphnav.gnss.rinex_nav import read_navigation
+from graphnav.gnss.rinex_obs import read_observations
+from graphnav.recording.formats import read
 
 
 @pytest.fixture(scope="module")

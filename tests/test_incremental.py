@@ -12,23 +12,23 @@ from helpers import Array, dense, errors, factors, random_states, truth_states
 
 from graphnav.config import settings_from
 from graphnav.constraints.vehicle import OdometerSpeed
-from graphnav.earth import LocalFrame
-from graphnav.formats import read
-from graphnav.noise.apply import with_noise
-from graphnav.noise_model import STATED, Figure, NoiseModel
-from graphnav.pipeline import run
-from graphnav.problem import Problem, pose
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import exp, right_jacobian_inverse
+from graphnav.core.state import DIM, States
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.model import STATED, Figure, NoiseModel
+from graphnav.estimation.pipeline import run
+from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.incremental import Incremental, incremental, node_steps
+from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.stages import Message, Place, Step, turned
+from graphnav.estimation.solvers.window import Window, first_message
 from graphnav.recording import Recording
-from graphnav.rotation import exp, right_jacobian_inverse
-from graphnav.solution import Solution
-from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import ekf
-from graphnav.solvers.incremental import Incremental, incremental, node_steps
-from graphnav.solvers.rts import backward
-from graphnav.solvers.stages import Message, Place, Step, turned
-from graphnav.solvers.window import Window, first_message
-from graphnav.state import DIM, States
-from graphnav.trajectory import Trajectory
+from graphnav.recording.formats import read
 
 EVERYTHING = 1e9  # s, a lag longer than any drive
 # errors of the fixes that last, for two fifths of the stated variance, and of wheels

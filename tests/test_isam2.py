@@ -10,23 +10,23 @@ import pytest
 from helpers import Array, truth_states
 
 from graphnav.config import settings_from
-from graphnav.earth import LocalFrame
-from graphnav.noise.apply import with_noise
-from graphnav.noise_model import Figure, NoiseModel
-from graphnav.problem import Problem, pose
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import exp
+from graphnav.core.state import States
+from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.model import Figure, NoiseModel
+from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.incremental import incremental, node_steps
+from graphnav.estimation.solvers.isam import isam2
+from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.stages import Place
+from graphnav.estimation.solvers.tree import Tree
+from graphnav.estimation.solvers.tree_marginals import newest_covariance, smoothed
+from graphnav.estimation.solvers.window import first_message, turn_limit
 from graphnav.recording import Recording
-from graphnav.rotation import exp
-from graphnav.solution import Solution
-from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import ekf
-from graphnav.solvers.incremental import incremental, node_steps
-from graphnav.solvers.isam import isam2
-from graphnav.solvers.rts import backward
-from graphnav.solvers.stages import Place
-from graphnav.solvers.tree import Tree
-from graphnav.solvers.tree_marginals import newest_covariance, smoothed
-from graphnav.solvers.window import first_message, turn_limit
-from graphnav.state import States
 
 Drive = tuple[Recording, States, Array]
 LASTING = NoiseModel(

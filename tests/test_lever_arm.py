@@ -8,8 +8,8 @@ import numpy as np
 import oracle
 import pytest
 
-from graphnav.errors import EstimationError
-from graphnav.lever_arm import find_antenna
+from graphnav.core.errors import EstimationError
+from graphnav.estimation.antenna import find_antenna
 
 ARM = np.array([0.3, -0.5, 1.2])
 

@@ -31,8 +31,8 @@ def test_a_mistake_gets_its_line_and_the_page_has_it(mistake, tmp_path):
 
 
 def test_the_recording_without_a_mistake_gives_no_warning(tmp_path):
-    from graphnav.checks import inspect
-    from graphnav.formats import read
+    from graphnav.recording.checks.overview import inspect
+    from graphnav.recording.formats import read
 
     assert inspect(read(ROOT / "data" / "tokyo")).warnings == ()
 

@@ -11,31 +11,31 @@ import pytest
 from scipy.special import chdtri
 
 from graphnav import load
-from graphnav.alignment import align
 from graphnav.config import Settings, settings_from
 from graphnav.config.gnss import GnssSettings
 from graphnav.constraints.gnss import STAMPS
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
-from graphnav.earth import LocalFrame
-from graphnav.noise.apply import row_weights, with_noise, without_parts
-from graphnav.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.noise.exclusion import FIXES, WHEELS
-from graphnav.noise.moments import imu_moments, lag_moments, process_moments, row_moments
-from graphnav.noise.priors import prior
-from graphnav.noise.spacing import space_fixes
-from graphnav.noise.words import describe_far
-from graphnav.noise_model import STATED, Figure, NoiseModel, RowWeights
-from graphnav.pipeline import SOLVERS, origin, run
-from graphnav.preintegration import NOISE_FIGURES, preintegrate
-from graphnav.problem import Problem, pose
+from graphnav.estimation.alignment import align
+from graphnav.estimation.noise.apply import row_weights, with_noise, without_parts
+from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
+from graphnav.estimation.noise.exclusion import FIXES, WHEELS
+from graphnav.estimation.noise.model import STATED, Figure, NoiseModel, RowWeights
+from graphnav.estimation.noise.moments import imu_moments, lag_moments, process_moments, row_moments
+from graphnav.estimation.noise.priors import prior
+from graphnav.estimation.noise.spacing import space_fixes
+from graphnav.estimation.noise.words import describe_far
+from graphnav.estimation.pipeline import SOLVERS, origin, run
+from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.solvers.ekf import ekf, refilter
+from graphnav.estimation.solvers.passes import Forward, Smoothed
+from graphnav.estimation.solvers.rts import backward, rts
+from graphnav.evaluation.scoring import errors
+from graphnav.imu.preintegration import NOISE_FIGURES, preintegrate
 from graphnav.recording import Recording
-from graphnav.rotation import Array
-from graphnav.scoring import errors
-from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import ekf, refilter
-from graphnav.solvers.passes import Forward, Smoothed
-from graphnav.solvers.rts import backward, rts
-from graphnav.trajectory import Trajectory
 
 # Wheels and stops hold exactly on these drives, which no sigma is made for
 INERTIAL = settings_from(
@@ -474,7 +474,7 @@ def test_wheels_that_are_wrong_are_not_taken_for_fixes(kind: str) -> None:
     assert np.mean(found.records["gnss_position"].weight < 1.0) < 0.02
     rows = found.records["odometer"]
     inside = (rows.t - recording.start > 62.0) & (rows.t - recording.start < 80.0)
-    # or the readings were taken out before: `graphnav.plausibility` knows another scale
+    # or the readings were taken out before: `graphnav.recording.plausibility.screening` knows another scale
     assert not inside.any() or np.mean(rows.weight[inside] < 0.1) > 0.9
     assert np.mean(rows.weight[rows.t - recording.start < 60.0] < 0.1) < 0.02
 

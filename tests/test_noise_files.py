@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graphnav import cli
+from graphnav.app import cli
+from graphnav.app.workflow import unused_noise
 from graphnav.config import Settings
-from graphnav.earth import LocalFrame
-from graphnav.errors import ConfigError
-from graphnav.formats import read as load
-from graphnav.noise.files import known_groups, noise_values, read_noise, read_noise_and_mode, write_noise
-from graphnav.noise.table import figure_rows, whole_ratio
-from graphnav.noise_model import STATED, Figure, NoiseModel, RowWeights
-from graphnav.problem import pose
-from graphnav.rotation import Array
-from graphnav.state import States
-from graphnav.workflow import unused_noise
+from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import ConfigError
+from graphnav.core.rotation import Array
+from graphnav.core.state import States
+from graphnav.estimation.noise.files import known_groups, noise_values, read_noise, read_noise_and_mode, write_noise
+from graphnav.estimation.noise.model import STATED, Figure, NoiseModel, RowWeights
+from graphnav.estimation.noise.table import figure_rows, whole_ratio
+from graphnav.estimation.problem import pose
+from graphnav.recording.formats import read as load
 
 TOKYO = Path(__file__).resolve().parents[1] / "data" / "tokyo"
 

@@ -11,13 +11,13 @@ import pytest
 
 from graphnav import load
 from graphnav.config import Settings, settings_from
-from graphnav.evaluation import evaluate_recording
-from graphnav.noise_model import NoiseModel
-from graphnav.pipeline import run
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.pipeline import run
+from graphnav.evaluation.evaluate import evaluate_recording
+from graphnav.evaluation.scoring import errors
 from graphnav.recording import Recording
-from graphnav.rotation import Array
-from graphnav.scoring import errors
-from graphnav.trajectory import Trajectory
 
 STATED_ONLY = settings_from({"noise": {"mode": "stated"}})
 # Wheels and stops hold exactly on these drives, which no sigma is made for

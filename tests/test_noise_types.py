@@ -13,13 +13,13 @@ from test_noise_scenarios import times, wandering, whole
 
 from graphnav.config import Settings
 from graphnav.constraints.gnss import ERRORS, GnssPosition
-from graphnav.earth import LocalFrame
-from graphnav.noise_model import Figure, NoiseModel
-from graphnav.pipeline import run
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.noise.model import Figure, NoiseModel
+from graphnav.estimation.pipeline import run
+from graphnav.evaluation.scoring import errors
 from graphnav.recording import Gnss, Recording
-from graphnav.rotation import Array
-from graphnav.scoring import errors
-from graphnav.trajectory import Trajectory
 
 
 @pytest.fixture(scope="module")

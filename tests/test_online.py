@@ -22,20 +22,20 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import graphnav
-from graphnav import cli
+from graphnav.app import cli
 from graphnav.config import Settings, settings_from
-from graphnav.errors import ConfigError, GraphnavError, RecordingError
-from graphnav.formats import read
+from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.pipeline import run
+from graphnav.estimation.solution import to_trajectory
+from graphnav.estimation.solvers.window import turn_limit
 from graphnav.online import Online, Row, Session, rows_of, without_rows
 from graphnav.online.buffers import Buffer
 from graphnav.online.lines import END, head_of, line_of, lines_of, row_of, setup_of
 from graphnav.online.tracker import Tracker
 from graphnav.online.view import view
-from graphnav.pipeline import run
 from graphnav.recording import Recording
-from graphnav.solution import to_trajectory
-from graphnav.solvers.window import turn_limit
-from graphnav.trajectory import Trajectory
+from graphnav.recording.formats import read
 
 ROOT = Path(__file__).resolve().parents[1]
 QUICK = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 20.0}})

@@ -16,16 +16,16 @@ import pytest
 from test_online import off, played, same
 
 import graphnav
-from graphnav.cli_online import Asked, follow
+from graphnav.app.cli_online import Asked, follow
 from graphnav.config import settings_from
-from graphnav.errors import ConfigError, GraphnavError, RecordingError
-from graphnav.formats.trajectories import read_trajectory
+from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
+from graphnav.core.trajectory import Trajectory
 from graphnav.online import Online, Row, Session, rows_of, smoother, without_rows
 from graphnav.online.lines import HEAD, line_of, lines_of, setup_of
 from graphnav.online.store import _MAGIC, Store
 from graphnav.online.tracker import Tracker
 from graphnav.recording import Recording
-from graphnav.trajectory import Trajectory
+from graphnav.recording.formats.trajectories import read_trajectory
 
 QUICK = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
 NAN = (float("nan"),) * 6

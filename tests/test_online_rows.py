@@ -10,7 +10,7 @@ import oracle
 import pytest
 
 from graphnav.config import Settings
-from graphnav.errors import RecordingError
+from graphnav.core.errors import RecordingError
 from graphnav.online import Fix, ImuSample, Online, WheelSpeed, live_setup, live_trajectory, rows_of
 
 SD = (0.02, 0.02, 0.04)

@@ -10,13 +10,13 @@ import oracle
 import pytest
 from test_solvers import NO_WHEELS, WHITE, nearly_linear, sigmas
 
-from graphnav.alignment import align
 from graphnav.config import settings_from
-from graphnav.earth import LocalFrame
-from graphnav.problem import Problem, pose
-from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import ekf
-from graphnav.solvers.rts import rts
+from graphnav.core.earth import LocalFrame
+from graphnav.estimation.alignment import align
+from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.rts import rts
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,16 @@ import pytest
 from mistakes import ROOT
 
 from graphnav import run
-from graphnav.checks import inspect
-from graphnav.errors import RecordingError
-from graphnav.evaluation import evaluate_recording
-from graphnav.formats import read
-from graphnav.formats.repair import Remarks, sigmas
-from graphnav.formats.table import Table
-from graphnav.plausibility import screen, screened
-from graphnav.plausibility_gnss import out_of_reach
+from graphnav.core.errors import RecordingError
+from graphnav.estimation.solution import to_trajectory
+from graphnav.evaluation.evaluate import evaluate_recording
 from graphnav.recording import Recording
-from graphnav.solution import to_trajectory
+from graphnav.recording.checks.overview import inspect
+from graphnav.recording.formats import read
+from graphnav.recording.formats.repair import Remarks, sigmas
+from graphnav.recording.formats.table import Table
+from graphnav.recording.plausibility.fixes import out_of_reach
+from graphnav.recording.plausibility.screening import screen, screened
 
 Change = Callable[[Recording], Recording]
 METRE = 1.0 / 6.37e6  # rad of latitude

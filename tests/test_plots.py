@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphnav import plots
 from graphnav.detectors.base import Detection
+from graphnav.estimation.solution import ConstraintRecord
 from graphnav.recording import Imu, Recording
-from graphnav.solution import ConstraintRecord
+from graphnav.report import plots
 
 go = pytest.importorskip("plotly.graph_objects")
 
@@ -280,7 +280,7 @@ def test_plotly_takes_every_figure(name):
 
 def test_figures_load_no_plotting_library():
     code = (
-        "import sys, numpy as np, graphnav.report, graphnav.plots as p\n"
+        "import sys, numpy as np, graphnav.report.documents, graphnav.report.plots as p\n"
         "p.bands({'ekf': p.Series(np.arange(3.0), np.ones((3, 1)))}, ('a',), 'm', 2.0, spans={}).json\n"
         "assert not {'matplotlib', 'plotly'} & set(sys.modules)"
     )

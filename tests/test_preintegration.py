@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from helpers import Array, difference, random_imu
 
-from graphnav import rotation as ro
-from graphnav.preintegration import Intervals, prefix, preintegrate, preintegrate_unknown
+from graphnav.core import rotation as ro
+from graphnav.imu.preintegration import Intervals, prefix, preintegrate, preintegrate_unknown
+from graphnav.imu.samples import Samples, bridge_gaps
 from graphnav.recording import Imu, ImuNoise
-from graphnav.samples import Samples, bridge_gaps
 
 BA, BG = np.array([0.08, -0.05, 0.03]), np.array([0.012, -0.02, 0.007])
 FIELDS = tuple(Intervals.__dataclass_fields__)

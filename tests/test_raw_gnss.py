@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphnav import earth
-from graphnav.errors import RecordingError
-from graphnav.formats import read
-from graphnav.raw.atmosphere import directions, klobuchar, saastamoinen
-from graphnav.raw.load import Sources, load_raw
-from graphnav.raw.placing import place
-from graphnav.raw.precise import read_precise
-from graphnav.raw.rinex_nav import read_navigation
-from graphnav.raw.rinex_obs import parse_observations, read_observations
-from graphnav.raw.series import Observations, primary
-from graphnav.raw.signals import BEIDOU, GALILEO, GLONASS, GPS, QZSS, C, satellite_id, signal_id, signal_name
-from graphnav.raw.single_point import look, solve
+from graphnav.core import earth
+from graphnav.core.errors import RecordingError
+from graphnav.gnss.atmosphere import directions, klobuchar, saastamoinen
+from graphnav.gnss.load import Sources, load_raw
+from graphnav.gnss.placing import place
+from graphnav.gnss.precise import read_precise
+from graphnav.gnss.rinex_nav import read_navigation
+from graphnav.gnss.rinex_obs import parse_observations, read_observations
+from graphnav.gnss.series import Observations, primary
+from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, QZSS, C, satellite_id, signal_id, signal_name
+from graphnav.gnss.single_point import look, solve
+from graphnav.recording.formats import read
 
 TOKYO = Path(__file__).resolve().parents[1] / "data" / "tokyo_raw"
 UCR, SLAC, CSSR = "ucr_riverside_20200712", "raw_gnss_slac_20210428", "cssrlib_2021_265"

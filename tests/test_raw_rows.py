@@ -16,11 +16,11 @@ from graphnav.config import settings_from
 from graphnav.constraints.base import Scene
 from graphnav.constraints.gnss import GnssPosition
 from graphnav.constraints.raw_gnss import BIASES, CLOCK, GnssCode, GnssDoppler
-from graphnav.earth import LocalFrame
-from graphnav.formats import read
-from graphnav.pipeline import run
-from graphnav.preintegration import preintegrate
-from graphnav.samples import bridge_gaps
+from graphnav.core.earth import LocalFrame
+from graphnav.estimation.pipeline import run
+from graphnav.imu.preintegration import preintegrate
+from graphnav.imu.samples import bridge_gaps
+from graphnav.recording.formats import read
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 TIGHT = settings_from({"raw_gnss": {"coupling": "tight"}})

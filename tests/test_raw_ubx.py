@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphnav.errors import RecordingError
-from graphnav.raw.load import read_rover
-from graphnav.raw.messages import Decoder
-from graphnav.raw.signals import satellite_id, satellite_name, signal_id
-from graphnav.raw.ubx import parse_ubx
-from graphnav.timescales import WEEK
+from graphnav.core.errors import RecordingError
+from graphnav.core.timescales import WEEK
+from graphnav.gnss.load import read_rover
+from graphnav.gnss.messages import Decoder
+from graphnav.gnss.signals import satellite_id, satellite_name, signal_id
+from graphnav.gnss.ubx import parse_ubx
 
 WEEK_NUMBER, TOW = 2200, 345678.0
 # gnssId, svId, sigId and RINEX' names for them

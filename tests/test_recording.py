@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from test_bad_input import TOML, write_small
 
-from graphnav.earth import LocalFrame
-from graphnav.formats import formats, read
-from graphnav.formats.folder import DEFAULT_SD
-from graphnav.formats.schema import rotation_from_letters, rotation_from_vectors
+from graphnav.core.earth import LocalFrame
 from graphnav.recording import ImuNoise
+from graphnav.recording.formats import formats, read
+from graphnav.recording.formats.folder import DEFAULT_SD
+from graphnav.recording.formats.schema import rotation_from_letters, rotation_from_vectors
 
 IMU_ROWS = "t,gx,gy,gz,ax,ay,az\n0.01,1,2,3,4,5,6\n0.02,1,2,3,4,5,6\n"
 

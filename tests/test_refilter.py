@@ -11,23 +11,23 @@ from helpers import random_states
 from test_faults import OFF, scattered
 from test_solvers import sigmas
 
-from graphnav.alignment import align
 from graphnav.config import Settings
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM
 from graphnav.detectors import detect
-from graphnav.earth import LocalFrame
-from graphnav.noise.apply import with_noise
-from graphnav.noise_model import Figure, NoiseModel
-from graphnav.pipeline import origin, run
-from graphnav.problem import Problem, pose
-from graphnav.rotation import Array
-from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import ekf, refilter
-from graphnav.solvers.linearise import Points
-from graphnav.solvers.near import near
-from graphnav.solvers.points import AtEstimate, AtPoints, Estimate
-from graphnav.solvers.rts import backward
-from graphnav.solvers.stack import Stack
-from graphnav.state import DIM
+from graphnav.estimation.alignment import align
+from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.model import Figure, NoiseModel
+from graphnav.estimation.pipeline import origin, run
+from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.solvers.ekf import ekf, refilter
+from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.near import near
+from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate
+from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.stack import Stack
 
 
 @pytest.fixture(scope="module")

@@ -13,27 +13,29 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from graphnav import page, report_pictures, rotation
 from graphnav.config import Settings
 from graphnav.constraints.foot import FOOT_AXIS, PATTERN, PIVOT, TRAVEL
 from graphnav.constraints.gnss import LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET
 from graphnav.constraints.vehicle import AXLE, BODY, MOUNTING, ODOMETER_DELAY, ODOMETER_SCALE
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.state import States
 from graphnav.detectors.base import Detection
-from graphnav.dynamics import SCALE
-from graphnav.earth import LocalFrame
-from graphnav.metrics import Errors
-from graphnav.noise.table import figure_rows
-from graphnav.noise_model import Figure, NoiseModel, RowWeights
+from graphnav.estimation.noise.model import Figure, NoiseModel, RowWeights
+from graphnav.estimation.noise.table import figure_rows
+from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution, joined
+from graphnav.evaluation.metrics import Errors
+from graphnav.evaluation.segments import relative_errors
+from graphnav.imu.dynamics import SCALE
 from graphnav.recording import Gnss, Imu, Recording, Truth
-from graphnav.report import write_comparison, write_report
-from graphnav.report_names import components, named
-from graphnav.report_provenance import command, toml_text
-from graphnav.report_summary import fix_table, left_out, sigma_table, verdicts
-from graphnav.report_tables import accuracy_row, consistency, excluded_table, span_row
-from graphnav.report_words import doubts
-from graphnav.segments import relative_errors
-from graphnav.solution import ConstraintRecord, ParameterEstimate, Solution, joined
-from graphnav.state import States
+from graphnav.report import page
+from graphnav.report import pictures as report_pictures
+from graphnav.report.documents import write_comparison, write_report
+from graphnav.report.names import components, named
+from graphnav.report.provenance import command, toml_text
+from graphnav.report.sentences import doubts
+from graphnav.report.summary import fix_table, left_out, sigma_table, verdicts
+from graphnav.report.tables import accuracy_row, consistency, excluded_table, span_row
 
 START, COUNT = 1000.0, 600
 NAME = "drive <script>alert('x')</script> & \"co\""

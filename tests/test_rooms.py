@@ -92,10 +92,12 @@ def test_only_the_command_line_prints():
 
 def loaded(*arguments: str) -> set[str]:
     """The modules there after the program has run on some arguments."""
-    code = f"import sys; import graphnav.cli as c; assert c.run({list(arguments)!r}) == 0; print(sorted(sys.modules))"
+    code = (
+        f"import sys; import graphnav.app.cli as c; assert c.run({list(arguments)!r}) == 0; print(sorted(sys.modules))"
+    )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     names = set(ast.literal_eval(run.stdout.splitlines()[-1]))
-    assert "graphnav.cli" in names
+    assert "graphnav.app.cli" in names
     return names
 
 

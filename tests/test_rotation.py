@@ -9,7 +9,7 @@ from scipy.integrate import fixed_quad
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from graphnav import rotation as ro
+from graphnav.core import rotation as ro
 
 MAGNITUDES = (0.0, 1e-12, 1e-9, 1e-6, 1e-4, 0.0099, 0.0101, 0.0999, 0.1001, 0.5, 1.5, 2.5, 3.1, np.pi - 1e-5)
 DEG = np.pi / 180.0

@@ -14,14 +14,14 @@ from hypothesis.extra import numpy as arrays
 
 from graphnav.config import read_settings, settings_from, settings_text
 from graphnav.config.gnss import GnssSettings
-from graphnav.exporters import write_as
-from graphnav.formats import read
-from graphnav.formats.table import read_table
-from graphnav.formats.trajectories import read_trajectory
-from graphnav.formats.writer import write_csv, write_folder
+from graphnav.core.rotation import Array
 from graphnav.online.lines import line_of, row_of
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer
-from graphnav.rotation import Array
+from graphnav.recording.exporters import write_as
+from graphnav.recording.formats import read
+from graphnav.recording.formats.table import read_table
+from graphnav.recording.formats.trajectories import read_trajectory
+from graphnav.recording.formats.writer import write_csv, write_folder
 
 BASE, _ = logs.simulated(5.0)
 FEW = settings(max_examples=25, deadline=None)

@@ -15,11 +15,13 @@ from pathlib import Path
 
 import pytest
 
-from graphnav import cli, gates, staging
+from graphnav.app import cli
+from graphnav.app.terminal import Pace
 from graphnav.config import PROFILES, Settings, read_settings, settings_from, settings_text
-from graphnav.errors import ConfigError
-from graphnav.progress import listening, tell
-from graphnav.terminal import Pace
+from graphnav.core import staging
+from graphnav.core.errors import ConfigError
+from graphnav.core.progress import listening, tell
+from graphnav.evaluation import gates
 
 ROOT = Path(__file__).resolve().parents[1]
 TOKYO = ROOT / "data" / "tokyo"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphnav.metrics import Errors
-from graphnav.report_words import believe
-from graphnav.sample_size import effective_epochs
-from graphnav.sigmas import judge_sigmas
+from graphnav.core.sample_size import effective_epochs
+from graphnav.evaluation.metrics import Errors
+from graphnav.evaluation.sigmas import judge_sigmas
+from graphnav.report.sentences import believe
 
 N = 600
 

@@ -14,17 +14,18 @@ import pytest
 from helpers import Array, truth_states
 from pyins import sim, strapdown, transform, util
 
-from graphnav import rotation as ro
-from graphnav.checks import inspect
-from graphnav.cli import run as command
-from graphnav.dynamics import Motion as Mechanisation
-from graphnav.earth import RATE, LocalFrame, gravity, llh_to_ecef
-from graphnav.errors import ConfigError
-from graphnav.formats import read
-from graphnav.formats.writing import write_folder
-from graphnav.preintegration import preintegrate
+from graphnav.app.cli import run as command
+from graphnav.core import rotation as ro
+from graphnav.core.earth import RATE, LocalFrame, gravity, llh_to_ecef
+from graphnav.core.errors import ConfigError
+from graphnav.core.state import States
+from graphnav.imu.dynamics import Motion as Mechanisation
+from graphnav.imu.preintegration import preintegrate
+from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu, Odometer
-from graphnav.samples import bridge_gaps
+from graphnav.recording.checks.overview import inspect
+from graphnav.recording.formats import read
+from graphnav.recording.formats.writing import write_folder
 from graphnav.simulation import Simulated, options_from, scenarios, simulate
 from graphnav.simulation.aiding import Fault, GnssModel, OdometerModel
 from graphnav.simulation.inertial import EG370N, MIMU, Triad, accelerometer, gyroscope
@@ -33,7 +34,6 @@ from graphnav.simulation.motion import HEADING, SLIP, SPEED, Manoeuvre, drive
 from graphnav.simulation.passengers import Boarding, movement
 from graphnav.simulation.scenarios.li2024 import TABLE_4
 from graphnav.simulation.vibration import MG, Shake, road_noise
-from graphnav.state import States
 
 pytestmark = pytest.mark.filterwarnings("ignore:The copy keyword")  # of pandas, about pyins
 

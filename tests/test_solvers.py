@@ -14,22 +14,22 @@ from helpers import Array, Factor, dense, errors, factors, truth_states
 from graphnav.config import Settings, settings_from
 from graphnav.constraints.gnss import ERRORS, LEVER_ARM
 from graphnav.constraints.standstill import PLACE
-from graphnav.dynamics import SCALE
-from graphnav.earth import LocalFrame
-from graphnav.formats import read
-from graphnav.noise.apply import with_noise
-from graphnav.noise_model import STATED, Figure, NoiseModel
-from graphnav.pipeline import run
-from graphnav.problem import Problem, pose
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import exp
+from graphnav.core.state import DIM
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.model import STATED, Figure, NoiseModel
+from graphnav.estimation.pipeline import run
+from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.robust import weight_and_cost
+from graphnav.estimation.solvers.rts import rts
+from graphnav.imu.dynamics import SCALE
 from graphnav.recording import Gnss, Recording
-from graphnav.rotation import exp
-from graphnav.solution import Solution
-from graphnav.solvers.batch import batch
-from graphnav.solvers.ekf import ekf
-from graphnav.solvers.robust import weight_and_cost
-from graphnav.solvers.rts import rts
-from graphnav.state import DIM
-from graphnav.trajectory import Trajectory
+from graphnav.recording.formats import read
 
 KERNELS = ("none", "huber", "cauchy", "geman-mcclure", "tukey", "welsch")
 NO_WHEELS = {"nhc": False, "odometer": False}
@@ -339,7 +339,7 @@ def test_states_between_keyframes_come_in_parts_just_the_same(
     _, solution = solved_lap
     whole = solution.trajectory(50.0)
     assert len(whole) > 1000
-    monkeypatch.setattr("graphnav.solution._ROWS", 37)
+    monkeypatch.setattr("graphnav.estimation.solution._ROWS", 37)
     parts = list(solution.blocks(50.0))
     assert max(len(part) for part in parts) == 37
     for name in ("t", "llh", "v", "rph", "sd_p", "sd_v", "sd_rph", "gyro_bias", "accel_bias"):

@@ -9,17 +9,17 @@ import pytest
 from test_faults import left_out, moved
 
 from graphnav import load
-from graphnav.alignment import Alignment, align
 from graphnav.config import Settings
+from graphnav.core.earth import LocalFrame
+from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
-from graphnav.earth import LocalFrame
+from graphnav.estimation.alignment import Alignment, align
+from graphnav.estimation.pipeline import origin, run
+from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.solvers.watch import Verdicts
+from graphnav.evaluation.scoring import Errors, errors
 from graphnav.online import Online, rows_of, without_rows
-from graphnav.pipeline import origin, run
 from graphnav.recording import Recording
-from graphnav.scoring import Errors, errors
-from graphnav.solvers.batch import batch
-from graphnav.solvers.watch import Verdicts
-from graphnav.trajectory import Trajectory
 
 
 @pytest.fixture(scope="module")

@@ -12,17 +12,17 @@ from helpers import Array
 from scipy.stats import chi2
 
 from graphnav import load
-from graphnav import rotation as ro
-from graphnav.alignment import Alignment, align
-from graphnav.alignment.travel import travel
 from graphnav.config import Settings
+from graphnav.core import rotation as ro
+from graphnav.core.earth import LocalFrame
 from graphnav.detectors import detect
 from graphnav.detectors.base import NONE
-from graphnav.earth import LocalFrame
-from graphnav.formats import read
-from graphnav.pipeline import origin
+from graphnav.estimation.alignment import Alignment, align
+from graphnav.estimation.alignment.travel import travel
+from graphnav.estimation.pipeline import origin
+from graphnav.estimation.solvers.batch import batch
 from graphnav.recording import Recording, Truth
-from graphnav.solvers.batch import batch
+from graphnav.recording.formats import read
 
 DEG = np.pi / 180.0
 SURE = 0.999  # of a chi-square that an honest sigma stays below

@@ -12,12 +12,12 @@ import pytest
 import stranger
 from test_formats_binary import write_bag, write_ubx
 
-from graphnav import cli
-from graphnav.draft import draft
-from graphnav.draft.guesses import noise_density
-from graphnav.formats import read
-from graphnav.formats.trajectories import read_trajectory
-from graphnav.timescales import between_clocks
+from graphnav.app import cli
+from graphnav.core.timescales import between_clocks
+from graphnav.recording.draft import draft
+from graphnav.recording.draft.guesses import noise_density
+from graphnav.recording.formats import read
+from graphnav.recording.formats.trajectories import read_trajectory
 
 RECORDING, TRUTH = logs.simulated(60.0)
 FAST = ("--solver", "ekf", "--noise", "stated", "--quiet")
@@ -186,7 +186,7 @@ def test_what_lies_between_clocks_that_are_known(t, zero, u, other, offset):
 
 def test_advice_is_for_the_log_at_hand(tmp_path):
     """Numbers of types are a matter of CSV files, and keys of a recording.toml."""
-    from graphnav.checks import inspect
+    from graphnav.recording.checks.overview import inspect
 
     bag = write_bag(tmp_path / "a", "db3")
     found = inspect(replace(read(bag), imu=replace(RECORDING.imu, t=read(bag).imu.t, accel=-RECORDING.imu.accel)))

@@ -10,22 +10,22 @@ import oracle
 import pytest
 from helpers import Array, truth_states
 
-from graphnav import rotation
 from graphnav.config import Settings, settings_from
 from graphnav.constraints.base import Scene
 from graphnav.constraints.standstill import PLACE, HeldPosition, ZeroRate, ZeroVelocity
 from graphnav.constraints.vehicle import AXLE, MOUNTING, ODOMETER_DELAY, ODOMETER_SCALE, NonHolonomic, OdometerSpeed
-from graphnav.earth import LocalFrame
-from graphnav.formats import read
-from graphnav.pipeline import run
-from graphnav.preintegration import preintegrate
-from graphnav.problem import keyframe_times
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.state import States
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.pipeline import run
+from graphnav.estimation.problem import keyframe_times
+from graphnav.estimation.solution import Solution
+from graphnav.imu.preintegration import preintegrate
+from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Recording
-from graphnav.samples import bridge_gaps
+from graphnav.recording.formats import read
 from graphnav.simulation import simulate
-from graphnav.solution import Solution
-from graphnav.state import States
-from graphnav.trajectory import Trajectory
 
 STOP = (88.0, 104.0)  # s, inside a stop of the lap
 MOUNT = np.radians([2.0, -3.0])  # pitch, heading of the IMU against the vehicle

@@ -9,19 +9,19 @@ import pytest
 from test_faults import drive, moved, posed, scattered
 
 from graphnav.config import settings_from
-from graphnav.noise.apply import row_weights
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.noise.apply import row_weights
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers import watch
+from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.incremental import node_steps
+from graphnav.estimation.solvers.stages import Place
+from graphnav.estimation.solvers.watch import Bank
+from graphnav.estimation.solvers.window import Window, first_message
 from graphnav.online import Online, rows_of, without_rows
-from graphnav.problem import Problem
 from graphnav.recording import Recording
-from graphnav.rotation import Array
-from graphnav.solvers import watch
-from graphnav.solvers.ekf import ekf
-from graphnav.solvers.incremental import node_steps
-from graphnav.solvers.stages import Place
-from graphnav.solvers.watch import Bank
-from graphnav.solvers.window import Window, first_message
-from graphnav.state import DIM
-from graphnav.trajectory import Trajectory
 
 __all__ = ["drive", "posed"]  # fixtures
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphnav import checks
-from graphnav.errors import RecordingError
-from graphnav.formats import read
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
 from graphnav.recording import Odometer, Recording
-from graphnav.rotation import Array
+from graphnav.recording.checks import overview as checks
+from graphnav.recording.formats import read
+from graphnav.recording.odometer import MeanSpeed, counts, faults, gaps, quantum, reading_sigma
+from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
 from graphnav.simulation import simulate
-from graphnav.wheels import MeanSpeed, counts, faults, gaps, quantum, reading_sigma
-from graphnav.wheels.faults import FROZEN, GAP, STUCK, WILD
 
 REAL = ("tokyo_20201105", "comma_highway_20180802", "oracle_drive")
 

@@ -9,10 +9,10 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from graphnav.complaints import complaint, read_toml
 from graphnav.config.settings import PROFILES, Profile, Settings
-from graphnav.errors import ConfigError
-from graphnav.files import parse_json, read_text
+from graphnav.core.complaints import complaint, read_toml
+from graphnav.core.errors import ConfigError
+from graphnav.core.files import parse_json, read_text
 
 
 def settings_from(values: Mapping[str, Any], source: str = "settings", text: str = "") -> Settings:

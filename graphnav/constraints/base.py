@@ -17,12 +17,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.earth import LocalFrame
-from graphnav.preintegration import Intervals
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.core.state import BLOCKS, DIM, Parameter, States
+from graphnav.imu.preintegration import Intervals
 from graphnav.recording import Recording
-from graphnav.rotation import Array
-from graphnav.state import BLOCKS, DIM, Parameter, States
-from graphnav.wheels import MeanSpeed
+from graphnav.recording.odometer import MeanSpeed
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,9 @@ class Constraint(ABC):
 
     keyframe: Array  # (N,) int, ascending
     parameters: tuple[Parameter, ...] = ()
-    processes: tuple[Parameter, ...] = ()  # of its errors; parameters where a noise model has them (`graphnav.noise`)
+    processes: tuple[
+        Parameter, ...
+    ] = ()  # of its errors; parameters where a noise model has them (`graphnav.estimation.noise`)
     robust: str = "none"
     robust_scale: float | Array = 3.0  # or (N,)
     graduation: float = np.inf  # mu of graduated non-convexity; infinite at its end

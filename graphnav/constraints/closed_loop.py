@@ -13,9 +13,9 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import Constraint, Linearized, Scene
+from graphnav.core.rotation import Array
+from graphnav.core.state import States
 from graphnav.recording import Recording
-from graphnav.rotation import Array
-from graphnav.state import States
 
 
 @dataclass(frozen=True)

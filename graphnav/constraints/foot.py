@@ -38,15 +38,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from graphnav import rotation
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
 from graphnav.constraints.standstill import standing_intervals
 from graphnav.constraints.vehicle import Past
-from graphnav.dynamics import scale_parameter
+from graphnav.core import rotation
+from graphnav.core.rotation import Array, mv
+from graphnav.core.state import Parameter, States
+from graphnav.imu.dynamics import scale_parameter
 from graphnav.recording import Recording
-from graphnav.rotation import Array, mv
-from graphnav.state import Parameter, States
 
 PIVOT = "pivot"
 TRAVEL = "pivot_travel"

@@ -15,7 +15,7 @@ e is the time-correlated part of a position's error: fixes of one receiver secon
 of them are not worth a thousand. It is the sum of three Gauss-Markov processes in units of the stated sigma: one of
 seconds (reflections), one of minutes (multipath as satellites move, satellites coming and going) and one of hours
 (orbits, atmosphere, the base's coordinates). The stated sigma itself is that of the white part. How much of each there
-is, the noise model says (`graphnav.noise`), for each type of fix where there are several: what fixed and single-point
+is, the noise model says (`graphnav.estimation.noise`), for each type of fix where there are several: what fixed and single-point
 fixes are wrong by has nothing to do with each other. With stated noise there is the white part alone.
 """
 
@@ -27,12 +27,12 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.ndimage import median_filter
 
-from graphnav import earth, rotation
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
+from graphnav.core import earth, rotation
+from graphnav.core.rotation import Array, mv
+from graphnav.core.state import NODE_SPACING, SECONDS, Parameter, States
 from graphnav.recording import FIX_TYPES, Imu, Recording
-from graphnav.rotation import Array, mv
-from graphnav.state import NODE_SPACING, SECONDS, Parameter, States
 
 LEVER_ARM = "gnss_lever_arm"
 TIME_OFFSET = "gnss_time_offset"

@@ -8,7 +8,7 @@ reception, and u = v + R_nb (omega_nb x l) its velocity (Groves 2013, sections 8
 
 b and b' are the receiver's clock and its drift, which begin anew at every epoch; b_s is the bias of the signals of
 another system, z what the model of the ionosphere is wrong by at the zenith and m how that grows towards the horizon; k
-comes of the flight time (`graphnav.raw.single_point.stretch`). What lasts of the errors: c of all satellites together,
+comes of the flight time (`graphnav.gnss.single_point.stretch`). What lasts of the errors: c of all satellites together,
 as a shift of the antenna in east, north, up, for seconds and minutes, reflections and what a receiver's smoothing of
 its codes leaves, and for hours; d for seconds the same of velocities; q for hours of the one satellite, orbit, clock
 and the atmosphere towards it. How large c and q are for hours is stated: a drive does not tell them from its place.
@@ -24,19 +24,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from graphnav import earth, rotation
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
 from graphnav.constraints.gnss import LEVER_ARM, TIMES, antenna_velocity, around, node_spacing, period
-from graphnav.raw.atmosphere import obliquity
-from graphnav.raw.ephemeris import turned
-from graphnav.raw.series import RawGnss, primary
-from graphnav.raw.sigmas import code_sigma, rate_sigma
-from graphnav.raw.signals import L1, NAMES, C, signal_name
-from graphnav.raw.single_point import coefficients, look, signal_groups, stretch
+from graphnav.core import earth, rotation
+from graphnav.core.rotation import Array
+from graphnav.core.state import SECONDS, Parameter, States
+from graphnav.gnss.atmosphere import obliquity
+from graphnav.gnss.ephemeris import turned
+from graphnav.gnss.series import RawGnss, primary
+from graphnav.gnss.sigmas import code_sigma, rate_sigma
+from graphnav.gnss.signals import L1, NAMES, C, signal_name
+from graphnav.gnss.single_point import coefficients, look, signal_groups, stretch
 from graphnav.recording import Recording
-from graphnav.rotation import Array
-from graphnav.state import SECONDS, Parameter, States
 
 CLOCK = "receiver_clock"
 BIASES = "gnss_signal_biases"
@@ -179,7 +179,7 @@ class _Satellites(Constraint):
     R_ln: Array = field(default_factory=lambda: np.empty((0, 3, 3)))
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
     sigma: Array = field(default_factory=lambda: np.empty((0, 1)))
-    satellite: Array = field(default_factory=lambda: np.empty(0, dtype=np.int16))  # (N,) graphnav.raw.signals
+    satellite: Array = field(default_factory=lambda: np.empty(0, dtype=np.int16))  # (N,) graphnav.gnss.signals
     elevation: Array = field(default_factory=lambda: np.empty(0))  # (N,) rad
     level: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of _CLASSES
 

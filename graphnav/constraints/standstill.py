@@ -22,12 +22,12 @@ from typing import ClassVar
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from graphnav import rotation
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
+from graphnav.core import rotation
+from graphnav.core.rotation import Array, mv
+from graphnav.core.state import Parameter, States
 from graphnav.recording import Recording
-from graphnav.rotation import Array, mv
-from graphnav.state import Parameter, States
 
 PLACE = "stop_position"
 _NEIGHBOURS = 5  # intervals over which unrest is looked for

@@ -31,16 +31,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from graphnav import rotation
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
-from graphnav.dynamics import SCALE, as_biases, by_scale, scale_parameter
-from graphnav.earth import LocalFrame
-from graphnav.preintegration import Intervals
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array, columns, mv
+from graphnav.core.state import SECONDS, Parameter, States
+from graphnav.imu.dynamics import SCALE, as_biases, by_scale, scale_parameter
+from graphnav.imu.preintegration import Intervals
 from graphnav.recording import Imu, Odometer, Recording
-from graphnav.rotation import Array, columns, mv
-from graphnav.state import SECONDS, Parameter, States
-from graphnav.wheels import Figures, MeanSpeed, faults
+from graphnav.recording.odometer import Figures, MeanSpeed, faults
 
 MOUNTING = "mounting"
 AXLE = "axle"

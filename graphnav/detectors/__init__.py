@@ -15,13 +15,13 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.config.detectors import FUSED
+from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, without
 from graphnav.detectors.fusion import Decision, decide, decide_fused, merge_decisions
 from graphnav.detectors.glrt import STATISTICS, glrt_statistic
 from graphnav.detectors.scene import Detector, Scene
 from graphnav.detectors.stance import detect_stances
 from graphnav.recording import Recording
-from graphnav.rotation import Array
 
 __all__ = ["Detection", "Detections", "Detector", "detect", "glrt_statistic", "registered", "stops"]
 

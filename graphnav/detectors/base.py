@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from graphnav.rotation import Array, columns
+from graphnav.core.rotation import Array, columns
 
 Mask = NDArray[np.bool_]
 

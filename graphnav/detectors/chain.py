@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from graphnav.core.rotation import Array
 from graphnav.detectors.windows import Blocks
-from graphnav.rotation import Array
 
 _INNER = 1.5  # s of a stretch that say what its force and rate are
 _LONGEST = 60.0  # s between stretches over which a difference of speed still means something

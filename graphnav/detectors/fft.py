@@ -21,12 +21,12 @@ from itertools import pairwise
 import numpy as np
 
 from graphnav.config.detectors import FftSettings
+from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Mask, spans_of, within
 from graphnav.detectors.motion import Speeds
 from graphnav.detectors.scene import MG, Detector, Labels, Scene
 from graphnav.detectors.spectrum import FEWEST_WINDOWS, LOWEST, IdleLine, Windows, idle_line, peaks
 from graphnav.detectors.thresholds import log_statistic, valley
-from graphnav.rotation import Array
 
 LINE_OF_THE_PAPER = 12.495  # Hz, to which its bands belong
 _MET = 0.7  # share of still windows that meet a ratio for it to be asked for

@@ -19,13 +19,13 @@ from itertools import pairwise
 import numpy as np
 
 from graphnav.config.detectors import FusionSettings
+from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, longer_than, merged, spans_of, union, within, without
 from graphnav.detectors.chain import Link, at_rest_until, link, moving_by_chain
 from graphnav.detectors.low_band import Scale, low_band
 from graphnav.detectors.motion import Speeds
 from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.windows import Blocks, kernel, share_of, smooth
-from graphnav.rotation import Array
 
 LOW_BAND, FFT = "low_band_glrt", "fft"
 _LOOK = 3.0  # s about an end in which the edge is sought

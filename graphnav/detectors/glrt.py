@@ -19,11 +19,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, spans_of, within
 from graphnav.detectors.scene import MG, Detector, Labels, Scene
 from graphnav.detectors.thresholds import fewest_errors, own_threshold
 from graphnav.detectors.windows import Blocks, running, unbroken, window_times
-from graphnav.rotation import Array
 
 _TINY = 1e-300
 _STEP = 0.1  # s between windows

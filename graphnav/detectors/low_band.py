@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.config.detectors import LowBandSettings
+from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, longer_than, spans_of, within
 from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.thresholds import FEWEST, MISLABELLED, MISTAKEN, log_statistic, valley
 from graphnav.detectors.windows import LowPassed, running, unbroken, window_times
 from graphnav.recording import ImuNoise
-from graphnav.rotation import Array
 
 NAME = "low_band_glrt"
 _DOWN, _UP = 1.5, 0.7  # decades that the data may move the threshold down and up

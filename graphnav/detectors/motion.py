@@ -12,11 +12,11 @@ from functools import cached_property
 import numpy as np
 
 from graphnav.config.detectors import FusionSettings
-from graphnav.crosschecks import local_positions
+from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, merged, spans_of, union
 from graphnav.detectors.windows import share_of
 from graphnav.recording import Gnss, Odometer, Recording
-from graphnav.rotation import Array
+from graphnav.recording.checks.crosschecks import local_positions
 
 _SIGMAS = 3.0
 _SIGMAS_APART = 6.0  # of positions compared: their errors wander by more than receivers state

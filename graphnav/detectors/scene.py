@@ -10,13 +10,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from graphnav.config.detectors import DetectorSettings
+from graphnav.core.earth import gravity
+from graphnav.core.findings import period_of
+from graphnav.core.rotation import Array
 from graphnav.detectors.base import Detection
 from graphnav.detectors.motion import Speeds, moving, speeds
 from graphnav.detectors.windows import Blocks, LowPassed, blocks, low_pass
-from graphnav.earth import gravity
-from graphnav.findings import period_of
 from graphnav.recording import Recording
-from graphnav.rotation import Array
 
 _STANDARD_GRAVITY = 9.80665
 MG = 9.80665e-3  # m/s^2

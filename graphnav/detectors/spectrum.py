@@ -18,7 +18,7 @@ import numpy as np
 import scipy.fft
 from numpy.lib.stride_tricks import sliding_window_view
 
-from graphnav.rotation import Array
+from graphnav.core.rotation import Array
 
 CHANNELS = ("force y", "force z", "rate x")  # forward, up, pitch
 _CHUNK = 256  # windows at a time: a few MB whatever the length of the recording

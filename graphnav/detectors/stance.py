@@ -28,13 +28,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from graphnav import rotation
 from graphnav.config.detectors import FUSED, StanceSettings
+from graphnav.core import rotation
+from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, merged, spans_of, union
 from graphnav.detectors.glrt import glrt_statistic
 from graphnav.detectors.windows import running, unbroken
 from graphnav.recording import Imu
-from graphnav.rotation import Array
 
 _QUIET = 1.0  # s; the quietest of the recording says what bias and gravity are
 _ENOUGH = 5  # spans, to say what is usual

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphnav.core.rotation import Array
 from graphnav.detectors.base import within
 from graphnav.detectors.scene import Scene
-from graphnav.rotation import Array
 
 _TINY = 1e-300
 FEWEST = 1.0  # s of a population that the data may tell of

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from graphnav.core.rotation import Array
 from graphnav.recording import Imu
-from graphnav.rotation import Array
 
 BLOCK_RATE = 50.0  # Hz, at least, of the blocks
 _KERNEL = 0.4  # s, length of the low-pass

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.constraints.base import SAME_TIME
-from graphnav.dense import Dense
-from graphnav.dynamics import SCALE, Motion, as_biases
-from graphnav.earth import LocalFrame
-from graphnav.noise_model import NoiseModel
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.estimation.dense import Dense
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.solvers.window import Message
+from graphnav.imu.dynamics import SCALE, Motion, as_biases
+from graphnav.imu.preintegration import NOISE_FIGURES, preintegrate
+from graphnav.imu.samples import bridge_gaps
 from graphnav.online.sensors import Sensors
-from graphnav.preintegration import NOISE_FIGURES, preintegrate
-from graphnav.rotation import Array
-from graphnav.samples import bridge_gaps
-from graphnav.solvers.window import Message
-from graphnav.state import DIM, States
 
 
 @dataclass(frozen=True)

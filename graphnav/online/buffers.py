@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphnav.rotation import Array
+from graphnav.core.rotation import Array
 
 SAME = 1e-9  # s; rows closer than this are one
 

@@ -14,20 +14,20 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.standstill import PLACE
-from graphnav.noise.apply import row_weights
-from graphnav.noise_model import STATED, NoiseModel
+from graphnav.core.rotation import Array
+from graphnav.core.state import Parameter
+from graphnav.estimation.noise.apply import row_weights
+from graphnav.estimation.noise.model import STATED, NoiseModel
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solution import Fault
+from graphnav.estimation.solvers.elimination import Predicted
+from graphnav.estimation.solvers.stages import Place, Step
+from graphnav.estimation.solvers.tree_window import TreeWindow
+from graphnav.estimation.solvers.watch import Verdicts, Watch
+from graphnav.estimation.solvers.window import Message, Smoothed, Window
+from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.online.looks import Stops
 from graphnav.online.sensors import Sensors
-from graphnav.preintegration import NOISE_FIGURES
-from graphnav.problem import Problem
-from graphnav.rotation import Array
-from graphnav.solution import Fault
-from graphnav.solvers.elimination import Predicted
-from graphnav.solvers.stages import Place, Step
-from graphnav.solvers.tree_window import TreeWindow
-from graphnav.solvers.watch import Verdicts, Watch
-from graphnav.solvers.window import Message, Smoothed, Window
-from graphnav.state import Parameter
 
 _PLACE_SIGMA = 1000.0  # m, of where a stop may be
 _FIXES = 5  # that tell how often they come

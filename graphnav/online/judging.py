@@ -1,6 +1,6 @@
 """Estimating the noise model again by more rows, beside the drive: no keyframe waits for it.
 
-The estimate itself (`graphnav.noise`), which filters and smooths some minutes a dozen times, is made in a thread. Its
+The estimate itself (`graphnav.estimation.noise`), which filters and smooths some minutes a dozen times, is made in a thread. Its
 answer is used at the first row after a fixed time of the drive, so that what comes out does not depend on how long it
 took. A second tracker then goes through what has not settled with the new model, some keyframes at a row, and takes the
 first one's place when it has caught up.
@@ -14,26 +14,26 @@ from typing import Any
 
 import numpy as np
 
-from graphnav import faults
-from graphnav.alignment import Alignment
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import TIMES, GnssPosition
+from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import EstimationError
+from graphnav.core.rotation import Array
 from graphnav.detectors import detect
-from graphnav.earth import LocalFrame
-from graphnav.errors import EstimationError
-from graphnav.noise.apply import with_noise
-from graphnav.noise.estimate import estimate_noise
-from graphnav.noise.exclusion import estimate_without_faults
-from graphnav.noise.words import describe
-from graphnav.noise_model import NoiseModel
+from graphnav.estimation import faults
+from graphnav.estimation.alignment import Alignment
+from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.estimate import estimate_noise
+from graphnav.estimation.noise.exclusion import estimate_without_faults
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.words import describe
+from graphnav.estimation.preparation import start_sigma
+from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.solution import Fault
 from graphnav.online.sensors import Sensors, unit_of
 from graphnav.online.tracker import Tracker
-from graphnav.preparation import start_sigma
-from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
-from graphnav.rotation import Array
-from graphnav.solution import Fault
 
 _PORTION = 4  # keyframes gone through again at a row
 

@@ -17,12 +17,12 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from graphnav.complaints import complaint
-from graphnav.errors import RecordingError
-from graphnav.files import parse_json, parse_number
-from graphnav.formats.schema import Noise, NotNegative, Positive, Vector
+from graphnav.core.complaints import complaint
+from graphnav.core.errors import RecordingError
+from graphnav.core.files import parse_json, parse_number
 from graphnav.online.sensors import Row, rows_of
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
+from graphnav.recording.formats.schema import Noise, NotNegative, Positive, Vector
 
 HEAD = "graphnav-online/1"
 END = "E"

@@ -10,11 +10,11 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
+from graphnav.core.rotation import Array
 from graphnav.detectors import stops
 from graphnav.detectors.base import merged
 from graphnav.online.sensors import Sensors
-from graphnav.rotation import Array
-from graphnav.wheels import Figures, faults
+from graphnav.recording.odometer import Figures, faults
 
 CONTEXT = 30.0  # s of rows before a keyframe that its constraints may look at
 SURE = 1.0  # s before now that the detectors answer for: the end of a stop shows only when it is over

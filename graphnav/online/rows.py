@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.errors import RecordingError
+from graphnav.core.errors import RecordingError
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.solution import to_trajectory
 from graphnav.online.steady import Online
-from graphnav.plausibility import ACCEL_RANGE, GYRO_RANGE
-from graphnav.plausibility_gnss import FASTEST
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
-from graphnav.solution import to_trajectory
-from graphnav.trajectory import Trajectory
+from graphnav.recording.plausibility.fixes import FASTEST
+from graphnav.recording.plausibility.screening import ACCEL_RANGE, GYRO_RANGE
 
 _NONE, _ROWS = np.empty(0), np.empty((0, 3))
 _BLANK = (float("nan"),) * 3

@@ -1,6 +1,6 @@
 """Which rows of a live source cannot be right: beyond any sensor, out of reach, or of a clock that was set back.
 
-The judgements are those of a recording (`graphnav.plausibility`, `graphnav.formats.repair`), made row by row: a row is
+The judgements are those of a recording (`graphnav.recording.plausibility.screening`, `graphnav.recording.formats.repair`), made row by row: a row is
 left out as if it had never come, and counted. Rows that every sensor can have sent pass untouched.
 """
 
@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from graphnav.earth import llh_to_ecef
-from graphnav.formats.repair import VAGUEST, VAGUEST_V, on_earth
-from graphnav.plausibility import ACCEL_RANGE, GYRO_RANGE
-from graphnav.plausibility_gnss import FASTEST, MISLED
-from graphnav.rotation import Array
+from graphnav.core.earth import llh_to_ecef
+from graphnav.core.rotation import Array
+from graphnav.recording.formats.repair import VAGUEST, VAGUEST_V, on_earth
+from graphnav.recording.plausibility.fixes import FASTEST, MISLED
+from graphnav.recording.plausibility.screening import ACCEL_RANGE, GYRO_RANGE
 
 Row = tuple[str, float, tuple[float, ...]]  # sensor, time (s), values
 
@@ -25,9 +25,11 @@ _MOST = 600  # fixes: what contradicts so many that agreed is believed when ther
 _SET_BACK = 20  # IMU rows one after the other at times that have passed: not some that came late, but another clock
 _LASTING = 1.2  # s, that these last: more than a second, so that one stands at a second that is remembered
 _REMEMBERED = 36_000  # s, ten hours
-_SLOWEST = 0.5  # s between rows of an IMU (as in `graphnav.formats.repair`)
+_SLOWEST = 0.5  # s between rows of an IMU (as in `graphnav.recording.formats.repair`)
 _HELD = 200  # rows of other sensors
-_OVERTAKING = 10.0  # periods; rows that merely overtake each other are closer (as in `graphnav.formats.repair`)
+_OVERTAKING = (
+    10.0  # periods; rows that merely overtake each other are closer (as in `graphnav.recording.formats.repair`)
+)
 _HOLE = 1.5  # periods between two rows in which another may have been
 
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from graphnav.formats.repair import LATEST
+from graphnav.core.rotation import Array
 from graphnav.online.buffers import SAME, Buffer
 from graphnav.online.sanity import Clock, Reach, Row, fix_odds, imu_reads, odometer_reads, with_sane_velocity
 from graphnav.recording import Gnss, Odometer, Recording
-from graphnav.rotation import Array
+from graphnav.recording.formats.repair import LATEST
 
 AHEAD = 60.0  # s; stamps of other sensors further than this before the IMU's are wrong
 _WIDTH = {"imu": 6, "gnss": 18, "odometer": 6}  # the last six of a fix: usual sigmas of place and velocity

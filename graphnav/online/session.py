@@ -7,13 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from graphnav.config import Settings
-from graphnav.errors import RecordingError
+from graphnav.core.errors import RecordingError
+from graphnav.core.trajectory import Trajectory
 from graphnav.online.lines import END, row_of, setup_of
 from graphnav.online.sensors import Row, rows_of, without_rows
 from graphnav.online.steady import Online
 from graphnav.online.store import Store
 from graphnav.recording import Recording
-from graphnav.trajectory import Trajectory
 
 CHECKPOINTS = 60.0  # s of IMU time between checkpoints, each of tens of MB: as long as a resumed run has to redo
 _FEW = 5  # bad lines that are told

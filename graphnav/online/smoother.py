@@ -10,27 +10,27 @@ from collections import Counter
 
 import numpy as np
 
-from graphnav.alignment import Alignment, align, ready, with_known_heading
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
+from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import EstimationError
+from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
-from graphnav.earth import LocalFrame
-from graphnav.errors import EstimationError
-from graphnav.noise.exclusion import FIXES
-from graphnav.noise_model import STATED, NoiseModel
+from graphnav.estimation.alignment import Alignment, align, ready, with_known_heading
+from graphnav.estimation.noise.exclusion import FIXES
+from graphnav.estimation.noise.model import STATED, NoiseModel
+from graphnav.estimation.pipeline import origin
+from graphnav.estimation.preparation import start_sigma
+from graphnav.estimation.solution import Fault, to_trajectory
+from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.solvers.watch import LONGEST
+from graphnav.estimation.solvers.window import first_message
 from graphnav.online.ahead import Live
 from graphnav.online.judging import Again, Judgement
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import Tracker
-from graphnav.pipeline import origin
-from graphnav.preparation import start_sigma
 from graphnav.recording import Recording
-from graphnav.solution import Fault, to_trajectory
-from graphnav.solvers.batch import batch
-from graphnav.solvers.watch import LONGEST
-from graphnav.solvers.window import first_message
-from graphnav.trajectory import Trajectory
 
 AFTER = 0.05  # s of IMU after a keyframe that a fix may look at
 _ODOMETER = 0.3  # s that a keyframe waits for the odometer

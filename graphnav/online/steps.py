@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphnav.clipping import first_not_cut, highest
 from graphnav.config import Settings
 from graphnav.constraints import registered
 from graphnav.constraints.base import SAME_TIME
+from graphnav.core.rotation import Array
 from graphnav.detectors import detect
+from graphnav.estimation.problem import keyframe_times, to_samples
+from graphnav.imu.clipping import first_not_cut, highest
+from graphnav.imu.samples import bridge_gaps
 from graphnav.online.looks import SURE, Stops, clipped
 from graphnav.online.sensors import Sensors
-from graphnav.problem import keyframe_times, to_samples
-from graphnav.rotation import Array
-from graphnav.samples import bridge_gaps
 
 _WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector sees, and the least
 _SHORTEST = 0.05  # s between looks at a walk that are worth keyframes
@@ -24,7 +24,7 @@ class Steps:
     """Up to where a walk has been cut into steps, and what its IMU has read at most."""
 
     def __init__(self) -> None:
-        self.highest: Array | None = None  # as `graphnav.clipping.highest` says
+        self.highest: Array | None = None  # as `graphnav.imu.clipping.highest` says
         self._seen = -np.inf  # s, up to where that is known
         self._pieces: float | None = None  # s, begin of a standing that goes on, of which keyframes were made
         self.over: float | None = None  # s, begin of one that is over by now: its keyframes are to be made anew

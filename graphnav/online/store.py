@@ -22,10 +22,10 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
-from graphnav.errors import ConfigError, GraphnavError
-from graphnav.exporters import csv
+from graphnav.core.errors import ConfigError, GraphnavError
+from graphnav.core.trajectory import Trajectory
 from graphnav.online.steady import Online
-from graphnav.trajectory import Trajectory
+from graphnav.recording.exporters import csv
 
 TRAJECTORY, CHECKPOINT, SUMMARY = "trajectory.csv", "checkpoint", "summary.json"
 _MAGIC = b"graphnav checkpoint 3\n"

@@ -1,6 +1,6 @@
 """The graph of a running drive: keyframes posed as they come, stops classified, the window kept and settled.
 
-New keyframes are posed like a recording (`graphnav.problem.pose`), from the rows around them: the same code builds
+New keyframes are posed like a recording (`graphnav.estimation.problem.pose`), from the rows around them: the same code builds
 the same rows as offline. Whatever changes the past inside the window (a fix that comes late, a stop that is
 recognised a second or two after it began) takes back the keyframes from there on and poses them again.
 
@@ -21,27 +21,27 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import GnssPosition, GnssVelocity, node_spacing, period
 from graphnav.constraints.vehicle import REACH
+from graphnav.core.earth import LocalFrame
+from graphnav.core.findings import period_of
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
 from graphnav.detectors.base import merged
-from graphnav.dynamics import Motion
-from graphnav.earth import LocalFrame
-from graphnav.findings import period_of
-from graphnav.noise.apply import with_noise
-from graphnav.noise_model import STATED, NoiseModel
+from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.model import STATED, NoiseModel
+from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.solvers.elimination import Predicted
+from graphnav.estimation.solvers.stages import Place
+from graphnav.estimation.solvers.window import Message, Smoothed, turn_limit
+from graphnav.imu.dynamics import Motion
+from graphnav.imu.preintegration import preintegrate
+from graphnav.imu.samples import GAP, bridge_gaps
 from graphnav.online.ahead import Live, live, since
 from graphnav.online.chain import Chain
 from graphnav.online.looks import CONTEXT, SURE, Readings, clipped
 from graphnav.online.sensors import Sensors
 from graphnav.online.steps import Steps
-from graphnav.preintegration import preintegrate
-from graphnav.problem import Problem, pose
 from graphnav.recording import Recording
-from graphnav.rotation import Array
-from graphnav.samples import GAP, bridge_gaps
-from graphnav.solvers.elimination import Predicted
-from graphnav.solvers.stages import Place
-from graphnav.solvers.window import Message, Smoothed, turn_limit
-from graphnav.state import DIM, States
-from graphnav.wheels import MeanSpeed
+from graphnav.recording.odometer import MeanSpeed
 
 _NEAR = 2.0  # s of rows before a keyframe that its constraints look at where the IMU has no gap; else `CONTEXT`
 _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphnav.noise.exclusion import FIXES
+from graphnav.estimation.noise.exclusion import FIXES
+from graphnav.estimation.solution import to_trajectory
 from graphnav.online.session import Session
-from graphnav.solution import to_trajectory
 
 
 def view(session: Session, silent: float = 0.0) -> list[tuple[str, str]]:

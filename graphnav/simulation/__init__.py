@@ -11,8 +11,8 @@ import tomllib
 from collections.abc import Sequence
 from typing import Any
 
-from graphnav.complaints import nearest
-from graphnav.errors import ConfigError
+from graphnav.core.complaints import nearest
+from graphnav.core.errors import ConfigError
 from graphnav.simulation.result import Simulated
 from graphnav.simulation.scenarios import Scenario, scenarios
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav.earth import E2, A
+from graphnav.core.earth import E2, A
+from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Odometer
-from graphnav.rotation import Array
 from graphnav.simulation.kinematics import Motion, Mount
 from graphnav.simulation.motion import SLIP, Path
 from graphnav.simulation.splines import stream

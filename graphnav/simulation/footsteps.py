@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav.rotation import Array
+from graphnav.core.rotation import Array
 
 _GRID = 0.005  # m, between the points at which a way is integrated
 

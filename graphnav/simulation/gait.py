@@ -21,7 +21,7 @@ from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import logsumexp
 
-from graphnav.rotation import Array
+from graphnav.core.rotation import Array
 from graphnav.simulation.footsteps import Steps
 from graphnav.simulation.splines import centres, spline
 

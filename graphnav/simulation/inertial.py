@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphnav.core.rotation import Array
 from graphnav.recording import ImuNoise
-from graphnav.rotation import Array
 from graphnav.simulation.splines import stream
 from graphnav.simulation.vibration import MG, gauss_markov
 

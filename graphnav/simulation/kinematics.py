@@ -20,10 +20,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from graphnav import rotation
-from graphnav.earth import E2, RATE, A, ecef_to_llh, enu_axes, gravity, llh_to_ecef
-from graphnav.progress import tell
-from graphnav.rotation import Array
+from graphnav.core import rotation
+from graphnav.core.earth import E2, RATE, A, ecef_to_llh, enu_axes, gravity, llh_to_ecef
+from graphnav.core.progress import tell
+from graphnav.core.rotation import Array
 from graphnav.simulation.motion import BANK, HEADING, SLIP, SLOPE, SPEED, Path
 from graphnav.simulation.vibration import PITCH, ROLL, Shake
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline
 
-from graphnav.errors import ConfigError
-from graphnav.findings import runs_of
-from graphnav.rotation import Array
+from graphnav.core.errors import ConfigError
+from graphnav.core.findings import runs_of
+from graphnav.core.rotation import Array
 from graphnav.simulation.splines import centres, spline
 
 STEP = 0.1  # s between coefficients: a driver's foot and hands do not move faster

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
-from graphnav.rotation import Array
+from graphnav.core.rotation import Array
 from graphnav.simulation.motion import Path
 from graphnav.simulation.vibration import UP, Part, oscillator, sampled, shake_times, swayed
 

@@ -18,15 +18,15 @@ from typing import Any
 
 import numpy as np
 
-from graphnav import rotation
-from graphnav.earth import LocalFrame
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array, mv
+from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Imu, Recording, Truth
-from graphnav.rotation import Array, mv
 from graphnav.simulation.gait import HEADING, PITCH, PLACE, ROLL, STEP, Foot
 from graphnav.simulation.inertial import ImuModel
 from graphnav.simulation.kinematics import Motion
 from graphnav.simulation.result import Simulated, rounded
-from graphnav.trajectory import Trajectory
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 _CHUNK = 1 << 13  # samples at a time

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.formats.writing import rounded, write_facts, write_folder
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Imu, Recording, Truth
-from graphnav.rotation import Array
+from graphnav.recording.formats.writing import rounded, write_facts, write_folder
 from graphnav.simulation.aiding import GnssModel, OdometerModel
 from graphnav.simulation.inertial import ImuModel
 from graphnav.simulation.kinematics import Motion, Mount, move
 from graphnav.simulation.motion import Path
 from graphnav.simulation.vibration import Shake
-from graphnav.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import zlib
 import numpy as np
 from scipy.interpolate import BSpline
 
-from graphnav.rotation import Array
+from graphnav.core.rotation import Array
 
 
 def centres(start: float, end: float, step: float, degree: int) -> Array:

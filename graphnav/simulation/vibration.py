@@ -13,7 +13,7 @@ import numpy as np
 from scipy import signal
 from scipy.interpolate import BSpline
 
-from graphnav.rotation import Array
+from graphnav.core.rotation import Array
 from graphnav.simulation.motion import HEADING, SPEED, Path
 from graphnav.simulation.splines import centres, spline
 

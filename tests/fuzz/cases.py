@@ -30,20 +30,20 @@ import numpy as np
 import raw_cases
 import test_formats_binary as binary
 
-from graphnav import cli
+from graphnav.app import cli
 from graphnav.config import read_settings, settings_from, settings_text
-from graphnav.errors import GraphnavError
-from graphnav.formats import load, read
-from graphnav.formats.schema import read_description
-from graphnav.formats.trajectories import read_trajectory
-from graphnav.formats.writer import write_recording
-from graphnav.noise.files import read_noise, write_noise
+from graphnav.core.errors import GraphnavError
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.noise.files import read_noise, write_noise
+from graphnav.estimation.pipeline import run
 from graphnav.online import Session
 from graphnav.online.lines import lines_of
-from graphnav.pipeline import run
-from graphnav.plausibility import screened
 from graphnav.recording import Recording
-from graphnav.trajectory import Trajectory
+from graphnav.recording.formats import load, read
+from graphnav.recording.formats.schema import read_description
+from graphnav.recording.formats.trajectories import read_trajectory
+from graphnav.recording.formats.writer import write_recording
+from graphnav.recording.plausibility.screening import screened
 
 KINDS = ("right", "refused", "traceback", "hang", "silent wrong")
 SECONDS = 10.0  # of a processor
@@ -106,7 +106,7 @@ def seeds() -> Path:
     shutil.copytree(logs.write_kitti(folder / "kitti", recording.crop(0.0, 2.0), truth), folder / "raw")
     found = run(recording, QUICK, ("ekf",))["ekf"]
     track = found.trajectory(5.0)
-    from graphnav.exporters import write_as
+    from graphnav.recording.exporters import write_as
 
     for name in ("csv", "tum"):
         write_as(name, track, folder / f"t.{name}")
@@ -117,7 +117,7 @@ def seeds() -> Path:
 
 
 def load_of(recording: Recording) -> Any:
-    from graphnav.formats.registry import Log
+    from graphnav.recording.formats.registry import Log
 
     r = recording
     return Log(r.name, r.imu, r.gnss, r.odometer, r.truth, r.platform)

@@ -13,12 +13,12 @@ import mutators
 import numpy as np
 import test_raw_ubx
 
-from graphnav.raw.load import Sources, load_raw
-from graphnav.raw.rinex_nav import read_navigation
-from graphnav.raw.rinex_obs import read_observations
-from graphnav.raw.series import Observations
-from graphnav.raw.signals import GPS, satellite_name
-from graphnav.timescales import gps_to_utc
+from graphnav.core.timescales import gps_to_utc
+from graphnav.gnss.load import Sources, load_raw
+from graphnav.gnss.rinex_nav import read_navigation
+from graphnav.gnss.rinex_obs import read_observations
+from graphnav.gnss.series import Observations
+from graphnav.gnss.signals import GPS, satellite_name
 
 REAL = Path(__file__).resolve().parents[2] / "data" / "tokyo_raw"
 _EPOCHS = 12

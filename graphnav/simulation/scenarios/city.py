@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.errors import ConfigError
-from graphnav.rotation import Array
+from graphnav.core.errors import ConfigError
+from graphnav.core.rotation import Array
 from graphnav.simulation.aiding import GnssModel, OdometerModel, Span
 from graphnav.simulation.inertial import MEMS
 from graphnav.simulation.kinematics import Mount

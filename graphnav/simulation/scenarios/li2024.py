@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphnav.errors import ConfigError
+from graphnav.core.errors import ConfigError
 from graphnav.simulation.aiding import GnssModel, OdometerModel
 from graphnav.simulation.inertial import EG370N
 from graphnav.simulation.kinematics import Mount

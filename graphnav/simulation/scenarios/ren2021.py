@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphnav.errors import ConfigError
+from graphnav.core.errors import ConfigError
 from graphnav.simulation.footsteps import Cadence, footsteps, rectangle, way
 from graphnav.simulation.gait import Sole, Style
 from graphnav.simulation.gait import walk as walk_over

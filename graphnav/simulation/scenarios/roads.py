@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from graphnav.errors import ConfigError
+from graphnav.core.errors import ConfigError
 from graphnav.simulation.aiding import OdometerModel
 from graphnav.simulation.inertial import MEMS
 from graphnav.simulation.kinematics import Mount

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from graphnav.errors import ConfigError
+from graphnav.core.errors import ConfigError
 from graphnav.simulation.aiding import Fault, GnssModel, OdometerModel, Span
 from graphnav.simulation.inertial import ImuModel, accelerometer, gyroscope
 from graphnav.simulation.kinematics import Mount

@@ -1,0 +1,260 @@
+"""The program `graphnav`. Commands read their options here; `graphnav.app.workflow` and `graphnav.app.outputs` do the work.
+
+Nothing heavy is imported before a command runs, so that help comes at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from graphnav import __version__
+from graphnav.app import cli_fleet, cli_logs, cli_online, cli_solve
+from graphnav.app.cli_options import (
+    SEVERAL,
+    AllowOutside,
+    Config,
+    End,
+    Fire,
+    Json,
+    Out,
+    Profile,
+    Quiet,
+    Require,
+    Source,
+    Start,
+    Topic,
+    Without,
+    firing,
+    only,
+    withheld_of,
+)
+from graphnav.app.talk import (
+    BAD_INPUT,
+    DEBUG,
+    INTERNAL,
+    INTERRUPTED,
+    PIPE_CLOSED,
+    Interrupted,
+    bar,
+    fail,
+    insist,
+    say,
+    show,
+)
+from graphnav.core.errors import GraphnavError
+from graphnav.core.files import outside_allowed
+from graphnav.core.progress import tell
+
+__all__ = ["DEBUG", "PIPE_CLOSED", "app", "main", "run"]
+
+# Before NumPy is imported: see `graphnav.estimation.pipeline`, which limits threads for those who do not come this way.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+app = typer.Typer(
+    name="graphnav",
+    add_completion=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Smooths recorded drives with a factor graph, beside the Kalman filter it replaces.",
+    epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out",
+)
+
+
+@app.callback(invoke_without_command=True)
+def _program(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
+) -> None:
+    if version:
+        say(f"graphnav {__version__}")
+        raise typer.Exit()
+    if context.invoked_subcommand is None:
+        say(context.get_help())
+        raise typer.Exit(BAD_INPUT)
+
+
+@app.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav info kitti")
+def info(
+    context: typer.Context,
+    recording: Source,
+    antenna: Annotated[
+        bool, typer.Option("--antenna", help="Also find the antenna from the drive, and compare with its lever arm.")
+    ] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Leave out what takes solving: the signs of lever arms.")
+    ] = False,
+    topic: Topic = None,
+    allow_outside: AllowOutside = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Check a recording and say what it holds: sensors, rates, gaps, distance, stops, and what is odd."""
+    from graphnav.recording.checks.overview import inspect
+    from graphnav.recording.formats import read
+
+    with bar(quiet, "ekf" if antenna else "info"):
+        tell("reading")
+        whole = read(only(context, recording), topic or (), allow_outside)
+        tell("checks")
+        found = inspect(whole)
+        from graphnav.estimation.antenna import find_antenna, reversed_arms
+
+        more = reversed_arms(found.recording) if found.trusted and not quick else []
+        found = replace(found, findings=(*more, *found.findings, *([find_antenna(whole).finding] if antenna else [])))
+    show(found.text, found.values, quiet, json)
+
+
+@app.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")
+def detect(
+    context: typer.Context,
+    recording: Source,
+    out: Out,
+    config: Config = None,
+    detectors: Fire = None,
+    without: Without = None,
+    start: Start = None,
+    end: End = None,
+    topic: Topic = None,
+    allow_outside: AllowOutside = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Find where the vehicle stands, and write the intervals, the statistics they come from and a picture."""
+    from graphnav.app import outputs, workflow
+    from graphnav.config import read_settings
+    from graphnav.core.staging import moved, staged
+    from graphnav.detectors import detect as detected
+    from graphnav.recording.plausibility.screening import screened
+    from graphnav.report import detections as detection_report
+
+    withheld = withheld_of(without, start, end)
+    settings = firing(read_settings(config), detectors)
+    folder = outputs.output_folder(out)
+    with bar(quiet, "detect"), outside_allowed(allow_outside):
+        tell("reading")
+        used, said = screened(workflow.read_part(only(context, recording), start, end, withheld, tuple(topic or ())))
+        tell("detection")
+        found = detected(used, settings)
+        found = replace(found, notes=(*said, *found.notes))
+        tell("writing")
+        with staged(folder) as part:
+            files = detection_report.write(used, found, part)
+    files = moved(files, part, folder)
+    show(
+        lambda: detection_report.text(used, found, files),
+        lambda: {**detection_report.values(used, found), "files": files},
+        quiet,
+        json,
+    )
+
+
+@app.command(epilog="\b\nExample:\n  graphnav evaluate out/kitti/trajectory.csv truth.csv --require 'h_rms<0.5'")
+def evaluate(
+    trajectory: Annotated[Path, typer.Argument(metavar="TRAJECTORY", help="CSV, TUM, KF-GINS .nav or RTKLIB .pos.")],
+    truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="The same kinds, or a recording with a truth.")],
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="OUT", help="Folder for evaluation.json and errors.csv.")
+    ] = None,
+    require: Require = None,
+    allow_outside: AllowOutside = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Compare any trajectory file with any truth file, ours or another program's."""
+    from graphnav.app import outputs
+    from graphnav.core.staging import staged
+    from graphnav.evaluation import gates
+    from graphnav.evaluation.evaluate import evaluate as compared
+    from graphnav.evaluation.metrics import comparison_rows, summary, text
+
+    requirements = [gates.parse_requirement(one) for one in require or ()]
+    folder = None if out is None else outputs.output_folder(out)
+    with bar(quiet, "evaluate"), outside_allowed(allow_outside):
+        tell("reading")
+        metrics = compared(trajectory, truth)
+    values = {"trajectory": str(trajectory), "truth": str(truth), **summary(metrics)}
+    verdicts = gates.judge(requirements, comparison_rows({trajectory.stem: metrics}))
+    if verdicts:
+        values["requirements"] = gates.values(verdicts)
+    if folder is not None:
+        with staged(folder) as part:
+            outputs.write_evaluation(part, values, metrics)
+    show(lambda: text(metrics) + gates.text(verdicts), lambda: values, quiet, json)
+    insist(verdicts)
+
+
+@app.command(epilog="\b\nExample:\n  graphnav settings --profile car > settings.toml")
+def settings(
+    profile: Profile = None,
+    config: Config = None,
+    json: Json = False,
+) -> None:
+    """Print all settings as a file for --config: the defaults, a profile's, or those that a file or a run comes to."""
+    from graphnav.config import read_settings, settings_text
+
+    found = read_settings(config, profile)
+    show(lambda: settings_text(found), found.model_dump, False, json)
+
+
+app.add_typer(cli_solve.commands)
+app.add_typer(cli_logs.commands)
+app.add_typer(cli_online.commands)
+app.add_typer(cli_fleet.commands)
+
+
+def main() -> None:
+    """Run the program and leave with its exit code: 0, or 2 for bad input or usage with one line that says why."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run the program on `arguments`; returns the exit code and lets no traceback through."""
+    debug = bool(os.environ.get(DEBUG))
+    if not debug:
+        import warnings
+
+        warnings.simplefilter("ignore")
+    try:
+        code = app(arguments, prog_name="graphnav", standalone_mode=False)
+    except GraphnavError as error:
+        return fail(str(error), BAD_INPUT, debug)
+    except Interrupted as error:
+        return fail(str(error), INTERRUPTED, False)
+    except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
+    except MemoryError:
+        return fail("out of memory; use a shorter part (--start, --end)", INTERNAL, debug)
+    except OSError as error:
+        # files are read and written by modules that turn what they expect into sentences; this is a full disk or so
+        return fail(f"{error.filename or 'input or output'}: {error.strerror or error}", BAD_INPUT, debug)
+    except Exception as error:
+        if hasattr(error, "format_message"):  # typer's own: a usage error
+            return fail(_usage(error), BAD_INPUT, debug)
+        return fail(_internal(error), INTERNAL, debug)
+    if code == INTERRUPTED:
+        return fail("interrupted", INTERRUPTED, False)
+    return code if isinstance(code, int) else 0
+
+
+def _usage(error: Any) -> str:
+    """A usage error, and the command whose help says more."""
+    path = getattr(getattr(error, "ctx", None), "command_path", "graphnav")
+    return f"{error.format_message().rstrip('.')}; see {path} --help"
+
+
+def _internal(error: Exception) -> str:
+    """The error and the last line of graphnav that led to it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    package = Path(__file__).parent
+    at = ([frame for frame in frames if package in Path(frame.filename).parents] or list(frames))[-1]
+    return (
+        f"internal error: {type(error).__name__}: {error} in {Path(at.filename).name}:{at.lineno}; "
+        f"please report this with the command ({DEBUG}=1 shows a traceback)"
+    )

@@ -1,0 +1,151 @@
+"""The command `fleet`: many recordings at once. `graphnav.app.cli` has the others."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from graphnav.app.cli_options import (
+    AllowOutside,
+    Config,
+    End,
+    Json,
+    Noise,
+    Out,
+    Pages,
+    Profile,
+    Quiet,
+    Rate,
+    Start,
+    Without,
+)
+from graphnav.app.talk import Interrupted, say, show
+from graphnav.core.errors import ConfigError
+from graphnav.core.files import outside_allowed
+
+commands = typer.Typer()
+
+
+@commands.command(epilog="\b\nExample:\n  graphnav fleet drives -o out --solver rts --withhold 60")
+def fleet(
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="A folder of recordings, or a manifest .csv or .toml.")
+    ],
+    out: Out,
+    solver: Annotated[
+        str, typer.Option("--solver", metavar="NAME", help="batch, incremental, isam2, rts or ekf.")
+    ] = "batch",
+    profile: Profile = None,
+    config: Config = None,
+    noise: Noise = None,
+    withhold: Annotated[
+        float | None, typer.Option("--withhold", metavar="S", help="Withhold GNSS for S s again and again; score that.")
+    ] = None,
+    without: Without = None,
+    rate: Rate = None,
+    start: Start = None,
+    end: End = None,
+    processes: Annotated[
+        int | None, typer.Option("--processes", metavar="N", min=1, help="Drives at once; default: one a processor.")
+    ] = None,
+    limit: Annotated[
+        float, typer.Option("--limit", metavar="S", min=1.0, help="What one drive may take before it is ended.")
+    ] = 3600.0,
+    memory: Annotated[
+        float | None,
+        typer.Option(
+            "--memory", metavar="MB", min=1.0, help="What one drive may hold; default: its share of the machine."
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster that sees the same files.")
+    ] = None,
+    again: Annotated[bool, typer.Option("--again", help="Solve also what is done already.")] = False,
+    pages: Pages = True,
+    allow_outside: AllowOutside = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Solve many recordings, each apart from the others: one table, one page. What is done is not done again."""
+    from graphnav.app import convert, outputs
+    from graphnav.app.fleet import manifest, page, tables, workers
+    from graphnav.app.fleet.drive import DONE, Row
+    from graphnav.core.staging import moved, staged
+
+    convert.check_rate(rate)
+    if withhold is not None and not withhold > 0.0:
+        raise ConfigError(f"--withhold {withhold:g}: must be a number of seconds above 0")
+    asked = manifest.Asked(
+        solver,
+        profile,
+        None if config is None else str(config),
+        None,
+        noise and _full(noise),
+        " ".join(without or ()) or None,
+        start,
+        end,
+    )
+    folder = outputs.output_folder(out, ("fleet.csv", "fleet.parquet", "fleet.html"), ("drives",)).resolve()
+    with outside_allowed(allow_outside):
+        drives = manifest.read_drives(source.resolve(), asked)
+    known: dict[Any, Any] = {}
+    tasks = [
+        manifest.task_of(
+            drive, folder, known, withhold=withhold, rate=rate, pages=pages, again=again, outside=allow_outside
+        )
+        for drive in drives
+    ]
+    if scheduler is not None:
+        found = workers.solve_on_cluster(tasks, scheduler, workers.Limits(limit, memory))
+    else:
+        count = processes or _processors()
+        found = workers.solve_here(tasks, count, workers.Limits(limit, memory or workers.share_of_memory(count)))
+    done: dict[str, Row] = {}
+    try:
+        for row in found:
+            done[row["drive"]] = row if len(done) < page.DRAWN else {**row, "track": None}
+            if not (quiet or json):
+                say(f"[{len(done)}/{len(tasks)}] {row['drive']}: {_said(row)}")
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted after {len(done)} of {len(tasks)} drives; the same command goes on") from None
+    rows = [done[task.name] for task in tasks]
+    with staged(folder) as part:
+        tables.write_csv(rows, part / "fleet.csv")
+        files = [part / "fleet.csv"]
+        if tables.write_parquet(rows, part / "fleet.parquet"):
+            files.append(part / "fleet.parquet")
+        page.write_page(rows, part / "fleet.html", f"{source.name}: {len(rows)} drives")
+        files.insert(0, part / "fleet.html")
+    files = moved(files, part, folder)
+    lacking = "" if len(files) > 2 else "\nno fleet.parquet: pyarrow is not installed"
+    show(
+        lambda: "\n".join([tables.text(rows) + lacking, "look at", *(f"  {file}" for file in files)]),
+        lambda: {
+            **tables.totals(rows),
+            "rows": [{k: v for k, v in r.items() if k != "track"} for r in rows],
+            "files": files,
+        },
+        quiet,
+        json,
+    )
+    if not any(row["status"] == DONE for row in rows):
+        raise ConfigError(f"{source}: none of {len(rows)} drives could be solved; {folder / 'fleet.csv'} says why")
+
+
+def _processors() -> int:
+    """Those that this process may use, where the system says so."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _full(noise: str) -> str:
+    return str(Path(noise).resolve()) if Path(noise).is_file() else noise
+
+
+def _said(row: dict[str, Any]) -> str:
+    """One line on a drive."""
+    if row["status"] != "done":
+        return f"{row['status']}: {row.get('error')}"
+    return f"{row.get('verdict')}, {row['time_s']:.1f} s" + (", done before" if row.get("skipped") else "")

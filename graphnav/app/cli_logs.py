@@ -1,0 +1,218 @@
+"""Commands that make or describe recordings: `convert`, `init`, `allan`, `simulate`. `graphnav.app.cli` has the others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tomllib import loads
+from typing import Annotated
+
+import typer
+
+from graphnav.app.cli_options import AllowOutside, Export, Json, Point, Quiet, Topic
+from graphnav.app.talk import bar, say, show
+from graphnav.core.errors import ConfigError
+from graphnav.core.files import outside_allowed
+from graphnav.core.progress import tell
+
+commands = typer.Typer()
+
+
+@commands.command(
+    epilog="\b\nExamples:\n  graphnav convert dataset/kf-gins.yaml -o drive\n"
+    "  graphnav convert out/trajectory.csv -o track.gpx --point antenna"
+)
+def convert(
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help="Another program's log, or a trajectory file.")],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder; for a trajectory, a file will do.")],
+    format: Annotated[
+        str | None, typer.Option("--format", metavar="NAME", help="What the log is, where that is not seen.")
+    ] = None,
+    export: Export = None,
+    point: Point = None,
+    rate: Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Trajectory: interpolate to.")] = None,
+    clock: Annotated[
+        str | None,
+        typer.Option("--clock", metavar="TEXT", help="Trajectory: unix, 'gps week 2313' or a UTC date of t = 0."),
+    ] = None,
+    topic: Topic = None,
+    allow_outside: AllowOutside = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Turn another program's log into a recording folder, or a trajectory into another format of trajectories."""
+    from graphnav.app import convert as conversion
+    from graphnav.app.outputs import output_folder
+    from graphnav.core.staging import moved, staged
+
+    if export is not None and format is not None:
+        raise ConfigError(f"--format {format}: is for logs; what a trajectory is, is seen from its content")
+    if export is not None or conversion.is_export(Path(source), out, format):
+        conversion.check_rate(rate)
+        alone = bool(out.suffix) and not out.is_dir()
+        folder = output_folder(out.parent if alone else out)
+        with bar(quiet, "convert"), staged(folder) as part:
+            target = part / out.name if alone else part
+            _, files, notes = conversion.export_file(Path(source), target, export or format, point, rate, clock)
+        files = moved(files, part, folder)
+        show(
+            lambda: "\n".join([*(f"note: {note}" for note in notes), *(f"wrote {file}" for file in files)]),
+            lambda: {"notes": notes, "files": files},
+            quiet,
+            json,
+        )
+        return
+    for option, value in (("--point", point), ("--rate", rate), ("--clock", clock)):
+        if value is not None:
+            raise ConfigError(f"{option}: is for trajectories; a log keeps its own")
+    folder = output_folder(out)
+    with bar(quiet, "convert"), outside_allowed(allow_outside):
+        tell("reading")
+        log, files = conversion.convert_log(source, folder, format, topic or ())
+    show(
+        lambda: conversion.log_text(log, files),
+        lambda: {**conversion.log_values(log), "files": files},
+        quiet,
+        json,
+    )
+
+
+@commands.command(epilog="\b\nExample:\n  graphnav allan rest.csv -o out/allan")
+def allan(
+    log: Annotated[str, typer.Argument(metavar="LOG", help="A log at rest: CSV, a recording or a known log.")],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into.")],
+    start: Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from its start.")] = None,
+    end: Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from its start.")] = None,
+    topic: Topic = None,
+    allow_outside: AllowOutside = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Measure the noise figures of an IMU from a log at rest, and print them as lines for recording.toml."""
+    from graphnav.app.outputs import output_folder
+    from graphnav.core.errors import RecordingError
+    from graphnav.core.staging import moved, staged
+    from graphnav.recording.allan import allan_of, files
+    from graphnav.recording.draft import imu_of
+    from graphnav.recording.formats import load
+
+    folder = output_folder(out)
+    with bar(quiet, "allan"), outside_allowed(allow_outside):
+        tell("reading")
+        if log.endswith((".csv", ".csv.gz")):
+            t, gyro, accel = imu_of(Path(log))
+        else:
+            imu = load(log, topics=topic or ()).imu
+            if imu is None:
+                raise RecordingError(f"{log}: holds no IMU")
+            t, gyro, accel = imu.t, imu.gyro, imu.accel
+        since = t - t[0]
+        part_asked = (since >= (start or 0.0)) & (since <= (since[-1] if end is None else end))
+        if part_asked.sum() < 2:
+            raise ConfigError(f"--start, --end: nothing of {log} lies between them; it runs to {since[-1]:.1f} s")
+        tell("variances")
+        try:
+            result = allan_of(t[part_asked], gyro[part_asked], accel[part_asked])
+        except RecordingError as error:
+            raise RecordingError(f"{log}: {error}") from None
+        tell("writing")
+        with staged(folder) as part:
+            written = files.write(result, part)
+    written = moved(written, part, folder)
+    lines = [f"{result.duration:.0f} s at rest, {result.rate:.4g} Hz", "", "[imu.noise]", *result.lines(), ""]
+    show(
+        lambda: "\n".join([*lines, *(f"wrote {path}" for path in written)]),
+        lambda: {
+            "duration_s": result.duration,
+            "rate_hz": result.rate,
+            "noise": loads("\n".join(result.lines())),
+            "files": written,
+        },
+        quiet,
+        json,
+    )
+
+
+@commands.command(epilog="\b\nExample:\n  graphnav init imu.csv ride.nmea -o recording.toml")
+def init(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="CSV files, or logs of a known kind.")],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The .toml to write.")] = Path(
+        "recording.toml"
+    ),
+    name: Annotated[str | None, typer.Option("--name", help="Of the recording; default: its folder's.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
+    topic: Topic = None,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Draft a recording.toml from logs: columns, units, axes and clocks as they seem to be, and why."""
+    from graphnav.app.outputs import output_folder
+    from graphnav.core.staging import staged
+    from graphnav.recording.draft import draft
+    from graphnav.recording.formats.writer import write_csv
+
+    out = out / "recording.toml" if out.is_dir() else out
+    if out.suffix != ".toml":
+        raise ConfigError(f"-o {out}: name a .toml file, or a folder for recording.toml")
+    if out.exists() and not force:
+        raise ConfigError(f"-o {out}: is there already; name another file, or say --force")
+    folder = output_folder(out.parent)
+    with bar(quiet, "init"):
+        tell("reading")
+        drafted = draft(logs, folder, name, topic or ())
+        for made in drafted.made:
+            if (folder / made).exists() and not force:
+                raise ConfigError(f"{folder / made}: is there already; say --force to write over it")
+        with staged(folder) as part:
+            for made, columns in drafted.made.items():
+                write_csv(part / made, list(columns), list(columns.values()))
+            (part / out.name).write_text(drafted.text, encoding="utf-8")
+    files = [out, *(folder / made for made in drafted.made)]
+    show(
+        lambda: "\n".join(
+            [*(f"  {line}" for line in drafted.decisions), f"wrote {out}; look at the lines marked CHECK"]
+        ),
+        lambda: {"decisions": drafted.decisions, "files": files},
+        quiet,
+        json,
+    )
+
+
+@commands.command(epilog="\b\nExample:\n  graphnav simulate urban -o out/urban --seed 1")
+def simulate(
+    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help="Its name; none lists them.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Folder for the recording; made if need be.")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", help="The same seed gives the same recording.")] = 0,
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="An option of the scenario; may be repeated. See --list."),
+    ] = None,
+    listing: Annotated[bool, typer.Option("--list", help="List the scenarios and their options.")] = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Make a recording with truth: a simulated drive, with the errors of simulated sensors."""
+    from graphnav.app import outputs
+    from graphnav.core.staging import moved, staged
+    from graphnav.simulation import catalogue, options_from
+    from graphnav.simulation import simulate as simulated
+
+    if listing or scenario is None:
+        say(catalogue())
+        return
+    if out is None:
+        raise ConfigError("say where to write the recording: -o DIR")
+    folder = outputs.output_folder(out)
+    options = options_from(scenario, option or [])
+    with bar(quiet, "simulate"):
+        made = simulated(scenario, seed, **options)
+        with staged(folder) as part:
+            files = made.write(part)
+    files = moved(files, part, folder)
+    show(
+        lambda: "\n".join([made.text(), *(f"  {file}" for file in files)]),
+        lambda: {"scenario": scenario, "seed": seed, "options": options, "stops": made.stops, "files": files},
+        quiet,
+        json,
+    )

@@ -1,0 +1,263 @@
+"""The command `online`: smooth while the drive happens, a recording replayed or a live source of lines.
+
+What has settled is on disk at once. Ctrl-C, a crash or a full disk lose none of it; --resume goes on from there.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from graphnav.app.cli_options import AllowOutside, Config, Profile, Quiet, Topic
+from graphnav.app.talk import Interrupted, say
+from graphnav.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from graphnav.config import Settings
+    from graphnav.online.session import Session
+
+LONGEST = 1 << 20  # bytes of a line
+TICK = 0.5  # s between views, and of waiting for a source
+
+commands = typer.Typer()
+
+
+@commands.command(
+    epilog="\b\nExamples:\n  graphnav online data/tokyo --speed 10 -o out/online\n"
+    "  graphnav online tcp:5005 -o out/live\n"
+    "  graphnav online data/tokyo --send --speed 1 | graphnav online - -o out/live"
+)
+def online(
+    source: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="A recording; - for lines from standard input; tcp:PORT.")
+    ],
+    out: Annotated[Path | None, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into.")] = None,
+    speed: Annotated[
+        float, typer.Option("--speed", metavar="X", help="Times real time of a replay; 0: as fast as it goes.")
+    ] = 0.0,
+    lag: Annotated[
+        float | None, typer.Option("--lag", metavar="S", help="How much of the future a settled state has seen.")
+    ] = None,
+    engine: Annotated[
+        str | None, typer.Option("--engine", metavar="NAME", help="What smooths: window, or isam2 (GTSAM's).")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in OUT.")] = False,
+    send: Annotated[bool, typer.Option("--send", help="Print the recording as lines instead of smoothing it.")] = False,
+    profile: Profile = None,
+    config: Config = None,
+    topic: Topic = None,
+    allow_outside: AllowOutside = False,
+    quiet: Quiet = False,
+) -> None:
+    """Smooth while the drive happens: a recording replayed, or lines of a live source (docs/online.md)."""
+    from graphnav.app.outputs import output_folder
+    from graphnav.config import read_settings
+    from graphnav.online.session import Session
+    from graphnav.recording.formats import read
+
+    if send:
+        _send(source, topic or [], allow_outside, speed)
+        return
+    settings = _changed(read_settings(config, profile), lag, engine)
+    if resume and out is None:
+        raise ConfigError("--resume: say which folder to go on in: -o OUT")
+    folder = None if out is None else output_folder(out)
+    live = source == "-" or source.startswith("tcp:")
+    recording = None if live else read(source, topic or (), allow_outside)
+    session = Session(settings, source, folder, resume, recording)
+    shown = Shown(session, quiet)
+    with Asked() as asked:
+        try:
+            if live:
+                follow(session, standard_input() if source == "-" else connections(source), shown, asked)
+            else:
+                replay(session, Pace(speed), shown, asked)
+            if not asked:
+                session.finish()
+            elif not session.done:
+                session.stop()
+        finally:
+            session.close()
+            shown.last()
+    if asked and not session.done:
+        raise Interrupted("interrupted" + (f"; go on with --resume -o {folder}" if folder else ""))
+    session.require_settled()
+
+
+def _changed(settings: Settings, lag: float | None, engine: str | None) -> Settings:
+    """The settings with what was typed in the place of theirs."""
+    from graphnav.config import settings_from
+
+    if lag is not None and not lag >= 1.0:
+        raise ConfigError(f"--lag {lag:g}: must be at least 1 s")
+    if engine is not None and engine not in ("window", "isam2"):
+        raise ConfigError(f"--engine {engine}: must be window or isam2")
+    typed = {key: value for key, value in (("lag", lag), ("engine", engine)) if value is not None}
+    return settings_from(settings.model_dump() | {"solver": settings.solver.model_dump() | typed})
+
+
+def _send(source: str, topics: list[str], allow_outside: bool, speed: float) -> None:
+    """Print a recording's lines, as its sensors would have sent them."""
+    from graphnav.online.lines import END, lines_of
+    from graphnav.recording.formats import read
+
+    pace = Pace(speed)
+    for t, line in lines_of(read(source, topics, allow_outside)):
+        pace.wait(t)
+        say(line, flush=speed > 0 or line == END)
+
+
+def replay(session: Session, pace: Pace, shown: Shown, asked: Asked) -> None:
+    """Take in the rows of a recording when they are due."""
+    for row in session.rows[session.taken :]:
+        pace.wait(row[1], shown.update, asked)
+        if asked:
+            return
+        session.add(row)
+        shown.now_and_then()
+
+
+class Asked:
+    """Whether Ctrl-C or a SIGTERM asked to end: between two rows, where the smoother is whole."""
+
+    def __init__(self) -> None:
+        self.so = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Asked:
+        self._before = {what: signal.signal(what, self._ask) for what in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        for what, handler in self._before.items():
+            signal.signal(what, handler)
+
+    def __bool__(self) -> bool:
+        return self.so
+
+    def _ask(self, _: int, frame: FrameType | None) -> None:
+        if self.so:
+            raise KeyboardInterrupt  # asked twice: at once, from the checkpoint on disk
+        self.so = True
+
+
+def follow(session: Session, chunks: Iterator[bytes], shown: Shown, asked: Asked) -> None:
+    """Take in lines until the source ends or says so; b"" means that nothing came for a while."""
+    rest, heard = b"", time.monotonic()
+    for chunk in chunks:
+        if chunk:
+            *whole, rest = (rest + chunk).split(b"\n")
+            rest = rest[:LONGEST]  # what never ends is no row, and told as such when it does
+            whole = [line[:LONGEST] for line in whole]
+            session.add_lines([line.decode("utf-8", "replace") for line in whole], asked.__bool__)
+            heard = time.monotonic()
+        shown.now_and_then(time.monotonic() - heard)
+        if session.done or asked:
+            return
+
+
+def standard_input() -> Iterator[bytes]:
+    while True:
+        if select.select([sys.stdin.fileno()], [], [], TICK)[0]:
+            chunk = os.read(sys.stdin.fileno(), 1 << 16)
+            if not chunk:
+                return
+            yield chunk
+        else:
+            yield b""
+
+
+def connections(source: str) -> Iterator[bytes]:
+    """What clients send, one after the other; a client that leaves may come back."""
+    try:
+        server = socket.create_server(("127.0.0.1", int(source.removeprefix("tcp:"))))
+    except (ValueError, OSError) as error:
+        raise ConfigError(f"{source}: cannot listen there ({error})") from None
+    with server:
+        while True:
+            if not select.select([server], [], [], TICK)[0]:
+                yield b""
+                continue
+            client, _ = server.accept()
+            with client:
+                while True:
+                    if not select.select([client], [], [], TICK)[0]:
+                        yield b""
+                        continue
+                    try:
+                        chunk = client.recv(1 << 16)
+                    except OSError:
+                        chunk = b""
+                    if not chunk:
+                        yield b"\n"  # a line torn off is none
+                        break
+                    yield chunk
+
+
+class Pace:
+    """Waits until a row is due at so many times real time."""
+
+    def __init__(self, speed: float) -> None:
+        self.speed, self.began, self.first = speed, time.monotonic(), float("nan")
+
+    def wait(self, t: float, meanwhile: Callable[[], None] | None = None, asked: Asked | None = None) -> None:
+        if self.speed <= 0.0:
+            return
+        if self.first != self.first:
+            self.first, self.began = t, time.monotonic()
+        while (ahead := (t - self.first) / self.speed - (time.monotonic() - self.began)) > 0.0:
+            time.sleep(min(ahead, TICK))
+            if asked:
+                return
+            if meanwhile is not None and ahead > TICK:
+                meanwhile()
+
+
+class Shown:
+    """The live view: a table that stays in place on a terminal, else a line now and then."""
+
+    def __init__(self, session: Session, quiet: bool) -> None:
+        self.session, self.quiet, self.next = session, quiet, 0.0
+        self.live: Any = None
+        if not quiet and sys.stdout.isatty():
+            from rich.live import Live
+
+            self.live = Live(auto_refresh=False)
+            self.live.start()
+
+    def now_and_then(self, silent: float = 0.0) -> None:
+        if not self.quiet and time.monotonic() >= self.next:
+            self.update(silent)
+
+    def update(self, silent: float = 0.0) -> None:
+        if self.quiet:
+            return
+        from graphnav.online.view import view
+
+        lines = view(self.session, silent)
+        if self.live is None:
+            self.next = time.monotonic() + 10.0 * TICK
+            say("; ".join(f"{label}: {value}" for label, value in lines))
+            return
+        from rich.table import Table
+
+        self.next = time.monotonic() + TICK
+        table = Table(show_header=False, box=None)
+        for label, value in lines:
+            table.add_row(label, value)
+        self.live.update(table, refresh=True)
+
+    def last(self) -> None:
+        self.update()
+        if self.live is not None:
+            self.live.stop()

@@ -1,0 +1,124 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from graphnav.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from graphnav.config import Settings
+
+Source = Annotated[
+    str, typer.Argument(metavar="RECORDING", help="A folder, a .toml, a known log, or a built-in name such as kitti.")
+]
+SEVERAL = {"allow_extra_args": True}  # of which `only` has more to say than the parser
+Export = Annotated[
+    str | None,
+    typer.Option("--export", metavar="NAMES", help="Formats to write: some of gpx,nav,nmea,csv,tum,kml,parquet."),
+]
+Point = Annotated[
+    str | None, typer.Option("--point", metavar="POINT", help="Of --export: imu, antenna or x,y,z (m; RFU).")
+]
+Out = Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into; made if need be.")]
+Config = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="Settings, TOML; or the summary.json of a run.")
+]
+Profile = Annotated[
+    str | None, typer.Option("--profile", metavar="NAME", help="Settings for car, car+odometer or foot.")
+]
+Without = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--without",
+        metavar="SOURCE[:FROM-TO]",
+        help="Withhold gnss or odometer, in a span in s from the start or throughout; may be repeated.",
+    ),
+]
+Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Output rate; default: at the keyframes.")]
+Pages = Annotated[
+    bool, typer.Option("--report/--no-report", help="Draw the report; 'graphnav report OUT' does it later.")
+]
+Start = Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from the recording's start.")]
+End = Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from the recording's start.")]
+Noise = Annotated[
+    str | None,
+    typer.Option(
+        "--noise",
+        metavar="stated|estimated|FILE",
+        help="How good the sensors are: as stated, estimated, or as in a file or the summary.json of a run.",
+    ),
+]
+Fire = Annotated[
+    str | None,
+    typer.Option(
+        "--detectors",
+        metavar="NAMES",
+        help="Who decides where it stands: fused (default), or some of fft,glrt,low_band_glrt,acceleration_variance,"
+        "acceleration_magnitude,angular_rate_energy, each of which then suffices.",
+    ),
+]
+Topic = Annotated[
+    list[str] | None,
+    typer.Option("--topic", metavar="NAME", help="Of a ROS bag, one to use for its sensor; may be repeated."),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")]
+Require = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--require", metavar="NAME<NUMBER", help="Leave with 3 unless it holds, as h_rms<0.5; may be repeated."
+    ),
+]
+AllowOutside = Annotated[
+    bool, typer.Option("--allow-outside", help="Read files that RECORDING names outside its own folder, too.")
+]
+
+
+def only(context: typer.Context, recording: str) -> str:
+    """The one recording that is asked for.
+
+    Raises
+    ------
+    ConfigError
+        If several are.
+    """
+    if context.args:
+        logs = " ".join([recording, *context.args])
+        raise ConfigError(
+            f"{logs}: one recording at a time; graphnav init {logs} -o recording.toml joins logs into one"
+        )
+    return recording
+
+
+def withheld_of(without: list[str] | None, start: float | None, end: float | None) -> tuple[Any, ...]:
+    """What is withheld; the span asked for must not be empty."""
+    from graphnav.app import workflow
+
+    if start is not None and end is not None and not start < end:
+        raise ConfigError(f"--end {end:g}: must be later than --start {start:g}")
+    return tuple(workflow.parse_withheld(one) for one in without or ())
+
+
+def firing(settings: Settings, names: str | None) -> Settings:
+    """The settings with the detectors of --detectors; as they are without.
+
+    Raises
+    ------
+    ConfigError
+        If one is not known.
+    """
+    if names is None:
+        return settings
+    from typing import get_args
+
+    from graphnav.config.detectors import FUSED, DetectorName
+    from graphnav.core.complaints import listed
+
+    fire = listed(names, get_args(DetectorName), "--detectors", "detector")
+    if FUSED in fire and len(fire) > 1:
+        raise ConfigError(f"--detectors {names}: '{FUSED}' is all detectors together: name it alone, or name detectors")
+    return settings.model_copy(update={"detectors": settings.detectors.model_copy(update={"fire": fire})})

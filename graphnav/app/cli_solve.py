@@ -1,0 +1,256 @@
+"""Commands that solve, or draw what was solved: `smooth`, `compare`, `report`. `graphnav.app.cli` has the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from json import loads
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from graphnav.app.cli_options import (
+    SEVERAL,
+    AllowOutside,
+    Config,
+    End,
+    Export,
+    Fire,
+    Json,
+    Noise,
+    Out,
+    Pages,
+    Point,
+    Profile,
+    Quiet,
+    Rate,
+    Require,
+    Source,
+    Start,
+    Topic,
+    Without,
+    firing,
+    only,
+    withheld_of,
+)
+from graphnav.app.talk import bar, insist, show
+from graphnav.core.errors import ConfigError
+from graphnav.core.files import outside_allowed
+from graphnav.core.progress import tell
+
+commands = typer.Typer()
+
+
+@commands.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav smooth kitti -o out/kitti")
+def smooth(
+    context: typer.Context,
+    recording: Source,
+    out: Out,
+    solver: Annotated[
+        str, typer.Option("--solver", "--solvers", metavar="NAME", help="batch, incremental, isam2, rts or ekf.")
+    ] = "batch",
+    profile: Profile = None,
+    config: Config = None,
+    noise: Noise = None,
+    detectors: Fire = None,
+    without: Without = None,
+    rate: Rate = None,
+    start: Start = None,
+    end: End = None,
+    export: Export = None,
+    point: Point = None,
+    pages: Pages = True,
+    require: Require = None,
+    topic: Topic = None,
+    allow_outside: AllowOutside = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
+    asked = _Asked(
+        only(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
+        quiet, json, pages,
+    )  # fmt: skip
+    with outside_allowed(allow_outside):
+        _solve(asked, solver, "--solver", export, point)
+
+
+@commands.command(
+    context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out/kitti"
+)
+def compare(
+    context: typer.Context,
+    recording: Source,
+    out: Out,
+    solvers: Annotated[
+        str,
+        typer.Option(
+            "--solvers",
+            "--solver",
+            metavar="NAMES",
+            help="Some of ekf, rts, incremental, isam2, batch, with commas between.",
+        ),
+    ] = "ekf,rts,batch",
+    profile: Profile = None,
+    config: Config = None,
+    noise: Noise = None,
+    detectors: Fire = None,
+    without: Without = None,
+    rate: Rate = None,
+    start: Start = None,
+    end: End = None,
+    against: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--against", metavar="FILE", help="Another program's .nav, .pos, TUM or CSV to put beside; may be repeated."
+        ),
+    ] = None,
+    against_point: Annotated[
+        list[str] | None,
+        typer.Option("--against-point", metavar="POINT", help="Of each --against: imu (default), antenna or x,y,z."),
+    ] = None,
+    against_shift: Annotated[
+        list[float] | None,
+        typer.Option("--against-shift", metavar="S", help="To add to the stamps of each --against; default: found."),
+    ] = None,
+    export: Export = None,
+    point: Point = None,
+    pages: Pages = True,
+    require: Require = None,
+    topic: Topic = None,
+    allow_outside: AllowOutside = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Put the same recording through several solvers and compare them, against the truth where there is one."""
+    asked = _Asked(
+        only(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
+        quiet, json, pages,
+    )  # fmt: skip
+    beside = _Beside(against or [], against_point or [], against_shift or [])
+    for option, values in (("--against-point", beside.points), ("--against-shift", beside.shifts)):
+        if values and len(values) != len(beside.files):
+            raise ConfigError(f"{option} {values[-1]}: say one for each of the {len(beside.files)} files of --against")
+    with outside_allowed(allow_outside):
+        _solve(asked, solvers, "--solvers", export, point, beside)
+
+
+@commands.command(epilog="\b\nExample:\n  graphnav report out/kitti")
+def report(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="What smooth or compare wrote into.")],
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Draw the pages of a run again, without solving: after another version of graphnav, or with plotly there."""
+    from graphnav.app import outputs
+    from graphnav.core.staging import moved, staged
+
+    if not out.is_dir():
+        raise ConfigError(f"{out}: no such folder; name what smooth or compare wrote into")
+    with bar(quiet, "detect"):
+        tell("reading")
+        with staged(out) as part:
+            files = outputs.draw_again(out, part)
+    files = moved(files, part, out)
+    show(lambda: "\n".join(["look at", *(f"  {file}" for file in files)]), lambda: {"files": files}, quiet, json)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """The options that smooth and compare share."""
+
+    recording: str
+    out: Path
+    profile: str | None
+    config: Path | None
+    noise: str | None
+    detectors: str | None
+    without: list[str] | None
+    rate: float | None
+    start: float | None
+    end: float | None
+    require: list[str] | None
+    topic: list[str] | None
+    quiet: bool
+    json: bool
+    pages: bool
+
+
+@dataclass(frozen=True)
+class _Beside:
+    """Trajectory files to put beside the solutions, of which point they are, and what to add to their stamps."""
+
+    files: list[Path]
+    points: list[str]
+    shifts: list[float]
+
+
+def _solve(
+    asked: _Asked,
+    solvers: str,
+    option: str,
+    export: str | None = None,
+    point: str | None = None,
+    beside: _Beside | None = None,
+) -> None:
+    from graphnav.app import convert, outputs, terminal, workflow
+    from graphnav.config import read_settings
+    from graphnav.core.complaints import listed
+    from graphnav.core.staging import moved, staged
+    from graphnav.estimation import pipeline
+    from graphnav.evaluation import gates
+    from graphnav.recording.exporters import NAMES
+
+    withheld = withheld_of(asked.without, asked.start, asked.end)
+    convert.check_rate(asked.rate)
+    chosen, alone = listed(solvers, pipeline.KNOWN, option, "solver"), option == "--solver"
+    if alone and len(chosen) > 1:
+        raise ConfigError(f"--solver {solvers}: smooth uses one; several are for graphnav compare")
+    requirements = [gates.parse_requirement(one, chosen) for one in asked.require or ()]
+    given: dict[str, Any] = {
+        "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
+        "config": asked.config and str(asked.config), "noise": asked.noise, "detectors": asked.detectors,
+        "without": asked.without, "rate": asked.rate, "start": asked.start, "end": asked.end, "topic": asked.topic,
+        "against": (beside and [str(file) for file in beside.files]) or None,
+    }  # fmt: skip
+    folder = outputs.output_folder(asked.out, outputs.FILES, () if alone else chosen)
+    if point is not None and export is None:
+        raise ConfigError(f"--point {point}: is of the files of --export; name some")
+    exported = listed(export, NAMES, "--export", "format to write") if export is not None else ()
+    convert.parse_point(point)
+    against = []
+    for k, file in enumerate(beside.files if beside is not None else ()):
+        assert beside is not None
+        if not file.is_file():
+            raise ConfigError(f"--against {file}: no such file")
+        of = convert.parse_point(beside.points[k] if beside.points else None, "--against-point")
+        against.append(workflow.Against(file, of, beside.shifts[k] if beside.shifts else None))
+    settings = firing(read_settings(asked.config, asked.profile), asked.detectors)
+    settings, noise = workflow.parse_noise(asked.noise, settings)
+    request = workflow.Request(
+        asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
+        {k: v for k, v in given.items() if v is not None}, noise, exported=exported, point=point,
+        topics=tuple(asked.topic or ()), against=tuple(against),
+    )  # fmt: skip
+    with bar(asked.quiet, *chosen) as progress:
+        outcome = workflow.run_request(request, progress)
+        tell("writing")
+        with staged(folder) as part:
+            files = (outputs.write_run if alone else outputs.write_comparison)(outcome, part, asked.pages)
+        files = moved(files, part, folder)
+        if not asked.pages:
+            outputs.remove_pages(folder, () if alone else chosen)
+        if exported:  # by itself, so that one that fails takes nothing with it
+            with staged(folder) as part:
+                more = convert.export_run(outcome, part, exported, point, alone)
+            files += moved(more, part, folder)
+    verdicts = gates.judge(requirements, outputs.comparison(outcome, ours=True)) if requirements else []
+
+    def values() -> dict[str, Any]:
+        places = {name: folder if alone else folder / name for name in chosen}
+        each = {name: loads((at / "summary.json").read_text(encoding="utf-8")) for name, at in places.items()}
+        found = each[chosen[0]] if alone else {"recording": outcome.recording.name, "solvers": each}
+        return {**found, "requirements": gates.values(verdicts), "files": files}
+
+    show(lambda: terminal.run_text(outcome, files) + gates.text(verdicts), values, asked.quiet, asked.json)
+    insist(verdicts)

@@ -1,0 +1,284 @@
+"""Logs of other programs into a recording folder, and trajectories into other programs' files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphnav.app.workflow import Outcome
+from graphnav.core.complaints import listed, nearest
+from graphnav.core.errors import ConfigError, RecordingError
+from graphnav.core.files import parse_json, read_text
+from graphnav.core.interpolation import interpolate
+from graphnav.core.rotation import Array
+from graphnav.core.staging import moved, staged
+from graphnav.core.timescales import gps_to_utc, parse_clock
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.solution import Solution, to_trajectory
+from graphnav.evaluation.against import antenna_lever_arm, own
+from graphnav.recording.exporters import NAMES, written
+from graphnav.recording.formats import formats, load
+from graphnav.recording.formats.registry import Log
+from graphnav.recording.formats.trajectories import read_trajectory
+from graphnav.recording.formats.writer import write_recording
+
+SUMMARY = "summary.json"  # of the run that wrote a trajectory: its clock and its points
+_DENSE = 20.0  # Hz
+_ROWS = 4096  # of these, handled at once
+_MOST_ROWS = 2e7
+_MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
+
+
+def is_export(source: Path, out: Path, name: str | None) -> bool:
+    """Whether a trajectory is to be written for another program, rather than a log to be read."""
+    if source.is_dir():
+        return False
+    if out.suffix[1:] in NAMES and not out.is_dir():
+        return True
+    if name is None or not {part.strip() for part in name.split(",")} <= set(NAMES):
+        return False
+    known = formats()
+    return name not in known or not known[name].recognises(source)
+
+
+def check_rate(rate: float | None) -> None:
+    """Refuse an output rate (Hz) that makes no sense.
+
+    Raises
+    ------
+    ConfigError
+        Naming the option.
+    """
+    if rate is not None and not 0.0 < rate <= 10_000.0:
+        raise ConfigError(f"--rate {rate:g}: must be above 0 and at most 10000 Hz")
+
+
+def convert_log(source: str, out: Path, name: str | None, topics: Sequence[str] = ()) -> tuple[Log, list[Path]]:
+    """Read a log of any kind that is known and write it as a recording folder.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read.
+    ConfigError
+        If it would be written over itself.
+    """
+    if name is not None and name not in formats():
+        raise ConfigError(f"--format {name}: no such format; {nearest(name, [*formats(), *NAMES])}")
+    log = _with_measured_noise(load(source, name, topics))
+    if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
+        raise ConfigError(f"-o {out}: the recording is read from there; name another folder")
+    with staged(out) as part:
+        files = write_recording(log, part)
+    return log, moved(files, part, out)
+
+
+def _with_measured_noise(log: Log) -> Log:
+    """The log with the densities that its IMU shows, where it states no figures."""
+    imu = log.imu
+    if imu is None or not imu.noise_assumed:
+        return log
+    from graphnav.recording.draft.guesses import noise_density
+
+    found = {
+        f"{name}_noise_density": float(f"{value:.2g}")
+        for name, x in (("gyro", imu.gyro), ("accel", imu.accel))
+        if (value := noise_density(imu.t, x)) > 0.0
+    }
+    if not found:
+        return log
+    said = ", ".join(f"{key} = {value:g}" for key, value in found.items())
+    remark = f"noise: {said} measured, between its quietest and usual state; the other figures are of a consumer IMU"
+    noise = replace(imu.noise, **found)
+    return replace(log, imu=replace(imu, noise=noise, noise_assumed=False), remarks=(*log.remarks, remark))
+
+
+def parse_point(text: str | None, option: str = "--point") -> str | Array:
+    """``imu``, ``antenna``, or a lever arm ``x,y,z`` (m; right, forward, up of the IMU).
+
+    Raises
+    ------
+    ConfigError
+        If it is none of these.
+    """
+    if text in (None, "imu", "antenna"):
+        return text or "imu"
+    assert text is not None
+    try:
+        arm = np.array([float(x) for x in text.split(",")])
+    except ValueError:
+        arm = np.empty(0)
+    if arm.shape != (3,) or not np.isfinite(arm).all():
+        raise ConfigError(f"{option} {text}: write imu, antenna, or x,y,z in m: right, forward, up of the IMU")
+    return arm
+
+
+def export_file(
+    source: Path, out: Path, name: str | None, point: str | None, rate: float | None, clock: str | None
+) -> tuple[Trajectory, list[Path], list[str]]:
+    """Write a trajectory file for other programs: into the file `out`, or into the folder `out` under its own name.
+
+    Returns
+    -------
+    trajectory, files, notes
+        As written, and sentences about what was not known.
+
+    Raises
+    ------
+    RecordingError
+        If the trajectory cannot be read, moved to the point or held by the format.
+    ConfigError
+        For options that cannot be used.
+    """
+    trajectory = read_trajectory(source)
+    if out.suffix[1:] in NAMES and not out.is_dir():
+        if name is not None and name != out.suffix[1:]:
+            raise ConfigError(f"--export {name}: but {out.name} is to be written")
+        targets = {out.suffix[1:]: out}
+    else:
+        assert name is not None
+        targets = {one: out / f"{source.stem}.{one}" for one in listed(name, NAMES, "--export", "format to write")}
+    run = _run(source)
+    arm = parse_point(point)
+    if isinstance(arm, str) and arm == "antenna":
+        stated = run.get("antenna_lever_arm")
+        if stated is None:
+            raise ConfigError(f"--point antenna: no {SUMMARY} beside {source.name} says where it is; say x,y,z")
+        arm = np.array(stated, dtype=float)
+    gps_zero = run.get("gps_zero")
+    if clock is not None:
+        try:
+            gps_zero = parse_clock(clock, float(trajectory.t[0]))
+        except ValueError as error:
+            raise ConfigError(f"--clock {clock}: {error}") from None
+    notes = list(trajectory.notes)
+    if gps_zero is None and trajectory.t[0] > 1e9:
+        gps_zero = parse_clock("unix", float(trajectory.t[0]))
+        notes.append("t is taken as Unix time: it is above 1e9")
+    if gps_zero is None and {"gpx", "nav"} & set(targets):
+        notes.append("what t counts from is not known: GPX is written without times, .nav with week 0; --clock says it")
+    moved = at_point(trajectory, None if isinstance(arm, str) else arm, rate)
+    files = write_formats(moved, targets, gps_zero)
+    return moved, files, notes
+
+
+def at_point(trajectory: Trajectory, arm: Array | None, rate: float | None = None) -> Trajectory:
+    """The trajectory of the point at the end of a lever arm, at its own times or at `rate` (Hz).
+
+    Raises
+    ------
+    RecordingError
+        If there is a lever arm and no attitude to turn it.
+    ConfigError
+        If the rate leaves no row, or too many.
+    """
+    if arm is not None and not np.any(arm):
+        arm = None
+    if arm is None and rate is None:
+        return trajectory
+    if arm is not None and trajectory.rph is None:
+        raise RecordingError("--point: the trajectory has no attitude, so no other point of the body can be placed")
+    t = trajectory.t
+    if rate is not None:
+        if (t[-1] - t[0]) * rate > _MOST_ROWS:
+            raise ConfigError(f"--rate {rate:g}: makes {(t[-1] - t[0]) * rate:.3g} rows, more than {_MOST_ROWS:g}")
+        t = np.arange(np.ceil(t[0] * rate - 1e-6), np.floor(t[-1] * rate + 1e-6) + 1) / rate
+    moved, _ = interpolate(trajectory, t, max_gap=_MAX_GAP, lever_arm=arm)
+    if not len(moved):
+        raise ConfigError(f"--rate {rate:g}: leaves no row of this trajectory; say a higher one")
+    return moved
+
+
+def write_formats(trajectory: Trajectory, targets: dict[str, Path], gps_zero: float | None) -> list[Path]:
+    """Write the formats, each to its path; `gps_zero` (s) is when t = 0 was, where it is known."""
+    return _write([trajectory], targets, gps_zero, trajectory.name)
+
+
+def export_run(
+    outcome: Outcome, folder: Path, names: Sequence[str], point: str | None, alone: bool = True
+) -> list[Path]:
+    """Write the solutions of a run in some formats, in files named after the point: trajectory.gpx, antenna.gpx.
+
+    One that is `alone` lies in `folder`, else each in a folder of its name in it.
+
+    Raises
+    ------
+    ConfigError
+        If the antenna is asked for and there is none.
+    """
+    rate = outcome.request.rate
+    arm = parse_point(point)
+    name = "trajectory" if point in (None, "imu") else "antenna" if point == "antenna" else "point"
+    files: list[Path] = []
+    for solver, solution in own(outcome.solutions).items():
+        lever_arm = arm
+        if isinstance(arm, str) and arm == "antenna":
+            found = antenna_lever_arm(outcome.recording, solution)
+            if found is None:
+                raise ConfigError("--point antenna: the recording has no GNSS")
+            lever_arm = found
+        blocks = solution.blocks(rate)
+        if not isinstance(lever_arm, str) and np.any(lever_arm):
+            blocks = _of_point(solution, rate, lever_arm)
+        title = f"{outcome.recording.name}, {solver}" + (f", {name}" if name != "trajectory" else "")
+        place = folder if alone else folder / solver
+        files += _write(blocks, {one: place / f"{name}.{one}" for one in names}, outcome.recording.gps_zero, title)
+    return files
+
+
+def _of_point(solution: Solution, rate: float | None, arm: Array) -> Iterator[Trajectory]:
+    """The trajectory of the point at the end of a lever arm, in parts."""
+    # between keyframes a second apart the turn rate, and with it the point's velocity, would be guessed
+    dense = max(rate or 0.0, _DENSE)
+    there = [piece.times(dense) for piece in solution.between]
+    wanted = solution.t if rate is None else np.concatenate([piece.times(rate) for piece in solution.between])
+    for t in np.split(wanted, np.flatnonzero(np.diff(np.floor(wanted * (dense / _ROWS)))) + 1):
+        # a row on each side for the place, two for the turn rate, and one to spare
+        around = [
+            times[max(np.searchsorted(times, t[0]) - 3, 0) : np.searchsorted(times, t[-1], side="right") + 3]
+            for times in there
+        ]
+        rows = to_trajectory(solution.solver, solution.frame, *solution.at(np.concatenate(around)))
+        yield interpolate(rows, t, max_gap=_MAX_GAP, lever_arm=arm)[0]
+
+
+def _write(blocks: Iterable[Trajectory], targets: dict[str, Path], gps_zero: float | None, name: str) -> list[Path]:
+    for path in targets.values():
+        path.parent.mkdir(parents=True, exist_ok=True)
+    written(blocks, targets, name, None if gps_zero is None else lambda t: gps_to_utc(t + gps_zero))
+    return list(targets.values())
+
+
+def _run(source: Path) -> dict[str, Any]:
+    """What the summary beside a trajectory says of its points and its clock."""
+    path = source.parent / SUMMARY
+    try:
+        values = parse_json(read_text(path))
+    except (RecordingError, ValueError):
+        return {}
+    return values if isinstance(values, dict) else {}
+
+
+def log_values(log: Log) -> dict[str, Any]:
+    """What was read and what was assumed, for JSON."""
+    sensors = {name: getattr(log, name) for name in ("imu", "gnss", "odometer", "truth")}
+    rows = {name: len(sensor.t) for name, sensor in sensors.items() if sensor is not None}
+    return {"name": log.name, "platform": log.platform, "rows": rows, "assumed": log.remarks}
+
+
+def log_text(log: Log, files: Sequence[Path]) -> str:
+    """What was read, what was assumed, and what was written."""
+    held = []
+    for name, label in (("imu", "IMU"), ("gnss", "GNSS"), ("odometer", "odometer"), ("truth", "truth")):
+        sensor = getattr(log, name)
+        if sensor is not None and len(sensor.t):
+            span = f"{sensor.t[0]:.3f} to {sensor.t[-1]:.3f} s"
+            held.append(f"  {label:<9} {len(sensor.t)} rows, {span}")
+    lines = [f"{log.name} ({log.platform})", *held, *(f"  assumed: {remark}" for remark in log.remarks)]
+    if log.imu is None:
+        lines.append("  warning: no IMU in it: put its rows into imu.csv beside recording.toml, or use 'graphnav init'")
+    return "\n".join([*lines, *(f"wrote {file}" for file in files)])

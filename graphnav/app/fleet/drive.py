@@ -1,0 +1,235 @@
+"""One drive of a fleet: solved, written, and summed up in a row; or the sentence that says why not."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import time
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import graphnav
+from graphnav.app import outputs
+from graphnav.app.fleet.manifest import Task
+from graphnav.app.stored import sha256
+from graphnav.app.workflow import Outcome, Request, parse_noise, parse_withheld, read_part, run_request
+from graphnav.config.files import settings_from
+from graphnav.core.errors import GraphnavError
+from graphnav.core.files import check_regular, outside_allowed, parse_json, read_text
+from graphnav.core.jsonable import peak_memory_mb, write_json
+from graphnav.core.staging import staged
+from graphnav.estimation.noise.apply import row_weights
+from graphnav.estimation.solution import Solution
+from graphnav.recording import Recording
+
+NAME = "drive.json"
+DONE, REFUSED, FAILED, CRASHED, HUNG = "done", "refused", "failed", "crashed", "hung"
+_FINAL = (DONE, REFUSED)  # that the same program makes of the same input again
+_POINTS = 200  # of a track on the map of all
+_FIRST, _BETWEEN = 60.0, 30.0  # s before the first span that is withheld, and more than a span's length after each
+
+Row = dict[str, Any]
+
+
+def solve_drive(task: Task) -> Row:
+    """Solve a drive and write it, unless it is done; its row in either case, whatever goes wrong."""
+    began = time.perf_counter()
+    folder = Path(task.folder)
+    row: Row = {"drive": task.name, "status": FAILED, "source": task.source, "solver": task.solver}
+    key = ""
+    _forget_peak()
+    try:
+        with outside_allowed(task.outside):
+            key = key_of(task)
+            if not task.again and (there := stored_row(folder, key)) is not None:
+                return {**there, "drive": task.name, "source": task.source, "skipped": True}
+            outcome = run_request(_request(task))
+            with staged(folder) as part:
+                outputs.write_run(outcome, part, task.pages)
+            if not task.pages:
+                outputs.remove_pages(folder)
+        row |= {"status": DONE, **_figures(outcome)}
+        row["report"] = str(Path("drives") / task.name / "report.html") if task.pages else None
+    except GraphnavError as error:
+        row |= {"status": REFUSED, "error": str(error)}
+    except MemoryError:
+        row["error"] = "out of memory; give a shorter part (start, end)"
+    except OSError as error:
+        row["error"] = f"{error.filename or 'input or output'}: {error.strerror or error}"
+    except Exception as error:
+        row["error"] = f"internal error: {type(error).__name__}: {error}"
+    row |= {"time_s": round(time.perf_counter() - began, 3), "memory_mb": peak_memory_mb()}
+    keep_row(folder, key, row)
+    return row
+
+
+def lost_row(task: Task, status: str, error: str, seconds: float) -> Row:
+    """The row of a drive that took its process with it, which could not write one."""
+    row: Row = {"drive": task.name, "status": status, "source": task.source, "solver": task.solver, "error": error}
+    row["time_s"] = round(seconds, 3)
+    keep_row(Path(task.folder), "", row)
+    return row
+
+
+def keep_row(folder: Path, key: str, row: Mapping[str, Any]) -> None:
+    """Write the row beside the drive's results; a folder that cannot be written to has no other place to say so."""
+    with suppress(GraphnavError), staged(folder) as part:
+        write_json(part / NAME, {"key": key, "row": row})
+
+
+def stored_row(folder: Path, key: str | None = None) -> Row | None:
+    """The row of a drive that was done before with the same key; with any, if `key` is None."""
+    try:
+        values = parse_json(read_text(folder / NAME))
+        row = values["row"]
+        same = key is None or (values["key"] == key and row["status"] in _FINAL)
+        return dict(row) if same else None
+    except (GraphnavError, ValueError, KeyError, TypeError):
+        return None
+
+
+def key_of(task: Task) -> str:
+    """What a result depends on: this version, all that is asked, and every byte of input."""
+    asked = {k: v for k, v in asdict(task).items() if k not in ("name", "source", "folder", "again")}
+    asked |= {"graphnav": graphnav.__version__, "noise": task.noise and sha256(Path(task.noise))}
+    asked["input"] = [(name, sha256(path)) for name, path in _input(task.source)]
+    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+
+
+def _input(source: str) -> Iterator[tuple[str, Path]]:
+    """The files that a recording is read from, by their names in it; a built-in one has none."""
+    path = Path(source)
+    if path.is_dir():
+        if not (path / "recording.toml").is_file():
+            for file in sorted(one for one in path.rglob("*") if one.is_file()):
+                yield str(file.relative_to(path)), file
+            return
+        path = path / "recording.toml"
+    if not path.exists():
+        return
+    check_regular(path)
+    yield path.name, path
+    if path.suffix == ".toml":
+        try:
+            values = tomllib.loads(read_text(path))
+        except (GraphnavError, tomllib.TOMLDecodeError, RecursionError):
+            return  # which reading it will say
+        for name in sorted({text for text in _texts(values) if len(text) < 255 and "\0" not in text}):
+            if (path.parent / name).is_file():
+                yield name, path.parent / name
+
+
+def _texts(values: Any) -> Iterator[str]:
+    if isinstance(values, str):
+        yield values
+    elif isinstance(values, Mapping | list):
+        for one in values.values() if isinstance(values, Mapping) else values:
+            yield from _texts(one)
+
+
+def _request(task: Task) -> Request:
+    """What `smooth` would ask for."""
+    settings = settings_from(task.settings)
+    noise = parse_noise(task.noise, settings)[1] if task.noise else None
+    withheld = tuple(parse_withheld(one) for one in task.without)
+    if task.withhold is not None:
+        part = read_part(task.source, task.start, task.end)
+        withheld += tuple(("gnss", span) for span in spans(part, task.withhold, task.start or 0.0))
+    given = {"recording": task.source, "solver": task.solver, "fleet": True, "withhold": task.withhold}
+    return Request(
+        task.source, (task.solver,), settings, withheld, task.start, task.end, task.rate,
+        {k: v for k, v in given.items() if v is not None}, noise,
+    )  # fmt: skip
+
+
+def spans(recording: Recording, length: float, zero: float = 0.0) -> list[tuple[float, float]]:
+    """Spans (s from the start of a recording of which this begins at `zero`) whose fixes are withheld and scored.
+
+    A minute is left to begin with, and between two of them more than their own length, so that each is an outage by
+    itself; half a minute is left at the end.
+    """
+    if recording.gnss is None:
+        return []
+    starts = np.arange(_FIRST, recording.duration - length - _BETWEEN + 1e-9, 2.0 * length + _BETWEEN)
+    return [(float(zero + s), float(zero + s + length)) for s in starts]
+
+
+def _figures(outcome: Outcome) -> Row:
+    """What a row says of a drive that was solved."""
+    ((name, solution),) = outcome.solutions.items()
+    summary = outputs.solver_summary(outcome, name, {}, {})
+    measured: Mapping[str, Any] = {**(summary["errors"] or {}), **(summary["nees"] or {})}
+    ends = [span["end_h_m"] for span in summary["spans"] if span.get("end_h_m") is not None]
+    speed = np.linalg.norm(solution.states.v[:, :2], axis=1)
+    doubts = summary["doubts"]
+    return {
+        "verdict": "doubtful" if doubts else "sound",
+        "doubts": "; ".join(doubts) or None,
+        "platform": outcome.recording.platform,
+        "duration_s": round(outcome.recording.duration, 3),
+        "distance_m": round(float(np.trapezoid(speed, solution.t)), 1),
+        "keyframes": len(solution.t),
+        "against": outcome.against,
+        **{key: measured.get(key) for key in MEASURED},
+        **{key: _short(value) for key, value in outputs.stated(solution).items()},
+        "spans": len(ends),
+        "span_end_h_median_m": _short(float(np.median(ends))) if ends else None,
+        "span_end_h_max_m": max(ends, default=None),
+        "left_out": _left_out(solution),
+        "warnings": len(outcome.warnings),
+        **{
+            f"noise.{group}": _short(figure.get("variance_factor"))
+            for group, figure in summary["noise"]["figures"].items()
+        },
+        "placed": outcome.recording.gnss is not None,
+        "track": _track(outcome, solution),
+        "version": graphnav.__version__,
+    }
+
+
+MEASURED = (
+    "h_rms_m",
+    "h_p95_m",
+    "h_max_m",
+    "up_rms_m",
+    "3d_rms_m",
+    "heading_rms_deg",
+    "nees_p",
+    "nees_p_inside_95",
+    "closure_h_m",
+)
+
+
+def _left_out(solution: Solution) -> float | None:
+    """The share of the fixes' information that is left out."""
+    fixes = solution.records.get("gnss_position")
+    if fixes is None or not len(fixes.t):
+        return None
+    return round(1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position"))), 5)
+
+
+def _track(outcome: Outcome, solution: Solution) -> list[list[float]] | None:
+    """Longitudes and latitudes (deg) of a few points, where the recording says where on the Earth it is."""
+    if outcome.recording.gnss is None:
+        return None
+    few = np.unique(np.linspace(0, len(solution.t) - 1, _POINTS).round().astype(int))
+    degrees = np.rad2deg(solution.frame.to_llh(solution.states.p[few])[:, [1, 0]])
+    return [[round(float(x), 6) for x in point] for point in degrees]
+
+
+def _short(x: float | None) -> float | None:
+    """Five digits, as a summary has."""
+    return None if x is None or not math.isfinite(x) else float(f"{x:.5g}")
+
+
+def _forget_peak() -> None:
+    """Begin to count the most memory anew, where the system can."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")

@@ -1,0 +1,282 @@
+"""Which drives a fleet has, and the settings of each: from a folder, or from a manifest in CSV or TOML."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import re
+import tomllib
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from graphnav.app.workflow import parse_noise, parse_withheld
+from graphnav.config import read_settings
+from graphnav.config.files import settings_from
+from graphnav.core.complaints import nearest, read_toml
+from graphnav.core.errors import ConfigError
+from graphnav.core.files import exists, inside, read_text
+from graphnav.estimation.noise.files import MODES
+from graphnav.estimation.pipeline import KNOWN
+from graphnav.recording.formats import formats
+
+_FORM = "graphnav-recording"  # that every recording.toml names
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of a drive; the same for all, except where a manifest says otherwise."""
+
+    solver: str = "batch"
+    profile: str | None = None
+    config: str | None = None  # path of a settings file
+    settings: str | None = None  # over those, TOML
+    noise: str | None = None
+    without: str | None = None  # some, with blanks between
+    start: float | None = None  # s from the recording's start
+    end: float | None = None
+
+
+@dataclass(frozen=True)
+class Task:
+    """One drive, in values that can be sent to another process or machine."""
+
+    name: str  # of the drive and of its folder
+    source: str
+    folder: str  # to write into
+    solver: str
+    settings: dict[str, Any]
+    noise: str | None = None  # a file, where one is given
+    without: tuple[str, ...] = ()
+    withhold: float | None = None  # s, length of the spans without GNSS that are scored
+    start: float | None = None
+    end: float | None = None
+    rate: float | None = None
+    pages: bool = True
+    again: bool = False  # solve even what is done
+    outside: bool = False  # whether recordings may name files outside their folders
+
+
+_COLUMNS = ("recording", "name", *(f.name for f in fields(Asked)))
+
+
+def read_drives(source: Path, asked: Asked) -> list[tuple[str, str, Asked, str]]:
+    """Name, recording, what is asked, and where that was said, of every drive.
+
+    Parameters
+    ----------
+    source : a folder, in which recordings are looked for at any depth; or a manifest, .csv or .toml.
+    asked : what holds where the manifest says nothing.
+
+    Raises
+    ------
+    ConfigError
+        If there are none, or the manifest says something that cannot be: naming the file, the line and the field.
+    """
+    if not exists(source, ConfigError):
+        raise ConfigError(f"{source}: no such folder or manifest")
+    if source.is_dir():
+        found = [(_name_of(path, source), str(path), asked, str(path)) for path in _recordings(source)]
+        if not found:
+            raise ConfigError(f'{source}: holds no recording; each is a .toml that says format = "{_FORM}/1"')
+        return _distinct(found)
+    rows = _csv_rows(source) if source.suffix == ".csv" else _toml_rows(source)
+    drives = [_drive(source, where, row, asked) for where, row in rows]
+    if not drives:
+        raise ConfigError(f"{source}: names no recording")
+    twice = [name for name, count in Counter(name for name, *_ in drives).items() if count > 1]
+    named = [name for where, row in rows if (name := str(row.get("name") or "")) in twice]
+    if named:
+        raise ConfigError(f"{source}: two drives are named '{named[0]}'; each is a folder of its own")
+    return _distinct(drives)
+
+
+def task_of(drive: tuple[str, str, Asked, str], out: Path, known: dict[Any, dict[str, Any]], **common: Any) -> Task:
+    """A drive with its settings read and checked; `known` keeps those that many share.
+
+    Raises
+    ------
+    ConfigError
+        Naming where it was said.
+    """
+    name, source, asked, where = drive
+    if asked.solver not in KNOWN:
+        raise ConfigError(f"{where}: no solver '{asked.solver}'; {nearest(asked.solver, KNOWN)}")
+    try:
+        without = tuple((asked.without or "").split())
+        for one in without:
+            parse_withheld(one)
+        key = (asked.config, asked.profile, asked.settings, asked.noise)
+        if key not in known:
+            settings = read_settings(asked.config, asked.profile)
+            if asked.settings:
+                settings = settings_from(_over(settings.model_dump(exclude_unset=True), _toml(asked.settings)))
+            known[key] = parse_noise(asked.noise, settings)[0].model_dump(mode="json")
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+    if asked.start is not None and asked.end is not None and not asked.start < asked.end:
+        raise ConfigError(f"{where}: end {asked.end:g} must be later than start {asked.start:g}")
+    given = asked.noise if asked.noise is not None and Path(asked.noise).is_file() else None
+    return Task(
+        name, source, str(out / "drives" / name), asked.solver, known[key], given, without,
+        start=asked.start, end=asked.end, **common,
+    )  # fmt: skip
+
+
+def _recordings(folder: Path) -> list[Path]:
+    """Files that say they are a recording, at any depth."""
+    found = []
+    for place, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for file in sorted(files):
+            path = Path(place) / file
+            # one that cannot be read has its name, and a row that says so
+            if file == "recording.toml" or (file.endswith(".toml") and path.is_file() and _FORM in _begin(path)):
+                found.append(path)
+    return found
+
+
+def _begin(path: Path) -> str:
+    """The first of a file, where the format is named."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            return file.read(4000)
+    except OSError:
+        return ""
+
+
+def _name_of(path: Path, folder: Path) -> str:
+    parts = path.relative_to(folder).with_suffix("").parts
+    parts = parts[:-1] if parts[-1] == "recording" and len(parts) > 1 else parts
+    return _plain("_".join(parts))
+
+
+def _plain(text: str) -> str:
+    """A name that every file system takes."""
+    return re.sub(r"[^\w.+-]+", "_", text).strip("._")[:120] or "drive"
+
+
+def _distinct(drives: list[tuple[str, str, Asked, str]]) -> list[tuple[str, str, Asked, str]]:
+    """The same with different names: a number behind those that come again."""
+    taken: set[str] = set()
+    out = []
+    for name, *rest in drives:
+        distinct, k = name, 1
+        while distinct in taken:
+            k += 1
+            distinct = f"{name}-{k}"
+        taken.add(distinct)
+        out.append((distinct, *rest))
+    return out  # type: ignore[return-value]
+
+
+def _csv_rows(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
+    reader = csv.DictReader(io.StringIO(read_text(path, ConfigError)), strict=True)
+    rows: list[tuple[str, Mapping[str, Any]]] = []
+    try:
+        _check_columns(reader.fieldnames or (), f"{path}, line 1")
+        for row in reader:
+            where = f"{path}, line {reader.line_num}"
+            if None in row or None in row.values():
+                raise ConfigError(f"{where}: {len(reader.fieldnames or ())} cells are needed, as the header has")
+            rows.append((where, {key: value.strip() for key, value in row.items()}))
+    except csv.Error as error:
+        raise ConfigError(f"{path}, line {reader.line_num}: {error}") from None
+    return rows
+
+
+def _toml_rows(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
+    values, _ = read_toml(path, ConfigError)
+    drives = values.get("drive")
+    if set(values) != {"drive"} or not isinstance(drives, list) or not all(isinstance(one, dict) for one in drives):
+        raise ConfigError(f'{path}: must be a list of tables [[drive]], each with recording = "...", and nothing else')
+    rows: list[tuple[str, Mapping[str, Any]]] = [(f"{path}, drive {k}", one) for k, one in enumerate(drives, 1)]
+    for where, row in rows:
+        _check_columns(row, where)
+    return rows
+
+
+def _check_columns(names: Iterable[str], where: str) -> None:
+    unknown = [name for name in names if name not in _COLUMNS]
+    if unknown:
+        raise ConfigError(f"{where}: no such column '{unknown[0]}'; {nearest(unknown[0], _COLUMNS)}")
+    if "recording" not in names:
+        raise ConfigError(f"{where}: 'recording' is missing")
+
+
+def _drive(source: Path, where: str, row: Mapping[str, Any], asked: Asked) -> tuple[str, str, Asked, str]:
+    """A row of a manifest; what is blank is as for all."""
+    said: dict[str, Any] = {}
+    for key in (f.name for f in fields(Asked)):
+        value = row.get(key)
+        if value is None or value == "":
+            continue
+        if key in ("start", "end"):
+            try:
+                said[key] = float(value)
+            except (TypeError, ValueError):
+                raise ConfigError(f"{where}, '{key}': {value!r} is not a number of seconds") from None
+        elif key == "settings" and isinstance(value, Mapping):
+            said[key] = _written(value)
+        elif key == "without" and isinstance(value, list):
+            said[key] = " ".join(map(str, value))
+        elif isinstance(value, str):
+            said[key] = value
+        else:
+            raise ConfigError(f"{where}, '{key}': {value!r} is not a text")
+    recording = row.get("recording")
+    if not isinstance(recording, str) or not recording:
+        raise ConfigError(f"{where}, 'recording': names no recording")
+    noise = said.get("noise")
+    if noise is not None and noise not in MODES:
+        said["noise"] = str(_beside(source, noise, where, "noise"))
+    if "config" in said:
+        said["config"] = str(_beside(source, said["config"], where, "config"))
+    builtin = recording in formats() and formats()[recording].builtin
+    path = recording if builtin else str(_beside(source, recording, where, "recording"))
+    name = row.get("name") or Path(recording.removesuffix("/recording.toml")).name.removesuffix(".toml")
+    if not isinstance(name, str):
+        raise ConfigError(f"{where}, 'name': {name!r} is not a text")
+    return _plain(name), path, replace(asked, **said), where
+
+
+def _beside(source: Path, name: str, where: str, key: str) -> Path:
+    """What a manifest names; as elsewhere, that lies in its folder or below unless the command says otherwise."""
+    path = source.parent / name
+    if not inside(path, source.parent, ConfigError):
+        raise ConfigError(
+            f"{where}, '{key}': {name} lies outside its folder; say --allow-outside if you trust who wrote it"
+        )
+    return path
+
+
+def _toml(text: str) -> dict[str, Any]:
+    """Settings in one cell, with semicolons for line ends."""
+    try:
+        return tomllib.loads(text if "\n" in text else text.replace(";", "\n"))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"settings {text!r}: {error}; write key = value, with semicolons between") from None
+
+
+def _written(values: Mapping[str, Any], at: str = "") -> str:
+    """A table of settings as lines of dotted keys."""
+    from graphnav.config.files import toml_value
+
+    lines = []
+    for key, value in values.items():
+        lines.append(
+            _written(value, f"{at}{key}.") if isinstance(value, Mapping) else f"{at}{key} = {toml_value(value)}"
+        )
+    return "\n".join(lines)
+
+
+def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested values with others over them."""
+    out = dict(below)
+    for key, value in above.items():
+        inner = out.get(key)
+        out[key] = _over(inner, value) if isinstance(value, Mapping) and isinstance(inner, Mapping) else value
+    return out

@@ -1,0 +1,195 @@
+"""What came of a run, kept in a file beside its results, so that its pages can be drawn again without solving.
+
+`run.npz` holds the arrays, and as JSON how they hang together: nested dataclasses of this package by their names, and
+plain values. The recording is not in it; it is read again, and must be the same to the byte. What lies between the
+keyframes is not in it either: it is drawn straight.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile, ZipFile
+
+import numpy as np
+
+from graphnav.app.workflow import Outcome, read_part
+from graphnav.config import Settings
+from graphnav.core import rotation
+from graphnav.core.errors import ConfigError, RecordingError
+from graphnav.core.files import check_regular, check_size, exists, parse_json
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.estimation.dense import times_between
+from graphnav.estimation.solution import Solution
+from graphnav.recording import Recording
+from graphnav.recording.checks.overview import inspect
+from graphnav.recording.checks.stated import truth_apart
+
+NAME = "run.npz"
+_FORM = "graphnav-run/1"
+_PACKAGE = __name__.partition(".")[0]
+
+
+@dataclass(frozen=True)
+class Straight:
+    """States between keyframes as straight lines, of one piece of a recording."""
+
+    t: Array  # (K,) s
+    states: States
+    covariance: Array  # (K, 15, 15)
+
+    @property
+    def start(self) -> float:
+        """First time, s."""
+        return float(self.t[0])
+
+    @property
+    def end(self) -> float:
+        """Last time, s."""
+        return float(self.t[-1])
+
+    def times(self, rate: float) -> Array:
+        """As those of the solution that was stored."""
+        return times_between(self.start, self.end, rate)
+
+    def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
+        """States and covariances, of the first errors, at times inside."""
+        k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
+        s = ((t - self.t[k]) / (self.t[k + 1] - self.t[k]))[:, None]
+        a, b = self.states[k], self.states[k + 1]
+        turn = rotation.exp(s * rotation.log(np.swapaxes(a.R_nb, -1, -2) @ b.R_nb))
+        p, v, ba, bg = (x + s * (y - x) for x, y in ((a.p, b.p), (a.v, b.v), (a.ba, b.ba), (a.bg, b.bg)))
+        P, Q = self.covariance[k, :size, :size], self.covariance[k + 1, :size, :size]
+        return States(a.R_nb @ turn, p, v, ba, bg), P + s[:, :, None] * (Q - P)
+
+
+def write_outcome(outcome: Outcome, provenance: Mapping[str, Any], path: Path) -> None:
+    """Keep all of an outcome but its recording, with the provenance of the run."""
+    arrays: list[Array] = []
+    plain = json.dumps({"form": _FORM, "outcome": _pack(outcome, arrays), "provenance": _pack(provenance, arrays)})
+    text = np.frombuffer(plain.encode(), dtype=np.uint8)
+    named: dict[str, Any] = {f"a{k}": a for k, a in enumerate(arrays)}
+    np.savez_compressed(path, text=text, **named)
+
+
+def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
+    """An outcome without its recording (`read_again` reads that), and the provenance of its run.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file, or it is none of this version's.
+    """
+    if not exists(path, ConfigError):
+        raise ConfigError(f"{path.parent}: holds no {path.name}: not the results of smooth or compare")
+    check_regular(path, ConfigError)
+    try:
+        with ZipFile(path) as packed:
+            check_size(path, sum(one.file_size for one in packed.infolist()), ConfigError)
+        with np.load(path, allow_pickle=False) as file:
+            values = parse_json(file["text"].tobytes().decode())
+            arrays = [file[f"a{k}"] for k in range(len(file.files) - 1)]
+    except (OSError, ValueError, KeyError, BadZipFile, zlib.error, EOFError, RuntimeError, MemoryError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from None
+    if not isinstance(values, dict) or values.get("form") != _FORM:
+        raise ConfigError(f"{path}: is of another version of graphnav; solve again")
+    try:
+        outcome, provenance = _unpacked(values["outcome"], arrays), _unpacked(values["provenance"], arrays)
+        names = [name for name in outcome.solutions if name != Path(name).name or name in ("", "..")]
+        if names or not isinstance(outcome, Outcome):
+            raise TypeError(f"a solver called '{names[0]}'" if names else "no outcome")
+        return outcome, dict(provenance)
+    except (AttributeError, ImportError, LookupError, TypeError, ValueError, RuntimeError) as error:
+        raise ConfigError(f"{path}: is of another version of graphnav ({error}); solve again") from None
+
+
+def read_again(outcome: Outcome, inputs: Mapping[str, str]) -> Outcome:
+    """An outcome of `read_outcome` with its recording; `inputs` are the sha256 of all files that it was read from.
+
+    Raises
+    ------
+    GraphnavError
+        If one of them has changed or is gone, naming it.
+    """
+    request = outcome.request
+    for name, digest in inputs.items():
+        if not Path(name).is_file():
+            raise RecordingError(f"{name}: is not there any more; it was read for these results")
+        if sha256(Path(name)) != digest:
+            raise RecordingError(f"{name}: has changed since; solve again")
+    part = read_part(request.source, request.start, request.end, topics=request.topics)
+    recording = inspect(part).recording
+    return replace(outcome, recording=replace(recording, truth=None) if truth_apart(recording) else recording)
+
+
+def sha256(path: Path) -> str:
+    """Of a file, in hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _pack(value: Any, arrays: list[Array]) -> Any:
+    """A value as JSON holds it, one key telling what it is; arrays go into the list."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.generic):
+        return _pack(value.item(), arrays)
+    if isinstance(value, np.ndarray):
+        known = next((k for k, one in enumerate(arrays) if one is value), None)  # solvers share detections
+        if known is None:
+            arrays.append(value)
+        return {"array": len(arrays) - 1 if known is None else known}
+    if isinstance(value, Settings):
+        return {"settings": value.model_dump(mode="json")}
+    if isinstance(value, Path):
+        return {"path": str(value)}
+    if isinstance(value, Recording):
+        return None
+    if isinstance(value, Mapping):
+        return {"map": [[_pack(k, arrays), _pack(v, arrays)] for k, v in value.items()]}
+    if isinstance(value, tuple | list):
+        return {"tuple" if isinstance(value, tuple) else "list": [_pack(one, arrays) for one in value]}
+    if not is_dataclass(value):
+        raise TypeError(f"{type(value).__name__} cannot be kept")
+    kept = {f.name: getattr(value, f.name) for f in fields(value) if f.init and f.name != "between"}
+    out = {"class": f"{type(value).__module__}.{type(value).__qualname__}", "of": _pack(kept, arrays)}
+    if isinstance(value, Solution):
+        out["pieces"] = [[piece.start, piece.end] for piece in value.between]
+    return out
+
+
+def _unpacked(value: Any, arrays: list[Array]) -> Any:
+    """The opposite of `_pack`."""
+    if not isinstance(value, dict):
+        return value
+    if "array" in value:
+        return arrays[value["array"]]
+    if "settings" in value:
+        return Settings.model_validate(value["settings"])
+    if "path" in value:
+        return Path(value["path"])
+    if "map" in value:
+        return {_unpacked(k, arrays): _unpacked(v, arrays) for k, v in value["map"]}
+    if "tuple" in value:
+        return tuple(_unpacked(one, arrays) for one in value["tuple"])
+    if "list" in value:
+        return [_unpacked(one, arrays) for one in value["list"]]
+    module, _, name = value["class"].rpartition(".")
+    if module.partition(".")[0] != _PACKAGE:
+        raise LookupError(f"{value['class']} is not of {_PACKAGE}")
+    kind: Any = getattr(import_module(module), name)
+    if not (isinstance(kind, type) and hasattr(kind, "__dataclass_fields__")):
+        raise LookupError(f"{value['class']} holds no values")
+    found = kind(**_unpacked(value["of"], arrays))
+    if isinstance(found, Solution):
+        pieces = [(found.t >= a) & (found.t <= b) for a, b in value["pieces"]]
+        straight = tuple(Straight(found.t[p], found.states[p], found.covariance[p]) for p in pieces if p.sum() > 1)
+        return replace(found, between=straight)
+    return found

@@ -1,0 +1,249 @@
+"""What the command line shows: summaries as plain text, and progress on a terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from graphnav.app.outputs import stated
+from graphnav.app.workflow import Outcome
+from graphnav.constraints.gnss import TIMES
+from graphnav.core.progress import Progress
+from graphnav.core.staging import uninterrupted
+from graphnav.estimation.solution import Solution
+from graphnav.evaluation.metrics import Span
+
+_IMU = {
+    "imu.gyro_noise_density": "gyro", "imu.accel_noise_density": "accelerometer",
+    "imu.gyro_bias_walk": "gyro bias walk", "imu.accel_bias_walk": "accelerometer bias walk",
+}  # fmt: skip
+_FIXES = {"gnss_position": "positions", "gnss_velocity": "velocities"}
+_ERRORS = (
+    ("hor. rms", "h", "rms", "m"), ("hor. max", "h", "max", "m"), ("up rms", "up", "rms", "m"),
+    ("roll rms", "roll", "rms", "deg"), ("pitch rms", "pitch", "rms", "deg"), ("head. rms", "heading", "rms", "deg"),
+)  # fmt: skip
+
+
+def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
+    """What was read, what is worth knowing, how good it is, and where to look."""
+    lines = [f"warning: {said[0].lower()}{said[1:]}" for said in _doubts(outcome)]
+    lines.append(_read(outcome))
+    lines += [f"  {source} withheld{'' if span is None else f' {span[0]:g}-{span[1]:g} s'}"
+              for source, span in outcome.request.withheld]  # fmt: skip
+    notes = [note for s in outcome.solutions.values() for note in s.notes]
+    lines += [f"  {said}" for said in _noise(outcome)]
+    severity = {f.sentence: f.severity for f in outcome.checks}
+    for note in dict.fromkeys([*outcome.findings, *notes]):
+        if note.startswith("noise model, "):
+            continue  # of one sensor: the report has the table
+        lines.append(f"  {severity.get(note, 'note')}: {note}")
+    lines.append("")
+    lines += _whole(outcome)
+    lines += _spans(outcome)
+    lines += ["", _stops(outcome), "", "look at"]
+    return "\n".join([*lines, *(f"  {file}" for file in files)])
+
+
+def _doubts(outcome: Outcome) -> tuple[str, ...]:
+    from graphnav.report.sentences import doubts
+
+    return doubts(outcome.solutions, {k: m.errors for k, m in outcome.metrics.items() if m.errors is not None})
+
+
+def _noise(outcome: Outcome) -> list[str]:
+    """The noise model in a line: what differs from what is stated."""
+    from graphnav.estimation.noise.table import whole_ratio
+
+    noise = next(iter(outcome.solutions.values())).noise
+    if not noise.figures:
+        return ["noise as stated"]
+    parts = [f"{words} x {short(float(np.exp(0.5 * noise.figures[group].log_factor)))}" for group, words in _IMU.items()
+             if group in noise.figures]  # fmt: skip
+    for source in dict.fromkeys(group.rpartition(".")[0] for group in noise.figures if group.startswith("gnss_")):
+        if source.rpartition(".")[2] in TIMES:
+            continue
+        name, _, kind = source.partition(".")
+        ratios = [(axis, whole_ratio(noise, source, axis)) for axis in ("horizontal", "up")]
+        said = " and ".join(f"x {short(ratio)} {axis}" for axis, ratio in ratios if ratio is not None)
+        parts.append(f"{_FIXES.get(name, name)}{f' ({kind})' if kind else ''} {said}")
+    given = outcome.request.noise
+    how = "estimated" if given is None else "as given" if given.file is None else f"from {given.file}"
+    return [f"noise {how}, in stated sigmas: {', '.join(parts)}"]
+
+
+def _stops(outcome: Outcome) -> str:
+    spans = next(iter(outcome.solutions.values())).stationary
+    if not len(spans):
+        return "stands nowhere"
+    many = "1 stop" if len(spans) == 1 else f"{len(spans)} stops"
+    return f"{many}, {np.diff(spans).sum():.1f} s in all: detections.csv"
+
+
+def _read(outcome: Outcome) -> str:
+    recording = outcome.recording
+    rate = 1.0 / float(np.median(np.diff(recording.imu.t)))
+    parts = [f"{recording.duration:.1f} s", f"IMU {len(recording.imu.t)} rows at {rate:.4g} Hz"]
+    if recording.gnss is not None:
+        parts.append(f"GNSS {len(recording.gnss.t)} fixes")
+    if recording.odometer is not None:
+        parts.append(f"odometer {len(recording.odometer.t)} rows")
+    if recording.truth is not None:
+        parts.append("truth")
+    return f"{recording.name} ({recording.platform}): {', '.join(parts)}"
+
+
+def _whole(outcome: Outcome) -> list[str]:
+    """A row per solver: its errors, or the sigmas it states where there is nothing to compare with."""
+    if not outcome.metrics:
+        head = ["solver", "keyframes", "sd hor. (m)", "sd up (m)", "sd head. (deg)", "seconds"]
+        rows = [
+            [name, str(len(s.t)), *(short(x) for x in _sigmas(s)), _seconds(s)] for name, s in outcome.solutions.items()
+        ]
+        return ["no truth to compare with; medians of the sigmas stated:", *table(head, rows)]
+    if all(m.closure is not None for m in outcome.metrics.values()):
+        rows = [
+            [name, short(m.closure.horizontal), short(m.closure.vertical), short(m.closure.percent)]
+            for name, m in outcome.metrics.items()
+            if m.closure is not None
+        ]
+        return [f"errors against {outcome.against}:", *table(["solver", "hor. (m)", "up (m)", "% of way"], rows)]
+    shown = [one for one in _ERRORS if any(one[1] in m.components for m in outcome.metrics.values())]
+    head = ["solver", *(f"{title} ({unit})" for title, _, _, unit in shown), "NEES pos.", "seconds"]
+    rows = []
+    for name, m in outcome.metrics.items():
+        row = [short(getattr(m.components[key], what)) if key in m.components else "-" for _, key, what, _ in shown]
+        nees = short(m.nees["p"].mean) if "p" in m.nees else "-"
+        rows.append([name, *row, nees, _seconds(outcome.solutions[name])])
+    return [f"errors against {outcome.against}:", *table(head, rows)]
+
+
+def _sigmas(solution: Solution) -> list[float]:
+    """Those that `outputs.stated` gives, NaN where there are none."""
+    found = stated(solution)
+    return [found.get(key, float("nan")) for key in ("sd_h_median_m", "sd_u_median_m", "sd_heading_median_deg")]
+
+
+def _seconds(solution: Solution) -> str:
+    return f"{sum(solution.timings.values()):.2f}" if solution.timings else "-"
+
+
+def _spans(outcome: Outcome) -> list[str]:
+    """For every span without a source, a row per solver."""
+    lines: list[str] = []
+    for k, missing in enumerate(outcome.span_names):
+        every = {name: m.spans[k] for name, m in outcome.metrics.items()}
+        first = next(iter(every.values()))
+        lines += ["", f"{missing} {first.start + outcome.zero:.1f}-{first.end + outcome.zero:.1f} s:"]
+        if not any(s.n for s in every.values()):
+            lines.append("  nothing to compare with in it")
+            continue
+        head = ["solver", "hor. end (m)", "hor. max (m)", "up max (m)", "% of way", "NEES pos."]
+        lines += table(
+            head,
+            [
+                [name, *(short(x) for x in (s.end_h, s.max_h, s.max_up)), _share(s), short(s.nees)]
+                for name, s in every.items()
+            ],
+        )
+    return lines
+
+
+def _share(span: Span) -> str:
+    """Drift as a share of the way; of a vehicle that stands it means nothing."""
+    return short(span.drift_percent) if span.distance >= 1.0 else "-"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Columns aligned, the first to the left and numbers to the right."""
+    widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
+    return [
+        "  "
+        + "  ".join(
+            cell.ljust(w) if k == 0 else cell.rjust(w) for k, (cell, w) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in [head, *rows]
+    ]
+
+
+def short(x: float) -> str:
+    """Three significant digits, '-' where there is no number."""
+    if not np.isfinite(x):
+        return "-"
+    return f"{x:.0f}" if abs(x) >= 1000 else f"{x:.3g}" if abs(x) >= 1e-3 or x == 0 else f"{x:.1e}"
+
+
+# What the stages weigh against each other: seconds of an hour's drive at 200 Hz, for the time left and nothing else.
+_STAGES = {
+    "reading": 0.5, "checks": 0.6, "driving": 5.0, "detection": 0.2, "alignment": 0.1, "preintegration": 0.7,
+    "noise": 12.0, "filter": 2.5, "smoother": 0.4, "batch": 0.9, "covariances": 0.2, "incremental": 4.8,
+    "isam2": 44.0, "evaluation": 0.1, "writing": 0.7,
+}  # fmt: skip
+_BEFORE = ("reading", "checks", "detection", "alignment", "preintegration", "noise", "filter", "smoother")
+_WORK = {
+    "info": ("reading", "checks"), "detect": ("reading", "detection", "writing"), "evaluate": ("reading",),
+    "simulate": ("driving", "writing"), "convert": ("reading", "writing"), "init": ("reading", "writing"),
+    "ekf": (*_BEFORE, "evaluation", "writing"), "rts": (*_BEFORE, "evaluation", "writing"),
+    "batch": (*_BEFORE, "batch", "covariances", "evaluation", "writing"),
+    "incremental": (*_BEFORE, "incremental", "evaluation", "writing"),
+    "isam2": (*_BEFORE, "isam2", "evaluation", "writing"),
+}  # fmt: skip
+
+
+class Pace:
+    """How much of some work is done when a stage has come to a share of its own, and how long the rest will take."""
+
+    def __init__(self, work: Sequence[str]) -> None:
+        wanted = {stage for one in work for stage in _WORK.get(one, ())}
+        self._stages = [stage for stage in _STAGES if stage in wanted]
+        self._total = sum(_STAGES[stage] for stage in self._stages) or 1.0
+        self.done = 0.0
+
+    def reach(self, stage: str, share: float) -> None:
+        """Take note; what is done a second time takes nothing back."""
+        name = stage.split()[0]
+        if name in self._stages:
+            before = self._stages[: self._stages.index(name)]
+            self.done = max(self.done, (sum(_STAGES[s] for s in before) + share * _STAGES[name]) / self._total)
+
+    def left(self, elapsed: float) -> float | None:
+        """s, as the time up to here tells; None where that is too little."""
+        return elapsed * (1.0 / self.done - 1.0) if self.done > 0.03 and elapsed > 1.0 else None
+
+
+@contextmanager
+def progress_bar(quiet: bool, work: Sequence[str]) -> Iterator[Progress | None]:
+    """A bar with stage and time left, on stderr if that is a terminal, of what takes longer than half a second."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as Bar
+
+    began, pace = time.monotonic(), Pace(work)
+    bar = Bar(
+        TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[left]}"),
+        console=Console(stderr=True), transient=True,
+    )  # fmt: skip
+    task = bar.add_task("", total=1.0, left="")
+
+    def update(stage: str, share: float) -> None:
+        elapsed = time.monotonic() - began
+        pace.reach(stage, share)
+        left = pace.left(elapsed)
+        said = "" if left is None else f"{left:.0f} s left" if left < 90 else f"{left / 60:.0f} min left"
+        bar.update(task, description=stage, completed=pace.done, left=said)
+        if elapsed > 0.5 and not bar.live.is_started:
+            with uninterrupted():
+                bar.start()
+
+    try:
+        yield update
+    finally:
+        with uninterrupted():
+            bar.stop()

@@ -1,0 +1,412 @@
+"""One run as the command line and scripts need it: read, withhold, solve, score. Prints and writes nothing.
+
+`graphnav.app.outputs` writes what `run_request` returns.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME
+from graphnav.core import rotation
+from graphnav.core.complaints import nearest
+from graphnav.core.errors import ConfigError, RecordingError
+from graphnav.core.findings import Finding
+from graphnav.core.progress import Progress, listening, tell
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.solution import Solution, to_trajectory
+from graphnav.evaluation.against import Against, Foreign, own, read_against, without_attitude
+from graphnav.recording import Recording
+from graphnav.recording.exporters import check_names
+
+if TYPE_CHECKING:
+    from graphnav.evaluation.metrics import Metrics
+
+Span = tuple[float, float]
+Withheld = tuple[str, Span | None]
+
+SOURCES = ("gnss", "odometer")
+_DENSEST, _MOST = 0.1, 5_000  # s between, and number of, the epochs of a truth that are met exactly
+_MOST_TURNING = 20_000  # the same where a point at the end of a lever arm swings between them
+_ENOUGH = 1000  # keyframes that make other epochs needless
+_SAME, _NEAR = 1e-4, 0.02  # s; between epochs that are one, and between rows where nothing else can happen
+OUTAGE = 10.0  # s; fixes further apart than this are an outage worth a line of its own
+
+
+@dataclass(frozen=True)
+class GivenNoise:
+    """A noise model, and the file that it is from, if it is from one."""
+
+    model: NoiseModel
+    file: Path | None = None
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked for; times in s from the recording's start."""
+
+    source: str
+    solvers: tuple[str, ...]
+    settings: Settings = field(default_factory=Settings)
+    withheld: tuple[Withheld, ...] = ()
+    start: float | None = None
+    end: float | None = None
+    rate: float | None = None  # Hz of the output; None: at the keyframes
+    options: Mapping[str, Any] = field(default_factory=dict)  # as they were given, for provenance
+    noise: GivenNoise | None = None  # to be used as it is; else what the settings say
+    against: tuple[Against, ...] = ()  # trajectories of other programs to put beside the solutions
+    topics: tuple[str, ...] = ()  # of a ROS bag, as `graphnav.recording.formats.read` takes them
+    exported: tuple[str, ...] = ()  # formats that are to be written as well, of
+    point: str | None = None  # "antenna", "imu" or a lever arm
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a request.
+
+    `recording` is the part asked for with nothing withheld; `zero` (s) is how far its start lies behind the start
+    of the whole recording, from which all times that people give or read are counted.
+    """
+
+    request: Request
+    recording: Recording
+    zero: float
+    solutions: dict[str, Solution]
+    metrics: dict[str, Metrics]  # empty where there is nothing to compare with
+    against: str | None  # what the metrics compare with, in words
+    span_names: tuple[str, ...]  # of the spans of every metrics: what is missing in each
+    findings: tuple[str, ...]  # everything worth knowing about the recording and the comparison
+    warnings: tuple[str, ...]  # those of the findings that results suffer from
+    timings: dict[str, float]  # s by stage, of what all solvers share
+    checks: tuple[Finding, ...] = ()  # what the checks of the recording found, with keys and severities
+
+    @property
+    def used_withheld(self) -> tuple[Withheld, ...]:
+        """What was withheld, in s from the start of `recording`."""
+        return _moved(self.request.withheld, self.zero)
+
+
+def parse_withheld(text: str) -> Withheld:
+    """``gnss:600-660`` or ``odometer`` as (source, span in s or None).
+
+    Raises
+    ------
+    ConfigError
+        If it is not of that form, or no source of that name can be withheld.
+    """
+    found = re.fullmatch(r"([^:]*)(?::([^-]+)-([^-]+))?", text.strip())
+    if re.fullmatch(r"[\d.]+-[\d.]+", text.strip()):
+        sensors = " or ".join(f"{source}:{text.strip()}" for source in SOURCES)
+        raise ConfigError(f"--without {text}: say of which sensor: {sensors}")
+    usage = "write SOURCE or SOURCE:FROM-TO in seconds from the start, such as gnss:600-660"
+    if found is None:
+        raise ConfigError(f"--without {text}: not a source and a span; {usage}")
+    source, first, last = found.groups()
+    if source not in SOURCES:
+        raise ConfigError(f"--without {text}: no source '{source}' can be withheld; {nearest(source, SOURCES)}")
+    if first is None:
+        return source, None
+    try:
+        span = float(first), float(last)
+    except ValueError:
+        raise ConfigError(f"--without {text}: '{first}-{last}' is not a span of two numbers; {usage}") from None
+    if not (np.isfinite(span).all() and span[0] < span[1]):
+        raise ConfigError(f"--without {text}: the span must end after it begins; {usage}")
+    return source, span
+
+
+def parse_noise(text: str | None, settings: Settings) -> tuple[Settings, GivenNoise | None]:
+    """What `--noise` says: the settings with its mode, and the noise model of a file.
+
+    Raises
+    ------
+    ConfigError
+        If it is neither "stated" nor "estimated" nor a file that holds a noise model.
+    """
+    from graphnav.estimation.noise.files import MODES, read_noise_and_mode
+
+    if text is None:
+        return settings, None
+    given = None
+    mode = text
+    if text not in MODES:
+        if not Path(text).is_file():
+            raise ConfigError(
+                f"--noise {text}: no such file; write {', '.join(MODES)} or name the summary.json of a run"
+            )
+        model, mode = read_noise_and_mode(text)
+        given = GivenNoise(model, Path(text))
+    return settings.model_copy(update={"noise": settings.noise.model_copy(update={"mode": mode})}), given
+
+
+def run_request(request: Request, progress: Progress | None = None) -> Outcome:
+    """Read, check, withhold, solve and score.
+
+    Raises
+    ------
+    GraphnavError
+        In one plain sentence, for anything that cannot be used as it is.
+    """
+    with listening(progress):
+        return _run(request, progress)
+
+
+def _run(request: Request, progress: Progress | None) -> Outcome:
+    from graphnav.recording.checks.aiding import gnss_apart
+    from graphnav.recording.checks.overview import inspect
+    from graphnav.recording.checks.stated import truth_apart
+    from graphnav.recording.formats import read
+
+    timings: dict[str, float] = {}
+    with _timed(timings, "reading"):
+        whole = read(request.source, request.topics)
+    check_names(request.exported, whole.gps_zero)
+    if request.point == "antenna" and whole.gnss is None:
+        raise ConfigError("--point antenna: the recording has no GNSS")
+    recording = _cropped(whole, request)
+    zero = recording.start - whole.start if recording is not whole else 0.0
+    moved = _moved(request.withheld, zero)
+    with _timed(timings, "checks"):
+        inspection = inspect(recording)
+        inspection.refuse()
+    recording = inspection.recording
+    used, notes = _withhold(recording, moved, zero)
+    findings = [f.sentence for f in inspection.findings]
+    if (sentence := gnss_apart(used)) is not None:  # it would be solved as if there were no GNSS
+        raise RecordingError(f"'{recording.name}': {sentence}")
+    if truth_apart(recording):
+        recording = replace(recording, truth=None)
+
+    from graphnav.estimation.pipeline import run
+    from graphnav.report.sentences import doubts
+
+    given = request.noise
+    solutions = run(used, request.settings, request.solvers, progress, None if given is None else given.model)
+    if given is not None:
+        notes += unused_noise(given.model, next(iter(solutions.values())))
+    solutions = {
+        name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
+    }
+    solutions |= _beside(request, recording, solutions)
+    spent: dict[str, float] = {}
+    with _timed(spent, "evaluation"):
+        metrics, against, names = _score(recording, used, solutions, moved)
+    for found in metrics.values():
+        if found.notes:
+            findings += [note for note in found.notes if note not in findings]
+    errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
+    checks = inspection.findings
+    if doubts(solutions, errors):  # which costs too much to be asked where nothing is wrong
+        from graphnav.estimation.antenna import reversed_arms
+
+        checks = (*reversed_arms(used), *checks)
+        findings = [*(f.sentence for f in checks), *findings]
+    return Outcome(
+        request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
+        tuple(f.sentence for f in checks if f.severity != "note"), timings | spent, checks,
+    )  # fmt: skip
+
+
+def _beside(request: Request, recording: Recording, solutions: Mapping[str, Solution]) -> dict[str, Solution]:
+    """The trajectories of other programs, by the names of their files."""
+    reference = list(solutions.values())[-1]
+    out: dict[str, Solution] = {}
+    for asked in request.against:
+        taken = {*solutions, *out}
+        name = next(n for n in (asked.path.stem, asked.path.name, str(asked.path)) if n not in taken)
+        out[name] = read_against(asked, name, recording, reference)
+    return out
+
+
+def unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
+    """Sentences on what a noise model says of measurements that a solution has not."""
+    have = {name: record.t for name, record in solution.records.items()}
+    named = {group.split(".")[0] for group in noise.figures} - {"imu"} | set(noise.weights) | set(noise.excluded)
+    notes = [
+        f"noise model: it has figures of {name}, of which nothing is used here" for name in sorted(named - set(have))
+    ]
+    for name, some in noise.weights.items():
+        if name in have and len(some.t):
+            t = have[name]
+            k = np.clip(np.searchsorted(t, some.t), 1, max(len(t) - 1, 1))
+            near = np.minimum(np.abs(t[k - 1] - some.t), np.abs(t[np.minimum(k, len(t) - 1)] - some.t))
+            lost = int(np.sum(near > SAME_TIME))
+            if lost:
+                notes.append(f"noise model: {lost} of the {len(some.t)} rows of {name} that it weighs are not here")
+    for name, spans in noise.excluded.items():
+        lost = sum(not np.any((have[name] >= a) & (have[name] <= b)) for a, b in spans) if name in have else 0
+        if lost:
+            notes.append(
+                f"noise model: {lost} of the {len(spans)} spans of {name} that it leaves out hold nothing here"
+            )
+    return notes
+
+
+def read_part(
+    source: str,
+    start: float | None = None,
+    end: float | None = None,
+    withheld: tuple[Withheld, ...] = (),
+    topics: tuple[str, ...] = (),
+) -> Recording:
+    """The part asked for of a recording, without what is withheld; times in s from the recording's start.
+
+    Raises
+    ------
+    GraphnavError
+        In one plain sentence, if it cannot be read or there is no such part.
+    """
+    from graphnav.recording.formats import read
+
+    whole = read(source, topics)
+    part = _cropped(whole, Request(source, (), start=start, end=end))
+    zero = part.start - whole.start if part is not whole else 0.0
+    return _withhold(part, _moved(withheld, zero), zero)[0]
+
+
+@contextmanager
+def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+    tell(stage)
+    began = time.perf_counter()
+    yield
+    timings[stage] = time.perf_counter() - began
+
+
+def _cropped(whole: Recording, request: Request) -> Recording:
+    """The part of the recording that is asked for."""
+    if (request.start or 0.0) >= whole.duration or (request.end is not None and request.end <= 0.0):
+        option = f"--start {request.start:g}" if (request.start or 0.0) >= whole.duration else f"--end {request.end:g}"
+        raise RecordingError(f"{option}: lies outside '{whole.name}', which runs from 0 to {whole.duration:.1f} s")
+    return whole.crop(request.start, request.end)
+
+
+def _moved(withheld: tuple[Withheld, ...], by: float) -> tuple[Withheld, ...]:
+    return tuple((source, span and (span[0] - by, span[1] - by)) for source, span in withheld)
+
+
+def _withhold(recording: Recording, withheld: tuple[Withheld, ...], zero: float) -> tuple[Recording, list[str]]:
+    """The recording without what is withheld (s from its start), and sentences about what that did not change."""
+    used, notes = recording, []
+    for source, span in withheld:
+        name = source if span is None else f"{source}:{span[0] + zero:g}-{span[1] + zero:g}"
+        if span is not None and (span[1] <= 0.0 or span[0] >= recording.duration):
+            raise RecordingError(
+                f"--without {name}: lies outside '{recording.name}', which runs from {zero:.0f} to "
+                f"{zero + recording.duration:.1f} s"
+            )
+        if getattr(recording, source) is not None and getattr(used, source) is None:
+            continue  # all of it is gone already
+        before = used
+        used = used.without(source, span)
+        if span is not None and len(getattr(used, source).t) == len(getattr(before, source).t):
+            notes.append(f"--without {name}: there was no {source} row in that span anyway")
+    return used, notes
+
+
+def outages(recording: Recording) -> list[Span]:
+    """Spans of more than `OUTAGE` s without a fix, s from the start; both ends of the recording count too.
+
+    Each lasts from the last fix to one period before the next: at its end there is still none.
+    """
+    if recording.gnss is None or not len(recording.gnss.t):
+        return []
+    t = recording.gnss.t[np.isfinite(recording.gnss.llh).all(axis=1)] - recording.start
+    t = t[(t >= 0.0) & (t <= recording.duration)]
+    period = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    begin, end = np.concatenate([[0.0], t]), np.concatenate([t - period, [recording.duration]])
+    return [(float(a), float(b)) for a, b in zip(begin, end, strict=True) if b - a > OUTAGE]
+
+
+def _score(
+    recording: Recording, used: Recording, solutions: Mapping[str, Solution], withheld: tuple[Withheld, ...]
+) -> tuple[dict[str, Metrics], str | None, tuple[str, ...]]:
+    """Metrics per solver against the best truth there is, what that is, and what is missing in each of their spans."""
+    from graphnav.evaluation.evaluate import evaluate_recording, truth_of, withheld_truth
+
+    spans = [(f"without {source}", span) for source, span in withheld if span is not None]
+    truth = recording.truth
+    gnss_withheld = any(source == "gnss" for source, _ in withheld)
+    if truth is not None and truth.closed_loop_sigma is not None:
+        if any("closed_loop" in solution.records for solution in own(solutions).values()):
+            return {}, None, ()  # what was put in is no measure of what came out
+        against, spans = "the start, where the loop ends", []
+    elif truth is not None:
+        against = "the recording's truth"
+        taken = [span for _, span in spans]
+        spans += [("no GNSS", s) for s in outages(recording) if not any(a < s[1] and b > s[0] for a, b in taken)]
+    elif gnss_withheld and recording.gnss is not None:
+        against = "the withheld GNSS fixes"
+        spans = [(name, span) for name, span in spans if name == "without gnss"]
+    else:
+        return {}, None, ()
+    # the evaluation scores each span of GNSS by itself, whatever it is that is missing there
+    asked: list[Withheld] = [("gnss", span) for _, span in spans]
+    if truth is None and any(source == "gnss" and span is None for source, span in withheld):
+        asked.append(("gnss", None))
+    reference, swings = np.empty(0), False
+    compared = truth_of(recording)
+    if compared is None and truth is None:
+        compared = withheld_truth(recording, "gnss", [span for _, span in asked])
+    if compared is not None:
+        reference, arm = compared[0].t, compared[1]
+        swings = compared[0].v is not None and arm is not None and bool(np.any(arm))
+    found = {}
+    for name, solution in solutions.items():
+        at = _epochs(solution, reference)
+        wanted = np.union1d(np.union1d(solution.t, at), _thinned(reference, solution, _MOST_TURNING)) if swings else at
+        track = _scored(solution, wanted, placed=used.gnss is not None)
+        metrics = evaluate_recording(track, recording, withheld=asked, at=at if len(at) else None)
+        if metrics is None:
+            return {}, None, ()
+        borrowed = isinstance(solution, Foreign) and solution.borrowed
+        found[name] = without_attitude(metrics) if borrowed else metrics
+    return found, against, tuple(name for name, _ in spans)
+
+
+def _epochs(solution: Solution, truth: Array) -> Array:
+    """Epochs to compare at: the keyframes where the truth has them and they are many, else (some of) the truth's.
+
+    Never others: interpolated between keyframes, a filter would seem to know in an outage what the fix after it
+    will tell.
+    """
+    truth = truth[np.isfinite(truth)]
+    if len(truth) > 1:
+        t = solution.t[(solution.t >= truth[0] - _SAME) & (solution.t <= truth[-1] + _SAME)]
+        k = np.clip(np.searchsorted(truth, t), 1, len(truth) - 1)
+        before, after = t - truth[k - 1], truth[k] - t
+        there = (np.minimum(np.abs(before), np.abs(after)) <= _SAME) | (before + after <= _NEAR)
+        if there.sum() >= max(_ENOUGH, 0.8 * len(t)):
+            return np.asarray(t[there])
+    return _thinned(truth, solution, _MOST)
+
+
+def _thinned(t: Array, solution: Solution, most: int) -> Array:
+    """At most so many of some times over the length of a solution, and none closer than `_DENSEST`."""
+    spacing = max(_DENSEST, (solution.t[-1] - solution.t[0]) / most)
+    _, apart = np.unique(np.floor(t / spacing), return_index=True)
+    return np.asarray(t[apart])
+
+
+def _scored(solution: Solution, t: Array, placed: bool) -> Trajectory:
+    """The solution at the times, or at all keyframes where these will do; in metres of its frame if not `placed`."""
+    if isinstance(solution, Foreign):
+        track = solution.track_at(t)
+        return track if placed else replace(track, llh=solution.frame.from_llh(track.llh), frame="local")
+    times, states, covariance = solution.t, solution.states, solution.covariance
+    if not np.isin(t, times).all():
+        times, states, covariance = solution.at(np.union1d(times[[0, -1]], t))
+    track = to_trajectory(solution.solver, solution.frame, times, states, covariance)
+    if placed:
+        return track
+    return replace(track, llh=states.p, v=states.v, rph=rotation.to_rph(states.R_nb), frame="local")

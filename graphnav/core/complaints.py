@@ -1,0 +1,171 @@
+"""What is wrong with a TOML file or a key of it, in one plain sentence: file, line, key, value, unit, nearest key."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from graphnav.core.errors import ConfigError, GraphnavError
+from graphnav.core.files import read_text
+
+_TABLE = re.compile(r"\[([^\[\]]+)\]")
+_NAMES = 30  # that a sentence lists
+_SHOWN = 60  # characters of a value in a sentence
+_WORD = re.compile(rf"\S{{{2 * _SHOWN},}}")  # that no sentence of ours has, but a value that it quotes
+_DEEPEST = 50  # tables in tables; what graphnav reads has four
+_KEY = re.compile(r"([\w\-.\"']+)\s*=")
+
+
+def read_toml(path: Path, error: type[GraphnavError]) -> tuple[dict[str, Any], str]:
+    """The values of a TOML file, and its text.
+
+    Raises
+    ------
+    GraphnavError
+        Of the kind given, if it cannot be read or is not TOML.
+    """
+    text = read_text(path, error)
+    try:
+        # keys of thousands of parts take the parser minutes
+        if any(line.partition("=")[0].count(".") > 2 * _DEEPEST for line in text.splitlines()):
+            raise RecursionError
+        values = tomllib.loads(text)
+        for key, value in _leaves(values):
+            if isinstance(value, int) and not -(2**63) <= value < 2**63:
+                raise ValueError(f"'{key}' is a whole number of more than 64 bits")
+        return values, text
+    except RecursionError:
+        raise error(f"{path}: not valid TOML (nested too deep)") from None
+    except ValueError as cause:  # tomllib's own is one, and that of a number of thousands of digits
+        raise error(f"{path}: not valid TOML ({cause})") from None
+
+
+def _leaves(value: Any, key: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Every value of nested tables and lists, with its key."""
+    if depth > _DEEPEST:
+        raise RecursionError
+    if isinstance(value, dict | list):
+        inner = value.items() if isinstance(value, dict) else ((key, one) for one in value)
+        for name, one in inner:
+            yield from _leaves(one, str(name), depth + 1)
+    else:
+        yield key, value
+
+
+def complaint(source: str | Path, error: ValidationError, model: type[BaseModel], text: str = "") -> str:
+    """The first complaint of pydantic; an unknown key goes before the missing one that it may have been meant for.
+
+    `text` is that of the file, for the line.
+    """
+    first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+    loc = tuple(str(part) for part in first["loc"])
+    line = _line_of(text, loc)
+    where = f"{source}, line {line}: " if line else f"{source}: "
+    return where + _WORD.sub(lambda word: f"{word[0][:_SHOWN]}...", _said_of(first, loc, model))
+
+
+def _said_of(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> str:
+    key = ".".join(loc)
+    if first["type"] == "extra_forbidden":
+        return f"unknown key '{key}'{_suggestion(loc, model)}"
+    if first["type"] == "missing":
+        return f"'{key}' is missing"
+    if first["type"] == "value_error":  # our own sentence
+        what = str(first["ctx"]["error"])
+        return f"'{key}': {what}{_meaning(loc, model)}" if key else what
+    if first["type"] in ("model_type", "model_attributes_type"):
+        return f"'{key}' must be a table: [{key}]"
+    what = f"{first['msg'][0].lower()}{first['msg'][1:]}{_meaning(loc, model)}"
+    return f"'{key}' = {shortened(first['input'])}: {what}"
+
+
+def shortened(value: Any) -> str:
+    """A value as it stands in a file, no longer than people look at."""
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+
+
+def nearest(name: str, known: Sequence[str]) -> str:
+    """What may have been meant: the nearest of the names there are, else all of them."""
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    if close:
+        return f"did you mean '{close[0]}'?"
+    return f"known: {', '.join(known[:_NAMES]) or 'none'}{', ...' * (len(known) > _NAMES)}"
+
+
+def listed(text: str, known: Sequence[str], option: str, what: str) -> tuple[str, ...]:
+    """The names of an option with commas between, each once.
+
+    Raises
+    ------
+    ConfigError
+        If one is not known, or there is none.
+    """
+    names = tuple(dict.fromkeys(name.strip().lstrip(".") for name in text.split(",") if name.strip()))
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"{option} {text}: no {what} '{name}'; known: {', '.join(known)}")
+    if not names:
+        raise ConfigError(f"{option}: names no {what}; known: {', '.join(known)}")
+    return names
+
+
+def _tables(model: type[BaseModel], at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], type[BaseModel]]]:
+    """Every table of a file by its place, the whole file first."""
+    yield at, model
+    for name, field in model.model_fields.items():
+        options = (field.annotation, *getattr(field.annotation, "__args__", ()))
+        for inner in options:
+            if isinstance(inner, type) and issubclass(inner, BaseModel):
+                yield from _tables(inner, (*at, name))
+
+
+def _suggestion(loc: tuple[str, ...], model: type[BaseModel]) -> str:
+    """'; did you mean ...' with the nearest key of the table `loc` lies in, else of any table."""
+    tables = dict(_tables(model))
+    here = loc[:-1]
+    while here not in tables:
+        here = here[:-1]
+    known = list(tables[here].model_fields)
+    elsewhere: dict[str, tuple[str, ...]] = {}
+    for at, table in tables.items():
+        for name in table.model_fields if at else ():
+            elsewhere.setdefault(name, at)
+    if loc[-1] in elsewhere:
+        return f"; did you mean '{loc[-1]}' in [{'.'.join(elsewhere[loc[-1]])}]?"
+    if close := difflib.get_close_matches(loc[-1], known, n=1, cutoff=0.5):
+        return f"; did you mean '{close[0]}'?"
+    if close := difflib.get_close_matches(loc[-1], list(elsewhere), n=1, cutoff=0.8):
+        return f"; did you mean '{close[0]}' in [{'.'.join(elsewhere[close[0]])}]?"
+    return f"; known keys: {', '.join(known)}"
+
+
+def _meaning(loc: tuple[str, ...], model: type[BaseModel]) -> str:
+    """The unit and the sentence of a key, in brackets."""
+    tables = dict(_tables(model))
+    for n in range(len(loc), 0, -1):  # an entry of a tuple has the key of the tuple
+        field = tables[loc[: n - 1]].model_fields.get(loc[n - 1]) if loc[: n - 1] in tables else None
+        if field is not None:
+            return f" ({field.description})" if field.description else ""
+    return ""
+
+
+def _line_of(text: str, loc: tuple[str, ...]) -> int | None:
+    """The line (1-based) that says the key or, for one that is nowhere, opens the table it should be in."""
+    table: tuple[str, ...] = ()
+    found, depth = None, 0
+    for number, line in enumerate(text.splitlines(), 1):
+        at: tuple[str, ...] = ()
+        if opening := _TABLE.match(line.strip()):
+            at = table = tuple(part.strip(" \"'") for part in opening[1].split("."))
+        elif key := _KEY.match(line.strip()):
+            at = (*table, *(part.strip("\"'") for part in key[1].split(".")))
+        if len(at) > depth and at == loc[: len(at)]:
+            found, depth = number, len(at)
+    return found

@@ -1,0 +1,283 @@
+"""Files from anywhere, opened within limits: regular files only, of so many bytes unpacked, in lines so long.
+
+Whatever goes wrong with a file, be it that it is a pipe or a device, that its compression is damaged, or that it
+unpacks to more than anybody meant, is one sentence in the caller's own kind of error. The limits are
+`GRAPHNAV_MAX_FILE_MB` and `GRAPHNAV_MAX_LINE_KB` of the environment; docs/formats.md has their defaults.
+
+What a file names in its turn is read only from its own folder and those in it, unless `outside_allowed`.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import math
+import os
+import stat
+import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import IO, Any
+
+from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
+
+MAX_FILE, MAX_LINE = "GRAPHNAV_MAX_FILE_MB", "GRAPHNAV_MAX_LINE_KB"
+_DEFAULTS = {MAX_FILE: 2000, MAX_LINE: 1000}
+_WRITTEN = 64 << 20  # bytes of a file that people or programs write as a whole: settings, descriptions, summaries
+_RATIO, _SMALL = 200, 8 << 20  # a log packs to a tenth or so; below so many bytes it does not matter
+_CHUNK = 1 << 16
+_GZIP = b"\x1f\x8b"
+
+Kind = type[GraphnavError]
+_outside: ContextVar[bool] = ContextVar("outside", default=False)
+
+
+@contextmanager
+def outside_allowed(allowed: bool = True) -> Iterator[None]:
+    """Files named in other files may lie anywhere as long as this lasts, if `allowed`."""
+    before = _outside.set(allowed or _outside.get())
+    try:
+        yield
+    finally:
+        _outside.reset(before)
+
+
+def beside(source: Path, name: str, key: str, error: Kind = RecordingError) -> Path:
+    """The path of a file that the file `source` names under a key.
+
+    Raises
+    ------
+    GraphnavError
+        Of the kind given, if it lies outside the folder of `source`, symbolic links followed, or is no path at all.
+    """
+    path = source.parent / name
+    if not inside(path, source.parent, error):
+        raise error(
+            f"{source}: '{key}' names a file outside the folder that it lies in; move it there, or say --allow-outside "
+            "if you trust who wrote this"
+        )
+    exists(path, error)
+    return path
+
+
+def inside(path: Path, folder: Path, error: Kind = RecordingError) -> bool:
+    """Whether a path may be read because of what a file in `folder` says."""
+    try:
+        return _outside.get() or path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):  # too long, a null character, a loop of links
+        raise error(f"{_shown(path)}: is no path of a file") from None
+
+
+def check_inside(files: Iterable[Path], source: Path, error: Kind = RecordingError) -> None:
+    """Refuse files found in a folder that are links to somewhere outside it.
+
+    Raises
+    ------
+    GraphnavError
+        Of the kind given.
+    """
+    folder = source if source.is_dir() else source.parent
+    for file in files:
+        if file.is_symlink() and not inside(file, folder, error):
+            raise error(f"{file}: is a link to outside of {folder}; say --allow-outside if you trust who made it")
+
+
+def exists(path: Path, error: Kind = RecordingError) -> bool:
+    """Whether anything is there.
+
+    Raises
+    ------
+    GraphnavError
+        Of the kind given, if it is no path of a file.
+    """
+    try:
+        return path.exists()
+    except (OSError, ValueError) as cause:
+        raise error(f"{_shown(path)}: {getattr(cause, 'strerror', None) or 'is no path of a file'}") from None
+
+
+def check_regular(path: Path, error: Kind = RecordingError) -> None:
+    """Refuse what is not a file of bytes that end: a pipe, a device, a socket, a folder.
+
+    Raises
+    ------
+    GraphnavError
+        Of the kind given.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except OSError as cause:
+        raise error(f"{_shown(path)}: cannot be read ({cause.strerror})") from None
+    except ValueError:
+        raise error(f"{_shown(path)}: is no path of a file") from None
+    if stat.S_ISDIR(mode):
+        raise error(f"{path}: cannot be read (it is a folder)")
+    if not stat.S_ISREG(mode):
+        raise error(f"{path}: cannot be read (it is a pipe or a device, not a file); write it to a file first")
+
+
+def open_file(path: Path, error: Kind = RecordingError, text: bool = True, limit: int | None = None) -> Opened:
+    """The bytes of a file, unpacked if it is gzip-compressed; reading them raises only `error`.
+
+    Parameters
+    ----------
+    text : whether lines longer than the limit are refused.
+    limit : bytes that it may hold unpacked; None: what `GRAPHNAV_MAX_FILE_MB` says.
+    """
+    check_regular(path, error)
+    most = _limit(MAX_FILE, 10**6) if limit is None else limit
+    try:
+        plain = path.open("rb")
+        size = os.fstat(plain.fileno()).st_size
+        magic = plain.read(2)
+        plain.seek(0)
+    except OSError as cause:
+        raise error(f"{path}: cannot be read ({cause.strerror})") from None
+    line = _limit(MAX_LINE, 1000) if text else None
+    return Opened(_Bounded(path, plain, magic == _GZIP, size, most, line, error), size, magic == _GZIP)
+
+
+def read_bytes(path: Path, error: Kind = RecordingError, text: bool = True, limit: int | None = None) -> bytes:
+    """All bytes of a file; as `open_file`."""
+    with open_file(path, error, text, limit) as file:
+        return file.read()
+
+
+def check_size(path: Path, count: int, error: Kind = RecordingError) -> None:
+    """Refuse what another program has unpacked to more bytes than a file may hold.
+
+    Raises
+    ------
+    GraphnavError
+        Of the kind given.
+    """
+    if count > (most := _limit(MAX_FILE, 10**6)):
+        raise error(_too_large(path, most, packed=True))
+
+
+def read_text(path: Path, error: Kind = RecordingError) -> str:
+    """The text of a file that is written as a whole: settings, a description.
+
+    Raises
+    ------
+    GraphnavError
+        Of the kind given, if it cannot be read, is larger than any of its kind, or is not UTF-8.
+    """
+    try:
+        return read_bytes(path, error, text=False, limit=_WRITTEN).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise error(f"{path}: is not UTF-8 text; save it as UTF-8") from None
+
+
+def parse_json(text: str) -> Any:
+    """JSON, with everything that is wrong with it as a ValueError in a few words."""
+    try:
+        values = json.loads(text, parse_int=_whole)
+    except RecursionError:
+        raise ValueError("nested too deep") from None
+    return values
+
+
+def parse_number(text: str) -> float:
+    """A number in ASCII digits, as C and every other program reads it; `float` takes 1_000 and digits of any script.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError("not a number")
+    return float(text)
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > 20:
+        raise ValueError(f"a number of {len(digits)} digits")
+    return int(digits)
+
+
+def _limit(name: str, unit: int) -> int:
+    """A limit in bytes."""
+    stated = os.environ.get(name, "")
+    if not stated:
+        return _DEFAULTS[name] * unit
+    try:
+        value = float(stated)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise ConfigError(f"{name} = {stated!r}: must be a number above 0")
+    return int(value * unit)
+
+
+def _too_large(path: Path, most: int, packed: bool) -> str:
+    return f"{path}: holds more than {most / 1e6:g} MB{' unpacked' if packed else ''}; if that is right, set {MAX_FILE}"
+
+
+def _shown(path: Path) -> str:
+    text = str(path)
+    return text if len(text) <= 200 else f"{text[:100]}...{text[-40:]}"
+
+
+class Opened(io.BufferedReader):
+    """The bytes of a file, unpacked; `size` is that on disk, `packed` whether it is gzip-compressed there."""
+
+    def __init__(self, raw: _Bounded, size: int, packed: bool) -> None:
+        super().__init__(raw, 4 * _CHUNK)
+        self.size, self.packed = size, packed
+
+
+class _Bounded(io.RawIOBase):
+    """A file that ends with a sentence where it goes beyond a limit or is damaged."""
+
+    def __init__(
+        self, path: Path, plain: IO[bytes], packed: bool, size: int, most: int, line: int | None, error: Kind
+    ) -> None:
+        self.path, self.error, self._plain = path, error, plain
+        self._source: IO[bytes] = gzip.GzipFile(fileobj=plain, mode="rb") if packed else plain  # type: ignore[assignment]
+        self._size, self._most, self._longest, self._packed = size, most, line, packed
+        self._count = self._run = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        try:
+            chunk = self._source.read(min(len(buffer), _CHUNK))
+        except (EOFError, zlib.error, gzip.BadGzipFile) as cause:
+            cut = isinstance(cause, EOFError)
+            why = "the compressed file is cut off" if cut else f"the compressed file is damaged ({cause})"
+            raise self.error(f"{self.path}: {why}; copy it again") from None
+        except OSError as cause:
+            raise self.error(f"{self.path}: cannot be read ({cause.strerror})") from None
+        self._count += len(chunk)
+        if self._count > self._most:
+            raise self.error(_too_large(self.path, self._most, self._packed))
+        if self._packed and self._count > _SMALL and self._count > _RATIO * self._size and not os.environ.get(MAX_FILE):
+            raise self.error(
+                f"{self.path}: unpacks to more than {_RATIO} times its size, which no log does; if that is right, "
+                f"unpack it, or set {MAX_FILE}"
+            )
+        if self._longest is not None:
+            self._check_line(chunk)
+        buffer[: len(chunk)] = chunk
+        return len(chunk)
+
+    def _check_line(self, chunk: bytes) -> None:
+        last = max(chunk.rfind(b"\n"), chunk.rfind(b"\r"))
+        self._run = self._run + len(chunk) if last < 0 else len(chunk) - last - 1
+        if self._longest is not None and self._run > self._longest:
+            raise self.error(
+                f"{self.path}: has a line of more than {self._longest / 1000:g} kB, which no table has; if that is "
+                f"right, set {MAX_LINE}"
+            )
+
+    def close(self) -> None:
+        if not self.closed:
+            self._source.close()
+            self._plain.close()
+        super().close()

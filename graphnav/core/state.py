@@ -1,0 +1,114 @@
+"""Navigation states as a struct of arrays, and the error state every solver works in.
+
+Error state of one keyframe, 15 numbers in this order::
+
+    theta (3)  rad     right perturbation, R_nb <- R_nb Exp(theta)
+    p     (3)  m       additive, navigation frame
+    v     (3)  m/s     additive, navigation frame
+    ba    (3)  m/s^2   additive, accelerometer bias
+    bg    (3)  rad/s   additive, gyro bias
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core import rotation
+from graphnav.core.rotation import Array
+
+BLOCKS = {
+    "theta": slice(0, 3),
+    "p": slice(3, 6),
+    "v": slice(6, 9),
+    "ba": slice(9, 12),
+    "bg": slice(12, 15),
+}
+DIM = 15
+SECONDS = 3.0  # s, correlation time at first of what is wrong for seconds: reflections, slipping tyres
+NODE_SPACING = 5.0  # s between the nodes of what walks slowly: mounting angles, scale of an odometer
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Something estimated beside the states: a constant, a random walk, a stationary Gauss-Markov process, or a
+    constant that begins anew at given times.
+    """
+
+    name: str
+    initial: Array  # (k,), or (n, k) for one that begins anew
+    sigma: Array  # the same shape, 1-sigma of the initial value
+    unit: str
+    walk: float | Array = 0.0  # unit/sqrt(s) of a random walk, (k,) or one for all; 0 = constant
+    correlation_time: float | None = None  # s; given, a Gauss-Markov process about zero with `sigma` at all times
+    spacing: float = NODE_SPACING  # s, at least, from one of its nodes to the next
+    begins: Array | None = None  # (n,) s; given, `initial` and `sigma` hold anew from each of these times on
+    noise_groups: tuple[
+        str, ...
+    ] = ()  # (k,) of a process: the variance component (`graphnav.estimation.noise`) of each number
+
+    @property
+    def size(self) -> int:
+        """k"""
+        return int(np.shape(self.initial)[-1])
+
+    @cached_property
+    def constant(self) -> bool:
+        """One value for the whole recording."""
+        return self.begins is None and self.correlation_time is None and not np.any(self.walk)
+
+    def step(self, dt: Array) -> tuple[Array, Array]:
+        """Decay (n,) and sigma (n, k) of what is added over times dt (n,)."""
+        if self.correlation_time is None:
+            return np.ones_like(dt), np.sqrt(dt)[:, None] * np.broadcast_to(self.walk, self.sigma.shape)
+        decay = np.exp(-dt / self.correlation_time)
+        return decay, np.sqrt(1.0 - decay**2)[:, None] * self.sigma
+
+
+@dataclass(frozen=True)
+class States:
+    """K states; `states[index]` takes rows (a slice or an index array, so rows stay an axis)."""
+
+    R_nb: Array  # (K, 3, 3)
+    p: Array  # (K, 3)
+    v: Array  # (K, 3)
+    ba: Array  # (K, 3)
+    bg: Array  # (K, 3)
+
+    def __len__(self) -> int:
+        return len(self.p)
+
+    def __getitem__(self, index: slice | NDArray[Any]) -> States:
+        return States(self.R_nb[index], self.p[index], self.v[index], self.ba[index], self.bg[index])
+
+    def plus(self, delta: Array) -> States:
+        """Move by error states (K, 15)."""
+        return States(
+            self.R_nb @ rotation.exp(delta[:, 0:3]),
+            self.p + delta[:, 3:6],
+            self.v + delta[:, 6:9],
+            self.ba + delta[:, 9:12],
+            self.bg + delta[:, 12:15],
+        )
+
+    def minus(self, other: States) -> Array:
+        """The error states (K, 15) with ``other.plus(d) == self``."""
+        return np.concatenate(
+            [
+                rotation.log(np.swapaxes(other.R_nb, -1, -2) @ self.R_nb),
+                self.p - other.p,
+                self.v - other.v,
+                self.ba - other.ba,
+                self.bg - other.bg,
+            ],
+            axis=-1,
+        )
+
+    @staticmethod
+    def stack(rows: list[States]) -> States:
+        """One struct of many."""
+        return States(*(np.concatenate([getattr(s, f) for s in rows]) for f in ("R_nb", "p", "v", "ba", "bg")))

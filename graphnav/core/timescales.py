@@ -1,0 +1,128 @@
+"""GPS time, UTC and the leap seconds between them.
+
+GPS time runs on since 6 January 1980 UTC; each leap second since then puts it one further ahead (IERS Bulletin C; the
+table of IS-GPS-200 applications). No leap second has been added since 2017, and none will be before 2027.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+
+WEEK = 604800.0  # s
+NEAR = 3600.0  # s; logs of one drive begin within that of each other
+UNIX = 1e9  # s; stamps above are dates of this century in Unix time
+GPS_TO_UNIX = 315964800.0  # s from the Unix to the GPS epoch, leap seconds aside
+_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
+# days on which GPS - UTC grew by one, to 1 s at the first
+_LEAPS = np.array(
+    [
+        "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01", "1992-07-01",
+        "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01", "1999-01-01", "2006-01-01", "2009-01-01", "2012-07-01",
+        "2015-07-01", "2017-01-01",
+    ],
+    dtype="datetime64[us]",
+)  # fmt: skip
+
+
+LEAP = float(len(_LEAPS))  # s, GPS time ahead of UTC since the last of them
+
+
+def leap_seconds(utc: Array) -> Array:
+    """GPS minus UTC (s) at dates of type datetime64."""
+    return np.searchsorted(_LEAPS, utc, side="right").astype(float)
+
+
+def utc_to_gps(utc: Array) -> Array:
+    """Seconds since the GPS epoch of UTC dates (datetime64[us])."""
+    return (utc - _EPOCH) / np.timedelta64(1, "us") * 1e-6 + leap_seconds(utc)
+
+
+def unix_to_gps(t: Array) -> Array:
+    """Seconds since the GPS epoch of Unix time."""
+    utc = (np.asarray(t) * 1e6).astype("int64").astype("datetime64[us]")
+    return np.asarray(t) - GPS_TO_UNIX + leap_seconds(utc)
+
+
+def gps_to_utc(t: Array) -> Array:
+    """UTC (datetime64[us]) of seconds since the GPS epoch; right but for the second before a leap."""
+    gps = _EPOCH + np.round(np.asarray(t, dtype=float) * 1e6).astype("timedelta64[us]")
+    leap = leap_seconds(gps)
+    leap = leap_seconds(gps - (leap * 1e6).astype("timedelta64[us]"))
+    return np.asarray(gps - (leap * 1e6).astype("timedelta64[us]"))
+
+
+def of_week(gps: Array) -> tuple[Array, float]:
+    """Seconds of the GPS week of the first of some GPS times, and where that week begins (s since the GPS epoch)."""
+    zero = WEEK * np.floor(gps[0] / WEEK)
+    return gps - zero, float(zero)
+
+
+def parse_clock(text: str, t: float) -> float:
+    """Seconds since the GPS epoch at t = 0 of a clock in words; `t` (s) is a time of the log, for the leap seconds.
+
+    ``unix``: seconds since 1970 UTC. ``gps week 2313``: seconds of that week. ``2024-05-01T12:00:00Z``: seconds since
+    then, UTC.
+
+    Raises
+    ------
+    ValueError
+        If it is none of these.
+    """
+    if text == "unix":
+        return float(unix_to_gps(np.array([t]))[0]) - t
+    if found := re.fullmatch(r"gps week (\d{1,4})", text):
+        return WEEK * int(found[1])
+    try:
+        return float(utc_to_gps(np.array([text.removesuffix("Z")], dtype="datetime64[us]"))[0])
+    except ValueError:
+        raise ValueError('must be "unix", "gps week 2313" or a UTC date such as "2024-05-01T12:00:00Z"') from None
+
+
+@dataclass(frozen=True)
+class Epochs:
+    """What lies between two clocks that are known: to be added to the second's stamps, s, and in words why."""
+
+    offset: float
+    words: str
+
+
+def between_clocks(t: float, zero: float | None, u: float, other: float | None) -> Epochs | None:
+    """From a clock that reads `u` to one that reads `t`, both s, whose zeros (s since the GPS epoch) may be known.
+
+    Stamps above 1e9 are Unix time; those below a week are seconds of the GPS week of the others, where these are known.
+    None where this does not tell, or the clocks are the same.
+    """
+    unix = [x > UNIX for x in (t, u)]
+    first = parse_clock("unix", t) if unix[0] else zero
+    second = parse_clock("unix", u) if unix[1] else other
+    if first is None and second is not None and 0.0 <= t < WEEK:
+        first = WEEK * float(np.floor((u + second) / WEEK))
+    if second is None and first is not None and 0.0 <= u < WEEK:
+        second = WEEK * float(np.floor((t + first) / WEEK))
+    if first is None or second is None or abs(second - first) < 1.0:
+        return None
+    offset = second - first
+    week = second if unix[0] else first
+    if unix[0] == unix[1] or week % WEEK:
+        return Epochs(offset, f"the clocks count from {clock_words(first)} and {clock_words(second)}")
+    leap = float(leap_seconds(gps_to_utc(np.array([week])))[0])
+    begins = week + GPS_TO_UNIX - leap
+    return Epochs(
+        offset,
+        f"GPS week {round(week / WEEK)} begins at Unix time {begins:.0f} ({GPS_TO_UNIX:.0f} + {round(week / WEEK)} x "
+        f"{WEEK:.0f} - {leap:.0f} leap seconds)",
+    )
+
+
+def clock_words(gps_zero: float) -> str:
+    """The words of `parse_clock` for a clock: a GPS week, Unix time, or the UTC date of its zero."""
+    if -GPS_TO_UNIX <= gps_zero < -GPS_TO_UNIX + 60.0:
+        return "unix"
+    if gps_zero % WEEK == 0.0:
+        return f"gps week {round(gps_zero / WEEK)}"
+    return f"{gps_to_utc(np.array([gps_zero]))[0]}Z"

@@ -1,0 +1,51 @@
+"""A trajectory as people exchange it: time, geodetic position, velocity, attitude, and their sigmas."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.rotation import Array
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """What every output format is written from and every evaluation reads; radians and metres.
+
+    Optional parts are None where a source does not have them. `sd_p` and `sd_v` are along the local
+    east, north and up; `sd_rph` are of roll, pitch, heading. `covariance`, where known, is of
+    (position, velocity, roll-pitch-heading) in those same axes, (K, 9, 9).
+    """
+
+    t: Array  # (K,) s, strictly increasing
+    llh: Array  # (K, 3) latitude, longitude (rad), ellipsoidal height (m)
+    v: Array | None = None  # (K, 3) m/s in the local ENU at the point
+    rph: Array | None = None  # (K, 3) roll, pitch, heading, rad
+    sd_p: Array | None = None  # (K, 3) m
+    sd_v: Array | None = None  # (K, 3) m/s
+    sd_rph: Array | None = None  # (K, 3) rad
+    gyro_bias: Array | None = None  # (K, 3) rad/s, RFU
+    accel_bias: Array | None = None  # (K, 3) m/s^2, RFU
+    covariance: Array | None = None  # (K, 9, 9)
+    fix_type: Array | None = None  # (K,) where it is of a receiver: its numbers, NaN where unknown
+    frame: str = "geodetic"  # "local": llh then holds metres x, y, z of unknown origin and yaw
+    name: str = ""
+    notes: tuple[str, ...] = field(default=())
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @property
+    def R_lb(self) -> Array | None:
+        """Body to local ENU, (K, 3, 3)."""
+        return None if self.rph is None else rotation.from_rph(self.rph)
+
+    def take(self, index: Array | slice) -> Trajectory:
+        """The rows of `index` (a mask, an index array or a slice)."""
+        values: dict[str, Any] = {
+            key: (value[index] if isinstance(value, np.ndarray) else value) for key, value in self.__dict__.items()
+        }
+        return Trajectory(**values)

@@ -1,0 +1,81 @@
+"""The first state of a drive: attitude, velocity, position and biases at the first IMU sample, with sigmas.
+
+A short smoothing problem, posed and solved with the same parts as the whole drive, over the first stretch in
+which the vehicle moves. Levelling (the mean specific force points up) and the median turn rate (a vehicle
+mostly goes straight or stands) start it, and the heading that turns the felt accelerations into those of the
+fixes, or one of three more 90 degrees apart: the one that explains the fixes best wins. So neither speed nor a standing
+start is assumed. What is too slow to feel its accelerations knows its heading by its course, which is forwards unless
+they say otherwise. From there the gyro carries the attitude back to the first sample.
+
+What the short problem learned, the long one will learn again from the same data. So the result enters as the
+point to start from, with a prior `prior_inflation` times wider than its own sigma: information counts once. Only
+what the fixes do not contain, that a vehicle's forward axis is roughly its course, enters at its own worth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.detectors.base import NONE
+from graphnav.estimation.alignment.course import COURSE_SIGMA
+from graphnav.estimation.alignment.first import Alignment
+from graphnav.estimation.alignment.motion import Smoother, in_motion, motion, plausible
+from graphnav.estimation.alignment.rest import at_rest
+from graphnav.recording import Recording
+
+__all__ = ["COURSE_SIGMA", "Alignment", "Smoother", "align", "ready", "with_known_heading"]
+
+
+def align(
+    recording: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, stationary: Array = NONE
+) -> Alignment:
+    """Find the first state of a recording.
+
+    Parameters
+    ----------
+    smooth : solves a posed problem from start states; handed in because solvers stand behind this room.
+    stationary : (N, 2) s, intervals in which a vehicle stands, where fixes that jump are no motion; a foot's stances.
+
+    Raises
+    ------
+    EstimationError
+        If nothing in the recording can give an attitude.
+    """
+    recording = plausible(recording)
+    span = motion(recording, settings, stationary)
+    if span is None:
+        return at_rest(recording, settings, frame, stationary)
+    return replace(in_motion(recording, settings, frame, smooth, span), motion=span[0], until=span[1])
+
+
+def ready(recording: Recording, settings: Settings, stationary: Array = NONE) -> bool:
+    """Whether the fixes so far show all the motion that an alignment wants to see."""
+    span = motion(plausible(recording), settings, stationary)
+    return span is not None and recording.gnss is not None and span[1] < recording.gnss.t[-1]
+
+
+def with_known_heading(found: Alignment, settings: Settings) -> Alignment:
+    """The alignment with the start heading the user states, where there is one."""
+    known = settings.alignment.heading
+    if known is None:
+        return found
+    rph = found.rph
+    rph[2] = np.radians(known)
+    sigma = found.sigma.copy()
+    sigma[2] = np.radians(settings.alignment.heading_sigma)
+    return replace(
+        found,
+        state=replace(found.state, R_nb=rotation.from_rph(rph)[None]),
+        sigma=sigma,
+        notes=(
+            *found.notes,
+            f"start heading stated: {known:g} deg, 1-sigma {settings.alignment.heading_sigma:g} deg "
+            f"(found: {np.degrees(found.rph[2]):.1f} deg)",
+        ),
+    )

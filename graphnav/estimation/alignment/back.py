@@ -1,0 +1,118 @@
+"""From the start of the first motion back to the first sample."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.core.state import States
+from graphnav.estimation.alignment.first import Alignment
+from graphnav.estimation.solution import Solution
+from graphnav.imu.preintegration import prefix
+from graphnav.imu.samples import bridge_gaps
+from graphnav.recording import Imu, Recording
+
+_BASE = 5.0  # s between fixes that tell the first velocity
+
+
+def carried_back(
+    recording: Recording,
+    settings: Settings,
+    solution: Solution,
+    R: Array,
+    wide: Array,
+    own: Array,
+    begin: float,
+    notes: tuple[str, ...],
+) -> Alignment:
+    """From the start of the short problem to the first sample of the recording."""
+    imu, noise = recording.imu, recording.imu.noise
+    bg, ba = solution.states.bg[0], solution.states.ba[0]
+    p, v = solution.states.p[0], solution.states.v[0]
+    sd = np.sqrt(np.diag(solution.covariance[0]))
+    sd_bg = sd[12:15]
+    sd_p, sd_v = np.full(3, 1.0) + 10.0 * sd[3:6], np.full(3, 0.5) + 10.0 * sd[6:9]
+    if begin - recording.start > 0.05:
+        still = _stands_until(imu, recording.start, begin)
+        stood, back = still - recording.start, begin - still
+        drift = np.zeros(3)
+        if back > 0.05:
+            dR, dV, dP = prefix(bridge_gaps(imu), still, np.array([begin]), ba, bg)
+            R = rotation.exp(solution.frame.omega_n * back) @ R @ dR[0].T  # the Earth turned meanwhile
+            g = solution.frame.gravity_n(p)
+            v0 = v - g * back - R @ dV[0]
+            p = p - v0 * back - 0.5 * g * back**2 - R @ dP[0]
+            v = v0
+            drift = sd_bg * back
+            tilt = 9.8 * float(np.max(wide[:2] + drift[:2])) + float(np.max(sd[9:12]))
+            sd_v, sd_p = sd_v + tilt * back, sd_p + sd_v * back + 0.5 * tilt * back**2
+            notes = (*notes, f"carried back {back:.1f} s by the gyro to the first sample")
+        if stood > 0.0:
+            rest = imu.t <= still
+            bg = imu.gyro[rest].mean(axis=0) - solution.frame.omega_n @ R
+            v, sd_v = np.zeros(3), np.minimum(sd_v, 0.5)
+            drift = np.hypot(drift, noise.gyro_noise_density * np.sqrt(stood))
+            notes = (*notes, f"stands for the first {stood:.0f} s; the attitude is that of the first motion")
+            sd_bg = np.full(3, noise.gyro_noise_density / np.sqrt(stood) + noise.gyro_bias_walk * np.sqrt(stood))
+        p, sd_p, v, sd_v = _by_first_fixes(recording, solution.frame, R, (p, sd_p, v, sd_v))
+        wide = np.hypot(wide, settings.alignment.prior_inflation * drift)
+        own = np.hypot(own, np.abs(rotation.rph_jacobian(rotation.to_rph(R))) @ drift)
+    sigma = np.concatenate(
+        [wide, sd_p, sd_v, [noise.accel_bias_sigma] * 3, np.maximum(noise.gyro_bias_sigma, 5.0 * sd_bg)]
+    )
+    state = States(R[None], p[None], v[None], ba[None], bg[None])
+    return Alignment(state, np.minimum(sigma, np.r_[[np.pi] * 3, [1e6] * 12]), own, notes)
+
+
+def _stands_until(imu: Imu, start: float, end: float) -> float:
+    """How long nothing but vibration is in the samples from the start: one-second means hardly differ. `start` if not.
+
+    The last second before the first that differs is left out as well: something may have begun in it.
+    """
+    rows = imu.t <= end
+    blocks = max(1, int(end - start))
+    size = np.count_nonzero(rows) // blocks
+    if size < 2 or blocks < 2:
+        return start
+    force = imu.accel[rows][: size * blocks].reshape(blocks, size, 3).mean(axis=1)
+    rate = imu.gyro[rows][: size * blocks].reshape(blocks, size, 3).mean(axis=1)
+    moves = np.any((_range(force) > 0.25) | (_range(rate) > 0.02), axis=1)
+    if not moves.any():
+        return end
+    stood = int(np.argmax(moves)) - 1
+    return float(imu.t[size * stood - 1]) if stood >= 2 else start
+
+
+def _range(x: Array) -> Array:
+    """(N, k) highest less lowest so far."""
+    return np.maximum.accumulate(x, axis=0) - np.minimum.accumulate(x, axis=0)
+
+
+def _by_first_fixes(
+    recording: Recording, frame: LocalFrame, R: Array, found: tuple[Array, Array, Array, Array]
+) -> tuple[Array, Array, Array, Array]:
+    """Position and velocity at the start, each with its sigma: as found, or by the first fixes where these know more.
+
+    Inertial sensors lose the place within a minute or so; fixes from before the first motion are still there.
+    """
+    p, sd_p, v, sd_v = found
+    gnss = recording.gnss
+    assert gnss is not None
+    inside = np.flatnonzero((gnss.t >= recording.start - 0.5) & np.isfinite(gnss.llh).all(axis=1))
+    i, later = inside[0], inside[gnss.t[inside] >= gnss.t[inside[0]] + _BASE]
+    fix = frame.from_llh(gnss.llh[i]) - R @ gnss.lever_arm
+    v_fix, sd_v_fix = v, np.full(3, np.inf)
+    if len(later):
+        j, dt = later[0], float(gnss.t[later[0]] - gnss.t[i])
+        v_fix = (frame.from_llh(gnss.llh[j]) - frame.from_llh(gnss.llh[i])) / dt
+        sd_v_fix = 3.0 * np.hypot(gnss.sd[i], gnss.sd[j]) / dt + 2.0 * dt  # the speed may change meanwhile, 2 m/s^2
+    if np.linalg.norm(sd_v_fix) < np.linalg.norm(sd_v):
+        v, sd_v = v_fix, sd_v_fix
+    away = abs(float(gnss.t[i]) - recording.start)
+    sd_fix = 1.0 + 10.0 * gnss.sd[i] + (np.linalg.norm(v) + sd_v) * away
+    if np.linalg.norm(sd_fix) < np.linalg.norm(sd_p):
+        p, sd_p = fix - v * (gnss.t[i] - recording.start), sd_fix
+    return p, sd_p, v, sd_v

@@ -1,0 +1,56 @@
+"""What an alignment gives, and what each way to it needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.rotation import Array
+from graphnav.core.state import States
+from graphnav.recording import Gnss, Recording
+
+_SIGMAS = 3.0
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The prior of the first keyframe: one state, 15 sigmas, and what was done in words."""
+
+    state: States
+    sigma: Array  # (15,) of the prior
+    own_sigma: Array  # (3,) rad, of roll, pitch, heading as the alignment itself believes them
+    notes: tuple[str, ...]
+    motion: float | None = None  # s, about when the vehicle first moves; None when it never does
+    until: float | None = None  # s, the end of what a filter goes through twice: the stretch of motion, or first steps
+
+    @property
+    def rph(self) -> Array:
+        """Roll, pitch, heading, rad."""
+        return rotation.to_rph(self.state.R_nb[0])
+
+    def contradicts(self, other: Alignment) -> bool:
+        """Whether another is not where this one can be: by its own sigma of attitude, by its prior's of the rest."""
+        sigma = np.concatenate([self.own_sigma, self.sigma[3:]])
+        off = np.concatenate([rotation.wrap(self.rph - other.rph), self.state.minus(other.state)[0, 3:]])
+        return bool(np.any(np.abs(off) > _SIGMAS * sigma))
+
+
+def level(recording: Recording, begin: float, seconds: float = 1.0) -> Array:
+    """(roll, pitch) from the mean specific force after `begin`, rad."""
+    imu = recording.imu
+    f = imu.accel[(imu.t > begin) & (imu.t <= begin + seconds)]
+    f = (f if len(f) else imu.accel[:1]).mean(axis=0)
+    return np.array([np.arctan2(-f[0], f[2]), np.arctan2(f[1], np.hypot(f[0], f[2]))])
+
+
+def some(gnss: Gnss, rows: Array) -> Gnss:
+    """Fixes picked by index or mask."""
+    pick: dict[str, Any] = {"t": gnss.t[rows], "llh": gnss.llh[rows], "sd": gnss.sd[rows]}
+    if gnss.v is not None and gnss.sd_v is not None:
+        pick |= {"v": gnss.v[rows], "sd_v": gnss.sd_v[rows]}
+    if gnss.type is not None:
+        pick["type"] = gnss.type[rows]
+    return replace(gnss, **pick)

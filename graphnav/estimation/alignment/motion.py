@@ -1,0 +1,193 @@
+"""The first state from motion: a short smoothing problem over the first stretch in which the vehicle moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from graphnav.config import Settings
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import EstimationError
+from graphnav.core.rotation import Array
+from graphnav.core.state import States
+from graphnav.detectors.base import NONE, inside
+from graphnav.estimation.alignment.back import carried_back
+from graphnav.estimation.alignment.course import COURSE_SIGMA, with_course
+from graphnav.estimation.alignment.first import Alignment, level, some
+from graphnav.estimation.alignment.travel import across, travel, turned
+from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.solution import Solution
+from graphnav.imu.preintegration import prefix
+from graphnav.imu.samples import bridge_gaps
+from graphnav.recording import Gnss, Imu, Recording
+
+_DIRECTION = 0.5 * COURSE_SIGMA  # rad, to which the fixes shall know the direction of travel: less than the rest does
+_FIXES = 10  # that the short problem wants to see
+_FEWEST = 3  # without which there is no acceleration
+_MOVES = 5.0  # sigmas of way that are motion: noise gets there once in 270 000 fixes, exp(-5^2/2)
+_BEFORE = 10.0  # s of the stretch before the motion
+_JUMP = 6.0  # times what fixes usually are off their running median, or their sigma
+_TURNS = (0.0, np.pi, 0.5 * np.pi, 1.5 * np.pi)  # rad, of the start headings that are tried from the first guess
+
+Smoother = Callable[[Problem, States], Solution]
+
+
+def plausible(recording: Recording) -> Recording:
+    """Without the fixes that lie far off the running median of five: they would be taken for motion."""
+    gnss = recording.gnss
+    if gnss is not None and not np.isfinite(gnss.llh).all():
+        gnss = some(gnss, np.flatnonzero(np.isfinite(gnss.llh).all(axis=1)))
+        recording = replace(recording, gnss=gnss)
+    if gnss is None or len(gnss.t) < 5:
+        return recording
+    p = LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
+    off = np.linalg.norm(p - median_filter(p, size=(5, 1), mode="nearest"), axis=1)
+    usual = np.maximum(np.median(off), np.linalg.norm(gnss.sd[:, :2], axis=1))
+    return replace(recording, gnss=some(gnss, off <= _JUMP * usual))
+
+
+def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:
+    """The stretch (s) to align over: from just before the first motion until enough of it was seen.
+
+    It moves where it is farther away than the errors of the fixes can have brought it, over ground or in its own axes
+    (`graphnav.estimation.alignment.travel`); enough is seen once these errors leave little doubt of the direction. What the fixes
+    say of motion while a vehicle stands, `stationary` (N, 2) s, is none.
+    """
+    gnss = recording.gnss
+    if gnss is None:
+        return None
+    used = (gnss.t >= recording.start) & (gnss.t <= recording.end)
+    if np.count_nonzero(used) < _FEWEST:
+        return None
+    gnss = _thinned(gnss, recording.start, recording.end)
+    if len(gnss.t) < _FEWEST:
+        return None
+    t, p = gnss.t, LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
+    if recording.platform == "vehicle":
+        yaw, still = turned(recording.imu, t, _usual_rate(recording.imu)), inside(t, stationary)
+    else:  # a foot turns about every axis
+        yaw, still = np.zeros(len(t)), np.zeros(len(t), dtype=bool)
+    sd = across(gnss.sd)
+    way = travel(p, sd, yaw, still)
+    away = np.maximum(way.times_sigma, travel(p, sd, np.zeros(len(t)), still).times_sigma) > _MOVES
+    if not away.any():
+        return None
+    first = int(np.argmax(away))
+    enough = (way.times_sigma > 1.0 / np.tan(_DIRECTION)) & (t > t[first] + settings.alignment.window)
+    enough &= np.arange(len(t)) >= first + _FIXES
+    last = int(np.argmax(enough)) if enough.any() else len(t) - 1
+    # at the speed that followed it took a while to get that far
+    speed = np.abs(way.D[last] - way.D[first]) / max(t[last] - t[first], 1.0)
+    under_way = np.abs(way.D[first]) / speed if speed > 0.0 else np.inf
+    begin = min(t[first] - _BEFORE - under_way, t[max(last - _FEWEST + 1, 0)])
+    return float(max(t[0], np.round(begin, 3))), float(t[last])  # what rounding did to D shall not show
+
+
+def in_motion(
+    recording: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, span: tuple[float, float]
+) -> Alignment:
+    """The first state from the short problem over `span` (s), carried back to the first sample."""
+    gnss, imu = recording.gnss, recording.imu
+    assert gnss is not None
+    begin, end = max(span[0], recording.start), span[1]
+    part = replace(
+        recording.crop(begin - recording.start, end - recording.start),
+        gnss=_thinned(gnss, begin, end),
+    )
+    bias = _usual_rate(imu)
+    rp = level(recording, begin)
+    heading = _heading_of_accelerations(part, frame, rp, bias)
+    tried = [_try(part, settings, frame, smooth, np.array([*rp, heading + turn]), bias) for turn in _TURNS]
+    tried = [one for one in tried if np.isfinite(one.cost)]
+    if not tried:
+        raise EstimationError(
+            f"'{recording.name}': no start attitude explains the GNSS fixes between {begin - recording.start:.0f} "
+            f"and {end - recording.start:.0f} s; check the axes, the units and the time stamps"
+        )
+    best = min(tried, key=lambda one: one.cost)
+    R, P = best.states.R_nb[0], best.covariance[0][:3, :3]
+    wide = settings.alignment.prior_inflation * np.sqrt(np.diag(P))
+    J = rotation.rph_jacobian(rotation.to_rph(R))
+    own = np.sqrt(np.diag(J @ P @ J.T))
+    said: tuple[str, ...] = ()
+    if recording.platform == "vehicle":
+        assert part.gnss is not None
+        found = with_course(tried, part.gnss, own[2], wide[2])
+        R = rotation.exp(np.array([0.0, 0.0, -found.turn])) @ R  # heading is clockwise, rotation about up is not
+        own[2], wide[2], said = found.own, found.wide, found.notes
+    notes = (
+        f"aligned over {begin - recording.start:.0f} to {end - recording.start:.0f} s: roll and pitch to "
+        f"{np.degrees(own[:2].max()):.2g} deg, heading to {np.degrees(own[2]):.2g} deg",
+        *said,
+    )
+    return carried_back(recording, settings, best, R, wide, own, begin, notes)
+
+
+def _heading_of_accelerations(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> float:
+    """Heading (rad) at the start of `part` by which levelled accelerations become those of the fixes.
+
+    With both horizontal accelerations as complex numbers east + i north, fixes = z * felt + d by least squares;
+    the argument of z is the turn from the heading-zero frame, d takes up tilt.
+    """
+    gnss = part.gnss
+    assert gnss is not None
+    t = gnss.t
+    p = frame.from_llh(gnss.llh)
+    v = gnss.v if gnss.v is not None and np.isfinite(gnss.v).all() else np.gradient(p, t, axis=0)
+    change = np.diff(v, axis=0) / np.diff(t)[:, None]
+    _, dV, _ = prefix(bridge_gaps(part.imu), part.start, t[1:], np.zeros(3), bias)
+    felt = np.diff(dV @ rotation.from_rph(np.array([*rp, 0.0])).T, axis=0) / np.diff(t[1:])[:, None]
+    a = felt[:, 0] + 1j * felt[:, 1]
+    b = change[1:, 0] + 1j * change[1:, 1]
+    z = np.vdot(a - a.mean(), b - b.mean())
+    return float(-np.angle(z))
+
+
+def _usual_rate(imu: Imu) -> Array:
+    """Median turn rate, kept within what the sensor's turn-on bias can be, rad/s."""
+    limit = 3.0 * imu.noise.gyro_bias_sigma
+    return np.clip(np.median(imu.gyro, axis=0), -limit, limit)
+
+
+def _thinned(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
+    """Fixes of a span at most about one a second: enough to align, and quick."""
+    inside = np.flatnonzero((gnss.t >= begin) & (gnss.t <= end))
+    keep, last = [], -np.inf
+    for i in inside:
+        if gnss.t[i] - last >= spacing:
+            keep.append(i)
+            last = gnss.t[i]
+    return some(gnss, np.array(keep))
+
+
+def _try(part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, rph: Array, bias: Array) -> Solution:
+    """Solve the short problem from one start attitude."""
+    noise, gnss = part.imu.noise, part.gnss
+    assert gnss is not None
+    fixes = frame.from_llh(gnss.llh)
+    R0 = rotation.from_rph(rph)
+    start = States(R0[None], fixes[:1], np.zeros((1, 3)), np.zeros((1, 3)), bias[None])
+    sigma = np.concatenate(
+        [
+            [0.3, 0.3, np.pi],
+            [100.0] * 3,
+            [50.0] * 3,
+            [noise.accel_bias_sigma] * 3,
+            [noise.gyro_bias_sigma] * 3,
+        ]
+    )
+    # one bad fix or a burst must not decide the heading
+    robust = settings.gnss.model_copy(update={"robust": "cauchy", "lever_arm_sigma": None, "time_offset_sigma": 0.0})
+    # what the wheels say of the heading is brought in by `_with_course`
+    problem = pose(part, settings.without_wheels().model_copy(update={"gnss": robust}), frame, start, sigma)
+    dR, _, _ = prefix(problem.samples, problem.t[0], problem.t[1:], np.zeros(3), bias)
+    t = problem.t
+    p = np.stack([np.interp(t, gnss.t, fixes[:, k]) for k in range(3)], -1)
+    v = np.gradient(p, t, axis=0)
+    K = len(t)
+    R = R0 @ np.concatenate([np.eye(3)[None], dR])
+    return smooth(problem, States(R, p, v, np.zeros((K, 3)), np.tile(bias, (K, 1))))

@@ -1,0 +1,75 @@
+"""The first state where nothing shows motion over ground: levelled, the heading unknown or zero by definition."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.core.state import States
+from graphnav.detectors.base import NONE
+from graphnav.estimation.alignment.first import Alignment, level
+from graphnav.imu.preintegration import prefix
+from graphnav.imu.samples import bridge_gaps
+from graphnav.recording import Recording
+
+_AT_ONCE = 0.05  # s from the start within which a foot that stands is found
+_OPENING = 10  # stances of a walk by which tilt and accelerometer bias are told apart
+_WALKING = 3.0  # m/s, 1-sigma of the start velocity of a foot in the air
+
+
+def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, stationary: Array) -> Alignment:
+    """Level only; the heading stays unknown. Of a foot, `stationary` (N, 2) s are its stances."""
+    noise, gnss = recording.imu.noise, recording.gnss
+    stances = stationary if recording.platform == "foot" else NONE
+    begin, seconds = _standing(recording, stances)
+    R = rotation.from_rph(np.array([*level(recording, begin, seconds), 0.0]))
+    tilt, sd_v = noise.accel_bias_sigma / 9.8 + np.radians(1.0), 0.5
+    bias, sd_bias = np.zeros(3), noise.gyro_bias_sigma
+    if settings.alignment.gyro_bias is not None:
+        bias, sd_bias = np.array(settings.alignment.gyro_bias), settings.alignment.gyro_bias_sigma
+    if begin > recording.start:
+        dR, _, _ = prefix(bridge_gaps(recording.imu), recording.start, np.array([begin]), np.zeros(3), bias)
+        R = R @ dR[0].T
+        R = rotation.from_rph(rotation.to_rph(R) * [1.0, 1.0, 0.0])
+        tilt, sd_v = np.hypot(tilt, sd_bias * (begin - recording.start)), _WALKING
+    own = np.array([tilt, tilt, np.pi])
+    if gnss is None or not len(gnss.t):
+        # without fixes the first pose defines the frame: position and heading are exact by definition
+        p, sd_p, sd_heading = np.zeros(3), np.full(3, 1e-3), 1e-4
+        note = "no GNSS: levelled at the start, position and heading count from zero there"
+    else:
+        p = frame.from_llh(gnss.llh[0]) - R @ gnss.lever_arm
+        sd_p, sd_heading = 10.0 * gnss.sd[0] + 1.0, np.pi
+        note = "no motion in the GNSS fixes: levelled at the start, heading unknown"
+    state = States(
+        R[None],
+        p[None],
+        np.zeros((1, 3)),
+        np.zeros((1, 3)),
+        bias[None],
+    )
+    sigma = np.concatenate(
+        [
+            [settings.alignment.prior_inflation * tilt] * 2,
+            [sd_heading],
+            sd_p,
+            [sd_v] * 3,
+            [noise.accel_bias_sigma] * 3,
+            [sd_bias] * 3,
+        ]
+    )
+    return Alignment(state, sigma, own, (note,), until=float(stances[:_OPENING][-1, 1]) if len(stances) else None)
+
+
+def _standing(recording: Recording, stances: Array) -> tuple[float, float]:
+    """From when (s), and for how long, to level: from the start, or for a foot that starts in the air its first stance.
+
+    Of a stance the middle half is used.
+    """
+    if len(stances) and stances[0, 0] > recording.start + _AT_ONCE:
+        length = float(stances[0, 1] - stances[0, 0])
+        return float(stances[0, 0]) + 0.25 * length, min(1.0, 0.5 * length)
+    return recording.start, 1.0

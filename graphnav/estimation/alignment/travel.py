@@ -1,0 +1,88 @@
+"""How far fixes show a platform to have travelled, seen from itself, beside what their own errors explain.
+
+A displacement over ground says nothing of a vehicle that circles, and little of one that creeps. So steps from fix to
+fix are turned back into the axes of the platform, as the gyro turns, and only then summed,
+
+    D = sum of (p_i - p_i-1) r_i,      r_i: the turn from the axes at i to those at the start,
+
+which grows with the way on any course. Summed by parts, the errors e_i of the fixes enter D at both ends, and in
+between with what the axes turn, e_i (r_i - r_i+1). What that adds depends on how long errors last. Of a Gauss-Markov
+process of variance s^2 and correlation time T, turned at the rate w, it has the variance 2 T w^2 s^2 / (1 + w^2 T^2)
+per second, and most for T = 1/w: w s^2. Nothing is known of T. So along each axis
+
+    var D  <=  s^2 (2 + total turn in rad)
+
+whatever T is. The direction of D in the body is that of travel, to sqrt(var D) / |D|.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.rotation import Array
+from graphnav.imu.samples import bridge_gaps
+from graphnav.recording import Imu
+
+_SWAY = 0.4  # m, 1-sigma along an axis: what an antenna moves on a vehicle that does not travel; springs, load, a mast
+
+
+@dataclass(frozen=True)
+class Travel:
+    """What was travelled since the first of N points."""
+
+    D: NDArray[np.complex128]  # (N,) m, forward + i left where `yaw` is of forward from east
+    sigma: Array  # (N,) m, along one axis
+    turn: Array  # (N,) rad, all turns since the start, either way
+
+    @property
+    def times_sigma(self) -> Array:
+        """(N,) how many sigmas the way is long."""
+        return np.abs(self.D) / self.sigma
+
+
+def travel(p: Array, sd: Array, yaw: Array, still: NDArray[np.bool_] | None = None) -> Travel:
+    """What was travelled along points.
+
+    The way between two points is a chord, as far as the turn between them goes; of more than a radian it says nothing.
+
+    Parameters
+    ----------
+    p : (N, 2) m, east and north.
+    sd : (N,) m, 1-sigma of a point along one axis.
+    yaw : (N,) rad, what a level axis of the body has turned counter-clockwise, whole circles included.
+    still : (N,) points at which the platform stands; between two of them no way is counted.
+    """
+    moves = np.ones(len(p) - 1) if still is None else 1.0 - (still[1:] & still[:-1])
+    angle = moves * np.abs(np.diff(yaw))
+    variance = sd**2 + _SWAY**2
+    seen = angle < 1.0
+    step = seen * moves * np.diff(p[:, 0] + 1j * p[:, 1]) * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
+    angle = np.where(seen, angle, 2.0)  # an end here and a beginning there, as of two ways
+    within = np.concatenate([[0.0], np.cumsum(angle * variance[1:])])
+    D, turn = (np.concatenate([[0.0], np.cumsum(x)]) for x in (step, angle))
+    return Travel(D, np.sqrt(variance[0] + variance + within), turn)
+
+
+def across(sd: Array) -> Array:
+    """(N,) m, 1-sigma along one horizontal axis of fixes with `sd` (N, 3)."""
+    return np.sqrt(np.mean(sd[:, :2] ** 2, axis=1))
+
+
+def turned(imu: Imu, t: Array, bias: Array) -> Array:
+    """(N,) rad, what the body has turned about up since the first of the times `t`, counter-clockwise, by the gyro.
+
+    Up is the mean specific force from each time to the next: what a vehicle accelerates by leans it by a few degrees,
+    of which a turn rate keeps the cosine. `bias` (3,) rad/s.
+    """
+    samples = bridge_gaps(imu)
+    edges = np.concatenate([[samples.start], samples.t])
+    dt = np.diff(edges)[:, None]
+    angle = np.concatenate([np.zeros((1, 3)), np.cumsum((samples.gyro - bias) * dt, axis=0)])
+    force = np.concatenate([np.zeros((1, 3)), np.cumsum(samples.accel * dt, axis=0)])
+    angle, force = (np.stack([np.interp(t, edges, x[:, k]) for k in range(3)], -1) for x in (angle, force))
+    up = np.diff(force, axis=0)
+    up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9)
+    return np.concatenate([[0.0], np.cumsum(np.sum(np.diff(angle, axis=0) * up, axis=1))])

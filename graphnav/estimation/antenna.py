@@ -1,0 +1,158 @@
+"""Whether the antenna is where the recording says: its lever arm estimated from the drive, beside the one stated.
+
+A wrong lever arm, or one with a wrong sign, fits no turn: the fixes swing about the IMU otherwise than stated. The
+estimate is that of `gnss.lever_arm_sigma`, from the first part of the drive, with next to nothing known before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.vehicle import AXLE
+from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import EstimationError
+from graphnav.core.findings import Finding
+from graphnav.core.progress import tell
+from graphnav.core.rotation import Array
+from graphnav.detectors import detect
+from graphnav.estimation.alignment import align
+from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.estimate import estimate_noise
+from graphnav.estimation.pipeline import origin
+from graphnav.estimation.problem import pose
+from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.rts import backward, rts
+from graphnav.recording import Recording, rows_of
+
+_UNKNOWN = 2.0  # m, 1-sigma before the drive
+_FINE = 0.3  # m, 1-sigma of fixes that tell
+_LONG = 0.25  # m, of the part of an arm whose sign matters
+_OPPOSITE = 0.5  # of how far it is found from where it is stated, it may be from where the other sign puts it
+_PART = 240.0  # s
+_FEWEST = 30  # fixes
+_SURE = 8.0  # sigmas: 4, and twice that because errors of fixes are alike for minutes
+
+
+@dataclass(frozen=True)
+class Antenna:
+    """Where the antenna is, from the IMU, right, forward, up."""
+
+    stated: Array  # (3,) m
+    found: Array  # (3,) m
+    sigma: Array  # (3,) m, of `found`
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the drive has nothing against what is stated."""
+        return bool((np.abs(self.found - self.stated) <= _SURE * self.sigma).all())
+
+    @property
+    def finding(self) -> Finding:
+        """It in a sentence."""
+        found = ", ".join(f"{x:.2f} +- {s:.2f}" for x, s in zip(self.found, self.sigma, strict=True))
+        stated = ", ".join(f"{x:.2f}" for x in self.stated)
+        if self.agrees:
+            return Finding(
+                "note", f"antenna: the drive finds it at [{found}] m, which agrees with [{stated}] as stated"
+            )
+        return Finding(
+            "warning",
+            f"antenna: the drive finds it at [{found}] m and not at [{stated}] as stated: look at lever_arm in [gnss] "
+            "(right, forward, up of the IMU) and its signs, or let gnss.lever_arm_sigma estimate it",
+        )
+
+
+def find_antenna(recording: Recording) -> Antenna:
+    """Estimate the lever arm of the antenna.
+
+    Raises
+    ------
+    EstimationError
+        Without GNSS, or if the drive cannot be aligned.
+    """
+    return _estimate(recording)[0]
+
+
+def reversed_arms(recording: Recording) -> list[Finding]:
+    """Parts of lever arms whose sign the drive denies: it finds them where the opposite sign would put them.
+
+    Of a vehicle with fixes that are precise enough to tell, by the part of the drive that turns most; else nothing.
+    """
+    gnss, odometer = recording.gnss, recording.odometer
+    if recording.platform != "vehicle" or gnss is None or len(gnss.t) < _FEWEST:
+        return []
+    told = np.abs(gnss.lever_arm) > _LONG
+    wheel = odometer is not None and abs(odometer.lever_arm[1]) > _LONG
+    if np.median(gnss.sd[:, :2]) > _FINE or not (told.any() or wheel):
+        return []
+    second = np.floor(gnss.t)
+    thin = rows_of(gnss, np.concatenate([[True], np.diff(second) > 0.0]))
+    try:
+        antenna, axle = _estimate(_most_turning(replace(recording, gnss=thin)))
+    except EstimationError:
+        return []
+    out = []
+    for name, stated, found, sigma, parts in (
+        ("gnss", antenna.stated, antenna.found, antenna.sigma, ("right", "forward", "up")),
+        *((("odometer", *axle, ("forward",)),) if axle is not None else ()),
+    ):
+        sure = np.abs(found - stated) > _SURE * sigma
+        nearer = np.abs(found + stated) < _OPPOSITE * np.abs(found - stated)
+        wrong = sure & (np.abs(stated) > _LONG) & (found * stated < 0.0) & nearer
+        for k in np.flatnonzero(wrong):
+            out.append(
+                Finding(
+                    "warning",
+                    f"the {parts[k]} part of lever_arm in [{name}] has the wrong sign: the drive finds {found[k]:+.2f} "
+                    f"+- {sigma[k]:.2f} m where {stated[k]:+.2f} is stated (from the IMU)",
+                    f"{name}.lever_arm_sign",
+                )
+            )
+    return out
+
+
+def _most_turning(recording: Recording) -> Recording:
+    """The part of a drive, `_PART` s long at most, in which it turns most where there are fixes."""
+    imu, gnss = recording.imu, recording.gnss
+    assert gnss is not None
+    if recording.duration <= _PART:
+        return recording
+    turned = np.concatenate([[0.0], np.cumsum(np.linalg.norm(imu.gyro[1:], axis=1) * np.diff(imu.t))])
+    starts = np.arange(recording.start, recording.end - _PART, 0.1 * _PART)
+    way = np.interp(starts + _PART, imu.t, turned) - np.interp(starts, imu.t, turned)
+    fixes = np.searchsorted(gnss.t, starts + _PART) - np.searchsorted(gnss.t, starts)
+    best = float(starts[np.argmax(way * fixes)]) - recording.start
+    return recording.crop(best, best + _PART)
+
+
+def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array] | None]:
+    """The antenna, and how far ahead the point is that does not slip, (1,) m each: stated, found, sigma."""
+    from graphnav.estimation.solvers.batch import batch
+
+    if recording.gnss is None or not len(recording.gnss.t):
+        raise EstimationError(f"'{recording.name}': there is no GNSS whose antenna could be found")
+    settings, frame = Settings(), LocalFrame(origin(recording))
+    tell("detection")
+    still = detect(recording, settings).stationary
+    tell("alignment")
+    aligned = align(recording, settings, frame, lambda p, start: batch(p, start, wanted=(0,), reintegrate=False))
+    if aligned.motion is None:
+        raise EstimationError(f"'{recording.name}': without motion nothing tells where the antenna is")
+    unknown = {"gnss": {"lever_arm_sigma": _UNKNOWN}, "vehicle": {"axle_sigma": _UNKNOWN}}
+    sections = {name: getattr(settings, name).model_copy(update=values) for name, values in unknown.items()}
+    settings = settings.model_copy(update=sections)
+    problem = pose(recording, settings, frame, aligned.state, aligned.sigma, still, parts_of_noise=True)
+    tell("noise")
+    problem = with_noise(problem, estimate_noise(problem, aligned.until).noise)
+    tell("filter")
+    forward = ekf(problem, opening=aligned.until)
+    parameters = rts(problem, forward, backward(problem, forward)).parameters
+    arm, axle = parameters["gnss_lever_arm"], parameters.get(AXLE)
+    antenna = Antenna(recording.gnss.lever_arm, arm.value[-1], arm.sigma[-1])
+    if axle is None or recording.odometer is None:
+        return antenna, None
+    stated = recording.odometer.lever_arm[1:2]
+    return antenna, (stated, stated + axle.value[-1], axle.sigma[-1])

@@ -1,0 +1,136 @@
+"""States between keyframes, at any rate: the IMU's own samples integrated from the keyframe before.
+
+A filter's state between keyframes is that prediction. A smoother knows the next keyframe too; what the
+prediction misses it by is laid over the interval so that position, velocity and attitude stay one motion: the
+position's share is the cubic that begins with nothing and ends with the miss in position and velocity, the
+velocity's is its derivative, attitude and biases go linearly. Covariances are interpolated linearly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.estimation.problem import Problem
+from graphnav.imu.dynamics import Motion, as_biases
+from graphnav.imu.preintegration import Intervals, within
+from graphnav.imu.samples import Samples
+
+
+def times_between(start: float, end: float, rate: float) -> Array:
+    """Multiples of 1/rate between two times (s), with both ends."""
+    steps = np.arange(np.ceil(start * rate), np.floor(end * rate) + 1) / rate
+    inner = steps[(steps > start + 1e-6) & (steps < end - 1e-6)]
+    return np.concatenate([[start], inner, [end]])
+
+
+@dataclass(frozen=True)
+class Dense:
+    """Callable for `Solution.between`."""
+
+    samples: Samples
+    frame: LocalFrame
+    t: Array  # (K,)
+    states: States
+    covariance: Array  # (K, 15, 15)
+    ba: Array  # (K-1, 3) biases with scale errors, as each interval saw them
+    bg: Array  # (K-1, 3)
+    smooth: bool
+
+    @property
+    def start(self) -> float:
+        """First keyframe, s."""
+        return float(self.t[0])
+
+    @property
+    def end(self) -> float:
+        """Last keyframe, s."""
+        return float(self.t[-1])
+
+    def times(self, rate: float) -> Array:
+        """Multiples of 1/rate on the recording's clock, with both ends."""
+        return times_between(self.start, self.end, rate)
+
+    def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
+        """States and covariances (M, size, size), of the first errors, at ascending times from `start` to `end`."""
+        k = np.clip(np.searchsorted(self.t, t, side="left") - 1, 0, len(self.t) - 2)
+        T = np.diff(self.t)[k]
+        s = (t - self.t[k]) / T
+        # every target is reached from its keyframe, and for the miss so is the end of every interval with one in it
+        touched = np.unique(k)
+        ends = self.t[touched + 1] if self.smooth else self.t[:0]
+        targets = np.unique(np.concatenate([t[t > self.t[0]], ends]))
+        ahead = self._predicted(targets)
+        states = self.states[k]
+        moved = t > self.t[0]
+        at = np.searchsorted(targets, t[moved])
+        reached = ahead[at]
+        if self.smooth:
+            predicted = ahead[np.searchsorted(targets, ends)]
+            miss = self.states[touched + 1].minus(predicted)[np.searchsorted(touched, k[moved])]
+            reached = reached.plus(_laid(miss, s[moved, None], T[moved, None]))
+        else:
+            exact = np.isclose(s[moved], 1.0, rtol=0.0, atol=1e-9)
+            reached = _choose(exact, self.states[k[moved] + 1], reached)
+        states = _choose(moved, _spread(reached, moved, states), states)
+        w = s[:, None, None]
+        before, after = self.covariance[k, :size, :size], self.covariance[k + 1, :size, :size]
+        return states, (1.0 - w) * before + w * after
+
+    def _predicted(self, t: Array) -> States:
+        """Prediction from the keyframe before each time."""
+        k = np.searchsorted(self.t, t, side="left") - 1
+        if not len(t):
+            return self.states[k]
+        # of the intervals touched alone: whoever asks for a few times pays for a few
+        first, last = int(k[0]), int(k[-1]) + 1
+        samples, used = self.samples.between(self.t[first], self.t[last]), slice(first, last)
+        dR, dV, dP = within(samples, self.t[first : last + 1], t, self.ba[used], self.bg[used])
+        n = len(t)
+        none = np.zeros((n, 3, 3))
+        start = self.states[k]
+        intervals = Intervals(
+            self.t[k], t, dR, dV, dP, none, none, none, none, none, start.ba, start.bg,
+            np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 0, 0)), np.zeros((n, 0, 0, 0)), none, none,
+            np.zeros((n, 3)), none,
+        )  # fmt: skip
+        return Motion(intervals, self.frame).propagate(slice(None), start, linear=False)[0]
+
+
+def _laid(miss: Array, s: Array, T: Array) -> Array:
+    """The share (M, 15) of a miss at the fraction s of intervals T long."""
+    out = miss * s
+    p, v = miss[:, 3:6], miss[:, 6:9]
+    out[:, 3:6] = p * (3 * s**2 - 2 * s**3) + v * T * (s**3 - s**2)
+    out[:, 6:9] = p * (6 * s - 6 * s**2) / T + v * (3 * s**2 - 2 * s)
+    return out
+
+
+def _choose(mask: Array, yes: States, no: States) -> States:
+    """Rows of one struct or another."""
+    return States(
+        np.where(mask[:, None, None], yes.R_nb, no.R_nb),
+        *(np.where(mask[:, None], getattr(yes, f), getattr(no, f)) for f in ("p", "v", "ba", "bg")),
+    )
+
+
+def _spread(rows: States, mask: Array, like: States) -> States:
+    """`rows` put where `mask` is true; elsewhere as in `like`."""
+    out = like[np.arange(len(like))]
+    for name in ("R_nb", "p", "v", "ba", "bg"):
+        getattr(out, name)[mask] = getattr(rows, name)
+    return out
+
+
+def dense(problem: Problem, states: States, covariance: Array, scale: Array | None, smooth: bool) -> Dense:
+    """For a solution of a problem; `scale` is (k,) or, as a filter knew it at each keyframe, (K, k)."""
+    ba, bg = states.ba[:-1], states.bg[:-1]
+    if scale is not None:
+        scale = np.broadcast_to(scale, (len(states), scale.shape[-1]))[:-1]
+        of_accel, of_gyro = as_biases(scale, problem.intervals.force, problem.intervals.rate)
+        ba, bg = ba + of_accel, bg + of_gyro
+    return Dense(problem.samples, problem.frame, problem.t, states, covariance, ba, bg, smooth)

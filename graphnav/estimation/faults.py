@@ -1,0 +1,56 @@
+"""Spans of measurements that no solver uses, and what is wrong with them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solution import Fault
+from graphnav.estimation.solvers.passes import Smoothed, residual_record
+
+
+def spans(problem: Problem, smoothed: Smoothed | None = None) -> tuple[Fault, ...]:
+    """The rows of weight 0, by constraint and in order of time; with a smoothed solution, what is wrong with them."""
+    out = []
+    for rows in problem.constraints:
+        lost = np.flatnonzero(rows.weight == 0.0) if rows.weight is not None else np.empty(0, dtype=int)
+        if not len(lost):
+            continue
+        t = problem.t[rows.keyframe]
+        off = None
+        if smoothed is not None:
+            record = residual_record(problem, rows, smoothed)
+            off = np.linalg.norm(record.residual, axis=1)
+        for run in np.split(lost, np.flatnonzero(np.diff(lost) > 1) + 1):
+            reason = ""
+            if off is not None:
+                reason = f"{np.median(off[run]):.2g} {rows.unit} from where everything else puts it"
+                if len(run) > 1:
+                    reason += f", {np.max(off[run]):.2g} at most"
+            out.append(Fault(rows.name, float(t[run[0]]), float(t[run[-1]]), len(run), reason))
+    return tuple(out)
+
+
+def notes(faults: tuple[Fault, ...], problem: Problem) -> tuple[str, ...]:
+    """A sentence for each kind of measurement that some are left out of."""
+    out = []
+    for rows in problem.constraints:
+        own = [fault for fault in faults if fault.kind == rows.name]
+        if own:
+            longest = max(own, key=lambda f: f.t_end - f.t_start)
+            begin = longest.t_start - problem.recording.start
+            out.append(
+                f"{rows.name}: {sum(f.count for f in own)} of {len(rows)} are wrong and left out, in {len(own)} spans; "
+                f"the longest, from {begin:.1f} s for {longest.t_end - longest.t_start:.1f} s, is {longest.reason}"
+            )
+    return tuple(out)
+
+
+def weighted(problem: Problem, weights: Mapping[str, Array]) -> Problem:
+    """A problem with its rows weighted, (N,) by constraint."""
+    constraints = (replace(c, weight=weights[c.name]) if c.name in weights else c for c in problem.constraints)
+    return replace(problem, constraints=tuple(constraints))

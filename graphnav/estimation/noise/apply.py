@@ -1,0 +1,108 @@
+"""A problem as a noise model has it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from graphnav.constraints.base import SAME_TIME, Constraint
+from graphnav.core.rotation import Array
+from graphnav.core.state import Parameter
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.problem import Problem
+from graphnav.imu.dynamics import Motion
+from graphnav.imu.preintegration import NOISE_FIGURES
+
+
+def with_noise(problem: Problem, noise: NoiseModel) -> Problem:
+    """A problem posed with stated noise, with a noise model's figures instead.
+
+    Parameters
+    ----------
+    problem : as posed; its intervals keep the parts of their covariances if a figure of the IMU differs.
+    """
+    factors = np.array([noise.factor(f"imu.{name}", 1.0) for name in NOISE_FIGURES])
+    if np.any(factors != 1.0):
+        intervals = problem.intervals.with_noise(factors)
+        figures = {
+            name: float(np.sqrt(f)) * getattr(problem.imu_noise, name)
+            for name, f in zip(NOISE_FIGURES, factors, strict=True)
+        }
+        problem = replace(
+            problem,
+            intervals=intervals,
+            motion=Motion(intervals, problem.frame),
+            imu_noise=replace(problem.imu_noise, **figures),
+        )
+    return replace(
+        problem, constraints=_with_common_nodes([_rows(problem, rows, noise) for rows in problem.constraints])
+    )
+
+
+def _with_common_nodes(constraints: list[Constraint]) -> tuple[Constraint, ...]:
+    """The same, with nodes at the same times for all processes that rows depend on: one variable of the graph."""
+    closest: dict[str, float] = {}
+    for _ in range(2):  # through what two constraints share
+        for rows in constraints:
+            some = [p for p in rows.parameters if p.begins is None and not p.constant]
+            least = min((closest.get(p.name, p.spacing) for p in some), default=np.inf)
+            closest |= {p.name: least for p in some}
+    return tuple(
+        replace(c, parameters=tuple(replace(p, spacing=closest.get(p.name, p.spacing)) for p in c.parameters))
+        for c in constraints
+    )
+
+
+def _rows(problem: Problem, rows: Constraint, noise: NoiseModel) -> Constraint:
+    own = tuple(_process(p, noise, 1.0) for p in rows.parameters)
+    errors = tuple(_process(p, noise, 0.0) for p in rows.processes)
+    changed: dict[str, Any] = {"parameters": tuple(p for p in (*own, *errors) if p is not None)}
+    names, index = rows.noise_groups()
+    if names:
+        root = np.sqrt([noise.factor(name, 1.0) for name in names])
+        changed["sigma"] = _scaled(rows, np.where(index >= 0, root[index], 1.0))
+    if rows.name in noise.weights or rows.name in noise.excluded:
+        changed["weight"] = row_weights(problem.t[rows.keyframe], noise, rows.name)
+    return replace(rows, **changed)
+
+
+def _scaled(rows: Constraint, root: Array) -> Array:
+    """(N, m) sigmas times the roots of variance factors, but for the part that has none."""
+    sigma: Array = rows.sigma  # type: ignore[attr-defined]
+    if rows.unscaled is None:
+        return sigma * root
+    return np.sqrt((sigma**2 - rows.unscaled**2) * root**2 + rows.unscaled**2)
+
+
+def _process(p: Parameter, noise: NoiseModel, missing: float) -> Parameter | None:
+    """A parameter with its factors; None for a process that does not exist."""
+    if not p.noise_groups:
+        return p
+    factors = np.array([noise.factor(group, missing) for group in p.noise_groups])
+    if not factors.any():
+        return None
+    sigma = p.sigma * np.sqrt(np.maximum(factors, 1e-12))
+    return replace(p, sigma=sigma, correlation_time=noise.times.get(p.name, p.correlation_time))
+
+
+def row_weights(t: Array, noise: NoiseModel, name: str) -> Array:
+    """(N,) weights of a constraint's rows at times t (N,), s; rows of one time, as of satellites, keep their order."""
+    out = np.ones(len(t))
+    some = noise.weights.get(name)
+    if some is not None and len(some.t):
+        number = np.arange(len(t)) - np.searchsorted(t, t - SAME_TIME)  # among the rows of its time
+        at = np.clip(np.searchsorted(some.t, t - SAME_TIME) + number, 0, len(some.t) - 1)
+        same = np.abs(some.t[at] - t) <= SAME_TIME
+        out[same] = some.weight[at[same]]
+    for begin, end in noise.excluded.get(name, ()):
+        out[(t >= begin - SAME_TIME) & (t <= end + SAME_TIME)] = 0.0
+    return out
+
+
+def without_parts(problem: Problem) -> Problem:
+    """The same without what each noise figure contributes, which takes room and nobody asks for any more."""
+    n, _, *size = problem.intervals.parts.shape
+    intervals = replace(problem.intervals, parts=np.empty((n, 0, *size)))
+    return replace(problem, intervals=intervals, motion=Motion(intervals, problem.frame))

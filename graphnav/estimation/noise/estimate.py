@@ -1,0 +1,280 @@
+"""All noise figures of a recording at once, by the likelihood of its innovations.
+
+Maximum a posteriori: with L the innovation log-likelihood of the filter and a log-normal prior on every variance
+factor, the estimate maximises L plus the logarithm of the priors. From pass to pass, filter and smoother linearised at
+the points that the pass before left, every factor f with redundancy B and the sum of squares A
+(`graphnav.estimation.noise.moments`) goes to the maximum over x = ln(f_new / f) of
+
+    -(B x + A e^-x) / 2 - (ln f + x - m)^2 / (2 s^2)
+
+the likelihood of A / f as a chi-square variable of B degrees of freedom, and the prior. Without a prior that is the
+fixed point f <- f A / B of Foerstner (1979), Koch (1999, section 3.6) and MacKay (1992); no sensor is judged before
+another, so none is believed for having come first. What few rows say is bounded: squares that chance would leave once
+in a thousand times have no more say than that (`_CHANCE`), and a row, or what is wrong with wheels for seconds, has a
+weight by which it would be that large.
+
+The first passes see the first `_FIRST` keyframes only; the last ones see all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+from graphnav.constraints.base import Constraint
+from graphnav.constraints.gnss import TIMES
+from graphnav.core.rotation import Array
+from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.model import Figure, NoiseModel, RowWeights
+from graphnav.estimation.noise.moments import imu_moments, lag_moments, process_moments, row_moments
+from graphnav.estimation.noise.priors import TIME_WITHIN, prior
+from graphnav.estimation.problem import ParameterChain, Problem
+from graphnav.estimation.solvers.ekf import ekf, refilter
+from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.passes import Forward, Smoothed, points_of, values_of
+from graphnav.estimation.solvers.rts import backward
+from graphnav.imu.preintegration import NOISE_FIGURES
+
+_CHANCE = 1e-3  # below which a squared residual is taken for an outlier
+_USUAL = 0.05  # of the squares of an aiding sensor, that count for no more: nearly two in five may be wrong
+_FIRST = 1500  # keyframes: figures told by a thousand numbers are good to a twentieth
+_ROUNDS, _AGAIN = 8, 3  # passes at most, from priors and from figures that were estimated before
+_AHEAD = 2.0  # times its own length that a step is taken at most (Aitken's extrapolation)
+_TIMES = 30.0  # by which a correlation time may be shorter or longer than usual
+_GRID = np.linspace(-1.0, 1.0, 21)
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """A noise model, the points its last pass left, and how it came about."""
+
+    noise: NoiseModel
+    points: Smoothed
+    forward: Forward
+    log_posterior: float
+    log_prior: float
+    passes: int  # of filter and smoother
+    looks: int = 0  # passes of the filter alone, for measurements that are wrong
+
+
+@dataclass
+class _Figures:
+    """The figures as they are so far."""
+
+    log: dict[str, float]
+    usual_times: dict[str, float]  # s, correlation times to look about
+    freedom: dict[str, float] = field(default_factory=dict)
+    times: dict[str, float] = field(default_factory=dict)
+    weights: dict[str, RowWeights] = field(default_factory=dict)
+    excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
+    steps: dict[str, float] = field(default_factory=dict)  # the latest of each, as it was found
+    ahead: float = 1.0  # times its own length that a step is taken at most
+
+    def model(self) -> NoiseModel:
+        figures = {}
+        for name, x in self.log.items():
+            m, s = self.prior(name)
+            B = self.freedom.get(name, 0.0)
+            figures[name] = Figure(x, float((0.5 * B + s**-2.0) ** -0.5), m, s, B)
+        return NoiseModel(figures, dict(self.times), dict(self.weights), self.excluded)
+
+    def prior(self, name: str) -> tuple[float, float]:
+        """Median and 1-sigma of a log factor; fixes that scatter more than stated are worse in what lasts as well."""
+        m, s = prior(name)
+        sensor, *kind, axis = name.split(".")
+        if sensor == "gnss_position" and kind and kind[-1] in TIMES:
+            m += max(0.0, self.log.get(".".join([sensor, *kind[:-1], axis]), 0.0))
+        return m, s
+
+    def log_prior(self) -> float:
+        return -0.5 * sum(((x - m) / s) ** 2 for name, x in self.log.items() for m, s in [self.prior(name)])
+
+    def update(self, name: str, A: float, B: float) -> None:
+        """One component, by its squares and its redundancy."""
+        m, s = self.prior(name)
+        x, before = 0.0, self.log[name]
+        for _ in range(50):
+            slope = 0.5 * (A * np.exp(-x) - B) - (before + x - m) / s**2
+            step = float(np.clip(slope / (0.5 * A * np.exp(-x) + s**-2.0), -1.0, 1.0))
+            x += step
+            if abs(step) < 1e-6:
+                break
+        x = float(np.clip(x, -3.0, 3.0))
+        # components that trade with each other creep: what the steps, each a share of the one before, will add up to
+        ratio = x / self.steps[name] if self.steps.get(name) else 0.0
+        self.steps[name] = x
+        if 0.0 < ratio < 1.0 and self.ahead > 1.0:
+            x = float(np.clip(x * min(1.0 / (1.0 - ratio), self.ahead), -3.0, 3.0))
+        self.log[name], self.freedom[name] = before + x, B
+
+
+def estimate_noise(
+    problem: Problem,
+    opening: float | None = None,
+    start: NoiseModel | None = None,
+    near: tuple[Points, Problem] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> NoiseEstimate:
+    """Estimate the noise model of a problem posed with stated noise and with the parts of its intervals' noise.
+
+    Parameters
+    ----------
+    opening : as for `graphnav.estimation.solvers.ekf.ekf`.
+    start : figures to set out from, weights of rows, and what is left out; prior medians when None.
+    near : points of all keyframes to linearise at first, and the problem that they are of.
+
+    Raises
+    ------
+    EstimationError
+        If the filter breaks down.
+    """
+    figures = _begin(problem, start)
+    about = (
+        _first_points(problem, figures, opening)
+        if near is None
+        else _carried(*near, with_noise(problem, figures.model()))
+    )
+    passes, total = int(near is None), len(problem.t)
+    warm = start is not None and bool(start.figures)
+    rounds = _AGAIN if warm else _ROUNDS
+    ends = [total] if total <= 2 * _FIRST or warm else [_FIRST, total]
+    for end in ends:
+        before = -np.inf
+        figures.ahead = 1.0
+        for k in range(rounds):
+            used = with_noise(problem, figures.model())
+            forward, smoothed = _pass(used, about, end)
+            passes += 1
+            prior_then = figures.log_prior()
+            now = float(np.sum(forward.log_likelihood)) + prior_then
+            if progress is not None:
+                progress("noise", (k + 1) / rounds)
+            _improve(figures, used, forward, smoothed, end)
+            about = _spliced(about, smoothed)
+            # a tenth of what chance makes as many figures gain
+            if k > 1 and abs(now - before) < 0.05 * len(figures.log):
+                break
+            before, figures.ahead = now, _AHEAD if k > 1 and now > before else 1.0
+    return NoiseEstimate(figures.model(), smoothed, forward, now, prior_then, passes)
+
+
+def _begin(problem: Problem, start: NoiseModel | None) -> _Figures:
+    names = [f"imu.{name}" for name in NOISE_FIGURES]
+    for rows in problem.constraints:
+        names += [*rows.noise_groups()[0], *(g for p in (*rows.parameters, *rows.processes) for g in p.noise_groups)]
+    names += [group for p in problem.parameters.values() for group in p.noise_groups]
+    log = {name: prior(name)[0] for name in dict.fromkeys(names)}
+    processes = [p for rows in problem.constraints for p in (*rows.parameters, *rows.processes)]
+    times = {p.name: p.correlation_time for p in processes if p.correlation_time is not None}
+    if start is None:
+        return _Figures(log, times)
+    log |= {name: start.figures[name].log_factor for name in log if name in start.figures}
+    return _Figures(log, times, times=dict(start.times), weights=dict(start.weights), excluded=start.excluded)
+
+
+def _first_points(problem: Problem, figures: _Figures, opening: float | None) -> Points:
+    used = with_noise(problem, figures.model())
+    return backward(used, ekf(used, opening=opening))
+
+
+def _carried(points: Points, before: Problem, after: Problem) -> Points:
+    return points_of(after, points.states, values_of(before, points))
+
+
+def _spliced(about: Points, part: Points) -> Points:
+    """Points with the first of them replaced."""
+    n = len(part.values)
+    if n == len(about.values):
+        return Points(part.states, part.values)
+    states = type(part.states).stack([part.states, about.states[n:]])
+    return Points(states, np.concatenate([part.values, about.values[n:]]))
+
+
+def _pass(problem: Problem, about: Points, end: int) -> tuple[Forward, Smoothed]:
+    forward = refilter(problem, about.first(end))
+    return forward, backward(problem, forward)
+
+
+def _capped(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, float]:
+    """Sums of squares and of redundancies; no square counts for more than chance allows, made up for in the mean.
+
+    For z^2 chi-square with m degrees of freedom and the limit q, E[min(z^2, q)] = m P(chi2_m+2 < q) + q P(chi2_m > q).
+    """
+    most = float(chdtri(freedom, chance))
+    mean = freedom * (1.0 - float(chdtrc(freedom + 2, most))) + most * chance
+    return float(np.sum(np.minimum(A, most / freedom * B))) * freedom / mean, float(np.sum(B))
+
+
+def _improve(figures: _Figures, problem: Problem, forward: Forward, smoothed: Smoothed, end: int) -> None:
+    """One step for all figures and weights."""
+    A, B = imu_moments(problem, forward, smoothed)
+    for i, name in enumerate(NOISE_FIGURES):
+        figures.update(f"imu.{name}", *_capped(A[:, i], B[:, i], 3, _CHANCE))
+    driven: dict[str, tuple[Array, Array, Array]] = {}
+    for chain in problem.chains:
+        if chain.parameter.noise_groups:
+            driven[chain.parameter.name] = process_moments(problem, chain, smoothed, end)
+            _improve_process(figures, chain, driven[chain.parameter.name])
+            if chain.parameter.correlation_time is not None:
+                _improve_time(figures, chain, lag_moments(problem, chain, forward, smoothed, end))
+    for rows in problem.constraints:
+        names, index = rows.noise_groups()
+        if not names:
+            continue
+        n = int(np.searchsorted(rows.keyframe, end))
+        found = row_moments(problem, rows, smoothed, n)
+        for i, name in enumerate(names):
+            own = index[:n] == i
+            if own.any():
+                figures.update(name, *_capped(found.A[own], found.B[own], 1, _USUAL))
+        _weigh(figures, problem, rows, np.maximum(found.left_out.sum(axis=1), found.whole.sum(axis=1)), n)
+
+
+def _improve_process(figures: _Figures, chain: ParameterChain, moments: tuple[Array, Array, Array]) -> None:
+    _, A, B = moments
+    groups = np.array(chain.parameter.noise_groups)
+    for group in dict.fromkeys(chain.parameter.noise_groups):
+        own = groups == group
+        figures.update(group, *_capped(A[:, own], B[:, own], 1, _USUAL))
+
+
+def _improve_time(figures: _Figures, chain: ParameterChain, lags: tuple[Array, ...]) -> None:
+    """The correlation time by expectation and maximisation, on a grid, with a log-normal prior about what it was."""
+    dt, later, cross, before = lags
+    p = chain.parameter
+    assert p.correlation_time is not None
+    told = np.array([figures.freedom.get(group, 0.0) > 1.0 for group in p.noise_groups])
+    if not told.any() or not len(dt):
+        return
+    times = p.correlation_time * np.exp(_GRID)
+    a = np.exp(-dt[:, None] / times)[..., None]
+    q = (1.0 - a * a) * chain.sigma[0] ** 2
+    squares = later[:, None] - 2.0 * a * cross[:, None] + a * a * before[:, None]
+    value = -0.5 * np.sum((np.log(q) + squares / q)[..., told], axis=(0, 2))
+    usual = figures.usual_times[p.name]
+    value -= 0.5 * (np.log(times / usual) / TIME_WITHIN) ** 2
+    j = int(np.clip(np.argmax(value), 1, len(_GRID) - 2))
+    low, here, high = value[j - 1 : j + 2]
+    bend = low - 2.0 * here + high
+    off = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
+    found = p.correlation_time * np.exp(_GRID[j] + (_GRID[1] - _GRID[0]) * np.clip(off, -1.0, 1.0))
+    figures.times[p.name] = float(np.clip(found, usual / _TIMES, usual * _TIMES))
+
+
+def _weigh(figures: _Figures, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:
+    """Weights of the first n rows by their squared errors (n,): of their own, and of the whole with what lasts."""
+    m = len(rows.axes)
+    t, most = problem.t[rows.keyframe], float(chdtri(m, _CHANCE))
+    before = np.ones(len(rows)) if rows.weight is None else rows.weight
+    some = squared[before[:n] > 0.0]
+    # what half of the rows do is no error of rows: the figures have not come to what they are yet
+    usual = float(np.median(some)) / float(chdtri(m, 0.5)) if len(some) else 1.0
+    squared = squared / max(usual, 1.0)
+    weight = np.minimum(1.0, most / np.maximum(squared, 1e-30))
+    weight = np.concatenate([weight, before[n:]])  # later ones as they were
+    less = (weight < 1.0) & (before > 0.0)
+    less |= np.isin(t, t[less])  # with all rows of their times, so that each is known by its number among them
+    figures.weights[rows.name] = RowWeights(t[less], weight[less])

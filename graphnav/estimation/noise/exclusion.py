@@ -1,0 +1,258 @@
+"""Which measurements are wrong for a while: each span decided once, by evidence.
+
+The bank of likelihood-ratio tests (`graphnav.estimation.solvers.watch`) says in which spans fixes disagree with everything else by
+something that lasts. Who is wrong there is another question. With the noise model as it is, each span is put as several
+models, each with its own likelihood of the innovations from the span's beginning to that of the next one:
+
+    neither     all is as the noise model has it
+    fixes       positions, velocities or both have one unknown error in common in the span, which grows steadily
+    wheels      what is assumed of wheels, and the odometer, have one such error in common there
+
+An unknown error has a Gaussian prior about zero, as wide as such errors get (`_WIDE`), and so has its growth; what that
+width costs in likelihood is the cost of the explanation (MacKay 1992, "Bayesian interpolation": the Occam factor). A
+fault is also as rare beforehand as the tests take it to be. The best model decides what is left out.
+
+Figures that are estimated with a fault in the data may have grown until they hide it. So the tests are made with the
+prior medians of the figures as well; where they find something else, the figures are estimated without that, each span
+is decided with these, and of the two explanations of all measurements the likelier one stands.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
+from graphnav.core.rotation import Array
+from graphnav.core.state import Parameter, States
+from graphnav.estimation import faults
+from graphnav.estimation.noise.apply import row_weights, with_noise
+from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
+from graphnav.estimation.noise.model import NoiseModel, RowWeights
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solution import Fault
+from graphnav.estimation.solvers.ekf import refilter
+from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.passes import points_of, values_of
+from graphnav.estimation.solvers.watch import FALSE_ALARM
+from graphnav.recording import Recording
+
+FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
+_WRONG: tuple[tuple[str, ...], ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS)
+_WIDE = {"m": 100.0, "m/s": 10.0}  # reflections in a city are off by up to a hundred metres; wheels by their speed
+_ODDS = -float(np.log(FALSE_ALARM))  # by which a fault is less likely beforehand than none
+_NONE = 1e-9  # sigma of an error that is not there
+_MINUTE = 60.0  # s
+
+
+@dataclass(frozen=True)
+class _Shifted(Constraint):
+    """Rows of a constraint with an error in common within spans."""
+
+    inner: Any = None
+    error: str = ""
+    since: Any = None  # (N,) s since the span began
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return str(self.inner.name)
+
+    @property
+    def axes(self) -> tuple[str, ...]:  # type: ignore[override]
+        return tuple(self.inner.axes)
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        return np.empty(0)
+
+    @classmethod
+    def build(cls, scene: Scene) -> None:
+        return None
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        unknown = parameters[self.error]  # (n, 2 m), at the beginning of the span and growth in a minute
+        linear = self.inner.linearize(states, {k: v for k, v in parameters.items() if k != self.error}, rows)
+        n, m = linear.residual.shape
+        minutes = (self.since[rows] / _MINUTE)[:, None]
+        J = np.concatenate([np.broadcast_to(np.eye(m), (n, m, m)), minutes[..., None] * np.eye(m)], axis=-1)
+        residual = linear.residual + unknown[:, :m] + minutes * unknown[:, m:]
+        return Linearized(residual, linear.jacobians | {self.error: J}, linear.sigma)
+
+
+def with_common_errors(problem: Problem, spans: list[tuple[float, float]], kinds: tuple[str, ...]) -> Problem:
+    """The problem with one unknown error of each of some constraints in each span (s)."""
+    begins, wide = [float(problem.t[0]) - 1.0], [0.0]
+    for a, b in spans:
+        begins += [a, b + 2.0 * SAME_TIME]  # a node holds from this much before it
+        wide += [1.0, 0.0]
+
+    def shifted(rows: Constraint) -> Constraint:
+        if rows.name not in kinds:
+            return rows
+        name, m = f"{rows.name}_fault", len(rows.axes)
+        sigma = np.maximum(np.outer(wide, np.full(2 * m, _WIDE[rows.unit])), _NONE)
+        own = Parameter(name, np.zeros(sigma.shape), sigma, rows.unit, begins=np.array(begins))
+        t = problem.t[rows.keyframe]
+        return _Shifted(
+            keyframe=rows.keyframe,
+            parameters=(*rows.parameters, own),
+            weight=rows.weight,
+            inner=rows,
+            error=name,
+            since=t - np.array(begins)[np.searchsorted(begins, t + SAME_TIME, side="right") - 1],
+        )
+
+    return replace(problem, constraints=tuple(shifted(rows) for rows in problem.constraints))
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What is left out where evidence says so, and how likely that makes all measurements."""
+
+    noise: NoiseModel
+    log_evidence: float
+    passes: int  # of filter and smoother
+    looks: int  # of the filter alone
+
+
+def estimate_without_faults(
+    base: Problem, opening: float | None = None, progress: Callable[[str, float], None] | None = None
+) -> NoiseEstimate:
+    """The noise model, estimated again without the spans of wrong measurements that evidence leaves out.
+
+    Parameters
+    ----------
+    base : posed with stated noise and the parts of its intervals' noise.
+    opening : as for `graphnav.estimation.solvers.ekf.ekf`.
+
+    Raises
+    ------
+    EstimationError
+        If the filter breaks down.
+    """
+    found = estimate_noise(base, opening, progress=progress)
+    explained = exclude(base, found)
+    found = replace(found, passes=found.passes + explained.passes, looks=explained.looks)
+    if not explained.noise.excluded:
+        return found
+    # from the priors on: figures that were estimated with what is wrong in it are far from what they come to
+    anew = NoiseModel(excluded=explained.noise.excluded)
+    again = estimate_noise(base, opening, anew, (found.points, with_noise(base, found.noise)), progress)
+    return replace(again, passes=found.passes + again.passes, looks=found.looks)
+
+
+def exclude(base: Problem, found: NoiseEstimate) -> Explained:
+    """A noise model that leaves out what is wrong in spans.
+
+    Parameters
+    ----------
+    base : posed with stated noise.
+    found : estimated with everything used.
+    """
+    spans = find_spans(base, found.noise, found)
+    one = decide(base, found, spans)
+    medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
+    hidden = find_spans(base, NoiseModel(medians), found)
+    if all(any(a <= begin and end <= b for a, b in spans) for begin, end in hidden):
+        return replace(one, looks=one.looks + 2)
+    without = NoiseModel(excluded=dict.fromkeys(FIXES, tuple(hidden)))
+    other = estimate_noise(base, None, without, (found.points, with_noise(base, found.noise)))
+    two = decide(base, other, hidden)
+    best = two if two.log_evidence > one.log_evidence else one
+    return replace(best, passes=other.passes, looks=one.looks + two.looks + 2)
+
+
+def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[tuple[float, float]]:
+    """Spans (s) in which fixes disagree with everything else, by figures that need not be those found."""
+    # a fault that rows have lost their weight for is to be seen by the tests
+    open_ = with_noise(base, replace(noise, weights={k: w for k, w in noise.weights.items() if k not in FIXES}))
+    known = values_of(with_noise(base, found.noise), found.points)
+    watched = refilter(open_, points_of(open_, found.points.states, known), watch=True)
+    return join_spans(faults.spans(faults.weighted(open_, watched.weights)))
+
+
+def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]) -> Explained:
+    """Who is wrong in each span, by the figures found."""
+    if not spans:
+        return Explained(found.noise, found.log_posterior, 0, 0)
+    noise = replace(found.noise, excluded={})
+    inside = {name: _outside(some, spans) for name, some in noise.weights.items()}
+    used = with_noise(base, replace(noise, weights=inside))
+    known = values_of(with_noise(base, found.noise), found.points)
+    before, likelihood = evidence(used, points_of(used, found.points.states, known), spans)
+    excluded: dict[str, tuple[tuple[float, float], ...]] = {}
+    total = before + found.log_prior
+    for span, one in zip(spans, likelihood - _ODDS * (np.arange(len(_WRONG)) > 0), strict=True):
+        best = int(np.argmax(one))
+        total += float(one[best])
+        excluded |= {name: (*excluded.get(name, ()), span) for name in _WRONG[best]}
+    present = {rows.name for rows in base.constraints}
+    excluded = {name: some for name, some in excluded.items() if name in present}
+    return Explained(replace(noise, weights=inside, excluded=excluded), total, 0, len(_WRONG))
+
+
+def _outside(some: RowWeights, spans: list[tuple[float, float]]) -> RowWeights:
+    """The weights of rows outside spans."""
+    keep = np.ones(len(some.t), dtype=bool)
+    for begin, end in spans:
+        keep &= (some.t < begin - SAME_TIME) | (some.t > end + SAME_TIME)
+    return RowWeights(some.t[keep], some.weight[keep])
+
+
+def share_left_out(problem: Problem, noise: NoiseModel) -> float:
+    """Share of the information of the positions that a noise model leaves out."""
+    rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
+    return 0.0 if rows is None else 1.0 - float(np.mean(row_weights(problem.t[rows.keyframe], noise, rows.name)))
+
+
+def evidence(problem: Problem, about: Points, spans: list[tuple[float, float]]) -> tuple[float, Array]:
+    """Log-likelihood of the innovations before all spans, and (M, 5) from each span's beginning on, by `_WRONG`.
+
+    Parameters
+    ----------
+    problem : with its noise model and no fix left out.
+    about : points of all keyframes.
+    spans : s, first and last wrong fix, in order and apart.
+    """
+    edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
+    known = values_of(problem, about)
+    found, before = [], 0.0
+    present = {rows.name for rows in problem.constraints}
+    for kinds in _WRONG:
+        if kinds and not (present.issuperset(kinds) if kinds != WHEELS else present & set(WHEELS)):
+            found.append([-np.inf] * len(spans))
+            continue
+        one = with_common_errors(problem, spans, kinds) if kinds else problem
+        likelihood = refilter(one, points_of(one, about.states, known)).log_likelihood
+        before = float(np.sum(likelihood[: edges[0]])) if not kinds else before
+        found.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)])
+    return before, np.array(found).T
+
+
+def join_spans(found: tuple[Fault, ...]) -> list[tuple[float, float]]:
+    """Spans (s) of some faults, those that touch in one; a single fix is no span, its weight says what it is worth."""
+    out: list[tuple[float, float]] = []
+    for a, b in sorted((fault.t_start, fault.t_end) for fault in found if fault.count > 1):
+        if out and a <= out[-1][1] + SAME_TIME:
+            out[-1] = (out[-1][0], max(b, out[-1][1]))
+        else:
+            out.append((a, b))
+    return out
+
+
+def without_excluded(recording: Recording, noise: NoiseModel) -> Recording:
+    """The recording without the fixes that a noise model leaves out."""
+    gnss = recording.gnss
+    assert gnss is not None
+    p, v = (row_weights(gnss.t, noise, name)[:, None] for name in ("gnss_position", "gnss_velocity"))
+    gnss = replace(
+        gnss,
+        llh=np.where(p > 0.0, gnss.llh, np.nan),
+        v=None if gnss.v is None else np.where(v > 0.0, gnss.v, np.nan),
+    )
+    return replace(recording, gnss=gnss)

@@ -1,0 +1,232 @@
+"""A noise model as JSON, and back: what a run found can be used again, to the last digit.
+
+Under the key "noise", in a file of its own or in the summary.json of a run::
+
+    mode                what `noise.mode` was: a walk whose figures are estimated has its own noise densities first
+    figures             by variance component: log_factor (natural, of the variance), its sigma, the prior, freedom
+    correlation_times   s, by the parameter of a process
+    weights             by constraint: t (s) and weight of rows with less information
+    excluded            by constraint: [begin, end] (s) of spans left out
+    spacing             s between the fixes that are used, 0 for all
+
+    pieces              how many pieces the recording was cut into, the figures being those of the first; for people
+
+What else stands beside a figure (the stated one, the one used) is for people. Numbers are written with as many digits
+as bring them back exactly.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from graphnav.config.settings import NoiseSettings
+from graphnav.constraints import registered
+from graphnav.constraints.gnss import ERRORS, OFFSETS, STAMP_ERROR, STAMPS, TIMES, VELOCITY_ERROR
+from graphnav.constraints.raw_gnss import CODE_ERRORS, RATE_ERROR
+from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
+from graphnav.core.complaints import nearest
+from graphnav.core.errors import ConfigError
+from graphnav.core.files import parse_json, read_text
+from graphnav.estimation.noise.model import Figure, NoiseModel, RowWeights
+from graphnav.imu.preintegration import NOISE_FIGURES
+from graphnav.recording import FIX_TYPES
+
+MODES: tuple[str, ...] = get_args(NoiseSettings.model_fields["mode"].annotation)
+_KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded", "spacing")
+_FIGURE = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
+           "degrees_of_freedom": "freedom"}  # fmt: skip
+_BESIDE = ("variance_factor", "stated", "used", "unit", "correlation_time")
+_TINY, _HUGE = -100.0, 100.0  # of a logarithm: e^100 is beyond what any sensor can be off by
+
+
+def noise_values(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
+    """A noise model as plain values, those under the key "noise" of a file.
+
+    Parameters
+    ----------
+    mode : what `noise.mode` of the settings was.
+    """
+    return {
+        "mode": mode,
+        "figures": {
+            group: {
+                "variance_factor": figure.factor,
+                **{key: float(getattr(figure, field)) for key, field in _FIGURE.items()},
+            }
+            for group, figure in noise.figures.items()
+        },
+        "correlation_times": {name: float(time) for name, time in noise.times.items()},
+        "weights": {
+            name: {"t": some.t.tolist(), "weight": some.weight.tolist()}
+            for name, some in noise.weights.items()
+            if len(some.t)
+        },
+        "excluded": {name: [[float(a), float(b)] for a, b in spans] for name, spans in noise.excluded.items() if spans},
+        "spacing": float(noise.spacing),
+    }
+
+
+def write_noise(path: str | Path, noise: NoiseModel, mode: str = "estimated") -> Path:
+    """Write a noise model as a file that `read_noise` reads."""
+    path = Path(path)
+    path.write_text(json.dumps({"noise": noise_values(noise, mode)}, indent=2) + "\n", encoding="utf-8")
+    return path
+
+
+def read_noise(path: str | Path) -> NoiseModel:
+    """The noise model of a file that `write_noise` wrote, or of the summary.json of a run.
+
+    Raises
+    ------
+    ConfigError
+        In one sentence that names the file and the key, if it cannot be read or holds no noise model.
+    """
+    return read_noise_and_mode(path)[0]
+
+
+def read_noise_and_mode(path: str | Path) -> tuple[NoiseModel, str]:
+    """A noise model, and the `noise.mode` of the settings that it was found with; raises as `read_noise`."""
+    path = Path(path)
+    what = "name a file that holds a noise model, or the summary.json of a run"
+    try:
+        values = parse_json(read_text(path, ConfigError))
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"{path}, line {error.lineno}: not valid JSON ({error.msg}); {what}") from None
+    except ValueError as error:
+        raise ConfigError(f"{path}: not valid JSON ({error}); {what}") from None
+    if not isinstance(values, Mapping) or not isinstance(values.get("noise"), Mapping):
+        raise ConfigError(f"{path}: holds no table 'noise'; {what}")
+    return _Reader(path).model(values["noise"])
+
+
+def known_groups() -> tuple[str, ...]:
+    """Names of all variance components that a recording can have."""
+    out = [*(f"imu.{name}" for name in NOISE_FIGURES), STAMPS, *OFFSETS]
+    for cls in registered():
+        axes = dict.fromkeys(cls.noise_axes)
+        kinds = ["", *(f".{kind}" for kind in FIX_TYPES.values())] if cls.name == "gnss_position" else [""]
+        out += [
+            f"{cls.name}{kind}{time}.{axis}"
+            for kind in kinds
+            for time in ("", *(f".{t}" for t in TIMES))
+            for axis in axes
+        ]
+    return tuple(out)
+
+
+def _known_processes() -> tuple[str, ...]:
+    typed = [f"{error}_{kind}" for error in ERRORS for kind in FIX_TYPES.values()]
+    return (*ERRORS, *typed, VELOCITY_ERROR, *CODE_ERRORS, RATE_ERROR, STAMP_ERROR, NHC_ERROR, ODOMETER_ERROR)
+
+
+class _Reader:
+    """Plain values checked one by one; complaints name the file and the key."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def model(self, values: Mapping[str, Any]) -> tuple[NoiseModel, str]:
+        self.names(values, _KEYS, "noise")
+        mode = values.get("mode", "estimated")
+        if mode not in MODES:
+            raise self.error("noise.mode", mode, f"must be one of {', '.join(MODES)}")
+        constraints = [cls.name for cls in registered()]
+        return NoiseModel(
+            self.each(values, "figures", known_groups(), self.figure),
+            self.each(values, "correlation_times", _known_processes(), self.time),
+            self.each(values, "weights", constraints, self.weights),
+            self.each(values, "excluded", constraints, self.spans),
+            self.number("noise.spacing", values.get("spacing", 0.0), 0.0, 60.0, "s between fixes"),
+        ), mode
+
+    def error(self, key: str, value: Any, why: str) -> ConfigError:
+        shown = json.dumps(value)
+        return ConfigError(f"{self.path}: '{key}' = {shown if len(shown) <= 40 else shown[:37] + '...'}: {why}")
+
+    def names(self, values: Mapping[str, Any], known: Sequence[str], at: str) -> None:
+        for name in values:
+            if name not in known:
+                raise ConfigError(f"{self.path}: unknown key '{at}.{name}'; {nearest(name, known)}")
+
+    def each(
+        self, values: Mapping[str, Any], key: str, known: Sequence[str], read: Callable[[str, Any], Any]
+    ) -> dict[str, Any]:
+        table = values.get(key, {})
+        if not isinstance(table, Mapping):
+            raise self.error(f"noise.{key}", table, "must be a table by name")
+        self.names(table, known, f"noise.{key}")
+        return {name: read(f"noise.{key}.{name}", value) for name, value in table.items()}
+
+    def number(self, key: str, value: Any, low: float, high: float, what: str) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise self.error(key, value, f"must be a number: {what}")
+        if not low <= value <= high:
+            raise self.error(key, value, f"must be between {low:g} and {high:g}: {what}")
+        return float(value)
+
+    def figure(self, key: str, value: Any) -> Figure:
+        if not isinstance(value, Mapping):
+            raise self.error(key, value, "must be a table with log_factor or variance_factor")
+        self.names(value, (*_FIGURE, *_BESIDE), key)
+        what = "the natural logarithm of a variance factor"
+        if "log_factor" not in value and "variance_factor" not in value:
+            raise ConfigError(f"{self.path}: '{key}' has neither log_factor nor variance_factor; give one")
+        given = None
+        if "variance_factor" in value:
+            given = math.log(
+                self.number(f"{key}.variance_factor", value["variance_factor"], math.exp(_TINY), math.exp(_HUGE),
+                            "on the stated variance")
+            )  # fmt: skip
+        log = given
+        if "log_factor" in value:
+            log = self.number(f"{key}.log_factor", value["log_factor"], _TINY, _HUGE, what)
+            if given is not None and abs(given - log) > 1e-9:
+                raise ConfigError(
+                    f"{self.path}: '{key}': log_factor and variance_factor disagree; leave one of them out"
+                )
+        assert log is not None
+        return Figure(
+            log,
+            self.number(f"{key}.sigma", value.get("sigma", 0.0), 0.0, _HUGE, f"1-sigma of {what}"),
+            self.number(f"{key}.prior", value.get("prior", 0.0), _TINY, _HUGE, f"the prior's median, {what}"),
+            self.number(f"{key}.prior_sigma", value.get("prior_sigma", 0.0), 0.0, _HUGE, f"1-sigma of {what}"),
+            self.number(f"{key}.degrees_of_freedom", value.get("degrees_of_freedom", 0.0), 0.0, math.inf, "a count"),
+        )
+
+    def time(self, key: str, value: Any) -> float:
+        return self.number(key, value, 1e-3, 1e9, "s, a correlation time")
+
+    def weights(self, key: str, value: Any) -> RowWeights:
+        if not isinstance(value, Mapping) or set(value) != {"t", "weight"}:
+            raise self.error(key, value, "must be a table with the lists t and weight")
+        lists = {}
+        for name, what, low, high in (("t", "s", -math.inf, math.inf), ("weight", "of information", 0.0, 1.0)):
+            some = value[name]
+            if not isinstance(some, list):
+                raise self.error(f"{key}.{name}", some, "must be a list of numbers")
+            lists[name] = np.array([self.number(f"{key}.{name}", x, low, high, what) for x in some], dtype=float)
+        t, weight = lists["t"], lists["weight"]
+        if len(t) != len(weight):
+            raise ConfigError(f"{self.path}: '{key}' has {len(t)} times and {len(weight)} weights; give one for each")
+        if np.any(np.diff(t) < 0.0):
+            raise ConfigError(f"{self.path}: '{key}.t' is not ascending; sort its rows by time")
+        return RowWeights(t, weight)
+
+    def spans(self, key: str, value: Any) -> tuple[tuple[float, float], ...]:
+        if not isinstance(value, list):
+            raise self.error(key, value, "must be a list of [begin, end], s")
+        out = []
+        for one in value:
+            if not isinstance(one, list) or len(one) != 2:
+                raise self.error(key, one, "must be [begin, end], s")
+            begin, end = (self.number(key, x, -math.inf, math.inf, "s") for x in one)
+            if end < begin:
+                raise self.error(key, one, "ends before it begins")
+            out.append((begin, end))
+        return tuple(out)

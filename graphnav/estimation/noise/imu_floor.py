@@ -1,0 +1,73 @@
+"""The white noise that an IMU on a shoe has of its own, where the figures stated are larger than it shows.
+
+Figures written down for a foot are often generous, because heel strikes make more noise than any data sheet says. But
+those have their own place (`graphnav.imu.unresolved`), and a gyro that is called ten times noisier than it is leaves its
+bias ten times less known by the rests at both ends of a walk. So the quietest stretch of the recording is asked: means
+over `_CLUSTER`, and of them the second differences, in which a slow sway cancels. White noise of a density q leaves
+6 q^2 / `_CLUSTER` in each of their squares (Allan variance has first differences, 2 q^2 / `_CLUSTER`). A person who
+stands adds to that, so it is a bound from above; but the quietest of many stretches is quiet by chance as well, and
+the figure is one that true noise would show less than in `_CHANCE` of them.
+
+A drive is not asked: while its engine runs it vibrates as it never does at rest. Nor is a walk that is still going on:
+its longest rest may be yet to come.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import gammaincinv  # scipy.stats would take half a second to import
+
+from graphnav.config import Settings
+from graphnav.core.findings import period_of
+from graphnav.core.rotation import Array
+from graphnav.detectors.windows import running
+from graphnav.recording import ImuNoise, Recording
+
+_CLUSTER = 0.1  # s
+_STRETCH = 2.0  # s
+_CHANCE = 1e-3
+_INDEPENDENT = 1.0 / (1.0 + 2.0 * ((4.0 / 6.0) ** 2 + (1.0 / 6.0) ** 2))  # of second differences: (1, -2, 1) overlap
+_WORDS = {"gyro_noise_density": "gyro", "accel_noise_density": "accelerometer"}
+_UNITS = {"gyro_noise_density": "rad/s/sqrt(Hz)", "accel_noise_density": "m/s^2/sqrt(Hz)"}
+
+
+def with_own_noise(recording: Recording, settings: Settings) -> tuple[Recording, tuple[str, ...]]:
+    """A walk with noise densities no larger than its quietest stretch shows, and a sentence on those lowered.
+
+    Other recordings, and figures to be taken as stated, are as they were.
+    """
+    imu = recording.imu
+    if recording.platform != "foot" or settings.noise.mode == "stated":
+        return recording, ()
+    shown = {
+        "gyro_noise_density": quietest_density(imu.t, imu.gyro),
+        "accel_noise_density": quietest_density(imu.t, imu.accel),
+    }
+    lower = {name: density for name, density in shown.items() if density < getattr(imu.noise, name)}
+    if not lower:
+        return recording, ()
+    said = ", ".join(
+        f"{_WORDS[name]} {density:.2g} instead of {getattr(imu.noise, name):.2g} {_UNITS[name]}"
+        for name, density in lower.items()
+    )
+    noise: ImuNoise = replace(imu.noise, **lower)
+    return replace(recording, imu=replace(imu, noise=noise)), (
+        f"where it stands the IMU is quieter than stated: {said}",
+    )
+
+
+def quietest_density(t: Array, x: Array) -> float:
+    """Bound from above of the white noise density of rows x (N, 3) at times t (N,), per axis; infinite if too short."""
+    period = period_of(t)
+    size = max(1, round(_CLUSTER / period)) if period < _CLUSTER else 1
+    count, stretch = len(t) // size, round(_STRETCH / (size * period)) if np.isfinite(period) else 1
+    if stretch < 3 or count < stretch:
+        return float("inf")
+    n = count * size
+    mean = x[:n].reshape(count, size, 3).mean(axis=1)
+    bend = np.sum((mean[2:] - 2.0 * mean[1:-1] + mean[:-2]) ** 2, axis=1) / (3.0 * 6.0) * (size * period)
+    degrees = 3.0 * (stretch - 2) * _INDEPENDENT
+    quietest = float(running(bend[:, None]).means(stretch - 2).min())
+    return float(np.sqrt(quietest * degrees / (2.0 * gammaincinv(0.5 * degrees, _CHANCE))))

@@ -1,0 +1,64 @@
+"""The noise model: by what factor each stated variance is used, how long errors last, and which rows weigh less.
+
+A variance component is a group of numbers whose stated variances are wrong by one common factor:
+
+    imu.gyro_noise_density ...            the four figures of `ImuNoise` that drive the intervals between keyframes
+    gnss_position.horizontal, .up         white part of the fixes, `gnss_position.fixed.up` where types differ
+    gnss_position.minutes.up ...          a Gauss-Markov process beside it, of seconds, minutes or hours
+    nhc.right, odometer.forward ...       and the same of wheels and of the receiver's velocities
+
+Factors are in units of what is stated; that of a process is in units of the stated white variance of its fixes, or of
+the process that the settings of the wheels state. A process with factor 0 does not exist: with `STATED`, no factor
+differs from 1 and no process exists, so a problem is what recording and settings say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A variance component: natural logarithm of its variance factor, with its uncertainty and its prior."""
+
+    log_factor: float
+    sigma: float = 0.0  # 1-sigma of `log_factor`
+    prior: float = 0.0  # median of the prior, log
+    prior_sigma: float = 0.0
+    freedom: float = 0.0  # degrees of freedom that the data tell it by
+
+    @property
+    def factor(self) -> float:
+        """On the variance."""
+        return float(np.exp(self.log_factor))
+
+
+@dataclass(frozen=True)
+class RowWeights:
+    """Rows of a constraint that have less information than their sigmas say."""
+
+    t: Array  # (n,) s, ascending; where a time has several rows, all of them
+    weight: Array  # (n,) in (0, 1]
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """How good the sensors are taken to be. Beside what it names, everything is as stated."""
+
+    figures: Mapping[str, Figure] = field(default_factory=dict)
+    times: Mapping[str, float] = field(default_factory=dict)  # s, correlation time of a process by its parameter
+    weights: Mapping[str, RowWeights] = field(default_factory=dict)  # by constraint
+    excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)  # spans (s) by constraint
+    spacing: float = 0.0  # s, at least, between the fixes that are used (`graphnav.estimation.noise.spacing`)
+
+    def factor(self, group: str, missing: float) -> float:
+        """On the variance of a group; `missing` where nothing is said of it."""
+        return self.figures[group].factor if group in self.figures else missing
+
+
+STATED = NoiseModel()

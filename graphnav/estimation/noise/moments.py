@@ -1,0 +1,101 @@
+"""What a smoother says of every variance component, and of every row.
+
+The innovation log-likelihood L of a linear Gaussian problem has, by the logarithm of the variance factor f of a
+component that adds the covariance f Q_i to a step or to rows, the derivative
+
+    dL / d ln f = (A - B) / 2      A = sum r^T f Q_i r      B = sum tr(f Q_i N)
+
+with r and N of the disturbance smoother (Koopman 1993, "Disturbance smoother for state space models"), at a step
+
+    r = P-^-1 (x^s - x-)           N = P-^-1 (P- - P^s) P-^-1
+
+and at rows with residual e and Jacobian H at the smoothed state, r = R^-1 e and N = R^-1 - R^-1 H P^s H^T R^-1. B is
+the component's redundancy, the degrees of freedom that the data tell it by (Foerstner 1979; MacKay 1992 calls it the
+number of well-determined parameters), and E[A] = B where f is right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.constraints.base import Constraint
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM
+from graphnav.estimation.problem import ParameterChain, Problem
+from graphnav.estimation.solvers.linearise import linearise
+from graphnav.estimation.solvers.passes import Forward, Smoothed, values_of
+
+
+@dataclass(frozen=True)
+class RowMoments:
+    """Rows of a constraint at a smoothed solution."""
+
+    A: Array  # (N, m) w e^2 / R
+    B: Array  # (N, m) redundancy
+    left_out: Array  # (N, m) squared residual against its variance, predicted without the row, as if its weight were 1
+    whole: Array  # (N, m) squared whole error, what lasts included, against its steady variance
+
+
+def imu_moments(problem: Problem, forward: Forward, smoothed: Smoothed) -> tuple[Array, Array]:
+    """A and B (K-1, 4) of `NOISE_FIGURES`, by interval."""
+    start = forward.predicted_from.R_nb
+    L = problem.motion.frames(slice(0, len(start)), start)
+    Lt = np.swapaxes(L, -1, -2)
+    r = (Lt @ smoothed.r[1:, :DIM, None])[..., 0]
+    N = Lt @ smoothed.N[1:, :DIM, :DIM] @ L
+    Q = problem.intervals.parts[: len(r)]
+    A = np.einsum("ni,nfij,nj->nf", r, Q, r, optimize=True)
+    return A, np.maximum(np.einsum("nfij,nji->nf", Q, N, optimize=True), 0.0)
+
+
+def process_moments(
+    problem: Problem, chain: ParameterChain, smoothed: Smoothed, end: int
+) -> tuple[Array, Array, Array]:
+    """Keyframes (n,) at which a process is driven, and A and B (n, k) there; the first is its steady variance."""
+    at = problem.columns[chain.parameter.name]
+    k = np.concatenate([[0], np.flatnonzero(np.diff(chain.node[:end])) + 1])
+    q = chain.sigma[chain.node[k]] ** 2
+    N = np.diagonal(smoothed.N[k][:, at, at], axis1=-2, axis2=-1)
+    return k, q * smoothed.r[k, at] ** 2, q * np.maximum(N, 0.0)
+
+
+def row_moments(problem: Problem, rows: Constraint, smoothed: Smoothed, n: int) -> RowMoments:
+    """Of the first n rows of a constraint."""
+    at, which = rows.keyframe[:n], slice(0, n)
+    values = values_of(problem, smoothed)
+    linear = linearise(rows, smoothed, problem.columns, which)
+    H = linear.H
+    HPH = np.einsum("nij,nij->ni", H @ smoothed.P[at], H)
+    w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
+    R = linear.stated**2
+    B = np.clip(1.0 - w * HPH / R, 1e-6, 1.0)
+    left_out = (linear.residual / B) ** 2 / (R + HPH / B)
+    error, variance = linear.residual, R
+    for p in rows.parameters:
+        if p.correlation_time is not None:
+            J = linear.H[:, :, problem.columns[p.name]]
+            error = error - np.einsum("nij,nj->ni", J, values[p.name][at])
+            variance = variance + J**2 @ p.sigma**2
+    # of the component that a factor scales
+    share = 1.0 if rows.unscaled is None else 1.0 - rows.unscaled[:n] ** 2 / R
+    A = share * w * linear.residual**2 / R
+    return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out, error**2 / variance)
+
+
+def lag_moments(
+    problem: Problem, chain: ParameterChain, forward: Forward, smoothed: Smoothed, end: int
+) -> tuple[Array, Array, Array, Array]:
+    """Of a process, from node to node: times between (n,), E[c' c'], E[c' c] and E[c c] (n, k), c' the later."""
+    at = problem.columns[chain.parameter.name]
+    own = slice(at.start - DIM, at.stop - DIM)
+    k = np.flatnonzero(np.diff(chain.node[:end])) + 1
+    # Cov(x_k-1, x_k) = P_k-1 F^T P-_k^-1 P^s_k = P_k-1 F^T (I - N P-_k), of the columns of the process
+    ahead = forward.P[k - 1][:, at] @ np.swapaxes(forward.F[k - 1], -1, -2)
+    rest = np.eye(ahead.shape[-1])[:, at] - smoothed.N[k] @ forward.P_predicted[k][:, :, at]
+    cross = np.einsum("kid,kdi->ki", ahead, rest)
+    c0, c1 = smoothed.values[k - 1, own], smoothed.values[k, own]
+    v0, v1 = (np.diagonal(smoothed.P[j][:, at, at], axis1=-2, axis2=-1) for j in (k - 1, k))
+    dt = np.diff(chain.t)[chain.node[k] - 1]
+    return dt, c1 * c1 + v1, c1 * c0 + cross, c0 * c0 + v0

@@ -1,0 +1,42 @@
+"""Fixes of a receiver that reports faster than its errors change, one of a second.
+
+A receiver's tracking loops and its own filter smooth over about a second: of ten fixes in one, nine repeat the error of
+the first, smoothly. A white variance that is told by such fixes is far too small, and an IMU that does not follow their
+smooth errors is called worse than it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.constraints.gnss import period
+from graphnav.core.rotation import Array
+from graphnav.estimation.alignment.first import some
+from graphnav.recording import Recording
+
+
+def space_fixes(recording: Recording, spacing: float) -> Recording:
+    """A recording with the best fix, by stated sigma, of every `spacing` (s); as it is where fixes are not closer.
+
+    The first among equals, so that a steady receiver's are evenly spaced. Where that one has no velocity and others
+    have, the best velocity's fix is kept as well.
+    """
+    gnss = recording.gnss
+    if gnss is None or len(gnss.t) < 2 or period(gnss.t) > 0.5 * spacing:
+        return recording
+    which = np.floor((gnss.t - gnss.t[0] + 0.5 * period(gnss.t)) / spacing).astype(int)
+    keep = _best(which, np.linalg.norm(gnss.sd, axis=1))
+    if gnss.v is not None and gnss.sd_v is not None:
+        moves = np.asarray(np.isfinite(gnss.v).all(axis=1))
+        best = _best(which, np.where(moves, np.linalg.norm(gnss.sd_v, axis=1), np.inf))
+        without = np.isin(which[best], which[keep[~moves[keep]]])
+        keep = np.union1d(keep, best[without & moves[best]])
+    return replace(recording, gnss=some(gnss, keep))
+
+
+def _best(which: Array, size: Array) -> Array:
+    """The row of the least size of each group, the first of several, in order."""
+    order = np.lexsort((size, which))  # stable: rows are in the order of time
+    return np.sort(order[np.concatenate([[True], np.diff(which[order]) > 0])])

@@ -1,0 +1,121 @@
+"""A noise model as a table: every variance component with what is stated, what is used, and how well it is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.constraints.gnss import OFFSETS, STAMPS, TIMES, VELOCITY_ERROR
+from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
+from graphnav.core.state import SECONDS
+from graphnav.estimation.noise.model import Figure, NoiseModel
+from graphnav.recording import FIX_TYPES, ImuNoise, Recording
+
+_IMU = {
+    "gyro_noise_density": ("gyro, noise density", "rad/s/sqrt(Hz)"),
+    "accel_noise_density": ("accelerometer, noise density", "m/s^2/sqrt(Hz)"),
+    "gyro_bias_walk": ("gyro, bias random walk", "rad/s/sqrt(s)"),
+    "accel_bias_walk": ("accelerometer, bias random walk", "m/s^2/sqrt(s)"),
+}
+_OF = {
+    "gnss_position": "fixes, position",
+    "gnss_velocity": "fixes, velocity",
+    "nhc": "non-holonomic constraint",
+    "odometer": "odometer",
+}
+_AXES = {"horizontal": slice(0, 2), "up": slice(2, 3)}
+
+
+@dataclass(frozen=True)
+class FigureRow:
+    """A variance component beside what is stated."""
+
+    group: str
+    words: str  # what it is, for people
+    figure: Figure
+    stated: float | None  # where it is one number: of an IMU, or the median sigma that fixes state
+    used: float | None
+    unit: str
+    correlation_time: float | None  # s, of a Gauss-Markov process; None for white noise
+
+
+def figure_rows(
+    noise: NoiseModel, recording: Recording, slow_times: tuple[float, float], imu: ImuNoise | None = None
+) -> tuple[FigureRow, ...]:
+    """All figures of a noise model.
+
+    Parameters
+    ----------
+    recording : as it was solved, with what it states.
+    slow_times : s, correlation times of a fix's errors of minutes and of hours, of the settings.
+    imu : what the factors of the IMU are relative to; what the recording states when None.
+    """
+    lasts = dict(zip(TIMES, (SECONDS, *slow_times), strict=True))
+    out = []
+    for group, figure in noise.figures.items():
+        source, *middle, axis = group.split(".")
+        root = float(np.exp(0.5 * figure.log_factor))
+        if source == "imu":
+            words, unit = _IMU[axis]
+            stated = float(getattr(recording.imu.noise, axis))
+            used = root * float(getattr(imu or recording.imu.noise, axis))
+            out.append(FigureRow(group, words, figure, stated, used, unit, None))
+            continue
+        if group == STAMPS or group in OFFSETS:
+            words = "fixes, stamp of each" if group == STAMPS else f"{OFFSETS[group]}, prior".replace("_", " ")
+            out.append(FigureRow(group, words, figure, None, None, "s", None))
+            continue
+        time = next((part for part in middle if part in lasts), None)
+        kind = next((part for part in middle if part not in lasts), None)
+        # what lasts for minutes and hours has one unit, whatever the type of a fix
+        sigma = _stated_sigma(recording, source, None if time in TIMES[1:] else kind, axis)
+        words = f"{_OF.get(source, source)}{f' ({kind})' if kind else ''}, {axis}"
+        words += ", white" if time is None else f", lasting {time}"
+        out.append(
+            FigureRow(
+                group,
+                words,
+                figure,
+                sigma,
+                None if sigma is None else root * sigma,
+                {"gnss_position": "m", "gnss_velocity": "m/s"}.get(source, ""),
+                None if time is None else noise.times.get(_process(source, time, kind), lasts[time]),
+            )
+        )
+    return tuple(out)
+
+
+def whole_ratio(noise: NoiseModel, source: str, axis: str) -> float | None:
+    """The sigma of a whole error, white and lasting, over the stated one; None where nothing is known of it.
+
+    Parameters
+    ----------
+    source : name of the constraint, with the type of the fixes where there are several.
+    """
+    times = [f"{source}.{axis}", *(f"{source}.{time}.{axis}" for time in TIMES)]
+    known = [noise.figures[name].factor for name in times if name in noise.figures]
+    return float(np.sqrt(sum(known))) if known else None
+
+
+def _process(source: str, time: str, kind: str | None) -> str:
+    """The parameter of a process."""
+    if source == "gnss_position":
+        return f"gnss_error_of_{time}{f'_{kind}' if kind else ''}"
+    return {"gnss_velocity": VELOCITY_ERROR, "nhc": NHC_ERROR, "odometer": ODOMETER_ERROR}.get(source, source)
+
+
+def _stated_sigma(recording: Recording, source: str, kind: str | None, axis: str) -> float | None:
+    """Median of what fixes state."""
+    gnss = recording.gnss
+    if gnss is None or axis not in _AXES:
+        return None
+    sd = {"gnss_position": gnss.sd, "gnss_velocity": gnss.sd_v}.get(source)
+    if sd is None:
+        return None
+    own = np.ones(len(gnss.t), dtype=bool)
+    if kind is not None and gnss.type is not None:
+        own = np.array([FIX_TYPES[int(k)] == kind for k in gnss.type], dtype=bool)
+    some = sd[own][:, _AXES[axis]]
+    some = some[np.isfinite(some)]
+    return float(np.median(some)) if some.size else None

@@ -1,0 +1,72 @@
+"""A noise model in words and numbers that people read."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.linearise import Points, shift
+
+_IMU = {
+    "imu.gyro_noise_density": "gyro noise",
+    "imu.accel_noise_density": "accelerometer noise",
+    "imu.gyro_bias_walk": "gyro bias walk",
+    "imu.accel_bias_walk": "accelerometer bias walk",
+}
+
+
+_FAR = 5.0  # prior sigmas, which chance does not reach
+
+
+def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
+    """Sentences on constants that the data put farther from what is stated of them than they can be."""
+    out = []
+    for chain in problem.chains:
+        p = chain.parameter
+        if not p.constant:
+            continue
+        value = smoothed.values[-1, shift(problem.columns[p.name])]
+        away = np.abs(value - p.initial) / p.sigma
+        k = int(np.argmax(away))
+        if away[k] > _FAR:
+            which = f" (number {k + 1} of {p.size})" if p.size > 1 else ""
+            out.append(
+                f"{p.name}{which} comes out at {value[k]:.2g} {p.unit}, {away[k]:.0f} sigmas from the "
+                f"{p.initial[k]:.2g} +- {p.sigma[k]:.2g} that is stated of it: what is stated is wrong, or it stands "
+                "in for an error of another kind"
+            )
+    return tuple(out)
+
+
+def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
+    """Sentences on the figures used, beside those stated; none where all is as stated."""
+    out = []
+    imu = [
+        f"{words} {np.sqrt(noise.figures[name].factor):.2g}" for name, words in _IMU.items() if name in noise.figures
+    ]
+    if imu:
+        out.append(f"noise model, IMU: stated figures multiplied by: {', '.join(imu)}")
+    for rows in problem.constraints:
+        names = [g for g in rows.noise_groups()[0] if g in noise.figures]
+        errors = [
+            p for p in rows.parameters if p.noise_groups and p.correlation_time is not None and p.name != STAMP_ERROR
+        ]
+        if not names:
+            continue
+        parts = [f"{g.removeprefix(rows.name + '.')} {np.sqrt(noise.figures[g].factor):.2g}" for g in names]
+        for p in errors:
+            sizes = dict.fromkeys(p.noise_groups)
+            each = ", ".join(f"{g.rsplit('.', 1)[-1]} {np.sqrt(noise.factor(g, 0.0)):.2g}" for g in sizes)
+            out_time = f"{p.correlation_time:.2g} s"
+            parts.append(f"Gauss-Markov with {out_time}: {each}")
+        stamps = next((p for p in rows.parameters if p.name == STAMP_ERROR), None)
+        if stamps is not None and rows.name == GnssPosition.name:
+            parts.append(f"stamp of each fix {stamps.sigma[0]:.2g} s")
+        out.append(f"noise model, {rows.name}: white part in stated sigmas: {'; '.join(parts)}")
+        some = noise.weights.get(rows.name)
+        if some is not None and len(some.t):
+            less = np.count_nonzero(some.weight < 1.0)
+            out.append(f"{rows.name}: {less} of {len(rows)} rows are outliers and have less weight")
+    return tuple(out)

@@ -1,0 +1,247 @@
+"""From a recording to solutions: cut where it must be, align, pose, solve with each solver."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from graphnav.config import Settings
+from graphnav.constraints.prior import InitialPrior
+from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import ConfigError, EstimationError
+from graphnav.core.progress import Progress, listening, tell
+from graphnav.detectors import detect
+from graphnav.estimation import faults
+from graphnav.estimation.noise.imu_floor import with_own_noise
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.words import describe_far
+from graphnav.estimation.preparation import prepare, start_sigma
+from graphnav.estimation.solution import Solution, joined
+from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.rts import backward, rts
+from graphnav.imu.onboard_offset import without_onboard_offset
+from graphnav.recording import Recording
+from graphnav.recording.plausibility.screening import screened
+
+SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
+KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
+_CLEARLY = 10.0  # half chi-square; a likelihood ratio of 22,000
+_SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
+
+
+def run(
+    recording: Recording,
+    settings: Settings | None = None,
+    solvers: tuple[str, ...] = SOLVERS,
+    progress: Progress | None = None,
+    noise: NoiseModel | None = None,
+) -> dict[str, Solution]:
+    """Solve a recording with several solvers on exactly the same information.
+
+    Parameters
+    ----------
+    recording
+        From `graphnav.load`.
+    settings
+        The defaults when None.
+    solvers
+        Out of "ekf", "rts", "incremental", "isam2", "batch".
+    progress
+        Called now and then with a stage and its share done, 0 to 1.
+    noise
+        How good the sensors are taken to be; estimated, or as `settings.noise` says, when None.
+
+    Returns
+    -------
+    dict
+        Solver name to `Solution`, in the order asked for.
+
+    Raises
+    ------
+    RecordingError
+        If a sensor is wrong throughout.
+    EstimationError
+        If the recording does not determine a trajectory.
+    ConfigError
+        If the settings' profile is of another platform.
+    """
+    settings = settings or Settings()
+    recording, found = screened(recording)
+    with listening(progress):
+        solutions = _run(recording, settings, solvers, progress, noise)
+    return {name: replace(one, notes=(*found, *one.notes)) for name, one in solutions.items()}
+
+
+def _run(
+    recording: Recording,
+    settings: Settings,
+    solvers: tuple[str, ...],
+    progress: Progress | None,
+    noise: NoiseModel | None,
+) -> dict[str, Solution]:
+    unknown = [name for name in solvers if name not in KNOWN]
+    if unknown:
+        raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}")
+    frame = LocalFrame(origin(recording))
+    said = fitting(recording, settings)
+    pieces, notes = _pieces(recording, settings)
+    notes = [*said, *notes]
+    found: list[dict[str, Solution]] = []
+    for piece in pieces:
+        try:
+            # matrices here have thirty rows: threads for them cost more than the work, twenty times on a busy machine
+            with threadpool_limits(limits=1, user_api="blas"):
+                found.append(_solved(piece, settings, frame, solvers, progress, noise))
+        except EstimationError as error:
+            if len(pieces) == 1:
+                raise
+            notes.append(f"{_span(recording, piece)} left out: {error}")
+    if not found:
+        raise EstimationError(f"'{recording.name}': no piece between its IMU gaps can be solved")
+    return {name: joined([one[name] for one in found], tuple(notes)) for name in solvers}
+
+
+def _solved(
+    recording: Recording,
+    settings: Settings,
+    frame: LocalFrame,
+    solvers: tuple[str, ...],
+    progress: Progress | None,
+    noise: NoiseModel | None,
+) -> dict[str, Solution]:
+    """`_solve`, and once more without what covariances may not have the digits for."""
+    try:
+        return _solve(recording, settings, frame, solvers, progress, noise)
+    except (EstimationError, np.linalg.LinAlgError) as error:
+        if not settings.standstill.held_position:
+            raise
+        still = settings.standstill.model_copy(update={"held_position": False})
+        again = _solve(recording, settings.model_copy(update={"standstill": still}), frame, solvers, progress, noise)
+        note = f"places of stops are not held: with them, {error}"
+        return {name: replace(one, notes=(note, *one.notes)) for name, one in again.items()}
+
+
+def _solve(
+    recording: Recording,
+    settings: Settings,
+    frame: LocalFrame,
+    solvers: tuple[str, ...],
+    progress: Progress | None,
+    noise: NoiseModel | None,
+) -> dict[str, Solution]:
+    began = time.perf_counter()
+    recording, undone = without_onboard_offset(recording, settings)
+    recording, shown = with_own_noise(recording, settings)
+    tell("detection")
+    detected = detect(recording, settings)
+    detection = time.perf_counter() - began
+    found = prepare(recording, settings, frame, detected, noise, progress)
+    problem, forward, smoothed = found.problem, found.forward, found.smoothed
+    wrong = faults.spans(problem, smoothed)
+    notes = (*found.start.notes, *undone, *shown, *found.detections.notes, *found.notes, *faults.notes(wrong, problem))
+    notes = (*notes, *describe_far(problem, smoothed))
+    start, passes = smoothed, Counter(found.passes)
+    if found.astray:
+        prior = InitialPrior(
+            keyframe=problem.prior.keyframe, mean=found.start.state, sigma=start_sigma(found.start)[None]
+        )
+        problem = replace(problem, prior=prior)
+        forward = ekf(problem, progress, found.aligned.until)
+        smoothed = backward(problem, forward, progress)
+        passes.update(filter=1, smoother=1)
+    out = {"ekf": forward.solution}
+    if "rts" in solvers:
+        out["rts"] = rts(problem, forward, smoothed)
+    # what a run does not need is not imported: GTSAM least of all
+    if "batch" in solvers:
+        from graphnav.estimation.solvers.batch import batch
+
+        out["batch"] = batch(problem, start.states, start.nodes(problem), progress=progress)
+        # what it took to get there is part of it
+        out["batch"] = replace(out["batch"], timings={**forward.solution.timings, **out["batch"].timings})
+    begin = found.aligned.state if found.astray else None
+    if "incremental" in solvers:
+        from graphnav.estimation.solvers.incremental import incremental
+
+        out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
+    if "isam2" in solvers:
+        from graphnav.estimation.solvers.isam import isam2
+        from graphnav.estimation.solvers.rows import cost_at
+
+        out["isam2"] = one = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin).settled
+        best = cost_at(problem, smoothed)
+        if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY:
+            note = "isam2 ended in an optimum that explains the data worse than rts does: do not trust it"
+            out["isam2"] = replace(one, notes=(f"{note} (half chi-square {one.cost:.0f}, not {best:.0f})", *one.notes))
+    timings = {"detection": detection, **found.timings}
+    return {
+        name: replace(
+            out[name],
+            notes=(*notes, *out[name].notes),
+            detections=found.detections.all,
+            excluded=wrong,
+            noise=found.noise,
+            passes=dict(passes),
+            timings={k: timings.get(k, 0.0) + out[name].timings.get(k, 0.0) for k in (*timings, *out[name].timings)},
+        )
+        for name in solvers
+    }
+
+
+def fitting(recording: Recording, settings: Settings) -> list[str]:
+    """What the settings' profile asks for and the recording lacks, in sentences.
+
+    Raises
+    ------
+    ConfigError
+        If the profile is of another platform.
+    """
+    profile = settings.profile
+    if profile is None:
+        return []
+    if (profile == "foot") != (recording.platform == "foot"):
+        raise ConfigError(
+            f"profile '{profile}': but '{recording.name}' says platform = \"{recording.platform}\"; change one of them"
+        )
+    if profile == "car+odometer" and recording.odometer is None:
+        return [f"profile '{profile}': there is no odometer in '{recording.name}', so it is solved without"]
+    return []
+
+
+def origin(recording: Recording) -> np.ndarray:
+    """Origin of the navigation frame: the first fix, or 45 deg north at sea level without any."""
+    gnss = recording.gnss
+    if gnss is not None and len(gnss.t):
+        inside = np.flatnonzero((gnss.t >= recording.start) & (gnss.t <= recording.end))
+        return gnss.llh[inside[0] if len(inside) else 0]
+    return np.array([np.pi / 4, 0.0, 0.0])
+
+
+def _pieces(recording: Recording, settings: Settings) -> tuple[list[Recording], list[str]]:
+    """The recording cut at IMU gaps too long to bridge, and a sentence for each cut."""
+    t = recording.imu.t
+    cuts = np.flatnonzero(np.diff(t) > settings.keyframes.bridge)
+    if not len(cuts):
+        return [recording], []
+    notes = [
+        f"IMU gap of {t[i + 1] - t[i]:.1f} s at {t[i] - recording.start:.1f} s: cut there, the parts are solved apart"
+        for i in cuts
+    ]
+    edges = np.concatenate([[-1], cuts, [len(t) - 1]])
+    pieces = []
+    for lo, hi in itertools.pairwise(edges):
+        begin, end = t[lo + 1] - recording.start, t[hi] - recording.start
+        if end - begin < _SHORTEST:
+            notes.append(f"{begin:.1f} to {end:.1f} s left out: too short between two gaps to be aligned")
+        else:
+            pieces.append(recording.crop(begin - 1e-9, end + 1e-9))
+    return pieces, notes
+
+
+def _span(recording: Recording, piece: Recording) -> str:
+    return f"{piece.start - recording.start:.0f} to {piece.end - recording.start:.0f} s"

@@ -1,0 +1,289 @@
+"""From a recording to the problem that every solver gets: aligned, posed, its noise model estimated.
+
+A straight line: align, build the problem, estimate the noise model, look once for measurements that are wrong in spans
+and decide each by evidence, estimate again without them. The filter then runs as a filter would, from the start on, and
+its smoother is where the batch solver sets out.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
+from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import EstimationError
+from graphnav.core.progress import Progress, tell
+from graphnav.core.rotation import Array
+from graphnav.core.state import BLOCKS, States
+from graphnav.detectors import Detections, detect
+from graphnav.estimation import faults
+from graphnav.estimation.alignment import Alignment, align, with_known_heading
+from graphnav.estimation.alignment.first import some
+from graphnav.estimation.noise.apply import with_noise, without_parts
+from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
+from graphnav.estimation.noise.exclusion import estimate_without_faults, share_left_out, without_excluded
+from graphnav.estimation.noise.model import STATED, NoiseModel
+from graphnav.estimation.noise.spacing import space_fixes
+from graphnav.estimation.noise.words import describe
+from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.ekf import ekf, refilter
+from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.near import near
+from graphnav.estimation.solvers.passes import Filtered, Smoothed, about_solved, near_to, points_of, values_of
+from graphnav.estimation.solvers.rts import backward
+from graphnav.recording import Recording
+
+_FAR = 0.5  # rad between the stated and the found start attitude, beyond which a filter is astray for a while
+_FAR_AWAY = 100.0  # m, by which single fixes in a city may be wrong
+_LOST = 0.1  # rad by which a filter may be off for a smoother to rest on it
+_MOST = 0.5  # share of the fixes that can be wrong; beyond it, it is the start that is
+_WHEELS = (NonHolonomic, OdometerSpeed)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What all solvers of a recording share."""
+
+    problem: Problem  # with its noise model
+    noise: NoiseModel
+    start: Alignment  # of the prior: with the heading that the user states
+    aligned: Alignment  # as found
+    detections: Detections
+    forward: Filtered
+    smoothed: Smoothed
+    notes: tuple[str, ...]
+    timings: dict[str, float]
+    passes: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def astray(self) -> bool:
+        """Whether the stated start is so far from the one found that a filter from there is astray for a while."""
+        return _astray(self.aligned, self.start)
+
+
+def prepare(
+    recording: Recording,
+    settings: Settings,
+    frame: LocalFrame,
+    detections: Detections,
+    noise: NoiseModel | None = None,
+    progress: Progress | None = None,
+) -> Prepared:
+    """Align a recording, build its problem and find its noise model.
+
+    Parameters
+    ----------
+    detections : where the platform stands.
+    noise : to be used as it is; estimated, or as stated if the settings say so, when None.
+
+    Raises
+    ------
+    EstimationError
+        If the recording does not determine a trajectory.
+    """
+    timings: dict[str, float] = {}
+    passes: Counter[str] = Counter()
+
+    def booked(stage: str, since: float) -> float:
+        now = time.perf_counter()
+        timings[stage] = timings.get(stage, 0.0) + now - since
+        return now
+
+    def aligned_by(fixes: Recording, stationary: Array) -> Alignment:
+        tell("alignment")
+        since = time.perf_counter()
+        found = align(fixes, settings, frame, _smooth, stationary)
+        booked("alignment", since)
+        return found
+
+    def build(at: Alignment, found: Detections, parts: bool) -> Problem:
+        tell("preintegration")
+        since, start = time.perf_counter(), _start(at, with_known_heading(at, settings))
+        problem = pose(used, settings, frame, start.state, start_sigma(start), found.stationary, parts_of_noise=parts)
+        booked("preintegration", since)
+        return problem
+
+    def without_wrong(noise: NoiseModel) -> tuple[Alignment, Detections, bool]:
+        """Start and stops, which are not to rest on fixes that are wrong, and whether they are others then."""
+        if not noise.excluded or recording.gnss is None:
+            return aligned, detections, False
+        fixes = without_excluded(recording, noise)
+        stops = detect(fixes, settings)
+        changed = _differ(stops.stationary, detections.stationary)
+        stops = stops if changed else detections
+        seen = recording.end if aligned.until is None else aligned.until
+        if not any(begin <= seen for spans in noise.excluded.values() for begin, _ in spans):
+            return aligned, stops, changed  # the start has seen none of them
+        try:
+            found = aligned_by(fixes, stops.stationary)
+        except EstimationError:
+            return aligned, stops, changed
+        other = found.motion is not None and found.contradicts(aligned)
+        return (found if other else aligned), stops, changed or other
+
+    known: Points | None = None
+    aligned = aligned_by(recording, detections.stationary)
+    told = aligned.motion is not None and settings.gnss.position
+    if noise is None and (settings.noise.mode == "stated" or not told):
+        noise = STATED
+    spacing = settings.noise.spacing if noise is None else noise.spacing
+    used = space_fixes(recording, spacing) if spacing else recording
+    base = build(aligned, detections, parts=noise != STATED)
+    if noise is None:
+        since = time.perf_counter()
+        tell("noise")
+        best = _estimated(base, aligned, settings, progress, passes)
+        if share_left_out(base, best.noise) > _MOST:
+            # most fixes contradict what came of the start: it is looked for in what follows
+            try:
+                later = aligned_by(_after(recording, aligned), detections.stationary)
+                other = build(later, detections, parts=True)
+                again = _estimated(other, later, settings, progress, passes)
+                if share_left_out(other, again.noise) < share_left_out(base, best.noise):
+                    aligned, base, best = later, other, again
+            except EstimationError:
+                pass  # nothing moves later on
+        aligned, detections, changed = without_wrong(best.noise)
+        if changed:
+            base = build(aligned, detections, parts=True)
+            best = estimate_noise(base, aligned.until, best.noise, progress=progress)
+            passes.update(filter=best.passes, smoother=best.passes)
+        noise, known = best.noise, best.points
+        passes.update(filter=1)
+        plain = NoiseModel(excluded=noise.excluded)
+        if _explains_more(base, plain, best):
+            noise, known = plain, None
+        noise = replace(noise, spacing=spacing)
+        booked("noise", since)
+    else:
+        aligned, detections, changed = without_wrong(noise)
+        base = build(aligned, detections, parts=noise != STATED) if changed else base
+    problem = without_parts(with_noise(base, noise))
+    start = with_known_heading(aligned, settings)
+    since = time.perf_counter()
+    forward = ekf(problem, progress, aligned.until)
+    filtered = booked("filter", since)
+    smoothed = backward(problem, forward, progress)
+    problem = _without_refused(problem, forward)
+    if any(rows.gate is not None for rows in problem.constraints):
+        smoothed = backward(problem, refilter(problem, smoothed, progress), progress)
+    forward, smoothed = _find_way(problem, aligned, known, forward, smoothed, progress, passes)
+    booked("smoother", filtered)
+    passes.update(filter=1, smoother=1)
+    del timings["filter"]  # the filter's own solution has it
+    return Prepared(
+        problem, noise, start, aligned, detections, forward, smoothed, describe(noise, problem), timings, passes
+    )
+
+
+def _estimated(
+    base: Problem, aligned: Alignment, settings: Settings, progress: Progress | None, passes: Counter[str]
+) -> NoiseEstimate:
+    """The noise model, with spans of wrong measurements left out if they are to be."""
+    estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
+    found = estimate(base, aligned.until, progress=progress)
+    passes.update(filter=found.passes + found.looks, smoother=found.passes)
+    return found
+
+
+def start_sigma(start: Alignment) -> Array:
+    """(15,) 1-sigma of the start, with a place that the alignment does not claim to know.
+
+    It has the place from fixes that the problem uses too, by sigmas that may be wrong; without fixes it is where the
+    start is said to be.
+    """
+    sigma = start.sigma.copy()
+    if start.motion is None:
+        return sigma
+    sigma[BLOCKS["p"]] = np.hypot(sigma[BLOCKS["p"]], _FAR_AWAY)
+    return sigma
+
+
+def _explains_more(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:
+    """Whether the figures as stated make the innovations likelier than the estimate, with its prior, does.
+
+    Both without what is left out: likelihoods are compared of the same measurements.
+    """
+    known = values_of(with_noise(base, found.noise), found.points)
+    problem = with_noise(base, plain)
+    forward = refilter(problem, points_of(problem, found.points.states, known))
+    return float(np.sum(forward.log_likelihood)) > found.log_posterior
+
+
+def _start(found: Alignment, stated: Alignment) -> Alignment:
+    """Where estimation sets out: the stated start, unless a filter from there would be astray."""
+    return found if _astray(found, stated) else stated
+
+
+def _astray(found: Alignment, stated: Alignment) -> bool:
+    turn = found.state.minus(stated.state)[0, :3]
+    return found.motion is not None and bool(np.linalg.norm(turn) > _FAR)
+
+
+def _find_way(
+    problem: Problem,
+    aligned: Alignment,
+    known: Points | None,
+    forward: Filtered,
+    smoothed: Smoothed,
+    progress: Progress | None,
+    passes: Counter[str],
+) -> tuple[Filtered, Smoothed]:
+    """Filter and smooth about better points where the filter was too far off for a smoother to rest on it.
+
+    These are `known`, from the estimation of the noise, where it came about; else those of a batch solution.
+
+    Fixes that weigh little beside wheels let a filter that is not sure of its heading turn the mounting round
+    rather than the velocity, and no step finds back from there. So wheels come second.
+    """
+    if near_to(smoothed, forward.linearised, _LOST):
+        return forward, smoothed
+    if known is not None and len(known.states) == len(problem.t):
+        passes.update(filter=2, smoother=1)
+        smoothed = backward(problem, refilter(problem, known, progress), progress)
+        if near_to(smoothed, known, _LOST):
+            return ekf(problem, progress, aligned.until, known=smoothed), smoothed
+    from graphnav.estimation.solvers.batch import batch  # and GTSAM with it, which few runs of a filter need
+
+    states = smoothed.states
+    if any(isinstance(c, _WHEELS) for c in problem.constraints):
+        free = replace(problem, constraints=tuple(c for c in problem.constraints if not isinstance(c, _WHEELS)))
+        states = backward(free, ekf(free, progress, aligned.until)).states
+        states = batch(free, states, wanted=(), reintegrate=False).states
+    solved = batch(problem, states, wanted=(), reintegrate=False)
+    about = about_solved(problem, solved, smoothed)
+    _, smoothed = near(problem, about, aligned.until, progress)
+    passes.update(filter=3, smoother=2)
+    return ekf(problem, progress, aligned.until, known=smoothed), smoothed
+
+
+def _without_refused(problem: Problem, forward: Filtered) -> Problem:
+    """The problem without the rows that a gate refused in the filter: no solver uses them."""
+    refused = {c.name: forward.records[c.name].decided for c in problem.constraints if c.gate is not None}
+    return faults.weighted(problem, refused) if refused else problem
+
+
+def _differ(a: Array, b: Array) -> bool:
+    """Whether one has a stop that the other has nothing of."""
+    return any(
+        not np.any((other[:, 0] < end) & (other[:, 1] > begin)) for one, other in ((a, b), (b, a)) for begin, end in one
+    )
+
+
+def _smooth(problem: Problem, start: States) -> Solution:
+    from graphnav.estimation.solvers.batch import batch
+
+    return batch(problem, start, wanted=(0,), reintegrate=False)
+
+
+def _after(recording: Recording, aligned: Alignment) -> Recording:
+    """Without the fixes that an alignment has seen."""
+    assert recording.gnss is not None
+    assert aligned.until is not None
+    return replace(recording, gnss=some(recording.gnss, recording.gnss.t > aligned.until))

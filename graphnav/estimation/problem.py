@@ -1,0 +1,226 @@
+"""Keyframes, the intervals between them and the constraint rows on them; no solver in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints import registered
+from graphnav.constraints.base import SAME_TIME, Constraint, Scene
+from graphnav.constraints.prior import InitialPrior
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, Parameter, States
+from graphnav.imu.clipping import with_whole_peaks
+from graphnav.imu.dynamics import Motion, scale_parameter
+from graphnav.imu.preintegration import Intervals, preintegrate, preintegrate_unknown
+from graphnav.imu.samples import Samples, bridge_gaps
+from graphnav.imu.unresolved import with_coning, with_unresolved_motion
+from graphnav.recording import ImuNoise, Recording
+from graphnav.recording.odometer import MeanSpeed
+
+
+@dataclass(frozen=True)
+class ParameterChain:
+    """A parameter and its nodes: one for a constant; a slow one has the next at the first keyframe after its spacing.
+
+    From node to node: value - mean -> decay (value - mean) + white noise of `sigma`.
+    """
+
+    parameter: Parameter
+    t: Array  # (n,) s
+    node: Array  # (K,) int, the node in force at each keyframe
+    mean: Array  # (n, k)
+    sigma: Array  # (n, k): of the first node, and of what is added on the way to each other
+    decay: Array  # (n,), that of the first means nothing
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything a solver needs, and nothing it has to look up elsewhere."""
+
+    recording: Recording
+    settings: Settings
+    frame: LocalFrame
+    t: Array  # (K,) keyframe times, s
+    samples: Samples
+    intervals: Intervals
+    motion: Motion
+    prior: InitialPrior
+    constraints: tuple[Constraint, ...]
+    notes: tuple[str, ...] = ()
+    imu_noise: ImuNoise = field(default_factory=ImuNoise)  # that the intervals were integrated with
+
+    @cached_property
+    def parameters(self) -> dict[str, Parameter]:
+        """What is estimated beside the states, by name."""
+        own = (*scale_parameter(self.recording), *(p for rows in self.constraints for p in rows.parameters))
+        return {p.name: p for p in own}
+
+    @cached_property
+    def chains(self) -> tuple[ParameterChain, ...]:
+        """The parameters with their nodes."""
+        return _chains(self.parameters.values(), self.t)
+
+    @cached_property
+    def columns(self) -> dict[str, slice]:
+        """Where each parameter stands behind the fifteen states in an augmented error state."""
+        out, at = {}, DIM
+        for chain in self.chains:
+            width = chain.parameter.size
+            out[chain.parameter.name] = slice(at, at + width)
+            at += width
+        return out
+
+    def completed(self, recording: Recording, usual: Array | None = None) -> Problem:
+        """With the constraints that look ahead, from a recording that reaches as far as they look.
+
+        `usual` as for `pose`.
+        """
+        scene = Scene(recording, self.settings, self.frame, self.t, np.empty((0, 2)), self.intervals, usual=usual)
+        rows = (*self.constraints, *_built(scene, True))
+        return replace(self, recording=recording, constraints=tuple(sorted(rows, key=lambda c: c.name)))
+
+    def reintegrated(self, ba: Array, bg: Array) -> Problem:
+        """The same problem with its intervals integrated anew about better biases, (K-1, 3) each."""
+        imu = replace(self.recording.imu, noise=self.imu_noise)
+        intervals = preintegrate(self.samples, imu, self.t, ba, bg)
+        return replace(self, intervals=intervals, motion=Motion(intervals, self.frame))
+
+
+def pose(
+    recording: Recording,
+    settings: Settings,
+    frame: LocalFrame,
+    start: States,
+    sigma: Array,
+    stationary: Array | None = None,
+    times: Array | None = None,
+    speed: MeanSpeed | None = None,
+    usual: Array | None = None,
+    known: Mapping[float, Motion] | None = None,
+    highest: Array | None = None,
+    complete: bool = True,
+    parts_of_noise: bool = False,
+) -> Problem:
+    """Pose the estimation problem for a recording.
+
+    Parameters
+    ----------
+    start : one state at the start of the recording: mean of the prior and where biases are expected.
+    sigma : (15,) 1-sigma of the prior.
+    stationary : (M, 2) spans in which the platform stands still, s; none when None.
+    times : (K,) keyframes, s, where they are given: measurements at other times are left out.
+    speed : of the odometer, where it is known already.
+    usual : (M, 3) m, the unit of the slow errors of the recording's fixes, where it is known already.
+    known : what intervals between keyframes say that were integrated before, by the time they end at.
+    highest : what the IMU has read at other times, as `graphnav.imu.clipping.highest` says.
+    complete : False leaves out the constraints that look ahead, for `Problem.completed`.
+    parts_of_noise : keep what each noise figure contributes to the intervals' covariances, for `graphnav.estimation.noise`.
+    """
+    stops = to_samples(stationary, recording)
+    if times is None:
+        wanted = [cls.epochs(recording, settings, stops) for cls in registered()]
+        epochs = np.concatenate([*wanted, np.empty(0)])
+        times = keyframe_times(recording.start, recording.end, epochs, settings.keyframes.rate)
+    t = times
+    samples = bridge_gaps(recording.imu)
+    said: tuple[str, ...] = ()
+    if recording.platform == "foot":
+        samples, said = with_whole_peaks(samples, recording.imu.R_bs, highest)
+        samples = with_unresolved_motion(samples, recording.imu.noise)
+        samples = with_coning(samples) if settings.imu.coning else samples
+    motion = known.get(float(t[1])) if known and len(t) == 2 else None
+    if motion is None or motion.intervals.t0[0] != t[0]:
+        before = {end: one.intervals for end, one in (known or {}).items()}
+        intervals = preintegrate_unknown(samples, recording.imu, t, start.ba[0], start.bg[0], before, parts_of_noise)
+        motion = Motion(intervals, frame)
+    intervals = motion.intervals
+    scene = Scene(recording, settings, frame, t, stops, intervals, speed, usual)
+    built = _built(scene, None if complete else False)
+    prior = InitialPrior(keyframe=np.zeros(1, dtype=int), mean=start, sigma=np.asarray(sigma)[None])
+    return Problem(
+        recording=recording,
+        settings=settings,
+        frame=frame,
+        t=t,
+        samples=samples,
+        intervals=intervals,
+        motion=motion,
+        prior=prior,
+        constraints=built,
+        notes=(*_notes(samples, recording), *said, *(note for rows in built for note in rows.notes)),
+        imu_noise=recording.imu.noise,
+    )
+
+
+def _built(scene: Scene, ahead: bool | None) -> tuple[Constraint, ...]:
+    """The constraints of a scene: those that look ahead, those that do not, or all (None)."""
+    classes = (cls for cls in registered() if ahead is None or cls.looks_ahead == ahead)
+    return tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
+
+
+def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Array:
+    """Keyframes at both ends, at every epoch between, and in between at `rate` at least."""
+    inside = epochs[(epochs > start + SAME_TIME) & (epochs < end - SAME_TIME)]
+    fixed = np.unique(np.concatenate([[start], inside, [end]]))
+    fixed = fixed[np.concatenate([[True], np.diff(fixed) > SAME_TIME])]
+    parts = np.maximum(1, np.ceil(np.diff(fixed) * rate - 1e-6).astype(int))
+    step = np.repeat(np.diff(fixed) / parts, parts)
+    within = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
+    return np.append(np.repeat(fixed[:-1], parts) + within * step, fixed[-1])
+
+
+def to_samples(stationary: Array | None, recording: Recording) -> Array:
+    """The parts of stationary spans that a recording covers, (M, 2), from sample to sample of the IMU."""
+    if stationary is None or not len(stationary):
+        return np.empty((0, 2))
+    begin, end = recording.start, recording.end
+    stationary = stationary[(stationary[:, 1] > begin - SAME_TIME) & (stationary[:, 0] < end + SAME_TIME)]
+    if not len(stationary):
+        return np.empty((0, 2))
+    t = np.concatenate([[begin], recording.imu.t])
+    first = np.searchsorted(t, stationary[:, 0] - SAME_TIME)
+    last = np.searchsorted(t, stationary[:, 1] + SAME_TIME, side="right") - 1
+    kept = last > first
+    return np.stack([t[first[kept]], t[last[kept]]], -1)
+
+
+def _chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterChain, ...]:
+    chains = []
+    for p in parameters:
+        if p.begins is not None:
+            nodes, mean, sigma, decay = p.begins, p.initial, p.sigma, np.zeros(len(p.begins))
+        else:
+            nodes = t[:1] if p.constant else _apart(t, p.spacing)
+            ahead, added = p.step(np.diff(nodes))
+            mean = np.tile(p.initial, (len(nodes), 1))
+            sigma, decay = np.concatenate([p.sigma[None], added]), np.concatenate([[0.0], ahead])
+        node = np.maximum(np.searchsorted(nodes, t + SAME_TIME, side="right") - 1, 0)
+        chains.append(ParameterChain(p, nodes, node, mean, sigma, decay))
+    return tuple(chains)
+
+
+def _apart(t: Array, spacing: float) -> Array:
+    """Those of the keyframes that lie so far apart at least; the same ones however long the drive goes on."""
+    out = [float(t[0])]
+    for x in t.tolist():
+        if x - out[-1] >= spacing - SAME_TIME:
+            out.append(x)
+    return np.array(out)
+
+
+def _notes(samples: Samples, recording: Recording) -> tuple[str, ...]:
+    if not len(samples.bridged):
+        return ()
+    length = samples.bridged[:, 1] - samples.bridged[:, 0]
+    worst = int(np.argmax(length))
+    return (
+        f"{len(length)} gaps in the IMU bridged ({length.sum():.2f} s in all, longest {length[worst]:.2f} s at "
+        f"{samples.bridged[worst, 0] - recording.start:.1f} s): uncertainty grows there by what the signal usually "
+        "changes in such a time",
+    )

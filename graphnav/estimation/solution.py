@@ -1,0 +1,221 @@
+"""What a solver returns: states, covariances, parameters, residuals and how it got there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.core.trajectory import Trajectory
+from graphnav.detectors.base import Detection
+from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights
+
+_OUT = 9  # errors of attitude, position, velocity, which are those of a trajectory
+_ROWS = 4096  # of a block: 25 MB while it is worked on
+
+
+class Between(Protocol):
+    """States between the keyframes of one piece of a recording."""
+
+    @property
+    def start(self) -> float:
+        """First time, s."""
+        ...
+
+    @property
+    def end(self) -> float:
+        """Last time, s."""
+        ...
+
+    def times(self, rate: float) -> Array:
+        """Times at a rate, ends included."""
+        ...
+
+    def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
+        """States and covariances (M, size, size), of the first errors, at times inside."""
+        ...
+
+
+@dataclass(frozen=True)
+class ConstraintRecord:
+    """What one constraint said to one solver: innovations of a filter, residuals of a smoother."""
+
+    kind: str  # "innovation" or "residual"
+    t: Array  # (N,) s
+    residual: Array  # (N, m) predicted minus measured
+    sigma: Array  # (N, m) of the innovation (state and measurement) or of the measurement
+    nis: Array  # (N,) normalised squared innovation or residual, chi-square with m degrees of freedom for a filter
+    weight: Array  # (N,) robust weight, 1 = as a Gaussian, 0 = rejected
+    axes: tuple[str, ...]  # names of the m components
+    unit: str
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """A slow or constant parameter: `t` holds its nodes, one for a constant."""
+
+    t: Array  # (n,) s
+    value: Array  # (n, k)
+    sigma: Array  # (n, k)
+    prior_sigma: Array  # (k,)
+    unit: str
+
+    @property
+    def observable(self) -> Array:
+        """(k,) whether the data told more than half of what was unknown."""
+        return self.sigma[-1] < 0.5 * self.prior_sigma
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Consecutive rows of one constraint that no solver uses."""
+
+    kind: str  # name of the constraint
+    t_start: float  # s, of the first row
+    t_end: float  # s, of the last
+    count: int
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """One solver's answer. Covariance blocks are of the error state of `graphnav.core.state`, (K, 15, 15)."""
+
+    solver: str
+    frame: LocalFrame
+    t: Array  # (K,) s
+    states: States
+    covariance: Array
+    parameters: dict[str, ParameterEstimate] = field(default_factory=dict)
+    records: dict[str, ConstraintRecord] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)  # factors or updates by kind
+    iterations: int = 0
+    cost: float = float("nan")  # half the sum of squared whitened residuals at the end
+    stopped: str = ""  # why it stopped, a sentence
+    timings: dict[str, float] = field(default_factory=dict)  # s by stage
+    notes: tuple[str, ...] = ()
+    detections: tuple[Detection, ...] = ()  # where the platform was found to stand, the fused answer last
+    excluded: tuple[Fault, ...] = ()  # spans of measurements found to be wrong, which no solver used
+    noise: NoiseModel = STATED  # that all solvers used
+    passes: Mapping[str, int] = field(default_factory=dict)  # over all keyframes, before the solver's own
+    between: tuple[Between, ...] = ()  # gives states between keyframes, one for each piece of the recording
+
+    @property
+    def stationary(self) -> Array:
+        """(M, 2) s, where the platform stands."""
+        spans = [d.intervals for d in self.detections if d.name == "fused"]
+        return np.concatenate([np.empty((0, 2)), *spans])
+
+    def trajectory(self, rate: float | None = None) -> Trajectory:
+        """In geodetic coordinates and local axes, with 9 x 9 covariances: at the keyframes, or at `rate` (Hz)."""
+        t, states, covariance = self.t, self.states, self.covariance
+        if rate is not None:
+            t, states, covariance = self.at(np.concatenate([b.times(rate) for b in self.between]))
+        return to_trajectory(self.solver, self.frame, t, states, covariance)
+
+    def blocks(self, rate: float | None = None) -> Iterator[Trajectory]:
+        """`trajectory` in parts, one behind the other, so that only one of them need be in memory."""
+        if rate is None:
+            yield self.trajectory()
+            return
+        for piece in self.between:
+            times = piece.times(rate)
+            for k in range(0, len(times), _ROWS):
+                t = times[k : k + _ROWS]
+                yield to_trajectory(self.solver, self.frame, t, *piece(t, _OUT))
+
+    def at(self, t: Array) -> tuple[Array, States, Array]:
+        """Times (M,), states and covariances (M, 15, 15) at ascending times; those in no piece are left out."""
+        parts = []
+        for piece in self.between:
+            inside = t[(t >= piece.start) & (t <= piece.end)]
+            if len(inside):
+                parts.append((inside, *piece(inside)))
+        times, states, covariances = zip(*parts, strict=True)
+        return np.concatenate(times), States.stack(list(states)), np.concatenate(covariances)
+
+
+def to_trajectory(name: str, frame: LocalFrame, t: Array, states: States, covariance: Array) -> Trajectory:
+    """States in the fixed navigation frame turned into the local ENU at each point."""
+    R_ln = frame.R_ln(states.p)
+    rph = rotation.to_rph(R_ln @ states.R_nb)
+    # (p, v, rph) in local axes from (theta, p, v) in the error state
+    J = np.zeros((len(t), 9, 9))
+    J[:, 0:3, 3:6] = R_ln
+    J[:, 3:6, 6:9] = R_ln
+    J[:, 6:9, 0:3] = rotation.rph_jacobian(rph)
+    cov = J @ covariance[:, :_OUT, :_OUT] @ np.swapaxes(J, -1, -2)
+    sd = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
+    return Trajectory(
+        t=t,
+        llh=frame.to_llh(states.p),
+        v=np.einsum("kij,kj->ki", R_ln, states.v),
+        rph=rph,
+        sd_p=sd[:, 0:3],
+        sd_v=sd[:, 3:6],
+        sd_rph=sd[:, 6:9],
+        gyro_bias=states.bg,
+        accel_bias=states.ba,
+        covariance=cov,
+        name=name,
+    )
+
+
+def joined(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:
+    """Solutions of the pieces of one recording, put end to end in one frame."""
+    first = parts[0]
+    if len(parts) == 1:
+        return replace(first, notes=(*notes, *first.notes))
+
+    def rows(name: str) -> ConstraintRecord:
+        have = [part.records[name] for part in parts if name in part.records]
+        arrays: dict[str, Any] = {
+            key: np.concatenate([getattr(r, key) for r in have]) for key in ("t", "residual", "sigma", "nis", "weight")
+        }
+        return replace(have[0], **arrays)
+
+    parameters = {}
+    for name in dict.fromkeys(key for part in parts for key in part.parameters):
+        own = [part.parameters[name] for part in parts if name in part.parameters]
+        nodes: dict[str, Any] = {key: np.concatenate([getattr(p, key) for p in own]) for key in ("t", "value", "sigma")}
+        parameters[name] = replace(own[0], **nodes)
+    return replace(
+        first,
+        t=np.concatenate([p.t for p in parts]),
+        states=States.stack([p.states for p in parts]),
+        covariance=np.concatenate([p.covariance for p in parts]),
+        parameters=parameters,
+        records={name: rows(name) for name in dict.fromkeys(key for part in parts for key in part.records)},
+        counts=_summed([p.counts for p in parts]),
+        timings=_summed([p.timings for p in parts]),
+        iterations=sum(p.iterations for p in parts),
+        cost=sum(p.cost for p in parts),
+        stopped="; ".join(dict.fromkeys(p.stopped for p in parts)),
+        notes=(*notes, *dict.fromkeys(note for part in parts for note in part.notes)),
+        detections=tuple(d for p in parts for d in p.detections),
+        excluded=tuple(f for p in parts for f in p.excluded),
+        noise=_noise_of_all([p.noise for p in parts]),
+        passes=_summed([dict(p.passes) for p in parts]),
+        between=tuple(b for p in parts for b in p.between),
+    )
+
+
+def _noise_of_all(parts: list[NoiseModel]) -> NoiseModel:
+    """Weights and spans of all pieces, and the figures of the first: each piece has its own."""
+    weights = {}
+    for name in dict.fromkeys(key for part in parts for key in part.weights):
+        own = [part.weights[name] for part in parts if name in part.weights]
+        weights[name] = RowWeights(np.concatenate([w.t for w in own]), np.concatenate([w.weight for w in own]))
+    names = dict.fromkeys(key for part in parts for key in part.excluded)
+    excluded = {name: tuple(span for part in parts for span in part.excluded.get(name, ())) for name in names}
+    return replace(parts[0], weights=weights, excluded=excluded)
+
+
+def _summed(tables: list[dict[str, Any]]) -> dict[str, Any]:
+    return {key: sum(table.get(key, 0) for table in tables) for key in dict.fromkeys(k for t in tables for k in t)}

@@ -1,0 +1,216 @@
+"""Batch smoother: the whole drive as one factor graph, solved by Gauss-Newton with Levenberg-Marquardt.
+
+Minimises, over all keyframe states and parameter nodes,
+
+    1/2 |prior|^2 + 1/2 sum |interval residual|^2_Q + sum rho(|constraint residual|_R)
+
+Each iteration linearises everything at once in NumPy, hands the whitened rows to GTSAM as Gaussian
+factors, eliminates with QR and moves the states on their manifold. A step that raises the cost is taken
+back and damped (Marquardt's scaling: lambda times the column norms). Converged means that the quadratic
+model promises less than `tolerance` from another step, in units of half squared sigmas: the optimum is
+then within sqrt(2 tolerance) sigma in every direction at once.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.estimation.dense import dense
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solution import ParameterEstimate, Solution
+from graphnav.estimation.solvers.graph import Eliminated, LinearGraph
+from graphnav.estimation.solvers.passes import Progress, integrated_again, residual_record
+from graphnav.estimation.solvers.robust import REDESCENDING
+from graphnav.estimation.solvers.rows import Layout, Point, Rows, Values, column_norms, cost, promised, whitened
+
+_GRADUATION = 1.4  # by which mu grows from step to step
+_SHARP = 100.0  # mu from which on the kernel bends within half a per cent of its scale
+_MIN_DAMPING, _MAX_DAMPING = 1e-4, 1e8
+
+
+def batch(
+    problem: Problem,
+    start: States,
+    values: Values | None = None,
+    progress: Progress | None = None,
+    wanted: tuple[int, ...] | None = None,
+    reintegrate: bool = True,
+) -> Solution:
+    """Solve a problem from any starting states (K rows) and parameter values.
+
+    `wanted` are the keyframes whose covariance is wanted, all when None; others are NaN. `reintegrate`
+    allows intervals to be integrated again when the gyro bias moves far.
+    """
+    began = time.perf_counter()
+    values = {c.parameter.name: c.mean for c in problem.chains} | (values or {})
+    point, notes = Point(start, values), []
+    if any(c.robust in REDESCENDING and c.robust != "gnc" for c in problem.constraints):
+        # such a kernel gives up on whatever is far from the start; Cauchy's never quite does, and leads there
+        rows = (replace(c, robust="cauchy") if c.robust in REDESCENDING else c for c in problem.constraints)
+        point = _minimise(replace(problem, constraints=tuple(rows)), point, progress, reintegrate).point
+    for gentle in _graduated(problem, point):
+        point = _minimise(gentle, point, progress, reintegrate, 1).point
+    found = _minimise(problem, point, progress, reintegrate)
+    problem, point, layout = found.problem, found.point, found.layout
+    solved = time.perf_counter()
+    if progress is not None:
+        progress("covariances", 0.0)
+    keys = set(layout.keys) if wanted is None else {*wanted, *layout.keys[layout.K :]}
+    assert found.eliminated is not None
+    marginal = found.eliminated.covariances(keys)
+    unknown = np.full((DIM, DIM), np.nan)
+    covariance = np.stack([marginal.get(k, unknown) for k in range(layout.K)])
+    done = time.perf_counter()
+    points, records = point.points(problem), {}
+    for constraint in problem.constraints:
+        record = records[constraint.name] = residual_record(problem, constraint, points, robust=True)
+        if constraint.robust != "none" and np.mean(record.weight < 0.1) > 0.5:
+            notes.append(f"most rows of {constraint.name} were given up as outliers: do not trust this solution")
+    return Solution(
+        solver="batch",
+        frame=problem.frame,
+        t=problem.t,
+        states=point.states,
+        covariance=covariance,
+        parameters=_estimates(problem, layout, point, marginal),
+        records=records,
+        counts={"initial_prior": 1, "imu": layout.K - 1, **{c.name: len(c) for c in problem.constraints}},
+        iterations=found.iterations,
+        cost=found.cost,
+        stopped=found.stopped,
+        timings={"batch": solved - began, "covariances": done - solved},
+        notes=(*problem.notes, *found.notes, *notes),
+        between=(dense(problem, point.states, covariance, point.scale, smooth=True),),
+    )
+
+
+@dataclass(frozen=True)
+class _Minimum:
+    problem: Problem  # with intervals integrated about the final biases
+    point: Point
+    layout: Layout
+    eliminated: Eliminated | None  # undamped, at the point; None where the iterations were limited
+    cost: float
+    iterations: int
+    stopped: str
+    notes: tuple[str, ...]
+
+
+def _graduated(problem: Problem, point: Point) -> Iterator[Problem]:
+    """The problem with its "gnc" kernels convex at first and then ever less so, for a step each."""
+    mu: dict[str, float] = {}
+    points = point.points(problem)
+    for c in problem.constraints:
+        if c.robust == "gnc":
+            s2 = residual_record(problem, c, points).nis * (1.0 if c.weight is None else c.weight)
+            if np.max(s2) > c.robust_scale**2:
+                mu[c.name] = float(1.0 / (2.0 * float(np.max(s2)) / c.robust_scale**2 - 1.0))
+    while mu and min(mu.values()) < _SHARP:
+        rows = (replace(c, graduation=mu.get(c.name, np.inf)) for c in problem.constraints)
+        yield replace(problem, constraints=tuple(rows))
+        mu = {name: _GRADUATION * x for name, x in mu.items()}
+
+
+def _minimise(
+    problem: Problem, point: Point, progress: Progress | None, reintegrate: bool, iterations: int | None = None
+) -> _Minimum:
+    settings = problem.settings.solver
+    if iterations is not None:
+        settings = settings.model_copy(update={"max_iterations": iterations})
+    renewed = refused = 0
+    if reintegrate:
+        problem, renewed = integrated_again(problem, point.states, point.scale)
+    layout = Layout(problem)
+    now = cost(problem, point, layout)
+    damping, gentlest = 0.0, _MIN_DAMPING
+    stopped = f"stopped at the limit of {settings.max_iterations} iterations"
+    eliminated: Eliminated | None = None
+    iteration = 0
+    while iteration < settings.max_iterations:
+        iteration += 1
+        if progress is not None:
+            progress("batch", iteration / settings.max_iterations)
+        rows = whitened(problem, point, layout)
+        while True:
+            eliminated = _eliminate(rows, layout, damping)
+            step = layout.unpack(eliminated.solve(layout.keys))
+            gain = promised(rows, layout, step)
+            candidate = point.moved(step)
+            ahead = cost(problem, candidate, layout)
+            if ahead < now or gain < settings.tolerance:
+                break
+            if damping == 0.0:
+                # an early heading swings all that comes after it along tangents, off the track by the square of
+                # the angle; the step after this one takes that back, and only then is it seen what both bring
+                second = layout.unpack(_eliminate(whitened(problem, candidate, layout), layout, 0.0).solve(layout.keys))
+                beyond = candidate.moved(second)
+                behind = cost(problem, beyond, layout)
+                if behind < now:
+                    candidate, ahead = beyond, behind
+                    break
+            refused += 1
+            damping = max(gentlest, 10.0 * damping)
+            if damping > _MAX_DAMPING:
+                break
+        if damping > _MAX_DAMPING:
+            stopped, eliminated = "stopped: no step lowers the cost", None
+            break
+        if gain < settings.tolerance and damping == 0.0:
+            if ahead < now:
+                point, now = candidate, ahead  # the last small step is free
+            stopped = f"converged: one more step would lower the cost by {gain:.1e}"
+            break
+        if ahead < now:
+            point, now = candidate, ahead
+        eliminated = None
+        # a damped step promises little by construction: convergence is judged by an undamped one
+        if damping == gentlest:
+            gentlest /= 10.0  # more would have been possible: a long valley is not crept along
+        damping = 0.0 if damping <= _MIN_DAMPING or gain < settings.tolerance else damping / 10.0
+        if reintegrate:
+            problem, again = integrated_again(problem, point.states, point.scale)
+            if again:
+                layout = Layout(problem)
+                now = cost(problem, point, layout)
+                renewed += again
+    if eliminated is None and iterations is None:
+        eliminated = _eliminate(whitened(problem, point, layout), layout, 0.0)
+    notes = []
+    if refused:
+        stopped += f" ({refused} steps taken back and damped)"
+    if renewed:
+        notes.append(f"{renewed} intervals integrated again because the gyro bias had moved")
+    return _Minimum(problem, point, layout, eliminated, now, iteration, stopped, tuple(notes))
+
+
+def _eliminate(rows: Rows, layout: Layout, damping: float) -> Eliminated:
+    graph = LinearGraph()
+    for blocks, b in rows:
+        graph.add(blocks, b)
+    if damping:
+        size = np.sqrt(damping) * column_norms(rows, layout)
+        for width in sorted(set(layout.width)):
+            keys = np.array([k for k in layout.keys if layout.width[k] == width])
+            graph.add([(keys, size[keys, :width, None] * np.eye(width))], np.zeros((len(keys), width)))
+    return graph.eliminate(layout.order)
+
+
+def _estimates(
+    problem: Problem, layout: Layout, point: Point, covariances: dict[int, Array]
+) -> dict[str, ParameterEstimate]:
+    out = {}
+    for chain in problem.chains:
+        p = chain.parameter
+        if p.begins is not None:
+            continue
+        group = layout.group_of[p.name]
+        at = group.columns[p.name]
+        sigma = np.sqrt(np.stack([np.diag(covariances[int(k)])[at] for k in group.keys]))
+        out[p.name] = ParameterEstimate(chain.t, point.values[p.name], sigma, p.sigma, p.unit)
+    return out

@@ -1,0 +1,334 @@
+"""Error-state extended Kalman filter.
+
+The filter holds one state and the covariance P of its error state, widened by the parameters that the
+constraints ask for. From keyframe to keyframe it predicts with a whole preintegrated interval,
+
+    x <- f(x)      P <- F P F^T + Q
+
+and updates with the rows of every constraint there, nu = -r,
+
+    S = H P H^T + R     K = P H^T S^-1     d = K nu     x <- x [+] d     P <- (I-KH) P (I-KH)^T + K R K^T
+
+(closed loop: the error state is moved into x at once; Joseph's form keeps P symmetric and positive).
+
+The opening, the part that the alignment has seen, is run through twice. Before a vehicle moves nothing tells its
+heading, the filter's wanders by degrees until the first motion puts it right, and Jacobians taken along the way
+contradict those taken afterwards: heading, tilt and accelerometer bias get correlations that were never measured.
+So the opening is filtered and smoothed, and filtered again from the same prior, linearised at the points that the first
+pass left (`graphnav.estimation.solvers.points`). So are the first steps of a walk, which tell tilt and accelerometer bias apart.
+Later keyframes are linearised where the filter is.
+
+Where only figures or weights have changed since the drive was filtered, `refilter` is linearised at given points
+throughout.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+from scipy.linalg.lapack import dposv
+
+from graphnav.core.errors import EstimationError
+from graphnav.core.rotation import Array
+from graphnav.core.state import BLOCKS, DIM, States
+from graphnav.estimation.dense import dense
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.linearise import Points, scale_at
+from graphnav.estimation.solvers.passes import (
+    Filtered,
+    Forward,
+    Gain,
+    Progress,
+    joined,
+    moved,
+    parameters_of,
+)
+from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate, about_own
+from graphnav.estimation.solvers.robust import PASSES, softened, weight_and_cost
+from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.stack import Innovations, Stack, Together
+from graphnav.estimation.solvers.watch import Bank, Verdicts
+
+_NONE = 1e-12  # weight of a row that is not used beside others of its keyframe
+_REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
+
+
+def ekf(
+    problem: Problem,
+    progress: Progress | None = None,
+    opening: float | None = None,
+    watch: bool = False,
+    known: Points | None = None,
+) -> Filtered:
+    """Run the filter over all keyframes.
+
+    Parameters
+    ----------
+    opening : s, the end of what the alignment has seen of the recording; up to there the filter runs twice. Estimates
+        after it depend on nothing later than themselves.
+    watch : look for errors that last in the rows that are to be watched, and go back to before them.
+    known : where the opening is linearised, from its first keyframe on, if that is known better than by a first pass.
+    """
+    began = time.perf_counter()
+    K, about = len(problem.t), None
+    if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
+        about = backward(problem, _forward(problem, n, watch=watch)) if known is None else known.first(n)
+    one = _forward(problem, K, about, progress, watch)
+    seconds = time.perf_counter() - began
+    filtered, P = one.states, one.P[:, :DIM, :DIM]
+    if about is not None:
+        n = len(about.values) - 1
+        P = P.copy()
+        P[:n] = about_own(P[:n], one.errors[:n])
+    solution = Solution(
+        solver="ekf",
+        frame=problem.frame,
+        t=problem.t,
+        states=filtered,
+        covariance=P,
+        parameters=parameters_of(problem, one.values, one.P),
+        records={name: r.record(problem) for name, r in one.records.items()},
+        counts={"imu": K - 1, **{rows.name: len(rows) for rows in problem.constraints}},
+        iterations=1,
+        stopped="one pass forward over all keyframes",
+        timings={"filter": seconds},
+        notes=problem.notes,
+        between=(dense(problem, filtered, P, scale_at(problem.columns, one.values), smooth=False),),
+    )
+    return Filtered(**vars(one), solution=solution)
+
+
+def refilter(problem: Problem, about: Points, progress: Progress | None = None, watch: bool = False) -> Forward:
+    """Run the filter over the first keyframes, linearised at given points; several times as fast as `ekf`.
+
+    Parameters
+    ----------
+    about : of these keyframes, near enough for what is left to be linear: an earlier pass.
+    watch : as for `ekf`.
+    """
+    return _forward(problem, len(about.values), about, progress, watch)
+
+
+def _forward(
+    problem: Problem,
+    K: int,
+    about: Points | None = None,
+    progress: Progress | None = None,
+    watch: bool = False,
+) -> Forward:
+    """Filter the first K keyframes, of which the first n are linearised at given points."""
+    n = 0 if about is None else len(about.values)
+    D = DIM + sum(c.parameter.size for c in problem.chains)
+    all_P, all_Pp, all_F = np.empty((K, D, D)), np.empty((K, D, D)), np.empty((K - 1, D, D))
+    stack, own = Stack(problem, K), AtEstimate(problem)
+    given = None if about is None else AtPoints(problem, about, stack, all_F)
+    state = problem.prior.mean
+    assert state is not None
+    x: Any = Estimate(state, np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)]))
+    if about is not None:
+        x = own.minus(x, _one(about, 0))
+    P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
+    records = stack.records
+    fixes = [c for c in problem.constraints if watch and c.fix_of]
+    watched = [c for c in fixes if c.watched]
+    alone = [c.gate is not None or c.robust != "none" or any(c is one for one in fixes) for c in problem.constraints]
+    one_by_one = [True] * len(alone)  # each linearised where those before it have led
+    bank = Bank(watched, problem.t, D) if watched else None
+    banks: dict[int, Bank] = {}  # as they were before the latest keyframes with fixes
+    met = {int(k) for c in watched for k in c.keyframe}
+    verdicts = Verdicts(
+        {c.name: problem.t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
+    )
+    gains: list[list[Gain]] = [[] for _ in range(n)]
+    begun, P = (x, P), _placed(P, records)
+    found: list[Any] = [None] * K  # estimates, or errors where points are given
+    ahead = found.copy()
+    k = 0
+    while k < K:
+        where: AtEstimate | AtPoints = given if given is not None and k < n else own
+        if bank is not None and k in met:
+            banks[k] = bank.copy()
+            if len(banks) > _REMEMBERED:
+                del banks[next(iter(banks))]
+        if k:
+            x, F, Q, added = where.step(k, x)
+            if where is own:
+                all_F[k - 1] = F
+            P = F @ P @ F.T
+            P[:DIM, :DIM] += Q
+            if bank is not None:
+                bank.predicted(F)
+            if added is not None:
+                P.flat[:: D + 1] += added
+        for kind in watched if verdicts.anew else ():
+            if (kind.name, problem.t[k]) in verdicts.anew:
+                P = _anywhere(P, kind.fix_of)
+        ahead[k], all_Pp[k] = x, P
+        back: int | None = None
+        taken: list[Gain] | None = None
+        if k < n:
+            taken = gains[k] = []
+        for some in stack.together(k, one_by_one if where is own else alone):
+            x, P, fault = _update(some, x, P, where, stack, bank, taken)
+            if fault is not None:
+                again = verdicts.settle(some.parts[0][0].name, fault, float(problem.t[k]))
+                back = int(np.searchsorted(problem.t, again))
+                break
+        if back is None and k == len(problem.t) - 1 and (trial := verdicts.ended()) is not None:
+            back = int(np.searchsorted(problem.t, trial))
+        if back is not None:  # once more from before the fault, without it
+            bank = banks.get(back) or bank.forgetful() if bank else None
+            banks = {key: old for key, old in banks.items() if key < back}
+            k = back
+            x, P = (found[k - 1], all_P[k - 1]) if k else (begun[0], _placed(begun[1], records))
+            if about is not None and k == n:
+                x = own.plus(_one(about, k - 1), x)
+            continue
+        found[k], all_P[k] = x, P
+        if progress is not None and k % 256 == 0:
+            progress("filter", k / K)
+        k += 1
+        if about is not None and k == n:  # from here on linearised where the filter is
+            all_P[k - 1] = P = about_own(P, x[:3])
+            x = own.plus(_one(about, k - 1), x)
+    stack.finish()
+    weights = {c.name: records[c.name].decided for c in fixes}
+    errors, errors_ahead = np.array(found[:n]).reshape(n, D), np.array(ahead[:n]).reshape(n, D)
+    filtered, predicted = _points(about, errors, found[n:]), _points(about, errors_ahead, ahead[n:])
+    return Forward(
+        filtered.states,
+        filtered.values,
+        all_P,
+        predicted,
+        all_Pp,
+        all_F,
+        records,
+        weights,
+        bool(verdicts.anew),
+        about,
+        errors,
+        errors_ahead,
+        gains,
+        stack.log_likelihood,
+    )
+
+
+def _placed(P: Array, records: dict[str, Innovations]) -> Array:
+    """What is known at the start, but for the place where the first fix, which tells it, is not used."""
+    first = [one.used[0] for one in records.values() if one.rows.fix_of == "p" and len(one.used)]
+    return _anywhere(P, "p") if first and first[0] == 0.0 else P
+
+
+def _anywhere(P: Array, block: str) -> Array:
+    """A covariance with nothing known of a block, but for what moves with it."""
+    P = P.copy()
+    P[BLOCKS[block], BLOCKS[block]] += 1e6 * np.eye(3)
+    return P
+
+
+def _one(points: Points, k: int) -> Estimate:
+    return Estimate(points.states[k : k + 1], points.values[k])
+
+
+def _points(about: Points | None, errors: Array, own: list[Estimate]) -> Points:
+    """Errors about given points, and the estimates that follow, as points."""
+    parts = [] if about is None else [moved(about, errors)]
+    if own:
+        parts.append(Points(States.stack([one.state for one in own]), np.array([one.values for one in own])))
+    return joined(parts)
+
+
+def _update(
+    some: Together, x: Any, P: Array, where: Any, stack: Stack, bank: Bank | None, taken: list[Gain] | None
+) -> tuple[Any, Array, float | None]:
+    """One measurement update, added to what the keyframe has taken in; when a fault began comes last."""
+    D, (rows, lo, hi) = len(P), some.parts[0]
+    end = D + 1 if taken is None else 2 * D + 1
+    record = stack.records[rows.name]
+    weight, root_weight = _weights(record, lo, hi) if some.alone else (1.0, stack.root_weight[some.at])
+    tests = bank if bank is not None and weight > 0.0 and rows.name in bank else None
+    at, e = where.about(x)
+    for left in range(where.passes(some) - 1, -1, -1):
+        r, H, sigma = where.rows(some, at)
+        r, sigma = r if e is None else r + H @ e, sigma / root_weight
+        PHt = P @ H.T
+        HPHt = H @ PHt
+        right = [r[None], PHt] if taken is None else [r[None], PHt, H.T]
+        if some.alone and not left and tests is not None:
+            G = tests.signature(rows.name, some.k, H)
+            right.append(tests.own(rows.name, G).T)
+        sides = np.concatenate(right).T
+        root, solved = _solve(HPHt, sigma, sides, some)
+        if not left:
+            stack.seen(some, root, solved[:, 0])
+            if some.alone:
+                nis, bent = float(r @ solved[:, 0]), 1.0
+                if rows.robust != "none" and rows.gate is None:  # a gate stands in place of a kernel
+                    sigma, solved, bent = _robust(HPHt, sigma, sides, solved, some)
+        K = solved[:, 1 : D + 1].T
+        d = -(K @ r) if e is None else e - K @ r
+        if left:  # again about where this leads (Jazwinski 1970, theorem 8.2)
+            at = where.plus(at, d)
+            e = where.minus(x, at)
+    if some.alone:
+        refused = rows.gate is not None and nis > rows.gate**2
+        weight = 0.0 if refused else weight * bent
+        record.weight[lo:hi] = weight if hi - lo == 1 else record.used[lo:hi] * (0.0 if refused else bent)
+        record.refused[lo:hi] = refused
+        if bank is not None:
+            bank.seen(rows.name, some.k, nis, weight > 0.0)
+        if weight == 0.0:
+            return x, P, None
+    if taken is not None:
+        taken.append((K, H, -solved[:, 0], solved[:, D + 1 : end]))
+    # Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T
+    P = P - K @ PHt.T
+    P = P - (P @ H.T - K * (sigma * sigma)) @ K.T
+    P = 0.5 * (P + P.T)  # rounding's asymmetry would grow, past what a stop leaves between its place and the state
+    fault = None
+    if tests is not None:
+        fault = tests.updated(rows.name, K, G, solved[:, end:], r, where.speed(some.k, x))
+    elif bank is not None:
+        bank.taken(K, H)
+    return where.plus(at, d), P, fault
+
+
+def _weights(record: Innovations, lo: int, hi: int) -> tuple[float, float | Array]:
+    """The largest weight of some rows, and the root of each number's; ones where none is used."""
+    used = record.used[lo:hi]
+    weight = float(max(used))
+    if hi - lo == 1 or weight == 0.0:
+        return weight, math.sqrt(weight) or 1.0
+    return weight, np.repeat(np.sqrt(np.maximum(used, _NONE)), len(record.rows.axes))
+
+
+def _solve(HPHt: Array, sigma: Array, right: Array, some: Together) -> tuple[Array, Array]:
+    """The upper root of S = H P H^T + R, and S^-1 times the right sides."""
+    S = HPHt.copy()
+    S.flat[:: len(S) + 1] += sigma * sigma
+    # LAPACK called directly: for matrices this small the checks around it would cost more than the work
+    root, solved, info = dposv(S.T, right, overwrite_a=1)
+    if info:
+        at = ", ".join(f"'{rows.name}' row {lo}" for rows, lo, _ in some.parts)
+        raise EstimationError(f"the filter's covariance broke down at {at}: check sigmas and units")
+    return root, solved
+
+
+def _robust(HPHt: Array, sigma: Array, right: Array, solved: Array, some: Together) -> tuple[Array, Array, float]:
+    """Sigmas with a kernel's weights in them, S^-1 times the right sides with these, and the least weight.
+
+    As the incremental smoother does with a new keyframe: none at first, then by what the update leaves, a few times.
+    """
+    rows, lo, hi = some.parts[0]
+    stated, weight = sigma, np.ones(hi - lo)
+    for _ in range(PASSES - 1):
+        left = (right[:, 0] - HPHt @ solved[:, 0]) / stated
+        s = np.linalg.norm(left.reshape(hi - lo, -1), axis=1)
+        weight = np.maximum(weight_and_cost(softened(rows.robust), s, rows.scale_of(slice(lo, hi)))[0], 1e-12)
+        sigma = stated / np.repeat(np.sqrt(weight), len(stated) // (hi - lo))
+        _, solved = _solve(HPHt, sigma, right, some)
+    return sigma, solved, float(np.min(weight))

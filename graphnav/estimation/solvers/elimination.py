@@ -1,0 +1,207 @@
+"""A keyframe enters the window in two steps, as in any filter: prediction, and the rows that had to be waited for.
+
+Prediction puts under the message of the keyframe before the rows of the interval, of parameters that move on, and of
+those measurements that the interval itself tells; QR eliminates what only they touch (see `graphnav.estimation.solvers.stages`).
+What smooths back is known from then on, because nothing that comes later touches the keyframe before. What is left is
+a triangle, and a fix adds a few rows under it: a QR of that shape (LAPACK's tpqrt) costs a fraction of the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from scipy.linalg.lapack import dgeqrf, dtpmqrt, dtpqrt, dtrtri, dtrtrs
+
+from graphnav.core import rotation
+from graphnav.core.errors import EstimationError
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.estimation.solvers.linearise import shift
+from graphnav.estimation.solvers.robust import PASSES
+from graphnav.estimation.solvers.stages import Columns, Measured, Message, Place, Stage, turned, width
+from graphnav.estimation.solvers.watch import Watch
+
+_BLOCK = 8  # reflectors that tpqrt applies at once
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """A keyframe that lacks only the rows it waits for, about a point of its own; `Stage` says what G, g, C are."""
+
+    before: Message  # what it was predicted from
+    place: Place
+    state: States
+    values: Array
+    columns: Columns
+    link: Array | None  # whitened rows of the interval
+    top: Array  # (D, D + 1 + tests) R z of a message without those rows, and what tests have beside it
+    G: Array
+    g: Array
+    lost: Array
+    C: Array
+    measured: tuple[Measured, ...]  # what has been taken in
+
+
+def predict(
+    before: Message,
+    place: Place,
+    link: Array | None,
+    rows: Sequence[Measured],
+    state: States,
+    values: Array,
+    columns: Columns,
+) -> Predicted:
+    """Go on from a message to the next keyframe, linearised at a point of its own.
+
+    Parameters
+    ----------
+    link : whitened rows of the interval, as `graphnav.estimation.solvers.stages.Linear` has them.
+    rows : measurements without kernels to take in as well.
+
+    Raises
+    ------
+    EstimationError
+        If the rows do not determine what is eliminated: sigmas or units are wrong.
+    """
+    D0, D = len(before.z), width(columns)
+    gone = [before.columns[s.name] for s in place.steps if s.name in before.columns]
+    lost = np.arange(DIM if place.linked else 0)
+    if gone:
+        lost = np.concatenate([lost, *(np.arange(at.start, at.stop) for at in gone)])
+    E = len(lost)
+    # where each column of the message goes: to the eliminated ones in front, or to its own place behind them
+    to = np.arange(E, E + D0)
+    to[lost] = np.arange(E)
+    steps, tests = sum(len(s.mean) for s in place.steps), before.tests
+    C = 0 if tests is None else tests.X.shape[1]
+    linked = 0 if link is None else DIM
+    A = np.zeros((D0 + steps + linked + sum(one.b.size for one in rows), E + D + 1 + C), order="F")
+    head = A[:, : E + D + 1]
+    head[:D0, to], head[:D0, -1] = before.R, before.z
+    if tests is not None:
+        A[:D0, E + D + 1 :] = before.R @ tests.X
+    apart = np.zeros(DIM) if place.linked else state.minus(before.state)[0]
+    if np.any(apart):  # one and the same state, but about its new point
+        head[:D0, -1] -= before.R[:, :DIM] @ apart
+        head[:D0, E : E + 3] = head[:D0, E : E + 3] @ rotation.right_jacobian_inverse(apart[None, :3])[0]
+    moved = values[: D0 - DIM] - before.values
+    for at in gone:
+        moved[shift(at)] = 0.0
+    if np.any(moved):  # parameters that stay are about the new point's values
+        head[:D0, -1] -= before.R[:, DIM:] @ moved
+    row = D0
+    for step in place.steps:
+        at = columns[step.name]
+        k = len(step.mean)
+        own, diagonal, value = np.arange(row, row + k), 1.0 / step.sigma, values[shift(at)]
+        head[own, E + np.arange(at.start, at.stop)] = diagonal
+        off = value - step.mean
+        if step.name in before.columns and step.decay:
+            old = before.columns[step.name]
+            head[own, to[old.start : old.stop]] = -step.decay * diagonal
+            off = off - step.decay * (before.value(step.name) - step.mean_before)
+        head[own, -1] = -off * diagonal
+        row += k
+    if link is not None:
+        head[row : row + DIM, :DIM], head[row : row + DIM, E:] = link[:, :DIM], link[:, DIM:]
+        row += DIM
+    for one in rows:
+        k = one.b.size
+        head[row : row + k, E:-1], head[row : row + k, -1] = one.H.reshape(k, D), one.b.ravel()
+        row += k
+    R = dgeqrf(A, overwrite_a=1)[0]
+    top = np.asfortranarray(R[E : E + D, E:])
+    top[:, :D] *= _upper(D)
+    root, info = dtrtri(R[:E, :E]) if E else (np.zeros((0, 0)), 0)
+    if info:
+        raise EstimationError(f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units")
+    root = root * _upper(E)
+    G, g = np.zeros((D0, D)), np.zeros(D0)
+    kept = np.arange(D0)
+    G[kept, kept] = 1.0
+    g[DIM:] = values[: D0 - DIM] - before.values
+    G[lost], g[lost] = -root @ R[:E, E : E + D], root @ R[:E, E + D]
+    if np.any(apart):
+        G[:DIM] = turned(G[:DIM], rotation.right_jacobian_inverse(apart[None, :3])[0])
+        g[:DIM] += apart
+    return Predicted(before, place, state, values, columns, link, top, G, g, lost, root @ root.T, tuple(rows))
+
+
+def update(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -> tuple[Stage, Array]:
+    """The stage with the rows that were waited for, and the error state (D,) that it makes most likely.
+
+    Robust rows get the weights they deserve at the point if that is an estimate of all data already (`weighted`);
+    else none at first, then those of what comes of it, a few times over.
+
+    Raises
+    ------
+    EstimationError
+        If the rows do not determine the state.
+    """
+    place, tests = ahead.place, ahead.before.tests
+    D = len(ahead.values) + DIM
+    robust = any(one.kernel != "none" for one in rows)
+    y, first = np.zeros(D), 1 if weighted else 0
+    for passes in range(first, first + 1 if weighted or not robust else PASSES):
+        top, beside, fault = ahead.top, None, None
+        plain = [one for one in rows if tests is None or one.name not in tests]
+        if plain:
+            tail = np.zeros((sum(one.b.size for one in plain), top.shape[1]))
+            row = 0
+            for one in plain:
+                H, b, _ = one.weighted(y, passes)
+                tail[row : row + b.size, :D], tail[row : row + b.size, D] = H.reshape(-1, D), b.ravel()
+                row += b.size
+            top, _ = _under(top, tail)
+        if tests is not None:
+            top, beside, fault = _tested(top, tests.copy(), rows, y, passes, place.t, ahead.state)
+        message = Message(ahead.state, ahead.values, ahead.columns, top[:, :D], top[:, D], beside)
+        y, info = dtrtrs(message.R, message.z)
+        if info:
+            raise EstimationError(f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units")
+    measured = (*ahead.measured, *rows)
+    return Stage(place, message, ahead.G, ahead.g, ahead.lost, ahead.C, measured, fault=fault), y
+
+
+def _tested(
+    top: Array, tests: Watch, rows: Sequence[Measured], y: Array, passes: int, t: float, state: States
+) -> tuple[Array, Watch, tuple[str, float] | None]:
+    """Add the measurements that have tests to the rows [R z Z] of a message, Z = R X (D, C)."""
+    fault, D, speed = None, len(top), float(np.linalg.norm(state.v))
+    for one in rows:
+        if one.name not in tests or not one.H.any():  # none of those that are left out
+            continue
+        H, b, sigma = one.weighted(y, passes)
+        own, columns, errors = tests.begin(one.name, t, sigma)
+        tail = np.zeros((len(errors), top.shape[1]))
+        tail[:, :D], tail[:, D] = H.reshape(-1, D), b.ravel()
+        tail[:, D + 1 :][:, columns] = errors
+        top = top.copy(order="F")
+        top[:, D + 1 :][:, own] = 0.0
+        top, left = _under(top, tail)
+        since = tests.found(one.name, t, left[:, 0], left[:, 1:][:, columns], speed)
+        if since is not None and fault is None:
+            fault = one.name, since
+    tests.stands(top[:, :D], top[:, D + 1 :])
+    return top, tests, fault
+
+
+def _under(top: Array, tail: Array) -> tuple[Array, Array]:
+    """Take rows (m, D + n) in under a triangle with columns beside it (D, D + n): the same again, and what is left.
+
+    Left are (m, n) that the states can do nothing about.
+    """
+    D = len(top)
+    out = np.empty(top.shape, order="F")
+    out[:, :D], reflectors, T, _ = dtpqrt(0, min(_BLOCK, D), top[:, :D], tail[:, :D])
+    out[:, D:], left, _ = dtpmqrt(0, reflectors, T, top[:, D:], tail[:, D:], trans="T")
+    return out, left
+
+
+@cache
+def _upper(n: int) -> Array:
+    """(n, n) 1 in the upper triangle."""
+    return np.asfortranarray(np.triu(np.ones((n, n))))

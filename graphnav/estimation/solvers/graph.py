@@ -1,0 +1,149 @@
+"""The adapter between NumPy rows and GTSAM: linear factor graphs built, eliminated with QR, read back.
+
+Variables are fifteen-dimensional error states, key k for keyframe k, and one key per parameter node.
+Elimination goes along time, which for a chain is the ordering without fill, and is sequential, so a
+long drive cannot exhaust the stack. QR, because GTSAM's Cholesky rejects the small pivots of tight bias
+walks beside loose priors.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import gtsam
+import numpy as np
+from scipy.linalg.lapack import dtrtri
+
+from graphnav.core.errors import EstimationError
+from graphnav.core.rotation import Array
+
+_SUMS = 1 << 60  # keys of variables that are eliminated before anybody sees them
+Blocks = Sequence[tuple[Array, Array]]  # (keys (N,), A (N, m, k)) per variable a factor touches
+
+
+def jacobian_factor(blocks: Sequence[tuple[int, Array]], b: Array) -> gtsam.JacobianFactor:
+    """Whitened rows: the sum of A d[key] over the blocks (key, A) is b.
+
+    GTSAM's constructors know up to three variables. More come in as sums of two: variables s with A d + B e = s
+    exactly, which are eliminated at once.
+    """
+    rest = [(key, np.asfortranarray(A)) for key, A in blocks]
+    sums: list[int] = []
+    make: Any = gtsam.JacobianFactor
+    graph, ordering, one = gtsam.GaussianFactorGraph(), gtsam.Ordering(), np.eye(len(b))
+    while len(rest) > 3:
+        (k0, A0), (k1, A1) = rest.pop(), rest.pop()
+        key = _SUMS + len(sums)
+        graph.push_back(make(k0, A0, k1, A1, key, -one, np.zeros(len(b)), gtsam.noiseModel.Constrained.All(len(b))))
+        rest.insert(0, (key, one))
+        sums.append(key)
+        ordering.push_back(key)
+    factor = make(*(part for block in rest for part in block), b, gtsam.noiseModel.Unit.Create(len(b)))
+    if not sums:
+        return factor
+    graph.push_back(factor)
+    _, left = graph.eliminatePartialSequential(ordering)
+    return gtsam.JacobianFactor(left.at(0)).whiten()
+
+
+class LinearGraph:
+    """A Gaussian factor graph over vector variables with whitened rows A d = b."""
+
+    def __init__(self) -> None:
+        self._graph = gtsam.GaussianFactorGraph()
+        self._unit: dict[int, gtsam.noiseModel.Unit] = {}
+
+    def add(self, blocks: Blocks, b: Array) -> None:
+        """N factors of m rows each: sum over blocks of A[n] d[key[n]] = b[n]."""
+        n, m = b.shape
+        unit = self._unit.setdefault(m, gtsam.noiseModel.Unit.Create(m))
+        # GTSAM keeps matrices by columns: handing them over that way saves it a strided copy
+        columns = [np.ascontiguousarray(np.swapaxes(A, 1, 2)).swapaxes(1, 2) for _, A in blocks]
+        keys = [k.tolist() for k, _ in blocks]
+        push, factor = self._graph.push_back, gtsam.JacobianFactor
+        if len(blocks) == 1:
+            (k0,), (A0,) = keys, columns
+            for i in range(n):
+                push(factor(k0[i], A0[i], b[i], unit))
+        elif len(blocks) == 2:
+            (k0, k1), (A0, A1) = keys, columns
+            for i in range(n):
+                push(factor(k0[i], A0[i], k1[i], A1[i], b[i], unit))
+        elif len(blocks) == 3:
+            (k0, k1, k2), (A0, A1, A2) = keys, columns
+            for i in range(n):
+                push(factor(k0[i], A0[i], k1[i], A1[i], k2[i], A2[i], b[i], unit))
+        else:
+            for i in range(n):
+                push(jacobian_factor([(k[i], A[i]) for k, A in zip(keys, columns, strict=True)], b[i]))
+
+    def eliminate(self, order: Sequence[int]) -> Eliminated:
+        """Eliminate the variables in this order."""
+        ordering = gtsam.Ordering()
+        for key in order:
+            ordering.push_back(int(key))
+        return Eliminated(self._graph.eliminateSequential(ordering, gtsam.EliminateQR))
+
+
+class Eliminated:
+    """The graph as a Bayes net: solution and covariances by substitution."""
+
+    def __init__(self, net: gtsam.GaussianBayesNet) -> None:
+        self._net = net
+
+    def solve(self, keys: Sequence[int]) -> list[Array]:
+        """The optimum, one vector per key."""
+        values = self._net.optimize()
+        return [values.at(int(k)) for k in keys]
+
+    def covariances(self, keys: set[int] | None = None) -> dict[int, Array]:
+        """Marginal covariance of every variable (or of `keys`).
+
+        Backwards through the net: a conditional |R x + S s - d|^2 gives, with U = -R^-1 S and the joint
+        covariance P_s of its parents s,
+
+            P_x = R^-1 R^-T + U P_s U^T        P_xs = U P_s
+
+        Of the joint covariance of what is done only the block is kept that variables still to come have among their
+        parents (Kaess and Dellaert 2009, eq. 20-21): the order runs along a chain, so that is one keyframe and the
+        parameters in force. It is kept as a root M, P = M^T M: a vehicle that stands, known to a millimetre against
+        the place of its stop and to a hundred metres on the Earth, would leave P itself without a digit.
+
+        Raises
+        ------
+        EstimationError
+            If a variable is not determined.
+        """
+        out: dict[int, Array] = {}
+        where: dict[int, range] = {}  # columns of the joint block, per variable in it
+        root = np.zeros((0, 0))
+        conditionals = [self._net.at(i) for i in range(self._net.size())]
+        first: dict[int, int] = {}  # the first to be eliminated that has a variable as parent: the last to ask for it
+        for i, conditional in enumerate(conditionals):
+            for parent in conditional.keys()[1:]:
+                first.setdefault(parent, i)
+        for i in range(len(conditionals) - 1, -1, -1):
+            conditional = conditionals[i]
+            key, *parents = conditional.keys()
+            R_inverse, singular = dtrtri(conditional.R())
+            if singular:
+                raise EstimationError("the data leave something undetermined: there is no covariance")
+            n = len(R_inverse)
+            kept = [*parents, *(k for k in where if first.get(k, i) < i and k not in parents)]
+            index = [column for p in kept for column in where[p]]
+            below = root[:, index]
+            root = np.zeros((n + len(below), n + len(index)))
+            root[:n, :n] = R_inverse.T
+            root[n:, n:] = below
+            if parents:
+                U = -R_inverse @ conditional.S()
+                root[n:, :n] = below[:, : U.shape[1]] @ U.T
+            if len(root) > 2 * root.shape[1]:
+                root = np.asarray(np.linalg.qr(root, mode="r"))
+            edges = list(itertools.accumulate([n, *(len(where[p]) for p in kept)], initial=0))
+            where = {k: range(lo, hi) for k, lo, hi in zip([key, *kept], edges, edges[1:], strict=False)}
+            if keys is None or key in keys:
+                out[key] = root[:, :n].T @ root[:, :n]
+        return out

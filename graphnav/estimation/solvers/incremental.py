@@ -1,0 +1,217 @@
+"""Incremental smoother: the graph of the batch solver, solved while the drive happens.
+
+`Incremental` takes the keyframes of a problem one by one. After each it has a live estimate, which knows only what
+came before, and keyframes older than the lag settle, each with at least the lag's future in it. See
+`graphnav.estimation.solvers.window` for how; `graphnav.online` feeds it from sensors instead of a recording.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.estimation.dense import dense
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solution import ParameterEstimate, Solution
+from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.passes import Progress, residual_record
+from graphnav.estimation.solvers.rows import cost_at
+from graphnav.estimation.solvers.stages import Place, Step
+from graphnav.estimation.solvers.window import Smoothed, Window, first_message, turn_limit
+from graphnav.imu.dynamics import SCALE
+
+_PORTIONS = 8  # of the lag: keyframes settle in groups this long
+_FINE = 0.02  # of the usual limits, within which the last window is converged
+
+
+@dataclass
+class Incremental:
+    """Fixed-lag smoothing of keyframes as they come.
+
+    Parameters
+    ----------
+    window : with its prior.
+    lag : s of future that every settled state has seen; infinite smooths everything, and settles at the end.
+    """
+
+    window: Window
+    lag: float = 120.0
+    settled: list[Smoothed] = field(default_factory=list)  # whoever reads them may clear them
+
+    def add(self, place: Place) -> None:
+        """Take in one more keyframe."""
+        turn = self.window.push(place)
+        if turn > self.window.turn:
+            self.window.converge()
+        t = self.window.stages[-1].place.t
+        if t - self.window.stages[0].place.t > self.lag * (1.0 + 1.0 / _PORTIONS):
+            self.settle_until(t - self.lag)
+
+    def settle_until(self, t: float) -> None:
+        """Let go of the keyframes before a time."""
+        count = int(np.searchsorted(self.window.t, t))
+        if count:
+            self.window.converge(always=_robust(self.window))
+            self.settled.append(self.window.settle(count))
+
+    def finish(self) -> None:
+        """Nothing more will come: settle all."""
+        if len(self.window):
+            self.window.converge(_FINE, always=True)
+            self.settled.append(self.window.settle(len(self.window)))
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """A whole problem solved incrementally: what settled, what was known live, and what each keyframe took."""
+
+    settled: Solution
+    live: Solution
+    seconds: Array  # (K,) of process time per keyframe
+
+
+def incremental(
+    problem: Problem,
+    lag: float = 120.0,
+    progress: Progress | None = None,
+    start: States | None = None,
+) -> Replayed:
+    """Solve a problem keyframe by keyframe.
+
+    Parameters
+    ----------
+    lag : s, see `Incremental`.
+    start : one state to begin at, where that is not the prior's mean.
+    """
+    began = time.perf_counter()
+    K, mean = len(problem.t), problem.prior.mean
+    assert mean is not None
+    message = first_message(mean, problem.prior.sigma[0])
+    if start is not None:
+        message = message.moved(start.minus(mean)[0])
+    solver = Incremental(Window(message, turn_limit(problem.imu_noise)), lag)
+    steps = node_steps(problem)
+    live, live_P, live_values = [], np.empty((K, DIM, DIM)), []
+    seconds = np.empty(K)
+    for k in range(K):
+        before = time.process_time()
+        solver.add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
+        newest = solver.window.newest
+        live.append(newest.state)
+        live_P[k] = newest.covariance[:DIM, :DIM]
+        live_values.append(newest.values)
+        seconds[k] = time.process_time() - before
+        if progress is not None and k % 64 == 0:
+            progress("incremental", k / K)
+    solver.finish()
+    spent = time.perf_counter() - began
+    live_states, values = States.stack(live), np.array(live_values)
+    found = replayed(problem, "incremental", solver.settled, live_states, live_P, values, seconds, spent, lag)
+    notes = (*found.settled.notes, f"{solver.window.relinearized} were linearised again")
+    return replace(found, settled=replace(found.settled, notes=notes))
+
+
+def replayed(
+    problem: Problem,
+    solver: str,
+    parts: list[Smoothed],
+    live: States,
+    live_P: Array,
+    live_values: Array,
+    seconds: Array,
+    spent: float,
+    lag: float,
+) -> Replayed:
+    """What an incremental solver has found, as solutions.
+
+    Parameters
+    ----------
+    parts : what settled, in turn.
+    live, live_P, live_values : (K,), (K, 15, 15) and (K, D-15) as known when each keyframe had come.
+    seconds, spent : (K,) s of process time, and s in all.
+    lag : s
+    """
+    columns, K = parts[-1].columns[-1], len(problem.t)
+    states = States.stack([part.states for part in parts])
+    values = np.array([row for part in parts for row in part.values])
+    sigma = np.array([row for part in parts for row in part.sigma])
+    covariance = np.concatenate([part.covariance for part in parts])
+    at = {name: slice(s.start - DIM, s.stop - DIM) for name, s in columns.items()}
+    order = [values[:, at[c.parameter.name]] for c in problem.chains]
+    points = Points(states, np.concatenate([np.empty((K, 0)), *order], axis=1))
+    records = {rows.name: residual_record(problem, rows, points, robust=True) for rows in problem.constraints}
+    whole = "all there was" if np.isinf(lag) else f"{lag:g} s of the future, or all there was"
+    settled = Solution(
+        solver=solver,
+        frame=problem.frame,
+        t=problem.t,
+        states=states,
+        covariance=covariance,
+        parameters=_parameters(problem, at, values, sigma),
+        records=records,
+        counts={"initial_prior": 1, "imu": K - 1, **{c.name: len(c) for c in problem.constraints}},
+        iterations=1,
+        cost=cost_at(problem, points),
+        stopped=f"every keyframe settled with {whole}",
+        timings={solver: spent},
+        notes=(*problem.notes, said(seconds) if np.isinf(lag) else f"lag {lag:g} s: {said(seconds)}"),
+        between=(dense(problem, states, covariance, _scale(at, values), smooth=True),),
+    )
+    now = replace(
+        settled,
+        solver="live",
+        states=live,
+        covariance=live_P,
+        parameters={},
+        records={},
+        stopped="each keyframe as it was known when it came",
+        between=(dense(problem, live, live_P, _scale(at, live_values), smooth=False),),
+    )
+    return Replayed(settled, now, seconds)
+
+
+def node_steps(problem: Problem) -> dict[int, tuple[Step, ...]]:
+    """The parameters that begin or move on to their next node, by keyframe."""
+    out: dict[int, list[Step]] = {}
+    for chain in problem.chains:
+        name = chain.parameter.name
+        out.setdefault(0, []).append(Step(name, chain.mean[0], chain.sigma[0]))
+        for k in np.flatnonzero(np.diff(chain.node)) + 1:
+            j = int(chain.node[k])
+            out.setdefault(int(k), []).append(
+                Step(name, chain.mean[j], chain.sigma[j], float(chain.decay[j]), chain.mean[j - 1])
+            )
+    return {k: tuple(steps) for k, steps in out.items()}
+
+
+def _robust(window: Window) -> bool:
+    problem = window.stages[-1].place.problem
+    return problem is not None and any(c.robust != "none" for c in problem.constraints)
+
+
+def _scale(at: dict[str, slice], values: Array) -> Array | None:
+    return values[:, at[SCALE]] if SCALE in at else None
+
+
+def _parameters(problem: Problem, at: dict[str, slice], values: Array, sigma: Array) -> dict[str, ParameterEstimate]:
+    """At each node: the value at the last keyframe that it governs; of a constant the last one settled."""
+    out = {}
+    for chain in problem.chains:
+        p = chain.parameter
+        if p.begins is not None:
+            continue
+        last = np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
+        out[p.name] = ParameterEstimate(
+            chain.t, values[last][:, at[p.name]], sigma[last][:, at[p.name]], p.sigma, p.unit
+        )
+    return out
+
+
+def said(seconds: Array) -> str:
+    """What a keyframe took, in words."""
+    middle, high, most = 1e3 * np.quantile(seconds, [0.5, 0.99, 1.0])
+    return f"a keyframe took {middle:.1f} ms (median), {high:.1f} ms (99 %), {most:.0f} ms (most)"

@@ -1,0 +1,126 @@
+"""Everything linearised at given points: the rows of constraints, the intervals of the IMU, the steps of parameters.
+
+The one place where solvers ask constraints for residuals and Jacobians. Filter, RTS smoother, the graph for GTSAM's QR,
+iSAM2 and the window take from here what they stack, eliminate or update with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from graphnav.constraints.base import Constraint, Linearized, assemble, weighted_sigma
+from graphnav.core.rotation import Array, mv
+from graphnav.core.state import DIM, States
+from graphnav.estimation.problem import ParameterChain, Problem
+from graphnav.estimation.solvers.robust import weight_and_cost
+from graphnav.imu.dynamics import SCALE, Motion
+
+Columns = dict[str, slice]
+
+
+@dataclass(frozen=True)
+class Points:
+    """Where rows are linearised: K states and the parameters' values there."""
+
+    states: States
+    values: Array  # (K, D-15)
+
+    def first(self, n: int) -> Points:
+        return Points(self.states[:n], self.values[:n])
+
+    def nodes(self, problem: Problem) -> dict[str, Array]:
+        """(n, k) per parameter: the value of each node after the last keyframe that it governs."""
+        return {
+            c.parameter.name: self.values[last_of(c), shift(problem.columns[c.parameter.name])] for c in problem.chains
+        }
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Some rows of a constraint at points: residual (n, m), its Jacobian over D error states, sigma."""
+
+    constraint: Constraint
+    which: slice | Array
+    linear: Linearized
+    columns: Columns
+    width: int
+
+    @property
+    def residual(self) -> Array:
+        """(n, m)"""
+        return self.linear.residual
+
+    @property
+    def stated(self) -> Array:
+        """(n, m) sigmas without the rows' weights."""
+        return self.linear.sigma
+
+    @cached_property
+    def sigma(self) -> Array:
+        """(n, m) sigmas with the rows' weights in them: infinite where a row is not used."""
+        return weighted_sigma(self.constraint, self.linear.sigma, self.which)
+
+    @cached_property
+    def H(self) -> Array:
+        """(n, m, D) derivative of the residual."""
+        return assemble(self.linear, self.columns, self.width)
+
+    def kernel(self) -> tuple[Array, Array]:
+        """Weight and cost (n,) of each row by its robust kernel."""
+        c = self.constraint
+        s = np.linalg.norm(self.residual / self.sigma, axis=-1)
+        return weight_and_cost(c.robust, s, c.scale_of(self.which), c.graduation)
+
+
+def linearise(
+    constraint: Constraint,
+    points: Points,
+    columns: Columns,
+    which: slice | Array = slice(None),
+    at: Array | None = None,
+) -> Rows:
+    """Rows `which` of a constraint at points.
+
+    Parameters
+    ----------
+    columns : where each parameter stands in the error state.
+    at : (n,) which point each row is at; its keyframe when None.
+    """
+    at = constraint.keyframe[which] if at is None else at
+    values = points.values
+    given = {p.name: values[at, shift(columns[p.name])] for p in constraint.parameters}
+    states = points.states if len(at) == len(values) == 1 else points.states[at]
+    return Rows(constraint, which, constraint.linearize(states, given, which), columns, DIM + values.shape[1])
+
+
+def linearise_links(motion: Motion, states: States, scale: Array | None) -> tuple[Array, Array, Array, Array]:
+    """Whitened rows of intervals between K states: A (K-1, 15, 15) of both ends, S (K-1, 15, k) of the scale, and b.
+
+    A_start d_start + A_end d_end + S d_scale = b
+    """
+    r, A_start, A_end, S = motion.linearize(states, scale)
+    W = motion.whitener
+    return W @ A_start, W @ A_end, W @ S, -mv(W, r)
+
+
+def scale_at(columns: Columns, values: Array) -> Array | None:
+    """Scale errors of the IMU among parameters (..., D-15), where they are estimated."""
+    return values[..., shift(columns[SCALE])] if SCALE in columns else None
+
+
+def shift(columns: slice) -> slice:
+    """Where columns of an error state stand among the parameters' values."""
+    return slice(columns.start - DIM, columns.stop - DIM)
+
+
+def last_of(chain: ParameterChain) -> Array:
+    """(n,) the last keyframe that each node governs."""
+    return np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
+
+
+def stepping(chain: ParameterChain, n: int | None = None) -> Array:
+    """Which of the first n keyframes a parameter moves on to its next node at."""
+    return np.flatnonzero(np.diff(chain.node[:n])) + 1

@@ -1,0 +1,154 @@
+"""What a pass over all keyframes leaves behind, forward or back, and what is said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.constraints.base import Constraint
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.estimation.solvers.linearise import Points, last_of, linearise, shift
+from graphnav.estimation.solvers.robust import weight_and_cost
+from graphnav.estimation.solvers.stack import Innovations
+from graphnav.imu.dynamics import as_biases
+
+_TURN = 0.02  # rad; what is linear in an error of attitude is wrong by half its square
+Progress = Callable[[str, float], None]
+Gain = tuple[Array, Array, Array, Array]  # of an update: K (D, m), H (m, D), S^-1 nu (m,) and S^-1 H (m, D)
+
+
+@dataclass(frozen=True)
+class Smoothed(Points):
+    """A backward pass: states, parameter values and their joint covariance at every keyframe."""
+
+    P: Array  # (K, D, D)
+    # of the disturbances before each keyframe that was linearised at given points: P^s = P- - P- N P-
+    r: Array  # (n, D)
+    N: Array  # (n, D, D)
+
+
+@dataclass(frozen=True)
+class Forward(Points):
+    """A forward pass over the first K keyframes, with what the backward pass needs."""
+
+    P: Array  # (K, D, D) filtered
+    predicted: Points
+    P_predicted: Array  # (K, D, D)
+    F: Array  # (K-1, D, D)
+    records: dict[str, Innovations]
+    weights: dict[str, Array]  # (N,) of fixes: 0 where a fault was found, less than 1 where noisy
+    anew: bool  # it began anew somewhere, which no other solver can: its estimates are not to be used
+    about: Points | None  # where the first n keyframes were linearised; up to the last of them P is of errors about
+    errors: Array  # (n, D) these points, and the filtered
+    errors_predicted: Array  # (n, D) and the predicted state is these errors away from them
+    gains: list[list[Gain]]  # (n,) of the updates there, in their order
+    log_likelihood: Array  # (K,) of the innovations at each keyframe, but for a constant
+
+    @property
+    def predicted_from(self) -> States:
+        """(K-1) the states that the steps to the next keyframes were linearised at."""
+        n = 0 if self.about is None else len(self.about.values)
+        given = [] if self.about is None else [self.about.states[: min(n, len(self.values) - 1)]]
+        return States.stack([*given, self.states[n:-1]]) if n < len(self.values) else given[0]
+
+    @property
+    def linearised(self) -> Points:
+        """Where its rows were linearised: at points given, then where it was."""
+        if self.about is None:
+            return self.predicted
+        n = len(self.about.values)
+        return joined([self.about, Points(self.predicted.states[n:], self.predicted.values[n:])])
+
+
+@dataclass(frozen=True)
+class Filtered(Forward):
+    """A forward pass over the whole problem."""
+
+    solution: Solution
+
+
+def moved(points: Points, errors: Array) -> Points:
+    """Points moved by error states (K, D)."""
+    return Points(points.states.plus(errors[:, :DIM]), points.values + errors[:, DIM:])
+
+
+def joined(parts: list[Points]) -> Points:
+    """One after the other."""
+    return Points(States.stack([part.states for part in parts]), np.concatenate([part.values for part in parts]))
+
+
+def near_to(points: Points, about: Points, turn: float = _TURN) -> bool:
+    """Whether attitudes are near enough (rad) for what lies between to be linear."""
+    turned = points.states.minus(about.states)[:, :3]
+    return float(np.max(np.sum(turned * turned, axis=1))) < turn**2
+
+
+def about_solved(problem: Problem, solved: Solution, before: Points) -> Points:
+    """Points of a solution of a problem; what it does not tell, places of stops, as before: rows are linear in them."""
+    told = {
+        c.parameter.name: solved.parameters[c.parameter.name].value[c.node]
+        for c in problem.chains
+        if c.parameter.name in solved.parameters
+    }
+    return points_of(problem, solved.states, values_of(problem, before) | told)
+
+
+def points_of(problem: Problem, states: States, known: dict[str, Array]) -> Points:
+    """Points of all keyframes: states, and values (K, k) of parameters, expected ones where they are not known."""
+    values = [known.get(c.parameter.name, c.mean[c.node]) for c in problem.chains]
+    return Points(states, np.concatenate([np.empty((len(states), 0)), *values], axis=1))
+
+
+def residual_record(problem: Problem, rows: Constraint, points: Points, robust: bool = False) -> ConstraintRecord:
+    """What is left of a constraint at the solution; `robust` has the kernel's weights in the rows'."""
+    linear = linearise(rows, points, problem.columns)
+    nis = np.sum((linear.residual / linear.stated) ** 2, axis=-1)
+    weight = np.ones(len(rows)) if rows.weight is None else rows.weight
+    if robust:
+        weight = weight * weight_and_cost(rows.robust, np.sqrt(nis), rows.robust_scale)[0]
+    t = problem.t[rows.keyframe]
+    return ConstraintRecord("residual", t, linear.residual, linear.stated, nis, weight, rows.axes, rows.unit)
+
+
+def integrated_again(problem: Problem, states: States, scale: Array | None, first: int = 0) -> tuple[Problem, int]:
+    """The problem integrated about the present biases where the first-order correction no longer holds, and how often.
+
+    Parameters
+    ----------
+    states : of keyframes from `first` on; intervals before stay as they are, of those behind the last is the guess.
+    scale : (k,) scale errors of the IMU, where they are parameters.
+    """
+    rows = slice(first, None)
+    ba, bg = problem.intervals.ba.copy(), problem.intervals.bg.copy()
+    at = np.minimum(np.arange(len(ba) - first), max(len(states) - 2, 0))
+    ba[rows], bg[rows] = states.ba[at], states.bg[at]
+    if scale is not None:
+        of_accel, of_gyro = as_biases(scale, problem.intervals.force[rows], problem.intervals.rate[rows])
+        ba[rows], bg[rows] = ba[rows] + of_accel, bg[rows] + of_gyro
+    far = problem.intervals.out_of_range(bg)
+    return (problem.reintegrated(ba, bg), int(far.sum())) if far.any() else (problem, 0)
+
+
+def values_of(problem: Problem, points: Points) -> dict[str, Array]:
+    """(K, k) per parameter."""
+    return {name: points.values[:, shift(at)] for name, at in problem.columns.items()}
+
+
+def parameters_of(problem: Problem, values: Array, P: Array) -> dict[str, ParameterEstimate]:
+    """At each node: the value after the last keyframe that it governs."""
+    out = {}
+    for chain in problem.chains:
+        if chain.parameter.begins is not None:
+            continue  # a place of a stop is no calibration
+        at = problem.columns[chain.parameter.name]
+        last = last_of(chain)
+        sigma = np.sqrt(np.maximum(np.diagonal(P[last][:, at, at], axis1=-2, axis2=-1), 0.0))
+        out[chain.parameter.name] = ParameterEstimate(
+            chain.t, values[last][:, shift(at)], sigma, chain.parameter.sigma, chain.parameter.unit
+        )
+    return out

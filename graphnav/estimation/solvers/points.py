@@ -1,0 +1,193 @@
+"""Where a filter takes its Jacobians: at its own estimate, or at points that are given.
+
+A filter goes from keyframe to keyframe with an estimate x and the covariance of its error, and asks one of these for
+the step to a keyframe and for the rows there. `AtEstimate` linearises where the filter is: x is a state and parameter
+values. `AtPoints` has linearised everything at once, at the points X of an earlier pass: x is the error state e with
+X_k [+] e_k the estimate, and (Bell 1994: one step of the iterated smoother)
+
+    e_{k+1} <- f(X_k) [-] X_{k+1} + F e_k     nu = -(r(X) + H e)
+
+A pass at given points takes a ninth of the time, and is the better one wherever the filter has gone astray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.estimation.problem import ParameterChain, Problem
+from graphnav.estimation.solvers.linearise import Points, linearise, shift, stepping
+from graphnav.estimation.solvers.stack import Stack, Together
+from graphnav.imu.dynamics import SCALE
+
+Rows = tuple[Array, Array, Array]  # residuals (m,), Jacobian (m, D) and sigmas (m,)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A state of one row and parameter values (D-15,)."""
+
+    state: States
+    values: Array
+
+
+class AtEstimate:
+    """Steps and rows linearised where the filter is."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem, self._columns, self._scale = problem, problem.columns, problem.columns.get(SCALE)
+        self._width = DIM + sum(s.stop - s.start for s in self._columns.values())
+        self._I = np.eye(self._width)
+
+    @cached_property
+    def _steps(self) -> dict[int, list[tuple[slice, ParameterChain, int]]]:
+        """At keyframes where a parameter moves on to its next node: its columns, its chain and that node."""
+        out: dict[int, list[tuple[slice, ParameterChain, int]]] = {}
+        for chain in self._problem.chains:
+            at = self._columns[chain.parameter.name]
+            for k in stepping(chain).tolist():
+                out.setdefault(k, []).append((at, chain, int(chain.node[k])))
+        return out
+
+    def step(self, k: int, x: Estimate) -> tuple[Estimate, Array, Array, Array | None]:
+        """The estimate at keyframe k from that at the one before, F (D, D), Q (15, 15), and more variance (D,)."""
+        motion, at, scale = self._problem.motion, slice(k - 1, k), self._scale
+        ahead, F15 = motion.propagate(at, x.state, None if scale is None else x.values[None, shift(scale)])
+        F = self._I.copy()
+        F[:DIM, :DIM] = F15[0]
+        if scale is not None:
+            F[:DIM, scale] = motion.scale_columns(at, F15, scale.stop - scale.start)[0]
+        values, added = x.values, None
+        if k in self._steps:
+            values, added = values.copy(), np.zeros(self._width)
+            for column, chain, j in self._steps[k]:
+                F[column, column] *= chain.decay[j]
+                own = shift(column)
+                values[own] = chain.mean[j] + chain.decay[j] * (values[own] - chain.mean[j - 1])
+                added[column] = chain.sigma[j] ** 2
+        return Estimate(ahead, values), F, motion.noise(at, x.state.R_nb)[0], added
+
+    def rows(self, some: Together, at: Estimate) -> Rows:
+        """Rows of one constraint linearised at an estimate."""
+        ((rows, lo, hi),) = some.parts
+        here = Points(at.state, at.values[None])
+        linear = linearise(rows, here, self._columns, slice(lo, hi), np.zeros(hi - lo, dtype=int))
+        return linear.residual.ravel(), linear.H.reshape(-1, self._width), linear.stated.ravel()
+
+    @staticmethod
+    def about(x: Estimate) -> tuple[Estimate, None]:
+        """What the rows of an update are linearised about, and the error state (D,) from there to x if there is one."""
+        return x, None
+
+    @staticmethod
+    def passes(some: Together) -> int:
+        """How often the rows of an update are linearised."""
+        return some.parts[0][0].passes
+
+    @staticmethod
+    def plus(at: Estimate, d: Array) -> Estimate:
+        """`at` moved by an error state."""
+        return Estimate(at.state.plus(d[None, :DIM]), at.values + d[DIM:])
+
+    @staticmethod
+    def minus(x: Estimate, at: Estimate) -> Array:
+        """The error state (D,) that leads from `at` to x."""
+        return np.concatenate([x.state.minus(at.state)[0], x.values - at.values])
+
+    @staticmethod
+    def speed(k: int, x: Estimate) -> float:
+        """m/s."""
+        return float(np.linalg.norm(x.state.v))
+
+
+class AtPoints:
+    """Steps and rows of the first n keyframes, all linearised at n points.
+
+    Parameters
+    ----------
+    F : (n-1, D, D) or more, for the transition matrices.
+    """
+
+    def __init__(self, problem: Problem, points: Points, stack: Stack, F: Array) -> None:
+        n, columns, motion = len(points.values), problem.columns, problem.motion
+        D = DIM + points.values.shape[1]
+        begin, end, at = points.states[: n - 1], points.states[1:n], slice(0, n - 1)
+        scale = columns.get(SCALE)
+        ahead, F15 = motion.propagate(at, begin, None if scale is None else points.values[: n - 1, shift(scale)])
+        self.F = F[: n - 1]
+        self.F[:] = np.eye(D)
+        self.F[:, :DIM, :DIM] = F15
+        if scale is not None:
+            self.F[:, :DIM, scale] = motion.scale_columns(at, F15, scale.stop - scale.start)
+        self._Q = motion.noise(at, begin.R_nb)
+        values = points.values[: n - 1].copy()
+        self._added = np.zeros((n, D))
+        for chain in problem.chains:
+            column, k = columns[chain.parameter.name], stepping(chain, n)
+            j, own, each = chain.node[k], shift(column), np.arange(column.start, column.stop)
+            self.F[k[:, None] - 1, each, each] *= chain.decay[j, None]
+            values[k - 1, own] = chain.mean[j] + chain.decay[j, None] * (values[k - 1, own] - chain.mean[j - 1])
+            self._added[k, column] = chain.sigma[j] ** 2
+        self._steps: list[bool] = np.any(self._added, axis=1).tolist()
+        self._gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
+        # Exp(gap) Exp(F e) = Exp(gap + J_r^-1(gap) F e)
+        turned = rotation.right_jacobian_inverse(self._gap[:, :3])
+        self.F[:, :3] = turned @ self.F[:, :3]
+        self._Q[:, :3] = turned @ self._Q[:, :3]
+        self._Q[:, :, :3] = self._Q[:, :, :3] @ np.swapaxes(turned, -1, -2)
+        self._speed = np.linalg.norm(points.states.v, axis=1)
+        self._r, self._sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
+        self._H = np.zeros((n, stack.M, D))
+        for rows in problem.constraints:
+            at_k = rows.keyframe[: int(np.searchsorted(rows.keyframe, n))]
+            if len(at_k):
+                linear = linearise(rows, points, columns, slice(0, len(at_k)))
+                place = at_k[:, None], stack.places[rows.name][1][: len(at_k)]
+                self._r[place], self._sigma[place] = linear.residual, linear.stated
+                self._H[place] = linear.H
+
+    def step(self, k: int, x: Array) -> tuple[Array, Array, Array, Array | None]:
+        """As `AtEstimate.step`, of error states (D,)."""
+        F = self.F[k - 1]
+        return self._gap[k - 1] + F @ x, F, self._Q[k - 1], self._added[k] if self._steps[k] else None
+
+    def rows(self, some: Together, at: None) -> Rows:
+        """As `AtEstimate.rows`, linearised at the points."""
+        at_k = some.at
+        return self._r[at_k], self._H[at_k], self._sigma[at_k]
+
+    @staticmethod
+    def about(x: Array) -> tuple[None, Array]:
+        """The points, which all error states are from."""
+        return None, x
+
+    @staticmethod
+    def passes(some: Together) -> int:
+        """The points stay."""
+        return 1
+
+    @staticmethod
+    def plus(at: None, d: Array) -> Array:
+        """The points moved by an error state."""
+        return d
+
+    def speed(self, k: int, x: Array) -> float:
+        """m/s."""
+        return float(self._speed[k])
+
+
+def about_own(P: Array, e: Array) -> Array:
+    """Covariances (..., D, D) of errors about points turned into those about states e away from them.
+
+    Exp(e + x) = Exp(e) Exp(J_r(e) x) to first order in x.
+    """
+    J = rotation.right_jacobian(e[..., :3])
+    P = P.copy()
+    P[..., :3, :] = J @ P[..., :3, :]
+    P[..., :3] = P[..., :3] @ np.swapaxes(J, -1, -2)
+    return P

@@ -1,0 +1,140 @@
+"""Rauch-Tung-Striebel smoother: what a filter's pass forward is worth with all that came later.
+
+Backwards, with C = P_k F^T P^-_{k+1}^-1 (Rauch, Tung, Striebel 1965),
+
+    x^s_k = x_k [+] C (x^s_{k+1} [-] x^-_{k+1})     P^s_k = P_k + C (P^s_{k+1} - P^-_{k+1}) C^T
+
+Where all is linearised at given points the errors are from those, and the same comes without an inverse of P^- from
+the disturbance smoother (Bryson and Frazier 1963; Koopman 1993), through every update and step
+
+    r <- (I - K H)^T r + H^T S^-1 nu     N <- (I - K H)^T N (I - K H) + H^T S^-1 H     r <- F^T r     N <- F^T N F
+    x^s_k = x^-_k + P^-_k r_k            P^s_k = P^-_k - P^-_k N_k P^-_k
+
+r and N are what the noise model is estimated by (`graphnav.estimation.noise.moments`).
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from scipy.linalg.lapack import dposv
+
+from graphnav.core.errors import EstimationError
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.estimation.dense import dense
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.linearise import scale_at
+from graphnav.estimation.solvers.passes import (
+    Filtered,
+    Forward,
+    Progress,
+    Smoothed,
+    moved,
+    parameters_of,
+    residual_record,
+)
+
+
+def backward(problem: Problem, forward: Forward, progress: Progress | None = None) -> Smoothed:
+    """Smooth a forward pass: keyframes linearised where the filter was, and before them those at given points."""
+    K, D = forward.P.shape[:2]
+    n = 0 if forward.about is None else len(forward.about.values)
+    end = max(n - 1, 0) if n < K else K  # of the keyframes whose errors are from points, and lead to such
+    P, values = np.empty((K, D, D)), np.empty((K, D - DIM))
+    r, N = np.empty((n, D)), np.empty((n, D, D))
+    states = []
+    if end < K:
+        states = [_smooth_filtered(problem, forward, end, values, P, progress)]
+    if forward.about is not None:
+        if n == end + 1:  # what comes after, as a disturbance of the prediction
+            away = states[0][:1].minus(forward.about.states[end:n])[0]
+            away = np.concatenate([away, values[end] - forward.about.values[end]]) - forward.errors_predicted[end]
+            ahead = forward.P_predicted[end]
+            _, inverse, info = dposv(ahead, np.eye(D))
+            if info:
+                raise _breakdown(problem, end)
+            r[end], N[end] = inverse @ away, inverse @ (ahead - P[end]) @ inverse
+        _find_disturbances(forward, end, r, N, progress)
+        ahead = forward.P_predicted[:end]
+        smoothed = ahead - ahead @ N[:end] @ ahead
+        P[:end] = 0.5 * (smoothed + np.swapaxes(smoothed, -1, -2))
+        errors = forward.errors_predicted[:end] + (ahead @ r[:end, :, None])[..., 0]
+        first = moved(forward.about.first(end), errors)
+        values[:end] = first.values
+        states = [first.states, *states]
+    return Smoothed(States.stack(states), values, P, r, N)
+
+
+def _smooth_filtered(
+    problem: Problem, forward: Forward, end: int, all_values: Array, all_P: Array, progress: Progress | None
+) -> States:
+    """States from keyframe `end` on, with values and covariances in their places."""
+    K, before = len(forward.P), forward.predicted
+    state, values, P = forward.states[K - 1 : K], forward.values[-1], forward.P[-1]
+    states: list[States] = []
+    for k in range(K - 1, end - 1, -1):
+        if k < K - 1:
+            Pp, at, ahead = forward.P_predicted[k + 1], slice(k, k + 1), slice(k + 1, k + 2)
+            _, gain, info = dposv(Pp, forward.F[k] @ forward.P[k])
+            if info:
+                raise _breakdown(problem, k)
+            C = gain.T
+            d = C @ np.concatenate([state.minus(before.states[ahead])[0], values - before.values[k + 1]])
+            state, values = forward.states[at].plus(d[None, :DIM]), forward.values[k] + d[DIM:]
+            P = forward.P[k] + C @ (P - Pp) @ C.T
+            P = 0.5 * (P + P.T)
+        states.append(state)
+        all_values[k], all_P[k] = values, P
+        if progress is not None and k % 256 == 0:
+            progress("smoother", 1.0 - k / K)
+    return States.stack(states[::-1])
+
+
+def _find_disturbances(forward: Forward, end: int, r: Array, N: Array, progress: Progress | None) -> None:
+    """r and N before keyframes 0 to `end`, that of `end` known if there is one."""
+    K, D = forward.P.shape[:2]
+    r_k, N_k = (r[end], N[end]) if end < len(r) else (np.zeros(D), np.zeros((D, D)))
+    I = np.eye(D)
+    for k in range(end - 1, -1, -1):
+        if k < K - 1:
+            F = forward.F[k]
+            r_k, N_k = r_k @ F, F.T @ N_k @ F
+        for gain, H, w, W in reversed(forward.gains[k]):
+            # I - K H as a whole: after a first fix it is what is left of a wide prior, of ten orders
+            M = I - gain @ H
+            r_k = r_k @ M + w @ H
+            N_k = M.T @ N_k @ M + H.T @ W
+        r[k], N[k] = r_k, 0.5 * (N_k + N_k.T)
+        if progress is not None and k % 256 == 0:
+            progress("smoother", 1.0 - k / K)
+
+
+def _breakdown(problem: Problem, k: int) -> EstimationError:
+    return EstimationError(f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas")
+
+
+def rts(problem: Problem, forward: Filtered, found: Smoothed | None = None) -> Solution:
+    """The smoothed solution; residuals are its own. `found` is the backward pass where it was done before."""
+    began = time.perf_counter()
+    found = found or backward(problem, forward)
+    smoothed, all_values, all_P = found.states, found.values, found.P
+    records = {rows.name: residual_record(problem, rows, found) for rows in problem.constraints}
+    seconds = time.perf_counter() - began
+    return Solution(
+        solver="rts",
+        frame=problem.frame,
+        t=problem.t,
+        states=smoothed,
+        covariance=all_P[:, :DIM, :DIM],
+        parameters=parameters_of(problem, all_values, all_P),
+        records=records,
+        counts=forward.solution.counts,
+        iterations=1,
+        stopped="one pass forward and one back",
+        timings={**forward.solution.timings, "smoother": seconds},
+        notes=problem.notes,
+        between=(dense(problem, smoothed, all_P[:, :DIM, :DIM], scale_at(problem.columns, all_values), smooth=True),),
+    )

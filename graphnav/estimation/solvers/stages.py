@@ -1,0 +1,273 @@
+"""One stage of a time-ordered elimination: what a new keyframe adds, and what of the one before it can go.
+
+With y = [x, theta] the error states of a keyframe and of the parameters in force there, all that earlier keyframes
+have to say of y_{k-1} is a square-root message R y_{k-1} = z. A stage puts under it the rows of the interval from
+k-1 to k, those of parameters that move on to their next node, and those of the measurements at k, and eliminates
+with QR (Bierman 1977, ch. VI; Dellaert and Kaess 2006) what only they touch: x_{k-1} and the nodes left behind:
+
+    [ R            0  ]           [ R_e  S   d ]     e   = R_e^-1 (d - S y_k)     what smooths back
+    [ A_{k-1}     A_k ]   - QR ->  [      R'  z']     R' y_k = z'                  the next message
+    [ 0           H_k ]
+
+For a chain this is the elimination that GTSAM does in the same order, on matrices that are dense anyway. Here are the
+rows and what comes of them; `graphnav.estimation.solvers.elimination` does it.
+
+A message may have tests beside it (`graphnav.estimation.solvers.watch`) that look for errors of fixes that last: more columns on
+the right, which go through the same QR.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg.lapack import dgesv
+
+from graphnav.constraints.base import Constraint
+from graphnav.core import rotation
+from graphnav.core.errors import EstimationError
+from graphnav.core.rotation import Array, mv
+from graphnav.core.state import DIM, States
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.linearise import Columns, Points, linearise, linearise_links, scale_at, shift
+from graphnav.estimation.solvers.robust import softened, weight_and_cost
+from graphnav.estimation.solvers.watch import Watch
+from graphnav.imu.dynamics import SCALE, Motion
+
+_I = np.eye(DIM)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A parameter that moves on to its next node, or begins: value - mean = decay (before - mean_before) + noise."""
+
+    name: str
+    mean: Array  # (k,)
+    sigma: Array  # (k,)
+    decay: float = 0.0
+    mean_before: Array | float = 0.0
+
+
+@dataclass(frozen=True)
+class Place:
+    """A keyframe: its time, the parameters that step there, and where its rows come from.
+
+    These are keyframe `k` of a problem, and the interval that ends there; None once nobody will ask again.
+    """
+
+    t: float  # s
+    problem: Problem | None
+    k: int = 0
+    steps: tuple[Step, ...] = ()
+    linked: bool = True  # to the keyframe before; the first of all is not
+
+
+@dataclass(frozen=True)
+class Message:
+    """R y = z about a point; `columns` says where the parameters stand behind the fifteen states."""
+
+    state: States  # one
+    values: Array  # (D-15,)
+    columns: Columns
+    R: Array  # (D, D)
+    z: Array  # (D,)
+    tests: Watch | None = None
+
+    @property
+    def estimate(self) -> Array:
+        """(D,) the error state that it makes most likely."""
+        found, info = dgesv(self.R, self.z)[2:]  # not triangular any more once its point has turned
+        if info:
+            raise EstimationError("the smoother's information broke down: check sigmas and units")
+        return np.asarray(found)
+
+    @property
+    def covariance(self) -> Array:
+        """(D, D)"""
+        root = np.linalg.inv(self.R)
+        return np.asarray(root @ root.T)
+
+    def moved(self, e: Array, J: Array | None = None) -> Message:
+        """The same about the point moved by the error state e (D,); J is Jr^-1 of its turn, if known."""
+        J = rotation.right_jacobian_inverse(e[None, :3])[0] if J is None else J
+        state, values = self.state.plus(e[None, :DIM]), self.values + e[DIM:]
+        return Message(state, values, self.columns, turned(self.R, J), self.z - self.R @ e, self.tests)
+
+    def value(self, name: str) -> Array:
+        """A parameter at the point."""
+        at = self.columns[name]
+        return self.values[at.start - DIM : at.stop - DIM]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Rows of one constraint at one keyframe, whitened: H y = b, with the kernel that weighs them and its scale."""
+
+    name: str
+    H: Array  # (n, m, D)
+    b: Array  # (n, m)
+    sigma: Array  # (n, m) that they were whitened with
+    kernel: str
+    scale: float | Array
+
+    def weighted(self, y: Array, passes: int) -> tuple[Array, Array, Array]:
+        """H, b and sigma, by the kernel's weights for the error state y once `passes` is not 0."""
+        if self.kernel == "none" or not passes:
+            return self.H, self.b, self.sigma
+        left = self.b - mv(self.H, np.broadcast_to(y, (len(self.b), len(y))))
+        weight = np.sqrt(weight_and_cost(self.kernel, np.linalg.norm(left, axis=-1), self.scale)[0])[:, None]
+        with np.errstate(divide="ignore"):
+            return self.H * weight[..., None], self.b * weight, self.sigma / weight
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A keyframe in the window. Smoothing back, y_before = g + G y + noise of covariance C in the rows `lost`."""
+
+    place: Place
+    message: Message
+    G: Array  # (D before, D)
+    g: Array  # (D before,)
+    lost: Array  # rows that were eliminated
+    C: Array  # (lost, lost)
+    measured: tuple[Measured, ...] = ()
+    fault: tuple[str, float] | None = None  # whose fixes are wrong, and since when (s)
+
+    def moved(self, e: Array) -> Stage:
+        """The same about the point moved by the error state e."""
+        J = rotation.right_jacobian_inverse(e[None, :3])[0]
+        message, G, g = self.message.moved(e, J), turned(self.G, J), self.g + self.G @ e
+        return Stage(self.place, message, G, g, self.lost, self.C, self.measured, self.fault)
+
+    @property
+    def noise(self) -> Array:
+        """(D before, D before), C in its place."""
+        out = np.zeros((len(self.G), len(self.G)))
+        out[self.lost[:, None], self.lost] = self.C
+        return out
+
+    def before(self, P: Array) -> Array:
+        """The covariance before from that of y."""
+        out = self.G @ P @ self.G.T
+        out[self.lost[:, None], self.lost] += self.C
+        return np.asarray(out)
+
+
+def turned(A: Array, J: Array) -> Array:
+    """Columns about a point turned by e, of which J is Jr^-1: log(Exp(e) Exp(d)) = e + Jr^-1(e) d."""
+    out = A.copy()
+    out[:, :3] = A[:, :3] @ J
+    return out
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Whitened rows of one stage: link (15, 15 + D + 1) over [x_before, y, b], or None; measurements by constraint."""
+
+    link: Array | None
+    measured: tuple[Measured, ...]
+
+
+def extended(columns: Columns, steps: Sequence[Step]) -> Columns:
+    """The columns with those of parameters that begin behind them."""
+    out, at = dict(columns), max((s.stop for s in columns.values()), default=DIM)
+    for step in steps:
+        if step.name not in out:
+            out[step.name] = slice(at, at + len(step.mean))
+            at += len(step.mean)
+    return out
+
+
+def width(columns: Columns) -> int:
+    """D"""
+    return max((s.stop for s in columns.values()), default=DIM)
+
+
+def predicted(before: Message, place: Place) -> tuple[States, Array, Columns, Array | None]:
+    """State, parameter values, columns and whitened link rows at a new keyframe, from the point of a message."""
+    columns = extended(before.columns, place.steps)
+    D = width(columns)
+    values = np.zeros(D - DIM)
+    values[: len(before.values)] = before.values
+    for step in place.steps:
+        at = shift(columns[step.name])
+        old = before.value(step.name) if step.name in before.columns else step.mean_before
+        values[at] = step.mean + step.decay * (old - step.mean_before)
+    if not place.linked:
+        return before.state, values, columns, None
+    assert place.problem is not None
+    motion, row = place.problem.motion, slice(place.k - 1, place.k)
+    scale = before.value(SCALE) if SCALE in before.columns else None
+    ahead, F = motion.propagate(row, before.state, scale)
+    try:
+        W = motion.whitener[row]
+    except np.linalg.LinAlgError:
+        raise EstimationError(f"the noise of the IMU before {place.t:.3f} s is none: check its figures") from None
+    link = np.zeros((1, DIM, DIM + D + 1))
+    link[:, :, :DIM] = -F
+    link[:, :, DIM : 2 * DIM] = _I
+    if scale is not None:
+        at = columns[SCALE]
+        link[:, :, DIM + at.start : DIM + at.stop] = -motion.scale_columns(row, F, at.stop - at.start)
+    return ahead, values, columns, (W @ motion.body_rows(link, before.state.R_nb, row))[0]
+
+
+def measured(place: Place, state: States, values: Array, columns: Columns, late: bool | None = None) -> Linear:
+    """The rows of a keyframe's measurements at a point, without a link; with `late` only those that `waits` says."""
+    assert place.problem is not None
+    rows = place.problem.constraints
+    if late is not None:
+        rows = tuple(c for c in rows if waits(c) == late)
+    return at_points([place], state, values[None], columns, linked=False, rows=rows)[0]
+
+
+def waits(rows: Constraint) -> bool:
+    """Whether rows enter last: those that look ahead, and those whose weights an estimate tells."""
+    return rows.looks_ahead or rows.robust != "none"
+
+
+def at_points(
+    places: Sequence[Place],
+    states: States,
+    values: Array,
+    columns: Columns,
+    linked: bool = True,
+    rows: Sequence[Constraint] | None = None,
+) -> list[Linear]:
+    """The rows of consecutive keyframes of one problem at given points, all at once.
+
+    `states` and `values` (n, D-15) are at the keyframes; with `linked` there is one more of them, the first, at the
+    keyframe before. `rows` are the constraints that are wanted, if not all.
+    """
+    problem, first, n = places[0].problem, places[0].k, len(places)
+    assert problem is not None
+    D, skip = width(columns), int(linked)
+    links: list[Array | None] = [None] * n
+    if linked:
+        scale = scale_at(columns, values[0])
+        motion = Motion(problem.intervals[slice(first - 1, first - 1 + n)], problem.frame)
+        link = np.zeros((n, DIM, DIM + D + 1))
+        link[:, :, :DIM], link[:, :, DIM : 2 * DIM], S, link[:, :, -1] = linearise_links(motion, states, scale)
+        if scale is not None:
+            here = columns[SCALE]
+            link[:, :, DIM + here.start : DIM + here.stop] = S
+        links = list(link)
+    parts: list[list[Measured]] = [[] for _ in places]
+    for constraint in problem.constraints if rows is None else rows:
+        lo, hi = constraint.keyframe.searchsorted((first, first + n))
+        if lo == hi or any(p.name not in columns for p in constraint.parameters):
+            continue  # none here, or of parameters that have not begun
+        at = constraint.keyframe[lo:hi] - first + skip
+        linear = linearise(constraint, Points(states, values), columns, slice(lo, hi), at)
+        sigma = linear.sigma
+        H, b = linear.H / sigma[..., None], -linear.residual / sigma
+        edge = np.searchsorted(at, np.arange(n + 1) + skip)
+        for i in np.flatnonzero(np.diff(edge)):
+            own = slice(edge[i], edge[i + 1])
+            c = constraint
+            kernel = softened(c.robust) if c.robust == "gnc" else c.robust
+            parts[i].append(
+                Measured(c.name, H[own], b[own], sigma[own], kernel, c.scale_of(slice(lo + own.start, lo + own.stop)))
+            )
+    return [Linear(link, tuple(part)) for link, part in zip(links, parts, strict=True)]

@@ -1,0 +1,460 @@
+"""GTSAM's iSAM2 (Kaess et al. 2012) over error states: keyframes come, are linearised again, and leave.
+
+Each variable is the error e of a state or of parameters about an anchor X0 that stays: X = X0 [+] e. Rows linearised
+where the errors are d, A (X [-] (X0 [+] d)) = b, are rows of e to first order,
+
+    A J (e - d) = b      J = J_r(d) in the columns of the attitude, else the identity
+
+so that GTSAM has a linear problem, and no factor of it calls back into Python. Relinearisation is fluid as there: a
+variable that has moved beyond a threshold from where its rows were linearised has them linearised anew, in NumPy and
+all at once, and they take the place of the old ones in the tree by their indices.
+
+Constants are chains with a node every half minute: what is the same all through the drive would tie every update to
+all of it. Keyframes older than a lag are marginalised: variables are ordered along time, so they are leaves of the
+tree, and what is known of them becomes a factor on what they touched. It stays as it is, linear about the anchors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.elimination import Predicted
+from graphnav.estimation.solvers.linearise import shift
+from graphnav.estimation.solvers.passes import integrated_again
+from graphnav.estimation.solvers.revision import Renewed
+from graphnav.estimation.solvers.robust import PASSES
+from graphnav.estimation.solvers.stages import (
+    Columns,
+    Measured,
+    Message,
+    Place,
+    Step,
+    at_points,
+    extended,
+    measured,
+    predicted,
+)
+from graphnav.estimation.solvers.tree_nodes import (
+    LINK,
+    Keyframe,
+    Variable,
+    factor,
+    file,
+    fresh_isam,
+    is_constant,
+    read_again,
+    turned,
+    units_of,
+    updated,
+    written,
+)
+from graphnav.estimation.solvers.window import limits
+from graphnav.imu.dynamics import SCALE
+
+NODE_EVERY = 30.0  # s from one node of a constant to the next
+_TIED = 1e-5  # of its prior sigma, by which a constant may differ from node to node: 0.03 % of it in ten hours
+_UNIT = np.repeat([1e-3, 1.0, 0.1, 1e-3, 1e-5], 3)  # of a state's errors, so that one threshold fits them all
+_ALMOST = 0.3  # what has moved almost as far goes with what has: it would be next
+
+
+class Tree:
+    """Keyframes in an iSAM2.
+
+    Parameters
+    ----------
+    prior : message on the first keyframe before any measurement.
+    turn : rad that an attitude may move before its rows are linearised anew.
+    """
+
+    def __init__(self, prior: Message, turn: float) -> None:
+        self.isam = fresh_isam()
+        self.turn = turn
+        self.keyframes: list[Keyframe] = []
+        self.relinearised = 0  # keyframes
+        self._prior = prior
+        self._number = self._key = 0
+        self._in_force: dict[str, tuple[Variable, slice]] = {}
+        self.variables: dict[int, Variable] = {}
+        self._first_sigma: dict[str, Array] = {}
+        self._constant: set[str] = set()
+        self._held = 0  # keyframes at the front that stay as they are: 1 where the first is behind the window
+
+    def __len__(self) -> int:
+        return len(self.keyframes)
+
+    # --------------------------------------------------------------------------------------------------- entering
+    @property
+    def newest(self) -> Message:
+        """State and parameter values of the newest keyframe as they are known now, without what is known of them."""
+        if not self.keyframes:
+            return self._prior
+        last, none = self.keyframes[-1], np.empty((0, 0))
+        return Message(last.estimate, last.values, last.columns, none, none[0:0])
+
+    def add(self, place: Place, ahead: Predicted | None = None, rows: Sequence[Measured] = ()) -> float:
+        """Take in one more keyframe; returns by how much its rows turned it, rad.
+
+        Parameters
+        ----------
+        ahead, rows : what it is predicted to be from `newest`, and its rows there, where that is known already.
+        """
+        if not self.keyframes and place.linked:
+            self._begin(place)
+        if ahead is None:
+            state, values, columns, link = predicted(self.newest, place)
+            rows = measured(place, state, values, columns).measured
+        else:
+            state, values, columns, link = ahead.state, ahead.values, ahead.columns, ahead.link
+        graph, new = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        x = self._variable(np.zeros(DIM), _UNIT, place.t)
+        nodes = self._open(place, graph, new)
+        keyframe = Keyframe(self._number, place, x, state, columns, nodes, {})
+        new.insert(x.key, np.zeros(DIM))
+        for node, _ in nodes.values():
+            node.last = self._number
+        for name, at in columns.items():
+            node, own = nodes[name]
+            node.delta[own] = values[shift(at)] - node.anchor[own]
+            if node.t == place.t:
+                node.point[own] = node.delta[own]
+        if link is None:
+            prior = self._prior
+            graph.push_back(factor([(x, prior.R[:, :DIM])], prior.z))
+        made: list[tuple[str, Any]] = []
+        if link is not None:
+            last = self.keyframes[-1]
+            blocks = [(last.state, turned(link[:, :DIM], last.state.delta)), (x, link[:, DIM : 2 * DIM])]
+            made.append((LINK, self._about(link[:, DIM:-1], link[:, -1], blocks, last.columns, last.nodes)))
+        made += [(one.name, self._rows(keyframe, one, weighted=False)) for one in rows]
+        self.keyframes.append(keyframe)
+        begin = graph.size()
+        for _, one in made:
+            graph.push_back(one)
+        # along time, where the order is free; CCOLAMD wants labels below the number of variables it is to order
+        most = min(3, len({key for _, one in made for key in list(one.keys())}) - 1)
+        groups = gtsam.KeyGroupMap()
+        for variable in self._recent():
+            groups.insert2(variable.key, max(variable.last - self._number + most, 0))
+        result = updated(self.isam, place.t, graph, new, [], groups)
+        self._number += 1
+        file(keyframe, made, list(result.getNewFactorsIndices())[begin:])
+        self._read([x, *(node for node, _ in nodes.values())])
+        for _ in range(PASSES - 1 if any(one.kernel != "none" for one in rows) else 0):
+            self.again([len(self.keyframes) - 1])
+            self._read([x, *(node for node, _ in nodes.values())])
+        return float(np.linalg.norm(x.delta[:3]))
+
+    def _begin(self, place: Place) -> None:
+        """Have the message that all goes on from as a keyframe before the first."""
+        prior = self._prior
+        x = self._variable(np.zeros(DIM), _UNIT, place.t)
+        new, graph, nodes = gtsam.Values(), gtsam.NonlinearFactorGraph(), {}
+        new.insert(x.key, np.zeros(DIM))
+        blocks = [(x, prior.R[:, :DIM])]
+        if prior.columns:
+            node = self._variable(prior.values, np.ones(len(prior.values)), place.t)
+            new.insert(node.key, np.zeros(len(prior.values)))
+            node.limit = limits(prior.columns, units_of(place))[1]
+            nodes = {name: (node, shift(at)) for name, at in prior.columns.items()}
+            blocks.append((node, prior.R[:, DIM:]))
+        graph.push_back(factor(blocks, prior.z))
+        assert place.problem is not None
+        for name, p in place.problem.parameters.items():
+            if name in prior.columns and p.constant:
+                self._constant.add(name)
+                self._first_sigma[name] = p.sigma
+        updated(self.isam, place.t, graph, new)
+        self._in_force = nodes
+        before = Place(place.t, None)
+        self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, {}))
+        self._number += 1
+        self._held = 1
+        self._read([x, *(node for node, _ in nodes.values())])
+
+    def _recent(self) -> Iterable[Variable]:
+        for keyframe in self.keyframes[-3:]:
+            yield keyframe.state
+        yield from {id(n): n for k in self.keyframes[-3:] for n, _ in k.nodes.values()
+                    if n.last >= self._number - 2}.values()  # fmt: skip
+
+    def _variable(self, anchor: Array, unit: Array, t: float) -> Variable:
+        none = np.zeros(len(unit))
+        out = Variable(self._key, unit, none.copy(), none, self._number, self._number, t, anchor)
+        self.variables[self._key] = out
+        self._key += 1
+        return out
+
+    def _open(self, place: Place, graph: Any, new: Any) -> dict[str, tuple[Variable, slice]]:
+        """Begin the nodes of parameters that step at a keyframe, and the next ones of constants; which are in force."""
+        steps = list(place.steps)
+        self._constant |= {s.name for s in steps if is_constant(place, s.name)}
+        named = {s.name for s in steps}
+        for name in sorted(self._constant.intersection(self._in_force) - named):
+            node, own = self._in_force[name]
+            if place.t - node.t >= NODE_EVERY:
+                value = node.anchor[own]
+                steps.append(Step(name, value, _TIED * self._first_sigma[name], 1.0, value))
+        if not steps:
+            return self._in_force
+        together: dict[int, list[Step]] = {}
+        for step in steps:
+            before = self._in_force.get(step.name)
+            together.setdefault(-1 if before is None else before[0].key, []).append(step)
+        in_force = dict(self._in_force)
+        for old_key, own_steps in together.items():
+            widths = [len(s.mean) for s in own_steps]
+            edge = np.concatenate([[0], np.cumsum(widths)])
+            node = self._variable(np.zeros(edge[-1]), np.ones(edge[-1]), place.t)
+            node.limit = limits(extended({}, own_steps), units_of(place))[1]
+            old = self.variables.get(old_key)
+            own_A, old_A = np.zeros((edge[-1], edge[-1])), np.zeros((edge[-1], 0 if old is None else len(old.unit)))
+            for step, lo, hi in zip(own_steps, edge[:-1], edge[1:], strict=True):
+                at = slice(int(lo), int(hi))
+                unit = self._first_sigma.setdefault(step.name, np.asarray(step.sigma, dtype=float))
+                node.unit[at] = unit
+                node.anchor[at] = step.mean
+                own_A[at, at] = np.diag(1.0 / step.sigma)
+                if old is not None and step.decay:
+                    was = self._in_force[step.name][1]
+                    node.anchor[at] += step.decay * (old.anchor[was] - step.mean_before)
+                    old_A[at, was] = -step.decay * own_A[at, at]
+                in_force[step.name] = node, at
+            new.insert(node.key, np.zeros(len(node.unit)))
+            blocks = [(node, own_A)] + ([(old, old_A)] if old is not None and old_A.any() else [])
+            graph.push_back(factor(blocks, np.zeros(edge[-1])))
+        self._in_force = in_force
+        return in_force
+
+    def _about(
+        self,
+        H: Array,
+        b: Array,
+        blocks: list[tuple[Variable, Array]],
+        columns: Columns,
+        nodes: dict[str, tuple[Variable, slice]],
+    ) -> Any:
+        """A factor of rows over states, `blocks`, and parameters, H (m, D), linearised where they are now."""
+        b = b + sum(A @ x.delta for x, A in blocks)
+        touched: dict[int, tuple[Variable, Array]] = {}
+        for name, at in columns.items():
+            if not H[:, at].any():
+                continue
+            node, own = nodes[name]
+            _, A = touched.setdefault(node.key, (node, np.zeros((len(b), len(node.unit)))))
+            A[:, own] = H[:, at]
+            b = b + H[:, at] @ node.delta[own]
+        return factor([*blocks, *touched.values()], b)
+
+    def _rows(self, keyframe: Keyframe, one: Measured, weighted: bool) -> Any:
+        """A factor of measurements linearised where keyframe and parameters are now."""
+        H, b, _ = one.weighted(np.zeros(one.H.shape[-1]), int(weighted))
+        H, x = H.reshape(-1, H.shape[-1]), keyframe.state
+        return self._about(H, b.ravel(), [(x, turned(H[:, :DIM], x.delta))], keyframe.columns, keyframe.nodes)
+
+    def _update(self, made: Sequence[tuple[Keyframe, str, Any]], gone: list[int], first: int) -> None:
+        """Have factors in place of others, on keyframes from one on."""
+        graph = gtsam.NonlinearFactorGraph()
+        for _, _, one in made:
+            graph.push_back(one)
+        # the order stays that of time; once it has much to do, GTSAM makes the whole tree anew
+        late = [v for v in self.variables.values() if v.last >= first]
+        every = None
+        if 2 * len(late) > len(self.variables):
+            late, first = list(self.variables.values()), self.keyframes[0].number
+            every = gtsam.KeyList()
+            for variable in late:
+                every.push_back(variable.key)
+        groups = gtsam.KeyGroupMap()
+        for variable in late:
+            groups.insert2(variable.key, variable.last - first)
+        t = self.keyframes[-1].place.t
+        result = updated(self.isam, t, graph, gtsam.Values(), gone, groups, None, every)
+        for (keyframe, name, _), index in zip(made, result.getNewFactorsIndices(), strict=True):
+            keyframe.slots.setdefault(name, []).append(index)
+
+    # ------------------------------------------------------------------------------------------ linearising again
+    def read(self) -> None:
+        """Bring all estimates up to date."""
+        self._read(list(self.variables.values()), all_at_once=True)
+
+    def _read(self, variables: Sequence[Variable], all_at_once: bool = False) -> None:
+        if not all_at_once:
+            for x in variables:
+                x.delta = x.unit * self.isam.calculateEstimateVector(x.key)
+            return
+        flat = np.asarray(self.isam.getDelta().vector([x.key for x in variables])).ravel()
+        begin = 0
+        for x in variables:
+            end = begin + len(x.unit)
+            x.delta = x.unit * flat[begin:end]
+            begin = end
+
+    def estimates(self, first: int = 0) -> list[tuple[States, Array]]:
+        """State and parameter values of each keyframe from one on, as last read."""
+        return [(k.estimate, k.values) for k in self.keyframes[first:]]
+
+    def moved(self, share: float = 1.0) -> Array:
+        """Which keyframes' estimates are further from where their rows were linearised than a share of the limits."""
+        if not self.keyframes:
+            return np.empty(0, dtype=int)
+        off = np.array([k.state.delta[:3] - k.state.point[:3] for k in self.keyframes])
+        far = np.einsum("ki,ki->k", off, off) > (share * self.turn) ** 2
+        own = self.keyframes[self._held :]
+        nodes = {id(n): n for k in own for n, _ in k.nodes.values() if np.isfinite(n.limit).any()}
+        gone = {i for i, n in nodes.items() if np.any(np.abs(n.delta - n.point) > share * n.limit)}
+        if gone:
+            far |= np.array([any(id(n) in gone for n, _ in k.nodes.values()) for k in self.keyframes])
+        far[: self._held] = False
+        return np.flatnonzero(far)
+
+    def relinearise(self, share: float = 1.0, renewed: Renewed | None = None) -> int:
+        """Linearise anew what has moved beyond a share of the limits; returns how many keyframes that are."""
+        self.read()
+        if not len(self.moved(share)):
+            return 0
+        which = self.moved(_ALMOST * share)
+        self.again(which, renewed)
+        self.read()
+        return len(which)
+
+    def integrate_again(self, problem: Problem) -> tuple[Problem, bool]:
+        """Where biases have moved too far, have their intervals integrated about them; all are of one problem."""
+        self.read()
+        own = self.keyframes
+        states = States.stack([k.anchor for k in own]).plus(np.array([k.state.delta for k in own]))
+        scale = None
+        if SCALE in own[-1].nodes:
+            node, at = own[-1].nodes[SCALE]
+            scale = node.value[at]
+        problem, count = integrated_again(problem, states, scale, own[0].place.k)
+        if count:
+            for k in own:
+                k.place = replace(k.place, problem=problem)
+            self.again(range(len(self)))
+        return problem, count > 0
+
+    def again(self, which: Iterable[int], renewed: Renewed | None = None) -> None:
+        """Linearise keyframes, and the intervals on either side, where they are now."""
+        rows = {i for i in map(int, which) if i >= self._held}
+        if not rows:
+            return
+        links = {k for i in rows for k in (i, i + 1) if k < len(self) and LINK in self.keyframes[k].slots}
+        made: list[tuple[Keyframe, str, Any]] = []
+        gone: list[int] = []
+        for run in list(self._runs(sorted(rows | links), posed=renewed is not None)):
+            own = self.keyframes[run[0] : run[-1] + 1]
+            places = [k.place for k in own]
+            if renewed is not None:
+                places = list(renewed(run[0] - self._held, run[-1] + 1 - self._held))
+            linked = run[0] in links
+            around = self.keyframes[run[0] - 1 : run[-1] + 1] if linked else own
+            columns = own[-1].columns
+            values = np.zeros((len(around), sum(at.stop - at.start for at in columns.values())))
+            for row, keyframe in zip(values, around, strict=True):
+                known = keyframe.values
+                row[: len(known)] = known
+            states = States.stack([k.anchor for k in around]).plus(np.array([k.state.delta for k in around]))
+            for i, linear in zip(run, at_points(places, states, values, columns, linked), strict=True):
+                keyframe = self.keyframes[i]
+                if i in links:
+                    assert linear.link is not None
+                    last, link = self.keyframes[i - 1], linear.link
+                    blocks = [(last.state, turned(link[:, :DIM], last.state.delta)),
+                              (keyframe.state, turned(link[:, DIM : 2 * DIM], keyframe.state.delta))]  # fmt: skip
+                    made.append((keyframe, LINK, self._about(
+                        link[:, DIM:-1], link[:, -1], blocks, last.columns, last.nodes)))  # fmt: skip
+                    gone += keyframe.slots.pop(LINK)
+                if i in rows:
+                    for one in linear.measured:
+                        if one.name in keyframe.slots:
+                            made.append((keyframe, one.name, self._rows(keyframe, one, weighted=True)))
+                            gone += keyframe.slots.pop(one.name)
+        for i in rows:
+            x = self.keyframes[i].state
+            x.point = x.delta.copy()
+            for node, _ in self.keyframes[i].nodes.values():
+                node.point = node.delta.copy()
+        self.relinearised += len(rows)
+        self._update(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
+
+    def _runs(self, which: Sequence[int], posed: bool) -> Iterable[list[int]]:
+        """Indices that can be linearised together: keyframe after keyframe of one problem, the same columns.
+
+        `posed` are keyframes that will be posed again, together.
+        """
+        run: list[int] = []
+        for i in which:
+            k = self.keyframes[i]
+            if run:
+                last = self.keyframes[run[-1]]
+                alike = i == run[-1] + 1 and k.columns == last.columns and LINK in k.slots and LINK in last.slots
+                same = posed or (k.place.problem is last.place.problem and k.place.k == last.place.k + 1)
+                if not (alike and same):
+                    yield run
+                    run = []
+            run.append(i)
+        if run:
+            yield run
+
+    # ---------------------------------------------------------------------------------------------------- leaving
+    def truncate(self, keep: int) -> None:
+        """Forget all but the first keyframes: something before what follows has changed."""
+        gone = self.keyframes[keep:]
+        if not gone:
+            return
+        del self.keyframes[keep:]
+        last = self.keyframes[-1]
+        self._number, self._in_force = last.number + 1, last.nodes
+        # whatever touches a variable that began later goes with it
+        late = {x.key for x in self.variables.values() if x.first > last.number}
+        factors = self.isam.getFactorsUnsafe()
+        own = [
+            i for i in range(factors.size()) if factors.at(i) is not None and not late.isdisjoint(factors.at(i).keys())
+        ]
+        for key in late:
+            del self.variables[key]
+        for x in self.variables.values():
+            x.last = min(x.last, last.number)
+        self._update([], own, last.number)
+        self._read([last.state, *(node for node, _ in last.nodes.values())])
+
+    def hold(self) -> None:
+        """The first keyframe is behind the window from now on, and stays as it is."""
+        self._held = 1
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the tree itself, which is made again from its factors."""
+        return {**self.__dict__, "isam": written(self.isam, self.variables.values())}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        rows = state.pop("isam")
+        self.__dict__.update(state)
+        self.isam, now = read_again(rows, {x: x.last for x in self.variables.values()})
+        for k in self.keyframes:
+            k.slots = {name: [now[i] for i in own] for name, own in k.slots.items()}
+
+    def marginalise(self, count: int) -> None:
+        """Let the first keyframes go, and the parameters' nodes that only they touch."""
+        first = self.keyframes[count].number
+        keys = gtsam.KeyList()
+        gone = [x for x in self.variables.values() if x.last < first]
+        for x in gone:
+            keys.push_back(x.key)
+        _, indices = self.isam.marginalizeLeavesWithIndices(keys)
+        left = set(indices)
+        for x in gone:
+            del self.variables[x.key]
+        del self.keyframes[:count]
+        for keyframe in self.keyframes:
+            if not any(left.intersection(own) for own in keyframe.slots.values()):
+                continue
+            kept = {name: [i for i in own if i not in left] for name, own in keyframe.slots.items()}
+            keyframe.slots = {name: own for name, own in kept.items() if own}

@@ -1,0 +1,144 @@
+"""The window of an online run on GTSAM's iSAM2: its keyframes are smoothed, relinearised and marginalised in a tree.
+
+What enters is made as in `graphnav.estimation.solvers.window`: a keyframe is predicted, its innovations tested, robust rows
+weighed, all of it from a message of the newest keyframe. From there on the tree holds the rows. Live and settled
+estimates are its own, and so is the message that the next keyframe is predicted from once the past has been linearised
+anew. The keyframe that settled last stays in the tree, so that all behind it can be taken back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.estimation.solvers.elimination import Predicted
+from graphnav.estimation.solvers.revision import Renewed
+from graphnav.estimation.solvers.stages import Message, Place
+from graphnav.estimation.solvers.tree import Tree
+from graphnav.estimation.solvers.tree_marginals import newest_root, smoothed
+from graphnav.estimation.solvers.window import Smoothed, Window
+
+_ROUNDS = 5
+_FINE = 0.02  # of the usual limits, within which the last window is converged
+
+
+class TreeWindow(Window):
+    """A window whose estimates are a `Tree`'s; parameters as of `Window`."""
+
+    def __init__(self, prior: Message, turn: float) -> None:
+        super().__init__(prior, turn)
+        self.tree: Tree | None = None
+        self._before = 0  # keyframes in the tree before the first stage
+
+    def push(self, place: Place, ahead: Predicted | None = None) -> float:
+        """As of `Window`; the newest message is about the tree's estimate."""
+        if self.tree is None:
+            self.tree, self._before = Tree(self.head, self.turn), int(place.linked)
+        ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
+        turn = super().push(place, ahead)
+        self.tree.add(place, ahead, self.stages[-1].measured)
+        self._adopt(full=False)
+        return turn
+
+    def _adopt(self, full: bool) -> None:
+        """Have the newest message about the tree's estimate; with `full` what it says of its errors is the tree's."""
+        assert self.tree is not None
+        stage, now = self.stages[-1], self.tree.newest
+        e = np.concatenate([now.state.minus(stage.message.state)[0], now.values - stage.message.values])
+        moved = stage.moved(e)
+        message = moved.message
+        R = newest_root(self.tree, message.columns) if full else message.R
+        tests = message.tests
+        self.stages[-1] = replace(moved, message=replace(message, R=R, z=np.zeros(len(R)), tests=tests))
+        self._means = None
+
+    # ------------------------------------------------------------------------------------------- what the tree knows
+    def means(self) -> list[Array]:
+        """Smoothed error states, one of the message before the window and one of each stage."""
+        if self._means is None:
+            out = [np.zeros(len(self.head.z))]
+            if self.stages:
+                assert self.tree is not None
+                self.tree.read()
+                known = self.tree.estimates(self._before)
+                for stage, (state, values) in zip(self.stages, known, strict=True):
+                    m = stage.message
+                    out.append(np.concatenate([state.minus(m.state)[0], values - m.values]))
+            self._means = out
+        return self._means
+
+    def first_moved(self, share: float = 1.0) -> int | None:
+        """The first stage that the tree would linearise anew; None if there is none."""
+        if self.tree is None or not self.stages:
+            return None
+        self.tree.read()
+        moved = self.tree.moved(share)
+        return int(moved[0]) - self._before if len(moved) else None
+
+    def relinearize(self, first: int, places: Sequence[Place] | None = None) -> None:
+        """Linearise the stages from `first` on anew."""
+        assert self.tree is not None
+        which = range(first + self._before, len(self.tree))
+        renewed: Renewed | None = None if places is None else (lambda lo, hi: places[lo - first : hi - first])
+        self.tree.again(which, renewed)
+        self._relinearised(len(self) - first)
+
+    def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> int:
+        """Relinearise until nothing has moved; returns how often."""
+        if self.tree is None or not self.stages:
+            return 0
+        count = 0
+        if always:
+            self.tree.again(range(self._before, len(self.tree)), renewed)
+            self._relinearised(len(self))
+            share, count = min(share, _FINE), 1
+        while count < _ROUNDS and (done := self.tree.relinearise(share, renewed)):
+            self._relinearised(done)
+            count += 1
+        return count
+
+    def revise(self, count: int, renewed: Renewed, always: bool = False) -> bool:
+        """As `converge`, all at once; False, as nothing is left to do."""
+        self.converge(always=always, renewed=renewed)
+        return False
+
+    def _relinearised(self, count: int) -> None:
+        self.relinearized += count
+        self._adopt(full=True)
+
+    def truncate(self, keep: int) -> None:
+        """Forget all but the first `keep` stages: something before what follows has changed."""
+        if keep >= len(self.stages):
+            return
+        assert self.tree is not None
+        del self.stages[keep:]
+        self._means = None
+        if keep + self._before == 0:
+            self.tree = None  # it has only just begun
+            return
+        self.tree.truncate(keep + self._before)
+        if self.stages:
+            self._adopt(full=True)
+
+    def settle(self, count: int) -> Smoothed:
+        """Let the first `count` stages go, as the tree knows them."""
+        assert self.tree is not None or not count
+        gone = self.stages[:count]
+        if self.tree is None or not gone:
+            return super().settle(0)
+        self.tree.read()
+        out = smoothed(self.tree, self._before + count, self._before)
+        self.head = gone[-1].message
+        del self.stages[:count]
+        self._gone += count
+        self._means = None
+        if len(self.tree) > self._before + count:
+            self.tree.marginalise(self._before + count - 1)
+            self.tree.hold()
+            self._before = 1
+        else:
+            self.tree, self._before = None, 0
+        return out

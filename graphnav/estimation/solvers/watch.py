@@ -1,0 +1,384 @@
+"""Watches a filter's fixes for errors that last: a bank of generalised likelihood ratio tests.
+
+A fault that grows slowly passes every test of one fix: the filter follows it. What it cannot do is follow without
+having been pushed in the same direction again and again. If the fixes have had a common error b since fix s, the
+innovations have the mean G b, where G is what a unit error does to them through the filter (Willsky and Jones 1976,
+"A generalized likelihood ratio approach to the detection and estimation of jumps in linear systems"),
+
+    X <- F X                       its effect on the predicted state
+    G = I - H X    X <- X + K G    at a fix since s (without I at other measurements)
+
+and with nu ~ N(0, S) white but for that, the error most likely and how much more likely it makes the innovations are
+
+    score = sum G^T S^-1 nu    info = sum G^T S^-1 G    b = info^-1 score    T = score^T info^-1 score
+
+Without a fault T is chi-square with as many degrees of freedom as a fix has components. Onsets are 1, 2, 4 ... fixes
+old, more or less: slot l of the bank begins anew at every odd multiple of 2^l.
+"""
+
+from __future__ import annotations
+
+from array import array
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from scipy.linalg.lapack import dtrtrs
+from scipy.special import chdtri, gammaincinv
+
+from graphnav.constraints.base import Constraint
+from graphnav.core.rotation import Array
+from graphnav.estimation.solution import Fault
+
+_PATIENCE = 60.0  # s
+_CHANCE = 3  # fixes that agree after a fault, below which the next that does not says that they did by chance
+_EVERY = 8  # fixes between two looks at what is usual
+LARGE = 3.0  # sigmas that are stated or that clocks can be off: less is no fault, however certain
+_CLOCKS = 0.05  # s, by which the stamps of IMU and receiver may disagree
+_BRAKING = 3.0  # m/s^2, of a usual manoeuvre
+FALSE_ALARM = 1e-7  # per test: one drive in a hundred of an hour, if errors were Gaussian
+LONGEST = 600.0  # s, about, of the oldest onset: what inertial sensors knew ten minutes ago says little
+
+
+class _Slots:
+    """The tests of one constraint: slot l has columns 3 l to 3 l + 2 of those it has in the bank."""
+
+    def __init__(self, columns: slice, L: int, m: int, stated: Array, moves: bool) -> None:
+        self.columns, self.L, self.m = columns, L, m
+        self.threshold = float(chdtri(m, FALSE_ALARM))
+        self.moves = moves  # a position, which is off by what the vehicle moves while clocks are
+        self.stated = stated  # (m,) typical sigma of a whole error
+        self.first = np.full(L, -1.0)  # when each slot began, -1 before
+        self.inputs = np.zeros((m, L * m))  # what a unit error is to each column: the identity since its slot began
+        self.one = np.eye(m)
+        self.score, self.info = np.zeros((L, m)), np.tile(self.one, (L, 1, 1))
+        self.seen = 0
+        self.usual = _Usual(m)
+
+    def copy(self) -> _Slots:
+        other = object.__new__(_Slots)
+        other.__dict__ |= self.__dict__
+        other.first, other.inputs = self.first.copy(), self.inputs.copy()
+        other.score, other.info = self.score.copy(), self.info.copy()
+        return other
+
+    def forget(self) -> None:
+        """Begin none again until its turn."""
+        self.first[:], self.score[:], self.info[:], self.inputs[:] = -1.0, 0.0, self.one, 0.0
+
+    def begin(self, t: float) -> slice:
+        """Begin the slot whose turn it is; its columns in the bank."""
+        self.seen += 1
+        slot = min((self.seen & -self.seen).bit_length() - 1, self.L - 1)
+        own = slice(slot * self.m, (slot + 1) * self.m)
+        self.first[slot], self.score[slot], self.info[slot] = t, 0.0, 0.0
+        self.inputs[:, own] = self.one
+        return slice(self.columns.start + own.start, self.columns.start + own.stop)
+
+    def found(self, score: Array, G: Array, weighted: Array, speed: float) -> float | None:
+        """When a fault began that a fix adds enough to be sure of, or None.
+
+        Parameters
+        ----------
+        score : (L m,) G^T S^-1 nu.
+        G : (n m, L m) signature, and `weighted` S^-1 G.
+        """
+        L, m = self.L, self.m
+        self.score += score.reshape(L, m)
+        G3, S3 = (x.reshape(-1, L, m).swapaxes(0, 1) for x in (G, weighted))
+        self.info += G3.swapaxes(1, 2) @ S3
+        b = np.linalg.solve(self.info, self.score[..., None])[..., 0]
+        T = np.einsum("lm,lm->l", self.score, b) / self.threshold
+        if T.max() <= self.usual.factor:
+            return None
+        allowed = self.stated**2 + (_CLOCKS * speed if self.moves else _CLOCKS * _BRAKING) ** 2
+        T = np.where(np.sum(b**2 / allowed, axis=1) > LARGE**2, T, 0.0)
+        worst = int(np.argmax(T))
+        return float(self.first[worst]) if T[worst] > self.usual.factor else None
+
+
+def _slots(constraints: Iterable[Constraint], t: Array | None, period: float) -> dict[str, _Slots]:
+    """Slots of each constraint, their columns behind each other; t (K,) of the keyframes, s, tells the period."""
+    out: dict[str, _Slots] = {}
+    end = 0
+    for rows in constraints:
+        m = len(rows.axes)
+        if t is not None and len(rows) > 1:
+            period = float(np.median(np.diff(t[rows.keyframe])))
+        L = 1 + int(np.clip(np.log2(LONGEST / max(period, 1e-3)), 0, 12))
+        columns = slice(end, end + L * m)
+        out[rows.name] = _Slots(columns, L, m, rows.typical_error(), rows.fix_of == "p")
+        end += L * m
+    return out
+
+
+class _Usual:
+    """By how much the innovations of a kind are usually larger than the filter says; all copies of a bank share it.
+
+    What half of all fixes do, those not used included, is no fault: the filter has lost its way. But for those of a
+    fault that goes on and has not lasted for long: soon after the start they are half of all by themselves.
+    """
+
+    def __init__(self, m: int) -> None:
+        self.median = 2.0 * float(gammaincinv(0.5 * m, 0.5))
+        self.t, self.nis, self.used, self.factor = array("d"), array("d"), array("b"), 1.0
+
+    def add(self, t: float, nis: float, used: bool = True) -> None:
+        k = bisect_left(self.t, t)
+        if k < len(self.t) and self.t[k] == t:
+            self.nis[k], self.used[k] = nis, used
+        else:
+            self.t.insert(k, t)
+            self.nis.insert(k, nis)
+            self.used.insert(k, used)
+        if k % _EVERY == 0:
+            before = np.flatnonzero(np.frombuffer(self.used, dtype=np.int8)[:k])
+            begin = int(before[-1]) + 1 if len(before) else 0
+            known = begin if begin < k and self.t[k - 1] - self.t[begin] <= _PATIENCE else k + 1
+            if known:
+                self.factor = max(1.0, float(np.median(np.frombuffer(self.nis)[:known])) / self.median)
+
+
+class Bank:
+    """All tests of a filter.
+
+    Parameters
+    ----------
+    constraints : those whose rows are tested.
+    t : (K,) times of the keyframes, s.
+    width : of the error state.
+    """
+
+    def __init__(self, constraints: Iterable[Constraint], t: Array, width: int) -> None:
+        self._slots, self._t = _slots(constraints, t, LONGEST), t
+        self.X = np.zeros((width, sum(s.L * s.m for s in self._slots.values())))
+
+    def copy(self) -> Bank:
+        """The same, on its own."""
+        other = object.__new__(Bank)
+        other._t, other.X, other._slots = (
+            self._t,
+            self.X.copy(),
+            {name: slots.copy() for name, slots in self._slots.items()},
+        )
+        return other
+
+    def forgetful(self) -> Bank:
+        """The same without any onset."""
+        other = self.copy()
+        other.X[:] = 0.0
+        for slots in other._slots.values():
+            slots.forget()
+        return other
+
+    def predicted(self, F: Array) -> None:
+        """The filter has gone on to the next keyframe."""
+        self.X = F @ self.X
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._slots
+
+    def signature(self, name: str, k: int, H: Array) -> Array:
+        """(n m, C) mean of an innovation at keyframe k for unit errors since each onset; a fix itself is one."""
+        slots = self._slots[name]
+        self.X[:, slots.begin(float(self._t[k]))] = 0.0
+        G = -(H @ self.X)
+        own = G[:, slots.columns].reshape(-1, slots.m, slots.inputs.shape[1])
+        G[:, slots.columns] = (own + slots.inputs).reshape(len(G), -1)
+        return G
+
+    def own(self, name: str, G: Array) -> Array:
+        """(n m, L m) what a signature says of errors of the fixes themselves."""
+        return G[:, self._slots[name].columns]
+
+    def seen(self, name: str, k: int, nis: float, used: bool) -> None:
+        """The filter has seen an innovation of so many squared sigmas, used or not."""
+        if slots := self._slots.get(name):
+            slots.usual.add(float(self._t[k]), nis, used)
+
+    def taken(self, K: Array, H: Array) -> None:
+        """The filter has used rows H with the gain K that are not tested."""
+        self.X -= K @ (H @ self.X)
+
+    def updated(self, name: str, K: Array, G: Array, weighted: Array, r: Array, speed: float) -> float | None:
+        """The filter has used an innovation; when a fault began, or None.
+
+        Parameters
+        ----------
+        K : (D, n m) gain.
+        G : (n m, C) its signature, and `weighted` S^-1 times its `own`.
+        r : (n m,) residual, -nu.
+        speed : m/s, of the vehicle.
+        """
+        self.X += K @ G
+        return self._slots[name].found(-(r @ weighted), self.own(name, G), weighted, speed)
+
+
+class Watch:
+    """The same tests beside a square-root message R y = z, which is then R y = z - R X b for errors b since each onset.
+
+    With columns B = 1 / sigma for them at a fix, the QR that takes in its rows leaves behind, below those of the
+    message, rho - Gamma b ~ N(0, 1): rho^T rho is its NIS, and Gamma^T rho and Gamma^T Gamma add to score and info.
+
+    Parameters
+    ----------
+    constraints : those whose rows are tested.
+    period : s, between fixes.
+    width : of the error state.
+    """
+
+    def __init__(self, constraints: Iterable[Constraint], period: float, width: int) -> None:
+        self._slots = _slots(constraints, None, period)
+        self._X: Array | None = np.zeros((width, sum(s.L * s.m for s in self._slots.values())))
+        self._stands: tuple[Array, Array] | None = None  # R and R X
+
+    def copy(self) -> Watch:
+        """The same, on its own."""
+        other = object.__new__(Watch)
+        other._X, other._stands = self._X, self._stands
+        other._slots = {name: slots.copy() for name, slots in self._slots.items()}
+        return other
+
+    @property
+    def X(self) -> Array:
+        """(D, C) what a unit error since each onset does to the estimate."""
+        if self._X is None:
+            assert self._stands is not None
+            self._X, self._stands = dtrtrs(*self._stands)[0], None
+        return self._X
+
+    def stands(self, R: Array, Z: Array) -> None:
+        """The message has come to a triangular R (D, D), with Z = R X (D, C) beside it."""
+        self._X, self._stands = None, (R, Z)
+
+    def forgetful(self) -> Watch:
+        """The same without any onset."""
+        other = self.copy()
+        other._X, other._stands = np.zeros_like(self.X), None
+        for slots in other._slots.values():
+            slots.forget()
+        return other
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._slots
+
+    def begin(self, name: str, t: float, sigma: Array) -> tuple[slice, slice, Array]:
+        """Begin an onset with fixes of these sigmas (n, m): its columns, those of the kind, and B (n m, L m) there."""
+        slots = self._slots[name]
+        own = slots.begin(t)
+        return own, slots.columns, (slots.inputs / sigma[..., None]).reshape(sigma.size, -1)
+
+    def found(self, name: str, t: float, rho: Array, Gamma: Array, speed: float) -> float | None:
+        """When a fault began, or None, by what a fix has left behind: rho (n m,) and Gamma (n m, L m) of its kind."""
+        slots = self._slots[name]
+        slots.usual.add(t, float(rho @ rho))
+        return slots.found(rho @ Gamma, Gamma, Gamma, speed)
+
+
+class Verdicts:
+    """Which fixes to give up when a fault is found: those from its onset on.
+
+    Unless that outlasts what was used since the fault before, and a minute. Then it is more likely the filter that has
+    lost its way with those: it drifts while fixes are refused, and a fault that grows meets it again; or it began with
+    wrong ones. So what it used since, of any kind, is given up instead, and the fixes are taken back; this in turn is
+    undone if they are refused even so. After `LONGEST` of a fault the filter begins anew where the fixes are.
+
+    The first fix that is used after a long fault meets a filter that knows little, and agrees easily; from then on the
+    filter is sure of it. If one of the next does not agree, it was chance, and the fault goes on.
+    """
+
+    def __init__(self, times: Mapping[str, Array], used: Mapping[str, Array]) -> None:
+        self.times, self.used = dict(times), dict(used)  # (N,) each; `used` is changed in place
+        self.anew: set[tuple[str, float]] = set()  # kinds and times at which the filter begins anew
+        self._tried: set[tuple[str, float]] = set()
+        self._trial: tuple[str, int, int, dict[str, Array]] | None = None  # fixes taken back, and what was used before
+
+    @property
+    def refused(self) -> float:
+        """The largest share of a kind that is not used."""
+        return max((float(np.mean(used == 0.0)) for used in self.used.values() if len(used)), default=0.0)
+
+    def faults(self) -> tuple[Fault, ...]:
+        """Spans of fixes that are not used."""
+        out = []
+        for name, t in self.times.items():
+            lost = np.flatnonzero(self.used[name] == 0.0)
+            for run in np.split(lost, np.flatnonzero(np.diff(lost) > 1) + 1) if len(lost) else []:
+                out.append(Fault(name, float(t[run[0]]), float(t[run[-1]]), len(run)))
+        return tuple(sorted(out, key=lambda fault: fault.t_start))
+
+    def weights(self, name: str, t: Array) -> Array:
+        """(n,) of fixes at the times t: 0 for what is not used. Fixes that were not known yet are."""
+        known, used = self.times.get(name, np.empty(0)), self.used.get(name, np.empty(0))
+        at = known.searchsorted(t)
+        new = at == len(known)
+        new[~new] = known[at[~new]] != t[~new]
+        if new.any():
+            if at[new][0] < len(known):
+                self._trial = None  # its rows have moved
+            self.times[name] = known = np.insert(known, at[new], t[new])
+            self.used[name] = used = np.insert(used, at[new], 1.0)
+            at = known.searchsorted(t)
+        return np.asarray(used[at])
+
+    def settle(self, name: str, since: float, now: float) -> float:
+        """Take from use what a fault of fixes `since` (s) up to `now` gives reason to; the time to go on from."""
+        t, used = self.times[name], self.used[name]
+        fault, end = int(np.searchsorted(t, since)), int(np.searchsorted(t, now, side="right"))
+        used[fault:end] = 0.0
+        begin = _begin(used, end, 0.0)
+        before = _begin(used, begin, 1.0)  # of what was used between two faults
+        if begin - before < min(_CHANCE, before - _begin(used, before, 0.0)):
+            used[before:begin] = 0.0
+            fault = min(fault, before)
+        if self._trial is not None and self._trial[0] == name:
+            _, begin, until, were = self._trial
+            if end > until:
+                self._trial = None
+            elif np.mean(used[begin:until] == 0.0) > 0.5:
+                self._trial = None
+                for other, was in were.items():
+                    self.used[other][: len(was)] = was
+                return float(t[_begin(used, _begin(used, begin, 1.0), 0.0)])
+        begin = _begin(used, end, 0.0)
+        before = _begin(used, begin, 1.0)  # of what was used between two faults
+        lasted = t[end - 1] - t[begin]
+        if lasted > LONGEST and (name, t[begin]) not in self.anew:
+            used[begin:end] = 1.0
+            self.anew.add((name, float(t[begin])))
+            return float(t[begin])
+        if lasted > _PATIENCE and self._outlasts(name, before, begin, end):
+            return self._try(name, before, begin, end)
+        return float(t[fault])
+
+    def ended(self) -> float | None:
+        """The time to go on from once no more fixes come: no more patience is needed then."""
+        for name, used in self.used.items():
+            end = len(used)
+            if end and used[-1] == 0.0:
+                begin = _begin(used, end, 0.0)
+                before = _begin(used, begin, 1.0)
+                if self._outlasts(name, before, begin, end):
+                    return self._try(name, before, begin, end)
+        return None
+
+    def _outlasts(self, name: str, before: int, begin: int, end: int) -> bool:
+        """Whether fixes begin..end, refused, are more than before..begin, which were used, and were not tried yet."""
+        return 0 < begin - before < end - begin and (name, self.times[name][begin]) not in self._tried
+
+    def _try(self, name: str, before: int, begin: int, end: int) -> float:
+        """Take fixes back, without what of any kind was used since the fault before; the time to go on from."""
+        t, used = self.times[name], self.used[name]
+        self._tried.add((name, float(t[begin])))
+        self._trial = name, begin, end, {other: u.copy() for other, u in self.used.items()}
+        used[begin:end] = 1.0
+        first = float(t[_begin(used, before, 0.0)])
+        for other, at in self.times.items():
+            self.used[other][(at >= first) & (at < t[begin])] = 0.0
+        return first
+
+
+def _begin(used: Array, end: int, value: float) -> int:
+    """First of the rows before `end` that are all used, or all not."""
+    other = np.flatnonzero((used[:end] > 0.0) != (value > 0.0))
+    return int(other[-1]) + 1 if len(other) else 0

@@ -1,0 +1,333 @@
+"""A window over the newest keyframes: exact smoothing with bounded time and memory.
+
+Keyframes enter one by one (`graphnav.estimation.solvers.stages`); the newest message is what a filter would hold. Back through
+the stages go means and covariances (Rauch, Tung, Striebel in information form). A keyframe that is older than the
+lag leaves the window: its state is settled, and the message behind it is the marginal of all the past, a Gaussian on
+what the future still touches. Where a state has moved so far that its rows should be linearised anew, the stages
+from there on are made again about the smoothed states: Gauss-Newton on the window. A measurement that comes late
+does the same from its own time on. With a lag longer than the drive this is the batch solution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.estimation.solvers.elimination import Predicted, predict, update
+from graphnav.estimation.solvers.points import about_own
+from graphnav.estimation.solvers.revision import Renewed, Revision
+from graphnav.estimation.solvers.stages import (
+    Columns,
+    Message,
+    Place,
+    Stage,
+    extended,
+    measured,
+    predicted,
+    width,
+)
+from graphnav.estimation.solvers.watch import Watch
+from graphnav.recording import ImuNoise
+
+_SHARE = (
+    0.01  # of the noise of a second's force that a turn may be neglected for: the same way every second, it adds up
+)
+_G = 9.8  # m/s^2
+_DELAY = 0.02  # s, of a delay: 1 mm where speed is known to 5 cm/s
+_ROUNDS = 5
+_SPAN = 16  # stages that are smoothed back over at once
+_ALMOST = 0.3
+_LIMITS = {"rad": 1e-2, "s": _DELAY}
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """Some keyframes with all that the window knows: states, covariances, and the parameters there."""
+
+    t: Array  # (n,)
+    states: States
+    covariance: Array  # (n, 15, 15)
+    columns: tuple[Columns, ...]
+    values: tuple[Array, ...]  # (D-15,) each
+    sigma: tuple[Array, ...]  # (D-15,) each
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+@dataclass(frozen=True)
+class _Span:
+    """Some stages as one, smoothing back: y_first = F y_last + noise of covariance C. Indices count from the first."""
+
+    first: int
+    last: int
+    stage: Stage  # the last: when it has been replaced, so may have been those before it
+    F: Array
+    C: Array
+
+
+class Window:
+    """The newest keyframes of a drive.
+
+    Parameters
+    ----------
+    prior : message on the first keyframe before any measurement, from `first_message`.
+    turn : rad that an attitude may move before rows are linearised anew, from `turn_limit`.
+    """
+
+    def __init__(self, prior: Message, turn: float) -> None:
+        self.turn = turn
+        self.head = prior  # all that is known before the first stage
+        self.stages: list[Stage] = []
+        self.relinearized = 0  # stages made anew
+        self._limit = limits(prior.columns, {})
+        self._gone = 0  # stages that have left
+        self._spans: list[_Span] = []
+        self._means: list[Array] | None = None
+        self._revision: Revision | None = None
+        self._rounds = 0  # of it
+
+    def __len__(self) -> int:
+        return len(self.stages)
+
+    @property
+    def newest(self) -> Message:
+        """What is known of the newest keyframe: the live estimate is its point."""
+        return self.stages[-1].message if self.stages else self.head
+
+    @property
+    def t(self) -> Array:
+        """Times of the keyframes in the window, s."""
+        return np.array([stage.place.t for stage in self.stages])
+
+    def since(self, t: float) -> list[Stage]:
+        """The stages from a time on."""
+        first = len(self.stages)
+        while first and self.stages[first - 1].place.t >= t:
+            first -= 1
+        return self.stages[first:]
+
+    def expect(self, place: Place) -> Predicted:
+        """A keyframe, linearised at its prediction, with the rows of its problem that need not be waited for."""
+        state, values, columns, link = predicted(self.newest, place)
+        rows = measured(place, state, values, columns, late=False).measured
+        return predict(self.newest, place, link, rows, state, values, columns)
+
+    def push(self, place: Place, ahead: Predicted | None = None) -> float:
+        """Add a keyframe; returns by how much its measurements turned it, rad.
+
+        `ahead` is what was expected of it after the newest, if known already: only the rows that had to be waited for
+        are then made.
+        """
+        ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
+        columns = ahead.columns
+        stage, e = update(ahead, measured(place, ahead.state, ahead.values, columns, late=True).measured)
+        self.stages.append(stage.moved(e))
+        self._means = None
+        if columns != self._limit[0]:
+            assert place.problem is not None
+            self._limit = limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})
+        return float(np.linalg.norm(e[:3]))
+
+    def watch(self, tests: Watch) -> None:
+        """Have the fixes from the next keyframe on tested."""
+        if self.stages:
+            newest = self.stages[-1]
+            self.stages[-1] = replace(newest, message=replace(newest.message, tests=tests))
+        else:
+            self.head = replace(self.head, tests=tests)
+
+    def forget_tests(self) -> None:
+        """What the tests know of fixes before the window is not true any more."""
+        if self.head.tests is not None:
+            self.head = replace(self.head, tests=self.head.tests.forgetful())
+
+    def truncate(self, keep: int) -> None:
+        """Forget all but the first `keep` stages: something before what follows has changed."""
+        if keep >= len(self.stages):
+            return
+        del self.stages[keep:]
+        self._means = None
+        if self.stages:
+            self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
+        else:
+            self.head = self.head.moved(self.head.estimate)
+
+    def replace_from(self, first: int, before: Stage | Message, stages: Sequence[Stage]) -> None:
+        """Have other stages from one on, and what comes before them about another point."""
+        if isinstance(before, Stage):
+            tests = self.stages[first - 1].message.tests
+            self.stages[first - 1] = replace(before, message=replace(before.message, tests=tests))
+        else:
+            self.head = replace(before, tests=self.head.tests)
+        self.stages[first:] = stages
+        if stages:
+            self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
+        self._means = None
+        self.relinearized += len(stages)
+
+    def means(self) -> list[Array]:
+        """Smoothed error states, one of the message before the window and one of each stage."""
+        if self._means is None:
+            e = self.newest.estimate
+            out = [e]
+            for stage in reversed(self.stages):
+                e = stage.G @ e
+                e += stage.g
+                out.append(e)
+            self._means = out[::-1]
+        return self._means
+
+    def settle(self, count: int) -> Smoothed:
+        """Smooth the window and let its first `count` stages go."""
+        gone, means = self.stages[:count], self.means()[1 : count + 1]
+        self._revision, self._rounds = None, 0
+        columns = tuple(stage.message.columns for stage in gone)
+        rows, covariance, sigma = [], np.empty((len(gone), DIM, DIM)), []
+        for k, (stage, P) in enumerate(zip(gone, self._covariances(count), strict=True)):
+            rows.append(stage.message.state)
+            covariance[k] = P[:DIM, :DIM]
+            sigma.append(np.sqrt(np.maximum(np.diagonal(P)[DIM:], 0.0)))
+        values = tuple(stage.message.values + e[DIM:] for stage, e in zip(gone, means, strict=True))
+        states = self.head.state[:0]
+        if gone:
+            moved = np.array([e[:DIM] for e in means])
+            states, covariance = States.stack(rows).plus(moved), about_own(covariance, moved)
+            self.head = gone[-1].message
+            del self.stages[:count]
+            self._gone += count
+            self._means = None
+            if not self.stages:
+                self.head = self.head.moved(self.head.estimate)
+        return Smoothed(
+            t=np.array([stage.place.t for stage in gone]),
+            states=states,
+            covariance=covariance,
+            columns=columns,
+            values=values,
+            sigma=tuple(sigma),
+        )
+
+    def _covariances(self, count: int) -> list[Array]:
+        """(D, D) of the first `count` stages."""
+        out: list[Array] = []
+        P, at = self.newest.covariance, len(self.stages) - 1
+        for span in reversed(self._bridged(count)):
+            while at > span.last - self._gone:
+                P = self.stages[at].before(P)
+                at -= 1
+            P = span.F @ P @ span.F.T + span.C
+            at = span.first - self._gone
+        while at >= 0:
+            if at < count:
+                out.append(P)
+            if at:
+                P = self.stages[at].before(P)
+            at -= 1
+        return out[::-1]
+
+    def _bridged(self, count: int) -> list[_Span]:
+        """What leads from the newest stages back to the last of the first `count`, most of it as it was last time."""
+        first, newest = self._gone + count - 1, self._gone + len(self.stages) - 1
+        spans = [
+            span
+            for span in self._spans
+            if first <= span.first and span.last <= newest and self.stages[span.last - self._gone] is span.stage
+        ]
+        begin = spans[-1].last if spans else first
+        for k in range(begin, newest - _SPAN + 1, _SPAN):
+            run = self.stages[k - self._gone + 1 : k - self._gone + _SPAN + 1]
+            F, C = run[-1].G, run[-1].noise
+            for stage in run[-2::-1]:
+                F, C = stage.G @ F, stage.before(C)
+            spans.append(_Span(k, k + _SPAN, run[-1], F, C))
+        self._spans = spans
+        return spans
+
+    # ------------------------------------------------------------------------------------------ linearising again
+    def first_moved(self, share: float = 1.0) -> int | None:
+        """The first stage whose point is further than its limit from the smoothed state; None if there is none."""
+        means = self.means()[1:]
+        if not means:
+            return None
+        limit = self._limit[1]
+        e = np.zeros((len(means), max(len(x) for x in means)))
+        for row, x in zip(e, means, strict=True):
+            row[: len(x)] = x
+        far = np.einsum("ki,ki->k", e[:, :3], e[:, :3]) > (share * self.turn) ** 2
+        far |= np.any(np.abs(e[:, DIM:]) > share * limit[: e.shape[1] - DIM], axis=1)
+        return int(np.argmax(far)) if far.any() else None
+
+    def relinearize(self, first: int, places: Sequence[Place] | None = None) -> None:
+        """Make the stages from `first` on anew about the smoothed states.
+
+        `places` are where their rows come from, if not where they came from before; all of one problem.
+        """
+        Revision(self, first).step(len(self), None if places is None else lambda *_: places)
+
+    def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> int:
+        """Relinearise until nothing has moved; returns how often.
+
+        Parameters
+        ----------
+        share : of the usual limits.
+        always : once at least.
+        renewed : gives the places of stages, from an index to another, where they no longer know their rows.
+        """
+        for count in range(_ROUNDS):
+            first = 0 if always and not count else self.first_moved(share)
+            if first is None:
+                return count
+            # what has moved almost as far goes with it: it would be next
+            first = min(first, self.first_moved(_ALMOST * share) or 0) if first else 0
+            self.relinearize(first, None if renewed is None else renewed(first, len(self)))
+        return _ROUNDS
+
+    @property
+    def revising(self) -> bool:
+        """Whether `revise` is not through."""
+        return self._revision is not None or self._rounds > 0
+
+    def revise(self, count: int, renewed: Renewed, always: bool = False) -> bool:
+        """A part of what `converge` does, at most so many stages of it; False once there is nothing left to do.
+
+        Keyframes may come and go before the next part, and what has been made of them goes with them.
+        """
+        if self._revision is None:
+            first = 0 if always and not self._rounds else self.first_moved()
+            if first is None or self._rounds == _ROUNDS:
+                self._rounds = 0
+                return False
+            first = min(first, self.first_moved(_ALMOST) or 0) if first else 0
+            self._revision, self._rounds = Revision(self, first), self._rounds + 1
+        if self._revision.step(count, renewed):
+            self._revision = None
+        return True
+
+
+def turn_limit(noise: ImuNoise) -> float:
+    """How far an attitude may move (rad) before rows are linearised anew.
+
+    What is neglected of a turn a is a^2/2 of the force it turns: in a second a^2/2 g, against the noise.
+    """
+    return float(np.clip(np.sqrt(2.0 * _SHARE * noise.accel_noise_density / _G), 3e-4, 1e-2))
+
+
+def first_message(state: States, sigma: Array) -> Message:
+    """A prior: one state and its fifteen sigmas."""
+    return Message(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM))
+
+
+def limits(columns: Columns, units: dict[str, str]) -> tuple[Columns, Array]:
+    """How far each parameter may move before rows are linearised anew."""
+    limit = np.full(width(columns) - DIM, np.inf)
+    for name, at in columns.items():
+        limit[at.start - DIM : at.stop - DIM] = _LIMITS.get(units.get(name, ""), np.inf)
+    return columns, limit
+
+
+__all__ = ["Message", "Place", "Smoothed", "Window", "extended", "first_message"]

@@ -1,0 +1,1 @@
+"""Solutions against a truth, and against other programs."""

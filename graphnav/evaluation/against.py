@@ -1,0 +1,192 @@
+"""Another program's trajectory beside our solutions: on the recording's clock, on the Earth, at the IMU.
+
+A file counts its time from where it likes. It is put on the recording's clock by what is known of both (GPS week, Unix
+time, UTC), else by its own start; what the speeds then say of a shift is applied where it is more than a second (leap
+seconds, another start), and only said where it is less, for that is the other program's own error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import RecordingError
+from graphnav.core.interpolation import fit_yaw, interpolate, placed
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.core.timescales import LEAP, NEAR, between_clocks
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.solution import Solution
+from graphnav.evaluation.metrics import Metrics
+from graphnav.recording import Gnss, Recording
+from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks.clock import CLEAR
+from graphnav.recording.checks.crosschecks import Track
+from graphnav.recording.formats.trajectories import read_trajectory
+
+_MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
+_APPLIED = 1.0  # s; a larger shift is of the clock
+_FEWEST = 10  # rows in common
+
+
+@dataclass(frozen=True)
+class Against:
+    """A trajectory file to compare with: of which point it is, and s to add to its stamps (None: to be found)."""
+
+    path: Path
+    point: str | Array = "imu"  # "imu", "antenna", or a lever arm (3,) m, RFU
+    shift: float | None = None
+
+
+@dataclass(frozen=True)
+class Foreign(Solution):
+    """Another program's trajectory as if it were a solution: it has states and what sigmas it states, nothing else."""
+
+    track: Trajectory = field(default_factory=lambda: Trajectory(np.empty(0), np.empty((0, 3))))
+    borrowed: bool = False  # whether its attitude is ours, to place points of the body by, and no answer of its own
+
+    def trajectory(self, rate: float | None = None) -> Trajectory:
+        """At the keyframes of the solution beside it, or at `rate` (Hz)."""
+        t = self.t if rate is None else np.arange(self.track.t[0], self.track.t[-1], 1.0 / rate)
+        track = self.track_at(t)
+        return replace(track, rph=None, sd_rph=None) if self.borrowed else track
+
+    def track_at(self, t: Array) -> Trajectory:
+        """At those of some times (M,) that it can be interpolated to."""
+        return interpolate(self.track, t, max_gap=_MAX_GAP)[0]
+
+    def at(self, t: Array) -> tuple[Array, States, Array]:
+        """Times, states (NaN where unknown) and covariances (NaN) at those of some times that it knows."""
+        track = self.track_at(t)
+        return track.t, _states(self.frame, track), np.full((len(track), DIM, DIM), np.nan)
+
+
+def own(solutions: Mapping[str, Solution]) -> dict[str, Solution]:
+    """The solutions that are ours."""
+    return {name: s for name, s in solutions.items() if not isinstance(s, Foreign)}
+
+
+def antenna_lever_arm(recording: Recording, solution: Solution) -> Array | None:
+    """From the IMU to the antenna, m, RFU: as estimated, else as stated; None without GNSS."""
+    if recording.gnss is None:
+        return None
+    estimated = solution.parameters.get("gnss_lever_arm")
+    return recording.gnss.lever_arm if estimated is None else estimated.value[-1]
+
+
+def read_against(asked: Against, name: str, recording: Recording, reference: Solution) -> Foreign:
+    """Read a trajectory file and put it beside `reference`, a solution of `recording`.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read, shares no time with the recording, or its point is the antenna and there is no GNSS.
+    """
+    track = read_trajectory(asked.path)
+    notes = list(track.notes)
+    if asked.shift is not None:
+        track = replace(track, t=track.t + asked.shift)
+        notes.append(f"{asked.path.name}: {asked.shift:+g} s, as was asked")
+    else:
+        shift, words = _shift(asked.path, track, recording, reference)
+        track = replace(track, t=track.t + shift)
+        notes += words
+    inside = (track.t >= reference.t[0]) & (track.t <= reference.t[-1])
+    if inside.sum() < _FEWEST:
+        raise RecordingError(
+            f"{asked.path}: {int(inside.sum())} rows in common with '{recording.name}': its time runs from "
+            f"{track.t[0]:.3f} to {track.t[-1]:.3f} s, the recording's from {reference.t[0]:.3f} to "
+            f"{reference.t[-1]:.3f} s; --against-shift says what to add"
+        )
+    if track.frame == "local":
+        at = track.t[inside]
+        yaw, offset = fit_yaw(track.llh[inside], reference.at(at)[1].p)
+        track = placed(track, reference.frame, yaw, offset)
+        notes.append(f"{asked.path.name}: metres of a frame of its own, turned by {np.degrees(yaw):.1f} deg onto ours")
+    arm = asked.point
+    if isinstance(arm, str):
+        stated = antenna_lever_arm(recording, reference) if arm == "antenna" else np.zeros(3)
+        if stated is None:
+            raise RecordingError(f"{asked.path}: is to be of the antenna, and '{recording.name}' has no GNSS")
+        arm = stated
+    borrowed = track.rph is None
+    if borrowed:
+        track = _with_attitude(track, reference)
+        notes.append(f"{asked.path.name}: has no attitude; points of the body are placed by that of {reference.solver}")
+    if np.any(arm):
+        track = interpolate(track, track.t, max_gap=_MAX_GAP, lever_arm=-arm)[0]
+        said = ", ".join(f"{x:.2f}" for x in arm)
+        notes.append(f"{asked.path.name}: moved to the IMU from [{said}] m (right, forward, up)")
+    track = replace(track, name=name)
+    _, known = interpolate(track, reference.t, max_gap=_MAX_GAP)
+    t = reference.t[known]
+    states = _states(reference.frame, interpolate(track, t, max_gap=_MAX_GAP)[0])
+    unknown = np.full((len(t), DIM, DIM), np.nan)
+    return Foreign(name, reference.frame, t, states, unknown, notes=tuple(notes), track=track, borrowed=borrowed)
+
+
+def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solution) -> tuple[float, list[str]]:
+    """What to add to the stamps of a trajectory, s, and why."""
+    known = between_clocks(recording.start, recording.gps_zero, float(track.t[0]), None)
+    own_start = recording.start - float(track.t[0])
+    if track.t[-1] > recording.start and track.t[0] < recording.end:
+        shift, notes = 0.0, []
+    elif known is not None and abs(track.t[0] + known.offset - recording.start) < NEAR:
+        shift, notes = known.offset, [f"{path.name}: {known.offset:+.0f} s: {known.words}"]
+    elif abs(track.t[0]) < NEAR:
+        shift, notes = own_start, [f"{path.name}: {own_start:+.3f} s: it counts from a start of its own"]
+    else:
+        return 0.0, []  # said by the caller
+    late = _late(replace(track, t=track.t + shift), reference)
+    if late is None or abs(late) < 0.02:
+        return shift, notes
+    if abs(late) < _APPLIED and shift != own_start:
+        return shift, [*notes, f"{path.name}: its speed is {-late:+.3f} s late against ours: left as it is"]
+    leap = ""
+    if abs(abs(late) - LEAP) < 0.1:
+        late, leap = float(np.copysign(LEAP, late)), ": the leap seconds between UTC and GPS time"
+    return shift + late, [*notes, f"{path.name}: {late:+.3f} s more, by which its speed fits ours{leap}"]
+
+
+def _late(track: Trajectory, reference: Solution) -> float | None:
+    """How much later the same speeds are in `reference`, s; None where that is not clear."""
+    llh = track.llh if track.frame == "geodetic" else reference.frame.to_llh(np.nan_to_num(track.llh))
+    places = crosschecks.track(Gnss(track.t, llh, np.ones((len(track), 3))))
+    v = reference.states.v
+    ours = Track(reference.t, v, np.zeros(len(v)), float(np.median(np.diff(reference.t))))
+    fit = crosschecks.velocity_fit(ours, places) if places is not None else None
+    return fit.lag if fit is not None and fit.correlation > CLEAR else None
+
+
+def _with_attitude(track: Trajectory, reference: Solution) -> Trajectory:
+    """The part of a trajectory that a solution covers, with the attitude of that."""
+    inside = track.take((track.t >= reference.t[0]) & (track.t <= reference.t[-1]))
+    states = reference.at(inside.t)[1]
+    return replace(inside, rph=rotation.to_rph(reference.frame.R_ln(states.p) @ states.R_nb))
+
+
+def without_attitude(metrics: Metrics) -> Metrics:
+    """Measures of a trajectory whose attitude is borrowed: those of the attitude are none of its own."""
+    errors = metrics.errors
+    if errors is not None:
+        none = np.full_like(errors.rph, np.nan)
+        errors = replace(errors, rph=none, sd_rph=none, nees_rph=none[:, 0], nees_heading=None)
+    components = {name: one for name, one in metrics.components.items() if name not in ("roll", "pitch", "heading")}
+    nees = {name: one for name, one in metrics.nees.items() if name not in ("rph", "heading")}
+    return replace(metrics, components=components, nees=nees, errors=errors)
+
+
+def _states(frame: LocalFrame, track: Trajectory) -> States:
+    """A trajectory on the Earth as states in a navigation frame, NaN where it does not say."""
+    p = frame.from_llh(track.llh)
+    R_nl = np.swapaxes(frame.R_ln(p), -1, -2)
+    unknown = np.full(p.shape, np.nan)
+    R_lb = track.R_lb
+    R_nb = np.full((len(p), 3, 3), np.nan) if R_lb is None else R_nl @ R_lb
+    v = unknown if track.v is None else np.einsum("kij,kj->ki", R_nl, track.v)
+    return States(R_nb, p, v, unknown, unknown)

@@ -1,0 +1,219 @@
+"""Errors of a trajectory against a truth: at the truth's epochs, at the truth's point, in the truth's axes.
+
+`errors` compares, `measure` boils down, `summary` and `text` show; `evaluate` does it for two files and
+`evaluate_recording` for a solution of a recording, with or without a truth of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.core.timescales import GPS_TO_UNIX, LEAP
+from graphnav.core.trajectory import Trajectory
+from graphnav.evaluation.metrics import (
+    COMPONENTS,
+    Closure,
+    Errors,
+    Metrics,
+    Nees,
+    Span,
+    Statistic,
+    average_nees,
+    chi_square_band,
+    comparison_rows,
+    ensemble_nees,
+    measure,
+    summary,
+    text,
+    write_comparison_csv,
+)
+from graphnav.evaluation.scoring import MAX_GAP, closure, errors, ranges
+from graphnav.recording import Recording
+from graphnav.recording.formats.trajectories import WEEK, read_trajectory
+
+__all__ = [
+    "COMPONENTS", "Closure", "Errors", "Metrics", "Nees", "Span", "Statistic", "average_nees", "chi_square_band",
+    "closure", "comparison_rows", "ensemble_nees", "errors", "evaluate", "evaluate_recording", "measure", "summary",
+    "text", "truth_of", "withheld_truth", "write_comparison_csv",
+]  # fmt: skip
+
+
+def truth_of(recording: Recording) -> tuple[Trajectory, Array | None] | None:
+    """The recording's truth and the lever arm from the IMU to its point; None without one or for a closed loop.
+
+    Raises
+    ------
+    RecordingError
+        If the truth is of a sensor the recording lacks, so that its lever arm is unknown.
+    """
+    truth = recording.truth
+    if truth is None or (truth.llh is None and truth.xyz is None):
+        return None
+    lever_arm = None
+    if truth.of != "imu":
+        sensor = getattr(recording, truth.of, None)
+        if sensor is None:
+            raise RecordingError(
+                f"'{recording.name}': truth is of = \"{truth.of}\" but there is no [{truth.of}] to give its lever arm"
+            )
+        lever_arm = sensor.lever_arm
+    if truth.llh is not None:
+        return Trajectory(truth.t, truth.llh, v=truth.v, rph=truth.rph, name="truth"), lever_arm
+    assert truth.xyz is not None
+    xyz = np.full((len(truth.t), 3), np.nan)
+    xyz[:, : truth.xyz.shape[1]] = truth.xyz
+    return Trajectory(truth.t, xyz, v=truth.v, rph=truth.rph, frame="local", name="truth"), lever_arm
+
+
+def withheld_truth(
+    recording: Recording, source: str = "gnss", spans: Sequence[tuple[float, float] | None] = (None,)
+) -> tuple[Trajectory, Array]:
+    """The fixes withheld in `spans` (s from the start; None: all) as the truth of those spans, with their lever arm.
+
+    `recording` is the full one, before `Recording.without`. The fixes' own sigmas go with them, so that
+    the NEES knows the truth is not exact.
+
+    Raises
+    ------
+    RecordingError
+        If the source has no positions, or no fix falls into the spans.
+    """
+    if source != "gnss" or recording.gnss is None:
+        raise RecordingError(f"'{recording.name}': withheld '{source}' gives no positions to compare with")
+    gnss = recording.gnss
+    t = gnss.t - recording.start
+    mask = np.zeros(len(t), dtype=bool)
+    for span in spans:
+        mask |= np.ones_like(mask) if span is None else (t >= span[0]) & (t <= span[1])
+    mask &= np.isfinite(gnss.llh).all(axis=1)
+    if not mask.any():
+        raise RecordingError(f"'{recording.name}': no GNSS fix in the withheld spans to compare with")
+    truth = Trajectory(
+        gnss.t[mask], gnss.llh[mask], v=None if gnss.v is None else gnss.v[mask], sd_p=gnss.sd[mask],
+        sd_v=None if gnss.sd_v is None else gnss.sd_v[mask], name="withheld GNSS",
+        notes=("the truth is the withheld GNSS itself",),
+    )  # fmt: skip
+    return truth, gnss.lever_arm
+
+
+def evaluate_recording(
+    trajectory: Trajectory,
+    recording: Recording,
+    *,
+    withheld: Sequence[tuple[str, tuple[float, float] | None]] = (),
+    max_gap: float = MAX_GAP,
+    at: Array | None = None,
+) -> Metrics | None:
+    """Metrics of a solution of `recording` (the full one, nothing withheld) against the best truth there is.
+
+    That is the recording's own truth, or the end being the start, or the GNSS that was withheld; None if
+    there is none of these. `withheld` holds (source, span in s from the start or None) as given to
+    `Recording.without`; each span of GNSS is reported by itself. `at` is that of `errors`.
+    """
+    gnss_spans = [span for source, span in withheld if source == "gnss"]
+    spans = [span for span in gnss_spans if span is not None]
+    found = truth_of(recording)
+    if found is None and recording.truth is not None and recording.truth.closed_loop_sigma is not None:
+        sigma = recording.truth.closed_loop_sigma
+        note = f"the only truth is that the end is the start, to {sigma:g} m"
+        return Metrics(trajectory.name, closure=closure(trajectory), notes=(*trajectory.notes, note))
+    if found is None and gnss_spans and recording.gnss is not None:
+        found = withheld_truth(recording, "gnss", gnss_spans)
+    if found is None:
+        return None
+    truth, lever_arm = found
+    alone = recording.gnss is None
+    found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, at=at, from_start=alone)
+    return measure(found_errors, trajectory.name, spans, start=recording.start)
+
+
+def evaluate(
+    trajectory_path: str | Path,
+    truth_path: str | Path,
+    *,
+    lever_arm: Array | None = None,
+    spans: Sequence[tuple[float, float]] = (),
+    max_gap: float = MAX_GAP,
+) -> Metrics:
+    """Metrics of one file against another, each of any kind `read_trajectory` knows.
+
+    `truth_path` may also be a recording (a folder or a .toml), whose truth and lever arm are then used.
+    `spans` are in s on the files' clock.
+
+    Raises
+    ------
+    RecordingError
+        If a file cannot be read, or the two share no time; it then says by how much they may be shifted.
+    """
+    trajectory_path, truth_path = Path(trajectory_path), Path(truth_path)
+    trajectory = read_trajectory(trajectory_path)
+    alone = None
+    if truth_path.is_dir() or truth_path.suffix == ".toml":
+        from graphnav.recording import formats
+
+        recording = formats.read(truth_path)
+        found = truth_of(recording)
+        if found is None:
+            metrics = evaluate_recording(trajectory, recording)
+            if metrics is None:
+                raise RecordingError(f"{truth_path}: the recording has no [truth] to evaluate against")
+            return metrics
+        truth, arm = found
+        alone = recording.gnss is None
+        lever_arm = arm if lever_arm is None else lever_arm
+    else:
+        truth = read_trajectory(truth_path)
+    if trajectory.t[-1] < truth.t[0] or truth.t[-1] < trajectory.t[0]:
+        raise RecordingError(f"{trajectory_path}: {ranges(trajectory, truth)}{_shift_hint(trajectory, truth)}")
+    found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, from_start=alone)
+    hint = _leap_hint(found_errors, trajectory, truth, lever_arm, max_gap)
+    return measure(
+        replace(found_errors, notes=found_errors.notes + hint), trajectory.name or trajectory_path.stem, spans
+    )
+
+
+def _shift_hint(trajectory: Trajectory, truth: Trajectory) -> str:
+    """'; ...' naming a shift of clocks that would make the two overlap, when a usual one does."""
+    middle = 0.5 * (truth.t[0] + truth.t[-1] - trajectory.t[0] - trajectory.t[-1])
+    half = 0.5 * (truth.t[-1] - truth.t[0] + trajectory.t[-1] - trajectory.t[0])
+    unix = GPS_TO_UNIX - LEAP
+    usual = [
+        (LEAP, "one may be in UTC and the other in GPS time, 18 s ahead"),
+        (WEEK * round(middle / WEEK), "one may count GPS seconds of the week and the other continuously"),
+        (unix + WEEK * round((abs(middle) - unix) / WEEK), "one may be in Unix time and the other in GPS time"),
+        (86400.0 * round(middle / 86400.0), "one may count seconds of the day"),
+    ]
+    for shift, sentence in usual:
+        if shift and abs(abs(middle) - abs(shift)) < half:
+            return f"; {sentence} (shift by {np.copysign(shift, middle):+.0f} s)"
+    if min(abs(trajectory.t[0]), abs(truth.t[0])) < 1.0:
+        shift = truth.t[0] - trajectory.t[0]
+        return f"; one may count from its own start (shift by {shift:+.3f} s)"
+    return "; put both on one clock"
+
+
+def _leap_hint(
+    found: Errors, trajectory: Trajectory, truth: Trajectory, lever_arm: Array | None, max_gap: float
+) -> tuple[str, ...]:
+    """A note if 18 s of shift would explain most of the error: UTC taken for GPS time or the other way round."""
+    before = float(np.sqrt(np.nanmean(found.horizontal**2)))
+    if before < 1.0:
+        return ()
+    for shift in (LEAP, -LEAP):
+        try:
+            moved = errors(replace(trajectory, t=trajectory.t + shift), truth, lever_arm=lever_arm, max_gap=max_gap)
+        except RecordingError:
+            continue
+        after = float(np.sqrt(np.nanmean(moved.horizontal**2)))
+        if len(moved) > 0.5 * len(found) and after < 0.2 * before:
+            return (
+                f"shifted by {shift:+.0f} s the horizontal error would fall from {before:.2f} to {after:.2f} m rms: "
+                "one file may be in UTC and the other in GPS time",
+            )
+    return ()

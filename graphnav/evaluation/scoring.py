@@ -1,0 +1,270 @@
+"""Estimate minus truth, epoch by epoch; `graphnav.evaluation.evaluate` is the door to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame, enu_axes, llh_to_ecef
+from graphnav.core.errors import RecordingError
+from graphnav.core.interpolation import fit_yaw, full_covariance, interpolate, placed
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
+from graphnav.evaluation.fitted import after_fit
+from graphnav.evaluation.metrics import Closure, Errors
+
+MAX_GAP = 3.0  # s; the widest gap that is interpolated over
+_LARGER = 1.05  # times the stated sigma: worth saying
+_SLOW = 0.5  # m/s; slower than this a direction of travel means little
+
+
+def errors(
+    trajectory: Trajectory,
+    truth: Trajectory,
+    *,
+    lever_arm: Array | None = None,
+    max_gap: float = MAX_GAP,
+    at: Array | None = None,
+    from_start: bool | None = None,
+) -> Errors:
+    """Estimate minus truth at every epoch of the sparser of the two that the other can be interpolated to.
+
+    So the attitude of one-second keyframes, which no interpolation follows through a turn, is compared
+    at the keyframes when the truth has ten rows a second, and a dense estimate at the truth's epochs.
+
+    Parameters
+    ----------
+    trajectory, truth
+        Either may be in a local frame; the yaw and offset that fit best are then found first. A local
+        truth without height (NaN) is compared in two dimensions.
+    lever_arm
+        (3,) m, RFU: from the estimate's point to the truth's.
+    max_gap
+        s; the estimate is not interpolated over wider gaps.
+    at
+        (M,) s; compare at these times only, where the estimate has rows and is not interpolated at all.
+    from_start
+        Whether the estimate's covariance counts from its own start, as without any fix; a fit then changes it
+        (`graphnav.evaluation.fitted`). Unless told: of an estimate in a local frame.
+
+    Raises
+    ------
+    RecordingError
+        If no epoch is shared, or a local frame cannot be fitted because nothing moves.
+    """
+    notes = [*trajectory.notes, *truth.notes]
+    if lever_arm is not None and not np.any(lever_arm):
+        lever_arm = None
+    if lever_arm is not None and trajectory.rph is None:
+        arm = float(np.linalg.norm(lever_arm))
+        notes.append(f"the estimate has no attitude, so the lever arm of {arm:.2f} m to the truth's point is left out")
+    elif lever_arm is not None and trajectory.covariance is None and trajectory.sd_rph is None:
+        notes.append("the estimate has no attitude sigma, so the lever arm adds nothing to its position sigma")
+    if trajectory.covariance is None and trajectory.sd_p is not None:
+        notes.append("NEES from the sigmas alone: the estimate comes without correlations between axes")
+    flat = truth.frame == "local" and bool(np.isnan(truth.llh[:, 2]).all())
+    fitted = "local" in (trajectory.frame, truth.frame)
+    from_start = fitted and (trajectory.frame == "local" if from_start is None else from_start)
+    if trajectory.frame == "local" or truth.frame == "local":
+        trajectory, truth = _fitted(trajectory, truth, lever_arm, max_gap, at, notes)
+    estimate, seen, travel, epochs = _paired(trajectory, truth, lever_arm, max_gap, at)
+    if _spacing(truth) < _spacing(trajectory) if at is None else _apart(seen.t, truth.t):
+        notes.append("compared at the estimate's own epochs, to which the denser truth is interpolated")
+
+    R_le = enu_axes(seen.llh)
+    p = np.einsum("kij,kj->ki", R_le, llh_to_ecef(estimate.llh) - llh_to_ecef(seen.llh))
+    if flat:
+        p[:, 2] = np.nan
+    missing = np.full((len(seen), 3), np.nan)
+    v = missing if estimate.v is None or seen.v is None else estimate.v - seen.v
+    rph, theta = missing, missing
+    if estimate.rph is not None and seen.rph is not None:
+        rph = rotation.wrap(estimate.rph - seen.rph)
+        # Through the rotation, not the angles: these are far from linear where a foot points down.
+        theta = rotation.log(np.swapaxes(rotation.from_rph(estimate.rph), -1, -2) @ rotation.from_rph(seen.rph))
+
+    cov = full_covariance(estimate)
+    cov = np.full((len(seen), 9, 9), np.nan) if cov is None else cov
+    if from_start:
+        cov = _of_the_rest(cov, estimate, notes)
+    of_truth = full_covariance(replace(seen, covariance=None))
+    if of_truth is not None:
+        cov = cov + np.nan_to_num(of_truth)
+    dof = 2 if flat else 3
+    nees_rph = missing[:, 0]
+    if estimate.rph is not None:
+        to_theta = np.linalg.inv(rotation.rph_jacobian(estimate.rph))
+        nees_rph = _nees(theta, to_theta @ cov[:, 6:9, 6:9] @ np.swapaxes(to_theta, -1, -2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        per_axis = p**2 / np.diagonal(cov, axis1=-2, axis2=-1)[:, :3]
+    if truth.v is None:
+        notes.append("the truth has no velocity: its direction of travel is taken from its positions")
+    speed = np.linalg.norm(travel, axis=1)
+    moving = speed > _SLOW
+    along = np.where(moving[:, None], travel / np.where(moving, speed, 1.0)[:, None], np.nan)
+    return Errors(
+        t=seen.t,
+        p=p,
+        track=np.column_stack(
+            [p[:, 0] * along[:, 0] + p[:, 1] * along[:, 1], p[:, 0] * along[:, 1] - p[:, 1] * along[:, 0]]
+        ),
+        v=v,
+        rph=rph,
+        sd_p=missing if estimate.sd_p is None else estimate.sd_p,
+        sd_v=missing if estimate.sd_v is None else estimate.sd_v,
+        sd_rph=missing if estimate.sd_rph is None else estimate.sd_rph,
+        nees_p=_nees(p[:, :dof], cov[:, :dof, :dof]),
+        nees_axis=np.where(np.isfinite(per_axis), per_axis, np.nan),
+        nees_v=_nees(v, cov[:, 3:6, 3:6]),
+        nees_rph=nees_rph,
+        distance=travelled(seen.t, seen.llh),
+        dof_p=dof,
+        epochs=epochs,
+        notes=tuple(dict.fromkeys(notes)),
+        nees_heading=_nees(rph[:, 2:], cov[:, 8:, 8:]),
+    )
+
+
+def closure(trajectory: Trajectory) -> Closure:
+    """How far the last row is from the first, for a loop that ends where it began."""
+    p = trajectory.llh if trajectory.frame == "local" else LocalFrame(trajectory.llh[0]).from_llh(trajectory.llh)
+    gap, length = p[-1] - p[0], float(np.sum(np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1)))
+    h = float(np.hypot(gap[0], gap[1]))
+    return Closure(h, float(gap[2]), length, 100.0 * h / length if length > 0 else float("nan"))
+
+
+def travelled(t: Array, llh: Array) -> Array:
+    """Horizontal distance (N,) m since the first of the points (N, 3), along points half a second apart.
+
+    Summed over every point, the noise of a standing receiver would count as travel.
+    """
+    _, first = np.unique(np.floor((t - t[0]) / 0.5), return_index=True)
+    knots = np.unique(np.append(first, len(t) - 1))
+    p = LocalFrame(llh[0]).from_llh(llh[knots])
+    # Chords in the plane at the first point; the drop of the Earth's surface below it is no travel.
+    steps = np.linalg.norm(np.diff(p, axis=0), axis=1) ** 2 - np.diff(llh[knots, 2]) ** 2
+    return np.interp(t, t[knots], np.concatenate([[0.0], np.cumsum(np.sqrt(np.maximum(steps, 0.0)))]))
+
+
+def _fitted(
+    trajectory: Trajectory,
+    truth: Trajectory,
+    lever_arm: Array | None,
+    max_gap: float,
+    at: Array | None,
+    notes: list[str],
+) -> tuple[Trajectory, Trajectory]:
+    """Both on the Earth, the local one turned and moved onto the other (the truth onto the estimate if both are)."""
+    if trajectory.frame == truth.frame:
+        # Neither knows where it is: anywhere will do, and lengths stay what they are.
+        trajectory = placed(trajectory, LocalFrame(np.zeros(3)), 0.0, np.zeros(3))
+    estimate, seen, _, _ = _paired(trajectory, truth, lever_arm, max_gap, at)
+    mine, theirs = estimate.llh, seen.llh
+    frame = LocalFrame(mine[0] if trajectory.frame == "geodetic" else theirs[0])
+    truth_is_local = truth.frame == "local"
+    source, target = (theirs, frame.from_llh(mine)) if truth_is_local else (mine, frame.from_llh(theirs))
+    spread = np.sqrt(np.mean(np.sum((source[:, :2] - source[:, :2].mean(0)) ** 2, axis=1)))
+    if spread < 0.1:
+        raise RecordingError(
+            f"the {len(source)} shared epochs spread over {spread:.3f} m only: too little to fit a yaw"
+        )
+    yaw, offset = fit_yaw(source, target)
+    notes.append(
+        f"{'truth' if truth_is_local else 'estimate'} in a local frame: fitted by {np.rad2deg(yaw):.2f} deg of yaw and "
+        f"an offset over {len(source)} epochs before scoring"
+    )
+    if truth_is_local:
+        if np.isnan(offset[2]):
+            level = np.where(np.isnan(truth.llh), target[:, 2].mean(), truth.llh)
+            truth = replace(truth, llh=np.column_stack([truth.llh[:, :2], level[:, 2]]))
+            offset[2] = 0.0
+        return trajectory, placed(truth, frame, yaw, offset)
+    return placed(trajectory, frame, yaw, offset), truth
+
+
+def _of_the_rest(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
+    """The covariance (N, 9, 9) of what a fit leaves of errors that count from the estimate's own start."""
+    if not np.isfinite(cov).all():
+        notes.append("NEES leaves the fit out of account: there is no covariance of place and heading at every epoch")
+        return cov
+    rest, larger = after_fit(cov, LocalFrame(estimate.llh[0]).from_llh(estimate.llh), estimate.v)
+    by = f", which takes sigmas {larger:.2f} times as large as stated" if larger > _LARGER else ""
+    notes.append(f"NEES is of what the fit leaves, errors of place and heading taken to last as in dead reckoning{by}")
+    return rest
+
+
+def _paired(
+    trajectory: Trajectory, truth: Trajectory, lever_arm: Array | None, max_gap: float, at: Array | None
+) -> tuple[Trajectory, Trajectory, Array, int]:
+    """Estimate and truth at the epochs they share, the truth's horizontal velocity there (N, 2), and of how many."""
+    moving = truth if truth.v is not None else replace(truth, v=_derived_velocity(truth, max_gap))
+    if at is not None:
+        seen, _ = interpolate(moving, at[np.isin(at, trajectory.t)], max_gap=max_gap)
+        epochs = len(at)
+    elif _spacing(truth) < _spacing(trajectory):
+        seen, _ = interpolate(moving, trajectory.t, max_gap=max_gap)
+        epochs = len(trajectory)
+    else:
+        seen, epochs = moving, len(truth)
+    estimate, reached = interpolate(trajectory, seen.t, max_gap=max_gap, lever_arm=lever_arm)
+    if not reached.any():
+        raise RecordingError(_nothing_shared(trajectory, truth, max_gap))
+    seen = seen.take(reached)
+    assert seen.v is not None
+    return estimate, seen if truth.v is not None else replace(seen, v=None), seen.v[:, :2], epochs
+
+
+def _spacing(trajectory: Trajectory) -> float:
+    """Usual time between rows, s, to 0.1 ms so that rounding decides nothing; infinite for one row."""
+    return float(np.round(np.median(np.diff(trajectory.t)), 4)) if len(trajectory) > 1 else np.inf
+
+
+def _apart(t: Array, rows: Array) -> bool:
+    """Whether some of the times are no row's, to 0.1 ms."""
+    k = np.clip(np.searchsorted(rows, t), 1, len(rows) - 1) if len(rows) > 1 else np.zeros(len(t), dtype=int)
+    return bool((np.minimum(np.abs(t - rows[k]), np.abs(t - rows[k - 1])) > 1e-4).any())
+
+
+def _derived_velocity(truth: Trajectory, max_gap: float) -> Array:
+    """Velocity (N, 3) from positions by central differences, NaN beside a gap."""
+    if len(truth) < 3:
+        return np.full((len(truth), 3), np.nan)
+    p = truth.llh if truth.frame == "local" else LocalFrame(truth.llh[0]).from_llh(truth.llh)
+    v = np.asarray(np.gradient(p, truth.t, axis=0))
+    gap = np.diff(truth.t) > max_gap
+    v[np.concatenate([[False], gap]) | np.concatenate([gap, [False]])] = np.nan
+    return v
+
+
+def _nees(e: Array, cov: Array) -> Array:
+    """e' P^-1 e for each row; NaN where something is missing or P is not positive definite."""
+    out = np.full(len(e), np.nan)
+    rows = np.flatnonzero(np.isfinite(e).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)))
+    diagonal = np.diagonal(cov[rows], axis1=-2, axis2=-1)
+    rows = rows[(diagonal > 0).all(axis=1)]
+    # Scaled to unit diagonal, so that the test for singularity knows no units.
+    sd = np.sqrt(np.diagonal(cov[rows], axis1=-2, axis2=-1))
+    unit = cov[rows] / (sd[:, :, None] * sd[:, None, :])
+    good = np.linalg.eigvalsh(unit)[:, 0] > 1e-12 if len(rows) else np.zeros(0, dtype=bool)
+    rows, unit, w = rows[good], unit[good], (e[rows] / sd)[good]
+    out[rows] = np.sum(w * np.linalg.solve(unit, w[..., None])[..., 0], axis=1)
+    return out
+
+
+def _nothing_shared(trajectory: Trajectory, truth: Trajectory, max_gap: float) -> str:
+    name = trajectory.name or "the trajectory"
+    if trajectory.t[-1] < truth.t[0] or truth.t[-1] < trajectory.t[0]:
+        return f"{name}: {ranges(trajectory, truth)}"
+    return (
+        f"{name}: nothing to compare; no row of the sparser file lies between two rows of the other at most "
+        f"{max_gap:g} s apart"
+    )
+
+
+def ranges(trajectory: Trajectory, truth: Trajectory) -> str:
+    return (
+        f"its times {trajectory.t[0]:.3f} to {trajectory.t[-1]:.3f} s do not overlap the truth's "
+        f"{truth.t[0]:.3f} to {truth.t[-1]:.3f} s"
+    )

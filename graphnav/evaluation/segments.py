@@ -1,0 +1,70 @@
+"""Relative errors: how far the displacement over a segment of the way is off, by the segment's length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.evaluation.metrics import Errors
+
+_FEWEST = 10  # segments
+_STEPS = (1.0, 2.0, 5.0)
+
+
+@dataclass(frozen=True)
+class Relative:
+    """Of all segments of one length. A start that is off, and an error that stays, are in none of it."""
+
+    length: float  # m, horizontal
+    count: int
+    rms: float  # m, of the horizontal error of the displacement
+    p95: float  # m
+    largest: float  # m
+    heading_rms: float  # deg, of the error of the change of heading; NaN where unknown
+
+    @property
+    def percent(self) -> float:
+        """Rms over the length, %."""
+        return 100.0 * self.rms / self.length
+
+
+def relative_errors(errors: Errors) -> tuple[Relative, ...]:
+    """Relative errors of segments of 10, 20, 50, 100 ... m that begin at every scored epoch.
+
+    The displacement is compared in east and north, so that a heading which is off counts by what it makes of the
+    position. Lengths of which there are fewer than ten segments that do not overlap are left out; for more than that
+    the whole way is too short. The idea is that of the relative pose error (Sturm et al., "A benchmark for the
+    evaluation of RGB-D SLAM systems", 2012) and of KITTI's odometry benchmark (Geiger et al., 2012).
+    """
+    known = np.isfinite(errors.horizontal) & np.isfinite(errors.distance)
+    if known.sum() < 2:
+        return ()
+    way, e, heading = errors.distance[known], errors.p[known, :2], errors.rph[known, 2]
+    out = []
+    for length in (step * 10.0**k for k in range(1, 6) for step in _STEPS):
+        if (way[-1] - way[0]) / length < _FEWEST:
+            break
+        first, last = _segments(way, length)
+        if len(first) >= _FEWEST:
+            off = np.hypot(*(e[last] - e[first]).T)
+            turned = np.degrees(np.angle(np.exp(1j * (heading[last] - heading[first]))))
+            p95, largest = np.quantile(off, 0.95), off.max()
+            out.append(Relative(length, len(first), rms(off), float(p95), float(largest), rms(turned)))
+    return tuple(out)
+
+
+def _segments(way: Array, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """First and last rows of segments as long as that to a tenth."""
+    last = np.searchsorted(way, way + length)
+    first = np.flatnonzero(last < len(way))
+    first = first[way[last[first]] - way[first] <= 1.1 * length]
+    first = first[np.diff(way[first], prepend=-np.inf) > 0.0]  # a standing vehicle begins one segment
+    return first, last[first]
+
+
+def rms(x: Array) -> float:
+    """Root mean square of what is finite."""
+    x = x[np.isfinite(x)]
+    return float(np.sqrt(np.mean(x * x))) if len(x) else float("nan")

@@ -1,0 +1,116 @@
+"""Files as bytes, unpacked, compress (.Z) and compressed RINEX (.crx, .21d) by hatanaka; their columns and dates."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core import files
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+
+_FIRST, _LAST = np.array([1980, 1, 1, 0, 0, 0.0]), np.array([2099, 12, 31, 24, 59, 61.0])  # of GPS; a leap second
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a file, whatever it is packed with.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read or unpacked, or is empty.
+    """
+    data = files.read_bytes(path, text=False)
+    if data[:2] in (b"\x1f\x9d", b"PK", b"BZ") or b"COMPACT RINEX FORMAT" in data[:200]:
+        try:
+            hatanaka = importlib.import_module("hatanaka")
+        except ImportError:
+            raise RecordingError(
+                f"{path}: compressed RINEX needs the package hatanaka: pip install -e '.[raw]' in the clone"
+            ) from None
+        try:
+            data = hatanaka.decompress(data)
+        except Exception as error:  # its own kinds, and those of the packers it calls
+            raise RecordingError(f"{path}: cannot be unpacked ({str(error)[:80]})") from None
+        files.check_size(path, len(data))
+    if not data.strip():
+        raise RecordingError(f"{path}: is empty")
+    return data
+
+
+class Lines:
+    """Text as an array of bytes, with where its lines begin and how long they are."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = np.frombuffer(data, dtype=np.uint8)
+        ends = np.flatnonzero(self.data == 10)
+        if not len(ends) or ends[-1] != len(data) - 1:
+            ends = np.append(ends, len(data))
+        self.start = np.concatenate([[0], ends[:-1] + 1])
+        last = self.data[np.maximum(ends - 1, 0)]
+        self.length = np.maximum(ends - self.start - (last == 13), 0)
+        self.whole = bool(data.endswith(b"\n"))  # the last line is not cut
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def text(self, k: int) -> str:
+        """Line k."""
+        return bytes(self.data[self.start[k] : self.start[k] + self.length[k]]).decode("latin-1")
+
+    def first(self) -> NDArray[np.uint8]:
+        """(L,) the first byte of each line, 0 of an empty one."""
+        at = np.minimum(self.start, len(self.data) - 1)
+        return np.where(self.length > 0, self.data[at], 0).astype(np.uint8)
+
+    def block(self, which: NDArray[np.intp], begin: int, end: int) -> NDArray[np.uint8]:
+        """(n, end - begin) bytes from column `begin` on of some lines, blanks where a line is shorter."""
+        column = np.arange(begin, end)
+        at = np.minimum(self.start[which][:, None] + column, len(self.data) - 1)
+        return np.where(column < self.length[which][:, None], self.data[at], 32).astype(np.uint8)
+
+
+def moved(block: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(n, m) whether the decimal point of a field (n, m, width) stands elsewhere than in most of its column.
+
+    In a line that has lost a character or has one more, fields are parts of two numbers.
+    """
+    there = block == ord(".")
+    at, told = there.argmax(axis=-1), there.any(axis=-1)
+    usual = np.array([np.bincount(x[y]).argmax() if y.any() else 0 for x, y in zip(at.T, told.T, strict=True)])
+    return np.asarray(told & (at != usual))
+
+
+def numbers(block: NDArray[np.uint8], width: int) -> Array:
+    """(n, m) numbers of n rows of m fields of `width` bytes each; NaN for blanks.
+
+    Raises
+    ------
+    ValueError
+        If a field is no number.
+    """
+    n, total = block.shape
+    if (block == ord("_")).any():  # which Python reads over
+        raise ValueError
+    cells = np.ascontiguousarray(block).view(f"S{width}").reshape(n, total // width)
+    blank = np.all(block.reshape(n, -1, width) == 32, axis=-1)
+    out = np.full(cells.shape, np.nan)
+    if not blank.all():
+        out[~blank] = cells[~blank].astype(float)
+        if not np.isfinite(out[~blank]).all():
+            raise ValueError
+    return out
+
+
+def calendar_days(fields: Array) -> tuple[NDArray[np.datetime64], NDArray[np.bool_]]:
+    """(n,) days of dates (n, 6), year to second, and which of them are dates that a receiver may have had."""
+    with np.errstate(invalid="ignore"):
+        good = np.all((fields >= _FIRST) & (fields <= _LAST), axis=1)
+        good &= np.all(fields[:, :5] == np.floor(fields[:, :5]), axis=1)
+    year, month, day = np.where(good[:, None], fields, _FIRST).astype(int).T[:3]
+    months = (year - 1970).astype("datetime64[Y]").astype("datetime64[M]") + (month - 1)
+    days = months.astype("datetime64[D]") + (day - 1)
+    return days, good & (days.astype("datetime64[M]") == months)

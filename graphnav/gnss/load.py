@@ -1,0 +1,213 @@
+"""A rover's files to its series, with times, places and clocks of its own single-point solutions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.gnss.differential import with_differences
+from graphnav.gnss.ephemeris import Ephemerides
+from graphnav.gnss.files import read_bytes
+from graphnav.gnss.placing import Corrected, place, with_own_stamps
+from graphnav.gnss.precise import Orbits, read_precise
+from graphnav.gnss.rinex_nav import read_navigation
+from graphnav.gnss.rinex_obs import parse_observations
+from graphnav.gnss.series import Observations, RawGnss, joined, primary
+from graphnav.gnss.signals import C
+from graphnav.gnss.single_point import SinglePoint, solve
+from graphnav.gnss.ubx import is_ubx, parse_ubx
+
+_FEW = 50  # epochs that a rough place is looked for in
+_BASE_OFF = 100.0  # m from its stated position that a base's single-point position may be
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The files that a series is made of."""
+
+    rover: tuple[Path, ...]
+    nav: tuple[Path, ...] = ()
+    sp3: tuple[Path, ...] = ()
+    clk: tuple[Path, ...] = ()
+    base: tuple[Path, ...] = ()
+    base_position: tuple[float, float, float] | None = None  # m in e; that of the file's header when None
+    corrected: Corrected = field(default_factory=Corrected)
+    nominal_stamps: bool = False
+    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All of them."""
+        return (*self.rover, *self.nav, *self.sp3, *self.clk, *self.base)
+
+
+def read_rover(paths: tuple[Path, ...]) -> tuple[Observations, Ephemerides | None]:
+    """The observations of RINEX or UBX files of one receiver, and the ephemerides that UBX files hold.
+
+    Raises
+    ------
+    RecordingError
+        If a file is neither, or cannot be read.
+    """
+    parts, sent = [], None
+    for path in paths:
+        data = read_bytes(path)
+        if is_ubx(data):
+            obs, found = parse_ubx(data, path)
+            sent = found if sent is None else sent.with_more(found)
+        else:
+            obs = parse_observations(data, path)
+        parts.append(obs)
+    return joined(parts), sent
+
+
+def load_raw(
+    sources: Sources, zero: float | None = None, observations: Observations | None = None
+) -> tuple[RawGnss, SinglePoint, tuple[str, ...]]:
+    """The series on a clock with a zero (s since the GPS epoch), its single-point solutions, and remarks.
+
+    Parameters
+    ----------
+    zero : that of the observations when None.
+    observations : of the rover, where they are read already.
+
+    Raises
+    ------
+    RecordingError
+        If a file cannot be used, or the observations determine no position.
+    """
+    obs, sent = read_rover(sources.rover) if observations is None else (observations, None)
+    nav = read_navigation(list(sources.nav)) if sources.nav else None
+    if sent is not None and sent.satellites:
+        nav = sent if nav is None else nav.with_more(sent)
+    precise = read_precise(list(sources.sp3), list(sources.clk)) if sources.sp3 else None
+    if nav is None and precise is None:
+        raise RecordingError(f"{sources.rover[0]}: holds no ephemerides; say nav or sp3 in [raw_gnss]")
+    _same_time(obs, nav, precise, sources)
+    if zero is not None:
+        obs = obs.on_clock(zero)
+    rover, corrected = _rough_place(obs, nav, precise, sources.corrected), sources.corrected
+    if sources.nominal_stamps:
+        obs = with_own_stamps(obs, precise or nav, rover, corrected)  # type: ignore[arg-type]
+    raw, remarks = place(obs, nav, precise, rover, corrected)
+    raw = replace(raw, lever_arm=np.array(sources.lever_arm))
+    one = primary(raw) & np.isfinite(raw.p[:, 0])
+    if not one.any():
+        raise RecordingError(f"{sources.rover[0]}: none of its satellites has an ephemeris at its times")
+    fixes = solve(raw.take(one))
+    if not np.isfinite(fixes.p[:, 0]).any():
+        raise RecordingError(f"{sources.rover[0]}: no epoch has enough satellites for a position")
+    said = [*obs.remarks, *remarks]
+    if raw.klobuchar is None:
+        said.append(
+            "no ionosphere coefficients in the navigation files: the delay of the night is assumed (5 ns at the zenith)"
+        )
+    raw, fixes = _at_true_times(raw, fixes)
+    if sources.base:
+        raw, more = _difference(raw, sources, nav, precise)
+        said += more
+        one = primary(raw) & np.isfinite(raw.difference)
+        if one.any():
+            better = raw.take(one)
+            fixes = solve(replace(better, code=better.code + better.difference))
+    return raw, fixes, tuple(said)
+
+
+def _difference(
+    raw: RawGnss, sources: Sources, nav: Ephemerides | None, precise: Orbits | None
+) -> tuple[RawGnss, list[str]]:
+    """The series with differences by the base station, and remarks."""
+    obs = read_rover(sources.base)[0].on_clock(raw.zero)
+    given = sources.base_position
+    position = obs.marker if given is None else np.array(given)
+    if position is None:
+        raise RecordingError(f"{sources.base[0]}: states no position; say base_position in [raw_gnss]")
+    apart = max(obs.t[0] - raw.t[-1], raw.t[0] - obs.t[-1])
+    if apart > 0.0:
+        raise RecordingError(
+            f"{sources.base[0]}: the base's observations are {apart / 3600.0:.1f} h away from those of the rover; "
+            "it must be of the same time"
+        )
+    away = float(np.linalg.norm(np.median(raw.antenna, axis=0) - position))
+    base, _ = place(obs, nav, precise, position)
+    base_fixes = solve(base.take(primary(base) & np.isfinite(base.p[:, 0])))
+    said = list(obs.remarks)
+    off = np.nanmedian(np.linalg.norm(base_fixes.p - position, axis=1))
+    if not off < _BASE_OFF:
+        raise RecordingError(
+            f"{sources.base[0]}: its observations put the base {off:.0f} m from its stated position; see base_position"
+        )
+    if given is None:
+        said.append(f"the base's position is that of its header, {off:.1f} m from its own single-point positions")
+    base, _ = _at_true_times(base, base_fixes)
+    raw, more = with_differences(raw, base, position)
+    said += [f"codes are differences against a base {away / 1e3:.1f} km away", *more]
+    return raw, said
+
+
+def _same_time(obs: Observations, nav: Ephemerides | None, precise: Orbits | None, sources: Sources) -> None:
+    """Whether observations and ephemerides are of the same days.
+
+    Raises
+    ------
+    RecordingError
+        If they are not.
+    """
+    begin, end = float(obs.t[0]) + obs.zero, float(obs.t[-1]) + obs.zero
+    for file, times in (
+        (sources.nav, [] if nav is None else [*nav.kepler["toe"], *nav.glonass["toe"]]),
+        (sources.sp3, [] if precise is None else [x for t, _ in precise.orbit.values() for x in t[[0, -1]]]),
+    ):
+        if not len(times):
+            continue
+        low, high = float(np.min(times)), float(np.max(times))
+        apart = max(low - end, begin - high)
+        if apart > 6.0 * 3600.0:
+            raise RecordingError(
+                f"{file[0]}: its ephemerides are {apart / 86400.0:.1f} days from the observations of "
+                f"{sources.rover[0].name}; it must be of the same day"
+            )
+
+
+def _rough_place(obs: Observations, nav: Ephemerides | None, precise: Orbits | None, corrected: Corrected) -> Array:
+    """(3,) within kilometres of the rover: by the codes of a few epochs."""
+    epochs = np.unique(obs.t)
+    few = obs.take(np.isin(obs.t, epochs[:: max(1, len(epochs) // _FEW)]))
+    start = np.zeros(3) if obs.marker is None else obs.marker
+    raw, _ = place(few, nav, precise, start, corrected)
+    raw = raw.take(primary(raw) & np.isfinite(raw.p[:, 0]))
+    if not len(raw):
+        return start
+    if obs.marker is None:  # under its satellites
+        middle = raw.p.mean(axis=0)
+        raw = replace(raw, place=tuple(6.37e6 * middle / np.linalg.norm(middle)))
+    places = solve(raw, mask=-np.pi).p
+    found = np.nanmedian(places, axis=0) if np.isfinite(places).any() else start
+    return np.asarray(found)
+
+
+def _at_true_times(raw: RawGnss, fixes: SinglePoint) -> tuple[RawGnss, SinglePoint]:
+    """Both at the times at which the antenna was there: the receiver's stamps less its clock error."""
+    epochs, of = raw.epochs
+    clock = _nearest(epochs, fixes.t, fixes.clock)  # not between two: a receiver's clock jumps by whole milliseconds
+    drift = _nearest(epochs, fixes.t, fixes.drift) if np.isfinite(fixes.drift).any() else np.zeros(len(epochs))
+    true = epochs - clock / C
+    fixes = replace(fixes, t=true[np.searchsorted(epochs, fixes.t)])
+    good = np.isfinite(fixes.p[:, 0])
+    antenna = np.stack([np.interp(true, fixes.t[good], fixes.p[good, i]) for i in range(3)], -1)
+    order: NDArray[np.intp] = np.argsort(true[of], kind="stable")
+    raw = replace(raw, t=true[of], antenna=antenna[of], receiver_clock=np.stack([clock, drift], -1)[of])
+    return raw.take(order), fixes
+
+
+def _nearest(t: Array, known: Array, value: Array) -> Array:
+    """(N,) at times t what is known at the nearest time."""
+    known, value = known[np.isfinite(value)], value[np.isfinite(value)]
+    right = np.clip(np.searchsorted(known, t), 0, len(known) - 1)
+    left = np.maximum(right - 1, 0)
+    return np.asarray(np.where(np.abs(known[left] - t) < np.abs(known[right] - t), value[left], value[right]))

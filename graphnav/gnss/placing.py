@@ -1,0 +1,100 @@
+"""From observations to a rover's series with satellites placed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.gnss.ephemeris import Ephemerides, Placed, turned
+from graphnav.gnss.precise import Orbits
+from graphnav.gnss.series import Observations, RawGnss, median_of_epochs
+from graphnav.gnss.signals import C, satellite_name
+
+_FLIGHT = 0.075  # s, of a signal from a satellite of medium height
+_TICK = 1e-3  # s, to which receivers keep their clocks
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """What is already taken off the codes of a file."""
+
+    clock: bool = False  # of the satellites, with their group delays
+    troposphere: bool = False
+
+
+def place(
+    obs: Observations,
+    nav: Ephemerides | None,
+    precise: Orbits | None,
+    rover: Array,
+    corrected: Corrected = Corrected(),
+) -> tuple[RawGnss, tuple[str, ...]]:
+    """The series with satellites placed, and remarks about those that cannot be.
+
+    Parameters
+    ----------
+    obs : on the clock wanted, stamps the receiver's own.
+    nav : broadcast ephemerides; with `precise` only for group delays and ionosphere.
+    rover : (3,) m in e, within kilometres of the rover.
+    """
+    if nav is not None and nav.channels:
+        obs = replace(obs, channels={**nav.channels, **obs.channels})
+    frequency = obs.frequency
+    # one time of transmission for all signals of a satellite: codes differ by metres, a tenth of a millimetre of orbit
+    told = np.flatnonzero(np.isfinite(obs.code))  # in order of time and satellite
+    new = np.concatenate([[True], (np.diff(obs.t[told]) != 0.0) | (np.diff(obs.satellite[told]) != 0)])
+    rows, of = told[new[: len(told)]], np.cumsum(new[: len(told)]) - 1
+    sent = obs.t[rows] - obs.code[rows] / C
+    source = precise if precise is not None else nav
+    assert source is not None
+    if corrected.clock:  # the code is without the satellite's clock: its time of transmission is GPS time
+        found = source.place(obs.satellite[rows], sent, obs.zero)
+        sent = sent + np.nan_to_num(found.clock)
+    found = source.place(obs.satellite[rows], sent, obs.zero)
+    placed = Placed.unknown(len(obs))
+    for name in ("p", "v", "clock", "drift"):
+        getattr(placed, name)[told] = getattr(found, name)[of]
+    delay = np.zeros(len(obs))
+    if nav is not None:
+        delay = nav.delay(obs.satellite, obs.signal, frequency, obs.t, obs.zero)
+    clock = np.where(np.isfinite(placed.clock), 0.0, np.nan) if corrected.clock else C * (placed.clock - delay)
+    remarks = [*(nav.remarks if nav is not None else ()), *(precise.remarks if precise is not None else ())]
+    lost = {int(s) for s in np.unique(obs.satellite[told[np.isnan(placed.p[told, 0])]])}
+    lost_all = sorted(s for s in lost if not np.isfinite(placed.p[(obs.satellite == s), 0]).any())
+    ill = sorted(set(lost_all) & (nav.unhealthy if nav is not None and precise is None else set()))
+    without = [s for s in lost_all if s not in ill]
+    if without:
+        names = ", ".join(satellite_name(s) for s in without)
+        remarks.append(f"no ephemeris for {names}: their observations are not used")
+    if ill:
+        remarks.append(f"unhealthy by their own word and not used: {', '.join(satellite_name(s) for s in ill)}")
+    partly = sorted(lost - set(lost_all))
+    if partly:
+        names = ", ".join(satellite_name(s) for s in partly)
+        remarks.append(f"no ephemeris near enough in time for a part of the observations of {names}")
+    raw = RawGnss(
+        t=obs.t, satellite=obs.satellite, signal=obs.signal, code=obs.code, carrier=obs.carrier,
+        range_rate=-obs.doppler * C / frequency, cn0=obs.cn0, slip=obs.slip, half=obs.half, frequency=frequency,
+        p=placed.p, v=placed.v, clock=clock, drift=C * placed.drift, difference=np.full(len(obs), np.nan),
+        zero=obs.zero, place=(float(rover[0]), float(rover[1]), float(rover[2])),
+        klobuchar=None if nav is None or nav.klobuchar is None else tuple(map(tuple, nav.klobuchar.tolist())),
+        troposphere=corrected.troposphere, files=obs.files,
+    )  # fmt: skip
+    return raw, tuple(remarks)
+
+
+def with_own_stamps(
+    obs: Observations, source: Ephemerides | Orbits, rover: Array, corrected: Corrected = Corrected()
+) -> Observations:
+    """Stamps of nominal epochs turned back into the receiver's own.
+
+    A receiver keeps its clock in whole milliseconds and sets it so that it measures within half of one of the nominal
+    epoch; codes are of its own stamp. So the milliseconds are those of its clock error, told by the codes themselves.
+    """
+    found = source.place(obs.satellite, obs.t - _FLIGHT, obs.zero)
+    away = np.linalg.norm(turned(found.p, np.full(len(obs), _FLIGHT)) - rover, axis=1)
+    error = (obs.code - away) / C + (0.0 if corrected.clock else found.clock)
+    off = median_of_epochs(obs.t, error)
+    return replace(obs, t=obs.t + _TICK * np.round(np.nan_to_num(off) / _TICK))

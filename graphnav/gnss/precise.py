@@ -1,0 +1,211 @@
+"""Precise orbits and clocks: SP3-a, -c and -d (Hilla 2016) and RINEX clock files 2 to 3.04.
+
+Positions between the nodes are those of the polynomial through the eleven nearest, which are turned to the Earth-fixed
+frame of the time asked for (Schenewerk 2003); clocks are linear between theirs, with the relativistic effect that
+products leave out, -2 r.v / c^2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.core.timescales import utc_to_gps
+from graphnav.gnss.ephemeris import Placed, turned
+from graphnav.gnss.files import Lines, calendar_days, numbers, read_bytes
+from graphnav.gnss.signals import SYSTEMS, C, Ids, satellite_id
+
+_NODES = 11  # of the polynomial
+_ABSENT = 0.9  # s; a clock of 999999.999999 us is none
+_LONGEST = 900.0  # s between nodes of a clock that a line is drawn through
+_HALF = 0.5  # s either way, over which velocities are differences
+
+
+@dataclass(frozen=True)
+class Orbits:
+    """Nodes by satellite; times in s since the GPS epoch."""
+
+    orbit: dict[int, tuple[Array, Array]]  # t (n,) and positions (n, 3), m, of the centre of mass
+    clock: dict[int, tuple[Array, Array]]  # t (n,) and s
+    remarks: tuple[str, ...] = ()
+
+    def place(self, satellite: Ids, t: Array, zero: float) -> Placed:
+        """As `graphnav.gnss.ephemeris.Ephemerides.place`."""
+        out = Placed.unknown(len(t))
+        for one in np.unique(satellite):
+            own = np.flatnonzero(satellite == one)
+            if int(one) not in self.orbit or int(one) not in self.clock:
+                continue
+            nodes, clocks = self.orbit[int(one)], self.clock[int(one)]
+            true = t[own]
+            for _ in range(2):
+                true = t[own] - np.nan_to_num(_interpolate_clocks(clocks, true, zero)[0])
+            p = _polynomial(nodes, true, zero)
+            ahead, behind = (_polynomial(nodes, true + h, zero) for h in (_HALF, -_HALF))
+            v = (ahead - behind) / (2.0 * _HALF)
+            clock, drift = _interpolate_clocks(clocks, true, zero)
+            out.p[own], out.v[own], out.drift[own] = p, v, drift
+            out.clock[own] = clock - 2.0 * np.sum(p * v, axis=1) / C**2
+        return out
+
+
+def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
+    """Orbits and clocks of some files; those of clock files go before those of orbit files.
+
+    Raises
+    ------
+    RecordingError
+        If a file is not what it should be, naming the line.
+    """
+    t, satellite, p, clock = (np.concatenate(x) for x in zip(*(_read_sp3(path) for path in sp3), strict=True))
+    orbit, clocks = {}, {}
+    for one in np.unique(satellite):
+        own = satellite == one
+        whole = own & np.any(p != 0.0, axis=1)
+        orbit[int(one)] = _once(t[whole], p[whole])
+        told = own & (np.abs(clock) < _ABSENT)
+        if told.any():
+            clocks[int(one)] = _once(t[told], clock[told])
+    if clk:
+        t, satellite, clock = (np.concatenate(x) for x in zip(*(_read_clk(path) for path in clk), strict=True))
+        clocks |= {int(one): _once(t[satellite == one], clock[satellite == one]) for one in np.unique(satellite)}
+    few = sorted(one for one, (t, _) in orbit.items() if len(t) < _NODES)
+    remarks = (f"{len(few)} satellites have fewer than {_NODES} nodes in {sp3[0].name} and no orbit",) if few else ()
+    return Orbits({k: x for k, x in orbit.items() if k not in few}, clocks, remarks)
+
+
+def _once(t: Array, x: Array) -> tuple[Array, Array]:
+    t, first = np.unique(t, return_index=True)
+    return t, x[first]
+
+
+def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
+    """Times, satellites, positions (m) and clocks (s) of all position records."""
+    lines = Lines(read_bytes(path))
+    head = lines.text(0)
+    if head[:1] != "#" or head[1:2] not in "abcd":
+        raise RecordingError(f"{path}: not an SP3 file; its first line begins '{head[:2]}'")
+    scale = next((lines.text(k)[9:12] for k in range(min(30, len(lines))) if lines.text(k)[:2] == "%c"), "GPS")
+    first = lines.first()
+    epoch = np.flatnonzero(first == ord("*"))
+    own = np.flatnonzero(first == ord("P"))
+    if not len(epoch) or not len(own):
+        raise RecordingError(f"{path}: holds no positions")
+    t = _stamps(lines, epoch, 3, scale, path)
+    if not lines.whole and own[-1] == len(lines) - 1:
+        own = own[:-1]
+    try:
+        value = numbers(lines.block(own, 4, 60), 14)
+        names = [bytes(x).decode() for x in lines.block(own, 1, 4)]
+        ids = {name: _id_of(name) for name in set(names)}
+    except ValueError:
+        for k in own:
+            try:
+                numbers(lines.block(np.array([k]), 4, 60), 14)
+            except ValueError:
+                text = lines.text(int(k))[:60]
+                raise RecordingError(f"{path}, line {k + 1}: '{text}' is not a position") from None
+        raise RecordingError(f"{path}: names a satellite of an unknown system") from None
+    satellite = np.array([ids[name] for name in names], dtype=np.int16)
+    of = np.searchsorted(epoch, own) - 1
+    whole = np.isfinite(value[:, :3]).all(axis=1) & (of >= 0) & (satellite >= 0)
+    clock = np.nan_to_num(value[:, 3] * 1e-6, nan=1.0)
+    return t[of[whole]], satellite[whole], value[whole, :3] * 1e3, clock[whole]
+
+
+def _read_clk(path: Path) -> tuple[Array, Ids, Array]:
+    """Times, satellites and clocks (s) of all satellite records."""
+    text = read_bytes(path)
+    if b"CLOCK" not in text[:8000] and b"RINEX VERSION" not in text[:200]:
+        raise RecordingError(f"{path}: not a RINEX clock file")
+    scale = "GPS"
+    for line in text[:20000].splitlines():
+        if line.rstrip().endswith(b"TIME SYSTEM ID"):
+            scale = line[:10].decode("latin-1").strip()[:3]
+    rows = [line.split() for line in text.splitlines() if line.startswith(b"AS ")]
+    rows = [row for row in rows if len(row) >= 10]
+    if not rows:
+        raise RecordingError(f"{path}: holds no clocks of satellites")
+    names = [row[1].decode("latin-1") for row in rows]
+    try:
+        table = np.array([[*row[2:8], row[9]] for row in rows]).astype(float)
+        ids = {name: _id_of(name) for name in set(names)}
+        t = _dates(table[:, :6], scale)
+        if not np.isfinite(table).all():
+            raise ValueError
+    except ValueError:
+        raise RecordingError(f"{path}: a record of a satellite's clock cannot be read") from None
+    satellite = np.array([ids[name] for name in names], dtype=np.int16)
+    return t[satellite >= 0], satellite[satellite >= 0], table[satellite >= 0, 6]
+
+
+def _id_of(name: str) -> int:
+    """The number of a satellite; -1 of one that no receiver observes, as those that carry a receiver."""
+    if name[0].isalpha() and name[0] not in SYSTEMS:
+        return -1
+    return satellite_id(name if name[0] != " " else "G" + name[1:])
+
+
+def _stamps(lines: Lines, which: NDArray[np.intp], begin: int, scale: str, path: Path) -> Array:
+    """(n,) s since the GPS epoch of lines that hold a date from a column on."""
+    words = [lines.text(k)[begin:].split()[:6] for k in which]
+    try:
+        return _dates(np.array(words, dtype=float), scale)
+    except ValueError:
+        for k, some in zip(which, words, strict=True):
+            try:
+                _dates(np.array([some], dtype=float), scale)
+            except ValueError:
+                text = " ".join(some)[:40]
+                raise RecordingError(f"{path}, line {k + 1}: '{text}' is not the date of an epoch") from None
+        raise RecordingError(f"{path}: the date of an epoch cannot be read") from None
+
+
+def _dates(fields: Array, scale: str) -> Array:
+    """(n,) s since the GPS epoch of dates (n, 6); ValueError if one is none."""
+    if fields.ndim != 2 or fields.shape[1] != 6:
+        raise ValueError
+    days, good = calendar_days(fields)
+    if not good.all():
+        raise ValueError
+    since = (days - np.datetime64("1980-01-06", "D")).astype(np.int64) * 86400.0
+    if scale in ("UTC", "GLO"):
+        since = utc_to_gps(days.astype("datetime64[us]"))
+    ahead = {"BDT": 14.0, "TAI": -19.0}.get(scale, 0.0)
+    return np.asarray(since + fields[:, 3:] @ np.array([3600.0, 60.0, 1.0]) + ahead)
+
+
+def _polynomial(nodes: tuple[Array, Array], t: Array, zero: float) -> Array:
+    """(N, 3) positions at times t (N,), s since `zero`, in the Earth-fixed frame of these; NaN outside the nodes."""
+    at, p = nodes[0] - zero, nodes[1]
+    first = np.clip(np.searchsorted(at, t) - (_NODES + 1) // 2, 0, len(at) - _NODES)
+    use = first[:, None] + np.arange(_NODES)
+    x = at[use] - t[:, None]  # (N, nodes)
+    span = x[:, -1] - x[:, 0]
+    apart = x[:, :, None] - x[:, None, :]
+    apart[:, np.arange(_NODES), np.arange(_NODES)] = 1.0
+    exact = np.where(np.abs(x) < 1e-9, 1e-9, x)
+    weight = np.prod(exact, axis=1)[:, None] / exact / np.prod(apart, axis=2)
+    weight *= np.where(_NODES % 2 == 0, -1.0, 1.0)
+    placed = turned(p[use].reshape(-1, 3), -x.ravel()).reshape(len(t), _NODES, 3)
+    out = np.einsum("nk,nki->ni", weight, placed)
+    usual = float(np.median(np.diff(at)))
+    out[(t < at[0] - 1.0) | (t > at[-1] + 1.0) | (span > 2.0 * _NODES * usual)] = np.nan
+    return np.asarray(out)
+
+
+def _interpolate_clocks(clocks: tuple[Array, Array], t: Array, zero: float) -> tuple[Array, Array]:
+    """Clocks and their drifts (N,) on lines between nodes; NaN outside them and in gaps."""
+    at, value = clocks[0] - zero, clocks[1]
+    if len(at) < 2:
+        return np.full(len(t), np.nan), np.full(len(t), np.nan)
+    k = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(at) - 2)
+    step = at[k + 1] - at[k]
+    drift = (value[k + 1] - value[k]) / step
+    good = (t >= at[0] - 1.0) & (t <= at[-1] + 1.0) & (step <= _LONGEST)
+    return np.where(good, value[k] + drift * (t - at[k]), np.nan), np.where(good, drift, np.nan)

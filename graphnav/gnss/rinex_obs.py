@@ -1,0 +1,398 @@
+"""RINEX observation files, versions 2.11, 3 and 4, read as whole arrays.
+
+Lines are sorted by what they are (epochs, satellites of each system), and the fields of all lines of a kind are turned
+into numbers at once. The formats: RINEX 2.11 (Gurtner and Estey 2007), 3.05 and 4.01 (IGS/RTCM). Types of version 2
+are given names of version 3 as RTKLIB 2.4.3 does (rinex.c, convcode).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.files import parse_number
+from graphnav.core.rotation import Array
+from graphnav.core.timescales import WEEK, utc_to_gps
+from graphnav.gnss.files import Lines, calendar_days, moved, numbers, read_bytes
+from graphnav.gnss.series import Observations, once
+from graphnav.gnss.signals import BEIDOU, GLONASS, GPS, QZSS, SYSTEMS, Ids, known_signal, satellite_id, signal_id
+
+_SYSTEM_OF = np.full(256, -1)
+for _k, _letter in enumerate(SYSTEMS):
+    _SYSTEM_OF[ord(_letter)] = _k
+_KINDS = "CLDS"
+_MOST_TYPES = 200  # of a system; RINEX 4.01 has some 80
+_WIDTH = 16  # of a field: value F14.3, loss of lock I1, strength I1
+
+
+@dataclass
+class Header:
+    """What the header of an observation file says."""
+
+    version: float = 0.0
+    system: str = "G"
+    types: dict[int, list[str]] = field(default_factory=dict)  # by system, in the file's order: "C1C"
+    scale: str = "GPS"  # of time
+    marker: Array | None = None
+    channels: dict[int, int] = field(default_factory=dict)
+    end: int = 0  # number of lines
+
+
+@dataclass
+class _Rows:
+    """Lines of satellites: their epoch and satellite, and where their fields are."""
+
+    line: NDArray[np.intp]
+    epoch: NDArray[np.intp]
+    satellite: Ids
+
+
+Cells = Callable[[NDArray[np.intp], int], NDArray[np.uint8]]  # the fields of some rows, so many of each
+_Body = tuple[Array, float, NDArray[np.intp], _Rows, Cells]  # stamps, their zero, flags of the epochs
+
+
+def read_observations(path: Path) -> Observations:
+    """The observations of a RINEX file.
+
+    Raises
+    ------
+    RecordingError
+        If it is no RINEX observation file, or a line of it cannot be read, naming the line.
+    """
+    return parse_observations(read_bytes(path), path)
+
+
+def parse_observations(data: bytes, path: Path) -> Observations:
+    """The observations of a RINEX file's content; `path` is only for what is said of it."""
+    lines = Lines(data)
+    header = _header(lines, path)
+    remarks: list[str] = []
+    stamp, zero, flag, rows, cells = (_version_2 if header.version < 3.0 else _version_3)(lines, header, path, remarks)
+    if not len(rows.line):
+        raise RecordingError(f"{path}: holds a header and no observations")
+    unknown: set[str] = set()
+    parts = []
+    for system, types in header.types.items():
+        own = np.flatnonzero(rows.satellite // 100 == system)
+        if not len(own):
+            continue
+        block = cells(own, len(types)).reshape(len(own), len(types), _WIDTH)
+        try:
+            value = numbers(block[:, :, :14].reshape(len(own), -1), 14)
+            if moved(block[:, :, :14]).any():
+                raise ValueError
+        except ValueError:
+            raise _bad_field(rows, own, types, block[:, :, :14], path) from None
+        value[value == 0.0] = np.nan  # absent (RINEX 2.11, table A2)
+        lli = block[:, :, 14].astype(np.intp) - 48
+        lli[(lli < 0) | (lli > 9)] = 0
+        named = [_translate_name(name, system, header.version) for name in types]
+        filled = np.asarray(np.isfinite(value).any(axis=0))
+        unknown |= {
+            f"{SYSTEMS[system]} {name}"
+            for name, there in zip(named, filled, strict=True)
+            if there and name[0] in _KINDS and not known_signal(system, name[1:])
+        }
+        for signal in dict.fromkeys(name[1:] for name in named if known_signal(system, name[1:])):
+            at = {kind: [k for k, name in enumerate(named) if name == kind + signal] for kind in _KINDS}
+            one = {kind: _first_of(value[:, some]) for kind, some in at.items()}
+            there = ~np.isnan(one["C"]) | ~np.isnan(one["L"])
+            lost = lli[:, at["L"][0]] if at["L"] else np.zeros(len(own), dtype=np.intp)
+            k = rows.epoch[own]
+            parts.append(
+                (
+                    stamp[k][there], rows.satellite[own][there],
+                    np.full(int(there.sum()), signal_id(signal), dtype=np.int16),
+                    *(one[kind][there] for kind in _KINDS),
+                    ((lost & 1 > 0) | (flag[k] == 1))[there], (lost & 2 > 0)[there],
+                )
+            )  # fmt: skip
+    if not parts:
+        raise RecordingError(f"{path}: no code or carrier of a known signal")
+    if unknown:
+        remarks.append(f"{path.name}: signals that are not known are left out: {', '.join(sorted(unknown))}")
+    t, satellite, signal_of, code, carrier, doppler, cn0, slip, half = (
+        np.concatenate(x) for x in zip(*parts, strict=True)
+    )
+    return once(
+        Observations(
+            zero, t, satellite, signal_of, code, carrier, doppler, cn0, slip, half, np.full(len(t), np.nan),
+            header.channels, header.marker, (str(path),), tuple(remarks),
+        )
+    )  # fmt: skip
+
+
+def _header(lines: Lines, path: Path) -> Header:
+    """Read up to END OF HEADER."""
+    out, system, many = Header(), -1, 0
+    for k in range(len(lines)):
+        text = lines.text(k)
+        label, body = text[60:].strip(), text[:60]
+        try:
+            if label == "RINEX VERSION / TYPE":
+                out.version = float(body[:9])
+                if body[20:21] != "O":
+                    raise RecordingError(f"{path}: a RINEX file of type '{body[20:40].strip()}', not of observations")
+                out.system = body[40:41].strip() or "G"
+            elif label == "SYS / # / OBS TYPES":
+                if body[0] != " ":
+                    system, many = SYSTEMS.find(body[0]), int(body[3:6])
+                    out.types[system] = []
+                out.types.setdefault(system, []).extend(body[6:].split())
+            elif label == "# / TYPES OF OBSERV":
+                many = int(body[:6]) if body[:6].strip() else many
+                both = out.types.setdefault(-2, [])
+                both += body[6:].split()
+            elif label == "APPROX POSITION XYZ":
+                place = np.array(body.split(), dtype=float)
+                out.marker = place if len(place) == 3 and 6e6 < np.linalg.norm(place) < 7e6 else None
+            elif label == "TIME OF FIRST OBS":
+                out.scale = body[48:51].strip() or ("GLO" if out.system == "R" else "GPS")
+            elif label == "GLONASS SLOT / FRQ #":
+                words = body[3:].split()
+                out.channels |= {
+                    100 * GLONASS + int(name[1:]): int(number)
+                    for name, number in zip(words[::2], words[1::2], strict=False)
+                    if name[:1] == "R"
+                }
+            elif label == "END OF HEADER":
+                out.end = k + 1
+                break
+        except (ValueError, IndexError):
+            raise RecordingError(f"{path}, line {k + 1}: the header's '{label}' cannot be read") from None
+        if k == 0 and not out.version:
+            break
+    if not out.version:
+        raise RecordingError(f"{path}: not a RINEX file; its first line says no version")
+    if not out.end:
+        raise RecordingError(f"{path}: the header has no END OF HEADER; the file is cut off")
+    if not 2.0 <= out.version < 5.0:
+        raise RecordingError(f"{path}: RINEX version {out.version:g}; 2.11, 3 and 4 are read")
+    if out.version < 3.0:
+        both = out.types.pop(-2, [])
+        out.types = dict.fromkeys(range(len(SYSTEMS)), both)
+    out.types.pop(-1, None)
+    if not any(out.types.values()):
+        raise RecordingError(f"{path}: the header names no types of observations")
+    if (most := max(map(len, out.types.values()))) > _MOST_TYPES:
+        raise RecordingError(f"{path}: the header names {most} types of observations of a system, more than there are")
+    return out
+
+
+def _translate_name(name: str, system: int, version: float) -> str:
+    """A type by its name of version 3.05."""
+    if version >= 3.0:
+        if system == BEIDOU and name[1:2] == "1" and version < 3.035 and name[2:3] in "IQX":
+            return name[0] + "2" + name[2:]  # B1I until 3.03
+        return name
+    kind, band = ("C", name[1:]) if name[0] in "CP" else (name[0], name[1:])
+    if name[0] == "P":
+        attribute = "P" if system == GLONASS else "W"
+    elif band == "1":
+        attribute = "C" if system in (GPS, GLONASS, QZSS) else "X"
+    elif band == "2":
+        # the carrier on L2 is that of P2, and C2 another code on it
+        attribute = {GPS: "X" if kind == "C" else "W", GLONASS: "C" if kind == "C" else "P"}.get(system, "X")
+    else:
+        attribute = "X"
+    return f"{kind}{band}{attribute}"
+
+
+def _since_week(fields: Array, scale: str, used: NDArray[np.bool_]) -> tuple[Array, float]:
+    """Seconds (n,) of the GPS week of the first used of some dates (n, 6), and where it begins (s since the GPS epoch).
+
+    Days and seconds are kept apart: seconds since the epoch are good to 0.2 us only.
+    """
+    days, good = calendar_days(fields)
+    hour, minute, second = np.where(good[:, None], fields, 0.0).T[3:]
+    since = (days - np.datetime64("1980-01-06", "D")).astype(np.int64)
+    week = int(since[used][0]) // 7
+    ahead = 0.0
+    if scale in ("GLO", "UTC"):
+        ahead = float(utc_to_gps(days[used][:1].astype("datetime64[us]"))[0]) - 86400.0 * float(since[used][0])
+    ahead += 14.0 if scale == "BDT" else 0.0
+    return (since - 7 * week) * 86400.0 + hour * 3600.0 + minute * 60.0 + second + ahead, week * WEEK
+
+
+def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> _Body:
+    first = lines.first()
+    first[: header.end] = 0
+    epoch = np.flatnonzero(first == ord(">"))
+    if not len(epoch):
+        raise RecordingError(f"{path}: holds a header and no observations")
+    try:
+        fields = _calendar(lines, epoch, 2, 4)
+        flag, count = numbers(lines.block(epoch, 29, 35), 3).T
+    except ValueError:
+        raise _bad_epoch(lines, epoch, path) from None
+    bad = (flag < 0) | (count < 0) | (~calendar_days(fields)[1] & ~(flag > 1))
+    if bad.any():
+        raise _bad_epoch(lines, epoch[bad], path)
+    flag, count = np.nan_to_num(flag).astype(int), np.nan_to_num(count).astype(int)
+    system = _SYSTEM_OF[first]
+    own = np.flatnonzero(system >= 0)
+    of = np.searchsorted(epoch, own) - 1
+    keep = (of >= 0) & (own - epoch[np.maximum(of, 0)] <= count[np.maximum(of, 0)]) & (flag[np.maximum(of, 0)] <= 1)
+    own, of = own[keep], of[keep]
+    _say_cut(lines, epoch, own, of, flag, count, path, remarks)
+    if len(own) and own[-1] == len(lines) - 1 and not lines.whole:
+        own, of = own[:-1], of[:-1]  # whether its last field is whole nobody knows
+    if not (flag <= 1).any():
+        raise RecordingError(f"{path}: holds a header and no observations")
+    stamp, zero = _since_week(fields, header.scale, flag <= 1)
+    try:
+        number = numbers(lines.block(own, 1, 3), 2)[:, 0]
+    except ValueError:
+        number = np.full(len(own), np.nan)
+    wrong = ~(number >= 1)
+    if wrong.any():
+        k = own[wrong][0]
+        raise RecordingError(f"{path}, line {k + 1}: '{lines.text(k)[:3]}' names no satellite")
+    satellite = (100 * system[own] + number).astype(np.int16)
+    rows = _Rows(own, of, satellite)
+
+    def cells(which: NDArray[np.intp], types: int) -> NDArray[np.uint8]:
+        return lines.block(rows.line[which], 3, 3 + _WIDTH * types)
+
+    return stamp, zero, flag, rows, cells
+
+
+def _first_of(value: Array) -> Array:
+    """(n,) the first number in each row of (n, m) that is there, else NaN."""
+    out = np.full(len(value), np.nan)
+    for column in value.T[::-1]:
+        out = np.where(np.isnan(column), out, column)
+    return out
+
+
+def _calendar(lines: Lines, epoch: NDArray[np.intp], begin: int, year: int) -> Array:
+    """(n, 6) date and time of epoch lines, year first."""
+    n = len(epoch)
+    whole = [numbers(lines.block(epoch, begin, begin + year), year)]
+    at = begin + year
+    for _ in range(4):
+        whole.append(numbers(lines.block(epoch, at, at + 3), 3))
+        at += 3
+    whole.append(numbers(lines.block(epoch, at, at + 11), 11))
+    return np.concatenate(whole, axis=1).reshape(n, 6)
+
+
+def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> _Body:
+    types = len(next(iter(header.types.values())))
+    each = -(-types // 5)  # lines of a satellite
+    epochs: list[int] = []
+    flags: list[int] = []
+    first_line: list[int] = []
+    of: list[int] = []
+    satellite: list[int] = []
+    k, cut = header.end, False
+    while k < len(lines):
+        text = lines.text(k)
+        if not text.strip():
+            k += 1
+            continue
+        try:
+            flag, count = int(text[26:29] or 0), int(text[29:32])
+        except ValueError:
+            raise RecordingError(f"{path}, line {k + 1}: expected the line of an epoch, found '{text[:32]}'") from None
+        if flag < 0 or count < 0:
+            raise RecordingError(f"{path}, line {k + 1}: an epoch of {count} satellites with the flag {flag}")
+        if flag > 1:
+            k += 1 + count
+            continue
+        more = max(1, -(-count // 12))
+        names = "".join(lines.text(j)[32:68].ljust(36) for j in range(k, min(k + more, len(lines))))
+        begin = k + more
+        whole = min(count, max(0, (len(lines) - begin) // each))
+        if whole < count or (begin + count * each == len(lines) and not lines.whole):
+            cut = True
+            whole = max(0, whole - (0 if lines.whole else int(whole == count)))
+        for i in range(whole):
+            name = names[3 * i : 3 * i + 3]
+            number = SYSTEMS.find(name[:1] if name[:1].strip() else (header.system if header.system != "M" else "G"))
+            try:
+                one = satellite_id(SYSTEMS[max(number, 0)] + name[1:])
+            except ValueError:
+                raise RecordingError(f"{path}, line {k + 1}: '{name}' names no satellite") from None
+            if number >= 0:
+                satellite.append(one)
+                of.append(len(epochs))
+                first_line.append(begin + i * each)
+        epochs.append(k)
+        flags.append(flag)
+        k = begin + count * each
+    if cut:
+        remarks.append(f"{path.name}: is cut off in the middle of a record; what is whole before it is used")
+    epoch = np.array(epochs, dtype=np.intp)
+    if not len(epoch):
+        raise RecordingError(f"{path}: holds a header and no observations")
+    try:
+        fields = _calendar(lines, epoch, 0, 3)
+    except ValueError:
+        raise _bad_epoch(lines, epoch, path, 0) from None
+    fields[:, 0] += np.where(fields[:, 0] < 80, 2000, 1900)
+    if (bad := ~calendar_days(fields)[1]).any():
+        raise _bad_epoch(lines, epoch[bad], path, 0)
+    rows = _Rows(np.array(first_line, dtype=np.intp), np.array(of, dtype=np.intp), np.array(satellite, dtype=np.int16))
+
+    def cells(which: NDArray[np.intp], types: int) -> NDArray[np.uint8]:
+        parts = [lines.block(rows.line[which] + j, 0, 5 * _WIDTH) for j in range(each)]
+        return np.concatenate(parts, axis=1)[:, : _WIDTH * types]
+
+    stamp, zero = _since_week(fields, header.scale, np.ones(len(epoch), dtype=bool))
+    return stamp, zero, np.array(flags), rows, cells
+
+
+def _say_cut(
+    lines: Lines, epoch: NDArray[np.intp], own: NDArray[np.intp], of: NDArray[np.intp], flag: NDArray[np.intp],
+    count: NDArray[np.intp], path: Path, remarks: list[str],
+) -> None:  # fmt: skip
+    """Remarks about epochs with fewer lines of satellites than they announce."""
+    short = np.flatnonzero((np.bincount(of, minlength=len(epoch)) < count) & (flag <= 1))
+    if len(short) == 1 and short[0] == len(epoch) - 1:
+        remarks.append(f"{path.name}: is cut off in the middle of a record; what is whole before it is used")
+    elif len(short):
+        remarks.append(
+            f"{path.name}: {len(short)} epochs hold fewer satellites than they announce (the first at line "
+            f"{epoch[short[0]] + 1})"
+        )
+
+
+def _bad_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int = 2) -> RecordingError:
+    """For the first epoch line that is none; its date begins at a column, two digits of the year in version 2."""
+    end = begin + 27 if begin else 26
+    for k in epoch:
+        text = lines.text(k)
+        try:
+            date = np.array([[parse_number(word) for word in text[begin:end].split()]])
+            date[:, 0] += 0 if begin else np.where(date[:, 0] < 80, 2000, 1900)
+            flag, count = (int(text[at : at + 3].strip() or 0) for at in (end, end + 3))
+            if date.shape == (1, 6) and calendar_days(date)[1].all() and min(flag, count) >= 0:
+                continue
+        except (ValueError, IndexError):
+            pass
+        return RecordingError(f"{path}, line {k + 1}: '{text[:35]}' is not the line of an epoch")
+    return RecordingError(f"{path}: the line of an epoch cannot be read")
+
+
+def _bad_field(
+    rows: _Rows, own: NDArray[np.intp], types: list[str], block: NDArray[np.uint8], path: Path
+) -> RecordingError:
+    """For the first field that is no number, of those (n, m, 14) of some rows."""
+    for k, cells, elsewhere in zip(own, block, moved(block), strict=True):
+        for name, cell, wrong in zip(types, cells, elsewhere, strict=True):
+            text = bytes(cell).decode("latin-1").strip()
+            where = f"{path}, line {rows.line[k] + 1}, {name}: '{text}'"
+            if wrong:
+                return RecordingError(f"{where} does not stand in its columns")
+            try:
+                if not np.isfinite(parse_number(text or "0")):
+                    raise ValueError
+            except ValueError:
+                return RecordingError(f"{where} is not a number")
+    return RecordingError(f"{path}: a field is not a number")

@@ -1,0 +1,197 @@
+"""Raw observations of one receiver, a row for each epoch, satellite and signal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.gnss.signals import C, Ids, frequencies
+
+_FARTHEST = 1e9  # m, of a code: satellites are 4.3e7 m away at most, and no clock of a receiver is seconds off
+_FASTEST = 1e6  # Hz, of a Doppler shift: satellites make 1e4, an oscillator off by 1e-4 makes 2e5
+_MOST_CYCLES = 1e11  # of a carrier: more than F14.3 holds
+_LONGEST = 3.15e7  # s, a year
+
+
+@dataclass(frozen=True)
+class Observations:
+    """N rows in order of time; NaN where a number is absent."""
+
+    zero: float  # s since the GPS epoch at t = 0
+    t: Array  # (N,) s, the receiver's stamp
+    satellite: Ids  # (N,)
+    signal: Ids  # (N,)
+    code: Array  # (N,) m
+    carrier: Array  # (N,) cycles
+    doppler: Array  # (N,) Hz, positive where the satellite comes nearer
+    cn0: Array  # (N,) dB-Hz
+    slip: NDArray[np.bool_]  # (N,) the carrier lost lock since the epoch before
+    half: NDArray[np.bool_]  # (N,) the carrier may be off by half a cycle
+    lock: Array  # (N,) s that the carrier has been in lock, where the receiver says so
+    channels: dict[int, int] = field(default_factory=dict)  # of GLONASS satellites
+    marker: Array | None = None  # (3,) m in e, rough position of the antenna as the file states it
+    files: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def take(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
+        """Some of the rows."""
+        own = {
+            f.name: getattr(self, f.name)[which]
+            for f in fields(self)
+            if f.name != "marker" and isinstance(getattr(self, f.name), np.ndarray)
+        }
+        return replace(self, **own)
+
+    def on_clock(self, zero: float) -> Observations:
+        """The same on a clock with another zero (s since the GPS epoch)."""
+        return replace(self, t=self.t + (self.zero - zero), zero=zero)
+
+    @property
+    def frequency(self) -> Array:
+        """(N,) Hz."""
+        return frequencies(self.satellite, self.signal, self.channels)
+
+    @property
+    def range_rate(self) -> Array:
+        """(N,) m/s, from the Doppler shift."""
+        return np.asarray(-self.doppler * C / self.frequency)
+
+
+def joined(parts: list[Observations]) -> Observations:
+    """Several files of one receiver as one series, in order of time; what two of them hold is taken once."""
+    if len(parts) == 1:
+        return parts[0]
+    zero = parts[0].zero
+    parts = [part.on_clock(zero) for part in parts]
+    arrays = {
+        f.name: np.concatenate([getattr(part, f.name) for part in parts])
+        for f in fields(Observations)
+        if f.name != "marker" and isinstance(getattr(parts[0], f.name), np.ndarray)
+    }
+    channels = {key: value for part in parts for key, value in part.channels.items()}
+    marker = next((part.marker for part in parts if part.marker is not None), None)
+    whole = Observations(
+        zero=zero, channels=channels, marker=marker, files=tuple(f for p in parts for f in p.files),
+        remarks=tuple(r for p in parts for r in p.remarks), **arrays,
+    )  # fmt: skip
+    return once(whole)
+
+
+def once(obs: Observations) -> Observations:
+    """In order of time, satellite and signal, and each of these once: the row that was first.
+
+    Raises
+    ------
+    RecordingError
+        If their times are years apart.
+    """
+    obs = _plausible(obs)
+    span = float(np.ptp(obs.t)) if len(obs) else 0.0
+    if not span <= _LONGEST:
+        raise RecordingError(f"{obs.files[0]}: its observations span {span / 86400.0:.3g} days; is a date wrong?")
+    tick = np.round(obs.t * 1e4).astype(np.int64)
+    key = (tick - tick.min(initial=0)) * 10**7 + obs.satellite.astype(np.int64) * 10**4 + obs.signal
+    if np.all(np.diff(key) > 0):
+        return obs
+    _, first = np.unique(key, return_index=True)
+    twice = len(obs) - len(first)
+    out = obs.take(first)
+    if not twice:
+        return out
+    return replace(out, remarks=(*out.remarks, f"{twice} observations are there twice; the first of each is used"))
+
+
+def _plausible(obs: Observations) -> Observations:
+    """Without the values that no receiver can have measured."""
+    with np.errstate(invalid="ignore"):
+        bad = (np.abs(obs.code) > _FARTHEST) | (np.abs(obs.doppler) > _FASTEST) | (np.abs(obs.carrier) > _MOST_CYCLES)
+    if not bad.any():
+        return obs
+    code, carrier, doppler = (np.where(bad, np.nan, x) for x in (obs.code, obs.carrier, obs.doppler))
+    said = f"{bad.sum()} observations are beyond what a receiver can measure and are left out"
+    return replace(obs, code=code, carrier=carrier, doppler=doppler, remarks=(*obs.remarks, said))
+
+
+@dataclass(frozen=True)
+class RawGnss:
+    """Observations of a rover with their satellites placed: N rows on the recording's clock, in order of time."""
+
+    t: Array  # (N,) s at which the antenna received: the receiver's stamp less its clock error
+    satellite: Ids  # (N,)
+    signal: Ids  # (N,)
+    code: Array  # (N,) m, by the receiver's stamp
+    carrier: Array  # (N,) cycles
+    range_rate: Array  # (N,) m/s, from the Doppler shift
+    cn0: Array  # (N,) dB-Hz
+    slip: NDArray[np.bool_]  # (N,)
+    half: NDArray[np.bool_]  # (N,)
+    frequency: Array  # (N,) Hz
+    p: Array  # (N, 3) m, satellite in the Earth-fixed frame of the time of transmission; NaN where unknown
+    v: Array  # (N, 3) m/s
+    clock: Array  # (N,) m that the satellite's clock is ahead, group delays taken off; 0 where the code is without it
+    drift: Array  # (N,) m/s of it
+    difference: Array  # (N,) m to add to the code by a base station; NaN where there is none
+    zero: float  # s since the GPS epoch at t = 0
+    place: tuple[float, float, float]  # m in e, within kilometres of the rover
+    klobuchar: tuple[tuple[float, ...], ...] | None = None  # coefficients that were broadcast
+    troposphere: bool = False  # already taken off the codes
+    antenna: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m in e, single-point, of each epoch
+    receiver_clock: Array = field(default_factory=lambda: np.empty((0, 2)))  # (N, 2) m and m/s, single-point
+    lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
+    files: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def take(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> RawGnss:
+        """Some of the rows."""
+        own = {
+            f.name: getattr(self, f.name)[which]
+            for f in fields(self)
+            if f.name != "lever_arm" and isinstance(getattr(self, f.name), np.ndarray) and len(getattr(self, f.name))
+        }
+        return replace(self, **own)
+
+    @property
+    def differenced(self) -> bool:
+        """Whether a base station is there."""
+        return bool(np.isfinite(self.difference).any())
+
+    @property
+    def seconds_of_week(self) -> Array:
+        """(N,) GPS seconds of the week."""
+        return np.mod(self.t + np.mod(self.zero, 604800.0), 604800.0)
+
+    @property
+    def epochs(self) -> tuple[Array, NDArray[np.intp]]:
+        """Times (E,) of the epochs, and which of them each row is of."""
+        return np.unique(self.t, return_inverse=True)
+
+
+def primary(raw: RawGnss) -> NDArray[np.bool_]:
+    """(N,) one row for each satellite and epoch: the signal whose group delay is best known, L1 or B1 first."""
+    order = np.where(raw.signal // 100 == 1, 0, raw.signal // 100) + np.where(raw.signal % 100 == 2, 0.0, 0.5)
+    order = np.where(np.isfinite(raw.code), order, 100.0)
+    sorted_rows = np.lexsort((order, raw.satellite, raw.t))
+    t, satellite = raw.t[sorted_rows], raw.satellite[sorted_rows]
+    first = np.concatenate([[True], (np.diff(t) > 0) | (np.diff(satellite) != 0)])
+    out = np.zeros(len(raw), dtype=bool)
+    out[sorted_rows[first]] = True
+    return out & np.isfinite(raw.code)
+
+
+def median_of_epochs(t: Array, value: Array) -> Array:
+    """(N,) the median of the values of each row's epoch; NaN where an epoch has none."""
+    epochs, of = np.unique(t, return_inverse=True)
+    order = np.lexsort((value, of))  # NaN last
+    edge = np.searchsorted(of[order], np.arange(len(epochs) + 1))
+    many = np.bincount(of, weights=np.isfinite(value), minlength=len(epochs)).astype(np.intp)
+    low, high = edge[:-1] + np.maximum(many - 1, 0) // 2, edge[:-1] + np.minimum(many // 2, np.diff(edge) - 1)
+    return np.asarray((0.5 * (value[order[low]] + value[order[high]]))[of])

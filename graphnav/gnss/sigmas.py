@@ -1,0 +1,35 @@
+"""How good a code and a Doppler shift are taken to be before the data say more.
+
+Noise falls with the signal's power (sigma-epsilon: Hartinger and Brunner 1999, "Variances of GPS phase observations"),
+reflections with elevation; the models of the atmosphere are good to half of Klobuchar's delay (IS-GPS-200N) and to a
+few decimetres of Saastamoinen's (RTKLIB 2.4.3, pntpos.c, varerr).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+
+_CODE, _CODE_POWER = 0.3, 1.1e4  # m at the zenith; m^2 Hz of a consumer receiver: 0.6 m at 45 dB-Hz
+_RATE, _RATE_POWER = 0.03, 60.0  # m/s; (m/s)^2 Hz: 0.04 m/s at 45 dB-Hz
+_IONOSPHERE, _TROPOSPHERE = 0.5, 0.3
+LEAST = 20.0  # dB-Hz that a signal without a C/N0, or below it, is taken to have
+_USUAL = 45.0  # dB-Hz where a file says nothing of it
+
+
+def code_sigma(cn0: Array, elevation: Array, ionosphere: Array) -> Array:
+    """(N,) m, 1-sigma of a code; `ionosphere` (N,) m is the delay that was modelled."""
+    rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
+    own = _CODE_POWER * 10.0 ** (-0.1 * _power(cn0)) + (_CODE * rising) ** 2
+    return np.asarray(np.sqrt(own + (_IONOSPHERE * ionosphere) ** 2 + (0.1 * _TROPOSPHERE * rising) ** 2))
+
+
+def rate_sigma(cn0: Array, elevation: Array) -> Array:
+    """(N,) m/s, 1-sigma of a range rate."""
+    rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
+    return np.asarray(np.sqrt(_RATE_POWER * 10.0 ** (-0.1 * _power(cn0)) + (_RATE * rising) ** 2))
+
+
+def _power(cn0: Array) -> Array:
+    return np.maximum(np.where(np.isfinite(cn0), cn0, _USUAL), LEAST)

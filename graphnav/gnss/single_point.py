@@ -1,0 +1,220 @@
+"""Single-point positions and velocities: least squares on the codes and Doppler shifts of each epoch.
+
+With rho the distance from the antenna at reception to the satellite at transmission, in the Earth-fixed frame of the
+reception,
+
+    P = rho + b + b_s - dt + I + T            b: receiver clock, b_s: of another system's signal, dt: satellite clock
+    rho' (1 + e.(v_s + omega x s) / c) = e.(v_s - v)          e: unit vector from the antenna to the satellite s
+    D = rho' + b' - dt'
+
+(Groves 2013, sections 8.4.1, 9.4.1; the denominator is what the flight time changes by). All epochs are solved at once.
+Rows that are far from the others of their epoch lose weight as Cauchy's kernel has it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core import earth
+from graphnav.core.rotation import Array
+from graphnav.gnss.atmosphere import NIGHT, directions, klobuchar, saastamoinen
+from graphnav.gnss.ephemeris import EARTH_RATE, turned
+from graphnav.gnss.series import RawGnss
+from graphnav.gnss.sigmas import code_sigma, rate_sigma
+from graphnav.gnss.signals import L1, C
+
+_ROUNDS, _ATMOSPHERE = 10, 3  # iterations, and from which on the atmosphere is modelled
+_KERNEL = 3.0  # sigma at which a row begins to lose weight
+_WEAK = 1e6  # m, 1-sigma of an unknown before any row
+_LOST = 100.0  # m, rms of residuals beyond which an epoch has no position
+_FLAT = 60.0  # PDOP beyond which a position says nothing
+_OMEGA = np.array([0.0, 0.0, EARTH_RATE])
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Rows seen from places of the antenna (N, 3), e."""
+
+    s: Array  # (N, 3) m, satellites in the Earth-fixed frame of the reception
+    e: Array  # (N, 3) unit vectors to them
+    distance: Array  # (N,) m
+    elevation: Array  # (N,) rad
+    ionosphere: Array  # (N,) m
+    troposphere: Array  # (N,) m
+
+
+@dataclass(frozen=True)
+class SinglePoint:
+    """Solutions of E epochs; NaN where there is none."""
+
+    t: Array  # (E,) s, as the rows have it
+    p: Array  # (E, 3) m in e
+    clock: Array  # (E,) m
+    biases: Array  # (E, G) m of each group of signals against the first; NaN where it has no satellites
+    covariance: Array  # (E, 3, 3) m^2 in east, north, up, by the stated sigmas
+    v: Array  # (E, 3) m/s in e
+    drift: Array  # (E,) m/s
+    covariance_v: Array  # (E, 3, 3)
+    satellites: NDArray[np.intp]  # (E,) with a weight above a half
+    rms: Array  # (E,) of whitened, weighted residuals
+    groups: tuple[tuple[int, int], ...]  # system and signal, the reference first
+    group: NDArray[np.intp]  # (N,) of each row
+    residual: Array  # (N,) m
+    weight: Array  # (N,)
+
+
+def look(raw: RawGnss, antenna: Array, ionosphere: Array | None) -> Geometry:
+    """Directions, distances and delays of all rows from places of the antenna (N, 3).
+
+    Parameters
+    ----------
+    ionosphere : (2, 4) Klobuchar's coefficients; no delay without them.
+    """
+    flight = np.linalg.norm(raw.p - antenna, axis=1) / C
+    s = turned(raw.p, flight)
+    away = s - antenna
+    distance = np.linalg.norm(away, axis=1)
+    azimuth, elevation = directions(antenna, s)
+    llh = earth.ecef_to_llh(antenna)
+    delay = np.zeros(len(raw))
+    if ionosphere is not None:
+        delay = klobuchar(ionosphere, raw.seconds_of_week, llh, azimuth, elevation) * (L1 / raw.frequency) ** 2
+    wet = np.zeros(len(raw)) if raw.troposphere else saastamoinen(llh, elevation)
+    return Geometry(s, away / distance[:, None], distance, elevation, delay, wet)
+
+
+def stretch(raw: RawGnss, geometry: Geometry) -> Array:
+    """(N,) 1 + e.(v_s + omega x s) / c: by how much a range changes less than satellite and antenna move."""
+    moving = turned(raw.v, geometry.distance / C) + np.cross(_OMEGA, geometry.s)
+    return np.asarray(1.0 + np.sum(geometry.e * moving, axis=1) / C)
+
+
+def coefficients(raw: RawGnss) -> Array:
+    """Klobuchar's coefficients: those broadcast, else those of the night."""
+    return NIGHT if raw.klobuchar is None else np.array(raw.klobuchar)
+
+
+def signal_groups(raw: RawGnss) -> tuple[tuple[tuple[int, int], ...], NDArray[np.intp]]:
+    """Systems with their signals, the one with most rows first, and which of them each row (N,) has."""
+    key = (raw.satellite // 100).astype(np.int64) * 1000 + raw.signal
+    found, of, many = np.unique(key, return_inverse=True, return_counts=True)
+    order = np.argsort(-many, kind="stable")
+    rank = np.empty(len(found), dtype=np.intp)
+    rank[order] = np.arange(len(found))
+    return tuple((int(found[k]) // 1000, int(found[k]) % 1000) for k in order), rank[of]
+
+
+def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True) -> SinglePoint:
+    """Positions and velocities of all epochs.
+
+    Parameters
+    ----------
+    raw : one row for each satellite and epoch (`graphnav.gnss.series.primary`).
+    mask : rad, elevation below which satellites are not used.
+    robust : take weight from rows that are far from the others.
+    """
+    t, of = raw.epochs
+    groups, group = signal_groups(raw)
+    E, G, n = len(t), len(groups), 3 + len(groups)
+    order = np.argsort(of, kind="stable")
+    place = np.empty(len(raw), dtype=np.intp)
+    place[order] = np.arange(len(raw)) - np.searchsorted(of[order], of[order])
+    S = int(place.max(initial=0)) + 1
+    klobuchar_of = coefficients(raw)
+    usable = np.isfinite(raw.p).all(axis=1) & np.isfinite(raw.code) & np.isfinite(raw.clock)
+
+    def padded(x: Array) -> Array:
+        out = np.zeros((E, S, *x.shape[1:]))
+        out[of, place] = x
+        return out
+
+    H = np.zeros((len(raw), n))
+    H[:, 3] = 1.0
+    other = group > 0
+    H[np.flatnonzero(other), 3 + group[other]] = 1.0
+    x = np.zeros((E, n))
+    x[:, :3] = raw.place
+    weight = np.ones(len(raw))
+    information = np.zeros((E, n, n))
+    measured = raw.code + np.nan_to_num(raw.clock)
+    for k in range(_ROUNDS):
+        geometry = look(raw, x[of, :3], klobuchar_of if k >= _ATMOSPHERE else None)
+        above = geometry.elevation >= mask if k >= _ATMOSPHERE else np.ones(len(raw), dtype=bool)
+        predicted = geometry.distance + np.sum(H[:, 3:] * x[of, 3:], axis=1)
+        if k >= _ATMOSPHERE:
+            predicted = predicted + geometry.ionosphere + geometry.troposphere
+        r = measured - predicted
+        sigma = code_sigma(raw.cn0, np.maximum(geometry.elevation, 0.05), geometry.ionosphere)
+        good = usable & above
+        if robust and k > _ATMOSPHERE:
+            weight = 1.0 / (1.0 + (np.nan_to_num(r) / (_KERNEL * sigma)) ** 2)
+        w = np.where(good, weight / sigma**2, 0.0)
+        H[:, :3] = np.nan_to_num(-geometry.e)
+        Hp, wp = padded(H), padded(w)
+        information = np.einsum("esi,es,esj->eij", Hp, wp, Hp, optimize=True)
+        right = np.einsum("esi,es->ei", Hp, wp * padded(np.where(good, np.nan_to_num(r), 0.0)), optimize=True)
+        x = x + np.linalg.solve(information + np.eye(n) / _WEAK**2, right[..., None])[..., 0]
+    P = np.linalg.inv(information + np.eye(n) / _WEAK**2)
+    used = w > 0.0
+    counted = np.bincount(of, weights=used & (weight > 0.5), minlength=E)
+    total = np.bincount(of, weights=np.where(used, weight * np.nan_to_num(r / sigma) ** 2, 0.0), minlength=E)
+    present = np.stack([np.bincount(of, weights=used & (group == g), minlength=E) for g in range(G)], -1) > 0
+    needed = 3 + present.sum(axis=1)
+    rms = np.sqrt(total / np.maximum(np.bincount(of, weights=used, minlength=E), 1.0))
+    found = np.bincount(of, weights=used, minlength=E) >= needed
+    R = earth.enu_axes(earth.ecef_to_llh(x[:, :3]))
+    cofactor = R @ P[:, :3, :3] @ np.swapaxes(R, -1, -2)
+    found &= (rms < _LOST) & (np.trace(cofactor, axis1=-2, axis2=-1) < _FLAT**2)
+    x[~found] = np.nan
+    cofactor[~found] = np.nan
+    biases = np.where(present, np.concatenate([np.zeros((E, 1)), x[:, 4:]], axis=1), np.nan)
+    clock = np.where(present[:, 0], x[:, 3], x[:, 3])
+    v, drift, covariance_v = _velocities(raw, of, place, (E, S), x, mask, robust)
+    return SinglePoint(
+        t, x[:, :3], clock, biases, cofactor, v, drift, covariance_v, counted.astype(np.intp), rms, groups, group,
+        np.where(used, r, np.nan), np.where(used, weight, 0.0),
+    )  # fmt: skip
+
+
+def _velocities(
+    raw: RawGnss, of: NDArray[np.intp], place: NDArray[np.intp], shape: tuple[int, int], x: Array, mask: float,
+    robust: bool,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Velocities (E, 3) in e, clock drifts (E,) and covariances of the velocities in east, north, up."""
+    E, S = shape
+    antenna = x[of, :3]
+    geometry = look(raw, antenna, None)
+    scale = stretch(raw, geometry)
+    moving = turned(raw.v, geometry.distance / C)
+    sigma = rate_sigma(raw.cn0, np.maximum(geometry.elevation, 0.05))
+    H = np.concatenate([-geometry.e / scale[:, None], np.ones((len(raw), 1))], axis=1)
+    measured = raw.range_rate + np.nan_to_num(raw.drift) - np.sum(geometry.e * moving, axis=1) / scale
+    good = np.isfinite(measured) & np.isfinite(H).all(axis=1) & (geometry.elevation >= mask)
+    y, weight = np.zeros((E, 4)), np.ones(len(raw))
+
+    def padded(a: Array) -> Array:
+        out = np.zeros((E, S, *a.shape[1:]))
+        out[of, place] = a
+        return out
+
+    Hp = padded(np.where(good[:, None], H, 0.0))
+    information = np.zeros((E, 4, 4))
+    for k in range(6 if robust else 1):
+        r = np.where(good, measured - np.sum(np.where(good[:, None], H, 0.0) * y[of], axis=1), 0.0)
+        if k:
+            weight = 1.0 / (1.0 + (r / (_KERNEL * sigma)) ** 2)
+        wp = padded(np.where(good, weight / sigma**2, 0.0))
+        information = np.einsum("esi,es,esj->eij", Hp, wp, Hp, optimize=True)
+        right = np.einsum("esi,es->ei", Hp, wp * padded(r), optimize=True)
+        y = y + np.linalg.solve(information + np.eye(4) / _WEAK**2, right[..., None])[..., 0]
+    P = np.linalg.inv(information + np.eye(4) / _WEAK**2)
+    known = (np.bincount(of, weights=good, minlength=E) >= 4) & np.isfinite(x[:, 0])
+    y[~known] = np.nan
+    R = earth.enu_axes(earth.ecef_to_llh(np.where(known[:, None], x[:, :3], raw.place)))
+    covariance = R @ P[:, :3, :3] @ np.swapaxes(R, -1, -2)
+    covariance[~known | (np.trace(covariance, axis1=-2, axis2=-1) > 100.0)] = np.nan
+    y[np.isnan(covariance[:, 0, 0])] = np.nan
+    return y[:, :3], y[:, 3], covariance

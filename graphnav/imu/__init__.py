@@ -1,0 +1,1 @@
+"""From raw IMU samples to the intervals between keyframes."""

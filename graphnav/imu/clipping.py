@@ -1,0 +1,137 @@
+"""Peaks that a sensor cut off: found by their shape, put back as far as that tells, and doubted accordingly.
+
+A foot turns faster than the usual 300 deg/s range of inertial units, and not all of them end at a round number that
+repeats itself: after temperature compensation a cut peak is flat to a per cent only. But it is wider than it could be.
+A peak that is a parabola, x = p - c t^2, is within a share b of its height for 2 tau with c tau^2 = b p, and outside of
+that, tau' from its middle, it has the slope s = 2 c tau'. So
+
+    q = s tau^2 / (2 tau' b p)
+
+is 1 for a peak and several where the sides would meet far above. With whole rows counted, q of a parabola is 2.25 at
+most (three rows). Ranges end softly, too: a peak that bends over the last few per cent is within 1 % of its height for
+a row or two only. So where one peak shows that an axis ends, all its peaks are asked again with b = 3 %.
+
+Within a cut peak the cubic goes on that leaves from either side with the slope it has there. How much is added is a
+guess, of which the half is taken for its 1-sigma: white noise of that effect over the peak.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.imu.samples import Samples
+from graphnav.recording import Imu
+
+_NEAR = 0.95  # of the highest reading: a range that ends lower than that for some peaks is none
+_BAND = 0.01  # b
+_SOFT_BAND = 0.03  # b, of an axis that is known to end: it does so softly
+_TOO_FLAT = 2.5  # q
+_FEWEST = 3  # rows of a flat top
+_LEAST = {"gyro": 4.0, "accel": 19.0}  # rad/s, m/s^2: no range ends lower (250 deg/s, 2 g)
+_DOUBT = 0.5  # of what is added
+
+
+@dataclass(frozen=True)
+class Peak:
+    """Rows `first` to `last` (not included) of an axis that were cut, and what they are likely to have been."""
+
+    first: int
+    last: int
+    values: Array
+
+
+def cut_peaks(t: Array, x: Array, least: float, highest: Array | None = None) -> list[Peak]:
+    """The peaks above `least` of one axis (N,), read at times (N,) s, that were cut off.
+
+    `highest` (2,) is what the sensor is known to have read at other times, up and down.
+    """
+    most = np.zeros(2) if highest is None else highest
+    if not (sure := _flat(t, x, least, _BAND, most)):
+        return []
+    soft = _flat(t, x, least, _SOFT_BAND, most)
+    return soft + [p for p in sure if all(p.last <= q.first or q.last <= p.first for q in soft)]
+
+
+def _flat(t: Array, x: Array, least: float, band: float, highest: Array) -> list[Peak]:
+    """The peaks that are within `band` of their height for longer than their sides allow."""
+    found = []
+    for sign, most in zip((1.0, -1.0), highest, strict=True):
+        y = sign * x
+        limit = max(_NEAR * max(float(y.max(initial=0.0)), float(most)), least)
+        high = np.flatnonzero(np.diff(np.r_[False, y >= limit, False].astype(int)))
+        for begin, end in zip(high[::2], high[1::2], strict=True):
+            top = y[begin:end].max()
+            rows = begin + np.flatnonzero(y[begin:end] >= (1.0 - band) * top)
+            first, last = int(rows[0]), int(rows[-1]) + 1
+            if last - first < _FEWEST or first < 2 or last + 2 > len(y):
+                continue
+            up = (y[first - 1] - y[first - 2]) / (t[first - 1] - t[first - 2])
+            down = (y[last] - y[last + 1]) / (t[last + 1] - t[last])
+            step = (t[last] - t[first - 1]) / (last + 1 - first)
+            half = 0.5 * (last - first) * step
+            if min(up, down) * half**2 < _TOO_FLAT * 2.0 * (half + 1.5 * step) * band * top:
+                continue
+            from scipy.interpolate import CubicHermiteSpline  # which few recordings need, and takes long to import
+
+            curve = CubicHermiteSpline(t[[first - 1, last]], y[[first - 1, last]], [up, -down])
+            found.append(Peak(first, last, sign * np.maximum(curve(t[first:last]), y[first:last])))
+    return found
+
+
+def highest(imu: Imu) -> Array:
+    """(2, 3, 2) the highest readings of gyro and accelerometer by their own axes, up and down."""
+    both = (imu.gyro @ imu.R_bs, imu.accel @ imu.R_bs)
+    return np.array([np.stack([x.max(axis=0, initial=0.0), (-x).max(axis=0, initial=0.0)], -1) for x in both])
+
+
+def first_not_cut(samples: Samples, R_bs: Array, before: Array, now: Array) -> float:
+    """When the first peak was, s, that seemed cut as long as readings were no higher than `before`, but is not.
+
+    Infinite if there is none; `before` and `now` are as `highest` says.
+    """
+    first = np.inf
+    for k, name in enumerate(_LEAST):
+        x = getattr(samples, name) @ R_bs
+        for axis in range(3):
+            old, new = (cut_peaks(samples.t, x[:, axis], _LEAST[name], most[k, axis]) for most in (before, now))
+            still = {p.first for p in new}
+            first = min([first, *(float(samples.t[p.first]) for p in old if p.first not in still)])
+    return first
+
+
+def with_whole_peaks(samples: Samples, R_bs: Array, known: Array | None = None) -> tuple[Samples, tuple[str, ...]]:
+    """The samples with cut peaks put back, and sentences that say so.
+
+    Parameters
+    ----------
+    R_bs : body from the sensors' own axes.
+    known : as `highest` says, what they have read at other times.
+    """
+    notes = []
+    out = samples
+    for k, (name, what, unit) in enumerate((("gyro", "gyro", "rad/s"), ("accel", "accelerometer", "m/s^2"))):
+        x, cut = getattr(samples, name) @ R_bs, False
+        extra = getattr(samples, f"extra_{name}").copy()
+        for axis in range(3):
+            peaks = cut_peaks(samples.t, x[:, axis], _LEAST[name], None if known is None else known[k, axis])
+            if not peaks:
+                continue
+            cut = True
+            limit = max(float(np.max(np.abs(x[p.first : p.last, axis]))) for p in peaks)
+            for p in peaks:
+                rows = slice(p.first, p.last)
+                T = samples.t[rows] - samples.t[p.first - 1 : p.last - 1]
+                added = float(np.sum((p.values - x[rows, axis]) * T))
+                extra[rows] += (_DOUBT * added) ** 2 / T.sum()
+                x[rows, axis] = p.values
+            notes.append(
+                f"{what} {'xyz'[axis]} (file axes) ends at {limit:.3g} {unit}: {len(peaks)} peaks were cut off and put "
+                "back by their sides"
+            )
+        if cut:
+            x = x @ R_bs.T
+            out = replace(out, gyro=x, extra_gyro=extra) if name == "gyro" else replace(out, accel=x, extra_accel=extra)
+    return out, tuple(notes)

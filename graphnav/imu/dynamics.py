@@ -1,0 +1,223 @@
+"""What a preintegrated interval says of the states at its ends, on the rotating, curved Earth.
+
+In the fixed local frame n the vehicle obeys (Groves 2013, eq. 5.18-5.29, with n Earth-fixed)::
+
+    dR/dt = R [omega_b - R^T omega]x    dv/dt = R f + g(p) - 2 omega x v    dp/dt = v
+
+with gravity g and Earth rate omega. Let E(s) = Exp(omega s) and y = E(s) p, the position seen from axes
+that stand still in inertial space and coincide with n at the interval's start. Then y'' = E(s) (R f + G)
+with G = g(p) + omega x (omega x p), and the Coriolis force is gone. Over an interval of length T::
+
+    R_j = E^T R_i dR
+    p_j = E^T (p_i + (v_i + omega x p_i) T + iint E G + R_i dP)
+    v_j = E^T ((v_i + omega x p_i) + int E G + R_i dV) - omega x p_j
+
+E is integrated in closed form and G, which changes only with position, linearly: exact to a millimetre
+in ten minutes of free inertial. Constant scale errors s of the sensors act like biases b + s * mean
+rate (or force) of the interval, which is how they are estimated; so do axes that are not quite square, b + M * mean.
+
+The residual of an interval is the end state minus this prediction. Its covariance is known in the frames
+of `Intervals.covariance`; there it does not depend on the states. Filter and smoothers use the one
+transition matrix F = d(end)/d(start) below.
+"""
+
+from __future__ import annotations
+
+from functools import cache, cached_property
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array, mv
+from graphnav.core.state import DIM, Parameter, States
+from graphnav.imu.preintegration import Intervals
+from graphnav.recording import ImuNoise, Recording
+
+SCALE = "imu_scale"
+_TO, _FROM = np.array([0, 1, 2, 0, 0, 1, 1, 2, 2]), np.array([0, 1, 2, 1, 2, 0, 2, 0, 1])  # M_ij in its order
+_INTO = np.eye(3)[_TO]
+_I3 = np.eye(3)
+
+
+def scale_parameter(recording: Recording) -> tuple[Parameter, ...]:
+    """Scale errors (gyro x y z, accelerometer x y z), where the noise figures leave them open.
+
+    Of a foot, which turns and is shaken about all axes, also what each axis has of the others: 9 and 9, those first.
+    """
+    return _scale_parameter(recording.imu.noise, 9 if recording.platform == "foot" else 3)
+
+
+@cache
+def _scale_parameter(noise: ImuNoise, each: int) -> tuple[Parameter, ...]:
+    if noise.gyro_scale_sigma <= 0 and noise.accel_scale_sigma <= 0:
+        return ()
+    sigma = np.repeat([max(noise.gyro_scale_sigma, 1e-9), max(noise.accel_scale_sigma, 1e-9)], each)
+    return (Parameter(SCALE, np.zeros(2 * each), sigma, "1"),)
+
+
+def as_biases(scale: Array, force: Array, rate: Array) -> tuple[Array, Array]:
+    """What scale errors (k,) or (n, k) are like at means (n, 3): biases of accelerometer and gyro, (n, 3) each."""
+    half = scale.shape[-1] // 2
+    of_accel, of_gyro = scale[..., half:] * force[:, _FROM[:half]], scale[..., :half] * rate[:, _FROM[:half]]
+    return (of_accel, of_gyro) if half == 3 else (of_accel @ _INTO, of_gyro @ _INTO)
+
+
+def by_scale(by_bias: Array, mean: Array, k: int) -> Array:
+    """(n, r, k): derivative by k errors of a triad, from that by its bias (n, r, 3)."""
+    return np.asarray(by_bias[..., _TO[:k]] * mean[:, None, _FROM[:k]])
+
+
+class Motion:
+    """Prediction over preintegrated intervals in a local frame; what does not depend on states is done once."""
+
+    def __init__(self, intervals: Intervals, frame: LocalFrame) -> None:
+        self.intervals, self.frame = intervals, frame
+        T = intervals.T[:, None]
+        h = T[..., None]
+        omega = frame.omega_n
+        W = self.W = frame.W
+        self.W2 = frame.W2
+        E = rotation.exp(omega * T)
+        gamma1, gamma2 = rotation.integrals(omega * T)
+        self.back = np.swapaxes(E, -1, -2)
+        gradient = frame.gravity_gradient
+        n = len(intervals)
+        self.post = np.zeros((n, 6, 6))  # from (E p, E u) to (p, v)
+        self.post[:, :3, :3] = self.post[:, 3:, 3:] = self.back
+        self.post[:, 3:, :3] = -W @ self.back
+        coast = np.zeros((n, 6, 6))  # (E p, E u) at the end from (p, v) at the start, without force
+        coast[:, :3, :3] = _I3 + h * W
+        coast[:, :3, 3:] = h * (_I3 + h * h / 6.0 * gradient)
+        coast[:, 3:, :3] = W
+        coast[:, 3:, 3:] = _I3 + 0.5 * h * h * gradient
+        self.coast = self.post @ coast
+        # and what gravity at the start changes with its position
+        coast[:, :3, :3] += 0.5 * h * h * (gradient + self.W2)
+        coast[:, 3:, :3] += h * (gradient + self.W2)
+        self.inner = self.post @ coast
+        self.pushed = self.post @ np.concatenate([gamma2 * h * h, gamma1 * h], axis=1)  # by G: iint E, int E
+        # d(theta, dP, dV) / d(ba, bg), (n, 9, 6)
+        self.bias = np.zeros((n, 9, 6))
+        self.bias[:, :3, 3:] = intervals.theta_bg
+        self.bias[:, 3:6, :3], self.bias[:, 3:6, 3:] = intervals.p_ba, intervals.p_bg
+        self.bias[:, 6:, :3], self.bias[:, 6:, 3:] = intervals.v_ba, intervals.v_bg
+        self.step = np.concatenate([intervals.dP, intervals.dV], axis=-1)
+        self.expected = np.concatenate([intervals.ba, intervals.bg], axis=-1)
+
+    def prepared(self) -> Motion:
+        """The same, with all that is made when it is asked for first made already."""
+        _ = self.whitener
+        return self
+
+    @cached_property
+    def whitener(self) -> Array:
+        """(n, 15, 15) W with W^T W the inverse of `Intervals.covariance`.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If a covariance is singular.
+        """
+        return np.linalg.inv(np.linalg.cholesky(self.intervals.covariance))
+
+    def propagate(
+        self, rows: slice, start: States, scale: Array | None = None, linear: bool = True
+    ) -> tuple[States, Array]:
+        """The states at the ends of intervals `rows` and F (n, 15, 15) there, from the states at their starts.
+
+        `scale` is (k,), (n, k) or None, k 6 or 18. Without `linear` F is not made, and empty.
+        """
+        iv, R = self.intervals, start.R_nb
+        n = len(R)
+        delta = np.concatenate([start.ba, start.bg], -1) - self.expected[rows]
+        if scale is not None:
+            delta += np.concatenate(as_biases(scale, iv.force[rows], iv.rate[rows]), -1)
+        bent = mv(self.bias[rows], delta)
+        turn, moved = bent[:, :3], self.step[rows] + bent[:, 3:]  # dP, dV
+        dR = iv.dR[rows] @ rotation.exp(turn)
+
+        turned = self._turned(rows, R)
+        G = self.frame.gravity_n(start.p) + start.p @ self.W2.T
+        pv = mv(self.coast[rows], np.concatenate([start.p, start.v], -1)) + mv(turned, moved) + mv(self.pushed[rows], G)
+        end = States(self.back[rows] @ R @ dR, pv[:, :3], pv[:, 3:], start.ba, start.bg)
+        if not linear:
+            return end, np.empty((0, DIM, DIM))
+
+        F = np.zeros((n, DIM, DIM))
+        F[:, 0:3, 0:3] = np.swapaxes(dR, -1, -2)
+        # right_jacobian(turn) is I - [turn]x/2 for the small turns this is used for
+        F[:, 0:3, 12:15] = (_I3 - 0.5 * rotation.skew(turn)) @ iv.theta_bg[rows]
+        F[:, 3:9, 0:3] = turned @ -rotation.skew(moved.reshape(n, 2, 3)).reshape(n, 6, 3)
+        F[:, 3:9, 3:9] = self.inner[rows]
+        F[:, 3:9, 9:15] = turned @ self.bias[rows, 3:]
+        F[:, 9:15, 9:15] = _I6
+        return end, F
+
+    def _turned(self, rows: slice, R_nb: Array) -> Array:
+        """(n, 6, 6) from (dP, dV) in the start's body axes to (p, v) at the end."""
+        return (self.post[rows].reshape(-1, 6, 2, 3) @ R_nb[:, None]).reshape(-1, 6, 6)
+
+    def scale_columns(self, rows: slice, F: Array, k: int) -> Array:
+        """d(end) / d(scale), (n, 15, k): the bias columns of F times what the scale multiplies."""
+        iv, half = self.intervals, k // 2
+        out = np.zeros((len(F), DIM, k))
+        out[:, :9, :half] = by_scale(F[:, :9, 12:15], iv.rate[rows], half)
+        out[:, :9, half:] = by_scale(F[:, :9, 9:12], iv.force[rows], half)
+        return out
+
+    def frames(self, rows: slice, R_nb: Array) -> Array:
+        """(n, 15, 15) from the frames of `Intervals.covariance` to the error state at the end."""
+        n = len(R_nb)
+        L = np.zeros((n, DIM, DIM))
+        L[:, 0:3, 0:3] = _I3
+        L[:, 3:9, 3:9] = self._turned(rows, R_nb)
+        L[:, 9:15, 9:15] = _I6
+        return L
+
+    def noise(self, rows: slice, R_nb: Array) -> Array:
+        """Q (n, 15, 15), covariance of the end's error state, for starts with attitudes R_nb."""
+        Q, turned = self.intervals.covariance[rows].copy(), self._turned(rows, R_nb)
+        Q[:, 3:9] = turned @ Q[:, 3:9]
+        Q[:, :, 3:9] = Q[:, :, 3:9] @ np.swapaxes(turned, -1, -2)
+        return np.asarray(Q)
+
+    def residual(self, states: States, scale: Array | None = None) -> Array:
+        """(n, 15) end minus prediction for all intervals, in the frames of `Intervals.covariance`."""
+        ahead, _ = self.propagate(slice(None), states[:-1], scale)
+        return self._body(states[1:].minus(ahead), states.R_nb[:-1])
+
+    def linearize(self, states: States, scale: Array | None = None) -> tuple[Array, Array, Array, Array]:
+        """`residual` of all intervals, its Jacobians by both ends (n, 15, 15) and by the scale (n, 15, k)."""
+        rows, start = slice(None), states[:-1]
+        ahead, F = self.propagate(rows, start, scale)
+        r = states[1:].minus(ahead)
+        r_theta = r[:, :3]
+        inverse = rotation.right_jacobian_inverse(r_theta)
+        S = self.scale_columns(rows, F, 6 if scale is None else scale.shape[-1])
+        both = -np.concatenate([F, S], -1)
+        both[:, :3] = inverse @ rotation.exp(-r_theta) @ both[:, :3]
+        Jj = np.zeros_like(F)
+        Jj[:] = np.eye(DIM)
+        Jj[:, :3, :3] = inverse
+        value = self._body(r, start.R_nb)
+        both, Jj = self.body_rows(both, start.R_nb), self.body_rows(Jj, start.R_nb)
+        # the frame of p and v turns with the start's attitude
+        both[:, 3:6, :3] += rotation.skew(value[:, 3:6])
+        both[:, 6:9, :3] += rotation.skew(value[:, 6:9])
+        return value, both[:, :, :DIM], Jj, both[:, :, DIM:]
+
+    def body_rows(self, J: Array, R_nb: Array, rows: slice = slice(None)) -> Array:
+        """Turn the p and v rows of (n, 15, k) back into the start's body axes: inverse of `frames`."""
+        Et = np.swapaxes(self.back[rows], -1, -2)
+        Rt = np.swapaxes(R_nb, -1, -2) @ Et
+        out = J.copy()
+        out[:, 3:6] = Rt @ J[:, 3:6]
+        out[:, 6:9] = Rt @ (J[:, 6:9] + self.W @ J[:, 3:6])
+        return out
+
+    def _body(self, r: Array, R_nb: Array) -> Array:
+        return self.body_rows(r[..., None], R_nb)[..., 0]
+
+
+_I6 = np.eye(6)

@@ -1,0 +1,128 @@
+"""IMU rows as pieces of constant rate and force: gaps filled, periods split at the times of keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphnav.core.findings import period_of
+from graphnav.core.rotation import Array
+from graphnav.recording import Imu
+
+GAP = 1.5  # sample periods between rows that are a gap
+MANY = 64  # pieces of an interval beyond which it is handled apart from shorter ones
+_CHUNK = 40_000  # pieces handled at once: keeps the working arrays in the processor's cache
+
+
+@dataclass(frozen=True)
+class Samples:
+    """IMU samples as pieces of constant rate and force, with gaps made explicit.
+
+    `extra_gyro`, `extra_accel` are white densities squared ((rad/s)^2/Hz, (m/s^2)^2/Hz) on top of the
+    sensor's own: where a gap is bridged, and what `graphnav.imu.unresolved` adds for a foot.
+    """
+
+    t: Array  # (N,) end of each sample's period
+    gyro: Array  # (N, 3)
+    accel: Array  # (N, 3)
+    extra_gyro: Array  # (N,)
+    extra_accel: Array  # (N,)
+    start: float  # start of the first period
+    bridged: Array  # (g, 2) start and end of every bridged gap, s
+
+    def between(self, begin: float, end: float) -> Samples:
+        """Those whose periods lie, all or in part, between two times (s); views."""
+        k = slice(np.searchsorted(self.t, begin, side="left"), np.searchsorted(self.t, end, side="left") + 1)
+        rows = {name: getattr(self, name)[k] for name in ("t", "gyro", "accel", "extra_gyro", "extra_accel")}
+        return replace(self, **rows)
+
+
+def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
+    """Put a made-up sample into every gap: the mean of its neighbours, with the noise that deserves.
+
+    A row only speaks for one sample period before its stamp. What happened in a longer silence g is
+    unknown by as much as the signal itself usually changes over g, which the recording shows:
+    half its structure function, D(g)/2 = E|x(t+g) - x(t)|^2 / 2 per axis, is the variance of a guess
+    from the neighbours. That error lasts the whole gap, so the equivalent white density is D(g)/2 * g.
+    """
+    dt = imu.t[1:] - imu.t[:-1]
+    period = period_of(imu.t)
+    gap = np.flatnonzero(dt > factor * period)
+    zero = np.zeros(len(imu.t))
+    if not len(gap):
+        return Samples(imu.t, imu.gyro, imu.accel, zero, zero, float(imu.t[0] - period), np.empty((0, 2)))
+    t_fill = imu.t[gap + 1] - period
+    length = t_fill - imu.t[gap]
+    at = gap + 1  # the made-up sample stands before the row that ends the gap
+    fill = {name: 0.5 * (getattr(imu, name)[gap] + getattr(imu, name)[gap + 1]) for name in ("gyro", "accel")}
+    extra = {name: _structure(getattr(imu, name), length / period) * length for name in ("gyro", "accel")}
+    return Samples(
+        t=np.insert(imu.t, at, t_fill),
+        gyro=np.insert(imu.gyro, at, fill["gyro"], axis=0),
+        accel=np.insert(imu.accel, at, fill["accel"], axis=0),
+        extra_gyro=np.insert(zero, at, extra["gyro"]),
+        extra_accel=np.insert(zero, at, extra["accel"]),
+        start=float(imu.t[0] - period),
+        bridged=np.stack([imu.t[gap], t_fill], -1),
+    )
+
+
+def _structure(x: Array, lags: Array) -> Array:
+    """Half the mean squared change per axis over each lag (in samples)."""
+    steps = np.maximum(1, np.rint(lags)).astype(int)
+    values = {}
+    for n in np.unique(np.minimum(steps, len(x) - 1)):
+        change = x[n:] - x[:-n]
+        values[n] = 0.5 * float(np.mean(change * change))
+    return np.array([values[min(n, len(x) - 1)] for n in steps])
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Sample periods split at keyframes: interval i owns pieces first[i] .. first[i] + count[i]."""
+
+    edges: Array  # (pieces + 1,) s
+    dt: Array
+    index: Array  # the sample each piece belongs to
+    first: Array
+    count: Array
+
+    def padded(self, rows: Array) -> tuple[Array, Array]:
+        """(L, n) lengths and sample indices of some intervals, padded with pieces of no length."""
+        piece = np.arange(int(self.count[rows].max()))[:, None]
+        inside = piece < self.count[rows]
+        at = np.minimum(self.first[rows] + piece, len(self.dt) - 1)
+        return np.where(inside, self.dt[at], 0.0), self.index[at]
+
+
+def pieces_of(samples: Samples, t: Array, extra: Array | None = None) -> Pieces:
+    """Pieces between keyframes t, split at the `extra` times too."""
+    inner = samples.t[(samples.t > t[0]) & (samples.t < t[-1])]
+    # all but sorted already, which is what a stable sort makes use of
+    edges = np.sort(np.concatenate([inner, t] if extra is None else [inner, t, extra]), kind="stable")
+    dt = edges[1:] - edges[:-1]
+    if dt.size and dt.min() <= 0.0:
+        edges = edges[np.append(True, dt > 0)]
+        dt = edges[1:] - edges[:-1]
+    index = np.minimum(np.searchsorted(samples.t, edges[1:], side="left"), len(samples.t) - 1)
+    starts = np.searchsorted(edges, t)
+    return Pieces(edges, dt, index, starts[:-1], starts[1:] - starts[:-1])
+
+
+def chunks(count: Array) -> Iterator[Array]:
+    """Intervals of similar length together, so that little is padded."""
+    order = np.argsort(count, kind="stable")
+    start = 0
+    while start < len(order):
+        # the longest of the chunk decides its width; lengths are ascending, so look ahead by bisection
+        lo, hi = start + 1, len(order)
+        while lo < hi:
+            mid = (lo + hi + 1) // 2
+            fits = (mid - start) * count[order[mid - 1]] <= _CHUNK
+            alike = count[order[mid - 1]] <= 2 * count[order[start]] + 16
+            alike &= (count[order[mid - 1]] >= MANY) == (count[order[start]] >= MANY)
+            lo, hi = (mid, hi) if fits and alike else (lo, mid - 1)
+        yield order[start:lo]
+        start = lo

@@ -1,0 +1,66 @@
+"""What a sampled IMU cannot know of a violent motion: the noise of heel strikes.
+
+A row holds the mean rate and force of its period, and they are integrated as if they were constant in it. A signal
+that changes evenly by D within a period deviates from its mean by D / sqrt(12) (1-sigma). In a drive that is far below
+the noise of the sensor; when a heel meets the floor, force changes by 10 m/s^2 and rate by 1 rad/s from row to row,
+and with them go the errors that no figure of a data sheet holds: filters not quite alike, axes not quite square, force
+felt by a gyro. So each row gets white noise on top of the sensor's own,
+
+    sigma_k = D_k / sqrt(48),    D_k = (|x_k - x_k-1| + |x_k+1 - x_k|) / (2 sqrt(3))    per axis
+
+a density of sigma_k^2 dt. Noise of the sensor itself changes rows too; what it does on its own is taken off before.
+Half of D / sqrt(12), because that is a bound: a sensor that averages before it is read loses less, and of its variance
+the residuals of real walks show 3 to 20 %, of the fastest 40 %.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.imu.samples import Samples
+from graphnav.recording import ImuNoise
+
+_SHARE = 0.25  # of the variance of an evenly changing signal
+
+
+def with_unresolved_motion(samples: Samples, noise: ImuNoise) -> Samples:
+    """The samples with the noise of what happens inside their periods."""
+    period = float(np.median(np.diff(samples.t)))
+    return replace(
+        samples,
+        extra_gyro=samples.extra_gyro + _density(samples.gyro, noise.gyro_noise_density, period),
+        extra_accel=samples.extra_accel + _density(samples.accel, noise.accel_noise_density, period),
+    )
+
+
+def _density(x: Array, white: float, period: float) -> Array:
+    """White density squared (N,) of rows (N, 3); `white` is the sensor's own density."""
+    change = np.sum(np.diff(x, axis=0) ** 2, axis=1) / 3.0
+    change = np.maximum(change - 2.0 * white**2 / period, 0.0)
+    both = 0.5 * (np.sqrt(np.r_[change[:1], change]) + np.sqrt(np.r_[change, change[-1:]]))
+    return np.asarray(_SHARE * both**2 / 12.0 * period)
+
+
+def with_coning(samples: Samples) -> Samples:
+    """The samples as rates and forces that, constant over a period, lead where changing ones of the same means would.
+
+    For a rate w and a force f that change evenly, w', f' per second, in a period T (Savage 1998, part 1, eq. 36-49 and
+    part 2, eq. 44-55, with slopes by central instead of backward differences, because all rows are there)::
+
+        coning      w + T^2/12 w x w'
+        sculling    f + T^2/12 (w x f' + f x w')
+
+    """
+    if len(samples.t) < 3:
+        return samples
+    T = np.diff(samples.t, prepend=samples.start)
+    middle = samples.t - 0.5 * T
+    w, f = samples.gyro, samples.accel
+    dw, df = np.zeros_like(w), np.zeros_like(f)
+    across = (middle[2:] - middle[:-2])[:, None]
+    dw[1:-1], df[1:-1] = (w[2:] - w[:-2]) / across, (f[2:] - f[:-2]) / across
+    part = (T * T / 12.0)[:, None]
+    return replace(samples, gyro=w + part * np.cross(w, dw), accel=f + part * (np.cross(w, df) + np.cross(f, dw)))

@@ -1,0 +1,209 @@
+"""A recording: what the sensors said, in SI units, body axes RFU and one clock. Frozen arrays.
+
+`graphnav.recording.formats.read` makes one from any source graphnav knows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.gnss.series import RawGnss
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """1-sigma noise figures of an IMU, SI, continuous time (the field names are recording.toml's)."""
+
+    gyro_noise_density: float = 1.0e-4  # rad/s/sqrt(Hz)
+    accel_noise_density: float = 1.0e-3  # m/s^2/sqrt(Hz)
+    gyro_bias_walk: float = 2.0e-6  # rad/s/sqrt(s)
+    accel_bias_walk: float = 5.0e-5  # m/s^2/sqrt(s)
+    gyro_bias_sigma: float = 5.0e-3  # rad/s at turn-on
+    accel_bias_sigma: float = 1.0e-1  # m/s^2 at turn-on
+    gyro_scale_sigma: float = 3.0e-3  # 1, constant scale error per axis; 0 = none, not estimated
+    accel_scale_sigma: float = 3.0e-3
+
+
+@dataclass(frozen=True)
+class Imu:
+    """Row k is the mean rate and specific force over the period that ends at t[k]."""
+
+    t: Array  # (N,) s, strictly increasing
+    gyro: Array  # (N, 3) rad/s with respect to inertial space, RFU
+    accel: Array  # (N, 3) m/s^2, specific force, RFU
+    noise: ImuNoise = ImuNoise()
+    R_bs: Array = field(default_factory=lambda: np.eye(3))  # body (RFU) from the file's axes
+    noise_assumed: bool = False  # True when the recording states no noise figures
+
+
+# Types of fixes by RTKLIB's quality numbers (SOLQ_FIX to SOLQ_PPP of rtklib.h); 0 where a fix says nothing
+FIX_TYPES = {0: "unknown", 1: "fixed", 2: "float", 3: "sbas", 4: "differential", 5: "single", 6: "ppp"}
+
+
+@dataclass(frozen=True)
+class Gnss:
+    """Position and optional velocity of the antenna; NaN where an epoch has none."""
+
+    t: Array  # (M,) s
+    llh: Array  # (M, 3) rad, rad, m
+    sd: Array  # (M, 3) m, east, north, up
+    v: Array | None = None  # (M, 3) m/s, local ENU
+    sd_v: Array | None = None  # (M, 3) m/s
+    lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
+    type: NDArray[np.intp] | None = None  # (M,) of FIX_TYPES; None: no fix says of what type it is
+    type_assumed: bool = False  # True when they are a CSV file's numbers, which were taken for RTKLIB's
+    derived: bool = False  # single-point positions computed from the recording's own raw observations
+
+    @property
+    def types(self) -> dict[str, int]:
+        """How many fixes there are of each type, by its name; empty where none says."""
+        if self.type is None:
+            return {}
+        return {name: n for k, name in FIX_TYPES.items() if (n := int(np.count_nonzero(self.type == k)))}
+
+
+def fix_types(said: Array, numbers: dict[int, int] | None = None) -> NDArray[np.intp] | None:
+    """Types (N,) of what a log says, by its own numbers -> those of `FIX_TYPES`; None if it says nothing anywhere.
+
+    Without `numbers` they are those of `FIX_TYPES`. Blanks (NaN) and numbers that mean none are 0.
+    """
+    numbers = {k: k for k in FIX_TYPES} if numbers is None else numbers
+    found = np.zeros(len(said), dtype=np.intp)
+    for theirs, ours in numbers.items():
+        found[said == theirs] = ours
+    return found if found.any() else None
+
+
+@dataclass(frozen=True)
+class Odometer:
+    """Forward speed of the point that does not slip sideways.
+
+    Where pulses were counted, `way` is what the readings are and `speed` its slope at t.
+    """
+
+    t: Array  # (M,) s
+    speed: Array  # (M,) m/s
+    lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
+    scale_sigma: float = 0.02
+    way: Array | None = None  # (M,) m counted up to t
+    pulse: float = 0.0  # m per count of `way`
+    wheels: Array | None = None  # (M, 4) m/s, front left, front right, rear left, rear right; NaN where unknown
+    signed: bool = True  # False: backward reads positive
+    speed_sigma: float | None = None  # m/s, of one reading; None: told from the readings
+    delay_sigma: float = 0.0  # s, of the stamps; 0: they are exact
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A reference, only for evaluation. Exactly one of `llh`, `xyz`, `closed_loop_sigma` is given."""
+
+    t: Array  # (M,) s
+    llh: Array | None = None  # (M, 3) rad, rad, m
+    xyz: Array | None = None  # (M, 2 or 3) m in a local frame of unknown origin and yaw
+    v: Array | None = None  # (M, 3) m/s, local ENU, NaN where absent
+    rph: Array | None = None  # (M, 3) rad, NaN where absent
+    of: str = "imu"  # whose point it is: "imu", "gnss", "odometer"
+    closed_loop_sigma: float | None = None  # m; the end is the start
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One drive or walk. `remarks` are sentences about what loading changed or found odd."""
+
+    name: str
+    platform: str  # "vehicle" | "foot"
+    imu: Imu
+    gnss: Gnss | None = None
+    odometer: Odometer | None = None
+    truth: Truth | None = None
+    source: Path | None = None
+    files: tuple[Path, ...] = ()  # everything that was read, for provenance
+    gps_zero: float | None = None  # s since the GPS epoch (1980-01-06) at t = 0, where it is known
+    remarks: tuple[str, ...] = ()
+    screened: bool = False  # whether `graphnav.recording.plausibility.screening.screen` has been over it
+    raw_gnss: RawGnss | None = None  # observations of the antenna that `gnss` has fixes of
+
+    @cached_property
+    def start(self) -> float:
+        """Start of the first IMU period: where the recording's own clock reads 0, s."""
+        t = self.imu.t
+        return float(t[0] - np.median(np.diff(t[:1000])))
+
+    @property
+    def end(self) -> float:
+        """End of the last IMU period, s."""
+        return float(self.imu.t[-1])
+
+    @property
+    def duration(self) -> float:
+        """Seconds covered by the IMU."""
+        return self.end - self.start
+
+    def tight(self, coupling: str) -> bool:
+        """Whether raw observations are used in place of the fixes, by `raw_gnss.coupling` of the settings."""
+        if self.raw_gnss is None or coupling == "loose":
+            return False
+        return coupling == "tight" or self.gnss is None or self.gnss.derived
+
+    def without(self, source: str, span: tuple[float, float] | None = None) -> Recording:
+        """The recording with one source withheld, in a span in seconds from the start or throughout.
+
+        Raises
+        ------
+        RecordingError
+            If the recording has no such source.
+        """
+        if source not in ("gnss", "odometer"):
+            raise RecordingError(f"cannot withhold '{source}': only 'gnss' or 'odometer' can be withheld")
+        sensor = getattr(self, source)
+        if sensor is None:
+            raise RecordingError(f"cannot withhold '{source}': the recording '{self.name}' has none")
+        left = None
+        if span is not None:
+            t = sensor.t - self.start
+            left = rows_of(sensor, ~((t >= span[0]) & (t <= span[1])))
+        changed: dict[str, Any] = {source: left}
+        if source == "gnss" and self.raw_gnss is not None:  # whose fixes they are
+            raw = self.raw_gnss.t - self.start
+            out = np.zeros(len(raw), dtype=bool) if span is None else (raw < span[0]) | (raw > span[1])
+            changed["raw_gnss"] = rows_of(self.raw_gnss, out) if out.any() else None
+        return replace(self, **changed)
+
+    def crop(self, start: float | None = None, end: float | None = None) -> Recording:
+        """The part between two times in seconds from the start; the clock keeps its epoch."""
+        if start is None and end is None:
+            return self
+        lo = -np.inf if start is None else self.start + start
+        hi = np.inf if end is None else self.start + end
+        parts: dict[str, Any] = {
+            name: rows_of(sensor, (sensor.t >= lo) & (sensor.t <= hi))
+            for name in ("imu", "gnss", "odometer", "raw_gnss")
+            if (sensor := getattr(self, name)) is not None
+        }
+        if len(parts["imu"].t) < 2:
+            raise RecordingError(f"nothing is left of '{self.name}' between {start} and {end} s")
+        if (
+            self.truth is not None
+            and self.truth.closed_loop_sigma is not None
+            and len(parts["imu"].t) < len(self.imu.t)
+        ):
+            parts["truth"] = None  # a part of a loop is none
+        return replace(self, **parts)
+
+
+def rows_of(sensor: Any, mask: NDArray[np.bool_]) -> Any:
+    """A sensor with only the rows of `mask`."""
+    parts = {
+        key: value[mask]
+        for key, value in sensor.__dict__.items()
+        if isinstance(value, np.ndarray) and key not in ("lever_arm", "R_bs")
+    }
+    return replace(sensor, **parts)

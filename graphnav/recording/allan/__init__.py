@@ -1,0 +1,143 @@
+"""Noise figures of an IMU from a log at rest, by the Allan variance.
+
+The overlapping estimate (IEEE Std 952-1997, annex C; Riley, *Handbook of Frequency Stability Analysis*, NIST SP 1065,
+section 5.2.4) and the model of its annex C: angle random walk N, bias instability B and rate random walk K add up as
+
+    sigma^2(tau) = N^2 / tau + B^2 (2 / pi) ln 2 + K^2 tau / 3
+
+and are fitted together, none below zero, each point weighted by how well its variance is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+
+PER_DECADE = 12  # averaging times
+_FEWEST = 9  # periods of the longest averaging time that the log must hold
+_SHORTEST = 60.0  # s of a log that is worth it
+_FLAT = 2.0 / np.pi * np.log(2.0)
+_STEP = 1.0  # s, of the means that show whether the log moves
+_TURNS, _PUSHES = np.radians(1.0), 0.1  # rad/s, m/s^2: more than this from the median, and it moves
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Figures of one sensor per axis (3,): of a gyro rad/s/sqrt(Hz), rad/s, rad/s/sqrt(s); with m/s^2 of forces."""
+
+    white: Array  # N, angle or velocity random walk
+    instability: Array  # B
+    walk: Array  # K, 0 where the log is too short to see it
+    floor: Array  # s, where the deviation is lowest
+
+
+@dataclass(frozen=True)
+class Allan:
+    """Deviations of the six axes at averaging times, and the figures fitted to them."""
+
+    tau: Array  # (M,) s
+    gyro: Array  # (M, 3) rad/s
+    accel: Array  # (M, 3) m/s^2
+    gyro_noise: Noise
+    accel_noise: Noise
+    duration: float  # s
+    rate: float  # Hz
+
+    def lines(self) -> list[str]:
+        """The lines to paste under [imu.noise]: root mean squares over the axes."""
+        out = []
+        for name, noise, unit in (("gyro", self.gyro_noise, "rad/s"), ("accel", self.accel_noise, "m/s2")):
+            out.append(_line(f"{name}_noise_density", _rms(noise.white), f"{unit}/sqrt(Hz)"))
+            walk, why = _rms(noise.walk), "rate random walk"
+            if walk == 0.0:
+                walk, why = _rms(noise.instability / np.sqrt(noise.floor)), "bias instability over the root of its time"
+            out.append(_line(f"{name}_bias_walk", walk, f"{unit}/sqrt(s): {why}"))
+        return out
+
+
+def allan_of(t: Array, gyro: Array, accel: Array) -> Allan:
+    """Allan deviations and figures of a log at rest: t (N,) s, gyro (N, 3) rad/s, accel (N, 3) m/s^2.
+
+    Raises
+    ------
+    RecordingError
+        If the log moves, has gaps, or is too short.
+    """
+    period = float(np.median(np.diff(t)))
+    gap = np.flatnonzero(np.diff(t) > 1.5 * period)
+    if len(gap):
+        raise RecordingError(
+            f"{len(gap)} gaps, the first of {t[gap[0] + 1] - t[gap[0]]:.3f} s at {t[gap[0]] - t[0]:.1f} s: an Allan "
+            "variance needs a log without any; choose a part with --start and --end"
+        )
+    duration = len(t) * period
+    if duration < _SHORTEST:
+        raise RecordingError(f"{duration:.0f} s are too short; an hour at rest is better, a minute the least")
+    moving = moves_at(t, gyro, accel)
+    if moving is not None:
+        raise RecordingError(
+            f"the log moves, first at {moving:.0f} s: an Allan variance is of an IMU at rest; choose a part with "
+            "--start and --end"
+        )
+    m = averaging(len(t))
+    tau = m * period
+    devs = [deviations(x, period, m) for x in (gyro, accel)]
+    noises = [_fit(tau, d, len(t)) for d in devs]
+    return Allan(tau, devs[0], devs[1], noises[0], noises[1], duration, 1.0 / period)
+
+
+def moves_at(t: Array, gyro: Array, accel: Array) -> float | None:
+    """The first time (s from the start) at which means over a second leave the median of the log; None at rest."""
+    n = max(round(_STEP / float(np.median(np.diff(t)))), 1)
+    for samples, limit in ((gyro, _TURNS), (accel, _PUSHES)):
+        means = samples[: len(samples) // n * n].reshape(-1, n, 3).mean(1)
+        far = np.flatnonzero((np.abs(means - np.median(means, axis=0)) > limit).any(-1))
+        if len(far):
+            return float(t[far[0] * n] - t[0])
+    return None
+
+
+def averaging(count: int) -> Array:
+    """Numbers of samples to average over, even on a logarithmic scale, up to a ninth of the log."""
+    most = max(count // _FEWEST, 1)
+    steps = np.logspace(0.0, np.log10(most), max(int(PER_DECADE * np.log10(most)), 1) + 1)
+    return np.unique(np.round(steps).astype(int))
+
+
+def deviations(x: Array, period: float, m: Array) -> Array:
+    """Overlapping Allan deviations (M, k) of samples (N, k) at averaging times of `m` (M,) samples."""
+    total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x - x.mean(0), axis=0)]) * period
+    out = np.empty((len(m), x.shape[1]))
+    for row, n in enumerate(m.tolist()):
+        second = total[2 * n :] - 2.0 * total[n:-n] + total[: -2 * n]
+        out[row] = np.sqrt(0.5 * np.mean(second**2, axis=0)) / (n * period)
+    return out
+
+
+def _fit(tau: Array, deviation: Array, count: int) -> Noise:
+    """N, B and K of each axis."""
+    from scipy.optimize import nnls
+
+    # the relative sigma of a variance from as many independent differences as fit into the log
+    weight = np.sqrt(np.maximum(count * tau[0] / tau / 2.0 - 1.0, 0.5))
+    terms = np.stack([1.0 / tau, np.full(len(tau), _FLAT), tau / 3.0], -1)
+    out = []
+    for variance in (deviation**2).T:
+        scaled = terms * (weight / variance)[:, None]
+        size = np.linalg.norm(scaled, axis=0)
+        found, _ = nnls(scaled / size, weight)
+        out.append(np.sqrt(found / size))
+    white, instability, walk = np.array(out).T
+    return Noise(white, instability, walk, tau[np.argmin(deviation, axis=0)])
+
+
+def _rms(x: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+def _line(key: str, value: float, unit: str) -> str:
+    return f"{key} = {value:.3g}".ljust(36) + f"# {unit}"

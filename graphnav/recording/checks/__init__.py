@@ -1,0 +1,1 @@
+"""What a recording shows of itself before anything is solved: clocks, axes, units, gaps."""

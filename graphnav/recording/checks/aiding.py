@@ -1,0 +1,326 @@
+"""Checks of GNSS and odometer, and of the IMU against them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from graphnav.config.gnss import GnssSettings
+from graphnav.core.findings import Finding, period_of
+from graphnav.core.rotation import Array
+from graphnav.core.timescales import NEAR, between_clocks
+from graphnav.recording import Imu, Odometer, Recording
+from graphnav.recording import odometer as wheels
+from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks.clock import Clock
+from graphnav.recording.checks.crosschecks import Fit, Track
+from graphnav.recording.checks.stated import exchanged, exchanged_finding
+from graphnav.recording.formats.schema import TIME
+from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
+
+_SURE = 4.0  # sigmas
+_NO_BETTER = 0.05  # of a correlation
+_MIN_SPEED = 5.0  # m/s, at which wheels are compared
+
+
+def overlap_s(recording: Recording) -> float:
+    t = recording.gnss.t  # type: ignore[union-attr]
+    return float(min(t[-1], recording.end) - max(t[0], recording.start))
+
+
+def gnss_apart(recording: Recording) -> str | None:
+    """That GNSS and IMU share no time, and what may mend it; None if they do."""
+    gnss = recording.gnss
+    if gnss is None or not len(gnss.t) or overlap_s(recording) >= 0:
+        return None
+    offset = recording.start - gnss.t[0]
+    apart = (
+        f"GNSS ({gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) do not "
+        "overlap in time"
+    )
+    known = between_clocks(recording.start, recording.gps_zero, float(gnss.t[0]), None)
+    if (unit := _unit_of_stamps(gnss.t, recording)) is not None:
+        return f'{apart}: the stamps of the fixes are in {unit}; say units = {{ t = "{unit}" }} in [gnss]'
+    left = gnss.t[0] + known.offset - recording.start if known is not None else np.inf
+    if known is not None and abs(left) < NEAR:
+        return (
+            f"{apart}: {known.words}; say time_offset = {known.offset:.0f} in [gnss], with which "
+            f"GNSS starts {abs(left):.2f} s {'after' if left > 0 else 'before'} the IMU"
+        )
+    hours = round(offset / 1800.0) / 2.0
+    local = (
+        f"; {abs(hours):g} h apart, one may be in local time" if hours and abs(offset - 3600.0 * hours) < 60.0 else ""
+    )
+    return f"{apart}; if their clocks differ, say time_offset in [gnss] ({offset:.3f} would start both together){local}"
+
+
+def _unit_of_stamps(t: Array, recording: Recording) -> str | None:
+    """The unit in which stamps would lie within the recording, where they do not in s."""
+    for unit, scale in TIME.items():
+        inside = (scale * t > recording.start) & (scale * t < recording.end)
+        if unit != "s" and inside.mean() > 0.5:
+            return unit
+    return None
+
+
+def gnss_coverage(recording: Recording) -> Iterator[Finding]:
+    gnss = recording.gnss
+    assert gnss is not None
+    if (sentence := gnss_apart(recording)) is not None:
+        yield Finding("warning", sentence)
+        return
+    for late, what in ((gnss.t[0] - recording.start, "starts"), (recording.end - gnss.t[-1], "ends")):
+        if late > 5.0:
+            yield Finding("note", f"GNSS {what} {late:.1f} s {'after' if what == 'starts' else 'before'} the IMU")
+    if len(gnss.t) < 3:
+        return
+    step = np.diff(gnss.t)
+    inside = (gnss.t[1:] > recording.start) & (gnss.t[:-1] < recording.end)
+    gaps = np.flatnonzero((step > max(3.5 * period_of(gnss.t), 1.5)) & inside)
+    if len(gaps):
+        worst = gaps[np.argmax(step[gaps])]
+        count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+        at = gnss.t[worst] - recording.start
+        yield Finding("note", f"{count} in GNSS, the longest {step[worst]:.1f} s at {at:.1f} s from the start")
+
+
+def gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Finding]:
+    """Fixes that no motion explains: a step against the velocities, or an acceleration no vehicle has."""
+    gnss = recording.gnss
+    assert gnss is not None
+    if track is None or len(gnss.t) < 5:
+        return
+    p, dt = crosschecks.local_positions(gnss)[:, :2], np.diff(gnss.t)
+    sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
+    near = dt < 3.5 * track.period
+    if gnss.v is not None and not track.width.any():
+        v = np.stack([np.interp(gnss.t, track.t, track.v[:, k]) for k in (0, 1)], -1)
+        off = np.diff(p, axis=0) - 0.5 * (v[1:] + v[:-1]) * dt[:, None]
+        size = np.linalg.norm(off, axis=1)
+        limit = 1.0 + 5.0 * np.hypot(sd[1:], sd[:-1]) + 3.0 * dt
+    else:
+        off = p[2:] - p[1:-1] - (p[1:-1] - p[:-2]) * (dt[1:] / dt[:-1])[:, None]
+        size = np.r_[0.0, np.linalg.norm(off, axis=1)]
+        near &= np.r_[False, near[:-1]]
+        limit = 1.0 + 12.0 * sd[1:] + 10.0 * dt * dt
+    bad = np.flatnonzero(near & (size > limit))
+    if len(bad):
+        worst = bad[np.argmax(size[bad])]
+        count = "1 jump" if len(bad) == 1 else f"{len(bad)} jumps"
+        at = gnss.t[worst + 1] - recording.start
+        yield Finding(
+            "warning",
+            f"{count} in GNSS position that the motion and the sigmas do not explain, the largest {size[worst]:.1f} m "
+            f"at {at:.1f} s from the start; a robust kernel or a gate is advisable",
+        )
+
+
+def imu_clock(clock: Clock, odometer: Fit | None = None) -> Iterator[Finding]:
+    """By GNSS speed, and by the positions alone, which in some receivers are of another time.
+
+    `odometer` is its fit against GNSS, which tells whose clock it is. What is further off than the stamps of the fixes
+    are allowed to be would be solved into something else. The course, which leads or lags with the lever arm, is not
+    asked.
+    """
+    if clock.apart is not None:
+        yield Finding(
+            "note",
+            f"the stamps of GNSS positions and velocities are {clock.apart:.2f} s apart: they cannot both be right, "
+            "and what is left after time_offset is estimated of each",
+            "gnss.two_clocks",
+        )
+    forward = clock.late
+    if forward is None:
+        return
+    lag = forward.lag
+    leap = ", the leap seconds between GPS time and UTC" if abs(abs(lag) - 18.0) < 0.5 else ""
+    certain = abs(lag) - 4.0 * forward.spread > _SURE * GnssSettings().time_offset_sigma
+    # what the odometer is off by as well is the receiver's
+    own = odometer is None or odometer.correlation < 0.9 or abs(odometer.lag - lag) > 0.5 * abs(lag)
+    mend = f"{-lag:+.2f} to time_offset in [imu]" if own else f"{lag:+.2f} to time_offset in [gnss]"
+    yield Finding(
+        "untrusted" if certain else "warning",
+        f"IMU stamps are {'late' if lag > 0 else 'early'} against GNSS by {abs(lag):.2f} s{leap} (forward force "
+        f"against speed, +-{max(forward.spread, 0.01):.2f} s): add {mend}",
+        "imu.clock",
+    )
+
+
+def mirrored(recording: Recording) -> Iterator[Finding]:
+    """Turns against the course that are those of the course with latitude and longitude exchanged."""
+    other = exchanged(recording.gnss) if recording.gnss is not None else None
+    way = crosschecks.track(replace(other, v=None)) if other is not None else None
+    yaw = crosschecks.yaw_fit(recording.imu, way) if way is not None else None
+    if yaw is not None and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
+        yield exchanged_finding("the turns of the gyro")
+
+
+def imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Finding]:
+    """Axes that the drive contradicts: by the mean force, and by the forward force where another fits it better."""
+    up = crosschecks.up_of(imu)
+    if up[2] > 0.8 and (forward is None or forward.correlation < 0.7):
+        return
+    if forward is None or forward.correlation < 0.7:
+        yield Finding("warning", f"the mean force points {_direction(up)}, not up: are the axes right?")
+        return
+    ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
+    if up[2] > 0.8 and ahead[1] > 0.7:
+        return
+    along = crosschecks.along_fit(imu, track) if up[2] > 0.8 and track is not None else None
+    # what is proposed explains no more than what is stated: few changes of speed, and none across, tell no direction
+    if along is not None and along.coefficients[0] > 0.5 and along.correlation > forward.correlation - _NO_BETTER:
+        return
+    letters = _letters(imu.R_bs, ahead, up)
+    hint = f'; axes = "{letters}" would agree' if letters else ""
+    yield Finding(
+        "warning",
+        f"the axes contradict the drive: forward by the GNSS speed is {_direction(ahead)}, up by gravity is "
+        f"{_direction(up)} in the axes stated{hint}",
+    )
+
+
+def _direction(v: Array) -> str:
+    names = (("left", "right"), ("backward", "forward"), ("down", "up"))
+    k = int(np.argmax(np.abs(v)))
+    return names[k][int(v[k] > 0)]
+
+
+def _letters(R_bs: Array, forward: Array, up: Array) -> str | None:
+    """The three letters under which `forward` and `up` (body axes as loaded) would be so; None if none clearly does."""
+    f, u = R_bs.T @ forward, R_bs.T @ up  # in the file's axes
+    if np.abs(f).max() < 0.8 or np.abs(u).max() < 0.8 or np.argmax(np.abs(f)) == np.argmax(np.abs(u)):
+        return None
+    unit = [np.sign(x) * (np.abs(x) == np.abs(x).max()) for x in (f, u)]
+    rows = np.stack([np.cross(*unit), *unit])  # right, forward, up
+    return "".join(
+        "LBD"[k] if rows[k, axis] < 0 else "RFU"[k] for axis in range(3) for k in [np.argmax(np.abs(rows[:, axis]))]
+    )
+
+
+def reversed_sign(imu: Imu) -> Iterator[Finding]:
+    """The gyro about the mean force turns against the course: no choice of axes mends that."""
+    if crosschecks.up_of(imu)[2] < 0:
+        sentence = (
+            "the accelerometer's sign is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
+        )
+    else:
+        sentence = "the gyro's sign is reversed: it turns against the GNSS course while gravity points as stated"
+    yield Finding("warning", f"{sentence}; negate it in the file")
+
+
+def yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
+    if yaw is None or abs(yaw.correlation) < 0.8:
+        return
+    scale = abs(float(yaw.coefficients[0]))
+    if 40.0 < scale < 80.0:
+        yield Finding(
+            "warning",
+            "the gyro is 57 times too small for the GNSS course: it is in rad/s already, leave out units.gyro",
+        )
+    elif 1 / 80.0 < scale < 1 / 40.0:
+        yield Finding("warning", 'the gyro is 57 times too large for the GNSS course: say units = { gyro = "deg/s" }')
+    elif abs(scale - 1.0) > 0.1:
+        yield Finding("warning", f"the course turns {scale:.2f} times as much as the gyro about the vertical")
+
+
+_WORD = {GAP: "gives no readings", STUCK: "is stuck at zero", FROZEN: "is frozen", WILD: "reads against the motion"}
+_COARSE = 0.1  # m/s, a step that is worth a word
+_WHEEL = 0.02  # of the speed by which a wheel may differ: worn tyres differ by half of that
+_WHEELS = ("front left", "front right", "rear left", "rear right")
+
+
+def odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iterator[Finding]:
+    """What the readings say of themselves, and the IMU of them."""
+    odometer = recording.odometer
+    assert odometer is not None
+    step = wheels.quantum(odometer.speed)
+    facts["sigma_mps"] = round(wheels.reading_sigma(odometer), 4)
+    if step > 0.0:
+        facts["step_mps"] = round(step, 5)
+    if odometer.pulse:
+        facts["pulse_m"] = odometer.pulse
+    elif step > _COARSE:
+        yield Finding("note", f"the odometer reads in steps of {step:.3g} m/s")
+    if not odometer.signed:
+        yield Finding("note", "the odometer never reads below zero: it is taken to read backward as forward")
+    found = wheels.faults(odometer, recording.imu)
+    for reason in dict.fromkeys(found.reasons):
+        spans = found.spans[[r == reason for r in found.reasons]]
+        longest = spans[np.argmax(spans[:, 1] - spans[:, 0])]
+        size, at = longest[1] - longest[0], longest[0] - recording.start
+        where = f"for {size:.2f} s at {at:.1f} s from the start"
+        if len(spans) > 1:
+            where = f"in {len(spans)} spans, the longest of {size:.2f} s at {at:.1f} s from the start"
+        yield Finding("note" if reason == GAP else "warning", f"the odometer {_WORD[reason]} {where}: not used there")
+    if odometer.wheels is not None:
+        yield from _wheels_apart(odometer, recording.imu)
+
+
+def _wheels_apart(odometer: Odometer, imu: Imu) -> Iterator[Finding]:
+    """A wheel that is faster or slower than the others where the vehicle goes straight."""
+    assert odometer.wheels is not None
+    turn = imu.gyro @ crosschecks.up_of(imu)
+    turn = np.abs(np.interp(odometer.t, imu.t, turn - np.median(turn)))
+    # a turn of 0.02 rad/s moves a wheel by 0.02 m/s against the middle
+    straight = (np.abs(odometer.speed) > _MIN_SPEED) & (turn < 0.02)
+    there = ~np.isnan(odometer.wheels).all(axis=0)
+    speeds = odometer.wheels[straight][:, there]
+    speeds = speeds[~np.isnan(speeds).any(axis=1)]
+    if there.sum() < 2 or len(speeds) < crosschecks.MIN_PAIRS:
+        return
+    share = np.median(speeds / np.median(speeds, axis=1)[:, None], axis=0)
+    for name, ratio in zip(np.array(_WHEELS)[there], share, strict=True):
+        if abs(ratio - 1.0) > _WHEEL:
+            more = "faster" if ratio > 1.0 else "slower"
+            yield Finding(
+                "warning",
+                f"the {name} wheel is {100 * abs(ratio - 1):.1f} % {more} than the others on the straight: "
+                "say use in [odometer], to leave its axle out",
+            )
+
+
+def odometer_findings(recording: Recording, track: Track | None, facts: dict[str, Any]) -> Iterator[Finding]:
+    odometer = recording.odometer
+    assert odometer is not None
+    if min(odometer.t[-1], recording.end) <= max(odometer.t[0], recording.start):
+        unit = _unit_of_stamps(odometer.t, recording)
+        hint = f'; its stamps are in {unit}: say units = {{ t = "{unit}" }} in [odometer]' if unit else ""
+        yield Finding("warning", f"odometer and IMU do not overlap in time{hint}")
+        return
+    yield from odometer_readings(recording, facts)
+    found = crosschecks.odometer_fit(odometer, track) if track is not None else None
+    if found is None:
+        return
+    fit, scale = found
+    if fit.correlation < 0.9:
+        return
+    facts["true_over_recorded"] = round(scale, 4)
+    facts["late_by_s"] = round(fit.lag, 3)
+    units = {1 / 3.6: "km/h", 0.44704: "mph", 1852 / 3600: "knots", 3.6: "m/s already: leave out units.speed"}
+    for factor, unit in units.items():
+        if abs(scale / factor - 1.0) < 0.06:
+            say = (
+                f'the odometer is in {unit}: say units = {{ speed = "{unit}" }}'
+                if factor < 1
+                else f"the odometer is in {unit}"
+            )
+            yield Finding("warning", f"GNSS speed is {scale:.3f} times the odometer's: {say}")
+            break
+    else:
+        if scale < 0:
+            yield Finding("warning", f"the odometer's sign is reversed (GNSS speed is {scale:.3f} times it)")
+        elif abs(scale - 1.0) > max(2.0 * odometer.scale_sigma, 0.02):
+            yield Finding(
+                "warning",
+                f"GNSS speed is {scale:.3f} times the odometer's, "
+                f"which scale_sigma = {odometer.scale_sigma:g} does not cover",
+            )
+    if abs(fit.lag) > 0.1 + 4.0 * fit.spread:
+        yield Finding(
+            "warning",
+            f"odometer stamps are {'late' if fit.lag > 0 else 'early'} against GNSS by {abs(fit.lag):.2f} s: "
+            f"add {-fit.lag:+.2f} to time_offset in [odometer]",
+        )

@@ -1,0 +1,322 @@
+"""What the sensors of one drive say about each other: clock, axes and units from regressions.
+
+Changes of GNSS speed are regressed on the integrated force, changes of course on the integrated rate, both on
+all three axes. The correlation as a function of a shift in time gives the clock error whatever the axes; the
+coefficients at the best shift give the axes and the scale whatever was assumed of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array, wrap
+from graphnav.recording import Gnss, Imu, Odometer
+from graphnav.recording.checks import lags as lags_of_clocks
+
+Index = NDArray[Any]  # of row numbers
+
+MIN_PAIRS = 20
+_MIN_SPEED = 3.0  # m/s, below which a course means little
+_FASTEST_CHANGE = 8.0  # m/s^2; what exceeds it is an error of the fix
+WIDE = 30.0  # s searched for clock errors
+
+
+@dataclass(frozen=True)
+class Track:
+    """Velocity from GNSS, each the mean over `width` seconds around t (0: of the instant)."""
+
+    t: Array  # (K,) s
+    v: Array  # (K, 3) m/s, ENU
+    width: Array  # (K,) s
+    period: float  # s between fixes
+
+    @property
+    def speed(self) -> Array:
+        """Horizontal speed, m/s."""
+        return np.hypot(self.v[:, 0], self.v[:, 1])
+
+    @property
+    def instant(self) -> bool:
+        """Whether these are velocities that the receiver gave."""
+        return not self.width.any()
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One regression: y = coefficients @ x, with x taken `lag` seconds later than y."""
+
+    lag: float  # s
+    spread: float  # s, 1-sigma of the lag (`graphnav.recording.checks.lags`)
+    correlation: float
+    at_zero: float  # the correlation without a shift
+    coefficients: Array  # (m,)
+
+
+def local_positions(gnss: Gnss) -> Array:
+    """Positions in ENU metres around the first fix, (M, 3)."""
+    return LocalFrame(gnss.llh[0]).from_llh(gnss.llh)
+
+
+def track(gnss: Gnss) -> Track | None:
+    """Velocities the receiver gave, or differences of positions about a second apart; None if too few."""
+    if len(gnss.t) < 5:
+        return None
+    period = float(np.median(np.diff(gnss.t)))
+    if gnss.v is not None:
+        there = ~np.isnan(gnss.v[:, 0])
+        if there.mean() > 0.3 and there.sum() >= 5:
+            return Track(gnss.t[there], gnss.v[there], np.zeros(there.sum()), period)
+    m = max(1, round(1.0 / period))
+    if len(gnss.t) <= m + 2:
+        return None
+    p = local_positions(gnss)
+    width = gnss.t[m:] - gnss.t[:-m]
+    near = width < 1.5 * m * period
+    t, v = 0.5 * (gnss.t[m:] + gnss.t[:-m]), (p[m:] - p[:-m]) / width[:, None]
+    return Track(t[near], v[near], width[near], period) if near.sum() >= 5 else None
+
+
+def _mean(x: Array) -> Array:
+    """Mean row of a long array, ten times quicker than `x.mean(axis=0)`."""
+    return np.asarray(np.full(len(x), 1.0 / len(x)) @ x)
+
+
+def _integral(t: Array, rate: Array) -> tuple[Array, Array]:
+    """Integral and its integral at the ends of the periods, of rows that are means over them."""
+    dt = np.diff(t, prepend=2 * t[0] - t[1])
+    change = rate.T * dt  # axes first: the sums then run along contiguous numbers
+    first = np.cumsum(change, axis=1)
+    second = np.cumsum((first - 0.5 * change) * dt, axis=1)
+    return np.ascontiguousarray(first.T), np.ascontiguousarray(second.T)
+
+
+def _sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
+    """mean(at, width) of the integral of `rate`; width 0 is the value there."""
+    rate = rate - _mean(rate)  # only changes matter; keeps the second integral small
+    first, second = _integral(t, rate)
+    period = (t[-1] - t[0]) / (len(t) - 1)
+
+    def columns(at: Array, values: Array) -> Array:
+        # rows are where even steps put them, but for those behind a gap
+        k = np.clip(np.ceil((at - t[0]) / period).astype(int), 1, len(t) - 1)
+        off = (t[k - 1] > at) | (t[k] < at)
+        if off.any():
+            k[off] = np.clip(np.searchsorted(t, at[off]), 1, len(t) - 1)
+        s = np.clip((at - t[k - 1]) / (t[k] - t[k - 1]), 0.0, 1.0)[:, None]
+        return np.asarray((1.0 - s) * values[k - 1] + s * values[k])
+
+    def mean(at: Array, width: Array) -> Array:
+        if not width.any():
+            return columns(at, first)
+        return (columns(at + width / 2, second) - columns(at - width / 2, second)) / width[:, None]
+
+    return mean
+
+
+def _pairs(track: Track) -> tuple[Index, Index]:
+    """Rows about a second apart."""
+    m = max(1, round(1.0 / track.period))
+    i = np.arange(len(track.t) - m)
+    near = track.t[i + m] - track.t[i] < 1.5 * max(1.0, m * track.period)
+    return i[near], i[near] + m
+
+
+def _regress(x: Array, y: Array) -> tuple[float, Array]:
+    x, y = x - x.mean(0), y - y.mean()
+    b = np.asarray(np.linalg.lstsq(x, y, rcond=None)[0], dtype=float)
+    prediction, norm = x @ b, np.linalg.norm(y)  # the sign is in b: a reversed axis correlates as well
+    scale = np.linalg.norm(prediction) * norm
+    return (float(prediction @ y / scale) if scale > 0 else 0.0), b
+
+
+def _regress_inliers(x: Array, y: Array) -> tuple[float, Array]:
+    """The same without what lies beyond 5 sigma (by the median), twice: spikes of a fix hide a good fit."""
+    x, y = x - np.median(x, axis=0), y - np.median(y)
+    keep = np.ones(len(y), dtype=bool)
+    for _ in range(2):
+        _, b = _regress(x[keep], y[keep])
+        off = np.abs(y - x @ b)
+        keep = off <= 5.0 * np.median(off) / 0.6745
+    return _regress(x[keep], y[keep]) if keep.sum() >= MIN_PAIRS else (0.0, b)
+
+
+def _peak(lags: Array, c: Array) -> float:
+    """Where evenly spaced values are highest, by the parabola through the highest and its neighbours."""
+    k = int(np.argmax(c))
+    if 0 < k < len(lags) - 1 and (curve := c[k - 1] - 2 * c[k] + c[k + 1]) < 0 and np.isfinite(curve):
+        return float(lags[k] + 0.5 * (c[k - 1] - c[k + 1]) / curve * (lags[1] - lags[0]))
+    return float(lags[k])
+
+
+def _search(
+    t: Array, y: Array, x_at: Callable[[Index, float], Array], span: Array, valid: Callable[[float], Array]
+) -> Fit:
+    """The shift at which x explains y, of times t, best; `x_at(rows, lag)`, `valid(lag)` a mask of the rows."""
+    every = np.arange(len(y))
+
+    def correlations(rows: Index, lags: Array) -> Array:
+        some = (rows[valid(lag)[rows]] for lag in lags)
+        return np.array(
+            [_regress(x_at(r, lag), y[r])[0] if len(r) >= MIN_PAIRS else 0.0 for r, lag in zip(some, lags, strict=True)]
+        )
+
+    def correlation(lag: float, rows: Index) -> float:
+        return float(correlations(rows, np.array([lag]))[0])
+
+    few = every[:: max(1, len(y) // 800)]
+    many = every[:: max(1, len(y) // 4000)]
+    # changes over a second stay alike for about as long: where they may fit best is seen from every fourth shift
+    lags = np.arange(-5.0, 5.01, 0.1)
+    rough = np.argsort(correlations(few, lags[::4]))[-3:] * 4
+    close = np.unique(np.clip(rough[:, None] + np.arange(-4, 5), 0, len(lags) - 1))
+    c = np.full(len(lags), -np.inf)
+    c[close] = correlations(few, lags[close])
+    near = _peak(lags, c)
+    coarse, reached = near, correlation(near, few)
+    # far away only if nothing near explains y, and only for clearly more, for there are many far shifts
+    reach = min(WIDE, 0.3 * (span[-1] - span[0]))
+    if reached < 0.6 and reach > 5.0:
+        wide = np.arange(-reach, reach + 0.1, 0.2)
+        far = _peak(wide, correlations(few, wide))
+        if abs(far) > 5.0 and correlation(far, few) > reached + 0.15:
+            coarse = far
+    lag, spread = lags_of_clocks.refined(t, y, x_at, valid, many, coarse, MIN_PAIRS)
+    rows = every[valid(lag)]
+    r, b = _regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
+    return Fit(lag, spread, r, correlation(0.0, every), b)
+
+
+def _imu_fit(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) -> Fit | None:
+    if len(y) < MIN_PAIRS:
+        return None
+    mean = _sampler(imu.t, rate)
+    ti, tj, wi, wj = track.t[i], track.t[j], track.width[i], track.width[j]
+
+    def x_at(rows: Index, lag: float) -> Array:
+        used = np.zeros(len(track.t), dtype=bool)  # most ends of one pair begin another
+        used[i[rows]] = used[j[rows]] = True
+        place = np.cumsum(used) - 1
+        values = mean(track.t[used] + lag, track.width[used])
+        return np.asarray(values[place[j[rows]]] - values[place[i[rows]]])
+
+    def valid(lag: float) -> Array:
+        return (ti + lag - wi / 2 > imu.t[0]) & (tj + lag + wj / 2 < imu.t[-1])
+
+    return _search(0.5 * (ti + tj), y, x_at, track.t, valid)
+
+
+def up_of(imu: Imu) -> Array:
+    """Unit vector of the mean force: up, in body axes as loaded, (3,)."""
+    f = _mean(imu.accel)
+    return f / np.linalg.norm(f) if f.any() else np.array([0.0, 0.0, 1.0])
+
+
+def forward_fit(imu: Imu, track: Track) -> Fit | None:
+    """Change of GNSS speed on integrated level force: coefficients are the forward direction in body axes, (3,).
+
+    Level is square to the mean force, so nothing need be known of the axes. None where speed
+    changes too little to say anything.
+    """
+    i, j = _pairs(track)
+    y = track.speed[j] - track.speed[i]
+    real = np.abs(y) < _FASTEST_CHANGE * (track.t[j] - track.t[i])
+    i, j, y = i[real], j[real], y[real]
+    if len(y) < MIN_PAIRS or y.std() < 0.25:
+        return None
+    level = np.linalg.svd(up_of(imu)[None, :])[2][1:]  # (2, 3)
+    fit = _imu_fit(imu, imu.accel @ level.T, track, i, j, y)
+    if fit is None or len(fit.coefficients) != len(level):  # no time in common
+        return None
+    return replace(fit, coefficients=fit.coefficients @ level)
+
+
+def along_fit(imu: Imu, track: Track) -> Fit | None:
+    """The same on the force along the stated forward axis alone, (1,): whether the axes as stated explain the speed."""
+    i, j = _pairs(track)
+    y = track.speed[j] - track.speed[i]
+    real = np.abs(y) < _FASTEST_CHANGE * (track.t[j] - track.t[i])
+    return _imu_fit(imu, imu.accel[:, 1:2], track, i[real], j[real], y[real])
+
+
+def yaw_fit(imu: Imu, track: Track) -> Fit | None:
+    """Change of course, counter-clockwise, on the integrated rate about the mean force: true over recorded, (1,).
+
+    None without turns.
+    """
+    i, j = _pairs(track)
+    course = np.arctan2(track.v[:, 1], track.v[:, 0])
+    y = wrap(course[j] - course[i])
+    speed = np.minimum(track.speed[i], track.speed[j])
+    real = (speed > _MIN_SPEED) & (np.abs(y) < 1.5 * (track.t[j] - track.t[i]))
+    i, j, y = i[real], j[real], y[real]
+    if len(y) < MIN_PAIRS or y.std() < 0.04:
+        return None
+    return _imu_fit(imu, imu.gyro @ up_of(imu)[:, None], track, i, j, y)
+
+
+def velocity_fit(track: Track, places: Track) -> Fit | None:
+    """Change of speed by places on that by velocities: how late velocities are against places; None without changes."""
+    i, j = _pairs(places)
+    y = places.speed[j] - places.speed[i]
+    real = np.abs(y) < _FASTEST_CHANGE * (places.t[j] - places.t[i])
+    i, j, y = i[real], j[real], y[real]
+    if len(y) < MIN_PAIRS or y.std() < 0.25:
+        return None
+    t, way = track.t, np.zeros((len(track.t), 2))
+    way[1:] = np.cumsum(0.5 * (track.v[1:, :2] + track.v[:-1, :2]) * np.diff(t)[:, None], axis=0)
+
+    def speed(of: Index, lag: float) -> Array:
+        a, b = (places.t[of] + side * places.width[of] / 2 + lag for side in (-1.0, 1.0))
+        gone = [np.interp(b, t, axis) - np.interp(a, t, axis) for axis in way.T]
+        return np.asarray(np.hypot(*gone) / places.width[of])
+
+    def x_at(rows: Index, lag: float) -> Array:
+        return (speed(j[rows], lag) - speed(i[rows], lag))[:, None]
+
+    def valid(lag: float) -> Array:
+        first, last = places.t[i] - places.width[i] / 2 + lag, places.t[j] + places.width[j] / 2 + lag
+        return np.asarray((first > t[0]) & (last < t[-1]))
+
+    return _search(0.5 * (places.t[i] + places.t[j]), y, x_at, places.t, valid)
+
+
+def odometer_fit(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
+    """GNSS speed on odometer speed, and the scale (true over recorded, median); None without movement."""
+    if len(odometer.t) < 5 or track.speed.std() < 0.5:
+        return None
+    t = odometer.t
+    distance = np.r_[0.0, np.cumsum(0.5 * (odometer.speed[1:] + odometer.speed[:-1]) * np.diff(t))]
+    width = np.maximum(track.width, 4.0 * float(np.median(np.diff(t))))
+
+    def x_at(rows: Index, lag: float) -> Array:
+        at, w = track.t[rows] + lag, width[rows]
+        return ((np.interp(at + w / 2, t, distance) - np.interp(at - w / 2, t, distance)) / w)[:, None]
+
+    def valid(lag: float) -> Array:
+        inside = (track.t + lag - width / 2 > t[0]) & (track.t + lag + width / 2 < t[-1])
+        return inside & usable
+
+    usable = np.ones(len(track.t), dtype=bool)
+    every = np.arange(len(track.t))
+    inside = valid(0.0)
+    if inside.sum() < MIN_PAIRS:
+        return None
+    # spikes of the fix would pull the fit: leave out what lies far from a first line
+    x = x_at(every, 0.0)[:, 0]
+    slope = _regress(x[inside, None], track.speed[inside])[1][0]
+    off = track.speed - slope * x
+    off = np.abs(off - np.median(off[inside]))
+    usable = off < 6.0 * np.median(off[inside]) + 0.5
+    fit = _search(track.t, track.speed, x_at, track.t, valid)
+    rows = every[valid(fit.lag)]
+    x = x_at(rows, fit.lag)[:, 0]
+    moving = (np.abs(x) > 0.3 * np.abs(x).max()) & (track.speed[rows] > _MIN_SPEED)
+    if moving.sum() < MIN_PAIRS:
+        return None
+    return fit, float(np.median(track.speed[rows][moving] / x[moving]))

@@ -1,0 +1,118 @@
+"""Checks of the IMU by itself: stamps, repeats, saturation, units, gravity and noise at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Literal
+
+import numpy as np
+
+from graphnav.core.earth import gravity
+from graphnav.core.findings import Finding, period_of, runs_of
+from graphnav.core.rotation import Array
+from graphnav.recording import Imu, Recording
+
+STANDARD_GRAVITY = 9.80665  # m/s^2, where the place is unknown
+
+
+def imu_time(imu: Imu) -> Iterator[Finding]:
+    step, period = np.diff(imu.t), period_of(imu.t)
+    gaps = np.flatnonzero(step > gap_limit(imu.t))
+    if len(gaps):
+        worst = gaps[np.argmax(step[gaps])]
+        severity: Literal["note", "warning"] = "warning" if step[worst] > 0.2 else "note"
+        count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+        after = imu.t[worst] - imu.t[0]
+        yield Finding(severity, f"{count} in the IMU, the longest {step[worst]:.3f} s at {after:.1f} s from the start")
+    uneven = float((np.abs(step - period) > 0.25 * period).mean())
+    if uneven > 0.05:
+        yield Finding(
+            "note",
+            f"IMU stamps are uneven: {100 * uneven:.0f} % of the steps differ by over 25 % from {1e3 * period:.4g} ms",
+        )
+
+
+def gap_limit(t: Array) -> float:
+    return 2.5 * period_of(t)
+
+
+def repeats(imu: Imu) -> Iterator[Finding]:
+    gyro, accel = imu.gyro[1:] == imu.gyro[:-1], imu.accel[1:] == imu.accel[:-1]
+    same = np.logical_and.reduce([*gyro.T, *accel.T])
+    if same.mean() > 0.002:
+        yield Finding("note", f"{same.sum()} IMU rows ({100 * same.mean():.1f} %) repeat the values of the row before")
+    stuck = max((b - a for a, b in runs_of(same)), default=0) * period_of(imu.t)
+    if stuck > 0.5:
+        yield Finding("warning", f"the IMU repeats one value for {stuck:.1f} s: it was stuck or its log was filled")
+
+
+def saturation(imu: Imu) -> Iterator[Finding]:
+    # in the file's axes: a tilted mount would spread a clipped axis over three
+    for what, values, smallest, unit in (("gyro", imu.gyro, 0.5, "rad/s"), ("accelerometer", imu.accel, 5.0, "m/s2")):
+        x = imu.R_bs.T @ values.T
+        for axis in range(3):
+            for sign in (1.0, -1.0):
+                signed = sign * x[axis]
+                top = signed.max()
+                if top < smallest or top < 3.0 * signed.std() or top == np.median(signed):
+                    continue
+                runs = [b - a for a, b in runs_of(signed > top - 1e-6 * top) if b - a >= 3]
+                if len(runs) >= 2 or max(runs, default=0) >= 5:
+                    yield Finding(
+                        "warning",
+                        f"{what} {'xyz'[axis]} (file axes) is saturated: "
+                        f"{sum(runs)} rows stay at {sign * top:.4g} {unit}",
+                    )
+
+
+def gyro_unit(recording: Recording) -> Iterator[Finding]:
+    """Turn rates that a sensor can read, but that its carrier does not reach."""
+    x, y, z = np.abs(recording.imu.gyro).T
+    rate = float(np.percentile(np.maximum(np.maximum(x, y), z), 99.0))
+    if rate > (4.0 if recording.platform == "vehicle" else 35.0):  # 35 rad/s = 2000 deg/s, the usual full scale
+        yield Finding(
+            "warning",
+            f"the gyro reaches {rate:.3g} rad/s, too fast for a {recording.platform}: if it is deg/s, "
+            'say units = { gyro = "deg/s" }' + ('; if it is on a foot, platform = "foot"' if rate < 35.0 else ""),
+        )
+
+
+def force_at_rest(recording: Recording, rest: Array, facts: dict[str, Any]) -> Iterator[Finding]:
+    f = float(np.linalg.norm(recording.imu.accel[rest].mean(axis=0)))
+    if recording.platform == "foot":  # every stance has another attitude
+        f = float(np.linalg.norm(recording.imu.accel[rest], axis=1).mean())
+    place, g = "standard", STANDARD_GRAVITY
+    if recording.gnss is not None:
+        place, g = "local", float(gravity(*recording.gnss.llh[0, [0, 2]]))
+    facts["force_at_rest_mps2"] = round(f, 4)
+    facts[f"{place}_gravity_mps2"] = round(g, 4)
+    off = f / g - 1.0
+    if 0.006 < abs(off) < 0.15:  # normal gravity differs by 0.3 % at most from the standard value
+        sigma = recording.imu.noise.accel_bias_sigma
+        covered = "" if abs(f - g) < 3 * sigma else f"; accel_bias_sigma = {sigma:g} does not cover that"
+        yield Finding(
+            "note" if not covered else "warning",
+            f"at rest the force is {f:.3f} m/s2 where gravity is {g:.3f} ({100 * off:+.1f} %){covered}",
+        )
+
+
+def noise_at_rest(imu: Imu, rest: Array) -> Iterator[Finding]:
+    """Allan deviation at 1 s, which for white noise is its density (IEEE Std 952-1997, annex C)."""
+    n = max(5, round(1.0 / period_of(imu.t)))
+    for what, x, stated in (
+        ("gyro_noise_density", imu.gyro, imu.noise.gyro_noise_density),
+        ("accel_noise_density", imu.accel, imu.noise.accel_noise_density),
+    ):
+        pairs: list[Array] = []
+        for a, b in runs_of(rest):
+            seconds = x[a : a + (b - a) // n * n].reshape(-1, n, 3).mean(axis=1)
+            pairs.append(np.diff(seconds, axis=0))
+        steps = np.concatenate(pairs)
+        if len(steps) < 10:
+            continue
+        # the median, not the mean: a start or a door between two seconds must not count
+        allan = float(np.max(np.median(np.abs(steps), axis=0))) / 0.6745 / np.sqrt(2.0)
+        if allan > 4.0 * stated:
+            yield Finding(
+                "warning", f"{what} = {stated:.2g} is small: at rest the noise is {allan:.2g} (Allan deviation at 1 s)"
+            )

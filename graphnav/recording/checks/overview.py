@@ -1,0 +1,258 @@
+"""Looks a recording over before it is solved: what it holds, and what in it is odd, in plain words.
+
+Each check is a small function that yields findings; it says nothing where the data do not tell. What cannot be right is
+looked for first (`graphnav.recording.plausibility.screening`), and the rest is checked without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from graphnav.core.findings import SEVERITIES, Finding, period_of, runs_of
+from graphnav.core.rotation import Array
+from graphnav.recording import Recording
+from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks.aiding import (
+    gnss_coverage,
+    gnss_jumps,
+    imu_axes,
+    mirrored,
+    odometer_findings,
+    overlap_s,
+    reversed_sign,
+    yaw_scale,
+)
+from graphnav.recording.checks.clock import clock_of
+from graphnav.recording.checks.crosschecks import Track
+from graphnav.recording.checks.imu import (
+    force_at_rest,
+    gap_limit,
+    gyro_unit,
+    imu_time,
+    noise_at_rest,
+    repeats,
+    saturation,
+)
+from graphnav.recording.checks.raw import raw_facts, raw_findings
+from graphnav.recording.checks.stated import (
+    fix_types,
+    lever_arms,
+    rounded_positions,
+    stated_noise,
+    too_fast_for_a_foot,
+    truth_findings,
+    velocities,
+)
+from graphnav.recording.plausibility.screening import refuse, screen
+
+_REST_WINDOW = 1.0  # s
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What `inspect` found; `facts` are per sensor, name -> value in SI units unless the name says otherwise."""
+
+    name: str
+    platform: str
+    facts: dict[str, dict[str, Any]]
+    recording: Recording = field(repr=False)  # what was inspected, without what cannot be right
+    findings: tuple[Finding, ...] = field(default=())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The sentences of the warnings, and of what is graver."""
+        return tuple(f.sentence for f in self.findings if f.severity != "note")
+
+    @property
+    def trusted(self) -> bool:
+        """Whether nothing was found with which a result may be wrong altogether."""
+        return all(f.severity in ("note", "warning") for f in self.findings)
+
+    def refuse(self) -> None:
+        """Raise what it cannot be solved with.
+
+        Raises
+        ------
+        RecordingError
+            With the first refused finding's sentence.
+        """
+        refuse(self.recording, self.findings)
+
+    def values(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        said = [f.values() for f in self.findings]
+        return {"name": self.name, "platform": self.platform, **self.facts, "findings": said}
+
+    def text(self) -> str:
+        """A summary of several lines for people."""
+        lines = [f"{self.name} ({self.platform})"]
+        for sensor, facts in self.facts.items():
+            shown = ", ".join(_show(name, value) for name, value in facts.items())
+            lines.append(f"  {sensor:<9} {shown}")
+        for finding in self.findings:
+            lines.append(f"  {finding.severity}: {finding.sentence}")
+        return "\n".join(lines)
+
+
+_UNITS = {"hz": "Hz", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s2", "dbhz": "dB-Hz"}
+
+
+def _show(name: str, value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(_show(*one) for one in value.items())
+    words = name.split("_")
+    unit = _UNITS.get(words[-1], "") if len(words) > 1 else ""
+    number = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{' '.join(words[:-1] if unit else words)} {number} {unit}".rstrip()
+
+
+def inspect(recording: Recording) -> Inspection:
+    """Check a recording; see the module's head.
+
+    Findings are in order of their severity, the gravest first, then of the checks, remarks of the loader first.
+    """
+    whole = screen(recording)
+    recording = whole.recording
+    findings = [Finding("note", remark) for remark in recording.remarks]
+    findings += whole.findings
+    for name in ("gnss", "odometer"):
+        if (sensor := getattr(recording, name)) is not None and not len(sensor.t):
+            findings.append(Finding("warning", f"[{name}] holds no rows in this part of the recording"))
+            recording = recording.without(name)
+    known = {f.key for f in whole.findings}
+    facts: dict[str, dict[str, Any]] = {"imu": _imu_facts(recording)}
+    vehicle = recording.platform == "vehicle"
+    overlap = recording.gnss is not None and overlap_s(recording) > 0
+    track = crosschecks.track(recording.gnss) if recording.gnss is not None else None
+    rest = _at_rest(recording, track if overlap else None)
+    findings += imu_time(recording.imu)
+    findings += repeats(recording.imu)
+    findings += saturation(recording.imu)
+    if "imu.gyro_unit" not in known:
+        findings += gyro_unit(recording)
+    findings += stated_noise(recording.imu.noise)
+    findings += lever_arms(recording)
+    findings += too_fast_for_a_foot(recording, track)
+    if rest.any():
+        facts["imu"]["still_s"] = float(rest.sum() * period_of(recording.imu.t))
+        findings += force_at_rest(recording, rest, facts["imu"])
+        if vehicle:  # a person who stands still sways
+            findings += noise_at_rest(recording.imu, rest)
+    if recording.gnss is not None:
+        facts["gnss"] = _gnss_facts(recording, track)
+        findings += gnss_coverage(recording)
+        findings += rounded_positions(recording.gnss)
+        findings += fix_types(recording.gnss)
+        wrong = list(velocities(recording.gnss))
+        if overlap or not wrong:
+            # against wrong velocities, or on another clock, every position jumps
+            findings += wrong or (gnss_jumps(recording, track) if overlap else ())
+    if recording.raw_gnss is not None and len(recording.raw_gnss):
+        facts["raw_gnss"] = raw_facts(recording.raw_gnss)
+        findings += raw_findings(recording.raw_gnss)
+    turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis"}
+    if vehicle and overlap and track is not None and recording.gnss is not None:
+        clock, yaw = clock_of(recording.imu, recording.gnss), crosschecks.yaw_fit(recording.imu, track)
+        forward = clock.by_velocity if track.instant else clock.by_places
+        turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
+        if turns_back and (said := list(mirrored(recording))):
+            findings += said
+        elif not turned:
+            findings += reversed_sign(recording.imu) if turns_back else imu_axes(recording.imu, forward, track)
+            findings += yaw_scale(yaw)
+    elif vehicle and not turned:
+        findings += imu_axes(recording.imu, None, None)
+    if recording.odometer is not None:
+        facts["odometer"] = _sensor_facts(recording.odometer.t)
+        step, speed = np.diff(recording.odometer.t), np.abs(recording.odometer.speed)
+        facts["odometer"]["distance_m"] = round(float(np.sum(0.5 * (speed[1:] + speed[:-1]) * step)), 1)
+        facts["odometer"]["max_speed_mps"] = float(np.abs(recording.odometer.speed).max())
+        findings += odometer_findings(recording, track, facts["odometer"])
+    if recording.truth is not None:
+        facts["truth"] = {"rows": len(recording.truth.t), "of": recording.truth.of}
+        if recording.truth.closed_loop_sigma:
+            facts["truth"] = {"closed_loop_sigma_m": recording.truth.closed_loop_sigma}
+        findings += truth_findings(recording)
+    if any(f.severity != "note" for f in findings) and not described(recording):
+        findings.append(
+            Finding(
+                "note",
+                "keys in brackets are those of a recording.toml, which this log has none of: graphnav init "
+                f"{recording.source} drafts one",
+                "recording.log",
+            )
+        )
+    findings.sort(key=lambda f: SEVERITIES.index(f.severity))
+    return Inspection(recording.name, recording.platform, facts, whole.recording, tuple(findings))
+
+
+def described(recording: Recording) -> bool:
+    """Whether keys of a recording.toml can be set: there is one, or nothing was read from files."""
+    source = recording.source
+    return source is None or source.suffix == ".toml" or not recording.files
+
+
+def _sensor_facts(t: Array) -> dict[str, Any]:
+    return {"rows": len(t), "rate_hz": round(1.0 / period_of(t), 3), "span_s": round(float(t[-1] - t[0]), 3)}
+
+
+def _imu_facts(recording: Recording) -> dict[str, Any]:
+    facts = _sensor_facts(recording.imu.t)
+    facts["duration_s"] = round(recording.duration, 3)
+    step = np.diff(recording.imu.t)
+    facts["gaps"] = int((step > gap_limit(recording.imu.t)).sum())
+    facts["longest_step_s"] = round(float(step.max()), 4)
+    return facts
+
+
+def _gnss_facts(recording: Recording, track: Track | None) -> dict[str, Any]:
+    gnss = recording.gnss
+    assert gnss is not None
+    facts: dict[str, Any] = {"rows": 1} if len(gnss.t) == 1 else _sensor_facts(gnss.t)
+    facts["velocities"] = 0 if gnss.v is None else int((~np.isnan(gnss.v[:, 0])).sum())
+    if gnss.types:
+        facts["types"] = gnss.types
+    if track is not None:
+        dt = np.diff(track.t)
+        near = dt < 5 * max(1.0, track.period)
+        usable = track.speed < 100.0
+        speed = track.speed
+        distance = np.sum((0.5 * (speed[1:] + speed[:-1]) * dt)[near])
+        facts["distance_m"] = round(float(distance), 1)
+        facts["max_speed_mps"] = round(float(np.percentile(speed[usable], 99.9)), 2) if usable.any() else float("nan")
+        stopped = runs_of(speed < 0.3)
+        stops = [(a, b) for a, b in stopped if track.t[b - 1] - track.t[a] >= 2.0]
+        facts["stops"] = len(stops)
+        facts["stopped_s"] = round(float(sum(track.t[b - 1] - track.t[a] for a, b in stops)), 1)
+    return facts
+
+
+def _at_rest(recording: Recording, track: Track | None) -> Array:
+    """IMU rows that lie in quiet seconds; quiet is near the quietest part, and not moving where speed is known."""
+    imu = recording.imu
+    period = period_of(imu.t)
+    n = max(5, round(_REST_WINDOW / period))
+    blocks = len(imu.t) // n
+    mask = np.zeros(len(imu.t), dtype=bool)
+    if blocks < 3:
+        return mask
+
+    def scatter(x: Array) -> Array:
+        axes = np.ascontiguousarray(x[: blocks * n].T).reshape(3, blocks, n)
+        return np.linalg.norm(axes.std(axis=-1), axis=0)
+
+    force, rate = scatter(imu.accel), scatter(imu.gyro)
+    quiet = (force < 4.0 * np.percentile(force, 2) + 0.02) & (rate < 4.0 * np.percentile(rate, 2) + 0.002)
+    middle = imu.t[: blocks * n].reshape(blocks, n).mean(axis=1)
+    if recording.odometer is not None:
+        o = recording.odometer
+        quiet &= np.abs(np.interp(middle, o.t, o.speed, left=np.inf, right=np.inf)) < 0.05
+    elif track is not None:
+        quiet &= np.interp(middle, track.t, track.speed, left=np.inf, right=np.inf) < 0.3
+    else:  # nothing but the IMU: stillness must be plain
+        quiet &= (force < 0.3) & (rate < 0.03)
+    mask[: blocks * n] = np.repeat(quiet, n)
+    return mask

@@ -1,0 +1,71 @@
+"""What raw GNSS observations hold: satellites, signals, gaps, slips and signal strengths, and what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from graphnav.core.findings import Finding, period_of
+from graphnav.gnss.series import RawGnss
+from graphnav.gnss.signals import NAMES, SYSTEMS, satellite_name, signal_name
+
+_LONG = 2.5  # periods beyond which a step between epochs is a gap
+_FEW = 5  # satellites, one more than a position with its clock takes
+
+
+def raw_facts(raw: RawGnss) -> dict[str, Any]:
+    """Figures of a series, by name."""
+    epochs, _ = raw.epochs
+    placed = np.isfinite(raw.p[:, 0])
+    by_epoch = _satellites(raw, placed)
+    system = raw.satellite // 100
+    facts: dict[str, Any] = {"epochs": len(epochs)}
+    if len(epochs) > 1:
+        period, step = period_of(epochs), np.diff(epochs)
+        facts |= {"rate_hz": round(1.0 / period, 3), "span_s": round(float(epochs[-1] - epochs[0]), 3)}
+        facts["gaps"] = int((step > _LONG * period).sum())
+        facts["longest_step_s"] = round(float(step.max()), 3)
+    for k in range(len(SYSTEMS)):
+        if (system == k).any():
+            facts[f"satellites_{NAMES[k]}"] = len(np.unique(raw.satellite[system == k]))
+    for s, g in np.unique(np.stack([system, raw.signal], -1), axis=0):
+        facts[f"observations_{NAMES[int(s)]}_{signal_name(int(g))}"] = int(((system == s) & (raw.signal == g)).sum())
+    facts["satellites_at_once"] = int(np.median(by_epoch))
+    carrier = np.isfinite(raw.carrier)
+    facts["carriers"] = int(carrier.sum())
+    facts["dopplers"] = int(np.isfinite(raw.range_rate).sum())
+    if carrier.any():
+        facts["slips"] = int((raw.slip & carrier).sum())
+        facts["half_cycles"] = int((raw.half & carrier).sum())
+    if np.isfinite(raw.cn0).any():
+        low, middle, high = np.nanpercentile(raw.cn0, [5.0, 50.0, 95.0])
+        facts |= {"cn0_low_dbhz": float(low), "cn0_median_dbhz": float(middle), "cn0_high_dbhz": float(high)}
+    missing = sorted({int(s) for s in raw.satellite} - {int(s) for s in raw.satellite[placed]})
+    if missing:
+        facts["without_ephemeris"] = " ".join(satellite_name(s) for s in missing)
+    if raw.differenced:
+        facts["with_base"] = int(np.isfinite(raw.difference).sum())
+    return facts
+
+
+def raw_findings(raw: RawGnss) -> Iterator[Finding]:
+    """What a tightly coupled solution suffers from."""
+    by_epoch = _satellites(raw, np.isfinite(raw.p[:, 0]))
+    few = float(np.mean(by_epoch < _FEW))
+    if few > 0.5:
+        yield Finding(
+            "warning",
+            f"raw GNSS: fewer than {_FEW} satellites have a place in {100.0 * few:.0f} % of the epochs",
+            "raw_gnss.few_satellites",
+        )
+    if not np.isfinite(raw.range_rate).any():
+        yield Finding("note", "raw GNSS: no Doppler shifts, so no velocities", "raw_gnss.no_doppler")
+
+
+def _satellites(raw: RawGnss, which: np.ndarray) -> np.ndarray:
+    """(E,) satellites of each epoch with rows of a mask."""
+    epochs, of = raw.epochs
+    pairs = np.unique(np.stack([of[which], raw.satellite[which].astype(np.intp)], -1), axis=0)
+    return np.bincount(pairs[:, 0], minlength=len(epochs))

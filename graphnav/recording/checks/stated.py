@@ -1,0 +1,227 @@
+"""Checks of what a recording states and of what its positions, velocities and truth say of each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.core.earth import LocalFrame
+from graphnav.core.findings import Finding
+from graphnav.core.rotation import Array
+from graphnav.core.timescales import LEAP
+from graphnav.recording import Gnss, ImuNoise, Recording, Truth
+from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks.crosschecks import Track
+
+_LONG = 15.0  # m; no lever arm on a road vehicle is that long
+_RUN = 8.0  # m/s, that nobody walks
+# SI figures that no IMU has (a phone's are a tenth or less), and the unit of a data sheet that may have been meant
+_IMPOSSIBLE = {
+    "gyro_noise_density": (0.02, "rad/s/sqrt(Hz)", "deg/sqrt(h)"),
+    "accel_noise_density": (0.5, "m/s2/sqrt(Hz)", "ug/sqrt(Hz)"),
+    "gyro_bias_sigma": (0.5, "rad/s", "deg/h"),
+    "accel_bias_sigma": (5.0, "m/s2", "mg"),
+}
+_SPEEDS = {1 / 3.6: "km/h", 0.44704: "mph", 1852 / 3600: "knots", 3.6: "m/s already"}
+_MENDED = 0.3  # of what is off is left by a change that mends it
+_FOOT = 0.3048  # m
+
+
+def stated_noise(noise: ImuNoise) -> Iterator[Finding]:
+    """Figures that were typed in a data sheet's unit."""
+    for key, (limit, unit, meant) in _IMPOSSIBLE.items():
+        value = float(getattr(noise, key))
+        if value > limit:
+            yield Finding(
+                "warning",
+                f'{key} = {value:g} {unit} is more than any IMU has; if it is {meant}, say "{value:g} {meant}"',
+            )
+
+
+def lever_arms(recording: Recording) -> Iterator[Finding]:
+    """Lever arms in another unit than metres."""
+    for name in ("gnss", "odometer"):
+        sensor = getattr(recording, name)
+        if sensor is not None and (length := float(np.linalg.norm(sensor.lever_arm))) > _LONG:
+            yield Finding("warning", f"the lever arm in [{name}] is {length:.3g} m long: it is to be in metres")
+
+
+def too_fast_for_a_foot(recording: Recording, track: Track | None) -> Iterator[Finding]:
+    """A vehicle's log with a foot's platform."""
+    if recording.platform == "foot" and track is not None:
+        speed = float(np.percentile(track.speed, 95.0))
+        if speed > _RUN:
+            yield Finding(
+                "warning",
+                f'the fixes move at {speed:.3g} m/s, too fast for a foot: if it is a car, say platform = "vehicle"',
+            )
+
+
+def rounded_positions(gnss: Gnss) -> Iterator[Finding]:
+    """Positions with fewer digits than their sigma is worth."""
+    degrees = np.degrees(gnss.llh[:, :2])
+    if len(degrees) < 10 or not np.ptp(degrees, axis=0).all():
+        return
+    for digits in range(2, 7):
+        scaled = degrees * 10.0**digits
+        if np.abs(scaled - np.round(scaled)).max() < 1e-4:
+            step = 10.0**-digits * 111_320.0
+            sd = float(np.median(gnss.sd[:, :2]))
+            if step > 3.0 * sd:
+                yield Finding(
+                    "warning",
+                    f"positions are rounded to {10.0**-digits:g} deg, {step:.2g} m, and their 1-sigma is {sd:.2g} m: "
+                    "log more digits, or state a larger sd",
+                )
+            return
+
+
+def fix_types(gnss: Gnss) -> Iterator[Finding]:
+    """Types in the numbers of GGA's quality, which differ."""
+    if gnss.type is None or not gnss.type_assumed:
+        return
+    from graphnav.recording.draft.guesses import fix_numbers
+
+    if (guess := fix_numbers(gnss.type, gnss.sd[:, 0])).value == "nmea":
+        sentence = (
+            f'types of the fixes look like GGA\'s qualities: {guess.why}; say units = {{ type = "nmea" }} in [gnss]'
+        )
+        yield Finding("warning", sentence)
+
+
+def velocities(gnss: Gnss) -> Iterator[Finding]:
+    """Velocities whose axes, signs or unit the positions deny."""
+    if gnss.v is None or len(gnss.t) < 10:
+        return
+    p, v, m = crosschecks.local_positions(gnss), gnss.v, max(1, round(1.0 / float(np.median(np.diff(gnss.t)))))
+    dt = gnss.t[m:] - gnss.t[:-m]
+    way = p[m:] - p[:-m]
+    # by the trapezoids of all rows between, which follow a change of speed
+    steps = 0.5 * (v[1:] + v[:-1]) * np.diff(gnss.t)[:, None]
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(np.nan_to_num(steps), axis=0)])
+    said = total[m:] - total[:-m]
+    holes = np.concatenate([[0], np.cumsum(np.isnan(steps).any(axis=1))])
+    real = (dt < 1.5 * max(1.0, float(np.median(dt)))) & (holes[m:] == holes[:-m])
+    size = np.hypot(way[:, 0], way[:, 1])
+    moving = real & (size > 2.0) & (size < 60.0 * dt)
+    if moving.sum() >= crosschecks.MIN_PAIRS:
+        other = exchanged(gnss)
+        if other is not None:
+            q = crosschecks.local_positions(other)
+            off, mended = (
+                float(np.median(np.linalg.norm((x[m:] - x[:-m] - said)[moving, :2], axis=1))) for x in (p, q)
+            )
+            if mended < _MENDED * off:
+                yield exchanged_finding("the velocities")
+                return
+        yield from _horizontal(way[moving, :2], said[moving, :2])
+    climb, meant = way[real, 2], said[real, 2]
+    if len(climb) >= crosschecks.MIN_PAIRS and climb.std() > 0.0 and meant.std() > 0.0:
+        alike = float(np.corrcoef(climb, meant)[0, 1])
+        ratio = float(climb @ meant) / float(meant @ meant)
+        if alike > 0.8 and abs(ratio * _FOOT - 1.0) < 0.1:
+            yield Finding(
+                "warning",
+                f"the heights climb {ratio:.2f} times as much as the upward velocity: they are in feet, of which "
+                f"0.3048 m make one; multiply h by 0.3048 in the file",
+                "gnss.feet",
+            )
+        if alike < -0.6:
+            yield Finding(
+                "warning",
+                f"the upward velocity goes down where the heights go up (correlation {alike:.2f}): if it is downward, "
+                "name its column vd",
+            )
+
+
+def exchanged(gnss: Gnss) -> Gnss | None:
+    """The fixes with latitude and longitude exchanged; None where that is no place."""
+    llh = gnss.llh[:, [1, 0, 2]]
+    return replace(gnss, llh=llh) if np.nanmax(np.abs(llh[:, 0])) < 0.5 * np.pi else None
+
+
+def exchanged_finding(witness: str) -> Finding:
+    """That they are, by `witness`."""
+    return Finding(
+        "refused",
+        f"latitude and longitude are exchanged: exchanged back, the positions agree with {witness}; exchange the names "
+        "in columns of [gnss]",
+        "gnss.lat_lon",
+    )
+
+
+def _horizontal(way: Array, said: Array) -> Iterator[Finding]:
+    """Which change of the velocities (N, 2) agrees with the ways (N, 2), if they do not themselves."""
+
+    def miss(change: Array) -> float:
+        return float(np.median(np.linalg.norm(way - said @ change.T, axis=1)))
+
+    changes: list[tuple[Array, str]] = [
+        (np.array([[0.0, 1.0], [1.0, 0.0]]), "east and north velocity are exchanged: exchange the names in columns"),
+        (np.diag([-1.0, 1.0]), "the east velocity is reversed: negate it in the file"),
+        (np.diag([1.0, -1.0]), "the north velocity is reversed: negate it in the file"),
+        (-np.eye(2), "the velocities are reversed: negate them in the file"),
+    ]
+    for factor, unit in _SPEEDS.items():
+        hint = f'say units = {{ speed = "{unit}" }}' if factor < 1.0 else "leave out units.speed"
+        changes.append((factor * np.eye(2), f"the velocities are in {unit}: {hint} in [gnss]"))
+    misses = [miss(change) for change, _ in changes]
+    best = int(np.argmin(misses))
+    if misses[best] < 0.3 * miss(np.eye(2)) and misses[best] < 0.2 * float(np.median(np.linalg.norm(way, axis=1))):
+        yield Finding("warning", f"by the positions {changes[best][1]}")
+
+
+def truth_findings(recording: Recording) -> Iterator[Finding]:
+    """A truth of another time, clock or place."""
+    truth, gnss = recording.truth, recording.gnss
+    if truth is None or truth.closed_loop_sigma is not None or not len(truth.t):
+        return
+    if truth_apart(recording):
+        yield Finding(
+            "warning",
+            f"the truth ({truth.t[0]:.3f} to {truth.t[-1]:.3f} s) and the IMU ({recording.start:.3f} to "
+            f"{recording.end:.3f} s) do not overlap in time: is it of another day, or on another clock (time_offset in "
+            "[truth])? It is not used",
+        )
+        return
+    if truth.llh is None or gnss is None:
+        return
+    frame = LocalFrame(truth.llh[0])
+    true, fixes = frame.from_llh(truth.llh)[:, :2], frame.from_llh(gnss.llh)[:, :2]
+    off = _apart(truth, true, gnss, fixes, 0.0)
+    if off is None:
+        return
+    shifted = {
+        shift: found for shift in (-LEAP, LEAP) if (found := _apart(truth, true, gnss, fixes, shift)) is not None
+    }
+    best = min(shifted, key=lambda shift: shifted[shift], default=0.0)
+    if shifted and off > 5.0 and shifted[best] < 0.2 * off:
+        yield Finding(
+            "warning",
+            f"the truth fits the fixes {best:+.0f} s later, the leap seconds between GPS time and UTC: add {best:+.0f} "
+            "to time_offset in [truth]",
+        )
+    elif off > 100.0 + 10.0 * float(np.median(gnss.sd[:, :2])):
+        metres = ', or in metres (name the columns x and y, say frame = "local")' if off > 1e6 else ""
+        yield Finding("warning", f"the truth lies {off / 1e3:.3g} km from the fixes: is it of this drive{metres}?")
+
+
+def truth_apart(recording: Recording) -> bool:
+    """Whether the truth shares no time with the IMU."""
+    if recording.truth is None or not len(recording.truth.t):
+        return False
+    t = recording.truth.t
+    return bool(t[-1] < recording.start or t[0] > recording.end)
+
+
+def _apart(truth: Truth, true: Array, gnss: Gnss, fixes: Array, shift: float) -> float | None:
+    """Median horizontal distance (m) between fixes and a truth `shift` s later; None where too few are near in time."""
+    t = truth.t + shift
+    k = np.clip(np.searchsorted(t, gnss.t), 1, len(t) - 1)
+    near = (gnss.t >= t[k - 1]) & (gnss.t <= t[k]) & (t[k] - t[k - 1] < 3.0)
+    if near.sum() < crosschecks.MIN_PAIRS:
+        return None
+    at = np.stack([np.interp(gnss.t[near], t, true[:, axis]) for axis in (0, 1)], -1)
+    return float(np.median(np.linalg.norm(at - fixes[near], axis=1)))

@@ -1,0 +1,301 @@
+"""Drafts a recording.toml from logs that nobody prepared: `draft` looks at them, guesses, and says why and how sure."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.files import inside
+from graphnav.core.rotation import Array
+from graphnav.core.timescales import NEAR, Epochs, between_clocks
+from graphnav.recording import Gnss, Odometer
+from graphnav.recording.draft import guesses, motion
+from graphnav.recording.draft.agreement import CLEAR, FAIR, Agreement, compare
+from graphnav.recording.draft.guesses import Guess
+from graphnav.recording.draft.sources import JOINED, Source, fix_speed_unit, fixes, sources
+from graphnav.recording.formats.schema import FORCE, RATE, SPEED
+from graphnav.recording.formats.writer import quoted
+
+__all__ = ["Draft", "draft"]
+
+_UNIX = 1e9  # s
+_SMALL = 0.03  # s; shifts of clocks below this are left to the smoother, which estimates them
+_SD = "[3.3, 3.3, 6.6]"  # m, what is assumed of fixes that state none (graphnav.recording.formats.repair.DEFAULT_SD)
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A recording.toml and what was decided on the way, in words."""
+
+    text: str
+    decisions: tuple[str, ...]
+    made: dict[str, dict[str, Array]]  # files to lie beside it: name -> columns
+
+
+def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: Sequence[str] = ()) -> Draft:
+    """Describe logs (CSV files, or logs of programs that are known) in a recording.toml that will lie in `folder`.
+
+    Of a folder all logs in it are looked at; what holds no sensor is left out and said. `topics` are those to use of
+    a ROS bag.
+
+    Raises
+    ------
+    RecordingError
+        If a file cannot be read, holds nothing that is known, or there is no IMU among them.
+    """
+    found = sources(paths, topics)
+    writer = _Writer(folder, topics)
+    writer.decisions += [f"left out: {said}" for said in found.left_out]
+    text = writer.text(found.sensors, name or folder.resolve().name or "drive")
+    return Draft(text, tuple(writer.decisions), writer.made)
+
+
+def imu_of(path: Path) -> tuple[Array, Array, Array]:
+    """Times (N,), rates and forces (N, 3) of a CSV file in SI, units as `draft` would guess them.
+
+    Raises
+    ------
+    RecordingError
+        As `draft`.
+    """
+    source = sources([path]).sensors["imu"]
+    gyro, accel = source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
+    force = guesses.accel_unit(path, accel, source.stated("ax", "accel"))
+    rate = guesses.gyro_unit(gyro, source.stated("gx", "gyro"), None, vehicle=False)
+    return source.t, gyro * RATE[str(rate.value)], accel * FORCE[str(force.value)]
+
+
+class _Writer:
+    """Lines of the file; every decision goes into a comment and into a list."""
+
+    def __init__(self, folder: Path, asked: Sequence[str]) -> None:
+        self.folder = folder
+        self.asked = asked  # topics
+        self.epochs: Epochs | None = None  # of the clocks of IMU and fixes
+        self.lines: list[str] = []
+        self.decisions: list[str] = []
+        self.made: dict[str, dict[str, Array]] = {}
+
+    def text(self, found: dict[str, Source], name: str) -> str:
+        vehicle = "gnss" in found or "odometer" in found
+        self.lines += [
+            "# Drafted by graphnav init. Comments say why each line is what it is; look at those marked CHECK.",
+            'format = "graphnav-recording/1"', f"name = {quoted(name)}",
+        ]  # fmt: skip
+        why = "there are fixes or speeds" if vehicle else "CHECK: no fixes and no speed, so it is taken for a walk"
+        self._key("platform", '"vehicle"' if vehicle else '"foot"', why)
+        if found["imu"].log is None and found["imu"].t[0] > _UNIX:
+            self._key("clock", '"unix"', "the stamps are dates of this century, s since 1970")
+        agreement, felt = self._imu(found["imu"], found.get("gnss"), vehicle)
+        course = None
+        if "gnss" in found:
+            course = motion.course_of(*fixes(found["gnss"]))
+            self._gnss(found["gnss"], agreement)
+        if "odometer" in found:
+            self._odometer(found["odometer"], course if course is not None and len(course.t) > 50 else None, felt)
+        return "\n".join(self.lines) + "\n"
+
+    # ---- one table each
+
+    def _imu(self, source: Source, gnss: Source | None, vehicle: bool) -> tuple[Agreement, tuple[Array, Array]]:
+        """Writes [imu]; returns what the fixes said, and times and forward forces."""
+        self.lines += ["", "[imu]"]
+        self._file(source, "imu")
+        if source.log is not None:
+            assert source.log.imu is not None
+            imu = source.log.imu
+            t, gyro, accel = imu.t, imu.gyro @ imu.R_bs, imu.accel @ imu.R_bs  # in the log's own axes
+        else:
+            t, gyro, accel = source.t, source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
+            force = guesses.accel_unit(source.path, accel, source.stated("ax", "accel"))
+            accel = accel * FORCE[str(force.value)]
+        up, up_why = guesses.up_of(accel)
+        agreement = Agreement()
+        if gnss is not None:
+            self.epochs = _epochs(source, gnss)
+            agreement = compare(t, gyro, accel, up, fixes(gnss), self.epochs.offset if self.epochs else 0.0)
+        if source.log is None:
+            rate = guesses.gyro_unit(gyro, source.stated("gx", "gyro"), agreement.turn, vehicle)
+            gyro = gyro * RATE[str(rate.value)]
+            self._units({"t": source.t_unit, "gyro": rate, "accel": force})
+            front = self._axes(up, up_why, agreement)
+        elif source.log.mount_known or agreement.clearest is None:
+            assert source.log.imu is not None
+            self.decisions.append(f"IMU: axes and units are those of {source.path.name}")
+            front = source.log.imu.R_bs[1]
+        else:
+            front = self._axes(up, up_why, agreement)
+        if source.log is None or (source.log.imu is not None and source.log.imu.noise_assumed):
+            self._noise(t, gyro, accel)
+        return agreement, (t, accel @ front)
+
+    def _axes(self, up: Array, up_why: str, agreement: Agreement) -> Array:
+        forward, words = guesses.default_forward(up), "CHECK: nothing tells which way is forward"
+        lag = agreement.clearest
+        if lag is not None and agreement.forward is not None and lag.correlation > 0.3:
+            forward = agreement.forward
+            sure = "forward" if lag.correlation > FAIR else "CHECK: forward, not surely,"
+            words = (
+                f"{sure} is where the accelerations of the fixes are felt (coherence {lag.correlation:.2f}, "
+                f"{abs(lag.slope):.2f} of their size)"
+            )
+        letters, (front, top) = guesses.axes(up, forward)
+        if letters is not None:
+            self._key("axes", f'"{letters}"', f"{up_why}; {words}")
+        else:
+            self._key("forward", _vector(front), words)
+            self._key("up", _vector(top), up_why)
+        return front
+
+    def _noise(self, t: Array, gyro: Array, accel: Array) -> None:
+        self.lines += ['# model = "..."                             # the IMU, if docs/imu-models.md has it']
+        self.lines += ["", "[imu.noise]                                 # better: the data sheet's figures"]
+        for key, samples, unit in (("gyro", gyro, "rad/s/sqrt(Hz)"), ("accel", accel, "m/s2/sqrt(Hz)")):
+            value = guesses.noise_density(t, samples)
+            if value > 0:
+                self._key(
+                    f"{key}_noise_density",
+                    f"{value:.2g}",
+                    f"{unit}, measured, between its quietest and usual state",
+                )
+
+    def _gnss(self, source: Source, agreement: Agreement) -> None:
+        self.lines += ["", "[gnss]"]
+        values = source.values
+        late = agreement.late_velocity
+        dropped = ("ve", "vn", "vu", "vd", "speed", "course") if late is not None else ()
+        numbers = None
+        if "type" in values:
+            sd = values.get("sd_e")
+            numbers = guesses.fix_numbers(values["type"], sd)
+            theirs = source.columns.names["type"]
+            if numbers.value is None and theirs != "type":
+                dropped = (*dropped, "type")
+                self.decisions.append(f"types of fixes: column '{theirs}' is left alone: {numbers.why}")
+        self._file(source, "gnss", dropped)
+        if source.log is None:
+            if "h" not in values:
+                raise RecordingError(f"{source.path}: no column of heights beside {source.columns.names['lat']}")
+            units = {"t": source.t_unit}
+            if numbers is not None and numbers.value is not None:
+                units["type"] = numbers
+            if source.radians:
+                units["angle"] = Guess("rad", "lat and lon are all small enough")
+            if {"speed", "course"} <= values.keys() and "ve" not in values and late is None:
+                units["speed"] = fix_speed_unit(source)
+            elif stated := source.stated("ve", "speed"):
+                units["speed"] = Guess(stated, "as the column's name says")
+            self._units(units)
+            if not {"sd_e", "sd_n", "sd_u"} <= values.keys():
+                why = "CHECK: m, 1-sigma east, north, up; the file states none, this is a receiver without corrections"
+                self._key("sd", _SD, why)
+            height = source.columns.names["h"]
+            if "msl" in height.lower() or "alt" in height.lower():
+                self.decisions.append(f"heights: '{height}' may be above mean sea level; they are used as they are")
+        if late is not None:
+            words = f"velocities are not used: they come {late:.2f} s after the positions"
+            self.lines.append(f"# {words}")
+            self.decisions.append(words)
+        self._lever_arm(source.log.gnss if source.log else None, "from the IMU to the antenna: right, forward, up")
+        if agreement.offset is not None:
+            seconds, sigma = agreement.offset
+            sure = "" if sigma < motion.STEP else "CHECK: "
+            why = f"{sure}s, +-{max(sigma, 0.01):.2f}; the accelerations agree best with the IMU's so"
+            if self.epochs is not None:
+                rest = seconds - self.epochs.offset
+                why = f"s; {self.epochs.words}"
+                if rest:
+                    why += (
+                        f"; the rest, {rest:+.2f} +-{max(sigma, 0.01):.2f}, is what the accelerations agree best with"
+                    )
+            self._key("time_offset", f"{seconds:.2f}", why)
+
+    def _odometer(self, source: Source, course: motion.Course | None, felt: tuple[Array, Array]) -> None:
+        self.lines += ["", "[odometer]"]
+        self._file(source, "odometer")
+        if source.log is None:
+            speed = guesses.speed_unit(source.t, source.values["speed"], course, source.stated("speed", "speed"))
+            self._units({"t": source.t_unit, "speed": speed})
+            lag = _odometer_lag(source.t, source.values["speed"] * SPEED[str(speed.value)], felt)
+            if lag is not None and lag.correlation > FAIR and abs(lag.seconds) > _SMALL:
+                sure = "" if lag.correlation > CLEAR else "CHECK: "
+                self._key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_agree(lag)}")
+                self._key("delay_sigma", "0.05", "s, what is left of it; it is estimated")
+        self._lever_arm(source.log.odometer if source.log else None, "from the IMU to the middle of the rear axle")
+
+    def _lever_arm(self, sensor: Gnss | Odometer | None, what: str) -> None:
+        """That of a log, if it has one."""
+        if sensor is not None and np.any(sensor.lever_arm):
+            self._key("lever_arm", _vector(sensor.lever_arm), f"m, {what}; as the log says")
+        else:
+            self._key("lever_arm", "[0.0, 0.0, 0.0]", f"CHECK: m, {what}")
+
+    # ---- lines
+
+    def _key(self, key: str, value: str, why: str) -> None:
+        self.lines.append(f"{key} = {value}".ljust(43) + f" # {why}")
+        self.decisions.append(f"{key} = {value}: {why}")
+
+    def _file(self, source: Source, sensor: str, dropped: Sequence[str] = ()) -> None:
+        relative = Path(os.path.relpath(source.path.resolve(), self.folder.resolve())).as_posix()
+        if source.joined_from is not None:
+            relative = JOINED
+            self.made[relative] = source.values
+            rates, forces = (path.name for path in source.joined_from)
+            self.decisions.append(f"{relative}: made of {rates} and {forces}, the forces at the times of the rates")
+        self.lines.append(f"file = {quoted(relative)}")
+        if source.log is not None and (topics := source.log.topics.get(sensor, ())):
+            others = f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}"
+            if topics[0] in self.asked:
+                others = "as was asked"
+            self._key("topic", quoted(topics[0]), others if len(topics) > 1 else "the only one")
+        if source.joined_from is None and not inside(source.path, self.folder):
+            self.decisions.append(f"{relative}: lies outside the folder of this file; say --allow-outside to read it")
+        names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
+        if names:
+            pairs = ", ".join(f"{ours} = {quoted(theirs)}" for ours, theirs in names.items())
+            self.lines.append(f"columns = {{ {pairs} }}")
+
+    def _units(self, units: dict[str, Guess]) -> None:
+        default = {"type": "rtklib", "t": "s", "gyro": "rad/s", "accel": "m/s2", "angle": "deg", "speed": "m/s"}
+        self.decisions += [f"{key} in {guess.value}: {guess.why}" for key, guess in units.items()]
+        other = {key: guess for key, guess in units.items() if guess.value != default[key]}
+        if other:
+            pairs = ", ".join(f'{key} = "{guess.value}"' for key, guess in other.items())
+            why = "; ".join(f"{key}: {guess.why}" for key, guess in other.items())
+            self.lines.append(f"units = {{ {pairs} }}".ljust(43) + f" # {why}")
+
+
+def _odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> motion.Lag | None:
+    """How late the wheel is, by its accelerations against the forward ones of the IMU."""
+    if len(t) < 50:
+        return None
+    grid, forward = motion.on_grid(felt[0], felt[1][:, None])
+    even = np.arange(t[0], t[-1], motion.STEP)
+    pull = np.gradient(motion.mean(np.interp(even, t, speed)), motion.STEP)
+    return motion.lag(grid, motion.band(forward[:, 0]), even, motion.band(pull))
+
+
+def _epochs(imu: Source, gnss: Source) -> Epochs | None:
+    """What lies between the clocks of two logs, where both are known."""
+    first = [_first(source, sensor) for source, sensor in ((imu, "imu"), (gnss, "gnss"))]
+    zeros = [None if source.log is None else source.log.gps_zero for source in (imu, gnss)]
+    found = between_clocks(first[0], zeros[0], first[1], zeros[1])
+    return found if found is not None and abs(first[1] + found.offset - first[0]) < NEAR else None
+
+
+def _first(source: Source, sensor: str) -> float:
+    return float((source.t if source.log is None else getattr(source.log, sensor).t)[0])
+
+
+def _agree(lag: motion.Lag) -> str:
+    return f"the accelerations agree best with the IMU's so (coherence {lag.correlation:.2f})"
+
+
+def _vector(v: Array) -> str:
+    return "[" + ", ".join(f"{x:.4f}" for x in v) + "]"

@@ -1,0 +1,139 @@
+"""What IMU and fixes say of each other: the gyro's unit, the shift of the clocks, the forward axis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.recording import Gnss, Imu
+from graphnav.recording.checks.clock import Clock, clock_of
+from graphnav.recording.draft import motion
+
+CLEAR, FAIR = 0.8, 0.5  # correlations: sure, likely
+_FAR = 0.75  # the least for a shift of clocks that have nothing in common
+_TWO_CLOCKS = 0.15  # s; velocities further from the positions than this have a latency of their own
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """`turn` of the turn rates; `position` and `velocity` of the accelerations, as `motion.Lag`, None where unknown.
+
+    These find clocks that have nothing in common and the way forward. How far apart clocks are that overlap is said by
+    `clock`, as in `graphnav info`, of fixes that come `far` seconds earlier than they are stamped.
+    """
+
+    turn: motion.Lag | None = None
+    position: motion.Lag | None = None
+    velocity: motion.Lag | None = None
+    forward: Array | None = None  # (3,) in file axes
+    far: float = 0.0  # s
+    clock: Clock | None = None
+    known: float = 0.0  # s, to be added to the stamps of the fixes beforehand; the rest is found on top
+
+    @property
+    def clearest(self) -> motion.Lag | None:
+        """The one with the highest coherence."""
+        both = [lag for lag in (self.position, self.velocity) if lag is not None]
+        return max(both, key=lambda lag: lag.correlation, default=None)
+
+    @property
+    def late_velocity(self) -> float | None:
+        """How much later than the positions the velocities come, s, where that is surely another latency."""
+        between = self.clock.between if self.clock is not None else None
+        if between is None or self.clock is None or self.clock.apart is None or abs(between.lag) < _TWO_CLOCKS:
+            return None
+        return between.lag
+
+    @property
+    def offset(self) -> tuple[float, float] | None:
+        """What to add to the stamps of the fixes, s, and its 1-sigma; None where nothing says that they are off."""
+        found = self._found_offset
+        if not self.known:
+            return found
+        return (self.known + found[0], found[1]) if found is not None else (self.known, 0.0)
+
+    @property
+    def _found_offset(self) -> tuple[float, float] | None:
+        """The same, of the fixes with what is known added to their stamps."""
+        if self.clock is None:
+            return None
+        clock = self.clock if self.late_velocity is None else Clock(None, self.clock.by_places, None)
+        if clock.late is not None:
+            return clock.late.lag - self.far, clock.late.spread
+        if not self.far:
+            return None
+        known = clock.by_velocity or clock.by_places
+        sure = known is not None and known.correlation > FAIR and known.spread < motion.STEP
+        return (known.lag - self.far, known.spread) if sure and known is not None else (-self.far, motion.STEP)
+
+
+def level_axes(up: Array) -> tuple[Array, Array]:
+    """Two axes square to `up` and each other, so that the first, the second and up are right-handed."""
+    start = np.eye(3)[int(np.abs(up).argmin())]
+    first = start - (start @ up) * up
+    first /= np.linalg.norm(first)
+    return first, np.cross(up, first)
+
+
+def compare(
+    t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array, Array, Array | None], known: float = 0.0
+) -> Agreement:
+    """IMU (N, 3 each, file axes; gyro in any unit) against fixes (times, positions, velocities or None).
+
+    `known` (s) is to be added to the stamps of the fixes before anything else.
+    """
+    near = _compare(t, gyro, accel, up, (fixes[0] + known, *fixes[1:]))
+    return replace(near, known=known)
+
+
+def _compare(t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array, Array, Array | None]) -> Agreement:
+    courses = [motion.course_of(fixes[0], fixes[1], v) for v in (None, fixes[2])]
+    courses = courses if fixes[2] is not None else courses[:1]
+    if any(len(course.t) < 10 for course in courses):
+        return Agreement()
+    grid, rate = motion.on_grid(t, gyro @ up[:, None])
+    turns = [lag for course in courses if (lag := _turn_lag(grid, rate[:, 0], course)) is not None]
+    turn = max(turns, key=lambda lag: lag.correlation, default=None)
+    shift = turn.seconds if turn is not None and abs(turn.seconds) > motion.NEAR else 0.0
+    axes = level_axes(up)
+    grid, felt = motion.on_grid(t, accel @ np.stack(axes, -1))
+    s = motion.band(felt[:, 0]) + 1j * motion.band(felt[:, 1])
+    lags: list[motion.Lag | None] = []
+    for one in courses:
+        z = motion.band(one.forward) + 1j * motion.band(one.left)
+        found = motion.lag(grid, s, one.t - shift, z)
+        if found is None:
+            lags.append(None)
+            continue
+        # An antenna ahead of the IMU feels sideways what the IMU will feel; along the course they feel the same.
+        ahead = motion.lag(grid, (s * np.exp(-1j * np.angle(found.slope))).real, one.t - shift, z.real)
+        seconds = ahead.seconds if ahead is not None and ahead.correlation > FAIR else found.seconds
+        lags.append(motion.Lag(seconds + shift, found.correlation, found.slope))
+    position, velocity = (*lags, None)[:2]
+    out = Agreement(turn, position, velocity, None, shift, _clock(t, gyro, accel, fixes, shift))
+    if out.clearest is None:
+        return out
+    angle = np.angle(out.clearest.slope)
+    return replace(out, forward=np.cos(angle) * axes[0] + np.sin(angle) * axes[1])
+
+
+def _clock(t: Array, gyro: Array, accel: Array, fixes: tuple[Array, Array, Array | None], shift: float) -> Clock:
+    """As the recording will hold them, with the fixes `shift` seconds earlier."""
+    rows = np.concatenate([[True], np.diff(fixes[0]) > 0.0]) & np.isfinite(fixes[1]).all(axis=1)
+    v = None if fixes[2] is None else fixes[2][rows]
+    if v is not None and v.shape[1] == 2:
+        v = np.column_stack([v, np.zeros(len(v))])
+    gnss = Gnss(fixes[0][rows] - shift, fixes[1][rows], np.ones((int(rows.sum()), 3)), v)
+    return clock_of(Imu(t, gyro, accel), gnss)
+
+
+def _turn_lag(grid: Array, rate: Array, course: motion.Course) -> motion.Lag | None:
+    """The shift of clocks that overlap, unless only another one, any, makes the turns agree."""
+    overlap = course.t[0] < grid[-1] and course.t[-1] > grid[0] if len(grid) else False
+    near = motion.lag(grid, rate, course.t, course.turn, course.speed**2) if overlap else None
+    if near is not None and near.correlation > FAIR:
+        return near
+    far = motion.lag(grid, rate, course.t, course.turn, course.speed**2, anywhere=True)
+    return far if far is not None and far.correlation > _FAR else near

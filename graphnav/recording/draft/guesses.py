@@ -1,0 +1,182 @@
+"""What the size and the course of the numbers tell: units, axes, shifts of clocks, noise; each with how sure it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.recording.draft import motion
+from graphnav.recording.formats.schema import FORCE, RATE, SPEED, TIME, rotation_from_letters
+
+_G = 9.80665
+_LASTING = 0.5  # of the usual force is in its mean, even of a foot that swings
+_LIKELY = 0.5  # correlation
+_STRAIGHT = np.cos(np.radians(12.0))  # nearer to a file axis than this, the axis is meant
+_QUIET = 5.0  # s
+_APART = 100.0  # s; stamps further apart are in a smaller unit
+_FIXED = 0.15  # m; fixed carrier phases state less, all else usually more
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A value for recording.toml and why, in words."""
+
+    value: object
+    why: str
+
+
+def time_unit(t: Array, stated: str | None, imu: bool) -> Guess:
+    """s, ms, us or ns, by the name, by the size of an epoch, by the step."""
+    if stated is not None:
+        return Guess(stated, "as the column's name says")
+    if (unit := _unix_unit(t)) is not None:
+        return Guess(unit, f"{t[0]:.0f} is then a date of this century in Unix time")
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
+    low, high = (5e-4, 0.11) if imu else (0.02, 11.0)
+    fits = [unit for unit, scale in TIME.items() if low <= step * scale <= high]
+    if not fits:
+        return Guess("s", f"rows are {step:g} apart, which fits no unit: a guess")
+    return Guess(fits[0], f"rows are then {step * TIME[fits[0]]:.4g} s apart")
+
+
+def is_date(t: Array) -> bool:
+    """Whether stamps are dates of this century in Unix time, in some unit."""
+    return _unix_unit(t) is not None
+
+
+def _unix_unit(t: Array) -> str | None:
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    return next((u for u, scale in TIME.items() if 1e9 <= float(t[0]) * scale < 3e9 and step * scale < _APART), None)
+
+
+def accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
+    """m/s2, g or mg, by the size of gravity.
+
+    Raises
+    ------
+    RecordingError
+        If gravity has been taken out, or the numbers are raw counts.
+    """
+    size = float(np.median(np.linalg.norm(accel, axis=-1)))
+    lasting = float(np.linalg.norm(np.mean(accel, axis=0))) > _LASTING * size  # what a motion alone does not do
+    for unit, scale in FORCE.items():
+        if lasting and 0.8 * _G < size * scale < 1.25 * _G:
+            return Guess(unit, f"the median force, {size:.4g}, is then that of gravity")
+    if stated is not None and lasting and size * FORCE[stated] > 0.8 * _G:
+        return Guess(stated, f"as the column's name says, though the median force is {size:.4g}")
+    if size < 0.5 * _G or not lasting:
+        raise RecordingError(
+            f"{path}: the accelerations are {size:.3g} in size at the median and not lasting: they are without "
+            "gravity; log the raw accelerometer (on iOS 'TotalAcceleration')"
+        )
+    raise RecordingError(
+        f"{path}: the accelerations are {size:.3g} in size at the median, which is gravity in no unit: raw counts?"
+    )
+
+
+def gyro_unit(gyro: Array, stated: str | None, lag: motion.Lag | None, vehicle: bool) -> Guess:
+    """rad/s or deg/s: by the turns of the course if there are any, by the name, by the size."""
+    if lag is not None and abs(lag.correlation) > _LIKELY:
+        for unit, scale in RATE.items():
+            if 0.6 < abs(lag.slope) * scale < 1.6:
+                return Guess(unit, f"the turns are then those of the course (correlation {abs(lag.correlation):.2f})")
+    if stated is not None:
+        return Guess(stated, "as the column's name says")
+    large = float(np.percentile(np.abs(gyro), 99.5))
+    limit = 2.5 if vehicle else 15.0
+    return Guess(
+        "deg/s" if large > limit else "rad/s",
+        f"99.5 % of the rates are below {large:.3g}; a guess, no turns to check it",
+    )
+
+
+def speed_unit(t: Array, speed: Array, course: motion.Course | None, stated: str | None) -> Guess:
+    """m/s, km/h, mph or knots: by the fixes if there are any, by the name, by the size."""
+    if course is not None:
+        mine = np.interp(course.t, t, speed, np.nan, np.nan)
+        ok = np.isfinite(mine) & (course.speed > 3.0)
+        if ok.sum() > 50:
+            ratio = float(np.median(np.abs(mine[ok]) / course.speed[ok]))
+            unit = min(SPEED, key=lambda u: abs(np.log(ratio * SPEED[u])))
+            if abs(np.log(ratio * SPEED[unit])) < 0.08:
+                return Guess(unit, f"the fixes move {1 / ratio / SPEED[unit]:.3f} times as fast")
+    if stated is not None:
+        return Guess(stated, "as the column's name says")
+    large = float(np.percentile(np.abs(speed), 95))
+    return Guess("km/h" if large > 45 else "m/s", f"95 % of the speeds are below {large:.3g}; a guess")
+
+
+def fix_numbers(said: Array, sd: Array | None) -> Guess:
+    """Whose numbers types of fixes (N,) are, "rtklib", "nmea" or None, by the horizontal sigmas (N,) m of the fixes.
+
+    A fixed solution is 1 or 4, and nothing else is that precise; what follows from it must fit the other numbers.
+    """
+    if sd is None:
+        return Guess(None, "no sigmas tell whose numbers they are")
+    usual = {int(k): float(np.median(sd[said == k])) for k in np.unique(said[np.isfinite(said)])}
+    precise = {k for k, s in usual.items() if s < _FIXED}
+    for whose, fixed, known in (("rtklib", 1, range(7)), ("nmea", 4, (0, 1, 2, 4, 5, 9))):
+        floats = {2} if whose == "rtklib" else {5}  # that have settled may state as little
+        if fixed in precise and precise <= {fixed} | floats and set(usual) <= set(known):
+            return Guess(whose, f"fixes of {fixed} state {usual[fixed]:.2g} m at the median, as fixed ones do")
+    return Guess(None, "its numbers and the sigmas do not tell whose they are")
+
+
+def up_of(accel: Array) -> tuple[Array, str]:
+    """The up axis (3,) in file axes, and how steady gravity was."""
+    mean = np.mean(accel, axis=0)
+    up = mean / np.linalg.norm(mean)
+    tilt = np.degrees(np.arccos(np.clip(np.abs(up).max(), 0, 1)))
+    axis = int(np.abs(up).argmax())
+    return up, f"gravity is felt along {'+' if up[axis] > 0 else '-'}{'xyz'[axis]}, {tilt:.0f} deg off it on average"
+
+
+def axes(up: Array, forward: Array) -> tuple[str | None, tuple[Array, Array]]:
+    """Three letters if both vectors are near file axes, and in any case the two vectors."""
+    square = forward - (forward @ up) * up
+    square /= np.linalg.norm(square)
+    if np.abs(up).max() > _STRAIGHT and np.abs(square).max() > _STRAIGHT:
+        letters = ["", "", ""]
+        for vector, positive, negative in ((up, "U", "D"), (square, "F", "B")):
+            k = int(np.abs(vector).argmax())
+            letters[k] = positive if vector[k] > 0 else negative
+        for side in "RL":
+            word = "".join(letter or side for letter in letters)
+            try:
+                rotation_from_letters(word)
+            except ValueError:
+                continue
+            return word, (square, up)
+    return None, (square, up)
+
+
+def default_forward(up: Array) -> Array:
+    """A forward axis where nothing tells: x if it is level, else y."""
+    return np.asarray(np.eye(3)[0 if abs(up[0]) < 0.7 else 1])
+
+
+def noise_density(t: Array, x: Array) -> float:
+    """Noise of samples (N, 3) per root Hz, taken as white: between the quietest tenth of the log and its usual state.
+
+    The Allan deviation times the root of its averaging time, which is the same for all times where noise is white;
+    the least of those up to half a second, as vibration is above it at the short ones and motion at the long ones.
+    Of the quietest tenth it is the sensor's own, of the median it has the shaking of the drive in it, and, too large,
+    its motion; the geometric mean of both is given.
+    """
+    period = float(np.median(np.diff(t)))
+    least = np.full(2, np.inf)
+    m = 1
+    while m * period <= 0.5 and len(x) // m > 4:
+        means = x[: len(x) // m * m].reshape(-1, m, x.shape[1]).mean(1)
+        squares = 0.5 * np.diff(means, axis=0) ** 2
+        n = max(round(_QUIET / (m * period)), 4)
+        windows = squares[: len(squares) // n * n].reshape(-1, n, x.shape[1])
+        if len(windows):
+            variance = np.percentile(windows.mean(1), (10, 50), axis=0).mean(1)
+            least = np.minimum(least, np.sqrt(variance * m * period))
+        m *= 2
+    return float(np.sqrt(least[0] * least[1])) if np.isfinite(least).all() else 0.0

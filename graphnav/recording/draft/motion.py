@@ -1,0 +1,216 @@
+"""Two sensors that saw the same motion: how far apart their clocks are, in what unit, and which way is forward.
+
+The turn rate about up, of the gyro and of the course over ground, is the same signal whatever the mount: the slope of
+one over the other is the gyro's unit, and where their clocks have nothing in common, the best agreement finds the
+shift roughly. Not finely: ahead of the rear axle the course turns before the body does, by the distance over the speed.
+
+The accelerations along and across the course are those that the accelerometer felt in its own horizontal plane, turned
+by the angle of the mount: planar vectors as complex numbers, least squares, at the shift of the clocks where they agree
+best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+
+STEP = 0.1  # s, of the common grid
+_WINDOW = 1.0  # s, of the moving mean over everything
+_SLOW = 3.0  # m/s; slower than this a course means little
+_FEWEST, _TRIMS = 50, 3
+NEAR = 3.0  # s, how far apart clocks are looked for that already overlap
+
+
+@dataclass(frozen=True)
+class Course:
+    """Motion over ground on an even grid: NaN turn rate and acceleration where it is too slow to have a course."""
+
+    t: Array  # (K,) s
+    speed: Array  # (K,) m/s
+    turn: Array  # (K,) rad/s, anticlockwise
+    forward: Array  # (K,) m/s^2 along the course
+    left: Array  # (K,) m/s^2 across it
+
+
+@dataclass(frozen=True)
+class Lag:
+    """How late the second signal is (s), the correlation there, and the slope of the first over the second."""
+
+    seconds: float
+    correlation: float  # the size of it, for planar vectors
+    slope: complex
+
+
+def course_of(t: Array, llh: Array, v: Array | None) -> Course:
+    """Course and accelerations of fixes: from velocities (N, 2 or 3) where they are known, else from positions."""
+    p = LocalFrame(llh[0]).from_llh(llh)
+    if v is None or np.isnan(v[:, :2]).all():
+        keep = np.concatenate([[True], np.diff(t) > 0])
+        t, p = t[keep], p[keep]
+        grid = np.arange(t[0], t[-1], STEP)
+        east, north = (mean(np.gradient(mean(np.interp(grid, t, p[:, k])), STEP)) for k in (0, 1))
+    else:
+        known = ~np.isnan(v[:, :2]).any(-1)
+        t, v = t[known], v[known]
+        grid = np.arange(t[0], t[-1], STEP)
+        east, north = (mean(np.interp(grid, t, v[:, k])) for k in (0, 1))
+    # nothing is known inside gaps, nor where the means reach into them or over an end
+    gap = mean(_in_gaps(grid, t).astype(float), 4.0 * _WINDOW) > 0.0
+    gap |= (grid < grid[0] + 2.0 * _WINDOW) | (grid > grid[-1] - 2.0 * _WINDOW)
+    speed = np.hypot(east, north)
+    ae, an = np.gradient(east, STEP), np.gradient(north, STEP)
+    slow = (speed < _SLOW) | gap
+    safe = np.where(slow, np.inf, speed)
+    forward, left = (east * ae + north * an) / safe, (east * an - north * ae) / safe
+    turn = left / safe
+    for x in (forward, left, turn):
+        x[slow] = np.nan
+    return Course(grid, np.where(gap, np.nan, speed), turn, forward, left)
+
+
+def on_grid(t: Array, x: Array) -> tuple[Array, Array]:
+    """Samples (N, k) as means over a second on an even grid; NaN inside gaps."""
+    cumulative = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x[1:] * np.diff(t)[:, None], axis=0)])
+    grid = np.arange(t[0] + _WINDOW / 2, t[-1] - _WINDOW / 2, STEP)
+    if not len(grid):
+        return grid, np.empty((0, x.shape[1]))
+    both = [np.stack([np.interp(grid + side * _WINDOW / 2, t, c) for c in cumulative.T], -1) for side in (-1, 1)]
+    out = (both[1] - both[0]) / _WINDOW
+    out[_in_gaps(grid, t)] = np.nan
+    return grid, out
+
+
+def mean(x: Array, window: float = _WINDOW) -> Array:
+    """Moving mean over some seconds, of the grid."""
+    n = 2 * round(window / STEP / 2)
+    kernel = np.ones(n + 1)
+    kernel[[0, -1]] = 0.5
+    within = slice(n // 2, n // 2 + len(x))  # "same" has the length of the longer, which may be the kernel
+    return np.convolve(x, kernel)[within] / np.convolve(np.ones(len(x)), kernel)[within]
+
+
+def lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None, anywhere: bool = False) -> Lag | None:
+    """How late `y` at `u` is behind `x` at `t` (both on grids of `STEP`), where they agree best; None without a hint.
+
+    Real signals, or planar vectors as complex numbers, whose `Lag.slope` then says how far `x` is turned from `y`.
+
+    Samples of `y` that fit by far the worst at the best lag are left out, and the best looked for again.
+
+    Parameters
+    ----------
+    weight
+        Of the samples of `y`: one over their variance.
+    anywhere
+        Look over the whole length instead of a few seconds: the clocks have nothing to do with each other. Only for
+        real signals.
+    """
+    if len(t) < 50 or len(u) < 50:
+        return None
+    apart = float(u[0] - t[0])
+    a, b = _even(t, x), _even(u, y)
+    w = np.ones(len(b)) if weight is None else np.nan_to_num(_even(u, weight))
+    if anywhere:
+        shifts, r, slope = _all_lags(a, b, w)
+    else:
+        shifts = np.arange(np.ceil((-NEAR - apart) / STEP), np.floor((NEAR - apart) / STEP) + 1).astype(int)
+        r, slope = _lags(a, b, w, shifts)
+        for _ in range(_TRIMS):
+            if not np.isfinite(r).any():
+                return None
+            best = int(np.nanargmax(np.abs(r)))
+            b = _trimmed(a, b, w, int(shifts[best]), slope[best])
+            r, slope = _lags(a, b, w, shifts)
+    if not np.isfinite(r).any():
+        return None
+    best = int(np.nanargmax(np.abs(r)))
+    peak = 0.0  # of the parabola through the best and its neighbours, in steps
+    if 0 < best < len(r) - 1 and np.isfinite(r[best - 1 : best + 2]).all():
+        left, top, right = np.abs(r[best - 1 : best + 2])
+        bend = left - 2 * top + right
+        peak = 0.5 * (left - right) / bend if bend < 0 else 0.0
+    return Lag(float(apart + (shifts[best] + peak) * STEP), float(r[best]), complex(slope[best]))
+
+
+def band(x: Array) -> Array:
+    """Smoothed over a second and without what is slower than ten, which slopes of the road would enter."""
+    known = np.isfinite(x)
+    filled = np.where(known, x, 0.0)
+    weight = mean(known.astype(float), 10.0)
+    slow = mean(filled, 10.0) / np.maximum(weight, 1e-9)
+    out = mean(np.where(known, x - slow, 0.0)) / np.maximum(mean(known.astype(float)), 1e-9)
+    return np.where(known, out, np.nan)
+
+
+def _even(t: Array, x: Array) -> Array:
+    grid = t[0] + STEP * np.arange(round((t[-1] - t[0]) / STEP) + 1)
+    known = np.isfinite(x)
+    if not known.any():
+        return np.full(len(grid), np.nan)
+    out = np.interp(grid, t[known], x[known])
+    k = np.clip(np.round((grid - t[0]) / STEP).astype(int), 0, len(x) - 1)
+    out[~np.isfinite(x[k])] = np.nan
+    return out
+
+
+def _pairs(a: Array, b: Array, w: Array, shift: int) -> tuple[Array, Array, Array, Array]:
+    """a[k], b[k + shift] and its weight where all are known, without their weighted means; and which of b they are."""
+    lo, hi = max(0, -shift), min(len(a), len(b) - shift)
+    if hi - lo < _FEWEST:
+        return np.empty(0), np.empty(0), np.empty(0), np.empty(0, int)
+    x, y, v = a[lo:hi], b[lo + shift : hi + shift], w[lo + shift : hi + shift]
+    ok = np.flatnonzero(np.isfinite(x) & np.isfinite(y) & (v > 0))
+    if len(ok) < _FEWEST:
+        return np.empty(0), np.empty(0), np.empty(0), np.empty(0, int)
+    x, y, v = x[ok], y[ok], v[ok] / v[ok].sum()
+    return x - v @ x, y - v @ y, v, ok + lo + shift
+
+
+def _lags(a: Array, b: Array, w: Array, shifts: Array) -> tuple[Array, Array]:
+    """Correlation, and slope of a over b, at every shift."""
+    r, slope = np.full(len(shifts), np.nan), np.full(len(shifts), np.nan, dtype=complex)
+    for k, shift in enumerate(shifts):
+        x, y, v, _ = _pairs(a, b, w, int(shift))
+        if not len(v):
+            continue
+        xx, yy, xy = float(v @ np.abs(x) ** 2), float(v @ np.abs(y) ** 2), v @ (x * np.conj(y))
+        if xx > 0 and yy > 0:
+            r[k] = (np.abs(xy) if np.iscomplexobj(xy) else xy) / np.sqrt(xx * yy)
+            slope[k] = xy / yy
+    return r, slope
+
+
+def _trimmed(a: Array, b: Array, w: Array, shift: int, slope: complex) -> Array:
+    """b without the samples that fit worst at a shift: beyond four robust sigmas of the weighted residuals."""
+    x, y, v, at = _pairs(a, b, w, shift)
+    factor = slope if np.iscomplexobj(y) else slope.real
+    residual = np.abs((x - factor * y) * np.sqrt(v))
+    out = b.copy()
+    out[at[residual > 4.0 * 1.4826 * np.median(residual)]] = np.nan
+    return out
+
+
+def _all_lags(a: Array, b: Array, w: Array) -> tuple[Array, Array, Array]:
+    """The same for every shift, by FFT, unknown samples as zero; only where half of the shorter overlaps."""
+    wa, wb = np.isfinite(a).astype(float), np.where(np.isfinite(b), w, 0.0)
+    a, b = np.nan_to_num(a), np.nan_to_num(b)
+    n = 1 << int(np.ceil(np.log2(len(a) + len(b))))
+
+    def cross(x: Array, y: Array) -> Array:
+        c = np.fft.irfft(np.conj(np.fft.rfft(x, n)) * np.fft.rfft(y, n), n)
+        return np.concatenate([c[-(len(a) - 1) :], c[: len(b)]])
+
+    shifts = np.arange(-(len(a) - 1), len(b))
+    xy, xx, yy, seen = cross(a, b * wb), cross(a * a, wb), cross(wa, b * b * wb), cross(wa, wb)
+    good = (seen > 0.5 * min(wb.sum(), wb.max() * wa.sum())) & (xx > 1e-12) & (yy > 1e-12)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return shifts, np.where(good, xy / np.sqrt(np.abs(xx * yy)), np.nan), np.where(good, xy / yy, np.nan)
+
+
+def _in_gaps(grid: Array, t: Array) -> Array:
+    """Grid times inside or next to a gap of more than two seconds."""
+    k = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
+    return np.asarray(t[k] - t[k - 1] > 2.0)

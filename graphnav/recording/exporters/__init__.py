@@ -1,0 +1,122 @@
+"""One module per output format, each with ``writing(path, name)``: a file that trajectories are added to in blocks.
+
+`write_all` writes what every run leaves, `write_as` one format by name, `written` any of them in one go.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
+
+NAMES = ("csv", "tum", "kml", "gpx", "nav", "nmea", "parquet")  # which are the suffixes of the files too
+
+
+class Add(Protocol):
+    """Adds rows to a file; `utc` (K,), datetime64, where the clock is known."""
+
+    def __call__(self, block: Trajectory, utc: Array | None = None) -> None: ...
+
+
+def write_all(blocks: Trajectory | Iterable[Trajectory], folder: Path, name: str | None = None) -> None:
+    """Write trajectory.csv, trajectory.kml and trajectory.tum into `folder`, which is made if need be.
+
+    Parameters
+    ----------
+    blocks : a trajectory, or its parts one behind the other: only one of them need be in memory.
+    name : that the files say; the trajectory's own if None.
+
+    Raises
+    ------
+    RecordingError
+        If the trajectory is in a local frame, or has no attitude (which TUM cannot leave out).
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    if isinstance(blocks, Trajectory):
+        name, blocks = (blocks.name if name is None else name), [blocks]
+    written(blocks, {one: folder / f"trajectory.{one}" for one in ("csv", "kml", "tum")}, name or "")
+
+
+def written(
+    blocks: Iterable[Trajectory],
+    targets: Mapping[str, Path],
+    name: str = "",
+    utc: Callable[[Array], Array] | None = None,
+) -> None:
+    """Write the parts of a trajectory, one behind the other, in some formats at once, each to its path.
+
+    Parameters
+    ----------
+    utc : of times of the trajectory, where the clock is known.
+
+    Raises
+    ------
+    RecordingError
+        If a format cannot hold this trajectory.
+    """
+    # under another name until all is there: what cannot be written leaves what was there before
+    parts = {path: path.with_name(f".{path.name}.part") for path in map(Path, targets.values())}
+    try:
+        with ExitStack() as stack:
+            adders = []
+            for one, part in zip(targets, parts.values(), strict=True):
+                module = import_module(f"graphnav.recording.exporters.{one}")
+                adders.append(stack.enter_context(module.writing(part, name)))
+            for block in blocks:
+                stamps = None if utc is None else utc(block.t)
+                for add in adders:
+                    add(block, stamps)
+        for path, part in parts.items():
+            os.replace(part, path)
+    except RecordingError as error:
+        sentence = str(error)
+        for path, part in parts.items():
+            sentence = sentence.replace(str(part), str(path))
+        raise RecordingError(sentence) from None
+    finally:
+        for part in parts.values():
+            part.unlink(missing_ok=True)
+
+
+def check_names(names: Sequence[str], gps_zero: float | None) -> None:
+    """Refuse formats that a recording cannot be written in, before it is solved; `gps_zero` as `Recording` has it.
+
+    Raises
+    ------
+    RecordingError
+        Saying what is missing.
+    """
+    if "nmea" in names and gps_zero is None:
+        raise RecordingError(
+            "--export nmea: needs the time of day, and what t counts from is not known; say clock in recording.toml"
+        )
+    if "parquet" in names and find_spec("pyarrow") is None:
+        raise RecordingError("--export parquet: needs pyarrow; pip install 'graphnav-ins[parquet]'")
+
+
+def write_as(name: str, trajectory: Trajectory, path: Path, utc: Array | None = None) -> None:
+    """Write one of `NAMES`; `utc` (K,), datetime64, where the clock is known.
+
+    Raises
+    ------
+    RecordingError
+        If the format cannot hold this trajectory.
+    """
+    written([trajectory], {name: path}, trajectory.name, None if utc is None else lambda t: np.asarray(utc))
+
+
+def require_geodetic(trajectory: Trajectory, path: Path) -> None:
+    """Refuse a trajectory whose place on Earth is not known."""
+    if trajectory.frame != "geodetic":
+        raise RecordingError(f"{path}: a trajectory in a local frame has no latitude and longitude; write it as .tum")

@@ -1,0 +1,96 @@
+"""KML: the path as a line on the ground, its start and its end, for Google Earth and the like."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
+from graphnav.recording.exporters import Add, require_geodetic
+from graphnav.recording.exporters.digits import rows_text
+
+_MAX_POINTS = 20000
+_SPACING = 0.05  # m, at least
+_SPARE = 16  # times as many are kept until the length of the path is known
+
+# The line is clamped to the ground: KML heights are above mean sea level and ours above the ellipsoid.
+_DOCUMENT = """<?xml version="1.0" encoding="UTF-8"?>
+<kml xmlns="http://www.opengis.net/kml/2.2">
+<Document>
+<name>{name}</name>
+<Style id="path"><LineStyle><color>ff0055ff</color><width>3</width></LineStyle></Style>
+<Placemark><name>{name}</name><styleUrl>#path</styleUrl>
+<LineString><tessellate>1</tessellate><altitudeMode>clampToGround</altitudeMode>
+<coordinates>
+{line}</coordinates></LineString></Placemark>
+{ends}
+</Document>
+</kml>
+"""
+_PLACEMARK = (
+    "<Placemark><name>{name}</name><description>t = {t:.3f} s, height {h:.2f} m above the ellipsoid</description>"
+    "<Point><coordinates>{lon:.9f},{lat:.9f},{h:.3f}</coordinates></Point></Placemark>"
+)
+
+
+@contextmanager
+def writing(path: Path, name: str = "") -> Iterator[Add]:
+    """A file, its path thinned by distance so that stops cost nothing and turns keep their shape."""
+    path_so_far = _Thinned()
+    with path.open("w", encoding="utf-8") as file:
+
+        def add(block: Trajectory, utc: Array | None = None) -> None:
+            require_geodetic(block, path)
+            path_so_far.add(block)
+
+        yield add
+        kept = path_so_far.rows()
+        degrees = kept[:, 1:4] * np.array([np.rad2deg(1.0), np.rad2deg(1.0), 1.0])
+        ends = "\n".join(
+            _PLACEMARK.format(name=name, t=kept[k, 0], lat=degrees[k, 0], lon=degrees[k, 1], h=degrees[k, 2])
+            for name, k in (("start", 0), ("end", -1))
+        )
+        line = rows_text(degrees[:, [1, 0, 2]], "%.9f,%.9f,%.3f")
+        file.write(_DOCUMENT.format(name=escape(name or "trajectory"), line=line, ends=ends))
+
+
+class _Thinned:
+    """Points a near-even distance apart along a path that comes in parts, the first and the last among them.
+
+    Kept are a few times as many as are wanted in the end: the distance between them is known only then.
+    """
+
+    def __init__(self) -> None:
+        self._frame: LocalFrame | None = None
+        self._kept = np.empty((0, 5))  # t, llh, way so far
+        self._last = np.empty((0, 3))  # where the path is, in metres
+        self._end = np.empty(5)
+
+    def add(self, block: Trajectory) -> None:
+        """Go on."""
+        self._frame = self._frame or LocalFrame(block.llh[0])
+        p = self._frame.from_llh(block.llh)
+        steps = np.linalg.norm(np.diff(np.concatenate([self._last if len(self._last) else p[:1], p]), axis=0), axis=1)
+        begin = self._end[4] if len(self._last) else 0.0
+        along = begin + np.cumsum(steps)
+        new = np.column_stack([block.t, block.llh, along])
+        self._last, self._end = p[-1:], new[-1]
+        self._kept = np.concatenate([self._kept, new])
+        if len(self._kept) > _SPARE * _MAX_POINTS:
+            self._kept = self._at_least(self._kept, along[-1] / (_SPARE / 2 * _MAX_POINTS))
+
+    def rows(self) -> Array:
+        """Times (s), llh (rad, m) and way (m) of the points, (N, 5)."""
+        kept = self._at_least(self._kept, max(self._end[4] / _MAX_POINTS, _SPACING))
+        return kept if kept[-1, 0] == self._end[0] else np.concatenate([kept, self._end[None]])
+
+    @staticmethod
+    def _at_least(rows: Array, spacing: float) -> Array:
+        _, first = np.unique(np.floor(rows[:, 4] / spacing), return_index=True)
+        return np.asarray(rows[first])

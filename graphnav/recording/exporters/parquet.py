@@ -1,0 +1,53 @@
+"""Apache Parquet: the columns of trajectory.csv as doubles with all their digits, a group of rows per block.
+
+A missing value is null. Units as in trajectory.csv: degrees for angles, SI for the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
+from graphnav.recording.exporters import Add, require_geodetic
+from graphnav.recording.exporters.csv import HEADER, columns
+
+
+@contextmanager
+def writing(path: Path, name: str = "") -> Iterator[Add]:
+    """A file that blocks are added to; `name` is kept in its metadata.
+
+    Raises
+    ------
+    RecordingError
+        If pyarrow is not installed.
+    """
+    pa, pq = _pyarrow(path)
+    schema = pa.schema([(column, pa.float64()) for column in HEADER.split(",")], metadata={"name": name})
+    # bytes of like meaning together pack to about half; a dictionary of doubles that never repeat only costs
+    with pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=False, use_byte_stream_split=True) as file:
+
+        def add(block: Trajectory, utc: Array | None = None) -> None:
+            require_geodetic(block, path)
+            table = np.concatenate(
+                [c if c is not None else np.full((len(block), 3), np.nan) for c, _ in columns(block)], 1
+            )
+            arrays = [pa.array(np.ascontiguousarray(x), from_pandas=True) for x in table.T]
+            file.write_table(pa.Table.from_arrays(arrays, schema=schema))
+
+        yield add
+
+
+def _pyarrow(path: Path) -> tuple[Any, Any]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise RecordingError(f"{path}: needs pyarrow; pip install 'graphnav-ins[parquet]'") from None
+    return pyarrow, pyarrow.parquet

@@ -1,0 +1,51 @@
+"""TUM trajectory: ``t x y z qx qy qz qw``, the format of the TUM RGB-D benchmark (Sturm et al., IROS 2012)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
+from graphnav.recording.exporters import Add
+from graphnav.recording.exporters.digits import rows_bytes
+
+
+@contextmanager
+def writing(path: Path, name: str = "") -> Iterator[Add]:
+    """A file in metres of the fixed ENU frame at the first point, and the quaternion from body (RFU) to that frame."""
+    frame: LocalFrame | None = None
+    with path.open("wb") as file:
+
+        def add(block: Trajectory, utc: Array | None = None) -> None:
+            nonlocal frame
+            R_lb = block.R_lb
+            if R_lb is None:
+                raise RecordingError(f"{path}: a TUM file needs an attitude and this trajectory has none")
+            if frame is None:
+                frame = LocalFrame(block.llh[0])
+                file.write(_head(block).encode())
+            p_n, R_nb = block.llh, R_lb
+            if block.frame == "geodetic":
+                p_n = frame.from_llh(block.llh)
+                # Attitudes are kept in the local level of each point; the file has one frame for everything.
+                R_nb = np.swapaxes(frame.R_ln(p_n), -1, -2) @ R_lb
+            q = rotation.to_quaternion(R_nb)
+            table = np.column_stack([block.t, p_n, q[:, 1:], q[:, 0]])
+            file.write(rows_bytes(table, " ".join(["%.6f"] + ["%.5f"] * 3 + ["%.10f"] * 4)))
+
+        yield add
+
+
+def _head(block: Trajectory) -> str:
+    about = "a local frame"
+    if block.frame == "geodetic":
+        lat, lon, h = block.llh[0] * np.array([np.rad2deg(1.0), np.rad2deg(1.0), 1.0])
+        about = f"ENU about lat {lat:.11f} lon {lon:.11f} h {h:.5f} (deg, m)"
+    return f"# t x y z qx qy qz qw; s, m; {about}; body right-forward-up\n"

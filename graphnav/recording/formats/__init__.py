@@ -1,0 +1,114 @@
+"""Every log format graphnav reads, one module each; `read` finds the one that fits.
+
+A new format is a new module in this package with a module-level ``FORMAT = Format(...)``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from graphnav.core.complaints import nearest
+from graphnav.core.errors import RecordingError
+from graphnav.core.files import exists, outside_allowed
+from graphnav.recording import Recording
+from graphnav.recording.formats.registry import Format, Log
+
+__all__ = ["Format", "Log", "formats", "load", "read"]
+
+
+def formats() -> dict[str, Format]:
+    """Every known format by name; built-in names come first, so that `kitti` never means a folder."""
+    modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
+    found = [m.FORMAT for m in modules if isinstance(getattr(m, "FORMAT", None), Format)]
+    return {f.name: f for f in sorted(found, key=lambda f: (not f.builtin, f.name))}
+
+
+def read(source: str | Path, topics: Sequence[str] = (), allow_outside: bool = False) -> Recording:
+    """A recording from a folder holding recording.toml, a .toml of that form, or a built-in name.
+
+    Parameters
+    ----------
+    source
+        A path, or a built-in name such as ``kitti``. A folder of that name is ``./kitti``.
+    topics
+        Of a ROS bag: those to use, each for the sensor that its type is of; the others are found.
+    allow_outside
+        Whether files that are named in it may lie outside its folder.
+
+    Raises
+    ------
+    RecordingError
+        If nothing is there, if nothing knows how to read it, or if what is there cannot be used.
+    """
+    known = formats()
+    exists(Path(source))
+    for candidate in known.values():
+        if candidate.recognises(source):
+            with outside_allowed(allow_outside):
+                return _choose(candidate, source, topics).recording(source) if topics else candidate.read(source)
+    raise _unknown(source, known)
+
+
+def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()) -> Log:
+    """Whatever a source holds, be it a whole recording or one sensor's log.
+
+    Parameters
+    ----------
+    name
+        The format to read it as; found from the content if None.
+    topics
+        As for `read`.
+
+    Raises
+    ------
+    RecordingError
+        As `read`, and for a name that no format has.
+    """
+    known = formats()
+    if name is not None and name not in known:
+        raise RecordingError(f"--format {name}: no such format; {nearest(name, list(known))}")
+    exists(Path(source))
+    chosen = known[name] if name else next((f for f in known.values() if f.recognises(source)), None)
+    if chosen is None:
+        raise _unknown(source, known)
+    if topics:
+        return _choose(chosen, source, topics)
+    if chosen.load is not None:
+        return chosen.load(source)
+    r = chosen.read(source)
+    return Log(
+        r.name, r.imu, r.gnss, r.odometer, r.truth, r.platform, gps_zero=r.gps_zero, files=r.files, remarks=r.remarks
+    )
+
+
+def _choose(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:
+    """The log with these topics."""
+    if chosen.choose is None:
+        raise RecordingError(
+            f"--topic {topics[0]}: {source} is no ROS bag; in a recording.toml say topic in the sensor's table"
+        )
+    return chosen.choose(source, topics)
+
+
+def _unknown(source: str | Path, known: dict[str, Format]) -> RecordingError:
+    """Why nothing can read a source."""
+    builtin = ", ".join(name for name, f in known.items() if f.builtin)
+    path = Path(source)
+    if path.is_dir():
+        there = sorted(p.name for p in path.glob("*.toml"))
+        hint = f"; point at one of {', '.join(there)} in it" if there else ""
+        return RecordingError(f"{path}: the folder holds no recording.toml{hint}")
+    if path.exists():
+        if path.suffix == ".csv" or path.name.endswith(".csv.gz"):
+            return RecordingError(
+                f"{path}: not a recording; point at its folder or its .toml file (graphnav init drafts one)"
+            )
+        others = ", ".join(name for name, f in known.items() if f.load is not None)
+        return RecordingError(
+            f"{path}: not a recording; point at its folder or its .toml file, or at a log of a kind that is known "
+            f"({others})"
+        )
+    return RecordingError(f"{path}: no such file or folder (built-in recordings: {builtin})")

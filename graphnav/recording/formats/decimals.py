@@ -1,0 +1,102 @@
+"""Plain decimal numbers in CSV text, read with whole-array arithmetic: several times quicker than cell by cell.
+
+Eight characters at a time are one 64-bit word, and three multiplications turn the digits in it into their number,
+for all cells at once. Digits that make a whole number below 2^53, divided by a power of ten up to 10^22, are rounded
+once: the result is the double nearest to what is written, the same that `float` gives (Clinger, "How to read
+floating point numbers accurately", 1990). Cells that are anything else (exponents, nan, more digits) are read
+one by one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import IO
+
+import numpy as np
+
+from graphnav.core.files import parse_number
+from graphnav.core.rotation import Array
+
+_BLOCK = 1 << 18  # bytes handled at once: keeps the working arrays in the processor's cache
+_COMMA, _MINUS, _POINT, _LINE = b",-.\n"
+_PAD = 16  # bytes before a block, for words that reach back beyond it
+_MOST = 16  # digits read on each side of the point
+_U = np.uint64
+_TENS = 10 ** np.arange(19, dtype=_U)
+_LAST = np.array([2**64 - 2 ** (64 - 8 * k) for k in range(9)], _U)  # the last k bytes of a word
+
+
+def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> Array:
+    """The columns `use`, (len(use), N), of lines of `width` cells.
+
+    Raises
+    ------
+    ValueError
+        If a line has another number of cells or a cell is not a number; a more patient reader may say which.
+    """
+    blocks = [np.empty((len(use), 0))]
+    while block := file.read(_BLOCK):
+        blocks.append(_columns(block + file.readline(), width, list(use)))
+    return np.concatenate(blocks, axis=1)
+
+
+def _columns(text: bytes, width: int, use: list[int]) -> Array:
+    """The same of a few whole lines."""
+    if b"\r" in text:
+        text = text.replace(b"\r\n", b"\n")
+    text = b"," * _PAD + text + (b"" if text.endswith(b"\n") else b"\n")
+    b = np.frombuffer(text, np.uint8)
+    # nothing below a comma is part of a plain number
+    edges = np.flatnonzero(b <= _COMMA)[_PAD - 1 :]
+    begin, end = edges[:-1].reshape(-1, width) + 1, edges[1:].reshape(-1, width)
+    if (b[end] != np.where(np.arange(width) < width - 1, _COMMA, _LINE)).any():
+        raise ValueError("not lines of so many cells")
+    point = _points(np.flatnonzero(b == _POINT), begin, end)
+    first, point, stop = (x[:, use].T.ravel() for x in (begin, point, end))
+    negative = b[first] == _MINUS
+    n_whole, n_part = point - first - negative, np.maximum(stop - point - 1, 0)
+    digits = n_whole + n_part
+    plain = (n_whole <= _MOST) & (n_part <= _MOST) & (digits > 0) & (digits < len(_TENS))
+    n_whole, n_part = n_whole * plain, n_part * plain
+    whole, whole_plain = _digits(text, point, n_whole)
+    part, part_plain = _digits(text, stop, n_part)
+    scale = _TENS[n_part]
+    number = whole * scale + part
+    value = number / scale
+    np.negative(value, out=value, where=negative)
+    for k in np.flatnonzero(~(plain & whole_plain & part_plain & (number < 2**53))):
+        value[k] = parse_number(text[first[k] : stop[k]].decode())
+    return value.reshape(len(use), -1)
+
+
+def _points(points: Array, begin: Array, end: Array) -> Array:
+    """Where in each cell the decimal point is; its end where there is none."""
+    if len(points) == end.size and ((points := points.reshape(end.shape)) >= begin).all() and (points < end).all():
+        return points
+    at = end.copy()
+    cell = np.searchsorted(end.ravel(), points)
+    at.flat[cell[::-1]] = points[::-1]  # the first of several: what is behind it will not pass as digits
+    return at
+
+
+def _digits(text: bytes, end: Array, n: Array) -> tuple[Array, Array]:
+    """The numbers written by the n digits (16 at most) that stand before `end`, and whether digits they are."""
+    value, plain = _eight(text, end, np.minimum(n, 8))
+    long = np.flatnonzero(n > 8)
+    if len(long):
+        high, high_plain = _eight(text, end[long] - 8, n[long] - 8)
+        value[long] += high * _U(10**8)
+        plain[long] &= high_plain
+    return value, plain
+
+
+def _eight(text: bytes, end: Array, n: Array) -> tuple[Array, Array]:
+    """`_digits` for n of 8 at most."""
+    words = np.ndarray(len(text) - 7, "<u8", text, 0, (1,))  # the eight bytes from each byte on, the first lowest
+    within = _LAST.take(n)
+    word = (words.take(end - 8) ^ _U(0x3030303030303030)) & within
+    plain = ((word + _U(0x0606060606060606) | word) & _U(0xF0F0F0F0F0F0F0F0)) == 0
+    word = word * _U(10) + (word >> _U(8))  # pairs of digits, then fours, then eight
+    pairs = _U(0x000000FF000000FF)
+    word = (word & pairs) * _U(100 + (1000000 << 32)) + (word >> _U(16) & pairs) * _U(1 + (10000 << 32))
+    return word >> _U(32), plain

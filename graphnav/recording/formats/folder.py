@@ -1,0 +1,327 @@
+"""graphnav's own form: a folder with recording.toml and CSV files, or any .toml of that form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphnav.core.earth import ecef_to_llh, enu_axes
+from graphnav.core.errors import RecordingError
+from graphnav.core.files import beside
+from graphnav.core.rotation import Array
+from graphnav.core.timescales import parse_clock
+from graphnav.gnss.series import RawGnss
+from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording, Truth
+from graphnav.recording.formats import schema
+from graphnav.recording.formats.pulses import counted
+from graphnav.recording.formats.registry import Format, Log
+from graphnav.recording.formats.repair import (
+    DEFAULT_SD,
+    DEFAULT_SD_V,
+    VAGUEST,
+    VAGUEST_V,
+    Remarks,
+    fixes_by_type,
+    geodetic,
+    horizontal_velocity,
+    sigmas,
+    usable_rows,
+)
+from graphnav.recording.formats.table import Table, read_table
+from graphnav.recording.formats.trajectories import read_trajectory
+
+_RAW_FILES = ("rover", "nav", "sp3", "clk", "base")
+
+
+def read_folder(source: str | Path) -> Recording:
+    """A recording from a folder holding recording.toml, or from a .toml of that form.
+
+    Raises
+    ------
+    RecordingError
+        For anything that cannot be used, naming file, line and field.
+    """
+    path = Path(source)
+    path = path / "recording.toml" if path.is_dir() else path
+    d = schema.read_description(path)
+    remarks = Remarks()
+    files = [path]
+    logs: dict[str, Log | None] = {}  # by file; one log may hold several sensors
+    zeros: list[float] = []  # of their clocks
+    topics: dict[str, tuple[str, ...]] = {}  # asked for of each file
+    for section in (d.imu, d.gnss, d.odometer):
+        if section is not None:
+            topics[section.file] = (*topics.get(section.file, ()), *section.topic)
+
+    def table(name: str) -> Table:
+        section = getattr(d, name)
+        file = beside(path, section.file, f"{name}.file")
+        files.append(file)
+        required, optional, keep = section.required, section.optional, section.keep
+        if name == "truth":
+            position = ("x", "y") if section.frame == "local" else ("lat", "lon", "h")
+            required, optional = (*required, *position), tuple(c for c in optional if c not in position)
+        rows = read_table(file, required, optional, section.columns, keep.column if keep else None)
+        if name == "odometer":  # which columns it needs depends on which it has
+            required = (*required, *section.readings(tuple(rows.columns)))
+            if not all(column in rows for column in required):
+                read_table(file, required, (), section.columns)  # says what is missing
+        return usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
+
+    def sensor(name: str, of_table: Callable[[Any, Table, Remarks], Any], of_log: Callable[[Any, Any], Any]) -> Any:
+        """The sensor of a table of the .toml: from its CSV file, or from the log of another program."""
+        section = getattr(d, name)
+        if section is None:
+            return None
+        if section.file not in logs:
+            logs[section.file] = other_log(beside(path, section.file, f"{name}.file"), topics.get(section.file, ()))
+        log = logs[section.file]
+        if section.topic and not (log and log.topics):
+            raise RecordingError(f"{path}: '{name}.topic' is only for ROS bags, and {section.file} is none")
+        if log is None:
+            return of_table(section, table(name), remarks)
+        files.extend(file for file in log.files if file not in files)
+        if getattr(log, name) is None:
+            raise RecordingError(f"{path}: '{name}.file': {section.file} holds no {name}")
+        for key in ("columns", "units", "keep"):
+            if key in section.model_fields_set:
+                raise RecordingError(f"{path}: '{name}.{key}' is only for CSV files, and {section.file} is none")
+        remarks.extend(r for r in log.remarks if r not in remarks)
+        if log.gps_zero is not None:
+            zeros.append(log.gps_zero - section.time_offset)
+        return of_log(section, getattr(log, name))
+
+    imu = sensor("imu", _imu, _imu_of)
+    gnss = sensor("gnss", _gnss, _gnss_of)
+    odometer = sensor("odometer", _odometer, _odometer_of)
+    gps_zero = parse_clock(d.clock, float(imu.t[0])) if d.clock else next(iter(zeros), None)
+    raw = None
+    if d.raw_gnss is not None:
+        raw, fixes = _raw_gnss(d.raw_gnss, path, gps_zero, remarks, files)
+        if gnss is None:
+            gnss = fixes
+            remarks.add(f"no [gnss]: {len(fixes.t)} single-point fixes of the raw observations stand in for it")
+    truth = None
+    if d.truth and d.truth.closed_loop_sigma:
+        truth = Truth(imu.t[[0, -1]], of=d.truth.of, closed_loop_sigma=d.truth.closed_loop_sigma)
+    elif d.truth and d.truth.file and Path(d.truth.file).suffix in (".nav", ".pos", ".tum"):
+        files.append(beside(path, d.truth.file, "truth.file"))
+        truth = _truth_of_log(d.truth, files[-1], remarks)
+    elif d.truth:
+        truth = _truth(d.truth, table("truth"), remarks)
+    name = d.name or (path.resolve().parent.name if path.name == "recording.toml" else path.stem)
+    return Recording(
+        name, d.platform, imu, gnss, odometer, truth, path, tuple(files), gps_zero, tuple(remarks), raw_gnss=raw
+    )
+
+
+def _imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
+    R_bs = d.R_bs
+    gyro = rows.stack("gx", "gy", "gz") * schema.RATE[d.units.gyro] @ R_bs.T
+    accel = rows.stack("ax", "ay", "az") * schema.FORCE[d.units.accel] @ R_bs.T
+    stated = d.figures
+    noise = replace(ImuNoise(), **stated)
+    missing = [key for key in schema.NOISE_FIGURES if key not in stated]
+    if 0 < len(missing) < len(schema.NOISE_FIGURES):
+        remarks.add(f"[imu.noise] says nothing of {', '.join(missing)}: defaults of a consumer IMU are used")
+    elif missing:
+        remarks.add(
+            "no [imu.noise]: figures of a consumer IMU are assumed "
+            f"(gyro {noise.gyro_noise_density:g} rad/s/sqrt(Hz), "
+            f"accelerometer {noise.accel_noise_density:g} m/s2/sqrt(Hz))"
+        )
+    return Imu(rows["t"], gyro, accel, noise, R_bs, noise_assumed=len(missing) == len(schema.NOISE_FIGURES))
+
+
+def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
+    llh, rows = geodetic(rows, d.units.angle, "GNSS", remarks)
+    every = np.ones(len(rows), dtype=bool)
+    sd = sigmas(rows, ("sd_e", "sd_n", "sd_u"), d.sd, DEFAULT_SD, "GNSS position", every, remarks)
+    vague = (sd > VAGUEST).any(axis=1)
+    if vague.any():
+        if vague.all():
+            raise RecordingError(f"{rows.path}: every fix has a sigma of more than {VAGUEST:g} m and says nothing")
+        remarks.add(f"{vague.sum()} of {len(rows)} fixes have a sigma of more than {VAGUEST:g} m: left out")
+        llh, sd, rows = llh[~vague], sd[~vague], rows.take(~vague)
+    v = sd_v = None
+    if "vd" in rows and "vu" not in rows:
+        rows = rows.with_column("vu", -rows["vd"])
+    there = [c for c in ("ve", "vn", "vu") if c in rows]
+    if len(there) == 3:
+        scale = schema.SPEED[d.units.speed]
+        for name in ("sd_ve", "sd_vn", "sd_vu"):  # the file's sigmas have the file's unit, the .toml's are m/s
+            rows = rows.with_column(name, rows[name] * scale) if name in rows else rows
+        v = rows.stack("ve", "vn", "vu") * scale
+        absent = np.isnan(v).any(-1)
+        v[absent] = np.nan
+        sd_v = sigmas(rows, ("sd_ve", "sd_vn", "sd_vu"), d.sd_v, DEFAULT_SD_V, "GNSS velocity", ~absent, remarks)
+        absent |= (sd_v > VAGUEST_V).any(-1)
+        v[absent] = sd_v[absent] = np.nan
+        if absent.all():
+            v = sd_v = None
+            remarks.add("the GNSS velocity columns are blank throughout: no velocities")
+    elif "speed" in rows and "course" in rows:
+        course = rows["course"] * schema.ANGLE[d.units.angle or "deg"]
+        v, sd_v, sentence = horizontal_velocity(
+            rows["speed"] * schema.SPEED[d.units.speed], course, d.sd_v or DEFAULT_SD_V
+        )
+        remarks.add(sentence)
+    elif there:
+        remarks.add(f"GNSS velocities need ve, vn and vu; only {', '.join(there)} is there, so none are used")
+    kinds = fixes_by_type(rows, d.units.type) if "type" in rows else None
+    return Gnss(
+        rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds, kinds is not None and d.units.type == "rtklib"
+    )
+
+
+def _raw_gnss(
+    d: schema.RawGnssTable, path: Path, zero: float | None, remarks: Remarks, files: list[Path]
+) -> tuple[RawGnss, Gnss]:
+    """The raw observations of [raw_gnss], and the single-point fixes that they make."""
+    if zero is None:
+        raise RecordingError(
+            f"{path}: 'clock': [raw_gnss] needs to know what t = 0 is: say clock = \"gps week 2130\" or a UTC date"
+        )
+    from graphnav.gnss import columns
+    from graphnav.gnss.load import Sources, load_raw
+    from graphnav.gnss.placing import Corrected
+
+    some = {
+        name: tuple(beside(path, file, f"raw_gnss.{name}") for file in getattr(d, name) or ()) for name in _RAW_FILES
+    }
+    corrected = Corrected(clock="clock" in d.corrected, troposphere="troposphere" in d.corrected)
+    sources = Sources(
+        **some, base_position=d.base_position, corrected=corrected, nominal_stamps=d.stamps == "nominal",
+        lever_arm=d.lever_arm,
+    )  # fmt: skip
+    files.extend(sources.files)
+    given = None
+    if sources.rover[0].name.endswith((".csv", ".csv.gz")):
+        if len(sources.rover) > 1:
+            raise RecordingError(f"{path}: 'raw_gnss.rover': one CSV file, not {len(sources.rover)}")
+        rows = read_table(sources.rover[0], columns.REQUIRED, columns.OPTIONAL, d.columns)
+        given = columns.observations(rows.columns, zero, sources.rover[0].name)
+    elif d.columns:
+        raise RecordingError(f"{path}: 'raw_gnss.columns' is only for a CSV file, and {d.rover[0]} is none")
+    raw, found, said = load_raw(sources, zero - d.time_offset, given)
+    remarks.extend(said)
+    good = np.isfinite(found.p[:, 0])
+    sd = np.sqrt(np.diagonal(found.covariance[good], axis1=1, axis2=2))
+    v = np.einsum("nij,nj->ni", enu_axes(ecef_to_llh(found.p[good])), found.v[good])
+    sd_v = np.sqrt(np.diagonal(found.covariance_v[good], axis1=1, axis2=2))
+    known = np.isfinite(v).any()
+    fixes = Gnss(
+        found.t[good], ecef_to_llh(found.p[good]), sd, v if known else None, sd_v if known else None,
+        np.array(d.lever_arm), derived=True,
+    )  # fmt: skip
+    return raw, fixes
+
+
+def _odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odometer:
+    t, scale = rows["t"], schema.SPEED[d.units.speed]
+    used = d.readings(tuple(rows.columns))
+    wheels = way = None
+    if any(name in rows for name in schema.WHEELS):
+        wheels = np.stack([rows.get(name, np.full(len(t), np.nan)) for name in schema.WHEELS], -1) * scale
+    if d.metres_per_pulse is not None:
+        if len(t) < 2:
+            raise RecordingError(f"{rows.path}: {len(t)} usable row; pulses need at least 2 to make a speed")
+        way = d.metres_per_pulse * counted(rows["pulses"], d.pulses, d.signed, remarks)
+        # over both neighbouring periods, so that it is the speed at t and not half a period before
+        ahead, behind = np.minimum(np.arange(len(t)) + 1, len(t) - 1), np.maximum(np.arange(len(t)) - 1, 0)
+        speed = (way[ahead] - way[behind]) / (t[ahead] - t[behind])
+    else:
+        speed = rows.stack(*used).mean(axis=-1) * scale
+    signed = bool((speed < 0.0).any()) if d.signed is None else d.signed
+    return Odometer(
+        t,
+        speed,
+        np.array(d.lever_arm),
+        d.scale_sigma,
+        way=way,
+        pulse=d.metres_per_pulse or 0.0,
+        wheels=wheels,
+        signed=signed,
+        speed_sigma=d.speed_sigma,
+        delay_sigma=d.delay_sigma,
+    )
+
+
+def _truth_of_log(d: schema.TruthTable, file: Path, remarks: Remarks) -> Truth:
+    """The truth from a trajectory file of another program."""
+    for key in ("columns", "units", "keep"):
+        if key in d.model_fields_set:
+            raise RecordingError(f"{file}: 'truth.{key}' is only for CSV files")
+    track = read_trajectory(file)
+    remarks.extend(track.notes)
+    local = track.frame == "local"
+    llh, xyz = (None, track.llh) if local else (track.llh, None)
+    return Truth(track.t + d.time_offset, llh, xyz, track.v, track.rph, d.of)
+
+
+def _truth(d: schema.TruthTable, rows: Table, remarks: Remarks) -> Truth:
+    llh = xyz = None
+    if d.frame == "local":
+        xyz = rows.stack("x", "y", "z") if "z" in rows else rows.stack("x", "y")
+    else:
+        llh, rows = geodetic(rows, d.units.angle, "truth", remarks)
+    v = _partial(rows, ("ve", "vn", "vu"), schema.SPEED[d.units.speed])
+    rph = _partial(rows, ("roll", "pitch", "heading"), schema.ANGLE[d.units.angle or "deg"])
+    return Truth(rows["t"], llh, xyz, v, rph, d.of)
+
+
+def _partial(rows: Table, names: tuple[str, ...], scale: float) -> Array | None:
+    """Columns of which some may be missing (NaN then); None if all are."""
+    if not any(name in rows for name in names):
+        return None
+    absent = np.full(len(rows), np.nan)
+    return np.stack([rows.get(name, absent) for name in names], -1) * scale
+
+
+def other_log(file: Path, topics: Sequence[str] = ()) -> Log | None:
+    """The log of another program, or None for a CSV file or one that is not there; `topics` are for a ROS bag."""
+    from graphnav.recording.formats import formats  # which imports this module
+
+    if file.name.endswith((".csv", ".csv.gz")) or not file.exists():
+        return None
+    for known in formats().values():
+        if known.load is not None and known.recognises(file):
+            return known.choose(file, topics) if topics and known.choose is not None else known.load(file)
+    return None
+
+
+def _imu_of(d: schema.ImuTable, imu: Imu) -> Imu:
+    """The IMU of another program's log, with what the .toml adds to it."""
+    if {"axes", "forward", "up"} & d.model_fields_set:
+        turn = d.R_bs @ imu.R_bs.T  # the .toml speaks of the file's own axes
+        imu = replace(imu, gyro=imu.gyro @ turn.T, accel=imu.accel @ turn.T, R_bs=d.R_bs)
+    stated = d.figures if d.noise or d.model else {}
+    return replace(
+        imu, t=imu.t + d.time_offset, noise=replace(imu.noise, **stated), noise_assumed=imu.noise_assumed and not stated
+    )
+
+
+def _gnss_of(d: schema.GnssTable, gnss: Gnss) -> Gnss:
+    lever_arm = np.array(d.lever_arm) if "lever_arm" in d.model_fields_set else gnss.lever_arm
+    sd = gnss.sd if d.sd is None else np.tile(d.sd, (len(gnss.t), 1))
+    sd_v = gnss.sd_v
+    if gnss.v is not None and d.sd_v is not None:
+        sd_v = np.where(np.isnan(gnss.v), np.nan, np.array(d.sd_v))
+    return replace(gnss, t=gnss.t + d.time_offset, lever_arm=lever_arm, sd=sd, sd_v=sd_v)
+
+
+def _odometer_of(d: schema.OdometerTable, odometer: Odometer) -> Odometer:
+    lever_arm = np.array(d.lever_arm) if "lever_arm" in d.model_fields_set else odometer.lever_arm
+    return replace(odometer, t=odometer.t + d.time_offset, lever_arm=lever_arm, scale_sigma=d.scale_sigma)
+
+
+FORMAT = Format(
+    name="folder",
+    about="a folder holding recording.toml and CSV files, or a .toml of that form",
+    recognises=lambda source: Path(source).suffix == ".toml" or (Path(source) / "recording.toml").is_file(),
+    read=read_folder,
+)

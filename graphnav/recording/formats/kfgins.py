@@ -1,0 +1,396 @@
+"""Data sets of KF-GINS and OB_GINS (i2Nav group, Wuhan University): text files and the YAML file that names them.
+
+Columns, units and axes are those of the tables in the README files of KF-GINS (section 2.2) and of
+awesome-gins-datasets (section 3), and of the comments in the projects' configuration files:
+
+IMU text (or the same as little-endian doubles, .bin)
+    seconds of week, angle increments x y z (rad), velocity increments x y z (m/s) in forward-right-down;
+    OB_GINS adds the odometer's speed (m/s) as an eighth column
+GNSS text
+    seconds of week, lat, lon (deg), height (m), sigmas north, east, down (m); with 13 columns a velocity
+    north, east, down (m/s) comes before the sigmas and its own sigmas after them
+YAML
+    arw deg/sqrt(h), vrw m/s/sqrt(h), gbstd deg/h, abstd mGal, gsstd and asstd ppm, corrtime h: bias and scale are
+    first-order Gauss-Markov processes; lever arms forward-right-down
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.files import check_inside, inside, parse_number, read_bytes, read_text
+from graphnav.core.rotation import Array
+from graphnav.core.timescales import WEEK
+from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Truth
+from graphnav.recording.formats.registry import Log, first_bytes, log_format
+from graphnav.recording.formats.repair import Remarks, on_earth
+from graphnav.recording.formats.schema import rotation_from_letters
+from graphnav.recording.formats.text import number_table, text_lines
+from graphnav.recording.formats.trajectories import read_trajectory
+
+DEG_PER_H = np.pi / 180 / 3600  # rad/s
+DEG_PER_SQRT_H = np.pi / 180 / 60  # rad/s/sqrt(Hz)
+MGAL = 1e-5  # m/s^2
+_GAP = 1.5  # a step this many times the period is a gap: the increments after it are still of one period
+_LARGEST = 0.3  # rad or m/s: more than any IMU increments by in one sample
+_LEAST, _MOST = 1e-12, 1e12  # of a noise figure in the configuration's units: wider than any sensor
+_DEEPEST = 50  # of tables in tables: what is read has two
+_FARTHEST = 1000.0  # m, of a lever arm
+_IMU_KEYS, _GNSS_KEYS = ("imupath", "imufile"), ("gnsspath", "gnssfile")
+
+
+def recognises(path: Path) -> bool:
+    """Whether this is a configuration of either program, a folder with one, or one of their data files."""
+    if path.is_dir():
+        return _config_in(path) is not None or any(_kind(p) == "imu" for p in _data_files(path))
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return _names_data(path)
+    return path.is_file() and _kind(path) is not None
+
+
+def load(path: Path) -> Log:
+    """A data set through its configuration, a folder of its files, or a single IMU or GNSS file.
+
+    Raises
+    ------
+    RecordingError
+        Naming the file and the line, column or key that cannot be used.
+    """
+    remarks = Remarks()
+    config: dict[str, Any] = {}
+    config_file = path if path.suffix.lower() in (".yaml", ".yml") else _config_in(path) if path.is_dir() else None
+    if config_file is not None:
+        config = _read_yaml(config_file)
+        imu_file = _named(config_file, config, _IMU_KEYS)
+        gnss_file = _named(config_file, config, _GNSS_KEYS)
+    else:
+        imu_file, gnss_file = _pair(path)
+        remarks.add(
+            "no configuration (.yaml) of KF-GINS or OB_GINS beside it: the antenna's lever arm is taken as zero"
+        )
+    files = [f for f in (config_file, imu_file, gnss_file) if f is not None]
+    if path.is_dir():
+        check_inside(files, path)
+    where = config_file or path
+    imu = odometer = gnss = truth = zero = None
+    if imu_file is not None:
+        imu, speed = _read_imu(imu_file, remarks)
+        if config:
+            imu = replace(imu, noise=_noise(where, config, remarks), noise_assumed=False)
+        if speed is not None:
+            odometer = Odometer(imu.t, speed, _frd(where, config, "odolever"))
+            remarks.add("the eighth column of the IMU file is taken as the odometer's forward speed in m/s")
+    if gnss_file is not None:
+        gnss = _read_gnss(gnss_file, _frd(where, config, "antlever"), remarks)
+    folder = where.parent if config else where
+    if nav := _truth_file(folder, remarks) if folder.is_dir() else None:
+        check_inside([nav], folder)
+        track = read_trajectory(nav)
+        truth = Truth(track.t, track.llh, v=track.v, rph=track.rph)
+        first = next((line.split()[0] for line in text_lines(nav) if line.strip() and line.strip()[0] not in "#%"), "0")
+        week = parse_number(first)
+        zero = WEEK * week if 0 < week < 10_000 else None  # KF-GINS itself writes week 0
+        files.append(nav)
+        remarks.add(
+            f"truth: {nav.name}, of the IMU, with north-east-down velocities and roll, pitch, yaw of an FRD body"
+        )
+    _mention(config, remarks)
+    remarks.add("clock: seconds of the GPS week, as in the files")
+    return Log(
+        path.stem if path.is_file() else path.resolve().name, imu, gnss, odometer, truth, gps_zero=zero,
+        files=tuple(files), remarks=tuple(remarks),
+    )  # fmt: skip
+
+
+# ---- files
+
+
+def _config_in(folder: Path) -> Path | None:
+    found = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in (".yaml", ".yml") and _names_data(p)]
+    return found[0] if found else None
+
+
+def _names_data(path: Path) -> bool:
+    head = first_bytes(path, 1 << 16).decode("utf-8", errors="replace")
+    return any(f"\n{key}:" in f"\n{head}" for key in _IMU_KEYS)
+
+
+def _data_files(folder: Path) -> list[Path]:
+    return [p for p in sorted(folder.iterdir()) if p.suffix.lower() in (".txt", ".pos", ".bin") and p.is_file()]
+
+
+def _kind(path: Path) -> str | None:
+    """'imu' or 'gnss' by the numbers of the first rows, None for anything else."""
+    rows = _first_rows(path)
+    if rows is None:
+        return None
+    t, rest = rows[:, 0], rows[:, 1:7]
+    if not (np.all(t >= 0) and np.all(t < 2e6) and np.all(np.diff(t) > 0)):
+        return None
+    if rows.shape[1] in (7, 8) and np.all(np.abs(rest) < _LARGEST) and np.all(np.diff(t) < 0.5):
+        return "imu"
+    if rows.shape[1] in (7, 13) and np.all(np.abs(rest[:, 0]) <= 90) and np.all(np.abs(rest[:, 1]) <= 360):
+        large = np.abs(rest[:, :2]).max() > 1.0
+        return "gnss" if large and np.all(rows[:, -3:] >= 0) else None
+    return None
+
+
+def _first_rows(path: Path) -> Array | None:
+    raw = first_bytes(path)
+    if path.suffix.lower() == ".bin":
+        return np.frombuffer(raw[: len(raw) // 56 * 56], "<f8").reshape(-1, 7)[:20] if len(raw) >= 112 else None
+    if b"\0" in raw:
+        return None
+    lines = [line.split() for line in raw.decode("utf-8", errors="replace").splitlines()[:21]]
+    lines = [line for line in lines if line and line[0][0] not in "#%"][:-1] or lines[:1]
+    try:
+        rows = np.array(lines, dtype=float)
+    except ValueError:
+        return None
+    return rows if rows.ndim == 2 and len(rows) else None
+
+
+def _pair(path: Path) -> tuple[Path | None, Path | None]:
+    if path.is_file():
+        kind = _kind(path)
+        if kind is None:
+            raise RecordingError(
+                f"{path}: neither an IMU text (seconds of week, three angle and three velocity increments) nor a GNSS "
+                "text (seconds of week, lat, lon, height, three sigmas) of KF-GINS"
+            )
+        return (path, None) if kind == "imu" else (None, path)
+    kinds = {p: _kind(p) for p in _data_files(path)}
+    out = []
+    for wanted in ("imu", "gnss"):
+        found = [p for p, kind in kinds.items() if kind == wanted]
+        if len(found) > 1:
+            names = ", ".join(p.name for p in found)
+            raise RecordingError(f"{path}: {len(found)} {wanted} files ({names}); name one, or the .yaml file")
+        out.append(found[0] if found else None)
+    if out[0] is None and out[1] is None:
+        raise RecordingError(f"{path}: no KF-GINS configuration (.yaml with imupath or imufile) and no data file in it")
+    return out[0], out[1]
+
+
+def _truth_file(folder: Path, remarks: Remarks) -> Path | None:
+    """The truth, which no key names: the only .nav file, or the only one called truth."""
+    found = [p for p in sorted(folder.iterdir()) if p.suffix.lower() == ".nav" and "navresult" not in p.name.lower()]
+    named = [p for p in found if "truth" in p.name.lower()]
+    if len(named or found) > 1:
+        remarks.add(f"no truth is read: it could be any of {', '.join(p.name for p in named or found)}")
+        return None
+    return next(iter(named or found), None)
+
+
+def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
+    if path.suffix.lower() == ".bin":
+        data = read_bytes(path, text=False)
+        if len(data) % 56:
+            raise RecordingError(f"{path}: {len(data)} bytes are not a whole number of rows of seven doubles")
+        table = np.frombuffer(data, "<f8").reshape(-1, 7)
+        at = [f"row {k + 1}" for k in (0, 1)]
+    else:
+        rows = [
+            (n, line) for n, line in enumerate(text_lines(path), 1) if line.strip() and line.lstrip()[0] not in "#%"
+        ]
+        if len(rows) < 2:
+            raise RecordingError(f"{path}: {len(rows)} rows; an IMU file needs at least 2")
+        width = len(rows[0][1].split())
+        if width < 7:
+            raise RecordingError(f"{path}, line {rows[0][0]}: {width} columns where an IMU file has 7 or 8")
+        names = ["t", "dtheta_x", "dtheta_y", "dtheta_z", "dvel_x", "dvel_y", "dvel_z", "odometer", *["other"] * width]
+        table = number_table(path, rows, names[:width], None)
+        at = [f"line {n}" for n, _ in rows]
+    t = table[:, 0]
+    step = np.diff(t)
+    if (step <= 0).any():
+        k = int(np.flatnonzero(step <= 0)[0]) + 1
+        where = at[k] if k < len(at) else f"row {k + 1}"
+        raise RecordingError(f"{path}, {where}, t: {t[k]:.6f} does not come after {t[k - 1]:.6f}; sort the rows")
+    if np.abs(table[:, 1:4]).max() > 2.0 or not np.isfinite(table[:, :7]).all():
+        raise RecordingError(
+            f"{path}: increments of more than 2 rad a sample; are these rates, or not increments at all?"
+        )
+    period = float(np.median(step))
+    gap = step > _GAP * period
+    dt = np.concatenate([[period], np.where(gap, period, step)])[:, None]
+    if gap.any():
+        remarks.add(f"{gap.sum()} gaps in the IMU: the increments after each are taken as those of one period")
+    R_bs = rotation_from_letters("FRD")
+    remarks.add(
+        f"IMU: angle (rad) and velocity (m/s) increments in forward-right-down, divided by their sample period "
+        f"({period:g} s)"
+    )
+    imu = Imu(t.copy(), table[:, 1:4] / dt @ R_bs.T, table[:, 4:7] / dt @ R_bs.T, R_bs=R_bs, noise_assumed=True)
+    return imu, table[:, 7].copy() if table.shape[1] == 8 else None
+
+
+def _read_gnss(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
+    rows = [(n, line) for n, line in enumerate(text_lines(path), 1) if line.strip() and line.lstrip()[0] not in "#%"]
+    if not rows:
+        raise RecordingError(f"{path}: no rows in it")
+    width = len(rows[0][1].split())
+    names = ["t", "lat", "lon", "h", "sd_n", "sd_e", "sd_u"]
+    if width == 13:
+        names = ["t", "lat", "lon", "h", "vn", "ve", "vd", "sd_n", "sd_e", "sd_u", "sd_vn", "sd_ve", "sd_vd"]
+    elif width != 7:
+        raise RecordingError(f"{path}, line {rows[0][0]}: {width} columns where a GNSS file has 7 (or 13)")
+    table = dict(zip(names, number_table(path, rows, names, None).T, strict=True))
+    for k in np.flatnonzero(~np.isfinite(table["t"]))[:1]:
+        raise RecordingError(f"{path}, line {rows[k][0]}, t: must be a finite number")
+    beyond = np.flatnonzero(~on_earth(np.radians(table["lat"]), np.radians(table["lon"]), table["h"]))
+    if len(beyond):
+        raise RecordingError(f"{path}, line {rows[beyond[0]][0]}: lat and lon must be degrees, h a height in m")
+    sd = np.stack([table["sd_e"], table["sd_n"], table["sd_u"]], -1)
+    bad = np.flatnonzero((sd <= 0).any(-1))
+    if len(bad):
+        raise RecordingError(f"{path}, line {rows[bad[0]][0]}: a sigma must be above zero")
+    order = np.argsort(table["t"], kind="stable")
+    keep = order[np.concatenate([[True], np.diff(table["t"][order]) > 0])]
+    if len(keep) < len(order) or (np.diff(order) < 0).any():
+        remarks.add("GNSS rows were sorted by time, repeated ones dropped")
+    llh = np.stack([np.radians(table["lat"]), np.radians(table["lon"]), table["h"]], -1)
+    remarks.add("GNSS: the sigma columns are taken as north, east, down; heights above the ellipsoid")
+    v = sd_v = None
+    if width == 13:
+        v = np.stack([table["ve"], table["vn"], -table["vd"]], -1)[keep]
+        sd_v = np.stack([table["sd_ve"], table["sd_vn"], table["sd_vd"]], -1)[keep]
+        remarks.add("GNSS: columns 5 to 7 are taken as the velocity north, east, down in m/s, 11 to 13 as its sigmas")
+    return Gnss(table["t"][keep], llh[keep], sd[keep], v, sd_v, lever_arm)
+
+
+# ---- configuration
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    import yaml
+
+    text = read_text(path)
+    try:
+        _check_tokens(path, yaml, text)
+        values = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark is not None else ""
+        why = " ".join(str(getattr(error, "problem", None) or error).split())
+        raise RecordingError(f"{path}{line}: not valid YAML ({why})") from None
+    except ValueError as error:  # a date that is none, a number of thousands of digits
+        raise RecordingError(f"{path}: not valid YAML ({error})") from None
+    if not isinstance(values, dict):
+        raise RecordingError(f"{path}: not a configuration of KF-GINS or OB_GINS")
+    return values
+
+
+def _check_tokens(path: Path, yaml: Any, text: str) -> None:
+    """Refuse what makes much out of little: a few lines of aliases stand for any amount of values."""
+    opening = (yaml.FlowSequenceStartToken, yaml.FlowMappingStartToken,
+               yaml.BlockSequenceStartToken, yaml.BlockMappingStartToken)  # fmt: skip
+    closing = (yaml.FlowSequenceEndToken, yaml.FlowMappingEndToken, yaml.BlockEndToken)
+    depth = 0
+    for token in yaml.scan(text):
+        depth += isinstance(token, opening) - isinstance(token, closing)
+        if isinstance(token, yaml.AliasToken):
+            line = token.start_mark.line + 1
+            raise RecordingError(f"{path}, line {line}: aliases (*name) are not read; write the values out")
+        if depth > _DEEPEST:
+            raise RecordingError(f"{path}, line {token.start_mark.line + 1}: not valid YAML (nested too deep)")
+
+
+def _named(config_file: Path, config: dict[str, Any], keys: tuple[str, ...]) -> Path | None:
+    """The file a key names: as it stands, below any folder above the configuration, or beside it."""
+    key = next((k for k in keys if k in config), None)
+    if key is None:
+        return None
+    if not isinstance(config[key], str):
+        raise RecordingError(f"{config_file}, {key}: must be the name of a file")
+    stated = Path(config[key].replace("\\", "/"))
+    folder = config_file.resolve().parent
+    for candidate in [
+        stated,
+        *(above / stated for above in (folder, *folder.parents)),
+        config_file.parent / stated.name,
+    ]:
+        if inside(candidate, folder) and candidate.is_file():
+            return candidate
+    raise RecordingError(
+        f"{config_file}, {key}: no file {str(stated)[:200]} beside the configuration or below it; elsewhere none is "
+        "read without --allow-outside"
+    )
+
+
+def _frd(where: Path, config: dict[str, Any], key: str) -> Array:
+    """A lever arm of the configuration (forward, right, down) in RFU; zero where there is none."""
+    value = config.get(key, [0.0, 0.0, 0.0])
+    if not (isinstance(value, list) and len(value) == 3 and all(_is_number(x) and abs(x) <= _FARTHEST for x in value)):
+        raise RecordingError(
+            f"{where}, {key}: must be three numbers, forward, right, down in m, of {_FARTHEST:g} m at most"
+        )
+    return rotation_from_letters("FRD") @ np.array(value, dtype=float)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether it is a number that a float can hold."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+def _noise(where: Path, config: dict[str, Any], remarks: Remarks) -> ImuNoise:
+    section = config.get("imunoise", config.get("imumodel"))
+    if not isinstance(section, dict):
+        raise RecordingError(f"{where}: no table imunoise (KF-GINS) or imumodel (OB_GINS)")
+
+    def figure(key: str, table: dict[str, Any] = section) -> float:
+        value = table.get(key)
+        stated: list[Any] = value if isinstance(value, list) else [value]
+        numbers = [float(x) for x in stated if _is_number(x) and _LEAST <= x <= _MOST]
+        if len(numbers) not in (1, 3) or len(numbers) < len(stated):
+            raise RecordingError(
+                f"{where}, {key}: must be a number above zero, or three, not {repr(value)[:60]} "
+                f"(from {_LEAST:g} to {_MOST:g})"
+            )
+        if len(set(numbers)) > 1:
+            remarks.add(f"{key} differs between the axes; the root mean square is used for all")
+        return float(np.sqrt(np.mean(np.square(numbers))))
+
+    root = np.sqrt(2.0 / (figure("corrtime") * 3600.0))
+    gyro, accel = figure("gbstd") * DEG_PER_H, figure("abstd") * MGAL
+    scales = {ours: figure(theirs) * 1e-6 for ours, theirs in
+              (("gyro_scale_sigma", "gsstd"), ("accel_scale_sigma", "asstd")) if theirs in section}  # fmt: skip
+    remarks.add(
+        "noise figures: from the configuration; a Gauss-Markov bias of sigma s and correlation time T becomes a random "
+        "walk of s sqrt(2/T) that starts from s"
+    )
+    return ImuNoise(
+        gyro_noise_density=figure("arw") * DEG_PER_SQRT_H,
+        accel_noise_density=figure("vrw") / 60.0,
+        gyro_bias_walk=float(gyro * root),
+        accel_bias_walk=float(accel * root),
+        gyro_bias_sigma=figure("initbgstd", config) * DEG_PER_H if config.get("initbgstd") else gyro,
+        accel_bias_sigma=figure("initbastd", config) * MGAL if config.get("initbastd") else accel,
+        **scales,
+    )
+
+
+def _mention(config: dict[str, Any], remarks: Remarks) -> None:
+    """Keys of the configuration that have no place in a recording."""
+    if any(key in config for key in ("starttime", "endtime")):
+        span = f"{str(config.get('starttime', ''))[:30]} to {str(config.get('endtime', ''))[:30]}"
+        remarks.add(f"starttime and endtime ({span}) are not applied: use --start and --end")
+    if any(key in config for key in ("initpos", "initvel", "initatt")):
+        remarks.add("the initial state of the configuration is not used: graphnav finds its own")
+    body = config.get("bodyangle")
+    if isinstance(body, list) and any(body):
+        remarks.add(f"bodyangle {repr(body)[:60]} deg is not applied: the body axes are the IMU's")
+    odometer = config.get("odometer")
+    if isinstance(odometer, dict) and odometer.get("isuseodo") is False:
+        remarks.add("the configuration does not use the odometer; withhold it with --without odometer")
+
+
+FORMAT = log_format(
+    "kf-gins", "text files of KF-GINS or OB_GINS: the .yaml file, its folder, or one IMU or GNSS file", recognises, load
+)

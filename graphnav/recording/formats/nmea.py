@@ -1,0 +1,222 @@
+"""NMEA 0183 sentences of any receiver: GGA positions, GST sigmas, RMC and VTG speed and course, ZDA and RMC dates.
+
+Sentences with the same time of day make one fix. Parsed and checked by pynmeagps.
+"""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.files import parse_number, read_bytes
+from graphnav.core.rotation import Array
+from graphnav.core.timescales import of_week, utc_to_gps
+from graphnav.recording import Gnss, fix_types
+from graphnav.recording.formats import ubx
+from graphnav.recording.formats.registry import Log, first_bytes, log_format
+from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES, Remarks, horizontal_velocity
+
+KNOTS = 1852 / 3600  # m/s
+KMH = 1 / 3.6
+_DAY = 86400.0
+# 1-sigma (m, one horizontal axis) by GGA's quality, multiplied by HDOP, where there is no GST: user range errors of
+# the standard service and of corrections of the code; fixed and float carrier phases as receivers state them
+_BY_QUALITY = {1: 2.5, 2: 1.0, 4: 0.02, 5: 0.4}
+
+
+@dataclass
+class _Epoch:
+    """What sentences of one time say; angles in degrees."""
+
+    time: float  # s of the UTC day
+    line: int
+    gga: Any = None
+    gst: Any = None
+    speed: float | None = None  # m/s
+    course: float | None = None  # deg
+    date: datetime.date | None = None
+    remarks: list[str] = field(default_factory=list)
+
+
+def recognises(path: Path) -> bool:
+    """Whether one of the first lines is a sentence ($, talker and type, a comma) and UBX does not say more."""
+    if ubx.recognises(path):
+        return False
+    lines = first_bytes(path).splitlines()[:20]
+    return any(line[:1] == b"$" and line[6:7] == b"," and line[1:6].isalpha() and line[1:2] != b"P" for line in lines)
+
+
+def load(path: Path) -> Log:
+    """Fixes of the antenna.
+
+    Raises
+    ------
+    RecordingError
+        If no sentence gives a position, naming the first line that is no sentence, if any.
+    """
+    remarks = Remarks()
+    epochs, broken, lines = _epochs(path)
+    if broken:
+        remarks.add(
+            f"{path.name}, line {broken[0]}: not a sound sentence (checksum or form); {len(broken)} of {lines} lines "
+            "were skipped"
+        )
+    fixes = [e for e in epochs if e.gga is not None and e.gga.quality not in (0, 6, 7, 8) and e.gga.lat != ""]
+    if not fixes:
+        at = f", line {broken[0]}: not a sound sentence (checksum or form), and" if broken else ":"
+        raise RecordingError(f"{path}{at} no GGA sentence with a position is in it")
+    simulated = sum(e.gga is not None and e.gga.quality in (6, 7, 8) for e in epochs)
+    if simulated:
+        remarks.add(f"{simulated} GGA positions that the receiver only estimated, or was told, were left out")
+    t, zero = _times(epochs, fixes, remarks)
+    separation = np.array([_number(e.gga.sep) for e in fixes])
+    height = np.array([_number(e.gga.alt) for e in fixes])
+    if np.isnan(separation).any():
+        remarks.add("GGA without the geoid's height: heights are above mean sea level there, not above the ellipsoid")
+    else:
+        remarks.add("heights: above the ellipsoid, as GGA's altitude and geoid separation add up")
+    llh = np.stack(
+        [
+            np.radians([_number(e.gga.lat) for e in fixes]),
+            np.radians([_number(e.gga.lon) for e in fixes]),
+            height + np.nan_to_num(separation),
+        ],
+        -1,
+    )
+    sd = _sigmas(fixes, remarks)
+    v, sd_v = _velocities(fixes, remarks)
+    order = np.argsort(t, kind="stable")
+    order = order[np.concatenate([[True], np.diff(t[order]) > 0]) & np.isfinite(llh[order]).all(-1)]
+    if len(order) < len(t):
+        remarks.add(f"{len(t) - len(order)} fixes without a height or with the time of another were left out")
+    kinds = fix_types(np.array([e.gga.quality for e in fixes])[order], NMEA_TYPES)
+    v, sd_v = (None if x is None else x[order] for x in (v, sd_v))
+    gnss = Gnss(t[order], llh[order], sd[order], v, sd_v, type=kinds)
+    remarks.add("GNSS: position of the antenna; its lever arm is not in the log and taken as zero")
+    return Log(path.stem, gnss=gnss, gps_zero=zero, remarks=tuple(remarks))
+
+
+def _epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
+    """Epochs in the order of the file, the numbers of broken lines, and how many lines hold anything."""
+    import pynmeagps
+
+    epochs: list[_Epoch] = []
+    broken: list[int] = []
+    count = 0
+    for number, raw in enumerate(read_bytes(path).splitlines(), 1):
+        start = raw.find(b"$")
+        if start < 0:
+            count += bool(raw.strip())
+            broken += [number] if raw.strip() else []
+            continue
+        count += 1
+        kind = raw[start + 3 : start + 6]
+        if kind not in (b"GGA", b"GST", b"RMC", b"VTG", b"ZDA"):
+            continue
+        try:
+            message = pynmeagps.NMEAReader.parse(raw[start:].strip() + b"\r\n")
+        except Exception:  # the parser's own errors and whatever a cut line makes it stumble over
+            broken.append(number)
+            continue
+        time = getattr(message, "time", None)
+        if isinstance(time, datetime.time):
+            seconds = time.hour * 3600 + time.minute * 60 + time.second + time.microsecond * 1e-6
+            if not epochs or epochs[-1].time != seconds:
+                epochs.append(_Epoch(seconds, number))
+        elif kind != b"VTG" or not epochs:
+            continue
+        try:
+            _note(epochs[-1], kind, message)
+        except (AttributeError, TypeError, ValueError):  # no number, or no field, where the checksum is right
+            broken.append(number)
+    return epochs, broken, count
+
+
+def _note(epoch: _Epoch, kind: bytes, message: Any) -> None:
+    if kind == b"GGA":
+        for value in (message.lat, message.lon, message.alt, message.sep, message.HDOP):
+            _number(value)
+        if message.lat != "" and (message.NS not in ("N", "S") or message.EW not in ("E", "W")):
+            raise ValueError("no hemisphere")
+        epoch.gga = message
+    elif kind == b"GST":
+        for value in (message.stdLong, message.stdLat, message.stdAlt):
+            _number(value)
+        epoch.gst = message
+    elif kind == b"RMC":
+        if message.status == "A" and message.spd != "":
+            epoch.speed, epoch.course = _number(message.spd) * KNOTS, _number(message.cog)
+        epoch.date = message.date if isinstance(message.date, datetime.date) else None
+    elif kind == b"ZDA":
+        try:
+            date = datetime.date(int(message.year), int(message.month), int(message.day))
+            epoch.date = date if date.year >= 1980 else None  # before there was GPS
+        except (TypeError, ValueError):
+            epoch.date = None
+    elif epoch.speed is None and (message.sogk != "" or message.sogn != ""):
+        epoch.speed = _number(message.sogk) * KMH if message.sogk != "" else _number(message.sogn) * KNOTS
+        epoch.course = _number(message.cogt)
+
+
+def _number(value: Any) -> float:
+    if value in ("", None):
+        return float("nan")
+    return parse_number(value) if isinstance(value, str) else float(value)
+
+
+def _times(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Remarks) -> tuple[Array, float | None]:
+    """GPS seconds of week of the fixes and where the week begins; a time that falls back by half a day is the next."""
+    days, day, before = {}, 0, epochs[0].time
+    for e in epochs:
+        day += e.time < before - 0.5 * _DAY
+        days[id(e)], before = day, e.time
+    dated = next((e for e in epochs if e.date is not None), None)
+    of_day = np.array([e.time + _DAY * days[id(e)] for e in fixes])
+    if dated is None or dated.date is None:
+        remarks.add("clock: seconds of the UTC day; no RMC or ZDA sentence gives a date, so it is not GPS time")
+        return of_day, None
+    midnight = np.datetime64(dated.date, "us") - np.timedelta64(days[id(dated)], "D")
+    gps = utc_to_gps(midnight + (of_day * 1e6).round().astype("timedelta64[us]"))
+    t, zero = of_week(gps)
+    ahead = round(float(gps[0] - (midnight - np.datetime64("1980-01-06", "us")) / np.timedelta64(1, "s") - of_day[0]))
+    remarks.add(f"clock: UTC turned into GPS time ({ahead} leap seconds in {dated.date.year}), seconds of the GPS week")
+    return t, zero
+
+
+def _sigmas(fixes: list[_Epoch], remarks: Remarks) -> Array:
+    sd = np.full((len(fixes), 3), np.nan)
+    for k, e in enumerate(fixes):
+        if e.gst is not None:
+            sd[k] = [_number(e.gst.stdLong), _number(e.gst.stdLat), _number(e.gst.stdAlt)]
+    without = ~(sd > 0).all(-1)
+    if not without.any():
+        remarks.add("position sigmas: from GST")
+        return sd
+    for k in np.flatnonzero(without).tolist():
+        e = fixes[k].gga
+        hdop = _number(e.HDOP)
+        axis = _BY_QUALITY.get(e.quality, DEFAULT_SD[0]) * (hdop if hdop > 0 else 1.0)
+        sd[k] = axis, axis, 2.0 * axis
+    remarks.add(
+        f"{without.sum()} of {len(fixes)} fixes have no GST: their sigmas are GGA's HDOP times 2.5 m (autonomous), 1 m "
+        "(differential), 0.4 m (float) or 0.02 m (fixed), twice that in height"
+    )
+    return sd
+
+
+def _velocities(fixes: list[_Epoch], remarks: Remarks) -> tuple[Array | None, Array | None]:
+    speed = np.array([np.nan if e.speed is None else e.speed for e in fixes])
+    course = np.radians([np.nan if e.course is None else e.course for e in fixes])
+    if np.isnan(speed).all():
+        return None, None
+    v, sd_v, sentence = horizontal_velocity(speed, course, DEFAULT_SD_V)
+    remarks.add(sentence)
+    return v, sd_v
+
+
+FORMAT = log_format("nmea", "NMEA 0183 sentences of a receiver", recognises, load)

@@ -1,0 +1,57 @@
+"""Pulses of a wheel into a running count: per row or cumulative, counters of 8, 16 or 32 bit unwrapped."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.recording.formats.repair import Remarks
+
+_MODULI = (2.0**8, 2.0**16, 2.0**32)
+
+
+def counted(
+    pulses: Array, kind: Literal["cumulative", "per_row"] | None, signed: bool | None, remarks: Remarks
+) -> Array:
+    """(M,) pulses since the first row.
+
+    A counter that is not said to be cumulative is taken for one if it hardly ever falls: counts per row rise and
+    fall with the speed.
+    """
+    step = np.diff(pulses)
+    if kind is None:
+        changes = step[step != 0.0]
+        kind = "cumulative" if len(changes) and (changes > 0.0).mean() > 0.9 else "per_row"
+        remarks.add(
+            f"the odometer's pulses are taken as {'a running count' if kind == 'cumulative' else 'counts per row'}; "
+            f'if they are not, say pulses = "{"per_row" if kind == "cumulative" else "cumulative"}"'
+        )
+    if kind == "per_row":  # those of row k came between the rows k-1 and k
+        return np.cumsum(pulses) - pulses[0]
+    return np.r_[0.0, np.cumsum(_unwrapped(pulses, step, signed, remarks))]
+
+
+def _unwrapped(pulses: Array, step: Array, signed: bool | None, remarks: Remarks) -> Array:
+    """Steps between rows without the jumps of a counter that ran over, or began anew."""
+    back = step < 0.0
+    if not back.any() or pulses.min() < 0.0:
+        return step
+    modulus = next((m for m in _MODULI if pulses.max() < m), None)
+    if modulus is None:
+        return step
+    if signed is None:  # what counts backward does so by a few pulses as well
+        signed = bool((step[back] > -0.5 * modulus).any())
+    # a step of less than half the range either way; of less than the whole range forward if there is no backward
+    whole = np.mod(step + 0.5 * modulus, modulus) - 0.5 * modulus if signed else np.mod(step, modulus)
+    ran_over = whole != step
+    # one that began anew at zero did not run over: nothing near the end of the range, and a step like no other
+    usual = np.abs(step[~ran_over]).max(initial=0.0)
+    anew = ran_over & (np.abs(whole) > 4.0 * usual + 4.0)
+    whole[anew] = 0.0
+    for mask, what in ((ran_over & ~anew, f"ran over ({modulus:.0f})"), (anew, "began anew")):
+        if mask.any():
+            times = "once" if mask.sum() == 1 else f"{mask.sum()} times"
+            remarks.add(f"the odometer's counter {what} {times}: mended")
+    return whole

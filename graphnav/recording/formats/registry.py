@@ -1,0 +1,121 @@
+"""How a log format makes itself known: its module in this package holds one `FORMAT`.
+
+A log need not hold every sensor: it is read into a `Log`, and becomes a recording alone, or with others through the
+``file`` keys of a recording.toml.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.files import check_regular, exists
+from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth, rows_of
+
+
+@dataclass(frozen=True)
+class Log:
+    """What one log holds, as a `Recording` would have it, with whatever it lacks left None."""
+
+    name: str
+    imu: Imu | None = None
+    gnss: Gnss | None = None
+    odometer: Odometer | None = None
+    truth: Truth | None = None
+    platform: str = "vehicle"
+    gps_zero: float | None = None  # s since the GPS epoch at t = 0 of the log, where it is known
+    mount_known: bool = True  # whether the IMU's axes are by definition those of the vehicle
+    files: tuple[Path, ...] = ()
+    remarks: tuple[str, ...] = ()  # sentences about what was assumed
+    topics: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # sensor -> that used, then those it could be
+
+    def recording(self, source: str | Path) -> Recording:
+        """The log as a recording.
+
+        Raises
+        ------
+        RecordingError
+            If it holds no IMU.
+        """
+        if self.imu is None:
+            held = [name for name in ("gnss", "odometer", "truth") if getattr(self, name) is not None]
+            raise RecordingError(
+                f"{source}: holds no IMU, only {' and '.join(held)}; 'graphnav init IMU-LOG {Path(source).name}' "
+                "drafts a recording.toml that joins both"
+            )
+        return Recording(
+            self.name, self.platform, self.imu, self.gnss, self.odometer, self.truth,
+            Path(source), self.files, self.gps_zero, self.remarks,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Format:
+    """One way a recording, or a part of one, can be stored.
+
+    `recognises` must be cheap and must not raise; `read` and `load` raise RecordingError for anything they cannot use.
+    """
+
+    name: str
+    about: str  # one sentence
+    recognises: Callable[[str | Path], bool]
+    read: Callable[[str | Path], Recording]
+    builtin: bool = False  # a name that is always there, such as "kitti", rather than a path
+    load: Callable[[str | Path], Log] | None = None  # for logs of other programs
+    choose: Callable[[str | Path, Sequence[str]], Log] | None = None  # `load` of named topics, where logs have them
+
+
+def log_format(
+    name: str,
+    about: str,
+    recognises: Callable[[Path], bool],
+    load: Callable[[Path], Log],
+    choose: Callable[[Path, Sequence[str]], Log] | None = None,
+) -> Format:
+    """The `Format` of another program's log."""
+
+    def known(source: str | Path) -> bool:
+        try:
+            return recognises(Path(source))
+        except (OSError, RecordingError):
+            return False
+
+    def loaded(source: str | Path, topics: Sequence[str] = ()) -> Log:
+        path = Path(source)
+        if not exists(path):
+            raise RecordingError(f"{path}: no such file or folder")
+        if not path.is_dir():
+            check_regular(path)
+        from graphnav.recording.formats.soundness import sound  # which imports this module
+
+        log = choose(path, topics) if choose is not None and topics else load(path)
+        return replace(_without_nowhere(sound(log, path)), files=log.files or _files(path))
+
+    return Format(
+        name, about, known, lambda source: loaded(source).recording(source), load=loaded,
+        choose=None if choose is None else loaded,
+    )  # fmt: skip
+
+
+def _without_nowhere(log: Log) -> Log:
+    """The log without fixes at latitude and longitude 0, which receivers write that have none."""
+    gnss = log.gnss
+    if gnss is None or not (nowhere := (gnss.llh[:, :2] == 0.0).all(axis=1)).any() or nowhere.all():
+        return log
+    many = "1 fix" if nowhere.sum() == 1 else f"{nowhere.sum()} fixes"
+    return replace(log, gnss=rows_of(gnss, ~nowhere), remarks=(*log.remarks, f"{many} at 0, 0 (no fix) left out"))
+
+
+def _files(path: Path) -> tuple[Path, ...]:
+    """A file, or those of a folder."""
+    return tuple(sorted(file for file in path.iterdir() if file.is_file())) if path.is_dir() else (path,)
+
+
+def first_bytes(path: Path, count: int = 4096) -> bytes:
+    """The beginning of a file; nothing of a folder or of what cannot be read."""
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        return file.read(count)

@@ -1,0 +1,307 @@
+"""Which rows of a sensor's file can be used; whatever is changed is said in a remark."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.recording import FIX_TYPES, fix_types
+from graphnav.recording.formats.schema import TIME, Keep
+from graphnav.recording.formats.table import Mask, Table
+
+_LABEL = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"}
+LATEST = 1e11  # s, either way: three thousand years
+VAGUEST, VAGUEST_V = 1e5, 1e4  # m, m/s; a fix with a sigma beyond these says nothing
+_SUREST = 1e-9  # m, m/s; a sigma below says that it was not meant as one
+_HIGHEST = 9000.0  # m, that a drive on Earth may come to
+_LOWEST, _SKY = -1000.0, 50000.0  # m, that anything may be read at
+_SET_BACK = 10.0  # periods; rows that merely overtake each other are closer
+_RADIANS = (1.58, 3.15)  # |lat|, |lon| that angles in radians cannot exceed
+
+
+# 1-sigma where a recording states none, from the GPS Standard Positioning Service Performance Standard (5th ed.,
+# 2020, section 3.8): 8 m horizontal (2.45 sigma in two dimensions) and 13 m vertical (1.96 sigma), both 95 %.
+DEFAULT_SD = (3.3, 3.3, 6.6)  # m
+# The same section's 0.2 m/s (95 %, one axis) is for the open sky; twice its sigma for a vehicle among buildings.
+DEFAULT_SD_V = (0.2, 0.2, 0.4)  # m/s
+
+
+# GGA's quality (NMEA 0183; 9 as NovAtel's OEM7 writes it) -> RTKLIB's number. 3, a military fix, is none of these; 6,
+# 7 and 8 are no fixes, but estimated, told or simulated.
+NMEA_TYPES = {0: 0, 1: 5, 2: 4, 3: 0, 4: 1, 5: 2, 9: 3}
+
+
+class Remarks(list[str]):
+    """Sentences about what loading changed or assumed."""
+
+    def add(self, sentence: str) -> None:
+        """One more sentence."""
+        self.append(sentence)
+
+
+def usable_rows(
+    rows: Table, sensor: str, needed: tuple[str, ...], keep: Keep | None, unit: str, offset: float, remarks: Remarks
+) -> Table:
+    """The rows that hold every needed value, in order of time, each time once; t in seconds plus `offset`.
+
+    Raises
+    ------
+    RecordingError
+        For infinite values but in an odometer's log, if too few rows are left, if the time steps cannot be seconds, or
+        if the stamps run over the same times twice.
+    """
+    label = _LABEL[sensor]
+    with np.errstate(over="ignore"):
+        t = rows["t"] * TIME[unit] + offset
+    # a stamp of thousands of years is none, as an infinite one
+    rows = rows.with_column("t", np.where(np.abs(t) > LATEST, np.inf, rows["t"]))
+    for name in rows.columns:
+        bad = np.flatnonzero(np.isinf(rows[name]))
+        if len(bad) and sensor == "odometer":  # of which single readings can be missed
+            rows = rows.with_column(name, np.where(np.isinf(rows[name]), np.nan, rows[name]))
+        elif len(bad):
+            what = "no time" if name == "t" else "infinite"
+            raise RecordingError(f"{rows.where(bad[0], name)}: the value is {what}")
+    if keep is not None:
+        rows = rows.take(rows[Table.KEEP] >= keep.at_least)
+        if not len(rows):
+            raise RecordingError(f"{rows.path}: no row has {keep.column} of at least {keep.at_least:g} (keep)")
+    rows = rows.with_column("t", rows["t"] * TIME[unit] + offset)
+
+    blank = np.isnan(np.stack([rows[name] for name in needed])).any(0)
+    if blank.all():
+        raise RecordingError(f"{rows.path}: no row holds all of {', '.join(needed)} (all blank or NaN)")
+    if blank.any():
+        first = np.flatnonzero(blank)[0]
+        at = f" (first at t = {rows['t'][first]:.3f} s)" if np.isfinite(rows["t"][first]) else ""
+        what = "blank, NaN or infinite" if sensor == "odometer" else "blank or NaN"
+        remarks.add(f"{_rows(blank, label)} with {what} values dropped{at}")
+        rows = rows.take(~blank)
+
+    t = rows["t"]
+    step = np.diff(t)
+    if (step < 0).any():
+        first = np.flatnonzero(step < 0)[0]
+        _check_passes(rows, label)
+        remarks.add(
+            f"{label} rows out of order sorted by time ({(step < 0).sum()} steps back, "
+            f"the first after t = {t[first]:.3f} s)"
+        )
+        rows = rows.take(np.argsort(t, kind="stable"))
+        t = rows["t"]
+    repeated = np.r_[False, np.diff(t) == 0]
+    if repeated.mean() > 0.6 and (~repeated).sum() > 1:
+        raise RecordingError(
+            f"{rows.path}: {repeated.sum()} of {len(rows)} rows have the time of the row before: the fraction of the "
+            "seconds was lost; log t with milliseconds"
+        )
+    if repeated.any():
+        remarks.add(
+            f"{_rows(repeated, label)} with the time of the row before dropped (first at t = {t[repeated][0]:.3f} s)"
+        )
+        rows = rows.take(~repeated)
+    if sensor == "imu":
+        _check_imu_time(rows, unit)
+    return rows
+
+
+def _check_passes(rows: Table, label: str) -> None:
+    """Refuse a clock that was set back: the stamps before and after it then lie among each other."""
+    t = rows["t"]
+    period = float(np.median(np.abs(np.diff(t))))
+    back = np.flatnonzero(np.diff(t) < -_SET_BACK * period)
+    for k in back[:20]:
+        again, before = float(t[k + 1]), t[: k + 1]
+        before = before[before >= again]
+        after = t[k + 1 :][t[k + 1 :] <= t[k]]
+        # rows that were only written later than others fill the hole that they left
+        shared = min(before.max(), after.max()) - max(before.min(), after.min())
+        if shared > 0.5 * (t[k] - again) and shared > _SET_BACK * period:
+            jump = float(t[k] - again + period)
+            leap = " (GPS time and UTC are 18 s apart)" if abs(jump - 18.0) < 0.5 else ""
+            raise RecordingError(
+                f"{rows.path}: the clock of the {label} is set back by {jump:.2f} s after t = {t[k]:.3f} s{leap}: what "
+                "lies between is there twice; write all stamps on one clock"
+            )
+
+
+def _rows(mask: Mask, label: str) -> str:
+    n = int(mask.sum())
+    return f"{n} {label} row{'s' if n > 1 else ''}"
+
+
+def _check_imu_time(rows: Table, unit: str) -> None:
+    if len(rows) < 2:
+        raise RecordingError(f"{rows.path}: {len(rows)} usable row; an IMU recording needs at least 2")
+    step = float(np.median(np.diff(rows["t"])))
+    if 1e-5 < step < 0.5:
+        return
+    fitting = [u for u in TIME if 2.5e-4 <= step / TIME[unit] * TIME[u] <= 0.1 and u != unit]
+    hint = f'; if t is in {fitting[0]}, say units = {{ t = "{fitting[0]}" }}' if fitting else ""
+    if step == 1.0:
+        hint += "; if it counts rows, write times instead"
+    raise RecordingError(f"{rows.path}: IMU rows are {step:g} s apart, which no usable IMU is{hint}")
+
+
+def on_earth(lat: Array, lon: Array, h: Array) -> Mask:
+    """Which of some places (N,) in rad and m a drive can be at."""
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(lat) <= np.pi / 2) & (np.abs(lon) <= 2 * np.pi) & (h >= _LOWEST) & (h <= _SKY)
+    return np.asarray(near)
+
+
+def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tuple[Array, Table]:
+    """(lat, lon, h) in rad, rad, m of rows whose position is usable, and those rows.
+
+    `unit` None means degrees, and angles that are all small enough to be radians are refused.
+
+    Raises
+    ------
+    RecordingError
+        For positions that are nowhere on Earth, naming the line and the likely mistake.
+    """
+    nowhere = (rows["lat"] == 0) & (rows["lon"] == 0)
+    if nowhere.any() and not nowhere.all():
+        first = rows["t"][nowhere][0]
+        remarks.add(f"{_rows(nowhere, label)} at 0, 0 (no fix) dropped (first at t = {first:.3f} s)")
+        rows = rows.take(~nowhere)
+    lat, lon, h = rows["lat"], rows["lon"], rows["h"]
+    scale = 1.0 if unit == "rad" else np.pi / 180.0
+    if unit is None and np.abs(lat).max() < _RADIANS[0] and np.abs(lon).max() < _RADIANS[1]:
+        raise RecordingError(
+            f"{rows.path}: lat and lon look like radians (first {lat[0]:g}, {lon[0]:g}); say "
+            'units = { angle = "rad" } if they are, { angle = "deg" } if the drive really is there'
+        )
+    beyond = np.flatnonzero(np.abs(lat) * scale > np.pi / 2)
+    if len(beyond):
+        k = beyond[0]
+        swapped = np.abs(lon * scale).max() <= np.pi / 2
+        hint = "; are lat and lon swapped?" if swapped else _other_form(lat, lon, label)
+        raise RecordingError(f"{rows.where(k, 'lat')}: {lat[k]:g} is not a latitude{hint}")
+    beyond = np.flatnonzero((lon * scale < -np.pi - 1e-9) | (lon * scale > 2 * np.pi))
+    if len(beyond):
+        hint = _other_form(lat, lon, label)
+        raise RecordingError(f"{rows.where(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude{hint}")
+    beyond = np.flatnonzero((h < _LOWEST) | (h > _SKY))
+    if not len(beyond) and np.median(h) > _HIGHEST:
+        beyond = np.flatnonzero(h > _HIGHEST)
+    if len(beyond):
+        k = beyond[0]
+        hint = "; is it in millimetres?" if abs(h[k]) > _HIGHEST else ""
+        raise RecordingError(f"{rows.where(k, 'h')}: {h[k]:g} m is not the height of a drive{hint}")
+    lon = np.where(lon * scale > np.pi, lon * scale - 2 * np.pi, lon * scale)
+    return np.stack([lat * scale, lon, h], -1), rows
+
+
+def _other_form(lat: Array, lon: Array, label: str) -> str:
+    """What latitudes and longitudes out of range may be instead."""
+    if all((np.abs(x) % 100.0 < 60.0).all() and np.abs(x).max() < 100.0 * top for x, top in ((lat, 91), (lon, 181))):
+        whole, minutes = divmod(abs(lat[0]), 100.0)
+        return f"; degrees and minutes together, as in NMEA? {lat[0]:g} is then {whole:g} deg {minutes:g} min"
+    return '; if they are metres, name them x and y and say frame = "local"' if label == "truth" else ""
+
+
+def sigmas(
+    rows: Table,
+    names: tuple[str, str, str],
+    stated: tuple[float, float, float] | None,
+    default: tuple[float, float, float],
+    what: str,
+    used: Mask,
+    remarks: Remarks,
+) -> Array:
+    """The 1-sigmas of `used` rows (N, 3): the file's, else the .toml's, else a default that is remarked on.
+
+    Raises
+    ------
+    RecordingError
+        If the file holds a sigma below zero, or only zeros and blanks.
+    """
+    there = [name for name in names if name in rows]
+    fallback = np.array(stated or default)
+    assumed = f"{what} sigmas of {default[0]:g}, {default[1]:g}, {default[2]:g} (east, north, up) are assumed"
+    if len(there) < 3:
+        if there:
+            remarks.add(f"{what} sigmas need {', '.join(names)}; only {', '.join(there)} is there, so it is not used")
+        if stated is None:
+            remarks.add(f"{assumed}: neither the file nor the description states any")
+        return np.tile(fallback, (len(rows), 1))
+    sd = rows.stack(*names)
+    for k, name in enumerate(names):
+        zero = used & (sd[:, k] == 0)
+        floor = _floor(sd[used & (sd[:, k] > 0), k])
+        bad = np.flatnonzero(used & ((sd[:, k] < 0) | ((sd[:, k] < _SUREST) & ~zero) | (zero & (floor is None))))
+        if len(bad):
+            raise RecordingError(f"{rows.where(bad[0], name)}: a 1-sigma must be above zero, not {sd[bad[0], k]:g}")
+        if zero.any():
+            sd[zero, k] = floor
+            remarks.add(
+                f"{what} sigma {name} is 0 in {zero.sum()} of {len(rows)} rows: rounded away, {floor:g} is taken there "
+                "(half of the column's last digit, or its smallest above zero)"
+            )
+    blank = np.isnan(sd)
+    if stated is None and (n := (blank.any(-1) & used).sum()):
+        remarks.add(f"{assumed} where the file's own are blank ({n} of {len(rows)} rows)")
+    return np.where(blank, fallback, sd)
+
+
+_FINEST = 5  # decimals that are written on purpose; with more, a column is not rounded
+
+
+def _floor(positive: Array) -> float | None:
+    """What a sigma is at most that was printed as zero: half a unit of the last decimal of the others in its column.
+
+    Where they are not rounded it is the smallest of them; None where there is none.
+    """
+    if not len(positive):
+        return None
+    for digits in range(_FINEST + 1):
+        scaled = positive * 10.0**digits
+        if np.abs(scaled - np.round(scaled)).max() < 1e-6 * max(1.0, scaled.max()):
+            return float(0.5 * 10.0**-digits)
+    return float(positive.min())
+
+
+def fixes_by_type(rows: Table, numbers: str) -> NDArray[np.intp] | None:
+    """Types (N,) of the fixes of a table with a column of them, in the numbers of "rtklib" or "nmea".
+
+    Raises
+    ------
+    RecordingError
+        For a number that is no type, naming the line and the numbers there are.
+    """
+    said, known = rows["type"], NMEA_TYPES if numbers == "nmea" else {k: k for k in FIX_TYPES}
+    bad = np.flatnonzero(~np.isnan(said) & ~np.isin(said, list(known)))
+    if len(bad):
+        there = ", ".join(f"{k} {FIX_TYPES[ours]}" for k, ours in known.items() if ours)
+        hint = "" if numbers == "nmea" else '; if they are GGA\'s, say units = { type = "nmea" }'
+        where = rows.where(bad[0], "type")
+        raise RecordingError(f"{where}: {said[bad[0]]:g} is no type of fix: {there}, blank where unknown{hint}")
+    return fix_types(said, known)
+
+
+# 1-sigma of a vertical velocity that is taken as zero because a receiver gives only speed and course: a slope of 10 %
+_SLOPE = 0.1
+
+
+def horizontal_velocity(speed: Array, course: Array, sd: tuple[float, float, float]) -> tuple[Array, Array, str]:
+    """East-north-up velocities of speed (N,) m/s over ground and course (N,) rad, their sigmas, and what was assumed.
+
+    A standing receiver may leave the course blank; a blank speed gives no velocity.
+    """
+    course = np.where(np.isnan(course) & (speed < sd[0]), 0.0, course)
+    v = np.stack([speed * np.sin(course), speed * np.cos(course), np.zeros_like(speed)], -1)
+    v[np.isnan(v).any(-1)] = np.nan
+    sd_v = np.tile(np.array(sd), (len(speed), 1))
+    sd_v[:, 2] = np.maximum(sd[2], _SLOPE * np.abs(np.nan_to_num(speed)))
+    sd_v[np.isnan(v).any(-1)] = np.nan
+    return (
+        v,
+        sd_v,
+        (
+            f"velocity: from speed and course over ground, 1-sigma {sd[0]:g} m/s a horizontal axis; the vertical one "
+            f"is taken as 0 with {sd[2]:g} m/s or a tenth of the speed"
+        ),
+    )

@@ -1,0 +1,408 @@
+"""recording.toml: every key it may hold, with its unit, and what is wrong with one that cannot be used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    create_model,
+    field_validator,
+    model_validator,
+)
+from pydantic.types import Strict
+
+from graphnav.core.complaints import complaint, nearest, read_toml
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.core.timescales import parse_clock
+from graphnav.recording import ImuNoise
+from graphnav.recording.formats.figures import parse_figure
+from graphnav.recording.formats.imu_models import MODELS, find_model
+
+_SMALLEST, _LARGEST = 1e-15, 1e9  # of a figure: squares of it are numbers
+_LONGEST = 1e7  # of the components of a vector: m, from the Earth's centre at most, or of a direction
+
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+
+
+def _usable(value: float) -> float:
+    if value and not _SMALLEST <= abs(value) <= _LARGEST:
+        raise ValueError(f"{value:g} must lie between {_SMALLEST:g} and {_LARGEST:g}")
+    return value
+
+
+Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0), AfterValidator(_usable)]
+
+NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0), AfterValidator(_usable)]
+
+
+def _three_numbers(value: Any) -> Any:
+    if not isinstance(value, list | tuple) or len(value) != 3:
+        raise ValueError("must be three numbers in brackets")
+    if any(isinstance(x, bool) or not isinstance(x, int | float) or not np.isfinite(x) for x in value):
+        raise ValueError("must be three numbers in brackets")
+    if any(abs(x) > _LONGEST for x in value):
+        raise ValueError(f"must be three numbers in brackets, none beyond {_LONGEST:g}")
+    return tuple(float(x) for x in value)
+
+
+def _three_positive(value: Any) -> Any:
+    value = _three_numbers(value)
+    if min(value) <= 0:
+        raise ValueError("must be three numbers above zero: a 1-sigma each for east, north, up")
+    return value
+
+
+Vector = Annotated[tuple[float, float, float], BeforeValidator(_three_numbers)]
+Sigmas = Annotated[tuple[float, float, float], BeforeValidator(_three_positive)]
+
+TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+ANGLE = {"deg": np.pi / 180.0, "rad": 1.0}
+RATE = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180e3}
+FORCE = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ft/s2": 0.3048}  # standard gravity, by definition
+SPEED = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600}
+
+TimeUnit = Literal["s", "ms", "us", "ns"]
+AngleUnit = Literal["deg", "rad"]
+SpeedUnit = Literal["m/s", "km/h", "mph", "knots"]
+
+_LETTERS = {"R": (1, 0, 0), "L": (-1, 0, 0), "F": (0, 1, 0), "B": (0, -1, 0), "U": (0, 0, 1), "D": (0, 0, -1)}
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def _one_or_more(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+Topics = Annotated[tuple[str, ...], BeforeValidator(_one_or_more)]
+
+
+class Keep(_Section):
+    """Rows to use: those whose column holds at least this."""
+
+    column: str
+    at_least: Number
+
+
+class _Sensor(_Section):
+    """What every sensor's table may hold."""
+
+    required: ClassVar[tuple[str, ...]] = ()
+    optional: ClassVar[tuple[str, ...]] = ()
+
+    file: str = Field(min_length=1)
+    columns: dict[str, str] = Field({}, description="our name = the file's")
+    time_offset: Number = Field(0.0, description="s, added to the file's stamps")
+    keep: Keep | None = None
+    topic: Topics = Field((), description="of a ROS bag, or several: a fix's and a velocity's")
+
+    @field_validator("columns")
+    @classmethod
+    def _known_columns(cls, columns: dict[str, str]) -> dict[str, str]:
+        known = (*cls.required, *cls.optional)
+        for name in columns:
+            if name not in known:
+                raise ValueError(f"'{name}' is not one of graphnav's columns; {nearest(name, known)}")
+        return columns
+
+
+class ImuUnits(_Section):
+    """Units of imu.csv."""
+
+    t: TimeUnit = "s"
+    gyro: Literal["rad/s", "deg/s", "mdeg/s"] = "rad/s"
+    accel: Literal["m/s2", "g", "mg", "ft/s2"] = "m/s2"
+
+
+class GnssUnits(_Section):
+    """Units of gnss.csv; `angle` is that of lat and lon, None: degrees unless they look like radians."""
+
+    t: TimeUnit = "s"
+    angle: AngleUnit | None = None
+    speed: SpeedUnit = "m/s"
+
+
+class FixUnits(GnssUnits):
+    """Units of gnss.csv; `type` is whose numbers the types of the fixes are."""
+
+    type: Literal["rtklib", "nmea"] = "rtklib"
+
+
+class OdometerUnits(_Section):
+    """Units of odometer.csv."""
+
+    t: TimeUnit = "s"
+    speed: SpeedUnit = "m/s"
+
+
+# [imu.noise]: the fields of ImuNoise, None where the file says nothing; only a scale error may be stated as none.
+# A figure is a number in SI, or text with a unit.
+NOISE_FIGURES = tuple(f.name for f in fields(ImuNoise) if not f.name.endswith("_scale_sigma"))
+
+
+def _figure(key: str) -> Any:
+    number = Positive if key in NOISE_FIGURES else NotNegative
+    return Annotated[number | None, BeforeValidator(partial(parse_figure, key))]
+
+
+NOISE_UNITS = {
+    "gyro_noise_density": "rad/s/sqrt(Hz)", "accel_noise_density": "m/s2/sqrt(Hz)", "gyro_bias_walk": "rad/s/sqrt(s)",
+    "accel_bias_walk": "m/s2/sqrt(s)", "gyro_bias_sigma": "rad/s, at turn-on", "accel_bias_sigma": "m/s2, at turn-on",
+    "gyro_scale_sigma": "1", "accel_scale_sigma": "1",
+}  # fmt: skip
+Noise = create_model(  # type: ignore[call-overload]
+    "Noise",
+    __base__=_Section,
+    **{f.name: (_figure(f.name), Field(None, description=NOISE_UNITS[f.name])) for f in fields(ImuNoise)},
+)
+
+
+class ImuTable(_Sensor):
+    """[imu]"""
+
+    required = ("t", "gx", "gy", "gz", "ax", "ay", "az")
+
+    axes: str | None = None
+    forward: Vector | None = None
+    up: Vector | None = None
+    units: ImuUnits = ImuUnits()
+    noise: Noise | None = None  # type: ignore[valid-type]
+    model: str | None = None  # of graphnav.recording.formats.imu_models; [imu.noise] goes before it
+
+    @field_validator("model")
+    @classmethod
+    def _known_model(cls, model: str | None) -> str | None:
+        if model is not None and find_model(model) is None:
+            raise ValueError(f"no figures of an IMU called '{model}' are known; {nearest(model, tuple(MODELS))}")
+        return model
+
+    @model_validator(mode="after")
+    def _one_mount(self) -> ImuTable:
+        if self.axes is not None and (self.forward is not None or self.up is not None):
+            raise ValueError("say either axes or forward and up, not both")
+        if (self.forward is None) != (self.up is None):
+            raise ValueError("forward and up belong together: give both")
+        return self
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """The noise figures that are stated: those of the model, with those of [imu.noise] over them."""
+        model = find_model(self.model) if self.model else None
+        stated: dict[str, float] = self.noise.model_dump(exclude_none=True) if self.noise else {}
+        return {**(model.noise if model else {}), **stated}
+
+    @property
+    def R_bs(self) -> Array:
+        """Body (RFU) from the file's axes, (3, 3); ValueError if they make none."""
+        if self.forward is not None and self.up is not None:
+            return rotation_from_vectors(self.forward, self.up)
+        return rotation_from_letters(self.axes or "RFU")
+
+
+class GnssTable(_Sensor):
+    """[gnss]"""
+
+    required = ("t", "lat", "lon", "h")
+    optional = ("sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu", "vd", "speed", "course", "type")
+
+    units: FixUnits = FixUnits()
+    lever_arm: Vector = Field((0.0, 0.0, 0.0), description="m from the IMU: right, forward, up")
+    sd: Sigmas | None = Field(None, description="m: east, north, up")
+    sd_v: Sigmas | None = Field(None, description="m/s: east, north, up")
+
+
+def _names(value: Any) -> Any:
+    names = [value] if isinstance(value, str) else value
+    if not isinstance(names, list | tuple) or not names or not all(isinstance(x, str) and x for x in names):
+        raise ValueError("must be the name of a file, or names in brackets")
+    return tuple(names)
+
+
+Files = Annotated[tuple[str, ...], BeforeValidator(_names)]
+
+
+class RawGnssTable(_Section):
+    """[raw_gnss]: observations of a receiver, and what places its satellites"""
+
+    columns_known: ClassVar[tuple[str, ...]] = (
+        "t", "prn", "qzss", "code", "carrier", "doppler", "range_rate", "cn0",
+    )  # fmt: skip
+
+    rover: Files = Field(description="RINEX or UBX files, or one CSV file")
+    nav: Files | None = Field(None, description="RINEX navigation files; UBX files may hold what they would")
+    sp3: Files | None = Field(None, description="precise orbits")
+    clk: Files | None = Field(None, description="precise clocks")
+    base: Files | None = Field(None, description="RINEX observations of a base station")
+    base_position: Vector | None = Field(None, description="m, Earth-centred, of its antenna")
+    lever_arm: Vector = Field((0.0, 0.0, 0.0), description="m from the IMU: right, forward, up")
+    time_offset: Number = Field(0.0, description="s, added to the receiver's stamps on the recording's clock")
+    columns: dict[str, str] = Field({}, description="of a CSV file: our name = the file's")
+    corrected: tuple[Literal["clock", "troposphere"], ...] = Field((), description="already taken off the codes")
+    stamps: Literal["receiver", "nominal"] = Field(
+        "receiver", description="nominal: rounded to the epoch, while codes are of the receiver's own clock"
+    )
+
+    @field_validator("columns")
+    @classmethod
+    def _known_columns(cls, columns: dict[str, str]) -> dict[str, str]:
+        for name in columns:
+            if name not in cls.columns_known:
+                raise ValueError(f"'{name}' is not one of graphnav's columns; {nearest(name, cls.columns_known)}")
+        return columns
+
+    @model_validator(mode="after")
+    def _check_place(self) -> RawGnssTable:
+        if self.clk is not None and self.sp3 is None:
+            raise ValueError("clk says nothing without sp3")
+        return self
+
+
+WHEELS = ("speed_fl", "speed_fr", "speed_rl", "speed_rr")
+
+
+class OdometerTable(_Sensor):
+    """[odometer]: a speed, or pulses counted, or the speeds of the wheels"""
+
+    required = ("t",)
+    optional = ("speed", "pulses", *WHEELS)
+
+    units: OdometerUnits = OdometerUnits()
+    lever_arm: Vector = Field((0.0, 0.0, 0.0), description="m from the IMU: right, forward, up")
+    scale_sigma: Positive = Field(0.02, description="1-sigma of the scale, 0.02 = 2 %")
+    metres_per_pulse: Positive | None = Field(None, description="m; given, the pulses are used")
+    pulses: Literal["cumulative", "per_row"] | None = None  # None: told from the counts
+    use: Literal["rear", "front", "all"] | None = None  # wheels; None: the rear ones if there is no `speed`
+    speed_sigma: Positive | None = Field(None, description="m/s, of one reading")
+    signed: Annotated[bool, Strict()] | None = None  # None: told from the readings
+    delay_sigma: NotNegative = Field(0.0, description="s, of the stamps")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> OdometerTable:
+        if self.metres_per_pulse is not None and self.use is not None:
+            raise ValueError("say either metres_per_pulse (pulses are used) or use (the speeds of wheels are)")
+        for key, needs in (("pulses", self.pulses is not None), ("columns.pulses", "pulses" in self.columns)):
+            if needs and self.metres_per_pulse is None:
+                raise ValueError(f"{key} says nothing without metres_per_pulse, the way of one pulse in m")
+        return self
+
+    def readings(self, there: Sequence[str]) -> tuple[str, ...]:
+        """The columns the speed comes from, out of those that are there; what is wanted and not there is named too."""
+        if self.metres_per_pulse is not None:
+            return ("pulses",)
+        wanted = {"front": WHEELS[:2], "rear": WHEELS[2:], "all": WHEELS}[self.use or "rear"]
+        if self.use is not None or ("speed" not in there and any(name in there for name in WHEELS)):
+            return wanted
+        return ("speed",)
+
+
+class TruthTable(_Sensor):
+    """[truth]"""
+
+    required = ("t",)
+    optional = ("lat", "lon", "h", "x", "y", "z", "ve", "vn", "vu", "roll", "pitch", "heading")
+
+    file: str | None = Field(None, min_length=1)  # type: ignore[assignment]
+    units: GnssUnits = GnssUnits()
+    of: Literal["imu", "gnss", "odometer"] = "imu"
+    frame: Literal["geodetic", "local"] = "geodetic"
+    closed_loop_sigma: Positive | None = Field(None, description="m, from the start to the end")
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> TruthTable:
+        if (self.file is None) == (self.closed_loop_sigma is None):
+            raise ValueError("say either file or closed_loop_sigma")
+        if self.topic:
+            raise ValueError("topic is for imu, gnss and odometer: a bag holds no truth")
+        return self
+
+
+class RecordingFile(_Section):
+    """The whole of recording.toml."""
+
+    format: Literal["graphnav-recording/1"]
+    name: str | None = None
+    platform: Literal["vehicle", "foot"]
+    clock: str | None = None  # what t = 0 is, see graphnav.core.timescales.parse_clock; only for output
+    imu: ImuTable
+    gnss: GnssTable | None = None
+    raw_gnss: RawGnssTable | None = None
+    odometer: OdometerTable | None = None
+    truth: TruthTable | None = None
+
+    @field_validator("clock")
+    @classmethod
+    def _known_clock(cls, clock: str | None) -> str | None:
+        if clock is not None:
+            parse_clock(clock, 0.0)
+        return clock
+
+    @model_validator(mode="after")
+    def _truth_of_a_sensor(self) -> RecordingFile:
+        of = self.truth.of if self.truth else "imu"
+        if getattr(self, of) is None and not (of == "gnss" and self.raw_gnss is not None):
+            raise ValueError(f"truth.of = '{of}', but there is no [{of}] table whose lever arm would apply")
+        return self
+
+
+def rotation_from_letters(axes: str) -> Array:
+    """R_bs of three letters saying where the file's x, y, z point; 'BRU': x backward, y right, z up."""
+    if len(axes) != 3 or any(letter not in _LETTERS for letter in axes):
+        raise ValueError("must be three letters out of R/L, F/B, U/D, such as RFU, FLU or FRD")
+    R_bs = np.array([_LETTERS[letter] for letter in axes], dtype=float).T
+    determinant = np.linalg.det(R_bs)
+    if abs(determinant) < 0.5:
+        raise ValueError("must use one of R/L, one of F/B and one of U/D")
+    if determinant < 0:
+        flipped = axes[:2] + {"U": "D", "D": "U", "R": "L", "L": "R", "F": "B", "B": "F"}[axes[2]]
+        raise ValueError(f"is a left-handed triple, which no sensor has; with z the other way it would be {flipped}")
+    return R_bs
+
+
+def rotation_from_vectors(forward: Sequence[float], up: Sequence[float]) -> Array:
+    """R_bs of two vectors in the file's axes: up is kept, forward is made square to it."""
+    f, u = np.asarray(forward, dtype=float), np.asarray(up, dtype=float)
+    if np.linalg.norm(f) < 1e-6 or np.linalg.norm(u) < 1e-6:
+        raise ValueError("forward and up must not be zero")
+    f, u = f / np.linalg.norm(f), u / np.linalg.norm(u)
+    square = f - (f @ u) * u
+    # Below 10 degrees apart a rough up turns forward into noise.
+    if np.linalg.norm(square) < np.sin(np.radians(10.0)):
+        raise ValueError("forward and up are nearly parallel")
+    f = square / np.linalg.norm(square)
+    return np.stack([np.cross(f, u), f, u])
+
+
+def read_description(path: Path) -> RecordingFile:
+    """Read and validate a recording's .toml.
+
+    Raises
+    ------
+    RecordingError
+        Naming the file and the key, and the nearest known key for an unknown one.
+    """
+    values, text = read_toml(path, RecordingError)
+    try:
+        description = RecordingFile.model_validate(values)
+    except ValidationError as error:
+        raise RecordingError(complaint(path, error, RecordingFile, text)) from None
+    try:
+        _ = description.imu.R_bs
+    except ValueError as error:
+        axes = description.imu.axes
+        where = "'imu': " if axes is None else f"'imu.axes' = '{axes}' "
+        raise RecordingError(f"{path}: {where}{error}") from None
+    return description

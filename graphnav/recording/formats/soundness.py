@@ -1,0 +1,70 @@
+"""What no log of another program may hold, whatever its form: rows that are no numbers, or nowhere, or at no time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.errors import RecordingError
+from graphnav.recording import Gnss, rows_of
+from graphnav.recording.formats.registry import Log
+from graphnav.recording.formats.repair import LATEST, VAGUEST, VAGUEST_V, on_earth
+
+
+def sound(log: Log, path: Path) -> Log:
+    """The log without rows that cannot be used, each kind of them said in a remark.
+
+    Raises
+    ------
+    RecordingError
+        If nothing of a sensor is left.
+    """
+    remarks = list(log.remarks)
+    imu, gnss, odometer, truth = log.imu, log.gnss, log.odometer, log.truth
+
+    def kept(what: str, good: NDArray[np.bool_], why: str) -> bool:
+        if good.all():
+            return True
+        if good.sum() < (2 if what == "IMU" else 1):
+            raise RecordingError(f"{path}: {what}: all {len(good)} rows {why}")
+        remarks.append(f"{what}: {np.sum(~good)} of {len(good)} rows {why}: left out")
+        return False
+
+    if imu is not None:
+        finite = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
+        good = finite & (np.abs(imu.t) <= LATEST)
+        if not kept("IMU", good, "are no numbers or at no time"):
+            imu = rows_of(imu, good)
+    if gnss is not None:
+        gnss = _sound_gnss(gnss, kept)
+    if odometer is not None:
+        good = np.isfinite(odometer.speed) & (np.abs(odometer.t) <= LATEST)
+        if not kept("odometer", good, "are no numbers or at no time"):
+            odometer = rows_of(odometer, good)
+    if truth is not None and truth.llh is not None:
+        good = on_earth(*truth.llh.T) & (np.abs(truth.t) <= LATEST)
+        if not kept("truth", good, "are nowhere on Earth or at no time"):
+            truth = rows_of(truth, good)
+    return replace(log, imu=imu, gnss=gnss, odometer=odometer, truth=truth, remarks=tuple(remarks))
+
+
+def _sound_gnss(gnss: Gnss, kept: Callable[[str, NDArray[np.bool_], str], bool]) -> Gnss:
+    """The fixes that are somewhere, and as sure of it as any receiver is that has a fix."""
+    there: NDArray[np.bool_] = np.asarray(on_earth(*gnss.llh.T) & (np.abs(gnss.t) <= LATEST))
+    first = gnss.llh[~there][:1]
+    at = "".join(f" (the first at {np.degrees(p[0]):.7g}, {np.degrees(p[1]):.7g} deg, {p[2]:.7g} m)" for p in first)
+    if not kept("GNSS", there, f"are nowhere on Earth or at no time{at}"):
+        gnss = rows_of(gnss, there)
+    sure: NDArray[np.bool_] = np.asarray(((gnss.sd > 0.0) & (gnss.sd <= VAGUEST)).all(axis=1))
+    if not kept("GNSS", sure, f"have a sigma that is not above 0 or beyond {VAGUEST:g} m"):
+        gnss = rows_of(gnss, sure)
+    if gnss.v is None or gnss.sd_v is None:
+        return gnss
+    with np.errstate(invalid="ignore"):
+        known = np.isfinite(gnss.v) & (np.abs(gnss.v) <= VAGUEST_V) & (gnss.sd_v > 0.0) & (gnss.sd_v <= VAGUEST_V)
+    blank = ~np.asarray(known.all(axis=1))[:, None]
+    return replace(gnss, v=np.where(blank, np.nan, gnss.v), sd_v=np.where(blank, np.nan, gnss.sd_v))

@@ -1,0 +1,282 @@
+"""CSV files of numbers, read with whole-array arithmetic and explained line by line when they fail."""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import IO, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.files import exists, open_file, parse_number
+from graphnav.core.rotation import Array
+from graphnav.recording.formats.decimals import read_decimals
+
+_BLANK = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that has cells
+
+
+Mask = Any  # an array of bool, or of row numbers
+
+
+@dataclass(frozen=True)
+class Table:
+    """The wanted columns of one file, by our names, NaN where a cell is blank."""
+
+    path: Path
+    columns: dict[str, Array]  # each (N,)
+    file_names: dict[str, str]  # our name -> the file's
+    rows: NDArray[np.intp]  # (N,) which rows of the file these are
+
+    KEEP: ClassVar[str] = "keep"  # the name under which the column of `keep` is found
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
+
+    def __getitem__(self, name: str) -> Array:
+        return self.columns[name]
+
+    def get(self, name: str, default: Array) -> Array:
+        """A column, or what stands for it."""
+        return self.columns.get(name, default)
+
+    def stack(self, *names: str) -> Array:
+        """Columns side by side, (N, len(names))."""
+        return np.stack([self.columns[n] for n in names], -1)
+
+    def take(self, mask: Mask) -> Table:
+        """The rows of a mask or an index array."""
+        return replace(self, columns={n: c[mask] for n, c in self.columns.items()}, rows=self.rows[mask])
+
+    def with_column(self, name: str, values: Array) -> Table:
+        """The table with one column replaced."""
+        return replace(self, columns={**self.columns, name: values})
+
+    def where(self, row: int, name: str) -> str:
+        """'file, line 12, column lat' for an error about one cell."""
+        for k, (number, _) in enumerate(_data_lines(self.path)):
+            if k == self.rows[row]:
+                return f"{self.path}, line {number}, column '{self.file_names[name]}'"
+        return f"{self.path}, column '{self.file_names[name]}'"
+
+
+def read_table(
+    path: Path,
+    required: Sequence[str],
+    optional: Sequence[str] = (),
+    renamed: Mapping[str, str] | None = None,
+    keep: str | None = None,
+) -> Table:
+    """Read columns of a .csv or .csv.gz by name, in any order; other columns are not looked at.
+
+    Parameters
+    ----------
+    required, optional
+        Our names. A missing optional column is simply not in the result.
+    renamed
+        Our name -> the file's name, for those that differ; what is listed must be there.
+    keep
+        The file's name of one more column, found in the result as `Table.KEEP`.
+
+    Raises
+    ------
+    RecordingError
+        Naming file, line, column and cell, for anything that is not a table of numbers.
+    """
+    renamed = dict(renamed or {})
+    skip, header = _header(path)
+    if keep is not None:
+        required, renamed = (*required, Table.KEEP), {**renamed, Table.KEEP: keep}
+    file_names = {}
+    for name in (*required, *optional):
+        theirs = renamed.get(name, name)
+        if header.count(theirs) > 1:
+            raise RecordingError(
+                f"{path}: {header.count(theirs)} columns are called '{theirs}'; give them their own names"
+            )
+        if theirs in header:
+            file_names[name] = theirs
+        elif name in required or name in renamed:
+            hint = "" if name in renamed else f'; if it has another name, say columns = {{ {name} = "..." }}'
+            raise RecordingError(f"{path}: no column '{theirs}' (there are: {_list_names(header)}){hint}")
+    use = [header.index(theirs) for theirs in file_names.values()]
+    values = _parse(path, skip, header, use)
+    if not values.shape[1]:
+        raise RecordingError(f"{path}: holds a header and no rows")
+    return Table(path, dict(zip(file_names, values, strict=True)), file_names, np.arange(values.shape[1]))
+
+
+def _list_names(header: list[str]) -> str:
+    """The names of columns, as many as people look at."""
+    names = [name[:40] for name in header[:30]]
+    return ", ".join(names if len(names) == len(header) else [*names, "..."])
+
+
+def read_header(path: Path) -> list[str]:
+    """The column names of a .csv or .csv.gz.
+
+    Raises
+    ------
+    RecordingError
+        If the file is none.
+    """
+    return _header(path)[1]
+
+
+def first_rows(path: Path, count: int) -> list[list[str]]:
+    """The cells of the first rows of a .csv or .csv.gz, as text.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read.
+    """
+    try:
+        return [[cell.strip().strip('"') for cell in line.split(",")] for _, line in islice(_data_lines(path), count)]
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: holds bytes that are not UTF-8 text; save it as UTF-8") from None
+
+
+def _open(path: Path) -> IO[str]:
+    """Text of a plain or gzip file."""
+    return io.TextIOWrapper(_open_bytes(path), encoding="utf-8-sig")
+
+
+def _open_bytes(path: Path) -> IO[bytes]:
+    if not exists(path):
+        other = path.with_suffix("") if path.suffix == ".gz" else path.with_name(path.name + ".gz")
+        hint = f"; there is {other.name}" if exists(other) else ""
+        raise RecordingError(f"{path}: no such file{hint}")
+    if path.is_dir():
+        raise RecordingError(f"{path}: is a folder where a CSV file is wanted")
+    file = open_file(path)
+    why = None
+    if not file.size:
+        why = "is empty"
+    elif file.packed != (path.suffix == ".gz"):
+        why = "is gzip-compressed; its name must end in .gz"
+        if not file.packed:
+            why = "is not gzip-compressed although its name ends in .gz"
+    if why is not None:
+        file.close()
+        raise RecordingError(f"{path}: {why}")
+    return file
+
+
+def _header(path: Path) -> tuple[int, list[str]]:
+    """How many lines come before the data, and the column names."""
+    with _open_bytes(path) as raw:
+        start = raw.read(1 << 16)
+    if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise RecordingError(f"{path}: is UTF-16 text; save it as UTF-8")
+    if b"\0" in start:
+        raise RecordingError(f"{path}: is a binary file, not a CSV table")
+    text = start.decode("utf-8-sig", errors="replace")
+    for number, line in enumerate(text.splitlines(), 1):
+        line = line.split("#")[0].strip()
+        if not line:
+            continue
+        names = [name.strip().strip('"') for name in line.split(",")]
+        if "\ufffd" in line:
+            raise RecordingError(f"{path}, line {number}: is not UTF-8 text")
+        if len(names) == 1 and (";" in line or "\t" in line):
+            mark = "a semicolon" if ";" in line else "a tab"
+            raise RecordingError(
+                f"{path}, line {number}: fields are separated by {mark}; they must be by commas, numbers written with "
+                "points"
+            )
+        if all(_is_number(name) for name in names):
+            raise RecordingError(f"{path}, line {number}: the first line must name the columns, and it holds numbers")
+        return number, names
+    raise RecordingError(f"{path}: is empty")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> Array:
+    """The wanted columns, (len(use), N): plain numbers, else as NumPy reads them, else cell by cell."""
+    try:
+        with _open_bytes(path) as raw:
+            head = b"".join(raw.readline() for _ in range(skip))
+            if len(head.splitlines()) == skip:  # else lines end in a way of their own
+                return read_decimals(raw, len(header), use)
+    except ValueError:
+        pass
+    try:
+        with _open(path) as file:
+            text = file.read()
+        values = _loadtxt(text, skip, header, use)
+    except ValueError:
+        values = _parse_cells(path, header, use)
+    return np.ascontiguousarray(values.T)
+
+
+def _loadtxt(text: str, skip: int, header: list[str], use: list[int]) -> Array:
+    # With usecols NumPy checks only that no row is too short for those.
+    for line in text.splitlines()[skip:]:
+        cells = line.partition("#")[0].strip()
+        if cells and cells.count(",") != len(header) - 1:
+            raise ValueError("rows and header differ in length")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # no rows: said by the caller
+        values = np.loadtxt(
+            io.StringIO(_BLANK.sub("nan", text)),
+            delimiter=",",
+            comments="#",
+            skiprows=skip,
+            usecols=use,
+            ndmin=2,
+            encoding="utf-8",
+        )
+    return values.reshape(-1, len(use))
+
+
+def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """(line number, text) of every line after the header that holds something."""
+    with _open(path) as file:
+        seen_header = False
+        for number, line in enumerate(file, 1):
+            line = line.split("#")[0].strip()
+            if line and seen_header:
+                yield number, line
+            seen_header = seen_header or bool(line)
+
+
+def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
+    """The slow and careful way, which says what is wrong and where."""
+    rows = []
+    try:
+        for number, line in _data_lines(path):
+            cells = [cell.strip() for cell in line.split(",")]
+            if len(cells) != len(header):
+                raise RecordingError(
+                    f"{path}, line {number}: has {len(cells)} fields where the header has {len(header)}"
+                )
+            row = []
+            for column in use:
+                cell = cells[column].strip('"')
+                try:
+                    row.append(parse_number(cell) if cell else np.nan)
+                except ValueError:
+                    raise RecordingError(
+                        f"{path}, line {number}, column '{header[column]}': '{cell[:40]}' is not a number"
+                    ) from None
+            rows.append(row)
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: is not UTF-8 text") from None
+    return np.array(rows, dtype=float).reshape(-1, len(use))

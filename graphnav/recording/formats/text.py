@@ -1,0 +1,64 @@
+"""Text files without a header that names their columns: lines, and tables of numbers with errors that name the line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.files import parse_number, read_bytes
+from graphnav.core.rotation import Array
+
+Rows = list[tuple[int, str]]  # line number in the file (from 1) and text
+
+
+def text_lines(path: Path) -> list[str]:
+    data = read_bytes(path)
+    if b"\0" in data[:4096]:
+        raise RecordingError(f"{path}: a binary file; expected text")
+    try:
+        return data.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: not a text file (it is not UTF-8)") from None
+
+
+def number_table(
+    path: Path, rows: list[tuple[int, str]], names: list[str], delimiter: str | None, wanted: set[str] | None = None
+) -> Array:
+    """Numbers (K, n) of text rows, NaN for a blank and in columns not `wanted`, which may hold words.
+
+    Errors name the line and the column.
+    """
+    lines = [line for _, line in rows]
+    use = [k for k, name in enumerate(names) if wanted is None or name in wanted]
+    whole = delimiter is None or all(line.count(delimiter) == len(names) - 1 for line in lines)
+    if delimiter == "," and whole:
+        lines = [
+            _fill(line) if ",," in line or line.rstrip()[-1:] == "," or line[:1] == "," else line for line in lines
+        ]
+    try:
+        if whole:
+            loaded = np.loadtxt(lines, delimiter=delimiter, ndmin=2, comments=None, usecols=use if wanted else None)
+            if loaded.shape[1] == len(use):
+                table = np.full((len(rows), len(names)), np.nan)
+                table[:, use] = loaded
+                return table
+    except ValueError:
+        pass
+    for number, line in rows:  # only to say where; the fast reader does not
+        fields = line.split(delimiter)
+        if len(fields) != len(names):
+            raise RecordingError(f"{path}, line {number}: {len(fields)} fields where {len(names)} were expected")
+        for k in use:
+            try:
+                parse_number(fields[k].strip() or "nan")
+            except ValueError:
+                raise RecordingError(
+                    f"{path}, line {number}, {names[k]}: '{fields[k].strip()[:40]}' is not a number"
+                ) from None
+    raise RecordingError(f"{path}: cannot be read as a table of numbers")
+
+
+def _fill(line: str) -> str:
+    return ",".join(field.strip() or "nan" for field in line.split(","))

@@ -1,0 +1,254 @@
+"""Trajectory files, ours and other programs', read into a `Trajectory`; the kind is seen from the content.
+
+=================  ====================================================================================
+graphnav CSV       a header line with t, lat, lon, h (deg, m) or x, y[, z] (m, a local frame), and any of
+                   ve vn vu, roll pitch heading, sd_e ... sd_heading, bgx ... baz; a unit may be part of a
+                   name (t_s, lat_deg, h_m, ve_mps); vd is turned into vu
+KF-GINS .nav       11 columns: GNSS week, seconds of week, lat, lon (deg), height (m), velocity north, east,
+                   down (m/s), roll, pitch, yaw (deg) of a forward-right-down body to north-east-down in ZYX
+                   order (the project's README, section 2), which are our roll, pitch and heading
+TUM                8 columns: t x y z qx qy qz qw, a local frame
+RTKLIB .pos        header lines with %, then date and time (or week and seconds), lat, lon, height, Q, ns,
+                   sdn, sde, sdu, ... (written by outsolheads and outsols of RTKLIB 2.4.3, solution.c)
+=================  ====================================================================================
+
+Files with a GNSS week give t in seconds of the week of their first row, running on past its end.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
+from graphnav.recording.formats.repair import LATEST
+from graphnav.recording.formats.text import number_table, text_lines
+
+WEEK = 604800.0  # s
+_DEG = np.pi / 180.0
+_UNITS = {"t": "s", "lat": "deg", "lon": "deg", "h": "m", "x": "m", "y": "m", "z": "m"} | dict.fromkeys(
+    ("ve", "vn", "vu", "vd"), "mps"
+)
+_UNITS |= dict.fromkeys(("roll", "pitch", "heading"), "deg")
+_SIGMAS = "sd_e sd_n sd_u sd_ve sd_vn sd_vu sd_roll sd_pitch sd_heading"
+_KNOWN = {*_UNITS, *_SIGMAS.split(), *["bgx", "bgy", "bgz", "bax", "bay", "baz"]}  # read; others may hold anything
+_GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
+
+
+def read_trajectory(path: str | Path) -> Trajectory:
+    """Read a trajectory file of any kind in the table above, gzipped or not.
+
+    Raises
+    ------
+    RecordingError
+        Naming the file, and the line and field where there is one, if it cannot be read as it is.
+    """
+    path = Path(path)
+    lines = text_lines(path)
+    numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
+    rows = [(number, line) for number, line in numbered if line.lstrip()[0] not in "#%"]
+    if not rows:
+        raise RecordingError(f"{path}: no rows in it; a trajectory file needs at least one")
+    first = rows[0][1]
+    if any(line.lstrip().startswith("%") for _, line in numbered[:100]):
+        return _rtklib(path, [line for _, line in numbered if line.lstrip().startswith("%")], rows)
+    if re.match(r"\s*\d{4}/\d\d/\d\d[\s,]", first):
+        raise RecordingError(f"{path}: an RTKLIB solution without its header; write it again with out-outhead=on")
+    if re.search(r"[A-Za-z_]{1,}", re.sub(r"(?i)\bnan\b|\d[eE][-+]?\d", "", first)):
+        return _csv(path, rows)
+    width = len(first.split())
+    if width == 11:
+        return _kf_gins(path, rows)
+    if width == 8:
+        return _tum(path, rows)
+    raise RecordingError(
+        f"{path}, line {rows[0][0]}: {width} columns without a header; expected a CSV header with t, lat, lon, h, "
+        "11 columns (KF-GINS .nav), 8 columns (TUM) or an RTKLIB .pos"
+    )
+
+
+def _build(
+    path: Path,
+    rows: list[tuple[int, str]],
+    t: Array,
+    position: Array,
+    notes: list[str],
+    local: bool = False,
+    **optional: Array | None,
+) -> Trajectory:
+    """Check time and position, leave out what cannot be used, and say so."""
+    numbers = np.array([number for number, _ in rows])
+    if (bad := ~(np.abs(t) <= LATEST)).any():
+        raise RecordingError(f"{path}, line {numbers[bad][0]}, t: {t[bad][0]:g} is no time in s")
+    if (bad := np.diff(t) < 0).any():
+        k = int(np.flatnonzero(bad)[0])
+        raise RecordingError(
+            f"{path}, line {numbers[k + 1]}, t: {t[k + 1]:.6f} comes after {t[k]:.6f}; sort the rows by time"
+        )
+    if not local:
+        limits = np.array([90.0 * _DEG, 360.0 * _DEG])
+        if (bad := np.abs(position[:, :2]) > limits * (1 + 1e-12)).any():
+            k, axis = (int(i) for i in np.argwhere(bad)[0])
+            raise RecordingError(
+                f"{path}, line {numbers[k]}, {('lat', 'lon')[axis]}: {position[k, axis] / _DEG:.6f} deg is out of range"
+            )
+    if np.isinf(position).any():
+        k = int(np.flatnonzero(np.isinf(position).any(axis=1))[0])
+        raise RecordingError(f"{path}, line {numbers[k]}: a position that is infinite")
+    usable = np.isfinite(position[:, :2]).all(1) if local else np.isfinite(position).all(1)
+    fresh = np.concatenate([[True], np.diff(t) > 0])
+    if not usable.all():
+        notes.append(f"{path.name}: {np.sum(~usable)} rows without a position left out")
+    if not fresh.all():
+        notes.append(f"{path.name}: {np.sum(~fresh)} rows that repeat the time of the row before left out")
+    keep = usable & fresh
+    if not keep.any():
+        raise RecordingError(f"{path}: no row has a position")
+    present = {
+        key: value[keep] for key, value in optional.items() if value is not None and not np.isnan(value[keep]).all()
+    }
+    return Trajectory(
+        t=t[keep],
+        llh=position[keep],
+        frame="local" if local else "geodetic",
+        name=path.stem,
+        notes=tuple(notes),
+        **present,
+    )
+
+
+def _csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
+    names = [field.strip().strip('"') for field in rows[0][1].split(",")]
+    rows = rows[1:]
+    if not rows:
+        raise RecordingError(f"{path}: a header and no rows")
+    # A unit that is ours may be part of the name; any other is left as it is and so not found.
+    columns = {(base if _UNITS.get(base := name.rpartition("_")[0]) == name.rpartition("_")[2] else name): k
+               for k, name in enumerate(names)}  # fmt: skip
+    local = "lat" not in columns and {"x", "y"} <= columns.keys()
+    needed = ("t", "x", "y") if local else ("t", "lat", "lon", "h")
+    if missing := [name for name in needed if name not in columns]:
+        raise RecordingError(f"{path}, line 1: no column '{missing[0]}'; found {', '.join(names)[:300]}")
+    wanted = {names[k] for name, k in columns.items() if name in _KNOWN}
+    table = number_table(path, rows, names, ",", wanted)
+
+    def take(*wanted: str, scale: float = 1.0) -> Array | None:
+        if not any(name in columns for name in wanted):
+            return None
+        missing = np.full(len(table), np.nan)
+        return scale * np.column_stack([table[:, columns[n]] if n in columns else missing for n in wanted])
+
+    v = take("ve", "vn", "vu")
+    if v is not None and "vu" not in columns and "vd" in columns:
+        v[:, 2] = -table[:, columns["vd"]]
+    position = take("x", "y", "z") if local else take("lat", "lon", "h")
+    assert position is not None
+    if not local:
+        position[:, :2] *= _DEG
+    return _build(
+        path, rows, table[:, columns["t"]], position, [],
+        v=v, rph=take("roll", "pitch", "heading", scale=_DEG), sd_p=take("sd_e", "sd_n", "sd_u"),
+        sd_v=take("sd_ve", "sd_vn", "sd_vu"), sd_rph=take("sd_roll", "sd_pitch", "sd_heading", scale=_DEG),
+        gyro_bias=take("bgx", "bgy", "bgz"), accel_bias=take("bax", "bay", "baz"),
+        local=local,
+    )  # fmt: skip
+
+
+def _kf_gins(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
+    names = ["week", "sow", "lat", "lon", "h", "vn", "ve", "vd", "roll", "pitch", "yaw"]
+    table = number_table(path, rows, names, None)
+    t = table[:, 1] + WEEK * (table[:, 0] - table[0, 0])  # KF-GINS itself writes week 0
+    position = np.column_stack([table[:, 2:4] * _DEG, table[:, 4]])
+    v = np.column_stack([table[:, 6], table[:, 5], -table[:, 7]])
+    return _build(path, rows, t, position, [], v=v, rph=table[:, 8:11] * _DEG)
+
+
+def _tum(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
+    names = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
+    table = number_table(path, rows, names, None)
+    norm = np.linalg.norm(table[:, 4:8], axis=1)
+    if (bad := ~(np.abs(norm - 1.0) <= 1e-2)).any():
+        k = int(np.flatnonzero(bad)[0])
+        raise RecordingError(
+            f"{path}, line {rows[k][0]}, qx qy qz qw: a norm of {norm[k]:.4f}; expected a unit quaternion"
+        )
+    rph = rotation.to_rph(rotation.from_quaternion(table[:, [7, 4, 5, 6]]))
+    return _build(path, rows, table[:, 0], table[:, 1:4], [], rph=rph, local=True)
+
+
+def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Trajectory:
+    titles = next((line for line in reversed(head) if re.search(r"\bQ\b.*\bns\b", line) and "=" not in line), None)
+    if titles is None:
+        raise RecordingError(f"{path}: no RTKLIB line '%  GPST  latitude(deg) ...' that names the columns")
+    if "baseline" in titles:
+        raise RecordingError(
+            f"{path}: an RTKLIB solution as east-north-up baseline to a base station whose place the columns do not "
+            "give; write it again with out-solformat=llh"
+        )
+    if "latitude(d'" in titles:
+        raise RecordingError(f"{path}: latitude in degrees, minutes, seconds; write it again with out-degform=deg")
+    if "latitude(deg)" not in titles:
+        raise RecordingError(
+            f"{path}: an RTKLIB solution not in lat/lon/height degrees; write it again with out-solformat=llh"
+        )
+    scale_name = re.split(r"[\s,]+", titles.strip().lstrip("% "))[0]
+    separator = "," if "," in rows[0][1] else None
+    columns = re.findall(r"[A-Za-z]+(?=\(|\s|$|,)", titles.strip().lstrip("%"))[1:]
+    names = ["date", "time", *columns]
+    notes = []
+    if scale_name != "GPST":
+        notes.append(f"{path.name}: times are in {scale_name}, not GPS time (18 s ahead of UTC since 2017)")
+    if any("lat/lon/height=Tokyo" in line for line in head):
+        raise RecordingError(f"{path}: coordinates on the Tokyo datum; write it again with out-datum=wgs84")
+    if any("lat/lon/height=WGS84/geodetic" in line for line in head):
+        notes.append(f"{path.name}: heights are above mean sea level, not above the ellipsoid")
+    dated = "/" in rows[0][1].split(separator)[0]
+    t, numeric = _rtklib_times(path, rows, separator) if dated else (None, rows)
+    table = number_table(path, numeric, names, separator)
+    if t is None:
+        t = table[:, 1] + WEEK * (table[:, 0] - table[0, 0])
+    at = {name: k for k, name in enumerate(names)}
+
+    def take(*wanted: str) -> Array | None:
+        return table[:, [at[n] for n in wanted]] if all(n in at for n in wanted) else None
+
+    position = take("latitude", "longitude", "height")
+    if position is None:
+        raise RecordingError(f"{path}: the RTKLIB header does not name latitude, longitude and height")
+    position = position * np.array([_DEG, _DEG, 1.0])
+    return _build(
+        path, rows, t, position, notes,
+        sd_p=take("sde", "sdn", "sdu"), v=take("ve", "vn", "vu"), sd_v=take("sdve", "sdvn", "sdvu"),
+        fix_type=None if "Q" not in at else table[:, at["Q"]],
+    )  # fmt: skip
+
+
+def _rtklib_times(
+    path: Path, rows: list[tuple[int, str]], separator: str | None
+) -> tuple[Array, list[tuple[int, str]]]:
+    """Seconds of the week from date and time, and the rows with both taken out so that they are numbers."""
+    joint = separator or " "
+    stamps, rest = [], []
+    for number, line in rows:
+        date, _, tail = line.strip().partition(" ")  # a space whatever the separator of the columns
+        clock, _, tail = tail.strip().partition(joint)
+        stamps.append(f"{date.replace('/', '-')}T{clock.strip()}")
+        rest.append((number, f"0{joint}0{joint}{tail}"))
+    try:
+        when = np.array(stamps, dtype="datetime64[us]")
+    except ValueError:
+        for (number, _), stamp in zip(rows, stamps, strict=True):
+            try:
+                np.datetime64(stamp, "us")
+            except ValueError:
+                raise RecordingError(
+                    f"{path}, line {number}: '{stamp.replace('T', ' ')[:60]}' is not a date and time"
+                ) from None
+        raise
+    seconds = (when - _GPS_EPOCH) / np.timedelta64(1, "us") * 1e-6
+    return seconds - WEEK * np.floor(seconds[0] / WEEK), rest

@@ -1,0 +1,65 @@
+"""What a made recording keeps of its digits, and the facts beside it; `graphnav.recording.formats.writer` writes the folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.recording import Recording
+from graphnav.recording.formats.schema import ANGLE
+from graphnav.recording.formats.writer import write_folder
+
+__all__ = ["rounded", "write_facts", "write_folder"]
+
+# digits after the point, each far below what any sensor resolves
+_T, _RATE, _FORCE, _LAT_LON, _M, _M_S, _DEG = 6, 9, 7, 10, 4, 5, 7
+
+
+def rounded(recording: Recording) -> Recording:
+    """The recording with the digits that a file of it should have: what is written is what is read again."""
+    imu = recording.imu
+    imu = replace(imu, t=_cut(imu.t, _T), gyro=_cut(imu.gyro, _RATE), accel=_cut(imu.accel, _FORCE))
+    gnss, odometer, truth = recording.gnss, recording.odometer, recording.truth
+    if gnss is not None:
+        v, sd_v = gnss.v, gnss.sd_v
+        gnss = replace(
+            gnss, t=_cut(gnss.t, _T), llh=_cut_llh(gnss.llh), sd=_cut(gnss.sd, _M),
+            v=None if v is None else _cut(v, _M_S), sd_v=None if sd_v is None else _cut(sd_v, _M_S),
+        )  # fmt: skip
+    if odometer is not None:
+        wheels = None if odometer.wheels is None else _cut(odometer.wheels, _M_S)
+        odometer = replace(odometer, t=_cut(odometer.t, _T), speed=_cut(odometer.speed, _M_S), wheels=wheels)
+    if truth is not None and truth.llh is not None:
+        v, rph = truth.v, truth.rph
+        truth = replace(
+            truth, t=_cut(truth.t, _T), llh=_cut_llh(truth.llh), v=None if v is None else _cut(v, _M_S),
+            rph=None if rph is None else _degrees(rph) * ANGLE["deg"],
+        )  # fmt: skip
+    return replace(recording, imu=imu, gnss=gnss, odometer=odometer, truth=truth)
+
+
+def _cut(values: Array, digits: int) -> Array:
+    return np.round(values, digits)
+
+
+def _cut_llh(llh: Array) -> Array:
+    return np.column_stack([np.round(llh[:, :2] / ANGLE["deg"], _LAT_LON) * ANGLE["deg"], np.round(llh[:, 2], _M)])
+
+
+def _degrees(rph: Array) -> Array:
+    """Roll and pitch as they are, heading from 0 to below 360."""
+    degrees = _cut(rph / ANGLE["deg"], _DEG)
+    degrees[:, 2] = _cut(np.mod(degrees[:, 2], 360.0), _DEG) % 360.0
+    return degrees
+
+
+def write_facts(path: Path, facts: Mapping[str, Any]) -> Path:
+    """What is known of a recording and no sensor says, as JSON beside it."""
+    path.write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    return path

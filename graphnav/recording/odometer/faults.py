@@ -1,0 +1,315 @@
+"""Where an odometer does not say what the wheels do: unplugged, stuck at zero, frozen, wild.
+
+Speed read, less the forward force integrated, is almost a constant while an odometer is right: what is left are the
+slope of the road and biases, which change slowly, and of the slope the gyro knows the changes::
+
+    x(t) = v(t) - integral of (f_y - g pitch - c) dt       pitch: integral of the pitch rate
+                                                           c: median of what is missing, within half a minute
+
+So x may not change within a short time by more than the error of two readings and what is not known of the force.
+Where it does, something is wrong (a *break*); which side of it is wrong is told by what comes before and after:
+readings that stay the same are stuck, and a short stretch between others that agree is wild. Without a usable IMU
+there is what tyres can grip.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from graphnav.core.findings import period_of, runs_of
+from graphnav.core.rotation import Array
+from graphnav.recording import Imu, Odometer
+from graphnav.recording.odometer.mean import Figures, gaps
+
+GAP, STUCK, FROZEN, WILD = "no readings", "stuck at zero", "frozen", "against the motion"
+
+_G = 9.81  # m/s^2
+_GRIP = 1.2 * _G  # m/s^2, more than tyres transmit on any road
+_SLOPE = 0.05 * _G  # m/s^2, what may be unknown of the force: 3 degrees of pitch
+_LAG_ERROR = 0.5  # s, shorter windows are not better known: the delay is known to some hundredths only
+_RADIUS = 0.05  # of the speed: scale, and tyres on bumps
+_DEAF = 1.0  # m/s, below which passive sensors do not see a wheel turn (ABS: about 3 km/h)
+_BACKWARD = 6.0  # m/s, the fastest that anyone reverses
+_WINDOWS = (0.0, 0.5, 1.0, 2.0, 4.0)  # s over which x is compared; 0: neighbours
+_USUAL = 6.0  # times the 90th percentile of the drive itself: an IMU or axes that are worse than thought
+_LATEST = 1.5  # s an odometer may be late (or a third of it early)
+_ALIKE = 0.05  # m/s in a second, on average: as good as no change
+_STAYS = 0.5  # s of equal readings (five at least) that may be stuck
+_LONGER = 5.0  # times what all but one in a hundred readings are repeated
+_SPIKE = 1.0  # s
+_ISLAND = 10.0  # s that can be bridged with the IMU
+_TURN = 0.05  # rad/s for a second: nothing that stands turns like that
+_SHAKEN = 5  # s in a row that shake as in motion
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Spans that are not to be used, in order, and why."""
+
+    spans: Array  # (M, 2) s, [first bad reading, next good one)
+    reasons: tuple[str, ...]
+    lag: float | None = None  # s by which the odometer is late, as far as the IMU can tell
+
+
+def faults(
+    odometer: Odometer, imu: Imu | None = None, figures: Figures | None = None, lag: float | None = None
+) -> Faults:
+    """Where readings are missing or wrong; see the module's head. Times are those of the odometer's own stamps.
+
+    `figures` and `lag` (s) are what is known of the odometer already.
+    """
+    figures = figures or Figures.of(odometer)
+    found = [(a, b, GAP) for a, b in gaps(odometer.t, figures.longest)]
+    if len(odometer.t) >= 10:
+        motion = _motion(odometer, imu, lag) if imu is not None and len(imu.t) > 10 else None
+        found += _wrong(odometer, imu, motion, figures)
+        lag = lag if motion is None else motion.lag
+    found.sort()
+    return Faults(np.array([f[:2] for f in found], dtype=float).reshape(-1, 2), tuple(f[2] for f in found), lag)
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """What the IMU knows at the odometer's times."""
+
+    force: Array  # (M,) m/s, forward force integrated, slope and bias taken off
+    known: NDArray[np.bool_]  # (M,)
+    lag: float  # s by which the odometer is late
+
+
+def _ahead_up(imu: Imu) -> tuple[Array, Array]:
+    """Forward square to up, and up as gravity has it, in body axes."""
+    up = np.median(imu.accel, axis=0)
+    size = np.linalg.norm(up)
+    up = up / size if size > 0.5 * _G else np.array([0.0, 0.0, 1.0])
+    ahead = np.array([0.0, 1.0, 0.0]) - up[1] * up
+    return ahead / max(float(np.linalg.norm(ahead)), 1e-9), up
+
+
+def _motion(odometer: Odometer, imu: Imu, known: float | None) -> _Motion | None:
+    t, speed = odometer.t, odometer.speed
+    dt = np.diff(imu.t, prepend=2 * imu.t[0] - imu.t[1])
+    ahead, up = _ahead_up(imu)
+    right = np.cross(ahead, up)
+    pitch = np.cumsum((imu.gyro @ right - np.median(imu.gyro @ right)) * dt)
+    force = imu.accel @ ahead - _G * pitch
+    gained = np.cumsum(force * dt)
+    begin, end = max(t[0], imu.t[0] + _LATEST), min(t[-1], imu.t[-1] - _LATEST)
+    seconds = np.arange(begin, end - 1.0)
+    if len(seconds) < 10:
+        return None
+    change = np.interp(seconds + 1.0, t, speed) - np.interp(seconds, t, speed)
+
+    def missing(lag: float) -> tuple[Array, Array]:
+        gain = np.interp(seconds + 1.0 - lag, imu.t, gained) - np.interp(seconds - lag, imu.t, gained)
+        off = change - gain
+        return off, median_filter(off, size=min(31, len(off) // 2 * 2 - 1), mode="nearest")
+
+    def size(off: Array) -> float:
+        return float(np.mean(np.minimum(np.abs(off), 1.0)))  # what is wrong has no more say than 1 m/s
+
+    lags = np.arange(-_LATEST / 3.0, _LATEST + 0.01, 0.05) if known is None else np.array([known])
+    misfits = [size(np.subtract(*missing(lag))) for lag in lags]
+    lag, left = float(lags[int(np.argmin(misfits))]), min(misfits)
+    # clocks far apart, wrong axes: the force explains nothing of the changes of speed
+    if left > max(0.5 * size(change), _ALIKE) and size(change) > _ALIKE:
+        return None
+    slow = missing(lag)[1]
+    # the sum of c, at the middles of the seconds; beyond them it goes on as it was
+    at = t - lag
+    ends = np.r_[min(at[0], seconds[0]) - 1.0 - lag, seconds + 0.5 - lag, max(at[-1], seconds[-1]) + 2.0]
+    c = np.r_[slow[0], slow, slow[-1]]
+    drift = np.r_[0.0, np.cumsum(0.5 * (c[1:] + c[:-1]) * np.diff(ends))]
+    holes = np.r_[0, np.cumsum(dt > 5.0 * np.median(dt))]
+    hole = holes[np.clip(np.searchsorted(imu.t, at), 0, len(imu.t))]
+    inside = (at >= imu.t[0]) & (at <= imu.t[-1])
+    # a different number of holes before two readings: the force between them is not known. A step no speed makes
+    return _Motion(np.interp(at, imu.t, gained) + np.interp(at, ends, drift) + 1e6 * hole, inside, lag)
+
+
+def _breaks(odometer: Odometer, motion: _Motion | None, figures: Figures) -> list[tuple[int, int]]:
+    """Pairs of readings between which x changes by more than it can, the closest pairs that show it, in order."""
+    t, v = odometer.t, odometer.speed
+    error = figures.step + 6.0 * figures.sigma
+    period = period_of(t)
+    part = np.r_[0, np.cumsum(np.diff(t) > figures.longest)]
+    found: list[tuple[int, int]] = []
+    for window in _WINDOWS:
+        i = np.arange(len(t) - 1)
+        j = np.maximum(np.searchsorted(t, t[i] + window - 1e-9), i + 1)
+        i, j = i[j < len(t)], j[j < len(t)]
+        i, j = i[part[i] == part[j]], j[part[i] == part[j]]
+        dt = t[j] - t[i]
+        fast = np.maximum(np.abs(v[i]), np.abs(v[j]))
+        allowed = error + _RADIUS * fast + np.where((v[i] == 0.0) | (v[j] == 0.0), _DEAF, 0.0)
+        off = np.abs(v[j] - v[i])
+        bad = off > allowed + _GRIP * (dt + period)
+        if motion is not None:
+            gained = motion.force[j] - motion.force[i]
+            known = motion.known[i] & motion.known[j] & (np.abs(gained) < 1e5)
+            off = np.abs(v[j] - v[i] - gained)
+            if not odometer.signed:  # what is read may be backward before or after
+                other = [np.abs(a * v[j] - b * v[i] - gained) for a, b in ((-1, -1), (1, -1), (-1, 1))]
+                off = np.where(fast < _BACKWARD, np.minimum(off, np.min(other, axis=0)), off)
+            if known.any():
+                moved = known & (fast > 0.0)
+                usual = _USUAL * float(np.percentile(off[moved], 90.0)) if moved.any() else 0.0
+                limit = np.maximum(allowed + _SLOPE * np.maximum(dt, _LAG_ERROR), usual)
+                bad |= known & (off > limit)
+        found += _closest(i[bad], j[bad], found)
+    return sorted(found)
+
+
+def _closest(i: NDArray[np.intp], j: NDArray[np.intp], found: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """What windows [i, j] that overlap have in common (or cover), without those that show a break found already."""
+    out: list[tuple[int, int]] = []
+    if found:
+        begins, ends = np.array(found).T
+        new = ~((i[:, None] < ends) & (j[:, None] > begins)).any(axis=1)
+        i, j = i[new], j[new]
+    if not len(i):
+        return out
+    for part in np.split(np.arange(len(i)), np.flatnonzero(i[1:] >= j[:-1]) + 1):
+        first, last = (int(i[part].max()), int(j[part].min()))
+        out.append((first, last) if first < last else (int(i[part].min()), int(j[part].max())))
+    return out
+
+
+def _wrong(
+    odometer: Odometer, imu: Imu | None, motion: _Motion | None, figures: Figures
+) -> list[tuple[float, float, str]]:
+    t, v = odometer.t, odometer.speed
+    breaks = _breaks(odometer, motion, figures)
+    equal = [(a - 1, b - 1) for a, b in runs_of(np.r_[False, v[1:] == v[:-1]])]  # first and last of equal readings
+    stays = [(a, b) for a, b in equal if b - a >= 4 and t[b] - t[a] >= _STAYS]
+    bad: list[tuple[int, int, str]] = []  # first bad reading, first good one
+    bad += _islands(t, v, motion, breaks, stays, _SPIKE)
+    bad += _stuck(t, v, motion, breaks, stays)
+    bad += _noiseless(v, figures, equal, stays)
+    if motion is not None and imu is not None:
+        bad += _moves(odometer, imu, motion.lag, stays)
+    bad += _islands(t, v, motion, breaks, stays, _ISLAND)
+    bad += [(k + 1, max(m, k + 2), WILD) for k, m in breaks]  # nobody knows which side is right
+    return _merged(t, bad)
+
+
+def _agree(t: Array, v: Array, motion: _Motion | None, i: int, j: int) -> bool:
+    """Whether the motion can have led from one reading to another."""
+    apart = t[j] - t[i]
+    gained = 0.0 if motion is None else motion.force[j] - motion.force[i]
+    if motion is None or abs(gained) > 1e5:
+        return bool(abs(v[j] - v[i]) <= _GRIP * apart)
+    return bool(abs(v[j] - v[i] - gained) <= _SLOPE * max(apart, _LAG_ERROR) + _RADIUS * max(v[i], v[j]) + 1e-9)
+
+
+def _islands(
+    t: Array,
+    v: Array,
+    motion: _Motion | None,
+    breaks: list[tuple[int, int]],
+    stays: list[tuple[int, int]],
+    longest: float,
+) -> list[tuple[int, int, str]]:
+    """What lies between two breaks, where what is before and after agrees; the breaks are taken off the list."""
+    out, k = [], 0
+    while k + 1 < len(breaks):
+        (before, begin), (end, after) = breaks[k], breaks[k + 1]
+        if t[after] - t[before] <= longest and _agree(t, v, motion, before, after):
+            still = any(a <= begin and end <= b for a, b in stays)
+            out.append((before + 1, after, WILD if not still else STUCK if v[begin] == 0.0 else FROZEN))
+            del breaks[k : k + 2]
+        else:
+            k += 1
+    return out
+
+
+def _stuck(
+    t: Array, v: Array, motion: _Motion | None, breaks: list[tuple[int, int]], stays: list[tuple[int, int]]
+) -> list[tuple[int, int, str]]:
+    """Equal readings with a break at either end or within; the breaks are taken off the list."""
+    out = []
+    for a, b in stays:
+        mine = [(i, j) for i, j in breaks if i <= b and j >= a]
+        # a break at the end alone: what comes then is wild, if the motion cannot have led there from the first of them
+        if not mine or (mine[0][0] >= b and not _agree(t, v, motion, a, mine[-1][1])):
+            continue
+        for one in mine:
+            breaks.remove(one)
+        first, last = mine[0][0], max(j for _, j in mine)
+        begin = a + (v[a] != 0.0)
+        if first < a:
+            begin = first + 1
+        elif v[a] == 0.0 and mine[0][1] <= b:  # where it stood before it was stuck, its zeros were true
+            begin = 1 + (first if motion is None else _pulled_away(t, motion.force, a, first))
+        out.append((begin, max(last, b + 1), STUCK if v[a] == 0.0 else FROZEN))
+    return out
+
+
+def _noiseless(
+    v: Array, figures: Figures, equal: list[tuple[int, int]], stays: list[tuple[int, int]]
+) -> list[tuple[int, int, str]]:
+    """Readings that stay the same while moving, of a sensor whose noise is above its step: it never is so still."""
+    if figures.sigma < 2.0 * figures.step:
+        return []
+    repeats = np.array([b - a for a, b in equal if v[a] != 0.0])
+    single: int = max(int((v != 0.0).sum()) - int(np.sum(repeats + 1)), 0)
+    usual = np.percentile(np.r_[repeats, np.zeros(single)], 99.0) if len(repeats) + single > 0 else 0.0
+    return [(a + 1, b + 1, FROZEN) for a, b in stays if v[a] != 0.0 and b - a > _LONGER * (usual + 1.0)]
+
+
+def _pulled_away(t: Array, force: Array, earliest: int, k: int) -> int:
+    """The reading at which what moves at k began to move: back while the force of the second before says so."""
+    while k > earliest:
+        before = max(int(np.searchsorted(t, t[k] - 1.0)), earliest)
+        if abs(force[k] - force[before]) <= _SLOPE * (t[k] - t[before]):
+            break
+        k -= 1
+    return k
+
+
+def _moves(odometer: Odometer, imu: Imu, lag: float, stays: list[tuple[int, int]]) -> list[tuple[int, int, str]]:
+    """Zeros while the vehicle turns, or shakes as it does when it moves."""
+    t, v = odometer.t, odometer.speed
+    up = _ahead_up(imu)[1]
+    n = max(2, round(1.0 / period_of(imu.t)))
+    count = len(imu.t) // n
+    gyro, accel = (x[: count * n].reshape(count, n, 3) for x in (imu.gyro, imu.accel))
+    second = imu.t[: count * n].reshape(count, n)[:, [0, -1]]
+    read = np.interp(second.mean(axis=1) + lag, t, np.abs(v))
+    rest, fast = read == 0.0, read > 3.0
+    if not rest.any():
+        return []
+    turn = np.abs((gyro.mean(axis=1) - np.median(gyro[rest].mean(axis=1), axis=0)) @ up) > _TURN
+    shaken = np.zeros(count, dtype=bool)
+    if fast.sum() >= 20:
+        shakes = [np.linalg.norm(x.std(axis=1), axis=-1) for x in (gyro, accel)]
+        like = np.all([x > np.median(x[fast]) for x in shakes], axis=0) & rest
+        for a, b in runs_of(like):
+            shaken[a:b] = b - a >= _SHAKEN
+    out = []
+    for a, b in stays:
+        if v[a] != 0.0:
+            continue
+        # a second that begins or ends a stop may be seen by a sensor that is deaf to slow wheels
+        inside = (second[:, 0] + lag > t[a] + 1.0) & (second[:, 1] + lag < t[b] - 1.0)
+        shows = np.flatnonzero(inside & (turn | shaken))
+        if len(shows):
+            out.append((int(np.searchsorted(t, second[shows[0], 0] + lag)), b + 1, STUCK))
+    return out
+
+
+def _merged(t: Array, bad: list[tuple[int, int, str]]) -> list[tuple[float, float, str]]:
+    """As times, with what overlaps in one; the reason is that of the longest part."""
+    out: list[tuple[int, int, str, int]] = []
+    for begin, end, reason in sorted(bad):
+        if out and begin < out[-1][1]:
+            first, last, why, size = out[-1]
+            out[-1] = (first, max(last, end), *((reason, end - begin) if end - begin > size else (why, size)))
+        else:
+            out.append((begin, end, reason, end - begin))
+    beyond = t[-1] + period_of(t)
+    return [(float(t[a]), float(t[b]) if b < len(t) else beyond, why) for a, b, why, _ in out]

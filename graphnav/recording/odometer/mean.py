@@ -1,0 +1,229 @@
+"""What an odometer's readings are worth: their step, their noise, and the mean speed over any window.
+
+A window's mean is the way covered in it over its length, so every reading of a fast odometer counts; the way is
+what was counted, or the integral of the speed read, straight between the readings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.findings import period_of
+from graphnav.core.rotation import Array
+from graphnav.recording import Odometer
+
+Spans = Array  # (M, 2) s, [first bad reading, next good one)
+
+_FINEST = 1e-7  # m/s, differences below are the rounding of floating point
+_MAD = 1.4826  # sigma over the median size of a normal variable
+_STEP = np.sqrt(1.0 / 12.0)  # 1-sigma of a rounding error, in steps
+
+
+def quantum(speed: Array) -> float:
+    """The step of which readings differ by whole multiples, m/s; 0 where there is none.
+
+    Differences of neighbouring readings are asked, not the readings: a step of 1 % of a percent is still told from
+    the next there, and an offset does no harm.
+    """
+    size = np.abs(np.diff(speed))
+    size = size[np.isfinite(size) & (size > _FINEST)]
+    if len(size) < 10:
+        return 0.0
+    # the coarsest that explains them: below it there may be the digits of a file, or a unit converted
+    for share in (50.0, 25.0, 10.0, 5.0, 1.0):
+        for parts in (1, 2, 3):  # the smallest seen may be two or three steps
+            step = float(np.percentile(size, share)) / parts
+            few = size[size < 20.5 * step]
+            for _ in range(3):  # sums over many steps tell one of them better than one does
+                count = np.round(few / step)
+                if not count.any():
+                    break
+                step = float(count @ few / (count @ count))
+            # without a step the remainders are spread evenly, three in ten below 0.15
+            if (np.abs(few / step - np.round(few / step)) < 0.15).mean() > 0.95 and len(few) >= 10:
+                return step
+    return 0.0
+
+
+def reading_sigma(odometer: Odometer, step: float | None = None) -> float:
+    """1-sigma of one reading by its own figures, m/s: as stated, else its scatter, at least that of its step.
+
+    The scatter is that of third differences while moving, which leave nothing of a motion that is smooth over four
+    readings: the variance of a third difference is 20 times that of a reading. `step` is the quantum, if known.
+    """
+    if odometer.speed_sigma is not None:
+        return odometer.speed_sigma
+    t, speed = odometer.t, odometer.speed
+    rounding = _STEP * (quantum(speed) if step is None else step)
+    if len(t) < 10:
+        return rounding
+    steps = np.diff(t)
+    even = np.lib.stride_tricks.sliding_window_view(steps < 2.5 * period_of(t), 3).all(axis=1)
+    moving = (np.lib.stride_tricks.sliding_window_view(speed, 4) != 0.0).all(axis=1)
+    third = np.abs(np.diff(speed, 3))[even & moving]
+    scatter = _MAD * float(np.median(third)) / np.sqrt(20.0) if len(third) >= 10 else 0.0
+    return max(scatter, rounding)
+
+
+def counts(odometer: Odometer, step: float | None = None) -> float:
+    """Metres per pulse where the speeds are pulses counted from row to row, else 0.
+
+    The rounding errors of such readings telescope: the mean of n of them is wrong by 1/n of what one is wrong by, and
+    by 1/sqrt(n) were they new with every reading. Third differences tell, as in `reading_sigma`.
+    """
+    t, speed = odometer.t, odometer.speed
+    step = quantum(speed) if step is None else step
+    if odometer.way is not None or step == 0.0:
+        return odometer.pulse
+    even = np.r_[True, np.diff(t) < 1.5 * period_of(t)] & (speed != 0.0)
+
+    def scatter(n: int) -> float:
+        rows = len(t) // n * n
+        whole = np.lib.stride_tricks.sliding_window_view(even[:rows].reshape(-1, n).all(axis=1), 4).all(axis=1)
+        third = np.abs(np.diff(speed[:rows].reshape(-1, n).mean(axis=1), 3))[whole]
+        return float(third.mean()) if len(third) >= 50 else np.inf
+
+    if len(t) < 800:
+        return 0.0
+    one = scatter(1)
+    # counts change to and fro by their step from row to row; what is counted over many periods hardly changes
+    if not step < one < np.inf:
+        return 0.0
+    telescopes = any(scatter(n) < one * n**-0.75 for n in (2, 4))  # half-way between
+    return step * period_of(t) if telescopes else 0.0
+
+
+def longest_step(t: Array) -> float:
+    """The longest step between stamps that is none of a gap, s: jitter and a dropped row or two are usual."""
+    return 3.5 * max(period_of(t), float(np.percentile(np.diff(t), 95.0))) if len(t) > 1 else 0.0
+
+
+def gaps(t: Array, longest: float | None = None) -> Spans:
+    """Spans without readings, from where the first one is missing; `longest` as `longest_step` says, if known."""
+    k = np.flatnonzero(np.diff(t) > (longest_step(t) if longest is None else longest))
+    return np.stack([t[k] + period_of(t), t[k + 1]], -1).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What many readings tell of each of them."""
+
+    step: float  # m/s, `quantum`
+    sigma: float  # m/s, `reading_sigma`
+    pulse: float  # m, `counts`
+    longest: float  # s, `longest_step`
+
+    @classmethod
+    def of(cls, odometer: Odometer) -> Figures:
+        """As these readings tell."""
+        step = quantum(odometer.speed)
+        return cls(step, reading_sigma(odometer, step), counts(odometer, step), longest_step(odometer.t))
+
+    def sigmas(self, odometer: Odometer) -> tuple[float, float, float]:
+        """`white`, `rounding` and `ends` of a `MeanSpeed`."""
+        if odometer.speed_sigma is not None:
+            return float(odometer.speed_sigma), 0.0, 0.0
+        if self.pulse:  # each end of a count is wrong by up to one pulse, evenly: a difference of two
+            return 0.0, 0.0, float(np.sqrt(2.0) * _STEP * self.pulse)
+        rounding = _STEP * self.step
+        return float(np.sqrt(max(self.sigma**2 - rounding**2, 0.0))), rounding, 0.0
+
+
+def _from_zero(steps: NDArray[Any]) -> NDArray[Any]:
+    """Running sums, from zero."""
+    out = np.zeros(len(steps) + 1, dtype=steps.dtype)
+    np.cumsum(steps, out=out[1:])
+    return out
+
+
+@dataclass(frozen=True)
+class MeanSpeed:
+    """Mean speed over windows, from sums made once: a call costs two searches per window.
+
+    Built by `of`. NaN where a window is not covered by good readings throughout.
+    """
+
+    t: Array  # (M,) s
+    speed: Array  # (M,) m/s
+    way: Array  # (M,) m up to t
+    straight: bool  # whether `way` is counted, and so interpolated evenly between readings
+    bad: NDArray[np.intp]  # (M,) how many of the segments between readings up to t are bad
+    changes: NDArray[np.intp]  # (M,) how often the reading changed up to t
+    white: float  # m/s, the part of a reading's sigma that is new with every reading
+    rounding: float  # m/s, the part that stays as long as the reading does
+    ends: float  # m, the error of a way that is counted
+
+    @classmethod
+    def of(cls, odometer: Odometer, spans: Spans | None = None, figures: Figures | None = None) -> MeanSpeed:
+        """Without the readings in `spans` (see `faults`) and not across gaps; `figures` if they are known already."""
+        figures = figures or Figures.of(odometer)
+        t, speed = odometer.t, odometer.speed
+        step = t[1:] - t[:-1]
+        good = np.ones(len(t), dtype=bool)
+        across = step > figures.longest
+        for begin, end in np.empty((0, 2)) if spans is None else spans:
+            good &= (t < begin) | (t >= end)
+            across |= (t[:-1] < end) & (t[1:] > begin)
+        bad = across | ~good[1:] | ~good[:-1]
+        counted = odometer.way is not None
+        way = odometer.way if odometer.way is not None else _from_zero(0.5 * (speed[1:] + speed[:-1]) * step)
+        white, rounding, ends = figures.sigmas(odometer)
+        return cls(
+            t,
+            speed,
+            np.asarray(way),
+            counted,
+            _from_zero(bad.astype(np.intp)),
+            _from_zero((speed[1:] != speed[:-1]).astype(np.intp)),
+            white=white,
+            rounding=rounding,
+            ends=ends,
+        )
+
+    def _segment(self, x: Array) -> NDArray[np.intp]:
+        """The segment k between t[k] and t[k+1] in which x lies."""
+        return np.minimum(np.maximum(np.searchsorted(self.t, x, side="right") - 1, 0), len(self.t) - 2)
+
+    def _at(self, k: NDArray[np.intp], x: Array) -> tuple[Array, Array]:
+        """Way and speed at x in the segments k."""
+        s, step = x - self.t[k], self.t[k + 1] - self.t[k]
+        slope = (self.speed[k + 1] - self.speed[k]) / step
+        speed = self.speed[k] + slope * s
+        if self.straight:
+            return self.way[k] + (self.way[k + 1] - self.way[k]) / step * s, speed
+        return self.way[k] + 0.5 * (self.speed[k] + speed) * s, speed
+
+    def __call__(self, a: Array, b: Array, delay: float | Array = 0.0) -> tuple[Array, Array]:
+        """Means over [a + delay, b + delay] and their derivative by the delay, (N,) each: m/s, m/s^2.
+
+        The derivative is that of the speeds read; where pulses are counted, of their slope over two periods, for
+        the exact one would be a staircase.
+        """
+        a, b = np.asarray(a, dtype=float) + delay, np.asarray(b, dtype=float) + delay
+        if len(self.t) < 2:
+            return np.full(np.shape(a), np.nan), np.full(np.shape(a), np.nan)
+        ka, kb = self._segment(a), self._segment(b)
+        kb = np.where((b == self.t[kb]) & (kb > ka), kb - 1, kb)
+        (way_a, v_a), (way_b, v_b) = self._at(ka, a), self._at(kb, b)
+        mean, slope = (way_b - way_a) / (b - a), (v_b - v_a) / (b - a)
+        covered = (a >= self.t[0]) & (b <= self.t[-1]) & (self.bad[kb + 1] == self.bad[ka])
+        return np.where(covered, mean, np.nan), np.where(covered, slope, np.nan)
+
+    def sigma(self, a: Array, b: Array, delay: float | Array = 0.0) -> Array:
+        """1-sigma of those means, (N,) m/s.
+
+        Noise is new with every reading. The error of a rounded one stays as long as the reading stays the same and
+        is another after a change: a counter at even speed changes to and fro between two values, a speed that was
+        rounded on the way stands. A count is wrong at its ends alone.
+        """
+        a, b = np.asarray(a, dtype=float) + delay, np.asarray(b, dtype=float) + delay
+        if len(self.t) < 2:
+            return np.full(np.shape(a), np.nan)
+        ka, kb = (np.maximum(np.searchsorted(self.t, x, side="right") - 1, 0) for x in (a, b))
+        readings = np.maximum(kb - ka, 1)
+        different = 1 + self.changes[kb] - self.changes[ka]
+        return np.sqrt(self.white**2 / readings + self.rounding**2 / different + (self.ends / (b - a)) ** 2)

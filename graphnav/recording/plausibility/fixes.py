@@ -1,0 +1,287 @@
+"""Fixes that cannot be right: out of reach, frozen heights, sigmas that the fixes deny, two groups, late stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter, uniform_filter1d
+
+from graphnav.core.earth import LocalFrame
+from graphnav.core.findings import Finding, runs_of
+from graphnav.core.rotation import Array
+from graphnav.recording import Gnss, Recording, rows_of
+
+FASTEST = 150.0  # m/s; the fastest cars that can be bought reach 490 km/h, 136 m/s
+# A receiver cannot follow a reflection that comes more than one and a half code chips late (GPS C/A: 293 m a chip).
+MISLED = 440.0  # m
+_CACHED = 60.0  # s; a receiver that is on fixes at least as often as that
+_FROZEN = (60.0, 300.0)  # s, and m driven: a road or the receiver's own noise moves a height within that
+_SLOPE = 0.1  # what a road climbs at most: so far may a height be from what it was
+_CARRIER = 1e-3  # m: a two-hundredth of the carrier's wave (0.19 m), what its phase can be measured to
+_WAVE = 0.19  # m, of L1
+_USUAL = 2.0  # m/s^2, what vehicles accelerate at usually
+_UNBELIEVED = 10.0  # times a sigma that is right the scatter of neighbouring fixes never is: errors last, scatter less
+_SMOOTH = 2e-3  # of the sigma; filtered fixes of phones scatter by five thousandths
+_MOST = 8.0  # m/s^2, what tyres grip
+_WINDOW = 11  # fixes, of which most steps are right even where half of the fixes are off
+_MINORITY = 0.2  # of the fixes: fewer that are off are outvoted by the rest
+_ISOLATED = 0.01  # of the steps
+_ALIKE = 0.25  # of their size by which steps between two groups differ; those of reflections are of all sizes
+_MOVING = 3.0  # m/s, below which a step says little of the time it took
+
+
+def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
+    """The recording without fixes out of reach and without trust in frozen heights, and what was found."""
+    gnss = recording.gnss
+    assert gnss is not None
+    findings: list[Finding] = []
+    if cached := cached_fixes(gnss.t, recording.start):
+        many = "1 fix" if cached == 1 else f"{cached} fixes"
+        early = recording.start - gnss.t[0]
+        findings.append(
+            Finding(
+                "note",
+                f"{many} of before the IMU, the first {early:.0f} s before it starts, left out: a receiver "
+                "gives out what it had kept until it has new ones",
+                "gnss.cached",
+            )
+        )
+        gnss = rows_of(gnss, np.arange(len(gnss.t)) >= cached)
+    p = _positions(gnss)
+    off = out_of_reach(gnss.t, p)
+    if off.any():
+        findings.append(_unreachable(gnss, p, off, recording.start))
+        gnss = rows_of(gnss, ~off)
+        p = _positions(gnss)
+    for a, b in frozen_heights(gnss, p):
+        driven = float(np.hypot(*np.diff(p[a:b, :2], axis=0).T).sum())
+        sd = gnss.sd.copy()
+        sd[a:b, 2] = np.maximum(sd[a:b, 2], _SLOPE * driven)
+        h, begin, end = gnss.llh[a, 2], gnss.t[a] - recording.start, gnss.t[b - 1] - recording.start
+        gnss = replace(gnss, sd=sd)
+        findings.append(
+            Finding(
+                "warning",
+                f"the heights of the fixes stay at {h:.4g} m from {begin:.1f} to {end:.1f} s, over {driven:.0f} m: "
+                f"frozen or not logged; they are given a sigma of {_SLOPE * driven:.0f} m there (a slope of a tenth)",
+                "gnss.height_frozen",
+            )
+        )
+    if len(gnss.t) >= 10:
+        findings += sigmas_denied(gnss, p)
+        findings += two_groups(gnss, p)
+        findings += stamped_on_arrival(gnss, p)
+    return replace(recording, gnss=gnss), findings
+
+
+def cached_fixes(t: Array, start: float) -> int:
+    """How many of the first fixes at t (M,) s are long before the IMU starts, with none for as long after them."""
+    before = np.flatnonzero((t[:-1] < start) & (np.diff(t) > _CACHED))
+    return int(before[-1]) + 1 if len(before) and t[-1] > start else 0
+
+
+def _positions(gnss: Gnss) -> Array:
+    """ENU metres around the middle one of the fixes, which one that is far off hardly ever is, (M, 3)."""
+    middle = np.median(gnss.llh[np.isfinite(gnss.llh).all(axis=1)], axis=0) if len(gnss.t) else np.zeros(3)
+    return LocalFrame(middle if np.isfinite(middle).all() else np.zeros(3)).from_llh(gnss.llh)
+
+
+def out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
+    """Fixes at p (M, 3) m, t (M,) s, that cannot be reached from the most that can be reached from each other."""
+    lost = np.zeros(len(t), dtype=bool)
+    there = np.flatnonzero(np.isfinite(p).all(axis=1))
+    if len(there) < 3:
+        return lost
+    t, p = t[there], p[there]
+    far = np.linalg.norm(np.diff(p, axis=0), axis=1) > FASTEST * np.diff(t) + MISLED
+    if not far.any():
+        return lost
+    edges = np.r_[0, np.flatnonzero(far) + 1, len(t)]
+    first, last = edges[:-1], edges[1:] - 1
+    # the chain of parts with the most fixes, each of which can be reached from the one before
+    best, before = (last - first + 1).astype(float), np.full(len(first), -1)
+    for k in range(1, len(first)):
+        apart = np.linalg.norm(p[first[k]] - p[last[:k]], axis=1)
+        count = np.where(apart <= FASTEST * (t[first[k]] - t[last[:k]]) + MISLED, best[:k], 0.0)
+        if count.max() > 0.0:
+            before[k] = int(np.argmax(count))
+            best[k] += count.max()
+    kept = np.zeros(len(t), dtype=bool)
+    k = int(np.argmax(best))
+    while k >= 0:
+        kept[first[k] : last[k] + 1] = True
+        k = int(before[k])
+    lost[there[~kept]] = True
+    return lost
+
+
+def _unreachable(gnss: Gnss, p: Array, off: NDArray[np.bool_], start: float) -> Finding:
+    k = int(np.flatnonzero(off)[0])
+    kept = np.flatnonzero(~off & np.isfinite(p).all(axis=1))
+    near = kept[np.argmin(np.abs(gnss.t[kept] - gnss.t[k]))]
+    away = float(np.linalg.norm(p[k] - p[near]))
+    many = "1 fix" if off.sum() == 1 else f"{off.sum()} fixes"
+    sure = len(kept) > 0.5 * len(off)
+    rest = "" if sure else "; what is left is fewer than half of them, so the result is not to be trusted"
+    return Finding(
+        "warning" if sure else "untrusted",
+        f"{many} out of reach of the others, the first {away / 1e3:.4g} km away at {gnss.t[k] - start:.1f} s from the "
+        f"start (nothing on land is faster than {FASTEST:g} m/s): not used{rest}",
+        "gnss.out_of_reach",
+    )
+
+
+def frozen_heights(gnss: Gnss, p: Array) -> list[tuple[int, int]]:
+    """[first, end) of the fixes whose height stays the same to the last digit while the vehicle drives."""
+    same = np.diff(gnss.llh[:, 2]) == 0.0
+    way = np.r_[0.0, np.cumsum(np.nan_to_num(np.hypot(*np.diff(p[:, :2], axis=0).T)))]
+    lasting, driven = _FROZEN
+    return [(a, b + 1) for a, b in runs_of(same) if gnss.t[b] - gnss.t[a] >= lasting and way[b] - way[a] >= driven]
+
+
+def _steps(gnss: Gnss) -> tuple[Array, float, NDArray[np.bool_]]:
+    """Time steps, their median, and which are no gap."""
+    dt = np.diff(gnss.t)
+    period = float(np.median(dt))
+    return dt, period, dt < 1.9 * period
+
+
+def sigmas_denied(gnss: Gnss, p: Array) -> Iterator[Finding]:
+    """Sigmas smaller than a phase can be measured, or that the scatter of the fixes denies; they are not changed."""
+    sd = float(np.median(gnss.sd[:, :2]))
+    _, period, near = _steps(gnss)
+    pairs = near[1:] & near[:-1]
+    bend = (p[2:] - 2.0 * p[1:-1] + p[:-2])[pairs, :2]
+    bend = bend[np.isfinite(bend).all(axis=1)]
+    # white errors of s bend by s sqrt(6)
+    scatter = float(np.median(np.abs(bend))) / 0.6745 / np.sqrt(6.0) if len(bend) >= 10 else float("nan")
+    driven = _USUAL * period**2 / np.sqrt(6.0)
+    if sd < _CARRIER:
+        yield Finding(
+            "warning",
+            f"the 1-sigma of the fixes is {sd:.2g} m, less than a carrier's phase can be measured to ({_CARRIER:g} m): "
+            "look at the unit of the sigmas",
+            "gnss.sigma_small",
+        )
+    elif scatter - driven > _UNBELIEVED * sd:
+        yield Finding(
+            "warning",
+            f"neighbouring fixes scatter by {scatter:.2g} m where their 1-sigma is {sd:.2g} m: look at the unit of the "
+            "sigmas",
+            "gnss.sigma_small",
+        )
+    elif scatter < _SMOOTH * sd and np.ptp(p[:, :2]) > 0.0:
+        yield Finding(
+            "warning",
+            f"neighbouring fixes scatter by {scatter:.2g} m only where their 1-sigma is {sd:.2g} m: look at the unit "
+            "of the sigmas",
+            "gnss.sigma_large",
+        )
+    if gnss.type is not None and (fixed := gnss.type == 1).sum() >= 10:
+        sd = float(np.median(gnss.sd[fixed, :2]))
+        if sd > _WAVE:
+            yield Finding(
+                "warning",
+                f"the 1-sigma of the fixed solutions is {sd:.2g} m, more than the carrier's wave ({_WAVE:g} m) whose "
+                "cycles they have told apart: look at the unit of the sigmas",
+                "gnss.sigma_large",
+            )
+
+
+def two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
+    """Fixes that go back and forth between two places a constant step apart: no vote tells which are right."""
+    there: NDArray[np.bool_] = np.asarray(np.isfinite(p).all(axis=1))
+    if there.sum() < 2 * _WINDOW:
+        return
+    gnss, p = rows_of(gnss, there), p[there, :2]
+    dt, period, _ = _steps(gnss)
+    jump = _jumps(p, dt)
+    sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
+    # the speed changes by what tyres grip over half the window; over a long gap no step shows, and none is taken
+    limit = 5.0 * np.hypot(sd[1:], sd[:-1]) + _MOST * np.maximum(0.5 * _WINDOW * period, dt) * dt
+    big = np.flatnonzero(np.linalg.norm(jump, axis=1) > limit)
+    if not len(big):
+        return
+    axis = np.linalg.svd(jump[big], full_matrices=False)[2][0]
+    sign = np.sign(jump[big] @ axis)
+    step = np.median(sign[:, None] * jump[big], axis=0)
+    size = float(np.linalg.norm(step))
+    for _ in range(3):  # the motion is clearer without the steps, and the steps are with the motion
+        group = _groups(jump @ (step / size), size)
+        jump = _jumps(p - group[:, None] * step, dt)
+    left = np.linalg.norm(jump, axis=1)
+    alike = float((left[np.diff(group) != 0] < _ALIKE * size).mean())
+    share = np.array([(group == 0).mean(), (group == 1).mean()])
+    if (left > limit).sum() > _MINORITY * len(big) or alike < 1.0 - _MINORITY or share.min() < _MINORITY:
+        return
+    yield Finding(
+        "untrusted",
+        f"the fixes are of two groups {size:.0f} m apart ({100 * share.min():.0f} and {100 * share.max():.0f} % of "
+        "them), each consistent in itself: nothing tells which is right, and the result is not to be trusted",
+        "gnss.two_groups",
+    )
+
+
+def _jumps(p: Array, dt: Array) -> Array:
+    """What steps between fixes at p (M, 2) m differ by from the usual pace around them, (M - 1, 2) m."""
+    rate = median_filter(np.diff(p, axis=0) / dt[:, None], size=(_WINDOW, 1), mode="nearest")
+    return np.asarray(np.diff(p, axis=0) - rate * dt[:, None])
+
+
+def _groups(jump: Array, size: float) -> NDArray[np.intp]:
+    """Group (M,) 0 or 1 of every fix: those with which jumps (M - 1,) along a step of that size are least off."""
+    cost = np.abs(jump[:, None, None] - size * np.array([[0.0, 1.0], [-1.0, 0.0]]))  # from, to
+    best, came = np.zeros(2), np.zeros((len(jump), 2), dtype=np.intp)
+    for k, one in enumerate(cost):
+        total = best[:, None] + one
+        came[k] = total.argmin(axis=0)
+        best = total.min(axis=0)
+    group = np.zeros(len(jump) + 1, dtype=np.intp)
+    group[-1] = int(best.argmin())
+    for k in range(len(jump), 0, -1):
+        group[k - 1] = came[k - 1, group[k]]
+    return group
+
+
+def stamped_on_arrival(gnss: Gnss, p: Array) -> Iterator[Finding]:
+    """Stamps that are uneven where positions advance evenly: of the arrival, not of the measurement."""
+    dt = np.diff(gnss.t)
+    p = p[:, :2]
+    # the mean steps: of fixes that arrive in bursts, the median says nothing
+    period = float(np.median(uniform_filter1d(dt, _WINDOW, mode="nearest")))
+    near = (dt < 3.5 * period) & np.isfinite(p[1:]).all(axis=1) & np.isfinite(p[:-1]).all(axis=1)
+    way = np.diff(p, axis=0)
+    way[~near] = 0.0
+    count = np.maximum(uniform_filter1d(near.astype(float), _WINDOW, mode="nearest"), 0.5 / _WINDOW)
+    pace = np.maximum(uniform_filter1d(np.where(near, dt, 0.0), _WINDOW, mode="nearest") / count, 1e-9)
+    usual = uniform_filter1d(way, _WINDOW, axis=0, mode="nearest") / count[:, None]
+    usual_size = np.linalg.norm(usual, axis=1)
+    moving = near & (usual_size > _MOVING * pace)
+    if moving.sum() < 2 * _WINDOW:
+        return
+    uneven = (dt / pace - 1.0)[moving]
+    ahead = (np.sum(way * usual, axis=1)[moving] / usual_size[moving] ** 2) - 1.0
+    # of most stamps: some fixes that are missing make steps uneven, too
+    spread = float(np.median(np.abs(uneven - np.median(uneven)))) / 0.6745
+    speed = float(np.median(usual_size[moving] / pace[moving]))
+    sd = float(np.median(gnss.sd[:, :2]))
+    late = spread * period / np.sqrt(2.0)  # two stamps make a step
+    if speed * late < sd or spread == 0.0:
+        return
+    # stamps so late that fixes overtook each other: against the motion by more than sigmas explain
+    back = float((ahead + 1.0 < -5.0 * np.sqrt(2.0) * sd / usual_size[moving]).mean())
+    ahead = np.clip(ahead, -3.0, 3.0)
+    slope = float(uneven @ ahead / (uneven @ uneven))
+    error = float(np.std(ahead - slope * uneven)) / float(np.linalg.norm(uneven))
+    if slope + 4.0 * error < 0.5 or back > _ISOLATED:  # nearer to no than to full part in the advance
+        seen = f"go back in {100 * back:.0f} % of the steps" if back > _ISOLATED else "advance evenly"
+        yield Finding(
+            "warning",
+            f"the stamps of the fixes are uneven by {late:.2g} s where the positions {seen}: they are "
+            f"of the arrival and not of the measurement, {speed * late:.2g} m at the usual speed; log the receiver's "
+            "own time",
+            "gnss.stamped_on_arrival",
+        )

@@ -1,0 +1,155 @@
+"""Odometer readings that cannot be right: beyond any speed, after a jump of the clock, or of another scale."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from graphnav.core.findings import Finding, period_of, runs_of
+from graphnav.recording import Odometer, Recording, rows_of
+from graphnav.recording.checks.crosschecks import MIN_PAIRS, Track
+from graphnav.recording.plausibility.fixes import FASTEST
+
+_JUMP = 1.0  # s, and ten periods: a silence of the odometer that may be a jump of its clock
+_RADIUS = 0.1  # by which a tyre may differ from another: wear, load, pressure, a spare wheel
+_MOVING = 5.0  # m/s, above which speeds are compared
+_LASTING = 10.0  # s; shorter is slip, or a fix's error
+_CLEAR = (
+    4.0  # times by which one clock fits better than the other (white errors: one in thousands with 20 of them a side)
+)
+_RATE = 10.0  # Hz that changes of speed need
+
+
+def screen(recording: Recording, way: Track | None) -> tuple[Recording, list[Finding]]:
+    """The recording without readings that cannot be right, and what was found; `way` is what GNSS says."""
+    findings: list[Finding] = []
+    for one in (_beyond, _clock_jump, _other_scale):
+        odometer = recording.odometer
+        if odometer is None or len(odometer.t) < 2:
+            break
+        bad, finding = one(odometer, way, recording.start)
+        if finding is None:
+            continue
+        findings.append(finding)
+        recording = replace(recording, odometer=None if bad.all() else rows_of(odometer, ~bad))
+    return recording, findings
+
+
+def track(odometer: Odometer) -> Track | None:
+    """The odometer's speed as if it were GNSS's, for where there is none."""
+    every = max(1, round(1.0 / (_RATE * period_of(odometer.t)))) if len(odometer.t) > 1 else 1
+    t, speed = odometer.t[::every], odometer.speed[::every]
+    if len(t) < 5:
+        return None
+    v = np.stack([np.zeros_like(speed), speed, np.zeros_like(speed)], -1)
+    return Track(t, v, np.zeros(len(t)), float(np.median(np.diff(t))))
+
+
+_Found = tuple[NDArray[np.bool_], Finding | None]
+
+
+def _beyond(odometer: Odometer, way: Track | None, start: float) -> _Found:
+    """Readings that no vehicle reaches."""
+    bad = ~(np.abs(odometer.speed) <= FASTEST)
+    if not bad.any():
+        return bad, None
+    k = int(np.flatnonzero(bad)[0])
+    many = "1 odometer reading" if bad.sum() == 1 else f"{bad.sum()} odometer readings"
+    return bad, Finding(
+        "warning",
+        f"{many} beyond any vehicle's speed (the first {odometer.speed[k]:.4g} m/s at {odometer.t[k] - start:.2f} s "
+        f"from the start; nothing on land is faster than {FASTEST:g} m/s): not used",
+        "odometer.beyond",
+    )
+
+
+def _misfit(odometer: Odometer, way: Track, rows: NDArray[np.bool_], later: float) -> float:
+    """Mean size of the GNSS speed less that of `rows` of the odometer `later` s later, m/s; NaN of too few."""
+    t, speed = odometer.t[rows] + later, odometer.speed[rows]
+    if len(t) < 2:
+        return float("nan")
+    both = (way.t > t[0]) & (way.t < t[-1])
+    if both.sum() < MIN_PAIRS:
+        return float("nan")
+    off = way.speed[both] - np.abs(np.interp(way.t[both], t, speed))
+    return float(np.mean(np.minimum(np.abs(off), _MOVING)))  # a wild fix has no more say than that
+
+
+def _clock_jump(odometer: Odometer, way: Track | None, start: float) -> _Found:
+    """A silence that was none: without it the readings on one side fit the GNSS speed, and with it they do not."""
+    t = odometer.t
+    none = np.zeros(len(t), dtype=bool)
+    if way is None:
+        return none, None
+    period = period_of(t)
+    step = np.diff(t)
+    for k in np.flatnonzero(step > max(_JUMP, 10.0 * period))[:20]:
+        jump = float(step[k] - period)
+        for after in (True, False):
+            side = (t > t[k]) if after else (t <= t[k])
+            shift = -jump if after else jump
+            as_read, moved = _misfit(odometer, way, side, 0.0), _misfit(odometer, way, side, shift)
+            other = _misfit(odometer, way, ~side, 0.0)
+            if moved * _CLEAR < as_read and (np.isnan(other) or other * _CLEAR < as_read):
+                leap = ", the leap seconds between GPS time and UTC" if abs(jump - 18.0) < 0.5 else ""
+                return side, Finding(
+                    "warning",
+                    f"the odometer's clock jumps by {jump:+.2f} s at {t[k] - start:.1f} s from the start{leap}: its "
+                    f"speed fits the GNSS speed on one side of that only; what comes {'after' if after else 'before'} "
+                    "it is not used",
+                    "odometer.clock_jump",
+                )
+    return none, None
+
+
+def _other_scale(odometer: Odometer, way: Track | None, start: float) -> _Found:
+    """Spans in which the odometer has another scale against GNSS than it has elsewhere, where it is nearly 1."""
+    t = odometer.t
+    bad = np.zeros(len(t), dtype=bool)
+    if way is None:
+        return bad, None
+    half = np.maximum(0.5 * way.width, period_of(t))
+    meant = np.r_[0.0, np.cumsum(0.5 * (odometer.speed[1:] + odometer.speed[:-1]) * np.diff(t))]
+    read = np.abs(np.interp(way.t + half, t, meant) - np.interp(way.t - half, t, meant)) / (2.0 * half)
+    k = np.clip(np.searchsorted(t, way.t), 1, len(t) - 1)
+    there = (way.t - half > t[0]) & (way.t + half < t[-1]) & (t[k] - t[k - 1] < _JUMP)
+    at = np.flatnonzero(there & (way.speed > _MOVING) & (read > 0.0))
+    if len(at) < MIN_PAIRS:
+        return bad, None
+    off = np.log(read[at] / way.speed[at])
+    seconds = max(1, round(_LASTING / way.period))
+    usual = median_filter(off, size=min(seconds + 1 - seconds % 2, len(off)), mode="nearest")
+    right = np.abs(usual) < np.log1p(_RADIUS)
+    if right.sum() * way.period < _LASTING:
+        return bad, None  # another unit, or another wheel, throughout
+    own = float(np.median(off[right]))
+    noise = float(np.median(np.abs(off[right] - own))) / 0.6745
+    # two tyres, one as large and one as small as may be
+    wrong = np.abs(usual - own) > max(np.log((1.0 + _RADIUS) / (1.0 - _RADIUS)), 6.0 * noise)
+    spans: list[tuple[float, float, float]] = []
+    for a, b in runs_of(wrong):
+        begin, end = way.t[at[a]], way.t[at[b - 1]]
+        factor = float(np.median(off[a:b]))
+        # a scale is one factor; fixes among high houses make speeds of all sizes
+        scatter = float(np.median(np.abs(off[a:b] - factor))) / 0.6745
+        if end - begin < _LASTING - 2.0 * way.period or scatter > np.log1p(_RADIUS):
+            continue
+        # up to the neighbours that are right: what lies between is not known
+        low = way.t[at[a - 1]] if a > 0 else -np.inf
+        high = way.t[at[b]] if b < len(at) else np.inf
+        bad |= (t > low) & (t < high)
+        spans.append((float(begin - start), float(end - start), float(np.exp(factor - own))))
+    if not spans:
+        return bad, None
+    begin_s, end_s, times = max(spans, key=lambda span: span[1] - span[0])
+    where = f"from {begin_s:.1f} to {end_s:.1f} s"
+    if len(spans) > 1:
+        where = f"in {len(spans)} spans, the longest {where}"
+    return bad, Finding(
+        "warning",
+        f"the odometer reads {times:.2f} times what it reads elsewhere against the GNSS speed {where}: not used there",
+        "odometer.other_scale",
+    )

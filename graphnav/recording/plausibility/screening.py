@@ -1,0 +1,289 @@
+"""What cannot be right is found before anything is solved: masked where the rest still solves, else refused.
+
+`screen` goes over a recording once. Single rows that no sensor can have read are taken out, as if they had never been
+logged, and said; a sensor that is wrong throughout, so that every state would be, is a *refused* finding, which
+`screened` raises. Nothing is mended by a guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.earth import gravity
+from graphnav.core.errors import RecordingError
+from graphnav.core.findings import Finding, period_of, runs_of
+from graphnav.core.rotation import Array
+from graphnav.recording import Imu, Recording, rows_of
+from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks.aiding import imu_axes, imu_clock, overlap_s
+from graphnav.recording.checks.clock import clock_of
+from graphnav.recording.checks.crosschecks import Fit, Track
+from graphnav.recording.formats.schema import FORCE
+from graphnav.recording.plausibility import fixes as plausibility_gnss
+from graphnav.recording.plausibility import odometer as plausibility_odometer
+
+# What can be read at all: no accelerometer for vehicles or feet has a range beyond 100 g (those for crash tests have
+# 200 g and more, and cannot tell gravity from their own offset), and no gyro for them one beyond 4000 deg/s.
+ACCEL_RANGE = 1000.0  # m/s^2
+GYRO_RANGE = 70.0  # rad/s
+_STANDARD_GRAVITY = 9.80665  # m/s^2, where the place is unknown
+_ISOLATED = 0.01  # of the rows; what more of them have in common is no fault of single rows
+_QUIET = 10.0  # percentile of the turn rate up to which a foot stands and a vehicle is calm
+# A factor of two is the smallest by which a scale is mistaken (the ranges of a sensor are that far apart): the middle.
+_SCALE = np.sqrt(2.0)
+_NEAR = 1.2  # between the force found and what a unit would give: a biased sensor among vibration
+_DEAD = 10.0  # s; the longest that an axis repeats itself in thirty real recordings while others move is 0.08 s
+_MOVES = 20.0  # steps of its own resolution by which an axis has moved and not only flickered
+# What a carrier that moves exceeds by far: a thousandth of g, and the Earth's rate, which one at rest reads
+_STIRS = {"accelerometer": 1e-3 * _STANDARD_GRAVITY, "gyro": 7.3e-5}  # m/s^2, rad/s
+_NOISY = 0.05  # of the steps go back on the one before; of noise up to a band B and a rate f it is 1.5 B / f
+_AXIS = "xyz"
+
+
+@dataclass(frozen=True)
+class Screened:
+    """A recording without what cannot be right, and what was found."""
+
+    recording: Recording
+    findings: tuple[Finding, ...] = ()
+
+
+def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:
+    """Raise what a recording cannot be solved with.
+
+    Raises
+    ------
+    RecordingError
+        With the first refused finding's sentence.
+    """
+    for finding in findings:
+        if finding.severity == "refused":
+            raise RecordingError(f"'{recording.name}': {finding.sentence}")
+
+
+def screened(recording: Recording) -> tuple[Recording, list[str]]:
+    """The recording without what cannot be right, and a sentence for everything found.
+
+    Raises
+    ------
+    RecordingError
+        If a sensor is wrong throughout.
+    """
+    found = screen(recording)
+    refuse(recording, found.findings)
+    return found.recording, [f.sentence for f in found.findings]
+
+
+def screen(recording: Recording) -> Screened:
+    """Look a recording over; one that was screened before is returned as it is, without findings."""
+    if recording.screened:
+        return Screened(recording)
+    findings = list(imu_scale(recording))
+    wrong_unit = bool(findings)
+    imu, spikes = without_spikes(recording.imu, recording.start, wrong_unit)
+    findings += spikes
+    recording = replace(recording, imu=imu, screened=True)
+    findings += dead_axes(recording)
+    track = None
+    if recording.gnss is not None and len(recording.gnss.t):
+        recording, said = plausibility_gnss.screen(recording)
+        findings += said
+        assert recording.gnss is not None
+        track = crosschecks.track(recording.gnss)
+        if track is not None and overlap_s(recording) <= 0:
+            track = None
+    if recording.odometer is not None and len(recording.odometer.t):
+        recording, said = plausibility_odometer.screen(recording, track)
+        findings += said
+    dead = any(f.key == "imu.dead_axis" for f in findings)
+    if recording.platform == "vehicle" and not dead and not wrong_unit:
+        way = track
+        if way is None and recording.odometer is not None:
+            way = plausibility_odometer.track(recording.odometer)
+        forward = crosschecks.forward_fit(recording.imu, way) if way is not None else None
+        findings += forward_sign(recording.imu, way, forward)
+        # stamps that are late by now this, now that have no clock
+        if track is not None and not any(f.key == "gnss.stamped_on_arrival" for f in findings):
+            assert recording.gnss is not None
+            odometer = crosschecks.odometer_fit(recording.odometer, track) if recording.odometer is not None else None
+            findings += imu_clock(clock_of(recording.imu, recording.gnss), None if odometer is None else odometer[0])
+    return Screened(recording, tuple(findings))
+
+
+def imu_scale(recording: Recording) -> Iterator[Finding]:
+    """A force at rest that is not gravity, and a turn rate that no sensor reads: units and scales."""
+    imu = recording.imu
+    rate = np.abs(imu.gyro).max(axis=1)
+    beyond = float((~(rate <= GYRO_RANGE)).mean())
+    if beyond > _ISOLATED:
+        yield Finding(
+            "refused",
+            f"the gyro reads more than {GYRO_RANGE:g} rad/s, which no sensor of a vehicle or a foot does, in "
+            f'{100 * beyond:.0f} % of the rows: if it is deg/s, say units = {{ gyro = "deg/s" }} in [imu]',
+            "imu.gyro_unit",
+        )
+    with np.errstate(over="ignore", invalid="ignore"):
+        turn = np.linalg.norm(imu.gyro - np.median(imu.gyro, axis=0), axis=1)
+        calm = turn <= np.percentile(turn, _QUIET)
+        f = float(np.median(np.linalg.norm(imu.accel[calm], axis=1)))
+    if (sentence := _scale(f)) is not None:
+        g = _STANDARD_GRAVITY if recording.gnss is None else _gravity(recording)
+        yield Finding(
+            "refused",
+            f"the force has a median of {f:.3g} m/s2 where it is calm, not {g:.1f}: {sentence}",
+            "imu.force_scale",
+        )
+
+
+def _gravity(recording: Recording) -> float:
+    """Where most fixes are, m/s^2."""
+    assert recording.gnss is not None
+    there = recording.gnss.llh[np.isfinite(recording.gnss.llh).all(axis=1)]
+    return float(gravity(*np.median(there, axis=0)[[0, 2]])) if len(there) else _STANDARD_GRAVITY
+
+
+def _scale(f: float) -> str | None:
+    """What a force at rest looks like that is not gravity; None if it is."""
+    g = _STANDARD_GRAVITY
+    if g / _SCALE < f < g * _SCALE:
+        return None
+    units = {g / size: f'the accelerometer seems to be in {name}: say units = {{ accel = "{name}" }}'
+             for name, size in FORCE.items() if name != "m/s2"}  # fmt: skip
+    units[g * FORCE["g"]] = "the accelerometer seems to be in m/s2 already: leave out units.accel"
+    near = min(units, key=lambda value: abs(np.log(max(f, 1e-9) / value)))
+    if 1.0 / _NEAR < f / near < _NEAR:
+        return f"{units[near]} in [imu]"
+    if f < g / FORCE["g"]:
+        return "gravity seems to have been removed from the accelerometer; graphnav needs the raw force"
+    step = round(float(np.log2(f / g))) if np.isfinite(f) else 0
+    if step and 1.0 / _NEAR < f / (g * 2.0**step) < _NEAR:
+        times = f"{2 ** abs(step)} times too {'large' if step > 0 else 'small'}"
+        return (
+            f"the accelerometer's scale is {times}, as of another full-scale range: no units.accel mends that, "
+            f"multiply ax, ay and az by {2.0**-step:g} in the file"
+        )
+    return "the accelerometer's scale is wrong: look at units.accel in [imu] and at the range that was set"
+
+
+def without_spikes(imu: Imu, start: float, wrong_unit: bool = False) -> tuple[Imu, list[Finding]]:
+    """The IMU without the rows that no sensor can have read, which leaves gaps that are bridged.
+
+    Where a unit is wrong throughout, nothing is known of single rows.
+    """
+    gyro, accel = ~(np.abs(imu.gyro) <= GYRO_RANGE), ~(np.abs(imu.accel) <= ACCEL_RANGE)
+    bad: NDArray[np.bool_] = np.asarray((gyro | accel).any(axis=1))
+    if wrong_unit or not bad.any():
+        return imu, []
+    k = int(np.flatnonzero(bad)[0])
+    name, unit, values, wild, most = (
+        ("accelerometer", "m/s2", imu.accel, accel, ACCEL_RANGE)
+        if accel[k].any()
+        else ("gyro", "rad/s", imu.gyro, gyro, GYRO_RANGE)
+    )
+    value = values[k][wild[k]][0]
+    many = "1 IMU row" if bad.sum() == 1 else f"{bad.sum()} IMU rows"
+    sentence = (
+        f"{many} that no sensor can have read (the first, of the {name}, {value:.4g} {unit} at "
+        f"{imu.t[k] - start:.2f} s from the start; {most:g} {unit} is beyond any range)"
+    )
+    if bad.mean() > _ISOLATED:
+        return imu, [Finding("refused", f"{sentence}: more than can be bridged; look at the log", "imu.spike")]
+    return rows_of(imu, ~bad), [Finding("warning", f"{sentence}: left out, as a gap", "imu.spike")]
+
+
+def dead_axes(recording: Recording) -> Iterator[Finding]:
+    """An axis that repeats one value while the others of its sensor move."""
+    imu = recording.imu
+    period = period_of(imu.t)
+    whole = recording.duration
+    for name, values in (("gyro", imu.gyro), ("accelerometer", imu.accel)):
+        x = values @ imu.R_bs  # the file's axes
+        size = np.abs(x).max(axis=0)
+        step = np.abs(np.diff(x, axis=0))
+        same = step <= 1e-12 * size  # turned into body axes and back, equal values differ by rounding
+        for axis in range(3):
+            a, b = max(runs_of(same[:, axis]), key=lambda run: run[1] - run[0], default=(0, 0))
+            lasts = float(imu.t[b] - imu.t[a])
+            if lasts < min(_DEAD, 0.9 * whole) or b - a < _DEAD:
+                continue
+            others = [k for k in range(3) if k != axis]
+            if not any(_moves(x[a : b + 1, k], same[a:b, k], _STIRS[name]) for k in others):
+                continue
+            value = x[a, axis]
+            when = (
+                "throughout"
+                if lasts > whole - 2.0 * period - 0.01 * whole
+                else f"from {imu.t[a] - recording.start:.1f} to {imu.t[b] - recording.start:.1f} s"
+            )
+            unit = "rad/s" if name == "gyro" else "m/s2"
+            yield Finding(
+                "refused",
+                f"{name} {_AXIS[axis]} (file axes) reads {value:.4g} {unit} {when} while the others move: it is dead "
+                "or its column was not logged"
+                + ("" if when == "throughout" else "; use what lies before or after (--start, --end)"),
+                "imu.dead_axis",
+            )
+
+
+def _moves(x: Array, same: Array, least: float) -> bool:
+    """Whether an axis moves by many steps of its resolution, not only now and then, and with a sensor's noise.
+
+    Its standard deviation is then above `least`.
+
+    Without noise an axis of a simulation may well be constant.
+    """
+    steps = np.diff(x)
+    steps = steps[np.abs(steps) > 1e-12 * np.abs(x).max()]
+    if len(steps) < 2 or float(np.std(x)) < least or float(same.mean()) >= 0.5:
+        return False
+    if float(np.ptp(x)) <= _MOVES * float(np.abs(steps).min()):
+        return False
+    return float((steps[1:] * steps[:-1] < 0.0).mean()) > _NOISY
+
+
+_SURE = 0.7  # of a correlation, and of a unit vector's component
+
+
+def forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iterator[Finding]:
+    """The forward force falls when the speed rises: one axis of the accelerometer is reversed, or all of the IMU."""
+    up = crosschecks.up_of(imu)
+    if way is None or forward is None or forward.correlation < _SURE or up[2] < 0.8:
+        return
+    ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
+    if ahead[1] > -_SURE:
+        return
+    along = f"the forward force falls when the speed rises (correlation {-forward.correlation:.2f})"
+    if (side := _sideways(imu, way)) is not None and side > 0:  # then nothing is turned: the other axes are right
+        column = "a" + _AXIS[int(np.argmax(np.abs(imu.R_bs[1])))]
+        yield Finding(
+            "refused",
+            f"{along} while the sideways force is right: the accelerometer's forward axis is reversed, which no axes "
+            f"in [imu] can say; negate {column} in the file",
+            "imu.forward_reversed",
+        )
+        return
+    for said in imu_axes(imu, forward, way):
+        yield Finding("refused", f"{said.sentence}; {along}", "imu.axes_turned")
+
+
+def _sideways(imu: Imu, way: Track) -> float | None:
+    """Correlation of the force to the right with what curves ask for; None where there are none."""
+    seconds = np.arange(max(way.t[0], imu.t[0]), min(way.t[-1], imu.t[-1]) - 1.0)
+    if len(seconds) < crosschecks.MIN_PAIRS:
+        return None
+    edge = np.searchsorted(imu.t, np.r_[seconds, seconds[-1] + 1.0])
+    count = np.diff(edge)
+    force, turn = (
+        np.diff(np.r_[0.0, np.cumsum(x)][edge]) / np.maximum(count, 1) for x in (imu.accel[:, 0], imu.gyro[:, 2])
+    )
+    wanted = -np.interp(seconds + 0.5, way.t, way.speed) * turn  # to the left in a curve to the left
+    used = count > 0
+    if used.sum() < crosschecks.MIN_PAIRS or wanted[used].std() == 0.0 or force[used].std() == 0.0:
+        return None
+    alike = float(np.corrcoef(wanted[used], force[used])[0, 1])
+    # 4 sigma of the correlation of that many that have nothing to do with each other
+    return alike if abs(alike) > 4.0 / np.sqrt(used.sum()) else None

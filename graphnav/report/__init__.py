@@ -1,0 +1,1 @@
+"""Pages for people: reports, comparisons, detections, and the figures in them."""

@@ -1,0 +1,117 @@
+"""What `graphnav detect` leaves on disk and says: detections.csv, statistics.csv.gz, detections.html, a summary."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.detectors import Detections
+from graphnav.estimation.stops import Stop, detections_text, stops_of
+from graphnav.recording import Recording
+from graphnav.recording.exporters.digits import rows_text
+from graphnav.report import page
+from graphnav.report import pictures as report_pictures
+
+_LISTED = 30  # stops
+
+
+def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
+    """All files; times are on the recording's clock, as in trajectory.csv."""
+    folder.mkdir(parents=True, exist_ok=True)
+    intervals, statistics = (folder / n for n in ("detections.csv", "statistics.csv.gz"))
+    intervals.write_text(detections_text(found.all), encoding="utf-8")
+    # no name and no time in the header: the same recording gives the same bytes
+    with statistics.open("wb") as raw, gzip.GzipFile("", "wb", 5, raw, mtime=0) as file:
+        file.write(statistics_text(found).encode())
+    html = folder / "detections.html"
+    html.write_text(_page(recording, found), encoding="utf-8")
+    return [html, intervals, statistics]
+
+
+def _page(recording: Recording, found: Detections) -> str:
+    spans = found.stationary - recording.start
+    rows = [
+        [page.Raw(f"{a:.2f} s"), page.Raw(f"{b:.2f} s"), page.Raw(f"{b - a:.2f} s"), fired_text(stop)]
+        for (a, b), stop in zip(spans, stops_of(found.all), strict=True)
+    ]
+    lead = [page.paragraph(line) for line in _words(recording, found)]
+    sections = [
+        ("What they saw", [page.gallery(report_pictures.detection_pictures(recording, found.all))]),
+        ("Where it stands", [page.table(["from", "to", "for", "share by detector"], rows)] if rows else []),
+        ("Notes", [page.bullets(found.notes)] if found.notes else []),
+    ]
+    return page.page(f"{recording.name}: detectors", lead, sections)
+
+
+def fired_text(stop: Stop) -> str:
+    """Who found a stop, and which share of it."""
+    return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in stop.fired.items())
+
+
+def statistics_text(found: Detections) -> str:
+    """Every detector's statistic, threshold and mask at the windows of the first; a blank where there is none."""
+    detections = [d for d in found.all if len(d.t)]
+    if not detections:
+        return "t\n"
+    t = max(detections, key=lambda d: len(d.t)).t
+    head, columns = ["t"], [t]
+    for d in detections:
+        k, near = _nearest(d.t, t)
+        threshold = np.broadcast_to(d.threshold, d.t.shape)
+        for values in (d.statistic, threshold, d.mask.astype(float)):
+            columns.append(np.where(near, values[k], np.nan))
+        head += [d.name, f"{d.name}_threshold", f"{d.name}_stationary"]
+    form = ",".join(["%.4f", *["%.5g", "%.5g", "%.0f"] * len(detections)])
+    return ",".join(head) + "\n" + rows_text(np.stack(columns, -1), form)
+
+
+def _nearest(of: Array, t: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Row of `of` nearest to each time, and whether it is as near as its own spacing lets it be."""
+    if len(of) == 1:
+        return np.zeros(len(t), dtype=int), np.abs(t - of[0]) < 1.0
+    k = np.clip(np.searchsorted(of, t), 1, len(of) - 1)
+    k = k - (t - of[k - 1] < of[k] - t)
+    return k, np.abs(of[k] - t) <= 0.51 * float(np.median(np.diff(of))) + 1e-6
+
+
+def values(recording: Recording, found: Detections) -> dict[str, Any]:
+    """The same for JSON; times are on the recording's clock, as in detections.csv."""
+    return {
+        "recording": recording.name,
+        "duration_s": recording.duration,
+        "stationary": found.stationary,
+        "stops": [{key: x for key, x in stop.values().items() if key != "rows"} for stop in stops_of(found.all)],
+        "seconds_by_detector": {d.name: float(np.diff(d.intervals).sum()) for d in found.all},
+        "notes": found.notes,
+    }
+
+
+def text(recording: Recording, found: Detections, files: list[Path]) -> str:
+    """Stops, seconds, the idle line or why there is none, and where to look."""
+    spans = found.stationary - recording.start
+    first, stops, each = _words(recording, found)
+    lines = [first, f"  {stops}"]
+    lines += [f"    {a:9.2f} - {b:9.2f}  {b - a:8.2f} s" for a, b in spans[:_LISTED]]
+    if len(spans) > _LISTED:
+        lines.append(f"    ... and {len(spans) - _LISTED} more in detections.csv")
+    lines.append(f"  {each}")
+    lines += [f"  note: {note}" for note in found.notes]
+    return "\n".join([*lines, "", "look at", *(f"  {file}" for file in files)])
+
+
+def _words(recording: Recording, found: Detections) -> tuple[str, str, str]:
+    """What was looked at, how much of it stands, and what each detector says."""
+    spans = found.stationary
+    seconds = float(np.diff(spans).sum()) if len(spans) else 0.0
+    many = "1 stop" if len(spans) == 1 else f"{len(spans)} stops"
+    share = f" ({100.0 * seconds / recording.duration:.1f} %)" if seconds else ""
+    each = [f"{d.name} {float(np.diff(d.intervals).sum()) if len(d.intervals) else 0.0:.1f}" for d in found.all]
+    return (
+        f"{recording.name} ({recording.platform}): {recording.duration:.1f} s",
+        f"{many}, {seconds:.1f} s in total{share}",
+        f"seconds by detector: {', '.join(each)}" if each else "no detector has run",
+    )

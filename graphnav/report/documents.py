@@ -1,0 +1,260 @@
+"""report.html and comparison.html: what was done on what, how good it is, and whether to believe the sigma."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from graphnav.core.timescales import GPS_TO_UNIX, gps_to_utc
+from graphnav.estimation.solution import Solution
+from graphnav.recording import Recording
+from graphnav.report import page
+from graphnav.report import pictures as pictures
+from graphnav.report import sentences as words
+from graphnav.report import summary as summary
+from graphnav.report import tables as tables
+from graphnav.report.names import named
+from graphnav.report.plots import Shades, Spans
+from graphnav.report.provenance import provenance_tables
+from graphnav.report.tables import Withheld
+
+if TYPE_CHECKING:
+    from graphnav.estimation.noise.table import FigureRow
+    from graphnav.evaluation.metrics import Errors
+
+Sections = list[tuple[str, Sequence[str]]]
+
+
+def write_report(
+    path: str | Path,
+    recording: Recording,
+    solution: Solution,
+    *,
+    settings: Mapping[str, Any],
+    metrics: Mapping[str, Any] | None = None,
+    errors: Errors | None = None,
+    withheld: Withheld = (),
+    outages: Spans = (),
+    findings: Sequence[str] = (),
+    provenance: Mapping[str, Any] | None = None,
+    detectors: Sequence[page.Raw] | None = None,
+    noise: Sequence[FigureRow] = (),
+    beside: Sequence[str] = (),
+) -> Path:
+    """One solver's report as one self-contained HTML file.
+
+    Parameters
+    ----------
+    settings : resolved settings, nested plain values.
+    metrics, errors : of `graphnav.evaluation.evaluate`, where there is a truth.
+    withheld : (source, span), span in s from the recording's start or None for all of it.
+    outages : s from the start, where the recording itself has no fixes.
+    findings : sentences about what was odd in the recording.
+    provenance : version, input hashes and the like, plain values; `options` are those of the command.
+    detectors : of `detector_pictures`, for who writes several reports of one recording; drawn here if None.
+    noise : figures of the noise model, of `graphnav.estimation.noise.table.figure_rows`.
+    beside : names of files in the same folder to link to.
+    """
+    name, start, end = solution.solver, recording.start, recording.duration
+    only, every = {name: solution}, {} if errors is None else {name: errors}
+    spans = _shades(solution, start, withheld, outages)
+    if detectors is None:
+        detectors = detector_pictures(recording, solution)
+    own, others = ({k: p for k, p in solution.parameters.items() if named(k) == of_it} for of_it in (True, False))
+    sections: Sections = [
+        (
+            "Trajectory",
+            [
+                page.gallery([pictures.trajectory_picture(recording, only, spans)]),
+                page.gallery([pictures.profile_picture(recording, only)]),
+                *_gallery(pictures.motion_pictures(recording, only, spans)),
+            ],
+        ),
+        (
+            "Accuracy",
+            [
+                *tables.accuracy_tables(every, withheld, start, outages),
+                *summary.relative_tables(every),
+                *tables.metric_tables(metrics),
+                *_gallery(pictures.error_pictures(every, start, end, spans)),
+            ],
+        ),
+        ("Can sigma be believed?", [*_verdicts(only, every), *_consistency(every, start, end, spans)]),
+        ("Uncertainty", _gallery(pictures.sigma_pictures({name: solution.trajectory()}, start, end, spans))),
+        (
+            "Calibration",
+            [
+                *tables.parameter_table(own),
+                *_gallery(
+                    [
+                        *pictures.bias_pictures(solution, start, end, spans),
+                        *pictures.parameter_pictures(own, name, start, end, spans),
+                    ]
+                ),
+            ],
+        ),
+        (
+            "Constraints",
+            [
+                *_gallery(pictures.timeline_picture(solution, recording, spans)),
+                *tables.constraint_table(solution),
+                *tables.rejected_table(solution, start),
+                *_folded("Residuals of each", _gallery(pictures.record_pictures(solution, start, end, spans))),
+            ],
+        ),
+        (
+            "Noise model",
+            [
+                *tables.noise_tables(noise, solution),
+                *tables.excluded_table(solution, start),
+                *_folded(
+                    "Noise processes, node by node",
+                    [
+                        *tables.parameter_table(others),
+                        *_gallery(pictures.parameter_pictures(others, name, start, end, spans)),
+                    ],
+                ),
+            ],
+        ),
+        ("Detectors", [*_gallery(detectors), *tables.stop_table(solution, start)]),
+        ("What was odd", tables.odd(recording, findings)),
+        ("How it ran", tables.run_table(only)),
+        ("Provenance", provenance_tables(settings, provenance)),
+    ]
+    lead = [
+        *_doubts(only, every),
+        page.paragraph(words.what_was_done(recording, only, withheld, outages)),
+        summary.verdicts(solution, errors),
+        *words.closure_note(name, metrics),
+        words.tiles(recording, only, every),
+        *summary.links(beside),
+        *summary.fix_table(recording, solution, withheld),
+        page.columns(["".join(summary.sigma_table(solution)), "".join(summary.left_out(solution, start))]),
+    ]
+    return _write(path, page.page(f"{recording.name}: {name}", lead, sections, _clocks(recording)))
+
+
+def write_comparison(
+    path: str | Path,
+    recording: Recording,
+    solutions: Mapping[str, Solution],
+    *,
+    settings: Mapping[str, Any],
+    metrics: Mapping[str, Mapping[str, Any]] | None = None,
+    errors: Mapping[str, Errors] | None = None,
+    withheld: Withheld = (),
+    outages: Spans = (),
+    findings: Sequence[str] = (),
+    provenance: Mapping[str, Any] | None = None,
+    noise: Sequence[FigureRow] = (),
+) -> Path:
+    """Several solvers on one recording as one self-contained HTML file; arguments as in `write_report`, per solver."""
+    start, end = recording.start, recording.duration
+    every, metrics_of = errors or {}, metrics or {}
+    first = next(iter(solutions.values()))
+    spans = _shades(first, start, withheld, outages)
+    gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
+    zooms = pictures.zoom_pictures(every, start, gone)
+    if not gone:
+        zooms = pictures.zoom_pictures(every, start, outages, "no GNSS")
+    rows = [
+        [kind, page.solver(name), *tables.consistency_row(tables.consistency(solution.records[kind]))]
+        for kind in dict.fromkeys(kind for s in solutions.values() for kind in s.records)
+        for name, solution in solutions.items()
+        if kind in solution.records
+    ]
+    measured = [table for name, values in metrics_of.items() for table in tables.metric_tables(values, name)]
+    tracks = {name: s.trajectory() for name, s in solutions.items()}
+    sections: Sections = [
+        (
+            "Accuracy",
+            [*tables.accuracy_tables(every, withheld, start, outages), *summary.relative_tables(every), *measured],
+        ),
+        ("Spans without GNSS" if not gone else "Withheld spans", _gallery(zooms)),
+        (
+            "Trajectory",
+            [
+                page.gallery([pictures.trajectory_picture(recording, solutions, spans)]),
+                page.gallery([pictures.profile_picture(recording, solutions)]),
+                *_gallery(pictures.motion_pictures(recording, solutions, spans)),
+            ],
+        ),
+        ("Errors against truth", _gallery(pictures.error_pictures(every, start, end, spans))),
+        ("Where they differ", _gallery(pictures.difference_pictures(solutions, start, end, spans))),
+        ("Can sigma be believed?", _consistency(every, start, end, spans)),
+        ("Uncertainty", _gallery(pictures.sigma_pictures(tracks, start, end, spans))),
+        ("Constraints", [page.table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
+        ("Noise model", [*tables.noise_tables(noise, first), *tables.excluded_table(first, start)]),
+        ("What was odd", tables.odd(recording, findings)),
+        ("How they ran", tables.run_table(solutions)),
+        ("Provenance", provenance_tables(settings, provenance)),
+    ]
+    lead = [
+        *_doubts(solutions, every),
+        page.paragraph(words.what_was_done(recording, solutions, withheld, outages)),
+        *_verdicts(solutions, every),
+        *(note for name, values in metrics_of.items() for note in words.closure_note(name, values)),
+        words.tiles(recording, solutions, every),
+    ]
+    return _write(path, page.page(f"{recording.name}: comparison", lead, sections, _clocks(recording)))
+
+
+def detector_pictures(recording: Recording, solution: Solution) -> list[page.Raw]:
+    """What the detectors saw, for `write_report`: the same for every solver of a recording."""
+    return pictures.detection_pictures(recording, solution.detections)
+
+
+def _clocks(recording: Recording) -> list[page.Clock]:
+    """The recording's own clock, and where it is known which one that is GPS time and UTC."""
+    out = [page.Clock("time on the recording's clock [s]", recording.start)]
+    if recording.gps_zero is not None:
+        gps = recording.gps_zero + recording.start
+        utc = (gps_to_utc(np.array([gps]))[0] - np.datetime64(0, "us")) / np.timedelta64(1, "s")
+        out += [page.Clock("UTC", float(utc), date=True), page.Clock("GPS time", gps + GPS_TO_UNIX, date=True)]
+    return out
+
+
+def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans) -> Shades:
+    """Spans of time worth a tint, s from the start, by what they are."""
+    excluded = [(part.t_start - start, part.t_end - start) for part in getattr(solution, "excluded", ())]
+    gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
+    return {"withheld": gone, "no GNSS": list(outages), "excluded": excluded}
+
+
+def _doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[page.Raw]:
+    """Why the result cannot be trusted, where it cannot."""
+    return [page.paragraph(said, "verdict bad") for said in words.doubts(solutions, errors)]
+
+
+def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[page.Raw]:
+    """Per solver, whether its sigma can be believed."""
+    if errors:
+        return [words.believe(name, e) for name, e in errors.items()]
+    # where there is no truth a filter's innovations judge the model that all share better than any residuals
+    met = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
+    return [words.believe_without_truth(solution) for solution in met or solutions.values()]
+
+
+def _consistency(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[str]:
+    table = tables.nees_table(errors)
+    if not table:
+        return []
+    note = "Errors of one drive are alike for seconds to minutes, so a true sigma scatters about 1 as well."
+    return [*table, page.paragraph(note, "soft"), *_gallery(pictures.nees_pictures(errors, start, end, spans))]
+
+
+def _gallery(images: Sequence[page.Raw]) -> list[str]:
+    return [page.gallery(images)] if images else []
+
+
+def _folded(title: str, parts: Sequence[str]) -> list[str]:
+    return [page.folded(title, "".join(parts))] if parts else []
+
+
+def _write(path: str | Path, html: str) -> Path:
+    path = Path(path)
+    path.write_text(html, encoding="utf-8")
+    return path

@@ -1,0 +1,76 @@
+"""What the numbers of a calibration are: words and a unit for people, by the names that constraints give them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from graphnav.estimation.solution import ParameterEstimate
+
+_AXES = ("right", "forward", "up")
+_DEG = 57.29577951308232
+_CROSS = ("right from forward", "right from up", "forward from right", "forward from up", "up from right",
+          "up from forward")  # as `graphnav.imu.dynamics` has them  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Component:
+    """One number of a parameter: what it is, and how it is shown."""
+
+    words: str
+    unit: str
+    scale: float = 1.0  # from the parameter's own unit
+
+
+def _scales(each: int) -> list[Component]:
+    out = []
+    for sensor in ("gyro", "accelerometer"):
+        out += [Component(f"{sensor} scale error, {axis}", "ppm", 1e6) for axis in _AXES]
+        out += [Component(f"{sensor} misalignment, {pair}", "mrad", 1e3) for pair in _CROSS[: each - 3]]
+    return out
+
+
+def _along(words: str) -> list[Component]:
+    return [Component(f"{words}, {axis}", "m") for axis in _AXES]
+
+
+# What is of interest in a calibration; all else belongs to the noise of the measurements.
+_NAMED = {
+    "mounting": [Component("mounting, pitch", "deg", _DEG), Component("mounting, heading", "deg", _DEG)],
+    "gnss_lever_arm": _along("antenna lever arm"),
+    "axle": [Component("axle without side slip, before the stated place", "m")],
+    "gnss_time_offset": [Component("stamps of the positions, to add", "ms", 1e3)],
+    "gnss_velocity_time_offset": [Component("stamps of the GNSS velocities, to add", "ms", 1e3)],
+    "odometer_delay": [Component("delay of the odometer", "ms", 1e3)],
+    "odometer_scale": [Component("odometer scale error", "%", 100.0)],
+    "slip_squat": [
+        Component("side slip by lateral acceleration", "deg per m/s²", _DEG),
+        Component("squat by forward acceleration", "deg per m/s²", _DEG),
+    ],
+    "pivot": _along("pivot of the foot"),
+    "pivot_travel": [
+        Component("travel of the pivot, right", "m"),
+        Component("travel of the pivot, forward", "m"),
+    ],
+    "foot_axis": [
+        Component("foot's sideways axis, forward part", "deg", _DEG),
+        Component("foot's sideways axis, upward part", "deg", _DEG),
+    ],
+}
+
+
+def named(name: str) -> bool:
+    """Whether a parameter is of the calibration, and its numbers have names."""
+    return name in _NAMED or name == "imu_scale"
+
+
+def components(name: str, estimate: ParameterEstimate) -> list[Component]:
+    """One for each of a parameter's numbers; those without a name are counted."""
+    size = estimate.value.shape[1]
+    known = _scales(size // 2) if name == "imu_scale" else _NAMED.get(name, [])
+    if len(known) == size:
+        return known
+    unit = estimate.unit or "-"
+    if size == 1:
+        return [Component(name, unit)]
+    axes = ("east", "north", "up") if name.startswith("gnss_") and size == 3 else range(size)
+    return [Component(f"{name} [{axis}]", unit) for axis in axes]

@@ -1,0 +1,324 @@
+"""The pictures that `graphnav.report.documents` puts together, each from plain data to a captioned figure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from graphnav.core.interpolation import fit_yaw, yaw_matrix
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
+from graphnav.detectors.base import Detection
+from graphnav.estimation.solution import ParameterEstimate, Solution
+from graphnav.evaluation.against import own
+from graphnav.recording import FIX_TYPES, Recording
+from graphnav.report import page, plots
+from graphnav.report.names import components
+from graphnav.report.page import Raw
+from graphnav.report.plots import Series, Shades, Spans
+from graphnav.report.plots.way import draw_fixes
+
+if TYPE_CHECKING:
+    from graphnav.evaluation.metrics import Errors
+
+ENU = ("east", "north", "up")
+RPH = ("roll", "pitch", "heading")
+XYZ = ("x right", "y forward", "z up")
+DEG = float(np.degrees(1.0))
+DEG_H = float(np.degrees(3600.0))
+
+
+def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> Raw:
+    """The way from above, with what was and what was not used of the fixes."""
+    start = recording.start
+    first = next(iter(solutions.values()))
+    truth = _truth(recording, solutions)
+    figure = plots.trajectory(
+        {name: (s.t - start, s.states.p[:, :2]) for name, s in solutions.items()},
+        fixes=fixes_of(recording, first),
+        truth=None if truth is None else truth[1][:, :2],
+        spans=spans,
+        stops=[(a - start, b - start) for a, b in first.stationary],
+        standing="step" if recording.platform == "foot" else "stop",
+    )
+    lat, lon = np.degrees(first.frame.origin[:2])
+    where = f"North is up; the origin is latitude {lat:.6f}, longitude {lon:.6f} deg."
+    if recording.gnss is None:
+        where = "Nothing says where on the Earth this is: place and heading count from the start."
+    return page.picture(figure, "Seen from above", where, kind="large")
+
+
+def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> Raw:
+    """Heights over the distance travelled."""
+    start, first = recording.start, next(iter(solutions.values()))
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(first.states.p[:, :2], axis=0), axis=1))])
+
+    def over_way(t: Array, h: Array) -> tuple[Array, Array]:
+        return np.interp(t, first.t, way), h
+
+    lines, points = {}, {}
+    truth, fixes = _truth(recording, solutions), fixes_of(recording, first)
+    base = 0.0 if recording.gnss is None else float(first.frame.origin[2])
+    if truth is not None and truth[1].shape[1] > 2:
+        lines["truth"] = over_way(truth[0], base + truth[1][:, 2])
+    lines |= {name: over_way(s.t, base + s.states.p[:, 2]) for name, s in solutions.items()}
+    if fixes is not None:
+        for kind, of_it in fixes.kinds.items():
+            rows = of_it & ~fixes.excluded
+            points[kind] = over_way(fixes.t[rows] + start, base + fixes.enu[rows, 2])
+    note = "Heights above the ellipsoid; fixes are of the antenna."
+    if recording.gnss is None:
+        note = "Heights count from the start."
+    return page.picture(plots.profile(lines, points), "Height profile", note, kind="large")
+
+
+def fixes_of(recording: Recording, solution: Solution) -> plots.Fixes | None:
+    """The fixes in metres, of what kind each is, and which the solver did not use though nobody withheld them."""
+    if recording.gnss is None:
+        return None
+    gnss, t = recording.gnss, recording.gnss.t
+    out = np.zeros(len(t), dtype=bool)
+    record = solution.records.get("gnss_position")
+    if record is not None and len(record.t):
+        gone = record.t[record.weight <= 1e-9]
+        out |= np.isin(np.round(t, 3), np.round(gone, 3))
+    for part in getattr(solution, "excluded", ()):
+        if part.kind in ("gnss", "gnss_position"):
+            out |= (t >= part.t_start) & (t <= part.t_end)
+    kinds = {"GNSS fix": np.ones(len(t), dtype=bool)}
+    if gnss.type is not None:
+        kinds = {FIX_TYPES[k]: gnss.type == k for k in (1, 2, 6, 4, 3, 5, 0) if np.any(gnss.type == k)}
+    elif gnss.sd is not None:
+        sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
+        classes = {
+            "sigma below 0.1 m": sd < 0.1,
+            "sigma 0.1 to 1 m": (sd >= 0.1) & (sd < 1.0),
+            "sigma 1 m and more": ~(sd < 1.0),
+        }
+        said = {name: rows for name, rows in classes.items() if rows.any()}
+        kinds = said if len(said) > 1 else kinds
+    return plots.Fixes(t - recording.start, solution.frame.from_llh(gnss.llh), out, kinds)
+
+
+def _truth(recording: Recording, solutions: Mapping[str, Solution]) -> tuple[Array, Array] | None:
+    """Times (M,) and places (M, 2 or 3) of the truth, in metres like the first solution's."""
+    truth, first = recording.truth, next(iter(solutions.values()))
+    if truth is not None and truth.llh is not None:
+        return truth.t, first.frame.from_llh(truth.llh)
+    if truth is not None and truth.xyz is not None:
+        return truth.t, _laid_on(truth.t, truth.xyz, list(own(solutions).values())[-1])
+    return None
+
+
+def _laid_on(t: Array, xyz: Array, solution: Solution) -> Array:
+    """A truth (M, 2 or 3) in a frame of its own, turned and moved onto a solution, (N, 2)."""
+    shared = (t >= solution.t[0]) & (t <= solution.t[-1]) & np.isfinite(xyz).all(axis=1)
+    p = solution.at(t[shared])[1].p
+    flat = np.column_stack([xyz[shared, :2], np.zeros(len(p))])
+    yaw, offset = fit_yaw(flat, p)
+    return np.asarray((flat @ yaw_matrix(yaw).T + offset)[:, :2])
+
+
+def error_series(errors: Errors, start: float) -> dict[str, Series]:
+    """Errors as things to draw: position (m), velocity (m/s), attitude (deg), where there are any."""
+    t = errors.t - start
+    out = {}
+    for kind, value, sigma, scale in (
+        ("position", errors.p, errors.sd_p, 1.0),
+        ("velocity", errors.v, errors.sd_v, 1.0),
+        ("attitude", errors.rph, errors.sd_rph, DEG),
+    ):
+        if np.isfinite(value).any():
+            out[kind] = Series(t, scale * value, scale * sigma if np.isfinite(sigma).any() else None)
+    return out
+
+
+def error_pictures(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Raw]:
+    """Position, velocity and attitude errors with 3 sigma."""
+    series = {name: error_series(e, start) for name, e in errors.items()}
+    out = []
+    for kind, parts, unit in (("position", ENU, "m"), ("velocity", ENU, "m/s"), ("attitude", RPH, "deg")):
+        chosen = {name: s[kind] for name, s in series.items() if kind in s}
+        if chosen:
+            banded = len(chosen) < 3 and any(s.sigma is not None for s in chosen.values())
+            note = "The line belongs inside the band." if banded else ""
+            figure = plots.bands(chosen, parts, unit, end, spans=spans)
+            out.append(page.picture(figure, f"{kind.capitalize()} error", note))
+    return out
+
+
+def nees_pictures(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Raw]:
+    """Squared errors over their covariance."""
+    series, names, dofs = {}, ["position", "velocity", "attitude"], [3, 3, 3]
+    for name, e in errors.items():
+        series[name] = Series(e.t - start, np.column_stack([e.nees_p, e.nees_v, e.nees_rph]))
+        dofs[0] = e.dof_p
+    known = [k for k in range(3) if any(np.isfinite(s.value[:, k]).any() for s in series.values())]
+    if not known:
+        return []
+    cut = {name: Series(s.t, s.value[:, known]) for name, s in series.items()}
+    figure = plots.nees(cut, [names[k] for k in known], [dofs[k] for k in known], end, spans=spans)
+    note = (
+        "Squared error over its covariance, divided by its degrees of freedom: about 1 where sigma is true, above the "
+        "band where it is too small."
+    )
+    return [page.picture(figure, "NEES over time", note)]
+
+
+def sigma_pictures(tracks: Mapping[str, Trajectory], start: float, end: float, spans: Shades) -> list[Raw]:
+    """What the solvers themselves say of their uncertainty."""
+    out = []
+    wanted = (
+        ("Position", "sd_p", ENU, "m", 1.0),
+        ("Velocity", "sd_v", ENU, "m/s", 1.0),
+        ("Attitude", "sd_rph", RPH, "deg", DEG),
+    )  # fmt: skip
+    for kind, key, parts, unit, scale in wanted:
+        series = {
+            name: Series(track.t - start, getattr(track, key) * scale)
+            for name, track in tracks.items()
+            if getattr(track, key) is not None
+        }
+        if series:
+            figure = plots.sigmas(series, parts, unit, end, spans=spans)
+            out.append(page.picture(figure, f"{kind}, 1 sigma as stated"))
+    return out
+
+
+def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> list[Raw]:
+    """Position, velocity and attitude as estimated, with 3 sigma, and what fixes and receiver said of them."""
+    start, end = recording.start, recording.duration
+    first = next(iter(solutions.values()))
+    tracks = {name: s.trajectory() for name, s in solutions.items()}
+    fixes, gnss = fixes_of(recording, first), recording.gnss
+    base = np.array([0.0, 0.0, 0.0 if gnss is None else float(first.frame.origin[2])])
+
+    def measured(panel: plots.Panel, k: int) -> None:
+        if fixes is not None:
+            draw_fixes(panel, replace(fixes, enu=fixes.enu + base), k)
+
+    def doppler(panel: plots.Panel, k: int) -> None:
+        if gnss is not None and gnss.v is not None and np.isfinite(gnss.v[:, k]).any():
+            panel.dots(gnss.t - start, gnss.v[:, k], "ink", "GNSS velocity", 2.5, alpha=0.5)
+
+    place = {name: Series(s.t - start, s.states.p + base, tracks[name].sd_p) for name, s in solutions.items()}
+    speed = {name: Series(t.t - start, t.v, t.sd_v) for name, t in tracks.items() if t.v is not None}
+    turned = {
+        name: Series(t.t - start, _unwrapped(t.rph), None if t.sd_rph is None else DEG * t.sd_rph)
+        for name, t in tracks.items() if t.rph is not None
+    }  # fmt: skip
+    out = []
+    for title, series, parts, unit, under in (
+        ("Position", place, ("east", "north", "height"), "m", measured),
+        ("Velocity", speed, ENU, "m/s", doppler),
+        ("Attitude", turned, RPH, "deg", None),
+    ):
+        if series:
+            figure = plots.bands(series, parts, unit, end, spans=spans, about_zero=False, under=under)
+            note = ""
+            if title == "Attitude" and any(np.nanmax(s.value[:, 2], initial=0.0) > 360.0 for s in series.values()):
+                note = "The heading goes on beyond 360 deg, turn by turn."
+            out.append(page.picture(figure, f"{title} and 3 sigma" if len(series) < 3 else title, note))
+    return out
+
+
+def _unwrapped(rph: Array) -> Array:
+    """Roll, pitch, heading (N, 3) in deg; the heading, from 0 to 360 at first, without a jump."""
+    out = np.degrees(rph)
+    known = np.isfinite(out[:, 2])
+    heading = np.unwrap(out[known, 2], period=360.0)
+    out[known, 2] = heading - 360.0 * np.floor(heading[0] / 360.0) if len(heading) else heading
+    return np.asarray(out)
+
+
+def bias_pictures(solution: Solution, start: float, end: float, spans: Shades) -> list[Raw]:
+    """Gyro and accelerometer biases with 3 sigma."""
+    sd = np.sqrt(np.maximum(np.diagonal(solution.covariance, axis1=1, axis2=2), 0.0))
+    t = solution.t - start
+    out = []
+    for words, value, sigma, unit, scale in (
+        ("Gyro bias", solution.states.bg, sd[:, 12:15], "deg/h", DEG_H),
+        ("Accelerometer bias", solution.states.ba, sd[:, 9:12], "mm/s²", 1000.0),
+    ):
+        series = {solution.solver: Series(t, value * scale, sigma * scale)}
+        figure = plots.bands(series, XYZ, unit, end, spans=spans, about_zero=False)
+        out.append(page.picture(figure, f"{words} and 3 sigma"))
+    return out
+
+
+def parameter_pictures(
+    parameters: Mapping[str, ParameterEstimate], solver: str, start: float, end: float, spans: Shades
+) -> list[Raw]:
+    """Slow parameters over time with 3 sigma, where the data told anything of them."""
+    out = []
+    for name, p in parameters.items():
+        if len(p.t) > 2 and np.any(p.sigma < 0.5 * p.prior_sigma):
+            shown = components(name, p)
+            scale = np.array([one.scale for one in shown])
+            series = {solver: Series(p.t - start, scale * p.value, scale * p.sigma)}
+            titles = [one.words for one in shown]
+            figure = plots.bands(series, titles, shown[0].unit, end, spans=spans, about_zero=False)
+            out.append(page.picture(figure, f"{name.replace('_', ' ')} and 3 sigma"))
+    return out
+
+
+def zoom_pictures(errors: Mapping[str, Errors], start: float, spans: Spans, what: str = "withheld") -> list[Raw]:
+    """Horizontal error in and around each span."""
+    if not spans or not errors:
+        return []
+    series = {}
+    for name, e in errors.items():
+        s = error_series(e, start)["position"]
+        series[name] = Series(s.t, np.hypot(s.value[:, 0], s.value[:, 1])[:, None])
+    figure = plots.span_zoom(series, spans, what)
+    return [page.picture(figure, "Horizontal error in and around each span", kind="large" if len(spans) > 1 else "")]
+
+
+def difference_pictures(solutions: Mapping[str, Solution], start: float, end: float, spans: Shades) -> list[Raw]:
+    """How far the solvers are from the last of them, at the keyframes they share."""
+    name, reference = list(own(solutions).items())[-1]
+    series = {}
+    for key, s in solutions.items():
+        if key == name:
+            continue
+        _, mine, its = np.intersect1d(s.t, reference.t, return_indices=True)
+        if len(mine) > 1:
+            series[key] = Series(s.t[mine] - start, s.states.p[mine] - reference.states.p[its])
+    if not series:
+        return []
+    figure = plots.bands(series, ENU, "m", end, spans=spans)
+    return [page.picture(figure, f"Position less that of {name}")]
+
+
+def record_pictures(solution: Solution, start: float, end: float, spans: Shades) -> list[Raw]:
+    """Whitened residuals and NIS of every constraint."""
+    out = []
+    for kind, record in solution.records.items():
+        if not len(record.t):
+            continue
+        figure = plots.residuals(record, start, end, solution.solver, spans=spans)
+        dof = record.residual.shape[1]
+        note = f"The lines are at 3 sigma; NIS is chi-square with {dof} degree{'s' if dof > 1 else ''} of freedom"
+        note += "." if record.kind == "innovation" else " at most, as a fit takes up part of the noise."
+        out.append(page.picture(figure, f"{kind}: {record.kind}s over their sigma", note))
+    return out
+
+
+def timeline_picture(solution: Solution, recording: Recording, spans: Shades) -> list[Raw]:
+    """Which constraint was used when."""
+    records = {kind: record for kind, record in solution.records.items() if len(record.t)}
+    if not records:
+        return []
+    figure = plots.timeline(records, recording.start, recording.duration, solution.solver, spans=spans)
+    return [page.picture(figure, "What was used when", kind="large")]
+
+
+def detection_pictures(recording: Recording, found: Sequence[Detection]) -> list[Raw]:
+    """What the detectors saw."""
+    if not found:
+        return []
+    note = "Tinted: the intervals in which it stands, all detectors together."
+    return [page.picture(plots.detections(recording, found), "What the detectors saw", note, kind="large")]

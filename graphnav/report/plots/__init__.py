@@ -1,0 +1,18 @@
+"""Figures of trajectories, errors, biases, residuals and detections: data in, `Figure` out, for plotly to draw.
+
+Times are seconds from the recording's start, as on the command line.
+"""
+
+from graphnav.report.plots.colours import PALETTE, css_colours
+from graphnav.report.plots.consistency import nees, residuals, timeline
+from graphnav.report.plots.detections import detections
+from graphnav.report.plots.figure import SHADES, TIME, Figure, Panel, Spans, limits
+from graphnav.report.plots.series import Series, Shades, bands, sigmas, span_zoom
+from graphnav.report.plots.thinning import BINS, chosen_rows, thin, with_breaks
+from graphnav.report.plots.way import FIX_COLOURS, Fixes, profile, trajectory
+
+__all__ = [
+    "BINS", "FIX_COLOURS", "PALETTE", "SHADES", "TIME", "Figure", "Fixes", "Panel", "Series", "Shades", "Spans",
+    "bands", "chosen_rows", "css_colours", "detections", "limits", "nees", "profile", "residuals",
+    "sigmas", "span_zoom", "thin", "timeline", "trajectory", "with_breaks",
+]  # fmt: skip

@@ -1,0 +1,250 @@
+"""Figures as plotly takes them: panels over one x axis, and in each what is to be seen.
+
+Plain JSON that refers to colours as `var(--name)`, as the page's style sheet does; `page.js` puts in those of the
+reader's light or dark page, and draws. Numbers go as little-endian 32-bit floats, which plotly reads as they are.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.report.plots.colours import PALETTE
+from graphnav.report.plots.thinning import BINS, chosen_rows, thin, with_breaks
+
+SHADES = {"withheld": "withheld", "no GNSS": "outage", "excluded": "alert", "stands": "stop"}  # span -> colour
+TIME = "time from the start [s]"
+Spans = Sequence[tuple[float, float]]
+_PANEL, _GAP, _ABOVE, _BELOW, _LEFT, _RIGHT = 104, 30, 20, 42, 58, 10  # pixels
+_SYMBOLS = {"o": "circle", "x": "x-thin", "s": "square", "^": "triangle-up", "D": "diamond"}
+
+
+class Panel:
+    """One y axis of a figure."""
+
+    def __init__(self, figure: Figure, k: int, unit: str, xlim: tuple[float, float], ylim: tuple[float, float]) -> None:
+        self.figure, self.unit, self.xlim, self.ylim = figure, unit, xlim, ylim
+        self.axes = {"xaxis": figure.x_of(k), "yaxis": _axis("y", k)}
+
+    def _add(self, label: str, trace: dict[str, Any], quiet: bool = False, at: str = "", way: bool = False) -> None:
+        said = {"hoverinfo": "skip"}
+        if not quiet:
+            place = ("%{x:.2f}, %{y:.2f} " if way else "%{y:.4~g} ") + self.unit
+            said = {"hovertemplate": f"{place.strip()}{at}<extra>{label}</extra>"}
+        first = bool(label) and label not in self.figure.labels
+        self.figure.labels.add(label)
+        self.figure.data.append(
+            {"type": "scatter", **self.axes, "name": label, "legendgroup": label, "showlegend": first, **said, **trace}
+        )
+
+    def line(
+        self, x: Array, y: Array, name: str, label: str = "", width: float = 1.4, alpha: float = 1.0,
+        dash: bool = False, quiet: bool = False,
+    ) -> None:  # fmt: skip
+        """A line over x in order, broken where y is not finite or x leaps."""
+        x, y = with_breaks(x, thin(x, y), y)
+        look = {"color": colour(name), "width": width, "dash": "dash" if dash else "solid"}
+        self._add(label, {"mode": "lines", "x": numbers(x), "y": numbers(y), "line": look, "opacity": alpha}, quiet)
+
+    def level(self, y: float, **kw: Any) -> None:
+        """A line across at y."""
+        self.line(np.array(self.xlim), np.full(2, y), "ink", quiet=True, **{"width": 1.0, **kw})
+
+    def way(
+        self, xy: Array, name: str, label: str, t: Array | None = None, width: float = 1.8, alpha: float = 1.0
+    ) -> None:
+        """A line through places (N, 2), passed at t."""
+        rows = chosen_rows(*xy.T)
+        at: dict[str, Any] = {} if t is None else {"customdata": numbers(t[rows])}
+        look = {"color": colour(name), "width": width}
+        places = {"x": numbers(xy[rows, 0]), "y": numbers(xy[rows, 1])}
+        words = "<br>at %{customdata:.2f} s" if at else ""
+        self._add(label, {"mode": "lines", "line": look, "opacity": alpha, **places, **at}, t is None, words, way=True)
+
+    def dots(
+        self, x: Array, y: Array, name: str, label: str = "", size: float = 4.0, marker: str = "o",
+        alpha: float = 1.0, t: Array | None = None, way: bool = False,
+    ) -> None:  # fmt: skip
+        """A marker (o, x, s, ^, D) at every row."""
+        rows = chosen_rows(x, y) if way else thin(x, y)
+        look = {"color": colour(name), "size": size, "symbol": _SYMBOLS[marker], "opacity": alpha}
+        if marker == "x":
+            look["line"] = {"color": colour(name), "width": 2}
+        at: dict[str, Any] = {} if t is None else {"customdata": numbers(t[rows])}
+        words = "<br>at %{customdata:.2f} s" if at else ""
+        places = {"x": numbers(x[rows]), "y": numbers(y[rows])}
+        self._add(label, {"mode": "markers", "marker": look, **places, **at}, at=words, way=way)
+
+    def band(self, x: Array, low: Array, high: Array, name: str, label: str = "", alpha: float = 0.18) -> None:
+        """A tinted area between two lines, broken where x leaps."""
+        x, low, high = with_breaks(x, thin(x, high - low, BINS // 2), low, high)
+        parts = []
+        for run in np.ma.clump_unmasked(np.ma.masked_invalid(low + high)):
+            outline = np.concatenate([high[run], low[run][::-1]])
+            parts += [[np.concatenate([x[run], x[run][::-1]]), outline], np.full((2, 1), np.nan)]
+        if parts:
+            both = np.concatenate([np.asarray(p) for p in parts[:-1]], axis=1)
+            tint = f"{colour(name)}{round(255 * alpha):02x}"
+            look = {"mode": "lines", "line": {"width": 0, "color": tint}, "fill": "toself", "fillcolor": tint}
+            self._add(label, {"x": numbers(both[0]), "y": numbers(both[1]), **look}, quiet=True)
+
+    def shade(self, spans: Mapping[str, Spans]) -> None:
+        """Tint whole spans of x, by what they are (a key of `SHADES`)."""
+        for what, every in spans.items():
+            cut = [(max(a, self.xlim[0]), min(b, self.xlim[1])) for a, b in every]
+            self.figure.shapes += [
+                {"type": "rect", "xref": self.axes["xaxis"], "yref": f"{self.axes['yaxis']} domain", "x0": a, "x1": b,
+                 "y0": 0, "y1": 1, "fillcolor": f"{colour(SHADES[what])}2b", "line": {"width": 0}, "layer": "below"}
+                for a, b in cut if b > a
+            ]  # fmt: skip
+            if any(b > a for a, b in cut) and what not in self.figure.labels:
+                look = {"symbol": "square", "size": 11, "color": colour(SHADES[what]), "opacity": 0.4}
+                self._add(what, {"mode": "markers", "marker": look, "x": [None], "y": [None]}, quiet=True)
+
+    def map(self, x: Array, y: Array, values: Array) -> None:
+        """Colours from dark to light for `values` (len(y), len(x)) at evenly spaced x and y."""
+        low, high = float(np.min(values)), float(np.max(values))
+        z = np.round(255.0 * (values - low) / max(high - low, 1e-12)).astype(np.uint8)
+        packed = {
+            "dtype": "u1",
+            "bdata": base64.b64encode(z.tobytes()).decode(),
+            "shape": f"{z.shape[0]}, {z.shape[1]}",
+        }
+        look = {"type": "heatmap", "colorscale": "Viridis", "showscale": False, "x": numbers(x), "y": numbers(y)}
+        self._add("", {**look, "z": packed})
+
+    def words(
+        self, x: float, y: float, text: str, align: str = "left", shift: tuple[float, float] = (6, 0),
+        name: str = "truth",
+    ) -> None:  # fmt: skip
+        """Words beside a place, moved by pixels."""
+        self.figure.annotations.append({
+            "text": text, "xref": self.axes["xaxis"], "yref": self.axes["yaxis"], "x": x, "y": y, "xanchor": align,
+            "yanchor": "bottom", "xshift": shift[0], "yshift": shift[1], "showarrow": False,
+            "font": {"color": colour(name)},
+        })  # fmt: skip
+
+
+class Figure:
+    """Panels one over the other, the first on top.
+
+    Parameters
+    ----------
+    titles, ylims : of the panels; limits are decimal logarithms where `log`.
+    xlim : of all of them, or a list with that of each where they stand `apart`.
+    height : of a panel, pixels.
+    x : title of the x axis; a figure over `TIME` is zoomed together with all such figures of a page.
+    names : instead of numbers on the y axis.
+    """
+
+    def __init__(
+        self, titles: Sequence[str], xlim: Any, ylims: Sequence[tuple[float, float]], *, units: Sequence[str] = (),
+        log: Sequence[bool] | bool = False, height: int = _PANEL, x: str = TIME, apart: bool = False,
+        names: Mapping[float, str] | None = None, equal: bool = False, columns: int = 1,
+    ) -> None:  # fmt: skip
+        count = len(titles)
+        rows = -(-count // columns)
+        self.apart, self.time = apart, x == TIME and not apart
+        gap = _GAP + 16 * apart  # room for numbers under every panel
+        inner = rows * height + (rows - 1) * gap
+        self.height = _ABOVE + _BELOW + inner
+        self.data: list[dict[str, Any]] = []
+        self.labels: set[str] = set()
+        self.shapes: list[dict[str, Any]] = []
+        self.annotations: list[dict[str, Any]] = []
+        self.axes: dict[str, Any] = {}
+        self.panels = []
+        lims = xlim if isinstance(xlim, list) else [xlim] * count
+        for k, (title, ylim) in enumerate(zip(titles, ylims, strict=True)):
+            row, column = divmod(k, columns)
+            top = 1.0 - row * (height + gap) / inner
+            across = [(column + 0.1 * (column > 0)) / columns, (column + 1 - 0.1 * (column < columns - 1)) / columns]
+            panel = Panel(self, k, units[k] if units else "", lims[k], ylim)
+            xname, yname = panel.axes["xaxis"], panel.axes["yaxis"]
+            lowest = k + columns >= count
+            # an axis that several panels share belongs to the lowest of them
+            self.axes[f"xaxis{xname[1:]}"] = {
+                **_LOOK, "range": list(lims[k]), "domain": across, "anchor": yname, "nticks": 6 if columns == 1 else 4,
+                "hoverformat": ".2f", "showline": True, **({"title": {"text": x, "standoff": 6}} if lowest else {}),
+            }  # fmt: skip
+            logarithmic = log if isinstance(log, bool) else log[k]
+            look = {**_LOOK, "range": list(ylim), "domain": [max(top - height / inner, 0.0), top], "anchor": xname}
+            if logarithmic:
+                look |= {"type": "log", "minorloglabels": "complete", "nticks": 4}
+            if names is not None:
+                look |= {"tickmode": "array", "tickvals": list(names), "ticktext": list(names.values()), "ticks": ""}
+                look["automargin"] = True
+            if equal:
+                look |= {"scaleanchor": xname, "scaleratio": 1}
+            self.axes[f"yaxis{yname[1:]}"] = {"nticks": 5, **look}
+            if title.strip():
+                self.annotations.append({
+                    "text": title, "xref": "paper", "yref": "paper", "x": across[0], "y": top, "xanchor": "left",
+                    "yanchor": "bottom", "showarrow": False,
+                })  # fmt: skip
+            self.panels.append(panel)
+
+    def x_of(self, k: int) -> str:
+        """The x axis of panel k: that of the first, unless it stands apart."""
+        return _axis("x", k if self.apart else 0)
+
+    @property
+    def json(self) -> dict[str, Any]:
+        """`data` and `layout` as plotly takes them; the width is the container's."""
+        layout = {
+            "autosize": True, "margin": {"l": _LEFT, "r": _RIGHT, "t": _ABOVE, "b": _BELOW},
+            "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)",
+            "font": {"family": 'system-ui, "Segoe UI", Roboto, sans-serif', "size": 11, "color": "var(--soft)"},
+            "showlegend": False,  # the page has one, outside the picture
+            "hovermode": "x" if self.time else "closest",
+            "hoverlabel": {"bgcolor": "var(--card)", "bordercolor": "var(--edge)", "font": {"color": "var(--words)"}},
+            "annotations": self.annotations, "shapes": self.shapes, **self.axes,
+        }  # fmt: skip
+        if self.time and len(self.panels) > 1:
+            layout["hoversubplots"] = "axis"
+        return {"data": self.data, "layout": layout}
+
+
+_LOOK = {"zeroline": False, "gridcolor": "var(--grid)", "linecolor": "var(--ink)", "exponentformat": "none"}
+
+
+def limits(
+    values: Sequence[Array], floor: float = 0.0, symmetric: bool = False, always: Sequence[Array] = ()
+) -> tuple[float, float]:
+    """Limits of an axis that a spike does not set, at least `floor` wide.
+
+    All is shown within the middle 99 % of the values and half as much again on either side, which are 5.2 sigma of a
+    Gaussian, and all of `always`; what lies farther out is found by zooming out.
+    """
+    flat = np.concatenate([np.ravel(v) for v in values]) if values else np.zeros(0)
+    flat = flat[np.isfinite(flat)]
+    lo, hi = (float(flat.min()), float(flat.max())) if len(flat) else (0.0, 1.0)
+    if len(flat) > 200:  # of fewer, 1 % is less than two
+        a, b = np.quantile(flat, [0.005, 0.995])
+        if b > a:
+            kept = [v[np.isfinite(v)] for v in always]
+            lo = max(lo, min([a - 0.5 * (b - a), *(float(v.min()) for v in kept if len(v))]))
+            hi = min(hi, max([b + 0.5 * (b - a), *(float(v.max()) for v in kept if len(v))]))
+    if symmetric:
+        hi = max(abs(lo), abs(hi))
+        lo = -hi
+    margin = max(0.06 * (hi - lo), (floor - (hi - lo)) / 2, 1e-9 * max(abs(lo), abs(hi), 1e-3))
+    return lo - margin, hi + margin
+
+
+def numbers(values: Array) -> dict[str, str]:
+    """A typed array, as plotly reads it."""
+    return {"dtype": "f4", "bdata": base64.b64encode(np.asarray(values, dtype="<f4").tobytes()).decode("ascii")}
+
+
+def colour(name: str) -> str:
+    """A colour of the page, by the name of a solver or of another drawn thing."""
+    return f"var(--{name if name in PALETTE else 'other'})"
+
+
+def _axis(letter: str, k: int) -> str:
+    return letter if k == 0 else f"{letter}{k + 1}"

@@ -1,0 +1,157 @@
+"""The way from above and from the side, with the fixes as good as each is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.report.plots.figure import SHADES, Figure, Panel, Spans, colour, limits
+
+_FEW = 60  # stops that get a large mark each
+_WIDE, _HIGH = 1080.0, 560  # pixels of the map on a desk; narrower pages show more of the north
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """GNSS fixes: times (M,) in s from the start, east, north, up (M, 3) in m, and which were excluded (M,).
+
+    `kinds` are the rows (M,) bool of each kind of fix, by its name: a type, or how exact it says it is.
+    """
+
+    t: Array
+    enu: Array
+    excluded: np.ndarray
+    kinds: Mapping[str, np.ndarray]
+
+
+# kind of a fix -> colour; others as they come
+FIX_COLOURS = {
+    "fixed": "fixed", "float": "float", "ppp": "ppp", "differential": "differential", "sbas": "sbas",
+    "single": "single", "unknown": "ink", "GNSS fix": "ink",
+    "sigma below 0.1 m": "fixed", "sigma 0.1 to 1 m": "float", "sigma 1 m and more": "single",
+}  # fmt: skip
+
+
+def trajectory(
+    tracks: Mapping[str, tuple[Array, Array]],
+    *,
+    fixes: Fixes | None = None,
+    truth: Array | None = None,
+    spans: Mapping[str, Spans] | None = None,
+    stops: Spans = (),
+    standing: str = "stop",
+) -> Figure:
+    """Where it went, to scale, north up.
+
+    Parameters
+    ----------
+    tracks : per solver the times (N,) in s and east, north (N, 2) in m.
+    truth : (L, 2) m
+    spans : s, by what they are ("withheld", "no GNSS", "excluded"): underlaid on the first track.
+    stops : s, marked where the first track was then; `standing` is what they are called.
+    """
+    parts = [np.zeros((0, 2)), *(en for _, en in tracks.values())]
+    parts += [] if fixes is None else [fixes.enu[:, :2]]
+    parts += [] if truth is None else [truth]
+    both = np.concatenate(parts)
+    both = both[np.isfinite(both).all(axis=1)]
+    (west, east), (south, north) = (limits([both[:, k]], floor=1.0, always=[en[:, k] for _, en in tracks.values()])
+                                    for k in (0, 1))  # fmt: skip
+    scale = max((east - west) / _WIDE, (north - south) / _HIGH)  # m per pixel, the same on both axes
+    figure = Figure(["north [m]"], (west, east), [(south, north)], units=["m"], height=_HIGH, x="east [m]", equal=True)
+    (panel,) = figure.panels
+    if fixes is not None:
+        draw_fixes(panel, fixes)
+    if truth is not None and len(truth):
+        panel.way(truth, "truth", "truth", width=3.5, alpha=0.5)
+    for number, (name, (t, en)) in enumerate(tracks.items()):
+        if number == 0:
+            _underlaid(panel, t, en, spans or {})
+        panel.way(en, name, name, t)
+        if number == 0:
+            _stops(panel, t, en, stops, standing)
+    if tracks:
+        _ends(panel, next(iter(tracks.values()))[1], scale)
+    _scale_bar(figure, panel)
+    return figure
+
+
+def profile(lines: Mapping[str, tuple[Array, Array]], points: Mapping[str, tuple[Array, Array]]) -> Figure:
+    """Heights (m) over the distance travelled (m): `lines` of solvers and truth, `points` of fixes by their kind."""
+    reach = max((float(x[-1]) for x, _ in lines.values() if len(x)), default=1.0)
+    kilo, unit = (1e-3, "km") if reach >= 2000.0 else (1.0, "m")
+    values = [y for _, y in (*lines.values(), *points.values())]
+    ylim = limits(values, floor=1.0, always=[y for name, (_, y) in lines.items() if name != "truth"])
+    x = f"distance travelled [{unit}]"
+    figure = Figure(["height [m]"], (0.0, kilo * max(reach, 1e-3)), [ylim], units=["m"], height=150, x=x)
+    (panel,) = figure.panels
+    for kind, (x_, y) in points.items():
+        panel.dots(kilo * x_, y, FIX_COLOURS.get(kind, "ink"), kind, 3.0, alpha=0.6)
+    for name, (x_, y) in lines.items():
+        panel.way(np.column_stack([kilo * x_, y]), name, name)
+    return figure
+
+
+def draw_fixes(panel: Panel, fixes: Fixes, k: int | None = None) -> None:
+    """Each kind in its colour, what was excluded as a cross: on a map, or component k over time."""
+    x, y = (fixes.enu[:, 0], fixes.enu[:, 1]) if k is None else (fixes.t, fixes.enu[:, k])
+    for kind, of_it in fixes.kinds.items():
+        rows = of_it & ~fixes.excluded & np.isfinite(y)
+        if rows.any():
+            name = FIX_COLOURS.get(kind, "ink")
+            size = 5.0 if k is None else 3.0
+            panel.dots(x[rows], y[rows], name, kind, size, alpha=0.6, t=fixes.t[rows], way=k is None)
+    out = fixes.excluded & np.isfinite(y)
+    if out.any():
+        panel.dots(x[out], y[out], "alert", "excluded fix", 7.0, "x", t=fixes.t[out], way=k is None)
+
+
+def _underlaid(panel: Panel, t: Array, en: Array, spans: Mapping[str, Spans]) -> None:
+    for what, every in spans.items():
+        pieces = [(t > a) & (t < b) for a, b in every]
+        gap = np.full((1, 2), np.nan)
+        way = [part for piece in pieces if piece.any() for part in (en[piece], gap)]
+        if way:
+            panel.way(np.concatenate(way), SHADES[what], what, width=8.0, alpha=0.5)
+
+
+def _stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) -> None:
+    if not len(stops) or len(t) < 2:
+        return
+    begin, end = np.array(stops).T
+    x, y = (np.interp(0.5 * (begin + end), t, en[:, k]) for k in (0, 1))
+    panel.dots(x, y, "stop", standing, 8.0 if len(stops) <= _FEW else 5.0, "D", t=begin, way=True)
+
+
+def _ends(panel: Panel, en: Array, scale: float) -> None:
+    """Where the track starts and ends, the words on the side where the track is not."""
+    together = bool(np.linalg.norm(en[-1] - en[0]) < 16.0 * scale)
+    few = max(1, len(en) // 30)
+    for row, inner, marker, words in ((0, few, "^", "start"), (-1, max(-1 - few, -len(en)), "s", "end")):
+        panel.dots(en[[row], 0], en[[row], 1], "truth", "", 10.0, marker)
+        left = en[row, 0] < en[min(inner, len(en) - 1), 0]
+        if not (together and row == 0):
+            words = "start and end" if together else words
+            panel.words(
+                float(en[row, 0]), float(en[row, 1]), words, "right" if left else "left", (-8 if left else 8, 0)
+            )
+
+
+def _scale_bar(figure: Figure, panel: Panel) -> None:
+    """A bar of a round number of metres, about a fifth of the width, at the lower edge of a map."""
+    west, east = panel.xlim
+    reach = east - west
+    metres = 10.0 ** math.floor(math.log10(reach / 5))
+    metres *= max(m for m in (1, 2, 5) if m * metres <= reach / 4)
+    x = east - 0.01 * reach
+    figure.shapes.append({
+        "type": "line", "xref": "x", "yref": "paper", "x0": x - metres, "x1": x, "y0": 0.02, "y1": 0.02,
+        "line": {"color": colour("truth"), "width": 3.5},
+    })  # fmt: skip
+    words = f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
+    panel.words(x - metres / 2, 0.02, words, "center", (0, 2))
+    figure.annotations[-1]["yref"] = "paper"

@@ -1,0 +1,72 @@
+"""From what, with what and how a result was made: enough to make it again."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shlex
+from collections.abc import Mapping
+from typing import Any
+
+from graphnav.report import page
+from graphnav.report.page import Raw
+
+SETTINGS = "settings.toml"
+
+
+def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any] | None) -> list[Raw]:
+    """The command and settings that make the same again; versions and inputs."""
+    provenance = dict(provenance or {})
+    out = []
+    options = provenance.pop("options", None)
+    toml = toml_text(settings)
+    if options:
+        saved = f"save the settings below as {SETTINGS}, " if toml else ""
+        out.append(page.paragraph(f"To repeat this run, {saved}take the inputs and versions listed, and call"))
+        out.append(page.code(command(options, bool(toml)), "command"))
+    if toml:
+        data = base64.b64encode(toml.encode()).decode("ascii")
+        link = Raw(f'<p><a download="{SETTINGS}" href="data:text/plain;base64,{data}">Save as {SETTINGS}</a></p>')
+        out.append(page.folded("Settings as resolved", link + page.code(toml, "settings")))
+    inputs = provenance.pop("inputs", {})
+    if provenance:
+        listed = [f"{key} {page.text(value)}" for key, value in page.flat(provenance).items()]
+        out += [page.heading("Versions"), page.paragraph(page.and_list(listed))]
+    if inputs:
+        rows = [[name, Raw(f"<code>{page.text(digest)}</code>")] for name, digest in inputs.items()]
+        out += [page.heading("Inputs"), page.table(["file", "sha256"], rows)]
+    return out
+
+
+def command(options: Mapping[str, Any], settings: bool = True) -> str:
+    """The call of the program for options as `graphnav.app.workflow.Request` keeps them, with `SETTINGS` if asked for."""
+    given = dict(options)
+    name = "compare" if "solvers" in given else "smooth"
+    words = ["graphnav", name, str(given.pop("recording", "RECORDING"))]
+    given.pop("config", None)
+    for key, value in given.items():
+        if value is None or value is False:
+            continue
+        for one in value if isinstance(value, list | tuple) else [value]:
+            words += [f"--{key.replace('_', '-')}"] if one is True else [f"--{key.replace('_', '-')}", str(one)]
+    words += ["--config", SETTINGS] if settings else []
+    return shlex.join([*words, "-o", "again"])
+
+
+def toml_text(values: Mapping[str, Any], table: str = "") -> str:
+    """Nested plain values as TOML; what is None is left out, as TOML has no word for it."""
+    plain = [f"{key} = {_toml(value)}" for key, value in values.items()
+             if value is not None and not isinstance(value, Mapping)]  # fmt: skip
+    head = [f"[{table}]"] if table and plain else []
+    parts = ["\n".join([*head, *plain])] if plain else []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            parts.append(toml_text(value, f"{table}.{key}" if table else key).rstrip("\n"))
+    return "\n\n".join(part for part in parts if part) + "\n" if any(parts) else ""
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_toml(one) for one in value)}]"
+    # JSON's words for numbers, truth and strings are TOML's
+    return json.dumps(value, ensure_ascii=False)

@@ -1,0 +1,215 @@
+"""The sentences and the few numbers that `graphnav.report.documents` begins with, each from plain data to HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from graphnav.estimation.noise.apply import row_weights
+from graphnav.estimation.solution import Solution
+from graphnav.evaluation.against import own
+from graphnav.evaluation.segments import rms
+from graphnav.recording import Recording
+from graphnav.report import page
+from graphnav.report.page import Raw
+from graphnav.report.plots import Spans
+from graphnav.report.tables import Withheld, consistency
+
+if TYPE_CHECKING:
+    from graphnav.evaluation.metrics import Errors
+
+_LISTED = 6  # outages
+_FEWEST = 10  # rows that say something of a sigma
+_MOST = 0.5  # share of what the fixes say; beyond it most of what was measured contradicts the result
+_TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduces residuals
+
+
+def doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> tuple[str, ...]:
+    """Sentences on why a result cannot be trusted, none where nothing speaks against it."""
+    from graphnav.evaluation.sigmas import judge_sigmas
+
+    out = []
+    solutions = own(solutions)
+    errors = {name: e for name, e in errors.items() if name in solutions}
+    for solution in solutions.values():
+        fixes = solution.records.get("gnss_position")
+        left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
+        if left_out > _MOST:
+            out.append(
+                f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest and "
+                "is left out"
+            )
+            break  # all solvers use the same noise model
+    wrong = []
+    for name, e in errors.items():
+        small = [j for j in judge_sigmas(e) if j.verdict == "too small"]
+        if small:
+            sizes = page.and_list([f"{j.size:.2g} times sigma ({j.block})" for j in small])
+            wrong.append(f"{name}: errors are {sizes}")
+    if not errors:
+        met = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
+        for solution in met or solutions.values():
+            kind, size, used = _met(solution)
+            if used >= _FEWEST and size > _TOO_LARGE[kind]:
+                wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")
+    if wrong:
+        out.append(f"The stated sigma cannot be trusted: {'; '.join(wrong)}")
+    return tuple(out)
+
+
+def _met(solution: Solution) -> tuple[str, float, int]:
+    """Of a solution's records: of which kind they are, RMS over sigma, and how many rows tell it."""
+    every = [consistency(record) for record in solution.records.values() if len(record.t)]
+    every = [c for c in every if np.isfinite(c.mean_nis)]
+    used = sum(c.count - c.rejected for c in every)
+    if not used:
+        return "residual", float("nan"), 0
+    return every[0].kind, float(np.sqrt(sum((c.count - c.rejected) * c.mean_nis / c.dof for c in every) / used)), used
+
+
+def what_was_done(recording: Recording, solutions: Mapping[str, Solution], withheld: Withheld, outages: Spans) -> str:
+    """The run in a few sentences."""
+    used = recording
+    for source, span in withheld:
+        if getattr(used, source, None) is not None:
+            used = used.without(source, span)
+    rate = 1.0 / float(np.median(np.diff(used.imu.t)))
+    sources = [f"{len(used.imu.t)} IMU rows at {rate:.4g} Hz"]
+    if used.gnss is not None:
+        sources.append(f"{len(used.gnss.t)} GNSS fixes")
+    if used.odometer is not None:
+        sources.append(f"{len(used.odometer.t)} odometer rows")
+    others = [name for name in solutions if name not in own(solutions)]
+    solutions = own(solutions)
+    solution = next(iter(solutions.values()))
+    several = len(solutions) > 1
+    who = f"The solvers {page.and_list(list(solutions))}" if several else f"The {solution.solver} solver"
+    words = (
+        f"{who} estimated the trajectory of the {recording.platform} recording '{recording.name}' "
+        f"({recording.duration:.1f} s) from {page.and_list(sources)}, at {len(solution.t)} keyframes."
+    )
+    if others:
+        words += f" Beside them, of other programs: {page.and_list(others)}."
+    if withheld:
+        listed = [f"{source} {span[0]:g} to {span[1]:g} s" if span else f"all of {source}" for source, span in withheld]
+        words += f" Withheld: {page.and_list(listed)} (seconds from the start)."
+    spans = solution.stationary
+    if len(spans) and recording.platform == "vehicle":
+        stops = "1 stop was" if len(spans) == 1 else f"{len(spans)} stops were"
+        words += f" {stops} found, {np.diff(spans).sum():.0f} s in all."
+    elif len(spans):
+        words += f" The foot was found on the floor {len(spans)} times."
+    if outages:
+        listed = [f"{a:.0f} to {b:.0f} s" for a, b in outages[:_LISTED]]
+        more = [f"{len(outages) - _LISTED} more"] if len(outages) > _LISTED else []
+        words += f" There were no GNSS fixes from {page.and_list([*listed, *more])}."
+    excluded = sum(int(part.count) for part in getattr(solution, "excluded", ()))
+    if excluded:
+        words += f" {excluded} measurements were excluded as faulty."
+    if not several and solution.stopped:
+        words += f" How it ended: {solution.stopped.rstrip('.')}."
+    return words
+
+
+def tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> Raw:
+    """The few numbers to see first."""
+    states = next(iter(solutions.values())).states
+    way = float(np.linalg.norm(np.diff(states.p, axis=0), axis=1).sum())
+    out = [
+        (f"{recording.duration:.1f} s", "duration"),
+        (f"{way / 1000:.2f} km" if way >= 1000 else f"{way:.1f} m", "distance"),
+    ]
+    spans = next(iter(solutions.values())).stationary
+    if len(spans):
+        out.append((f"{len(spans)}", "stops" if recording.platform == "vehicle" else "steps"))
+    several = len(solutions) > 1
+    for name, solution in solutions.items():
+        if name in errors:
+            value = f"{page.number(rms(errors[name].horizontal), 3)} m"
+            out.append((value, f"horizontal error, RMS{', ' + name if several else ''}"))
+        else:
+            sd = solution.trajectory().sd_p
+            if sd is not None:
+                value = f"{page.number(float(np.median(np.hypot(sd[:, 0], sd[:, 1]))), 3)} m"
+                out.append((value, f"horizontal sigma, median{', ' + name if several else ''}"))
+    if not several:
+        seconds = sum(next(iter(solutions.values())).timings.values())
+        out.append((f"{seconds:.2f} s", "run time"))
+    return page.tiles(out)
+
+
+def believe(name: str, errors: Errors) -> Raw:
+    """One sentence that compares errors with their sigma (and the truth's own, where it states one)."""
+    from graphnav.evaluation.sigmas import judge_sigmas
+
+    judged = judge_sigmas(errors)
+    if not judged:
+        return page.paragraph(f"{name}: no epoch has both an error and a sigma, so sigma cannot be judged.", "verdict")
+    worst = [j for j in judged if j.verdict == "too small"] or [j for j in judged if j.verdict == "unclear"]
+    shown = worst or judged
+    measured = page.and_list(
+        [
+            f"{j.block} errors are {j.size:.2f} times their sigma (RMS), {100 * j.inside:.1f} % within 3 sigma"
+            for j in shown
+        ]
+    )
+    measured += " (a Gaussian: 1 and 99.7 %)"
+    blocks = page.and_list([j.block for j in shown])
+    if worst and worst[0].verdict == "too small":
+        when = " at times" if all(j.inside > 0.9 for j in worst) else ""
+        return page.paragraph(
+            f"{name}: the stated sigma is too small{when}, of {blocks}: {measured}. Errors of the truth itself count "
+            "here as well.",
+            "verdict bad",
+        )
+    if worst:
+        alike = page.and_list([f"{j.effective:.0f}" for j in worst])
+        return page.paragraph(
+            f"{name}: whether sigma of {blocks} can be relied on remains open: {measured}, but the errors are alike "
+            f"for so long that they are worth {alike} independent values, and chance may do that.",
+            "verdict",
+        )
+    seen = {j.block for j in judged}
+    unseen = [what for what in ("position", "velocity", "attitude") if what not in seen]
+    rest = f" Nothing is there to judge {page.and_list(unseen)} by." if unseen else ""
+    if all(j.verdict == "cautious" for j in judged):
+        return page.paragraph(f"{name}: the stated sigma is cautious: {measured}.{rest}", "verdict")
+    return page.paragraph(f"{name}: the stated sigma can be believed: {measured}.{rest}", "verdict good")
+
+
+def believe_without_truth(solution: Solution) -> Raw:
+    """One sentence on what innovations or residuals say of the sigma, where there is no truth to say it."""
+    kind, size, used = _met(solution)
+    name = solution.solver
+    missing = "there is no truth to compare with"
+    if used < _FEWEST:
+        return page.paragraph(
+            f"{name}: no truth and too few measurements to say whether sigma can be believed.", "verdict"
+        )
+    if kind == "innovation":
+        measured = f"they are {size:.2f} times as large as predicted (RMS; 1 where sigma is true)"
+        if size > _TOO_LARGE[kind]:
+            return page.paragraph(
+                f"{name}: {missing}, and sigma looks too small for the innovations: {measured}.", "verdict bad"
+            )
+        if size < 0.5:
+            return page.paragraph(
+                f"{name}: {missing}; the stated sigma looks cautious for the innovations: {measured}.", "verdict"
+            )
+        return page.paragraph(f"{name}: {missing}. Innovations speak for the stated sigma: {measured}.", "verdict good")
+    measured = f"residuals are {size:.2f} times the measurements' sigma (RMS; 1 or a little less where sigma is true)"
+    if size > _TOO_LARGE[kind]:
+        return page.paragraph(f"{name}: {missing}, and sigma looks too small: {measured}.", "verdict bad")
+    said = f"{name}: {missing}, and residuals of a fit tell little; a filter's innovations tell more. The {measured}."
+    return page.paragraph(said, "verdict")
+
+
+def closure_note(name: str, metrics: Mapping[str, Any] | None) -> list[Raw]:
+    """How far from the start a loop ended, where that is the truth."""
+    if not metrics or metrics.get("closure_h_m") is None:
+        return []
+    h, up, way, share = (page.text(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))
+    words = f"the loop of {way} m closes to {h} m horizontally ({share} % of the way) and {up} m in height."
+    return [page.paragraph(Raw(f"{page.text(name)}: {words}"), "verdict")]

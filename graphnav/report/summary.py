@@ -1,0 +1,191 @@
+"""The first page of a report: whether position, velocity and attitude can be used, from what, and what was left out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.estimation.noise.apply import row_weights
+from graphnav.estimation.solution import Solution
+from graphnav.evaluation.segments import relative_errors, rms
+from graphnav.recording import Recording
+from graphnav.report import page
+from graphnav.report.page import Raw
+from graphnav.report.pictures import fixes_of
+from graphnav.report.tables import Withheld, consistency
+
+if TYPE_CHECKING:
+    from graphnav.evaluation.metrics import Errors
+
+_LINES = 3  # of what was left out
+_SAYS = {
+    "fits": ("good", "sigma can be believed"),
+    "cautious": ("", "sigma is cautious"),
+    "too small": ("bad", "sigma is too small"),
+    "unclear": ("", "open whether sigma can be believed: errors are alike for too long"),
+}
+# by whose innovations or residuals a block is judged where there is no truth
+_SHOWS = {
+    "position": ("gnss_position", "gnss_code"),
+    "velocity": ("gnss_velocity", "gnss_doppler", "odometer", "nhc", "zero_velocity", "stance"),
+    "attitude": (),
+}
+
+
+def verdicts(solution: Solution, errors: Errors | None) -> Raw:
+    """Position, velocity and attitude: how good, and whether the stated sigma can be believed."""
+    judged = _by_records(solution) | ({} if errors is None else _by_truth(errors))
+    cells = []
+    for block in ("position", "velocity", "attitude"):
+        kind, words = judged.get(block, ("", "nothing is there to judge it by"))
+        cells.append(f'<div class="verdict {kind}"><b>{block.capitalize()}</b>{page.text(words)}</div>')
+    return Raw(f'<div class="judged">{"".join(cells)}</div>')
+
+
+def _by_truth(errors: Errors) -> dict[str, tuple[str, str]]:
+    from graphnav.evaluation.sigmas import judge_sigmas
+
+    sizes = {
+        "position": f"{page.number(rms(errors.horizontal), 3)} m rms horizontal, "
+        f"{page.number(rms(errors.p[:, 2]), 3)} m up",
+        "velocity": f"{page.number(rms(np.linalg.norm(errors.v, axis=1)), 3)} m/s rms",
+        "attitude": f"{page.number(rms(np.degrees(errors.rph[:, :2])), 3)} deg rms roll and pitch, "
+        f"{page.number(rms(np.degrees(errors.rph[:, 2])), 3)} deg heading",
+    }
+    every = judge_sigmas(errors)
+    worst = {"too small": 0, "unclear": 1, "cautious": 2, "fits": 3}
+    out = {}
+    for block, size in sizes.items():
+        # three angles together hide one: heading is judged by itself as well
+        own = [j for j in every if j.block == block or (block == "attitude" and j.block == "heading")]
+        if own:
+            one = min(own, key=lambda j: worst[j.verdict])
+            kind, says = _SAYS[one.verdict]
+            out[block] = kind, f"{size}; {says} (errors are {one.size:.2f} sigma, rms)"
+    return out
+
+
+def _by_records(solution: Solution) -> dict[str, tuple[str, str]]:
+    out = {}
+    for block, kinds in _SHOWS.items():
+        for kind in kinds:
+            c = consistency(solution.records[kind]) if kind in solution.records else None
+            if c is None or c.count - c.rejected < 10 or not np.isfinite(c.mean_nis):
+                continue
+            # a row of weight w counts as one with a sigma larger by 1 / sqrt(w)
+            record = solution.records[kind]
+            used = record.weight > 1e-9
+            c = replace(c, mean_nis=float(np.nanmean(record.weight[used] * record.nis[used])))
+            bad = c.mean_nis / c.dof > (1.5 if c.kind == "innovation" else 1.3)
+            mark = "bad" if bad else "good" if c.kind == "innovation" else ""
+            out[block] = mark, f"no truth; {kind}: {c.verdict}"
+            break
+    return out
+
+
+def sigma_table(solution: Solution) -> list[Raw]:
+    """The stated 1-sigma that half, 95 % and all of the keyframes keep within."""
+    track = solution.trajectory()
+    rows: list[list[Any]] = []
+
+    def add(words: str, unit: str, values: Array) -> None:
+        values = values[np.isfinite(values)]
+        if len(values):
+            rows.append([f"{words} [{unit}]", *(float(np.quantile(values, q)) for q in (0.5, 0.95, 1.0))])
+
+    for words, unit, sd in (("position", "m", track.sd_p), ("velocity", "m/s", track.sd_v)):
+        if sd is not None:
+            add(f"{words}, horizontal", unit, np.hypot(sd[:, 0], sd[:, 1]))
+            add(f"{words}, up", unit, sd[:, 2])
+    if track.sd_rph is not None:
+        deg = np.degrees(track.sd_rph)
+        add("roll, pitch", "deg", np.maximum(deg[:, 0], deg[:, 1]))
+        add("heading", "deg", deg[:, 2])
+    return [page.heading("Stated 1-sigma"), page.table(["of", "50 %", "95 %", "largest"], rows)] if rows else []
+
+
+def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> list[Raw]:
+    """Fixes of each kind: how many, how many were left out or used, the longest gap, the largest residual."""
+    fixes, nan = fixes_of(recording, solution), float("nan")
+    if fixes is None:
+        return []
+    gone = np.zeros(len(fixes.t), dtype=bool)
+    for source, span in withheld:
+        if source == "gnss":
+            gone |= True if span is None else (fixes.t >= span[0]) & (fixes.t <= span[1])
+    record = solution.records.get("gnss_position")
+    at = _rows_at(fixes.t + recording.start, None if record is None else record.t)
+    kinds = {**fixes.kinds, **({"all": np.ones(len(gone), bool)} if len(fixes.kinds) > 1 else {})}
+    rows = []
+    for kind, of_it in kinds.items():
+        used = np.flatnonzero(of_it & ~gone & ~fixes.excluded & (at >= 0))
+        cells: list[Any] = [
+            kind,
+            *(int(np.count_nonzero(of_it & mask)) for mask in (~gone, gone, fixes.excluded & ~gone)),
+        ]
+        largest, over, gap = nan, nan, nan
+        if record is not None and len(used):
+            residual = record.residual[at[used]]
+            largest = float(np.nanmax(np.linalg.norm(residual, axis=1)))
+            over = float(np.nanmax(np.abs(residual / record.sigma[at[used]])))
+            gap = float(np.max(np.diff(fixes.t[used]), initial=0.0))
+        rows.append([*cells, len(used), gap, largest, over])
+    head = ["fixes", "count", "withheld", "left out", "used", "longest gap [s]", "largest residual [m]", "over sigma"]
+    out = [page.heading("Fixes"), page.table(head, rows)]
+    if "gnss_code" in solution.records:
+        out.append(page.paragraph("Raw observations are used in place of the fixes.", "soft"))
+    elif any(row[4] < row[1] - row[3] for row in rows):
+        out.append(page.paragraph("Of fixes that come more often than noise.spacing, the best one is used.", "soft"))
+    return out
+
+
+def _rows_at(t: Array, of: Array | None) -> np.ndarray:
+    """Row of `of` at each time, -1 where there is none within a millisecond."""
+    if of is None or not len(of):
+        return np.full(len(t), -1)
+    k = np.clip(np.searchsorted(of, t - 1e-3), 0, len(of) - 1)
+    return np.where(np.abs(of[k] - t) <= 1e-3, k, -1)
+
+
+def left_out(solution: Solution, start: float) -> list[Raw]:
+    """What was left out and why, in three lines: the largest spans, the rest together, what weighs less."""
+    spans = sorted(getattr(solution, "excluded", ()), key=lambda p: -p.count)
+    some = spans[:_LINES] if len(spans) <= _LINES else spans[: _LINES - 1]
+    lines = [
+        f"{p.kind}, {p.count} rows from {p.t_start - start:.1f} to {p.t_end - start:.1f} s: {p.reason or 'faulty'}"
+        for p in some
+    ]
+    if len(spans) > len(some):
+        rest = spans[len(some) :]
+        lines.append(f"{sum(int(p.count) for p in rest)} rows in {len(rest)} more spans: see the noise model")
+    less = [
+        f"{np.count_nonzero((w > 0) & (w < 0.5))} of {name}"
+        for name, record in solution.records.items()
+        if np.any(((w := row_weights(record.t, solution.noise, name)) > 0) & (w < 0.5))
+    ]
+    if less and len(lines) < _LINES:
+        lines.append(f"less than half weight, because they are farther off than chance allows: {page.and_list(less)}")
+    return [page.heading("Left out"), page.bullets(lines or ["Nothing was left out."])]
+
+
+def links(files: Sequence[str]) -> list[Raw]:
+    """The files beside the page, to open in other programs."""
+    inner = ", ".join(f'<a href="{page.text(name)}">{page.text(name)}</a>' for name in files)
+    return [Raw(f'<p class="soft screen">Beside this page: {inner}.</p>')] if files else []
+
+
+def relative_tables(errors: Mapping[str, Errors]) -> list[Raw]:
+    """Relative errors by the length of segments, where there is a truth."""
+    rows = [
+        [page.solver(name), Raw(f"{r.length:g}"), r.count, r.rms, r.percent, r.p95, r.largest, r.heading_rms]
+        for name, e in errors.items()
+        for r in relative_errors(e)
+    ]
+    head = ["solver", "segment [m]", "count", "RMS [m]", "% of length", "95 % [m]", "largest [m]", "heading RMS [deg]"]
+    if not rows:
+        return []
+    return [page.heading("Relative error by segment length"), page.table(head, rows)]

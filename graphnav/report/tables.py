@@ -1,0 +1,372 @@
+"""The tables and sentences that `graphnav.report.documents` puts together, each from plain data to HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.estimation.stops import stops_of_solution
+from graphnav.evaluation.against import own
+from graphnav.evaluation.segments import rms
+from graphnav.recording import Recording
+from graphnav.report import page
+from graphnav.report.names import components
+from graphnav.report.page import Raw
+from graphnav.report.plots import Spans
+
+if TYPE_CHECKING:
+    from graphnav.estimation.noise.table import FigureRow
+    from graphnav.evaluation.metrics import Errors
+
+_LISTED = 40  # rejected measurements
+_SHOWN = 10  # excluded spans; the others open on demand
+Withheld = Sequence[tuple[str, tuple[float, float] | None]]
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """How one constraint's residuals compare with their sigma."""
+
+    count: int
+    rejected: int
+    reduced: int
+    mean_nis: float  # of what was not rejected
+    dof: int
+    outside: float  # share of components beyond 3 sigma, of what was not rejected
+    kind: str
+
+    @property
+    def verdict(self) -> str:
+        """One sentence: can sigma be believed?"""
+        if self.count - self.rejected < 10 or not np.isfinite(self.mean_nis):
+            return "too few to judge"
+        ratio = self.mean_nis / self.dof
+        if self.kind == "residual":
+            # a fit takes up part of the noise, so a smoother's residuals are below their sigma, never above
+            if ratio > 1.3:
+                return "residuals larger than sigma allows: sigma is too small, or something is unmodelled"
+            return "residuals within their sigma"
+        if ratio > 1.5:
+            return "innovations larger than predicted: the filter is overconfident"
+        if ratio < 0.5:
+            return "innovations smaller than predicted: sigma is wider than it need be"
+        return "innovations as large as predicted: sigma can be believed"
+
+
+def consistency(record: ConstraintRecord) -> Consistency:
+    """Summarise a record."""
+    used = record.weight > 1e-9
+    white = np.abs(record.residual[used] / record.sigma[used])
+    white = white[np.isfinite(white)]
+    return Consistency(
+        count=len(record.t),
+        rejected=int(np.sum(~used)),
+        reduced=int(np.sum(used & (record.weight < 0.5))),
+        mean_nis=_mean(record.nis[used]),
+        dof=record.residual.shape[1],
+        outside=_mean((white > 3.0).astype(float)),
+        kind=record.kind,
+    )
+
+
+CONSISTENCY_HEAD = ("used", "rejected", "weight < 0.5", "mean NIS", "components", "outside 3 sigma", "what it says")
+
+
+def consistency_row(c: Consistency) -> list[Any]:
+    """The cells under `CONSISTENCY_HEAD`."""
+    outside = f"{100 * c.outside:.2f} %" if np.isfinite(c.outside) else "-"
+    return [c.count - c.rejected, c.rejected, c.reduced, float(c.mean_nis), c.dof, Raw(outside), c.verdict]
+
+
+def constraint_table(solution: Solution) -> list[Raw]:
+    """Counts of everything used, and the consistency of what left a record."""
+    out = []
+    rows = [[kind, *consistency_row(consistency(record))] for kind, record in solution.records.items()]
+    if rows:
+        out.append(page.table(["constraint", *CONSISTENCY_HEAD], rows))
+        kinds = {r.kind for r in solution.records.values()}
+        note = "A Gaussian leaves 0.27 % outside 3 sigma. "
+        if "innovation" in kinds:
+            note += "The mean NIS of honest innovations is the number of components. "
+        if "residual" in kinds:
+            note += "A fit takes up part of the noise: the mean NIS of its residuals lies below the components."
+        out.append(page.paragraph(note, "soft"))
+    if solution.counts:
+        counted = page.and_list([f"{count} {kind}" for kind, count in solution.counts.items()])
+        out.append(page.paragraph(f"Factors or updates by kind: {counted}.", "soft"))
+    return out
+
+
+def _largest(x: Array) -> float:
+    x = np.abs(x[np.isfinite(x)])
+    return float(x.max()) if x.size else float("nan")
+
+
+def _mean(x: Array) -> float:
+    x = x[np.isfinite(x)]
+    return float(np.mean(x)) if x.size else float("nan")
+
+
+COMPARED_SPAN = ("horizontal RMS [m]", "largest [m]", "at the end [m]", "largest, % of way", "up largest [m]",
+                 "heading largest [deg]", "error / sigma, RMS")  # fmt: skip
+COMPARED = ("horizontal RMS [m]", "horizontal largest [m]", "up RMS [m]", "speed RMS [m/s]", "roll, pitch RMS [deg]",
+            "heading RMS [deg]", "error / sigma, RMS")  # fmt: skip
+
+
+def accuracy_row(errors: Errors) -> list[float]:
+    """The numbers under `COMPARED`."""
+    rph = np.degrees(errors.rph)
+    return [
+        rms(errors.horizontal),
+        _largest(errors.horizontal),
+        rms(errors.p[:, 2]),
+        rms(np.linalg.norm(errors.v, axis=1)),
+        rms(rph[:, :2]),
+        rms(rph[:, 2]),
+        float(np.sqrt(_mean(errors.nees_axis))),
+    ]
+
+
+def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[float]:
+    """The numbers under `COMPARED_SPAN`, over a span in seconds from the recording's start."""
+    t = errors.t - start
+    rows = np.flatnonzero((t >= span[0]) & (t <= span[1]))
+    rows = rows[np.isfinite(errors.horizontal[rows])]
+    if not len(rows):
+        return [float("nan")] * len(COMPARED_SPAN)
+    h = errors.horizontal[rows]
+    way = float(errors.distance[rows[-1]] - errors.distance[rows[0]])
+    return [
+        rms(h),
+        _largest(h),
+        float(h[-1]),
+        100.0 * _largest(h) / way if way >= 1.0 else float("nan"),
+        _largest(errors.p[rows, 2]),
+        float(np.degrees(_largest(errors.rph[rows, 2]))),
+        float(np.sqrt(_mean(errors.nees_axis[rows]))),
+    ]
+
+
+def accuracy_tables(errors: Mapping[str, Errors], withheld: Withheld, start: float, outages: Spans = ()) -> list[Raw]:
+    """A table of all solvers over everything, and one for each withheld span."""
+    if not errors:
+        return []
+    rows = [[page.solver(name), *accuracy_row(e)] for name, e in errors.items()]
+    out = [page.heading("Whole recording"), page.table(["solver", *COMPARED], rows, best=range(1, 7))]
+    gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
+    spans = [("Withheld", span) for span in gone]
+    spans += [("No GNSS", (a, b)) for a, b in outages if not any(c < b and d > a for c, d in gone)]
+    if len(errors) == 1 and spans:
+        (only,) = errors.values()
+        rows = [[Raw(f"{a:.1f} to {b:.1f} s"), what, *span_row(only, (a, b), start)] for what, (a, b) in spans]
+        return [
+            *out,
+            page.heading("Spans without a source"),
+            page.table(["span", "what", *COMPARED_SPAN], rows),
+            *_notes(errors),
+        ]
+    for what, (a, b) in spans:
+        rows = [[page.solver(name), *span_row(e, (a, b), start)] for name, e in errors.items()]
+        out.append(page.heading(f"{what} {a:g} to {b:g} s" if what == "Withheld" else f"{what} {a:.1f} to {b:.1f} s"))
+        out.append(page.table(["solver", *COMPARED_SPAN], rows, best=range(1, 7)))
+    return [*out, *_notes(errors)]
+
+
+def _notes(errors: Mapping[str, Errors]) -> list[Raw]:
+    notes = list(dict.fromkeys(note for e in errors.values() for note in e.notes))
+    return [page.bullets(notes)] if notes else []
+
+
+NOISE_HEAD = ("figure", "stated", "used", "unit", "times stated sigma", "1-sigma", "correlation time [s]",
+              "degrees of freedom", "expected beforehand")  # fmt: skip
+
+
+def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Raw]:
+    """How good the sensors were taken to be, and which rows weigh less."""
+    noise = solution.noise
+    if not rows and not noise.weights:
+        return [page.paragraph("All noise figures are used as they are stated.")]
+    out = []
+    if rows:
+        cells = [
+            [
+                row.words,
+                float("nan") if row.stated is None else row.stated,
+                float("nan") if row.used is None else row.used,
+                row.unit or "-",
+                float(np.exp(0.5 * row.figure.log_factor)),
+                _range(row.figure.log_factor, row.figure.sigma),
+                float("nan") if row.correlation_time is None else row.correlation_time,
+                Raw(f"{row.figure.freedom:.0f}"),
+                _range(row.figure.prior, row.figure.prior_sigma),
+            ]
+            for row in rows
+        ]
+        out.append(page.table(NOISE_HEAD, cells))
+        note = (
+            "Stated figures of fixes are medians of their sigmas. The white part and the lasting parts add up as "
+            "variances. A figure with few degrees of freedom is mostly what was expected beforehand."
+        )
+        if len(solution.between) > 1:
+            note += f" The recording was cut into {len(solution.between)} pieces: these are the figures of the first."
+        out.append(page.paragraph(note, "soft"))
+    less = [
+        f"{np.count_nonzero(some.weight < 1.0)} of {len(solution.records[name].t)} rows of {name} are off by "
+        "more than chance allows once in a thousand times and weigh less, the least of them "
+        f"{page.number(float(some.weight.min()), 2)} of a row."
+        for name, some in noise.weights.items()
+        if len(some.t) and name in solution.records
+    ]
+    return [*out, page.bullets(less)] if less else out
+
+
+def _range(log_factor: float, sigma: float) -> Raw:
+    """1-sigma range of a factor on sigma, of the logarithm of that on the variance."""
+    if sigma <= 0.0:
+        return Raw("-")
+    low, high = (page.number(float(np.exp(0.5 * (log_factor + s * sigma))), 2) for s in (-1.0, 1.0))
+    return Raw(f"{low} to {high}")
+
+
+def excluded_table(solution: Solution, start: float) -> list[Raw]:
+    """What the solver left out of itself, when and why."""
+    parts = getattr(solution, "excluded", ())
+    if not parts:
+        return []
+    rows = [[Raw(f"{p.t_start - start:.1f} to {p.t_end - start:.1f} s"), p.kind, int(p.count), p.reason] for p in parts]
+    head = ["when", "what", "rows", "why"]
+    out = [page.heading("What was excluded"), page.table(head, rows[:_SHOWN])]
+    if len(rows) > _SHOWN:
+        out.append(page.folded(f"{len(rows) - _SHOWN} more", page.table(head, rows[_SHOWN:])))
+    return out
+
+
+def rejected_table(solution: Solution, start: float) -> list[Raw]:
+    """Every rejected measurement with its time; of many the largest."""
+    rows: list[tuple[float, list[Any]]] = []
+    for kind, r in solution.records.items():
+        white = np.abs(r.residual) / r.sigma
+        for k in np.flatnonzero(r.weight <= 1e-9):
+            worst = int(np.argmax(white[k]))
+            size = f"{r.residual[k, worst]:+.3g} {r.unit}, {r.axes[worst]}"
+            rows.append((float(r.t[k]), [Raw(f"{r.t[k] - start:.2f} s"), kind, size, float(white[k, worst])]))
+    if not rows:
+        return []
+    largest = sorted(rows, key=lambda row: -row[1][3])[:_LISTED]
+    table = page.table(
+        ["when", "constraint", "largest component", "over sigma"], [r for _, r in sorted(largest, key=lambda r: r[0])]
+    )
+    many = len(rows)
+    words = f"{many} rejected measurement{'s' if many > 1 else ''}"
+    if many > _LISTED:
+        words += f", the {_LISTED} farthest off"
+    return [page.folded(words, table)]
+
+
+def nees_table(errors: Mapping[str, Errors]) -> list[Raw]:
+    """Mean NEES per degree of freedom and the share of epochs inside the 95 % region, per solver."""
+    from graphnav.evaluation.metrics import average_nees
+    from graphnav.evaluation.sigmas import judge_sigmas
+
+    rows = []
+    says = {
+        "too small": "sigma too small",
+        "cautious": "sigma cautious",
+        "unclear": "chance may do that",
+        "fits": "fits",
+    }
+    for name, e in errors.items():
+        judged = {one.block: one for one in judge_sigmas(e)}
+        nees = {"position": (e.nees_p, e.dof_p), "velocity": (e.nees_v, 3), "attitude": (e.nees_rph, 3)}
+        if e.nees_heading is not None:
+            nees["heading"] = (e.nees_heading, 1)
+        for words, (values, dof) in nees.items():
+            found = average_nees(values, dof)
+            if found is not None:
+                inside, one = Raw(f"{100 * found.inside:.1f} %"), judged[words]
+                worth = Raw(f"{one.effective:.0f}")
+                rows.append([page.solver(name), words, found.mean, inside, found.n, worth, says[one.verdict]])
+    head = ["solver", "of", "mean NEES / dof", "epochs inside 95 %", "epochs", "worth independent", "what it says"]
+    return [page.table(head, rows)] if rows else []
+
+
+def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Raw]:
+    """What was estimated once or slowly: last value and sigma, and what was known before."""
+    rows = []
+    for name, p in parameters.items():
+        for k, one in enumerate(components(name, p)):
+            value, sigma = one.scale * float(p.value[-1, k]), one.scale * float(p.sigma[-1, k])
+            known = "yes" if p.observable[k] else "no: mostly the prior"
+            before = one.scale * float(p.prior_sigma[k])
+            said = [Raw(page.measured(value, sigma)), Raw(page.measured(sigma, sigma)), before]
+            rows.append([one.words, *said, one.unit, known])
+    head = ["parameter", "value", "sigma", "sigma before", "unit", "seen by the data"]
+    return [page.table(head, rows)] if rows else []
+
+
+def run_table(solutions: Mapping[str, Solution]) -> list[Raw]:
+    """Seconds by stage, iterations and cost, a column per solver; why each stopped."""
+    every, solutions = solutions, own(solutions)
+    stages = list(dict.fromkeys(stage for s in solutions.values() for stage in s.timings))
+
+    def seconds(solution: Solution, stage: str) -> Raw | None:
+        return Raw(f"{solution.timings[stage]:.3f}") if stage in solution.timings else None
+
+    rows: list[list[Any]] = [[f"{stage} [s]", *(seconds(s, stage) for s in solutions.values())] for stage in stages]
+    rows += [
+        ["sum [s]", *(Raw(f"<b>{sum(s.timings.values()):.3f}</b>") for s in solutions.values())],
+        ["iterations", *(s.iterations for s in solutions.values())],
+        ["cost", *(float(s.cost) for s in solutions.values())],
+    ]
+    several = len(solutions) > 1
+    notes = [f"{name} stopped: {s.stopped}" for name, s in solutions.items() if s.stopped and several]
+    shared = [note for note in next(iter(solutions.values())).notes if all(note in s.notes for s in solutions.values())]
+    theirs = [f"{name}: {note}" for name, s in every.items() for note in s.notes if note not in shared]
+    table = page.table(["stage", *(page.solver(name) for name in solutions)], rows)
+    said = [*notes, *shared, *theirs]
+    return [page.columns([table, page.bullets(said)]) if said else table]
+
+
+def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Raw]:
+    """Whatever the evaluation measured, as tables that open on demand."""
+    if not metrics:
+        return []
+    plain = {key: value for key, value in metrics.items() if key not in ("spans", "notes")}
+    inner = page.pairs({k: v if v is None or isinstance(v, float) else str(v) for k, v in page.flat(plain).items()})
+    spans = metrics.get("spans")
+    if isinstance(spans, Sequence) and spans and isinstance(spans[0], Mapping):
+        inner = Raw(inner + page.table(list(spans[0]), [[s.get(k) for k in spans[0]] for s in spans]))
+    return [page.folded(f"All measures{' of ' if name else ''}{name}", inner)]
+
+
+def stop_table(solution: Solution, start: float) -> list[Raw]:
+    """Every stop: who found which share of it, and how many rows of which constraint came of it."""
+    stops = stops_of_solution(solution)
+    if not stops:
+        return []
+    rows = [
+        [
+            Raw(f"{stop.start - start:.2f} s"),
+            Raw(f"{stop.end - stop.start:.2f} s"),
+            ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in stop.fired.items()),
+            ", ".join(f"{count} {name}" for name, count in stop.rows.items()) or "none",
+        ]
+        for stop in stops[:_LISTED]
+    ]
+    note = "Share: of the stop that a detector by itself calls stationary."
+    if len(stops) > _LISTED:
+        note += f" {len(stops) - _LISTED} more are in detections.csv."
+    return [page.table(["stands from", "for", "share by detector", "rows"], rows), page.paragraph(note, "soft")]
+
+
+def odd(recording: Recording, findings: Sequence[str]) -> list[Raw]:
+    """What was odd in the recording, each said once."""
+    lines = list(dict.fromkeys([*recording.remarks, *findings]))
+    if recording.imu.noise_assumed:
+        lines.append("The recording states no IMU noise figures; consumer-grade ones were assumed.")
+    return [page.bullets(lines)] if lines else [page.paragraph("Nothing odd was found in the recording.")]

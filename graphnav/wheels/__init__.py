@@ -1,8 +1,0 @@
-"""Odometers as they are: what a reading is worth, where readings are wrong, and the mean speed over any window."""
-
-from __future__ import annotations
-
-from graphnav.wheels.faults import Faults, faults
-from graphnav.wheels.mean import Figures, MeanSpeed, counts, gaps, longest_step, quantum, reading_sigma
-
-__all__ = ["Faults", "Figures", "MeanSpeed", "counts", "faults", "gaps", "longest_step", "quantum", "reading_sigma"]
