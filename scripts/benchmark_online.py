@@ -32,7 +32,7 @@ from graphnav.estimation.alignment import align
 from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.pipeline import origin
-from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.online import Online, Row, rows_of, without_rows
@@ -120,7 +120,7 @@ def posed(recording: Recording, settings: Settings) -> Problem:
     """A recording aligned and posed with its noise model, as for any solver."""
     frame, stationary = LocalFrame(origin(recording)), detect(recording, settings).stationary
     found = align(recording, settings, frame, lambda p, x: batch(p, x, wanted=(0,), reintegrate=False))
-    base = pose(recording, settings, frame, found.state, found.sigma, stationary, parts_of_noise=True)
+    base = build_problem(recording, settings, frame, found.state, found.sigma, stationary, parts_of_noise=True)
     return with_noise(base, estimate_noise(base, found.until).noise)
 
 

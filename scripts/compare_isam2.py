@@ -24,7 +24,7 @@ from benchmark_online import posed
 from graphnav.config import Settings
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.incremental import Replayed, incremental
+from graphnav.estimation.solvers.incremental import Replay, incremental
 from graphnav.estimation.solvers.isam import isam2
 
 LAG = 120.0
@@ -42,7 +42,7 @@ def main() -> None:
     began = time.process_time()
     ekf(problem)
     print(f"the filter takes {1e3 * (time.process_time() - began) / len(problem.t):.2f} ms a keyframe\n")
-    found: dict[str, Replayed] = {}
+    found: dict[str, Replay] = {}
     count = max(1, round(options.minutes / 10.0))
     parts = np.array_split(np.arange(len(problem.t)), min(count, 6))
     ends = " | ".join(f"{(problem.t[p[-1]] - problem.t[0]) / 60:.0f} min" for p in parts)

@@ -22,7 +22,7 @@ from withheld_spans import runs_of
 from graphnav import load
 from graphnav.app.workflow import Withheld, _score
 from graphnav.config import Settings, settings_from
-from graphnav.detectors import detect, registered
+from graphnav.detectors import detect, list_detectors
 from graphnav.detectors.base import inside, longer_than, spans_of
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.pipeline import SOLVERS, run
@@ -124,7 +124,7 @@ def main() -> None:
     parser.add_argument("--fire", default=",".join(FIRE), help="comma separated (%(default)s)")
     parser.add_argument("--without", choices=("odometer",), help="take a sensor away altogether")
     options = parser.parse_args()
-    assert set(registered()) < set(FIRE)
+    assert set(list_detectors()) < set(FIRE)
     print(
         "| drive | fires | found, % | false, % | stops | begins late, s | ends late, s | IMU alone: found, % ", end=""
     )

@@ -22,7 +22,7 @@ from graphnav.core import rotation
 from graphnav.core.state import States
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.strides import fitted_point, shapes
+from graphnav.evaluation.strides import fit_point, shapes
 from graphnav.recording import Imu, Recording
 
 FORCE, TURN, ZERO = 0.5, 0.03, 0.01  # m/s^2, rad/s of a row; m/s
@@ -107,7 +107,7 @@ def measures(recording: Recording, stances: np.ndarray, t: np.ndarray, states: S
     X = np.column_stack([np.interp(t, truth.t, x) for x in truth.xyz.T])
     height = states.p[:, 2] - X[:, 2]
     height -= height[t <= t[0] + 1.0].mean()
-    of_point, _ = fitted_point(states, X * [1.0, 1.0, 0.0])
+    of_point, _ = fit_point(states, X * [1.0, 1.0, 0.0])
     return *shapes(t, states.p, X, stances), of_point, float(np.sqrt(np.mean(height**2)))
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from graphnav.app import cli
 from graphnav.core.earth import LocalFrame
-from graphnav.core.interpolation import placed
+from graphnav.core.interpolation import place_on_earth
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Truth
 from graphnav.recording.exporters import write_as
@@ -54,7 +54,7 @@ def test_three_kinds_of_files_stand_beside_ours(drive, tmp_path):
     local = replace(moved(0.0), t=moved(0.0).t - RECORDING.start, frame="local")
     frame = LocalFrame(local.llh[0])
     local = replace(local, llh=frame.from_llh(local.llh))
-    turned = placed(local, frame, 0.7, np.array([5.0, 6.0, 7.0]))
+    turned = place_on_earth(local, frame, 0.7, np.array([5.0, 6.0, 7.0]))
     turned = replace(turned, llh=frame.from_llh(turned.llh), frame="local", v=None)
     write_as("tum", turned, tmp_path / "slam.tum", None)
     write_as("csv", moved(0.0, 0.2), tmp_path / "late.csv", None)

@@ -35,7 +35,7 @@ def test_the_error_of_a_lag_is_as_large_as_stated(misfit_lasts: float) -> None:
         def x_at(rows: np.ndarray, lag: float, moved: np.ndarray = moved, x: np.ndarray = x) -> np.ndarray:
             return np.interp(t[rows] + lag, moved, x)[:, None]
 
-        lag, spread = lags.refined(t, y, x_at, lambda lag: np.ones(n, dtype=bool), np.arange(n), 0.0, 20)
+        lag, spread = lags.refine_lag(t, y, x_at, lambda lag: np.ones(n, dtype=bool), np.arange(n), 0.0, 20)
         off.append(lag - late)
         sigma.append(spread)
     z = np.array(off) / np.array(sigma)
@@ -50,7 +50,7 @@ def test_nothing_is_known_of_a_lag_where_nothing_changes() -> None:
     def x_at(rows: np.ndarray, lag: float) -> np.ndarray:
         return (t[rows, None] + lag) * 1e-3
 
-    _, sigma = lags.refined(t, y, x_at, lambda lag: np.ones(300, dtype=bool), np.arange(300), 0.0, 20)
+    _, sigma = lags.refine_lag(t, y, x_at, lambda lag: np.ones(300, dtype=bool), np.arange(300), 0.0, 20)
     assert sigma > 1.0
 
 

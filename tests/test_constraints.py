@@ -12,14 +12,14 @@ import raw_drive
 from helpers import STEPS, Array, difference, random_states, truth_states
 
 from graphnav.config import Settings, settings_from
-from graphnav.constraints import registered
-from graphnav.constraints.base import Constraint, Scene, assemble
+from graphnav.constraints import list_constraints
+from graphnav.constraints.base import BuildContext, Constraint, assemble
 from graphnav.constraints.gnss import LEVER_ARM, GnssPosition
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core import rotation as ro
 from graphnav.core.earth import LocalFrame
 from graphnav.core.state import BLOCKS, DIM, States
-from graphnav.estimation.problem import Problem, keyframe_times, pose
+from graphnav.estimation.problem import Problem, build_problem, keyframe_times
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.graph import LinearGraph
 from graphnav.imu.preintegration import preintegrate
@@ -58,13 +58,13 @@ def seen_by(name: str, recording: Recording) -> Recording:
     return replace(recording, platform="foot", gnss=None, odometer=None) if name in ON_FOOT else recording
 
 
-def scene_of(cls: type[Constraint], recording: Recording, settings: Settings, frame: LocalFrame) -> Scene:
+def scene_of(cls: type[Constraint], recording: Recording, settings: Settings, frame: LocalFrame) -> BuildContext:
     """A scene with the keyframes one constraint asks for."""
     inside = STANDING[(STANDING[:, 0] >= recording.start) & (STANDING[:, 1] <= recording.end)]
     t = keyframe_times(recording.start, recording.end, cls.epochs(recording, settings, inside), 1.0)
     imu = recording.imu
     intervals = preintegrate(bridge_gaps(imu), imu, t, np.full(3, 0.02), np.full(3, 1e-3))
-    return Scene(recording, settings, frame, t, inside, intervals)
+    return BuildContext(recording, settings, frame, t, inside, intervals)
 
 
 def prior_row(rng: np.random.Generator) -> InitialPrior:
@@ -76,7 +76,7 @@ def build(name: str, recording: Recording, settings: Settings) -> Case:
     if name == InitialPrior.name:
         rows: Constraint | None = prior_row(rng)
     else:
-        cls = next(c for c in registered() if c.name == name)
+        cls = next(c for c in list_constraints() if c.name == name)
         frame = LocalFrame(recording.gnss.llh[0])
         rows = cls.build(scene_of(cls, seen_by(name, recording), settings, frame))
     assert rows is not None, f"the drive holds nothing for '{name}': extend it"
@@ -88,7 +88,7 @@ def build(name: str, recording: Recording, settings: Settings) -> Case:
     return Case(rows, random_states(rng, n, span=500.0), values)
 
 
-NAMES = tuple(cls.name for cls in registered())
+NAMES = tuple(cls.name for cls in list_constraints())
 
 
 # those that are off by default have no plain case
@@ -218,13 +218,13 @@ def test_the_filter_itself_does_that_update(recording: Recording, copies: int) -
 def tiny_problem(recording: Recording, settings: Settings) -> Problem:
     frame = LocalFrame(recording.gnss.llh[0])
     start = States(ro.exp(np.array([[0.1, 0.05, 0.8]])), *(np.full((1, 3), x) for x in (0.3, 0.1, 0.01, 1e-4)))
-    return pose(recording.crop(0.0, 4.0), settings, frame, start, SIGMA)
+    return build_problem(recording.crop(0.0, 4.0), settings, frame, start, SIGMA)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_epochs_lie_within_the_imu(name: str, recording: Recording) -> None:
     """Measurements before the first and after the last IMU sample ask for no keyframes and make no rows."""
-    cls = next(c for c in registered() if c.name == name)
+    cls = next(c for c in list_constraints() if c.name == name)
     settings = with_parameters() if name in ON_FOOT else Settings()
     recording = seen_by(name, recording)
     imu = recording.imu
@@ -242,7 +242,7 @@ def test_epochs_lie_within_the_imu(name: str, recording: Recording) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_recording_without_the_sensor_has_no_rows(name: str, recording: Recording) -> None:
-    cls = next(c for c in registered() if c.name == name)
+    cls = next(c for c in list_constraints() if c.name == name)
     bare = replace(recording, gnss=None, odometer=None, platform="foot")
     assert len(cls.epochs(bare, Settings(), np.empty((0, 2)))) == 0
     scene = scene_of(cls, bare, Settings(), LocalFrame(recording.gnss.llh[0]))
@@ -251,7 +251,7 @@ def test_a_recording_without_the_sensor_has_no_rows(name: str, recording: Record
 
 @pytest.mark.parametrize("kind", ["position", "velocity"])
 def test_a_switched_off_measurement_has_no_rows(kind: str, recording: Recording) -> None:
-    cls = next(c for c in registered() if c.name == f"gnss_{kind}")
+    cls = next(c for c in list_constraints() if c.name == f"gnss_{kind}")
     off = settings_from({"gnss": {kind: False}})
     assert len(cls.epochs(recording, off, STANDING)) == 0
     assert cls.build(scene_of(cls, recording, off, LocalFrame(recording.gnss.llh[0]))) is None
@@ -263,7 +263,7 @@ def test_gnss_rows_are_the_measurement_of_the_truth(recording: Recording) -> Non
     # no turn rate of the IMU enters where it is exact, but the mean over 0.1 s does
     made, truth = oracle.drive(path, imu_noise=None, gnss_exact=True, gnss_velocity_sd=(0.1, 0.1, 0.1))
     frame = LocalFrame(made.gnss.llh[40])
-    for cls in registered():
+    for cls in list_constraints():
         if not cls.name.startswith("gnss") or cls.name in RAW:
             continue
         scene = scene_of(cls, made, Settings(), frame)

@@ -124,11 +124,11 @@ def test_spans_are_sets():
     one, other = some(), some()
     in_one = np.any([(grid >= a) & (grid <= b) for a, b in one], axis=0)
     in_other = np.any([(grid >= a) & (grid <= b) for a, b in other], axis=0)
-    joined, taken = base.merged(one), base.merged(other)
+    joined, taken = base.merge_spans(one), base.merge_spans(other)
     assert (joined[1:, 0] > joined[:-1, 1]).all()
     np.testing.assert_array_equal(covered(grid, joined), in_one)
-    np.testing.assert_array_equal(covered(grid, base.without(joined, taken)), in_one & ~in_other)
-    assert len(base.without(joined, np.array([[-1.0, 200.0]]))) == 0
+    np.testing.assert_array_equal(covered(grid, base.subtract_spans(joined, taken)), in_one & ~in_other)
+    assert len(base.subtract_spans(joined, np.array([[-1.0, 200.0]]))) == 0
     shared = [np.sum(in_one & (grid >= a) & (grid <= b)) * 0.013 for a, b in taken]
     np.testing.assert_allclose(base.seconds_in(joined, taken), shared, atol=0.013 * 2 * len(joined))
     np.testing.assert_allclose(base.seconds_in(joined, joined), np.diff(joined).ravel())

@@ -14,13 +14,13 @@ from road import made, with_gnss
 from graphnav.config import Settings, settings_from
 from graphnav.config.detectors import FUSED, DetectorName
 from graphnav.core.earth import LocalFrame
-from graphnav.detectors import base, detect, registered, stops
+from graphnav.detectors import base, detect, list_detectors, stops
 from graphnav.estimation.pipeline import run
-from graphnav.estimation.problem import pose
+from graphnav.estimation.problem import build_problem
 from graphnav.estimation.stops import stops_of_solution
 from graphnav.recording import Imu, Recording
 
-NAMES = (FUSED, *registered())
+NAMES = (FUSED, *list_detectors())
 LEGS = [(40, 0), (6, 12), (30, 12), (6, 0), (40, 0), (5, 10), (20, 10)]
 STOPS = np.array([[0.0, 40.0], [82.0, 122.0]])
 ENGINE = 18.0  # Hz: below half of the slowest rate
@@ -77,7 +77,7 @@ def test_none_fires_while_driving(name: str) -> None:
 def test_a_window_while_the_drive_goes_on_says_what_the_recording_says(name: str) -> None:
     recording, settings = drive(), firing(name)
     whole = detect(recording, settings).stationary
-    edge = registered()[name].edge if name != FUSED else max(d.edge for d in registered().values())
+    edge = list_detectors()[name].edge if name != FUSED else max(d.edge for d in list_detectors().values())
     looked = 0
     for now in np.arange(35.0, recording.end, 4.0):
         look = recording.crop(now - 30.0, now)
@@ -137,13 +137,13 @@ def test_the_old_name_of_a_table_is_read_and_said() -> None:
     assert Settings.model_validate(old.model_dump()).detectors.low_band_glrt.threshold == 4.5
 
 
-@pytest.mark.parametrize("name", sorted(registered()))
+@pytest.mark.parametrize("name", sorted(list_detectors()))
 def test_each_alone_puts_rows_into_the_problem_of_all_solvers(name: str) -> None:
     recording, settings = drive().crop(70.0, 130.0), firing(name)
     assert recording.gnss is not None
     frame = LocalFrame(recording.gnss.llh[0])
     spans = detect(recording, settings).stationary
-    posed = pose(recording, settings, frame, random_states(np.random.default_rng(0), 1), np.ones(15), spans)
+    posed = build_problem(recording, settings, frame, random_states(np.random.default_rng(0), 1), np.ones(15), spans)
     rows = {c.name: posed.t[c.keyframe] for c in posed.constraints if c.of_stops}
     assert set(rows) == {"zero_velocity", "zero_rate", "held_position"}
     for t in rows.values():

@@ -14,7 +14,7 @@ import pytest
 
 import graphnav
 from graphnav.core.earth import LocalFrame
-from graphnav.estimation.solution import Fault
+from graphnav.estimation.solution import ExcludedSpan
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
@@ -179,7 +179,7 @@ def counts(script, recording, first, last, weight=None):
     """What is said of a solution without the fixes from first to last, found wrong or of no weight."""
     t = recording.gnss.t
     record = SimpleNamespace(t=t, weight=np.ones(len(t)) if weight is None else weight)
-    fault = Fault("gnss_position", t[first], t[last], last - first + 1)
+    fault = ExcludedSpan("gnss_position", t[first], t[last], last - first + 1)
     return script.left_out(
         recording, SimpleNamespace(records={"gnss_position": record}, excluded=(fault,) if weight is None else ())
     )

@@ -17,10 +17,10 @@ import pytest
 from helpers import STEPS, difference, random_states
 
 from graphnav.config import Settings, read_settings
-from graphnav.constraints import registered
-from graphnav.constraints.base import Scene, assemble
+from graphnav.constraints import list_constraints
+from graphnav.constraints.base import BuildContext, assemble
 from graphnav.core.earth import LocalFrame
-from graphnav.detectors import registered as known_detectors
+from graphnav.detectors import list_detectors as known_detectors
 from graphnav.estimation.pipeline import SOLVERS
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
@@ -148,7 +148,7 @@ def test_the_example_of_a_constraint_keeps_the_contract():
     t = np.arange(recording.start, recording.end, 5.0)
     intervals = preintegrate(bridge_gaps(recording.imu), recording.imu, t, np.zeros(3), np.zeros(3))
     frame = LocalFrame(recording.gnss.llh[0])
-    rows = module.NotSteep.build(Scene(recording, Settings(), frame, t, np.empty((0, 2)), intervals))
+    rows = module.NotSteep.build(BuildContext(recording, Settings(), frame, t, np.empty((0, 2)), intervals))
     states = random_states(np.random.default_rng(0), len(rows))
     found = rows.linearize(states, {}, slice(None))
     assert found.residual.shape == found.sigma.shape == (len(t), 1)
@@ -233,7 +233,7 @@ def test_toml_examples_are_valid(tmp_path):
 def test_every_constraint_detector_and_solver_has_its_line():
     constraints = (ROOT / "docs" / "constraints.md").read_text(encoding="utf-8")
     solvers = (ROOT / "docs" / "solvers.md").read_text(encoding="utf-8")
-    for cls in registered():
+    for cls in list_constraints():
         assert re.search(rf"^\| `{cls.name}` \|", constraints, re.MULTILINE), f"docs/constraints.md: no row {cls.name}"
     detectors = (ROOT / "docs" / "detectors.md").read_text(encoding="utf-8")
     for name in known_detectors():

@@ -10,7 +10,7 @@ from helpers import FRAME, STEPS, Array, difference, random_imu, random_states
 
 from graphnav.core import rotation as ro
 from graphnav.core.state import DIM, Parameter, States
-from graphnav.imu.dynamics import SCALE, Motion, as_biases, scale_parameter
+from graphnav.imu.dynamics import SCALE, ImuFactors, as_biases, scale_parameter
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu, ImuNoise, Recording
@@ -24,10 +24,10 @@ def near(x: States, ba: float, bg: float) -> States:
 
 
 @pytest.fixture(scope="module")
-def motion() -> Motion:
+def motion() -> ImuFactors:
     imu = random_imu(np.random.default_rng(1), 8.0, 200.0)
     t = np.array([0.0, 0.01, 0.5, 1.503, 2.5, 4.0, 8.0])
-    return Motion(preintegrate(bridge_gaps(imu), imu, t, np.full(3, 0.05), np.full(3, 0.01)), FRAME)
+    return ImuFactors(preintegrate(bridge_gaps(imu), imu, t, np.full(3, 0.05), np.full(3, 0.01)), FRAME)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def sizes(J: Array) -> Array:
 
 
 @pytest.mark.parametrize("scale", [None, SCALES])
-def test_transition_numerically(motion: Motion, start: States, scale: Array | None) -> None:
+def test_transition_numerically(motion: ImuFactors, start: States, scale: Array | None) -> None:
     end, F = motion.propagate(slice(None), start, scale)
 
     def moved(d: Array) -> Array:
@@ -59,7 +59,7 @@ def test_transition_numerically(motion: Motion, start: States, scale: Array | No
 
 
 @pytest.mark.parametrize("scale", [SCALES, SQUARE], ids=["scales", "square"])
-def test_scale_columns_numerically(motion: Motion, start: States, scale: Array) -> None:
+def test_scale_columns_numerically(motion: ImuFactors, start: States, scale: Array) -> None:
     end, F = motion.propagate(slice(None), start, scale)
     numerical = difference(
         lambda d: motion.propagate(slice(None), start, scale + d)[0].minus(end), np.full(len(scale), 1e-4)
@@ -68,7 +68,7 @@ def test_scale_columns_numerically(motion: Motion, start: States, scale: Array) 
     assert np.all(np.abs(S - numerical) < 3e-6 * sizes(numerical) + 2e-7)
 
 
-def test_slices_are_rows_of_the_whole(motion: Motion, start: States) -> None:
+def test_slices_are_rows_of_the_whole(motion: ImuFactors, start: States) -> None:
     end, F = motion.propagate(slice(None), start, SCALES)
     for k in range(N):
         rows = slice(k, k + 1)
@@ -78,15 +78,15 @@ def test_slices_are_rows_of_the_whole(motion: Motion, start: States) -> None:
 
 
 @pytest.fixture(scope="module")
-def torn() -> tuple[Motion, States]:
+def torn() -> tuple[ImuFactors, States]:
     """A chain whose states do not fit together at all: residuals of radians and hundreds of metres."""
     imu = random_imu(np.random.default_rng(4), 4.0, 200.0)
     t = np.array([0.0, 1.0, 1.7, 3.0, 4.0])
-    motion = Motion(preintegrate(bridge_gaps(imu), imu, t, np.zeros(3), np.zeros(3)), FRAME)
+    motion = ImuFactors(preintegrate(bridge_gaps(imu), imu, t, np.zeros(3), np.zeros(3)), FRAME)
     return motion, near(random_states(np.random.default_rng(5), 5, span=300.0), 0.0, 0.0)
 
 
-def test_linearize_numerically_at_large_residuals(torn: tuple[Motion, States]) -> None:
+def test_linearize_numerically_at_large_residuals(torn: tuple[ImuFactors, States]) -> None:
     motion, x = torn
     value, Ji, Jj, _ = motion.linearize(x, SCALES)
     assert np.linalg.norm(value[:, :3], axis=1).max() > 1.5
@@ -112,7 +112,7 @@ def test_linearize_numerically_at_large_residuals(torn: tuple[Motion, States]) -
         assert np.all(np.abs(Js - numerical) < 1e-6 * sizes(numerical) + 1e-6)
 
 
-def test_residual_of_propagated_states_is_zero(motion: Motion) -> None:
+def test_residual_of_propagated_states_is_zero(motion: ImuFactors) -> None:
     state = random_states(np.random.default_rng(6), 1)
     chain = [state]
     for k in range(N):
@@ -123,12 +123,12 @@ def test_residual_of_propagated_states_is_zero(motion: Motion) -> None:
     assert np.abs(motion.residual(x)).max() > 1e-4  # and the scale matters
 
 
-def test_transition_is_the_linearization_where_the_residual_is_zero(motion: Motion, start: States) -> None:
+def test_transition_is_the_linearization_where_the_residual_is_zero(motion: ImuFactors, start: States) -> None:
     """The filter's F and Q against the graph's Ji and Jj: at zero residual they say the same of every interval."""
     end, F = motion.propagate(slice(None), start)
     Q = motion.noise(slice(None), start.R_nb)
     for k in range(N):
-        one = Motion(motion.intervals[k : k + 1], FRAME)
+        one = ImuFactors(motion.intervals[k : k + 1], FRAME)
         _, Ji, Jj, _ = one.linearize(States.stack([start[k : k + 1], end[k : k + 1]]))
         Jinv = np.linalg.inv(Jj[0])
         np.testing.assert_allclose(-Jinv @ Ji[0], F[k], rtol=1e-9, atol=1e-9)
@@ -137,7 +137,7 @@ def test_transition_is_the_linearization_where_the_residual_is_zero(motion: Moti
         )
 
 
-def test_noise_by_monte_carlo(motion: Motion, start: States) -> None:
+def test_noise_by_monte_carlo(motion: ImuFactors, start: States) -> None:
     """Perturb the interval's dR, dV, dP and see where the end goes: the frames and the signs of Q."""
     k, runs = 3, 4000
     row = motion.intervals[k : k + 1]
@@ -148,7 +148,7 @@ def test_noise_by_monte_carlo(motion: Motion, start: States) -> None:
     disturbed = replace(many, dR=many.dR @ ro.exp(d[:, :3]), dP=many.dP + d[:, 3:6], dV=many.dV + d[:, 6:9])
     x = start[np.full(runs, k)]
     exact = motion.propagate(slice(k, k + 1), start[k : k + 1])[0]
-    end = Motion(disturbed, FRAME).propagate(slice(None), x)[0]
+    end = ImuFactors(disturbed, FRAME).propagate(slice(None), x)[0]
     e = end.minus(exact[np.zeros(runs, dtype=int)])
     e[:, 9:] += d[:, 9:]  # the biases walk by themselves
     Q = motion.noise(slice(k, k + 1), start.R_nb[k : k + 1])[0]

@@ -146,7 +146,7 @@ def test_parts_of_a_trajectory_make_the_files_of_the_whole(tmp_path: Path) -> No
     for folder, parts in (("whole", [whole]), ("parts", [whole.take(k) for k in rows])):
         targets = {name: tmp_path / folder / f"a.{name}" for name in names}
         (tmp_path / folder).mkdir()
-        exporters.written(parts, targets, "a", lambda t: gps_to_utc(t + 1.3e9))
+        exporters.write_parts(parts, targets, "a", lambda t: gps_to_utc(t + 1.3e9))
     for name in names:
         assert (tmp_path / "whole" / f"a.{name}").read_bytes() == (tmp_path / "parts" / f"a.{name}").read_bytes(), name
 
@@ -157,7 +157,7 @@ def test_what_a_format_cannot_hold_leaves_what_was_there(tmp_path: Path) -> None
     with pytest.raises(RecordingError, match=re.escape(f"{path}: ")):
         write_as("csv", replace(made(), frame="local"), path)
     with pytest.raises(RecordingError, match=re.escape(f"{path}: ")):  # of several, one
-        exporters.written([replace(made(), rph=None)], {"csv": tmp_path / "b.csv", "tum": path})
+        exporters.write_parts([replace(made(), rph=None)], {"csv": tmp_path / "b.csv", "tum": path})
     assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {"a.csv": "before"}
 
 

@@ -17,11 +17,11 @@ from graphnav.detectors import detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import align
 from graphnav.estimation.pipeline import origin, run
-from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.rows import Layout, Point, whitened
+from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.watch import Bank, Verdicts
 from graphnav.evaluation.scoring import errors
@@ -44,7 +44,7 @@ def posed(drive: tuple[Recording, Trajectory]) -> Problem:
     frame = LocalFrame(origin(recording))
     found = align(recording, settings, frame, lambda p, s: batch(p, s, wanted=(0,), reintegrate=False))
     stationary = detect(recording, settings).stationary
-    return pose(recording, settings, frame, found.state, found.sigma, stationary)
+    return build_problem(recording, settings, frame, found.state, found.sigma, stationary)
 
 
 def moved(recording: Recording, rows: Array, by: Array) -> Recording:
@@ -219,8 +219,8 @@ def test_spans_and_back(posed: Problem) -> None:
     rows = next(c for c in posed.constraints if c.name == "gnss_position")
     weight = np.ones(len(rows))
     weight[[3, 4, 5, 9]] = 0.0
-    problem = faults.weighted(posed, {rows.name: weight})
-    found = faults.spans(problem)
+    problem = faults.weigh_rows(posed, {rows.name: weight})
+    found = faults.fault_spans(problem)
     assert [(f.count, f.kind) for f in found] == [(3, rows.name), (1, rows.name)]
     t = posed.t[rows.keyframe]
     assert [(f.t_start, f.t_end) for f in found] == [(t[3], t[5]), (t[9], t[9])]
@@ -268,7 +268,7 @@ def test_kernel_is_of_whole_measurements(posed: Problem) -> None:
     """A fix with 2 sigma on each of three axes is beyond a scale of 3, one with 2 sigma on one is not."""
     rows = next(c for c in posed.constraints if c.name == "gnss_position")
     layout = Layout(posed)
-    point = Point(backward(posed, ekf(posed)).states, {c.parameter.name: c.mean for c in posed.chains})
+    point = Iterate(backward(posed, ekf(posed)).states, {c.parameter.name: c.mean for c in posed.chains})
     linear = rows.linearize(point.states[rows.keyframe], {}, slice(None))
     p = rows.p_n + np.einsum("nji,nj->ni", rows.R_ln, linear.residual)  # nothing left
     for axes, weighed in ((3, True), (1, False)):
@@ -277,7 +277,7 @@ def test_kernel_is_of_whole_measurements(posed: Problem) -> None:
         bent = replace(rows, p_n=q, robust="gnc", robust_scale=3.0)
         problem = replace(posed, constraints=tuple(bent if c is rows else c for c in posed.constraints))
         at = 1 + [c.name for c in problem.constraints].index(rows.name) + 1  # behind intervals and prior
-        blocks, _ = whitened(problem, point, layout)[at]
+        blocks, _ = whiten(problem, point, layout)[at]
         assert bool(np.abs(blocks[0][1][100]).max() == 0.0) is weighed
 
 

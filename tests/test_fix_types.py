@@ -19,7 +19,7 @@ from graphnav.estimation.alignment.first import some
 from graphnav.recording import Recording
 from graphnav.recording.checks.overview import inspect
 from graphnav.recording.formats import load, read
-from graphnav.recording.formats.writing import rounded, write_folder
+from graphnav.recording.formats.writing import round_recording, write_folder
 
 RECORDING, _ = logs.simulated()
 
@@ -78,7 +78,7 @@ def test_types_go_with_their_fixes(tmp_path):
     assert recording.crop(5.0, 20.0).gnss.type.tolist() == gnss.type[(t >= 5.0) & (t <= 20.0)].tolist()
     assert recording.without("gnss", (5.0, 20.0)).gnss.type.tolist() == gnss.type[(t < 5.0) | (t > 20.0)].tolist()
     assert some(gnss, np.array([3, 1])).type.tolist() == [3, 1]
-    assert np.array_equal(rounded(recording).gnss.type, gnss.type)
+    assert np.array_equal(round_recording(recording).gnss.type, gnss.type)
     write_folder(replace(recording, truth=None), tmp_path / "a")
     _, files = convert.convert_log(str(tmp_path / "a"), tmp_path / "b", None)
     found = read(files[0])

@@ -20,7 +20,7 @@ import pytest
 from graphnav import load
 from graphnav.app import cli
 from graphnav.app.fleet import page, tables
-from graphnav.app.fleet.drive import CRASHED, DONE, HUNG, REFUSED, key_of, spans, stored_row
+from graphnav.app.fleet.drive import CRASHED, DONE, HUNG, REFUSED, key_of, read_row, spans
 from graphnav.app.fleet.manifest import Asked, Task, read_drives, task_of
 from graphnav.app.fleet.workers import Limits, Worker, solve_on_cluster
 from graphnav.config import Settings
@@ -97,8 +97,8 @@ def test_a_killed_process_and_one_that_takes_too_long_are_said_and_replaced(tmp_
     assert "SIGKILL" in killed["error"]
     for row in (killed, late):  # and both would be tried again
         folder = tmp_path / str(row["drive"])
-        assert stored_row(folder) is not None
-        assert stored_row(folder, "") is None
+        assert read_row(folder) is not None
+        assert read_row(folder, "") is None
 
 
 class Cluster:

@@ -12,7 +12,7 @@ from helpers import Array
 
 from graphnav.app.workflow import Request, run_request
 from graphnav.config import Settings, settings_from
-from graphnav.constraints.base import Scene
+from graphnav.constraints.base import BuildContext
 from graphnav.constraints.foot import FOOT_AXIS, PATTERN, PIVOT, TRAVEL, FootLateral, Stance
 from graphnav.constraints.standstill import ZeroRate, _swaying
 from graphnav.core import rotation as ro
@@ -52,13 +52,13 @@ def true_states(walk: Simulated, t: Array, frame: LocalFrame) -> States:
     return States(R_nl @ ro.from_rph(at.rph), p, v, zero, zero)
 
 
-def scene_of(walk: Simulated, settings: Settings) -> Scene:
+def scene_of(walk: Simulated, settings: Settings) -> BuildContext:
     recording = walk.recording
     frame = LocalFrame(walk.truth.llh[0])
     spans = detect(recording, settings).stationary
     t = keyframe_times(recording.start, recording.end, Stance.epochs(recording, settings, spans), 1.0)
     intervals = preintegrate(bridge_gaps(recording.imu), recording.imu, t, np.zeros(3), np.zeros(3))
-    return Scene(recording, settings, frame, t, spans, intervals)
+    return BuildContext(recording, settings, frame, t, spans, intervals)
 
 
 # ------------------------------------------------------------------------------------------------------------ stances
@@ -226,7 +226,7 @@ def test_zero_velocity_alone_makes_strides_too_short() -> None:
 
 
 # ------------------------------------------------------------------------------------------------------------ lateral
-def lateral_rows(course: str) -> tuple[Simulated, Scene, FootLateral]:
+def lateral_rows(course: str) -> tuple[Simulated, BuildContext, FootLateral]:
     walk = made("normal", exact=True, course=course)
     scene = scene_of(walk, settings_from({"foot": {"lateral": True}}))
     rows = FootLateral.build(scene)

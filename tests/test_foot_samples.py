@@ -14,8 +14,8 @@ from graphnav.config import Settings, settings_from
 from graphnav.core import rotation as ro
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
-from graphnav.estimation.noise.imu_floor import quietest_density, with_own_noise
-from graphnav.imu.clipping import cut_peaks, with_whole_peaks
+from graphnav.estimation.noise.imu_floor import quietest_density, with_measured_floor
+from graphnav.imu.clipping import find_cut_peaks, with_whole_peaks
 from graphnav.imu.onboard_offset import evidence, offset_learnt, without_onboard_offset
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import Samples, bridge_gaps
@@ -80,18 +80,18 @@ def test_what_is_too_short_for_a_bound_has_none() -> None:
 def test_figures_stated_too_large_are_lowered_for_a_walk_and_for_nothing_else() -> None:
     walk = made("normal").recording
     true = walk.imu.noise
-    same, said = with_own_noise(walk, Settings())
+    same, said = with_measured_floor(walk, Settings())
     assert said == ()
     assert same.imu.noise == true
     tenfold = replace(true, gyro_noise_density=10.0 * true.gyro_noise_density)
     stated = replace(walk, imu=replace(walk.imu, noise=tenfold))
-    found, (sentence,) = with_own_noise(stated, Settings())
+    found, (sentence,) = with_measured_floor(stated, Settings())
     assert true.gyro_noise_density < found.imu.noise.gyro_noise_density < 2.0 * true.gyro_noise_density
     assert found.imu.noise.accel_noise_density == true.accel_noise_density
     assert "gyro" in sentence
-    assert with_own_noise(stated, settings_from({"noise": {"mode": "stated"}})) == (stated, ())
+    assert with_measured_floor(stated, settings_from({"noise": {"mode": "stated"}})) == (stated, ())
     drive = replace(stated, platform="vehicle")
-    assert with_own_noise(drive, Settings()) == (drive, ())
+    assert with_measured_floor(drive, Settings()) == (drive, ())
 
 
 # ------------------------------------------------------------------------- offsets that the unit has taken off itself
@@ -204,7 +204,7 @@ def test_whole_peaks_stay_as_they_are(pace: str) -> None:
     imu = made(pace).recording.imu
     for x, least in ((imu.gyro, 4.0), (imu.accel, 19.0)):
         for axis in range(3):
-            assert not cut_peaks(imu.t, x[:, axis], least)
+            assert not find_cut_peaks(imu.t, x[:, axis], least)
     samples = bridge_gaps(imu)
     assert with_whole_peaks(samples, np.eye(3)) == (samples, ())
 

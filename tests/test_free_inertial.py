@@ -15,7 +15,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.state import States
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.pipeline import run
-from graphnav.imu.dynamics import Motion
+from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import prefix, preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Recording
@@ -32,7 +32,7 @@ def exact(lat: float) -> tuple[Recording, Trajectory]:
 def propagated(recording: Recording, truth: Trajectory, t: Array, frame: LocalFrame) -> States:
     """From the exact first state through all intervals, one after the other."""
     zero = np.zeros(3)
-    motion = Motion(preintegrate(bridge_gaps(recording.imu), recording.imu, t, zero, zero), frame)
+    motion = ImuFactors(preintegrate(bridge_gaps(recording.imu), recording.imu, t, zero, zero), frame)
     chain = [truth_states(truth, t[:1], frame)]
     for k in range(len(t) - 1):
         chain.append(motion.propagate(slice(k, k + 1), chain[-1])[0])

@@ -18,7 +18,7 @@ from graphnav.core import rotation as ro
 from graphnav.core.earth import LocalFrame, gravity
 from graphnav.core.errors import ConfigError
 from graphnav.core.state import States
-from graphnav.imu.dynamics import Motion as Mechanisation
+from graphnav.imu.dynamics import ImuFactors as Mechanisation
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu

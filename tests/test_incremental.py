@@ -19,13 +19,13 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.model import STATED, Figure, NoiseModel
 from graphnav.estimation.pipeline import run
-from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.incremental import Incremental, incremental, node_steps
 from graphnav.estimation.solvers.rts import backward
-from graphnav.estimation.solvers.stages import Message, Place, Step, turned
+from graphnav.estimation.solvers.stages import Message, Place, Step, rotate_columns
 from graphnav.estimation.solvers.window import Window, first_message
 from graphnav.recording import Recording
 from graphnav.recording.formats import read
@@ -68,7 +68,7 @@ def posed(drive: tuple[Recording, Trajectory]) -> Problem:
     settings = settings_from({"gnss": {"lever_arm_sigma": 0.2}})
     still = np.array([[0.0, 8.0]]) if np.linalg.norm(truth.v[truth.t <= 8.0], axis=1).max() < 1e-3 else None
     return with_noise(
-        pose(recording, settings, frame, start, np.repeat([0.1, 1.0, 0.5, 0.05, 5e-3], 3), still), LASTING
+        build_problem(recording, settings, frame, start, np.repeat([0.1, 1.0, 0.5, 0.05, 5e-3], 3), still), LASTING
     )
 
 
@@ -93,7 +93,7 @@ def test_a_window_is_the_dense_least_squares_solution(drive: tuple[Recording, Tr
     """Ten seconds against one QR of all rows as `helpers.factors` makes them, with none of the solver's code."""
     part = posed.recording.crop(40.0, 50.0)
     start = truth_states(drive[1], np.round(np.array([part.start]), 6), posed.frame)
-    problem = with_noise(pose(part, posed.settings, posed.frame, start, posed.prior.sigma[0]), LASTING)
+    problem = with_noise(build_problem(part, posed.settings, posed.frame, start, posed.prior.sigma[0]), LASTING)
     found = incremental(problem, lag=EVERYTHING).settled
     parts, widths = factors(problem, found.states, {n: p.value for n, p in found.parameters.items()})
     step, covariance = dense(parts, widths)
@@ -108,7 +108,7 @@ def test_the_live_estimate_is_the_end_of_a_batch_solution_so_far(posed: Problem)
     speed = next(rows.speed for rows in posed.constraints if isinstance(rows, OdometerSpeed))
     for end in (60.0, 130.0, 200.0):  # the second in the outage
         # what the odometer is worth is told from its readings: the same ones
-        part = pose(posed.recording.crop(0.0, end), posed.settings, posed.frame, posed.prior.mean,
+        part = build_problem(posed.recording.crop(0.0, end), posed.settings, posed.frame, posed.prior.mean,
                     posed.prior.sigma[0], np.array([[0.0, 8.0]]), speed=speed)  # fmt: skip
         part = with_noise(part, LASTING)
         smoothed = backward(part, ekf(part))
@@ -156,7 +156,7 @@ def test_a_moved_message_says_the_same() -> None:
 def test_turned_columns_are_the_derivative_of_the_chart() -> None:
     rng = np.random.default_rng(2)
     e = np.concatenate([rng.standard_normal(3), np.zeros(12)])
-    A = turned(np.eye(15), right_jacobian_inverse(e[None, :3])[0])
+    A = rotate_columns(np.eye(15), right_jacobian_inverse(e[None, :3])[0])
     h = 1e-6
     start = random_states(rng, 1)
     for k in range(3):

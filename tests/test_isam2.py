@@ -15,7 +15,7 @@ from graphnav.core.rotation import exp
 from graphnav.core.state import States
 from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.model import Figure, NoiseModel
-from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
@@ -24,7 +24,7 @@ from graphnav.estimation.solvers.isam import isam2
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import newest_covariance, smoothed
+from graphnav.estimation.solvers.tree_marginals import newest_covariance, smooth_keyframes
 from graphnav.estimation.solvers.window import first_message, turn_limit
 from graphnav.recording import Recording
 
@@ -60,7 +60,9 @@ def posed(drive: Drive) -> Problem:
     recording, start, still = drive
     settings = settings_from({"gnss": {"lever_arm_sigma": 0.2}})
     sigma = np.repeat([0.1, 1.0, 0.5, 0.05, 5e-3], 3)
-    return with_noise(pose(recording, settings, LocalFrame(recording.gnss.llh[0]), start, sigma, still), LASTING)
+    return with_noise(
+        build_problem(recording, settings, LocalFrame(recording.gnss.llh[0]), start, sigma, still), LASTING
+    )
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +95,7 @@ def test_a_start_that_is_off_by_sixty_degrees_is_mended_by_relinearisation(posed
 
 def test_within_a_lag_it_is_the_window(posed: Problem, solved: Solution) -> None:
     # about the right biases: the window does not integrate again
-    problem = posed.reintegrated(solved.states.ba[:-1], solved.states.bg[:-1])
+    problem = posed.reintegrate(solved.states.ba[:-1], solved.states.bg[:-1])
     tree, window = isam2(problem, lag=30.0), incremental(problem, lag=30.0)
     assert apart(tree.settled, window.settled).max() < 0.05
     np.testing.assert_allclose(sigmas(tree.settled), sigmas(window.settled), rtol=0.01)
@@ -159,7 +161,7 @@ def test_keyframes_come_again_after_others_were_taken_back(drive: Drive) -> None
     sigma = np.repeat([0.1, 1.0, 0.5, 0.05, 5e-3], 3)
     frame = LocalFrame(recording.gnss.llh[0])
     settings = settings_from({"keyframes": {"rate": 10.0}})
-    stated = pose(recording.crop(0.0, 4.0), settings, frame, start, sigma, still)
+    stated = build_problem(recording.crop(0.0, 4.0), settings, frame, start, sigma, still)
     never, _ = _played(stated, 36)
     tree, _ = _played(stated, 26, every=1000)
     steps = node_steps(stated)
@@ -170,7 +172,7 @@ def test_keyframes_come_again_after_others_were_taken_back(drive: Drive) -> None
     for one in (tree, never):
         while one.relinearise(0.02):
             pass
-    a, b = smoothed(tree, len(tree)), smoothed(never, len(never))
+    a, b = smooth_keyframes(tree, len(tree)), smooth_keyframes(never, len(never))
     assert np.abs(a.states.minus(b.states) / np.sqrt(np.diagonal(b.covariance, axis1=1, axis2=2))).max() < 0.01
     np.testing.assert_allclose(a.covariance[:, range(15), range(15)], b.covariance[:, range(15), range(15)], rtol=0.01)
 
@@ -186,7 +188,7 @@ def test_a_tree_made_again_from_its_rows_goes_on_as_before(posed: Problem) -> No
         for one in (tree, again):
             one.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=True))
             one.relinearise()
-    a, b = smoothed(tree, len(tree)), smoothed(again, len(again))
+    a, b = smooth_keyframes(tree, len(tree)), smooth_keyframes(again, len(again))
     np.testing.assert_allclose(a.states.p, b.states.p, atol=1e-6)
     np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-4, atol=1e-14)
     assert isinstance(a.states, States)

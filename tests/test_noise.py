@@ -28,10 +28,10 @@ from graphnav.estimation.noise.priors import prior
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.pipeline import SOLVERS, origin, run
-from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf, refilter
-from graphnav.estimation.solvers.passes import Forward, Smoothed
+from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.evaluation.scoring import errors
 from graphnav.imu.preintegration import NOISE_FIGURES, preintegrate
@@ -53,7 +53,7 @@ def posed(recording: Recording, settings: Settings | None = None) -> tuple[Probl
     settings = settings or Settings()
     frame, stops = LocalFrame(origin(recording)), detect(recording, settings).stationary
     found = align(recording, settings, frame, lambda p, x: batch(p, x, wanted=(0,), reintegrate=False), stops)
-    return pose(recording, settings, frame, found.state, found.sigma, stops, parts_of_noise=True), found.until
+    return build_problem(recording, settings, frame, found.state, found.sigma, stops, parts_of_noise=True), found.until
 
 
 def groups(problem: Problem) -> list[str]:
@@ -64,7 +64,7 @@ def groups(problem: Problem) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def moments(problem: Problem, forward: Forward, smoothed: Smoothed) -> dict[str, tuple[float, float]]:
+def moments(problem: Problem, forward: ForwardRecord, smoothed: SmootherPass) -> dict[str, tuple[float, float]]:
     """A and B of every component."""
     out: dict[str, tuple[float, float]] = {}
     A, B = imu_moments(problem, forward, smoothed)
@@ -111,7 +111,7 @@ def test_moments_are_the_derivative_of_the_likelihood(name: str) -> None:
         assert pytest.approx(slope, abs=2e-4 * (1.0 + A + B)) == 0.5 * (A - B), group
 
 
-def mixed(base: Problem, opening: float | None) -> tuple[Problem, NoiseModel, Smoothed]:
+def mixed(base: Problem, opening: float | None) -> tuple[Problem, NoiseModel, SmootherPass]:
     """With figures that differ, so that no component is all of its noise; and points that smoothing leaves alone."""
     size = np.random.default_rng(1).normal(0.0, 0.5, len(groups(base)))
     noise = NoiseModel({name: Figure(float(x)) for name, x in zip(groups(base), size, strict=True)})

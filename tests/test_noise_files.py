@@ -20,7 +20,7 @@ from graphnav.core.state import States
 from graphnav.estimation.noise.files import known_groups, noise_values, read_noise, read_noise_and_mode, write_noise
 from graphnav.estimation.noise.model import STATED, Figure, NoiseModel, RowWeights
 from graphnav.estimation.noise.table import figure_rows, whole_ratio
-from graphnav.estimation.problem import pose
+from graphnav.estimation.problem import build_problem
 from graphnav.recording.formats import read as load
 
 TOKYO = Path(__file__).resolve().parents[1] / "data" / "tokyo"
@@ -60,7 +60,7 @@ def test_every_group_of_a_problem_can_be_written_down() -> None:
     frame = LocalFrame(recording.gnss.llh[0])
     zero: Array = np.zeros((1, 3))
     start = States(np.eye(3)[None], zero, zero, zero, zero)
-    problem = pose(recording, Settings(), frame, start, np.ones(15), np.empty((0, 2)))
+    problem = build_problem(recording, Settings(), frame, start, np.ones(15), np.empty((0, 2)))
     groups = {g for rows in problem.constraints for g in rows.noise_groups()[0]}
     groups |= {g for rows in problem.constraints for p in (*rows.parameters, *rows.processes) for g in p.noise_groups}
     assert {"odometer.forward", "gnss_velocity.seconds.up", "nhc.seconds.right"} <= groups

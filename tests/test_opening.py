@@ -13,7 +13,7 @@ from test_solvers import NO_WHEELS, WHITE, nearly_linear, sigmas
 from graphnav.config import settings_from
 from graphnav.core.earth import LocalFrame
 from graphnav.estimation.alignment import align
-from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import rts
@@ -34,7 +34,8 @@ def posed(shared_data: Path, seed: int) -> Start:
     assert aligned.until is not None
     assert aligned.motion < recording.start + 90.0 < aligned.until < recording.start + 140.0
     long, short = (
-        pose(recording.crop(0.0, seconds), settings, frame, aligned.state, aligned.sigma) for seconds in (200.0, 150.0)
+        build_problem(recording.crop(0.0, seconds), settings, frame, aligned.state, aligned.sigma)
+        for seconds in (200.0, 150.0)
     )
     return Start(long, short, aligned.until)
 

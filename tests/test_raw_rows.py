@@ -13,7 +13,7 @@ import raw_drive
 from helpers import errors, truth_states
 
 from graphnav.config import settings_from
-from graphnav.constraints.base import Scene
+from graphnav.constraints.base import BuildContext
 from graphnav.constraints.gnss import GnssPosition
 from graphnav.constraints.raw_gnss import BIASES, CLOCK, GnssCode, GnssDoppler
 from graphnav.core.earth import LocalFrame
@@ -33,7 +33,7 @@ def scene(recording, settings=TIGHT, cls=GnssCode):
     t = t[np.concatenate([[True], np.diff(t) > 1e-6])]
     intervals = preintegrate(bridge_gaps(recording.imu), recording.imu, t, np.zeros(3), np.zeros(3))
     frame = LocalFrame(recording.gnss.llh[0])
-    return Scene(recording, settings, frame, t, np.empty((0, 2)), intervals)
+    return BuildContext(recording, settings, frame, t, np.empty((0, 2)), intervals)
 
 
 @pytest.fixture(scope="module")

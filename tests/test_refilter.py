@@ -20,7 +20,7 @@ from graphnav.estimation.alignment import align
 from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.model import Figure, NoiseModel
 from graphnav.estimation.pipeline import origin, run
-from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
@@ -39,7 +39,7 @@ def posed() -> Problem:
     settings = Settings()
     frame = LocalFrame(origin(recording))
     found = align(recording, settings, frame, lambda p, s: batch(p, s, wanted=(0,), reintegrate=False))
-    base = pose(recording, settings, frame, found.state, found.sigma, detect(recording, settings).stationary)
+    base = build_problem(recording, settings, frame, found.state, found.sigma, detect(recording, settings).stationary)
     lasting = (f"gnss_position.{time}.{axis}" for time in ("minutes", "hours") for axis in ("horizontal", "up"))
     return with_noise(base, NoiseModel({name: Figure(float(np.log(0.25))) for name in lasting}))
 

@@ -23,7 +23,7 @@ from graphnav.core.state import States
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import Figure, NoiseModel, RowWeights
 from graphnav.estimation.noise.table import figure_rows
-from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution, joined
+from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution, join_solutions
 from graphnav.evaluation.metrics import Errors
 from graphnav.evaluation.segments import relative_errors
 from graphnav.imu.dynamics import SCALE
@@ -31,7 +31,7 @@ from graphnav.recording import Gnss, Imu, Recording, Truth
 from graphnav.report import page
 from graphnav.report import pictures as report_pictures
 from graphnav.report.documents import write_comparison, write_report
-from graphnav.report.names import components, named
+from graphnav.report.names import components, has_names
 from graphnav.report.provenance import command, toml_text
 from graphnav.report.sentences import doubts
 from graphnav.report.summary import fix_table, left_out, sigma_table, verdicts
@@ -359,11 +359,11 @@ def test_a_calibration_has_names_and_no_index():
     for name, size in (*sizes.items(), (SCALE, 18)):
         one = np.ones((1, size))
         found = components(name, ParameterEstimate(np.zeros(1), one, one, one[0], "u"))
-        assert named(name)
+        assert has_names(name)
         assert len({c.words for c in found}) == size
         assert not any("[" in c.words for c in found)
     one = np.ones((1, 15))
-    assert not named(PATTERN)
+    assert not has_names(PATTERN)
     assert len(components(PATTERN, ParameterEstimate(np.zeros(1), one, one, one[0], "m/s"))) == 15
 
 
@@ -481,7 +481,7 @@ def test_pieces_keep_all_weights_and_spans_and_the_report_says_whose_figures_it_
         )
         for k in (0, 1)
     ]
-    whole = joined(parts)
+    whole = join_solutions(parts)
     assert whole.noise.figures == parts[0].noise.figures
     assert {name: list(some.t) for name, some in whole.noise.weights.items()} == {
         "gnss_position": [t[0]],

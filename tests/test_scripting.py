@@ -214,14 +214,14 @@ def test_a_staged_folder_replaces_at_the_end_or_not_at_all(tmp_path):
     old.write_text("old")
 
     def stopped(folder, error):
-        with staging.staged(folder) as part:
+        with staging.stage_results(folder) as part:
             (part / "a.txt").write_text("half")
             raise error
 
     with pytest.raises(KeyboardInterrupt):
         stopped(old.parent, KeyboardInterrupt())
     assert (old.read_text(), [p.name for p in old.parent.iterdir()]) == ("old", ["a.txt"])
-    with staging.staged(old.parent) as part:
+    with staging.stage_results(old.parent) as part:
         (part / "sub").mkdir()
         (part / "a.txt").write_text("new")
         (part / "sub" / "b.txt").write_text("new")
@@ -237,7 +237,7 @@ def test_ctrl_c_waits_for_what_must_not_be_cut():
     done = []
 
     def move():
-        with staging.uninterrupted():
+        with staging.defer_interrupts():
             os.kill(os.getpid(), signal.SIGINT)
             done.append("moved")
         done.append("more")

@@ -19,7 +19,7 @@ from graphnav.core import rotation as ro
 from graphnav.core.earth import RATE, LocalFrame, gravity, llh_to_ecef
 from graphnav.core.errors import ConfigError
 from graphnav.core.state import States
-from graphnav.imu.dynamics import Motion as Mechanisation
+from graphnav.imu.dynamics import ImuFactors as Mechanisation
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu, Odometer
@@ -27,9 +27,9 @@ from graphnav.recording.checks.overview import inspect
 from graphnav.recording.formats import read
 from graphnav.recording.formats.writing import write_folder
 from graphnav.simulation import Simulated, options_from, scenarios, simulate
-from graphnav.simulation.aiding import Fault, GnssModel, OdometerModel
+from graphnav.simulation.aiding import GnssModel, OdometerModel, SimulatedFault
 from graphnav.simulation.inertial import EG370N, MIMU, Triad, accelerometer, gyroscope
-from graphnav.simulation.kinematics import Motion, Mount, move
+from graphnav.simulation.kinematics import Mount, TrueMotion, move
 from graphnav.simulation.motion import HEADING, SLIP, SPEED, Manoeuvre, drive
 from graphnav.simulation.passengers import Boarding, movement
 from graphnav.simulation.scenarios.li2024 import TABLE_4
@@ -58,7 +58,7 @@ def made(name: str, seed: int = 0, **options: float) -> Simulated:
 
 
 @lru_cache(maxsize=4)
-def smooth(lat: float = 30.5, rate: float = 200.0, slip: float = 0.0) -> Motion:
+def smooth(lat: float = 30.5, rate: float = 200.0, slip: float = 0.0) -> TrueMotion:
     """A drive with nothing that shakes."""
     path = drive(WAY, heading=62.0, slip_per_accel=slip)
     return move(path, (lat, *ORIGIN[1:]), ASKEW, Shake(), rate)
@@ -88,7 +88,7 @@ def test_free_inertial_by_graphnav(name: str, seconds: int, attitude_deg: float)
     assert np.abs(ro.log(np.swapaxes(true.R_nb, -1, -2) @ end.R_nb)).max() < attitude_deg * DEG
 
 
-def pyins_readings(motion: Motion) -> pd.DataFrame:
+def pyins_readings(motion: TrueMotion) -> pd.DataFrame:
     readings = np.hstack([oracle_path.swap(motion.gyro), oracle_path.swap(motion.accel)]) / 200.0
     return pd.DataFrame(np.vstack([readings[:1], readings]), index=motion.t, columns=util.GYRO_COLS + util.ACCEL_COLS)
 
@@ -240,7 +240,7 @@ def test_backing_up_is_a_negative_speed() -> None:
     assert np.all(forward < -0.5)
 
 
-def heading_at(motion: Motion, t: Array) -> Array:
+def heading_at(motion: TrueMotion, t: Array) -> Array:
     return np.interp(t, motion.t, np.unwrap(motion.rph[:, 2]))
 
 
@@ -386,7 +386,7 @@ def test_recording_states_what_was_put_in() -> None:
 
 
 # ------------------------------------------------------------------------------------------------- GNSS and odometer
-def enu_errors(motion: Motion, model: GnssModel, seed: int = 0) -> tuple[Array, Array, Array]:
+def enu_errors(motion: TrueMotion, model: GnssModel, seed: int = 0) -> tuple[Array, Array, Array]:
     fixes = model.read(motion, seed)
     llh, v = motion.point(fixes.t, fixes.lever_arm)
     frame = LocalFrame(llh[0])
@@ -414,12 +414,12 @@ def test_gnss_errors_have_their_sizes_and_times() -> None:
 def test_gnss_faults() -> None:
     motion = smooth(rate=200.0)
     model = GnssModel(white=(0.01, 0.01, 0.01), rate=10.0)
-    t, e, dv = enu_errors(motion, replace(model, faults=(Fault(20.0, 30.0, growth=(1.0, 0.5, 0.0)),)))
+    t, e, dv = enu_errors(motion, replace(model, faults=(SimulatedFault(20.0, 30.0, growth=(1.0, 0.5, 0.0)),)))
     inside = (t >= 20.0) & (t <= 30.0)
     np.testing.assert_allclose(e[inside, 0], t[inside] - 20.0, atol=0.06)
     np.testing.assert_allclose(e[inside, 1], 0.5 * (t[inside] - 20.0), atol=0.06)
     assert np.abs(e[~inside]).max() < 0.06
-    _, e, dv = enu_errors(motion, replace(model, faults=(Fault(20.0, 30.0, noise=100.0),)))
+    _, e, dv = enu_errors(motion, replace(model, faults=(SimulatedFault(20.0, 30.0, noise=100.0),)))
     assert e[inside].std() == pytest.approx(1.0, rel=0.2)
     assert dv[~inside].std() < 0.1
 

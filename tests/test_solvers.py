@@ -21,7 +21,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.model import STATED, Figure, NoiseModel
 from graphnav.estimation.pipeline import run
-from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
@@ -84,7 +84,9 @@ def nearly_linear(kind: str) -> Trio:
     sigma = np.repeat([1e-5, 0.05, 1e-3, 1e-3, 1e-6], 3)
     settings = settings_from({"gnss": gnss, "vehicle": NO_WHEELS})
     stops = np.array([[0.5, 2.0], [3.0, 4.5]]) if kind == "stops" else None
-    problem = with_noise(pose(recording, settings, frame, start, sigma, stops), LASTING if kind == "slow" else STATED)
+    problem = with_noise(
+        build_problem(recording, settings, frame, start, sigma, stops), LASTING if kind == "slow" else STATED
+    )
     forward = ekf(problem)
     smoothed = rts(problem, forward)
     return Trio(problem, smoothed, batch(problem, smoothed.states), truth)
@@ -170,7 +172,7 @@ def solved_lap(lap: tuple[Recording, Trajectory]) -> tuple[Problem, Solution]:
     frame = LocalFrame(part.gnss.llh[0])
     start = truth_states(truth, np.round(np.array([part.start]), 6), frame)
     sigma = np.repeat([0.02, 1.0, 0.5, 0.03, 2e-3], 3)
-    problem = pose(part, settings, frame, start, sigma)
+    problem = build_problem(part, settings, frame, start, sigma)
     smoothed = rts(problem, ekf(problem))
     solution = batch(problem, smoothed.states, {n: p.value for n, p in smoothed.parameters.items()}, reintegrate=False)
     return problem, solution
@@ -234,7 +236,7 @@ def test_covariances_of_some_keyframes_only(lap: tuple[Recording, Trajectory]) -
     part = recording.crop(30.0, 40.0)
     frame = LocalFrame(part.gnss.llh[0])
     start = truth_states(truth, np.round(np.array([part.start]), 6), frame)
-    problem = pose(part, Settings(), frame, start, np.repeat([0.02, 1.0, 0.5, 0.03, 2e-3], 3))
+    problem = build_problem(part, Settings(), frame, start, np.repeat([0.02, 1.0, 0.5, 0.03, 2e-3], 3))
     smoothed = rts(problem, ekf(problem))
     whole = batch(problem, smoothed.states)
     some = batch(problem, smoothed.states, wanted=(0, 7))
@@ -380,7 +382,7 @@ def test_batch_converges_from_a_wrong_heading(lap: tuple[Recording, Trajectory],
     found = []
     for heading in (0.0, off):
         start = replace(true, R_nb=exp(np.array([0.0, 0.0, np.radians(heading)])) @ true.R_nb, ba=0 * true.ba)
-        problem = pose(recording, settings_from({"gnss": WHITE}), frame, start, sigma)
+        problem = build_problem(recording, settings_from({"gnss": WHITE}), frame, start, sigma)
         smoothed = rts(problem, ekf(problem))
         found.append(batch(problem, smoothed.states, {n: p.value for n, p in smoothed.parameters.items()}))
     assert "converged" in found[1].stopped

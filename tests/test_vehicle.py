@@ -11,7 +11,7 @@ import pytest
 from helpers import Array, truth_states
 
 from graphnav.config import Settings, settings_from
-from graphnav.constraints.base import Scene
+from graphnav.constraints.base import BuildContext
 from graphnav.constraints.standstill import PLACE, HeldPosition, ZeroRate, ZeroVelocity
 from graphnav.constraints.vehicle import AXLE, MOUNTING, ODOMETER_DELAY, ODOMETER_SCALE, NonHolonomic, OdometerSpeed
 from graphnav.core import rotation
@@ -38,13 +38,15 @@ def exact(request: pytest.FixtureRequest) -> tuple[Recording, Trajectory]:
     return oracle.drive(path, imu_noise=None, gnss_exact=True, odometer_rate=20.0, odometer_sd=0.0, odometer_scale=0.01)
 
 
-def scene_of(recording: Recording, settings: Settings, ba: Array | None = None, bg: Array | None = None) -> Scene:
+def scene_of(
+    recording: Recording, settings: Settings, ba: Array | None = None, bg: Array | None = None
+) -> BuildContext:
     frame = LocalFrame(recording.gnss.llh[40])
     t = keyframe_times(recording.start, recording.end, np.array(STOP), 1.0)
     zero = np.zeros(3)
     imu = recording.imu
     intervals = preintegrate(bridge_gaps(imu), imu, t, zero if ba is None else ba, zero if bg is None else bg)
-    return Scene(recording, settings, frame, t, np.array([STOP]), intervals)
+    return BuildContext(recording, settings, frame, t, np.array([STOP]), intervals)
 
 
 def residual(cls: type, recording: Recording, truth: Trajectory, values: dict[str, Array], **biases: Array) -> Array:

@@ -49,7 +49,7 @@ from graphnav.app.talk import (
     show,
 )
 from graphnav.core.errors import GraphnavError
-from graphnav.core.files import outside_allowed
+from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
 
 __all__ = ["DEBUG", "PIPE_CLOSED", "app", "main", "run"]
@@ -104,9 +104,9 @@ def info(
         whole = read(only(context, recording), topic or (), allow_outside)
         tell("checks")
         found = inspect(whole)
-        from graphnav.estimation.antenna import find_antenna, reversed_arms
+        from graphnav.estimation.antenna import find_antenna, find_reversed_arms
 
-        more = reversed_arms(found.recording) if found.trusted and not quick else []
+        more = find_reversed_arms(found.recording) if found.trusted and not quick else []
         found = replace(found, findings=(*more, *found.findings, *([find_antenna(whole).finding] if antenna else [])))
     show(found.text, found.values, quiet, json)
 
@@ -129,7 +129,7 @@ def detect(
     """Find where the vehicle stands, and write the intervals, the statistics they come from and a picture."""
     from graphnav.app import outputs, workflow
     from graphnav.config import read_settings
-    from graphnav.core.staging import moved, staged
+    from graphnav.core.staging import final_path, stage_results
     from graphnav.detectors import detect as detected
     from graphnav.recording.plausibility.screening import screened
     from graphnav.report import detections as detection_report
@@ -137,16 +137,16 @@ def detect(
     withheld = withheld_of(without, start, end)
     settings = firing(read_settings(config), detectors)
     folder = outputs.output_folder(out)
-    with bar(quiet, "detect"), outside_allowed(allow_outside):
+    with bar(quiet, "detect"), permit_outside(allow_outside):
         tell("reading")
         used, said = screened(workflow.read_part(only(context, recording), start, end, withheld, tuple(topic or ())))
         tell("detection")
         found = detected(used, settings)
         found = replace(found, notes=(*said, *found.notes))
         tell("writing")
-        with staged(folder) as part:
+        with stage_results(folder) as part:
             files = detection_report.write(used, found, part)
-    files = moved(files, part, folder)
+    files = final_path(files, part, folder)
     show(
         lambda: detection_report.text(used, found, files),
         lambda: {**detection_report.values(used, found), "files": files},
@@ -169,14 +169,14 @@ def evaluate(
 ) -> None:
     """Compare any trajectory file with any truth file, ours or another program's."""
     from graphnav.app import outputs
-    from graphnav.core.staging import staged
+    from graphnav.core.staging import stage_results
     from graphnav.evaluation import gates
     from graphnav.evaluation.evaluate import evaluate as compared
     from graphnav.evaluation.metrics import comparison_rows, summary, text
 
     requirements = [gates.parse_requirement(one) for one in require or ()]
     folder = None if out is None else outputs.output_folder(out)
-    with bar(quiet, "evaluate"), outside_allowed(allow_outside):
+    with bar(quiet, "evaluate"), permit_outside(allow_outside):
         tell("reading")
         metrics = compared(trajectory, truth)
     values = {"trajectory": str(trajectory), "truth": str(truth), **summary(metrics)}
@@ -184,7 +184,7 @@ def evaluate(
     if verdicts:
         values["requirements"] = gates.values(verdicts)
     if folder is not None:
-        with staged(folder) as part:
+        with stage_results(folder) as part:
             outputs.write_evaluation(part, values, metrics)
     show(lambda: text(metrics) + gates.text(verdicts), lambda: values, quiet, json)
     insist(verdicts)

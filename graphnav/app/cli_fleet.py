@@ -24,7 +24,7 @@ from graphnav.app.cli_options import (
 )
 from graphnav.app.talk import Interrupted, say, show
 from graphnav.core.errors import ConfigError
-from graphnav.core.files import outside_allowed
+from graphnav.core.files import permit_outside
 
 commands = typer.Typer()
 
@@ -73,7 +73,7 @@ def fleet(
     from graphnav.app import convert, outputs
     from graphnav.app.fleet import manifest, page, tables, workers
     from graphnav.app.fleet.drive import DONE, Row
-    from graphnav.core.staging import moved, staged
+    from graphnav.core.staging import final_path, stage_results
 
     convert.check_rate(rate)
     if withhold is not None and not withhold > 0.0:
@@ -89,7 +89,7 @@ def fleet(
         end,
     )
     folder = outputs.output_folder(out, ("fleet.csv", "fleet.parquet", "fleet.html"), ("drives",)).resolve()
-    with outside_allowed(allow_outside):
+    with permit_outside(allow_outside):
         drives = manifest.read_drives(source.resolve(), asked)
     known: dict[Any, Any] = {}
     tasks = [
@@ -108,18 +108,18 @@ def fleet(
         for row in found:
             done[row["drive"]] = row if len(done) < page.DRAWN else {**row, "track": None}
             if not (quiet or json):
-                say(f"[{len(done)}/{len(tasks)}] {row['drive']}: {_said(row)}")
+                say(f"[{len(done)}/{len(tasks)}] {row['drive']}: {_describe(row)}")
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted after {len(done)} of {len(tasks)} drives; the same command goes on") from None
     rows = [done[task.name] for task in tasks]
-    with staged(folder) as part:
+    with stage_results(folder) as part:
         tables.write_csv(rows, part / "fleet.csv")
         files = [part / "fleet.csv"]
         if tables.write_parquet(rows, part / "fleet.parquet"):
             files.append(part / "fleet.parquet")
         page.write_page(rows, part / "fleet.html", f"{source.name}: {len(rows)} drives")
         files.insert(0, part / "fleet.html")
-    files = moved(files, part, folder)
+    files = final_path(files, part, folder)
     lacking = "" if len(files) > 2 else "\nno fleet.parquet: pyarrow is not installed"
     show(
         lambda: "\n".join([tables.text(rows) + lacking, "look at", *(f"  {file}" for file in files)]),
@@ -144,7 +144,7 @@ def _full(noise: str) -> str:
     return str(Path(noise).resolve()) if Path(noise).is_file() else noise
 
 
-def _said(row: dict[str, Any]) -> str:
+def _describe(row: dict[str, Any]) -> str:
     """One line on a drive."""
     if row["status"] != "done":
         return f"{row['status']}: {row.get('error')}"

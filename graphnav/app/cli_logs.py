@@ -11,7 +11,7 @@ import typer
 from graphnav.app.cli_options import AllowOutside, Export, Json, Point, Quiet, Topic
 from graphnav.app.talk import bar, say, show
 from graphnav.core.errors import ConfigError
-from graphnav.core.files import outside_allowed
+from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
 
 commands = typer.Typer()
@@ -42,7 +42,7 @@ def convert(
     """Turn another program's log into a recording folder, or a trajectory into another format of trajectories."""
     from graphnav.app import convert as conversion
     from graphnav.app.outputs import output_folder
-    from graphnav.core.staging import moved, staged
+    from graphnav.core.staging import final_path, stage_results
 
     if export is not None and format is not None:
         raise ConfigError(f"--format {format}: is for logs; what a trajectory is, is seen from its content")
@@ -50,10 +50,10 @@ def convert(
         conversion.check_rate(rate)
         alone = bool(out.suffix) and not out.is_dir()
         folder = output_folder(out.parent if alone else out)
-        with bar(quiet, "convert"), staged(folder) as part:
+        with bar(quiet, "convert"), stage_results(folder) as part:
             target = part / out.name if alone else part
             _, files, notes = conversion.export_file(Path(source), target, export or format, point, rate, clock)
-        files = moved(files, part, folder)
+        files = final_path(files, part, folder)
         show(
             lambda: "\n".join([*(f"note: {note}" for note in notes), *(f"wrote {file}" for file in files)]),
             lambda: {"notes": notes, "files": files},
@@ -65,7 +65,7 @@ def convert(
         if value is not None:
             raise ConfigError(f"{option}: is for trajectories; a log keeps its own")
     folder = output_folder(out)
-    with bar(quiet, "convert"), outside_allowed(allow_outside):
+    with bar(quiet, "convert"), permit_outside(allow_outside):
         tell("reading")
         log, files = conversion.convert_log(source, folder, format, topic or ())
     show(
@@ -90,13 +90,13 @@ def allan(
     """Measure the noise figures of an IMU from a log at rest, and print them as lines for recording.toml."""
     from graphnav.app.outputs import output_folder
     from graphnav.core.errors import RecordingError
-    from graphnav.core.staging import moved, staged
+    from graphnav.core.staging import final_path, stage_results
     from graphnav.recording.allan import allan_of, files
     from graphnav.recording.draft import imu_of
     from graphnav.recording.formats import load
 
     folder = output_folder(out)
-    with bar(quiet, "allan"), outside_allowed(allow_outside):
+    with bar(quiet, "allan"), permit_outside(allow_outside):
         tell("reading")
         if log.endswith((".csv", ".csv.gz")):
             t, gyro, accel = imu_of(Path(log))
@@ -115,9 +115,9 @@ def allan(
         except RecordingError as error:
             raise RecordingError(f"{log}: {error}") from None
         tell("writing")
-        with staged(folder) as part:
+        with stage_results(folder) as part:
             written = files.write(result, part)
-    written = moved(written, part, folder)
+    written = final_path(written, part, folder)
     lines = [f"{result.duration:.0f} s at rest, {result.rate:.4g} Hz", "", "[imu.noise]", *result.lines(), ""]
     show(
         lambda: "\n".join([*lines, *(f"wrote {path}" for path in written)]),
@@ -146,7 +146,7 @@ def init(
 ) -> None:
     """Draft a recording.toml from logs: columns, units, axes and clocks as they seem to be, and why."""
     from graphnav.app.outputs import output_folder
-    from graphnav.core.staging import staged
+    from graphnav.core.staging import stage_results
     from graphnav.recording.draft import draft
     from graphnav.recording.formats.writer import write_csv
 
@@ -162,7 +162,7 @@ def init(
         for made in drafted.made:
             if (folder / made).exists() and not force:
                 raise ConfigError(f"{folder / made}: is there already; say --force to write over it")
-        with staged(folder) as part:
+        with stage_results(folder) as part:
             for made, columns in drafted.made.items():
                 write_csv(part / made, list(columns), list(columns.values()))
             (part / out.name).write_text(drafted.text, encoding="utf-8")
@@ -194,7 +194,7 @@ def simulate(
 ) -> None:
     """Make a recording with truth: a simulated drive, with the errors of simulated sensors."""
     from graphnav.app import outputs
-    from graphnav.core.staging import moved, staged
+    from graphnav.core.staging import final_path, stage_results
     from graphnav.simulation import catalogue, options_from
     from graphnav.simulation import simulate as simulated
 
@@ -207,9 +207,9 @@ def simulate(
     options = options_from(scenario, option or [])
     with bar(quiet, "simulate"):
         made = simulated(scenario, seed, **options)
-        with staged(folder) as part:
+        with stage_results(folder) as part:
             files = made.write(part)
-    files = moved(files, part, folder)
+    files = final_path(files, part, folder)
     show(
         lambda: "\n".join([made.text(), *(f"  {file}" for file in files)]),
         lambda: {"scenario": scenario, "seed": seed, "options": options, "stops": made.stops, "files": files},

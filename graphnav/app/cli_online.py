@@ -68,7 +68,7 @@ def online(
     if send:
         _send(source, topic or [], allow_outside, speed)
         return
-    settings = _changed(read_settings(config, profile), lag, engine)
+    settings = _override(read_settings(config, profile), lag, engine)
     if resume and out is None:
         raise ConfigError("--resume: say which folder to go on in: -o OUT")
     folder = None if out is None else output_folder(out)
@@ -94,7 +94,7 @@ def online(
     session.require_settled()
 
 
-def _changed(settings: Settings, lag: float | None, engine: str | None) -> Settings:
+def _override(settings: Settings, lag: float | None, engine: str | None) -> Settings:
     """The settings with what was typed in the place of theirs."""
     from graphnav.config import settings_from
 

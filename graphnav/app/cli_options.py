@@ -116,9 +116,9 @@ def firing(settings: Settings, names: str | None) -> Settings:
     from typing import get_args
 
     from graphnav.config.detectors import FUSED, DetectorName
-    from graphnav.core.complaints import listed
+    from graphnav.core.complaints import split_names
 
-    fire = listed(names, get_args(DetectorName), "--detectors", "detector")
+    fire = split_names(names, get_args(DetectorName), "--detectors", "detector")
     if FUSED in fire and len(fire) > 1:
         raise ConfigError(f"--detectors {names}: '{FUSED}' is all detectors together: name it alone, or name detectors")
     return settings.model_copy(update={"detectors": settings.detectors.model_copy(update={"fire": fire})})

@@ -35,7 +35,7 @@ from graphnav.app.cli_options import (
 )
 from graphnav.app.talk import bar, insist, show
 from graphnav.core.errors import ConfigError
-from graphnav.core.files import outside_allowed
+from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
 
 commands = typer.Typer()
@@ -71,7 +71,7 @@ def smooth(
         only(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
         quiet, json, pages,
     )  # fmt: skip
-    with outside_allowed(allow_outside):
+    with permit_outside(allow_outside):
         _solve(asked, solver, "--solver", export, point)
 
 
@@ -131,7 +131,7 @@ def compare(
     for option, values in (("--against-point", beside.points), ("--against-shift", beside.shifts)):
         if values and len(values) != len(beside.files):
             raise ConfigError(f"{option} {values[-1]}: say one for each of the {len(beside.files)} files of --against")
-    with outside_allowed(allow_outside):
+    with permit_outside(allow_outside):
         _solve(asked, solvers, "--solvers", export, point, beside)
 
 
@@ -143,15 +143,15 @@ def report(
 ) -> None:
     """Draw the pages of a run again, without solving: after another version of graphnav, or with plotly there."""
     from graphnav.app import outputs
-    from graphnav.core.staging import moved, staged
+    from graphnav.core.staging import final_path, stage_results
 
     if not out.is_dir():
         raise ConfigError(f"{out}: no such folder; name what smooth or compare wrote into")
     with bar(quiet, "detect"):
         tell("reading")
-        with staged(out) as part:
+        with stage_results(out) as part:
             files = outputs.draw_again(out, part)
-    files = moved(files, part, out)
+    files = final_path(files, part, out)
     show(lambda: "\n".join(["look at", *(f"  {file}" for file in files)]), lambda: {"files": files}, quiet, json)
 
 
@@ -195,15 +195,15 @@ def _solve(
 ) -> None:
     from graphnav.app import convert, outputs, terminal, workflow
     from graphnav.config import read_settings
-    from graphnav.core.complaints import listed
-    from graphnav.core.staging import moved, staged
+    from graphnav.core.complaints import split_names
+    from graphnav.core.staging import final_path, stage_results
     from graphnav.estimation import pipeline
     from graphnav.evaluation import gates
     from graphnav.recording.exporters import NAMES
 
     withheld = withheld_of(asked.without, asked.start, asked.end)
     convert.check_rate(asked.rate)
-    chosen, alone = listed(solvers, pipeline.KNOWN, option, "solver"), option == "--solver"
+    chosen, alone = split_names(solvers, pipeline.KNOWN, option, "solver"), option == "--solver"
     if alone and len(chosen) > 1:
         raise ConfigError(f"--solver {solvers}: smooth uses one; several are for graphnav compare")
     requirements = [gates.parse_requirement(one, chosen) for one in asked.require or ()]
@@ -216,7 +216,7 @@ def _solve(
     folder = outputs.output_folder(asked.out, outputs.FILES, () if alone else chosen)
     if point is not None and export is None:
         raise ConfigError(f"--point {point}: is of the files of --export; name some")
-    exported = listed(export, NAMES, "--export", "format to write") if export is not None else ()
+    exported = split_names(export, NAMES, "--export", "format to write") if export is not None else ()
     convert.parse_point(point)
     against = []
     for k, file in enumerate(beside.files if beside is not None else ()):
@@ -235,15 +235,15 @@ def _solve(
     with bar(asked.quiet, *chosen) as progress:
         outcome = workflow.run_request(request, progress)
         tell("writing")
-        with staged(folder) as part:
+        with stage_results(folder) as part:
             files = (outputs.write_run if alone else outputs.write_comparison)(outcome, part, asked.pages)
-        files = moved(files, part, folder)
+        files = final_path(files, part, folder)
         if not asked.pages:
             outputs.remove_pages(folder, () if alone else chosen)
         if exported:  # by itself, so that one that fails takes nothing with it
-            with staged(folder) as part:
+            with stage_results(folder) as part:
                 more = convert.export_run(outcome, part, exported, point, alone)
-            files += moved(more, part, folder)
+            files += final_path(more, part, folder)
     verdicts = gates.judge(requirements, outputs.comparison(outcome, ours=True)) if requirements else []
 
     def values() -> dict[str, Any]:

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 
 from graphnav.app.workflow import Outcome
-from graphnav.core.complaints import listed, nearest
+from graphnav.core.complaints import nearest, split_names
 from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.files import parse_json, read_text
 from graphnav.core.interpolation import interpolate
 from graphnav.core.rotation import Array
-from graphnav.core.staging import moved, staged
+from graphnav.core.staging import final_path, stage_results
 from graphnav.core.timescales import gps_to_utc, parse_clock
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.solution import Solution, to_trajectory
-from graphnav.evaluation.against import antenna_lever_arm, own
-from graphnav.recording.exporters import NAMES, written
+from graphnav.evaluation.against import antenna_lever_arm, own_solutions
+from graphnav.recording.exporters import NAMES, write_parts
 from graphnav.recording.formats import formats, load
 from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.trajectories import read_trajectory
@@ -72,9 +72,9 @@ def convert_log(source: str, out: Path, name: str | None, topics: Sequence[str] 
     log = _with_measured_noise(load(source, name, topics))
     if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
         raise ConfigError(f"-o {out}: the recording is read from there; name another folder")
-    with staged(out) as part:
+    with stage_results(out) as part:
         files = write_recording(log, part)
-    return log, moved(files, part, out)
+    return log, final_path(files, part, out)
 
 
 def _with_measured_noise(log: Log) -> Log:
@@ -141,7 +141,7 @@ def export_file(
         targets = {out.suffix[1:]: out}
     else:
         assert name is not None
-        targets = {one: out / f"{source.stem}.{one}" for one in listed(name, NAMES, "--export", "format to write")}
+        targets = {one: out / f"{source.stem}.{one}" for one in split_names(name, NAMES, "--export", "format to write")}
     run = _run(source)
     arm = parse_point(point)
     if isinstance(arm, str) and arm == "antenna":
@@ -214,7 +214,7 @@ def export_run(
     arm = parse_point(point)
     name = "trajectory" if point in (None, "imu") else "antenna" if point == "antenna" else "point"
     files: list[Path] = []
-    for solver, solution in own(outcome.solutions).items():
+    for solver, solution in own_solutions(outcome.solutions).items():
         lever_arm = arm
         if isinstance(arm, str) and arm == "antenna":
             found = antenna_lever_arm(outcome.recording, solution)
@@ -249,7 +249,7 @@ def _of_point(solution: Solution, rate: float | None, arm: Array) -> Iterator[Tr
 def _write(blocks: Iterable[Trajectory], targets: dict[str, Path], gps_zero: float | None, name: str) -> list[Path]:
     for path in targets.values():
         path.parent.mkdir(parents=True, exist_ok=True)
-    written(blocks, targets, name, None if gps_zero is None else lambda t: gps_to_utc(t + gps_zero))
+    write_parts(blocks, targets, name, None if gps_zero is None else lambda t: gps_to_utc(t + gps_zero))
     return list(targets.values())
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 import graphnav
 from graphnav.app import stored
-from graphnav.app.stored import read_again, sha256, write_outcome
+from graphnav.app.stored import attach_recording, sha256, write_outcome
 from graphnav.app.workflow import Outcome, outages
 from graphnav.core.errors import ConfigError, PartlyWrittenError
 from graphnav.core.files import exists
@@ -24,7 +24,7 @@ from graphnav.core.jsonable import peak_memory_mb, write_json
 from graphnav.core.timescales import gps_to_utc
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.estimation.stops import detections_text, stops_of_solution
-from graphnav.evaluation.against import antenna_lever_arm, own
+from graphnav.evaluation.against import antenna_lever_arm, own_solutions
 
 if TYPE_CHECKING:
     from graphnav.estimation.noise.table import FigureRow
@@ -79,7 +79,7 @@ def write_run(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
 
     Without `pages` none is drawn; `draw_again` can do that later.
     """
-    (name,) = own(outcome.solutions)
+    (name,) = own_solutions(outcome.solutions)
     provenance = _provenance(outcome)
     failed = write_solver(outcome, name, folder, provenance, pages=pages)
     write_outcome(outcome, provenance, folder / stored.NAME)
@@ -98,7 +98,7 @@ def write_comparison(outcome: Outcome, folder: Path, pages: bool = True) -> list
 
         detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
     failed = []
-    for name in own(outcome.solutions):
+    for name in own_solutions(outcome.solutions):
         failed += write_solver(outcome, name, folder / name, provenance, detectors, pages)
     write_comparison_csv(folder / "comparison.csv", comparison(outcome))
     if pages:
@@ -125,11 +125,11 @@ def draw_again(folder: Path, part: Path) -> list[Path]:
     from graphnav.report import documents as report
 
     outcome, provenance = stored.read_outcome(folder / stored.NAME)
-    outcome = read_again(outcome, provenance["inputs"])
+    outcome = attach_recording(outcome, provenance["inputs"])
     alone = not (folder / "comparison.csv").exists()
     detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
     files = []
-    for name in own(outcome.solutions):
+    for name in own_solutions(outcome.solutions):
         place = part if alone else part / name
         place.mkdir(parents=True, exist_ok=True)
         _draw_solver(outcome, name, place, provenance, detectors)
@@ -174,7 +174,7 @@ def write_solver(
     list of str
         What could not be written, and why: a picture that fails takes no number with it.
     """
-    from graphnav.recording.exporters import written
+    from graphnav.recording.exporters import write_parts
 
     solution = outcome.solutions[name]
     began = time.perf_counter()
@@ -182,7 +182,7 @@ def write_solver(
     zero, title = outcome.recording.gps_zero, f"{outcome.recording.name}, {name}"
     folder.mkdir(parents=True, exist_ok=True)
     utc = None if zero is None else lambda t: gps_to_utc(t + zero)
-    written(solution.blocks(outcome.request.rate), targets, title, utc)
+    write_parts(solution.blocks(outcome.request.rate), targets, title, utc)
     write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
     text = detections_text(solution.detections, solution.records)
     (folder / "detections.csv").write_text(text, encoding="utf-8")
@@ -302,10 +302,10 @@ def noise_rows(outcome: Outcome, solution: Solution) -> tuple[FigureRow, ...]:
     imu = None
     if recording.platform == "foot" and any(group.startswith("imu.") for group in solution.noise.figures):
         # factors of a walk are relative to the densities of its rests
-        from graphnav.estimation.noise.imu_floor import with_own_noise
+        from graphnav.estimation.noise.imu_floor import with_measured_floor
         from graphnav.imu.onboard_offset import without_onboard_offset
 
-        imu = with_own_noise(without_onboard_offset(recording, settings)[0], settings)[0].imu.noise
+        imu = with_measured_floor(without_onboard_offset(recording, settings)[0], settings)[0].imu.noise
     return figure_rows(solution.noise, recording, settings.gnss.slow_times, imu)
 
 
@@ -328,18 +328,18 @@ def comparison(outcome: Outcome, ours: bool = False) -> list[dict[str, Any]]:
 
     measured = {row["solver"]: row for row in comparison_rows(outcome.metrics)}
     rows = []
-    for name, solution in (own(outcome.solutions) if ours else outcome.solutions).items():
+    for name, solution in (own_solutions(outcome.solutions) if ours else outcome.solutions).items():
         row = measured.get(name, {"solver": name})
-        row |= {key: _rounded(value) for key, value in stated(solution).items()}
-        row |= {"keyframes": len(solution.t), "iterations": solution.iterations, "final_cost": _rounded(solution.cost)}
-        row["run_time_s"] = _rounded(sum(solution.timings.values()))
+        row |= {key: _round(value) for key, value in median_sigmas(solution).items()}
+        row |= {"keyframes": len(solution.t), "iterations": solution.iterations, "final_cost": _round(solution.cost)}
+        row["run_time_s"] = _round(sum(solution.timings.values()))
         for key in [k for k in row if k.startswith("span") and k.endswith(("_start_s", "_end_s"))]:
             row[key] = round(row[key] + outcome.zero, 6)
         rows.append(row)
     return rows
 
 
-def stated(solution: Solution) -> dict[str, float]:
+def median_sigmas(solution: Solution) -> dict[str, float]:
     """Medians of the sigmas a solution states of itself: horizontal and up (m), heading (deg)."""
     track = solution.trajectory()
     out = {}
@@ -406,5 +406,5 @@ def _provenance(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def _rounded(x: float) -> float | None:
+def _round(x: float) -> float | None:
     return float(f"{x:.5g}") if math.isfinite(x) else None

@@ -80,7 +80,7 @@ def write_outcome(outcome: Outcome, provenance: Mapping[str, Any], path: Path) -
 
 
 def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
-    """An outcome without its recording (`read_again` reads that), and the provenance of its run.
+    """An outcome without its recording (`attach_recording` reads that), and the provenance of its run.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
     if not isinstance(values, dict) or values.get("form") != _FORM:
         raise ConfigError(f"{path}: is of another version of graphnav; solve again")
     try:
-        outcome, provenance = _unpacked(values["outcome"], arrays), _unpacked(values["provenance"], arrays)
+        outcome, provenance = _unpack(values["outcome"], arrays), _unpack(values["provenance"], arrays)
         names = [name for name in outcome.solutions if name != Path(name).name or name in ("", "..")]
         if names or not isinstance(outcome, Outcome):
             raise TypeError(f"a solver called '{names[0]}'" if names else "no outcome")
@@ -110,7 +110,7 @@ def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
         raise ConfigError(f"{path}: is of another version of graphnav ({error}); solve again") from None
 
 
-def read_again(outcome: Outcome, inputs: Mapping[str, str]) -> Outcome:
+def attach_recording(outcome: Outcome, inputs: Mapping[str, str]) -> Outcome:
     """An outcome of `read_outcome` with its recording; `inputs` are the sha256 of all files that it was read from.
 
     Raises
@@ -165,7 +165,7 @@ def _pack(value: Any, arrays: list[Array]) -> Any:
     return out
 
 
-def _unpacked(value: Any, arrays: list[Array]) -> Any:
+def _unpack(value: Any, arrays: list[Array]) -> Any:
     """The opposite of `_pack`."""
     if not isinstance(value, dict):
         return value
@@ -176,18 +176,18 @@ def _unpacked(value: Any, arrays: list[Array]) -> Any:
     if "path" in value:
         return Path(value["path"])
     if "map" in value:
-        return {_unpacked(k, arrays): _unpacked(v, arrays) for k, v in value["map"]}
+        return {_unpack(k, arrays): _unpack(v, arrays) for k, v in value["map"]}
     if "tuple" in value:
-        return tuple(_unpacked(one, arrays) for one in value["tuple"])
+        return tuple(_unpack(one, arrays) for one in value["tuple"])
     if "list" in value:
-        return [_unpacked(one, arrays) for one in value["list"]]
+        return [_unpack(one, arrays) for one in value["list"]]
     module, _, name = value["class"].rpartition(".")
     if module.partition(".")[0] != _PACKAGE:
         raise LookupError(f"{value['class']} is not of {_PACKAGE}")
     kind: Any = getattr(import_module(module), name)
     if not (isinstance(kind, type) and hasattr(kind, "__dataclass_fields__")):
         raise LookupError(f"{value['class']} holds no values")
-    found = kind(**_unpacked(value["of"], arrays))
+    found = kind(**_unpack(value["of"], arrays))
     if isinstance(found, Solution):
         pieces = [(found.t >= a) & (found.t <= b) for a, b in value["pieces"]]
         straight = tuple(Straight(found.t[p], found.states[p], found.covariance[p]) for p in pieces if p.sum() > 1)

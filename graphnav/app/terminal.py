@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav.app.outputs import stated
+from graphnav.app.outputs import median_sigmas
 from graphnav.app.workflow import Outcome
 from graphnav.constraints.gnss import TIMES
 from graphnav.core.progress import Progress
-from graphnav.core.staging import uninterrupted
+from graphnav.core.staging import defer_interrupts
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.metrics import Span
 
@@ -123,8 +123,8 @@ def _whole(outcome: Outcome) -> list[str]:
 
 
 def _sigmas(solution: Solution) -> list[float]:
-    """Those that `outputs.stated` gives, NaN where there are none."""
-    found = stated(solution)
+    """Those that `outputs.median_sigmas` gives, NaN where there are none."""
+    found = median_sigmas(solution)
     return [found.get(key, float("nan")) for key in ("sd_h_median_m", "sd_u_median_m", "sd_heading_median_deg")]
 
 
@@ -239,11 +239,11 @@ def progress_bar(quiet: bool, work: Sequence[str]) -> Iterator[Progress | None]:
         said = "" if left is None else f"{left:.0f} s left" if left < 90 else f"{left / 60:.0f} min left"
         bar.update(task, description=stage, completed=pace.done, left=said)
         if elapsed > 0.5 and not bar.live.is_started:
-            with uninterrupted():
+            with defer_interrupts():
                 bar.start()
 
     try:
         yield update
     finally:
-        with uninterrupted():
+        with defer_interrupts():
             bar.stop()

@@ -26,7 +26,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.solution import Solution, to_trajectory
-from graphnav.evaluation.against import Against, Foreign, own, read_against, without_attitude
+from graphnav.evaluation.against import Against, Foreign, own_solutions, read_against, without_attitude
 from graphnav.recording import Recording
 from graphnav.recording.exporters import check_names
 
@@ -94,7 +94,7 @@ class Outcome:
     @property
     def used_withheld(self) -> tuple[Withheld, ...]:
         """What was withheld, in s from the start of `recording`."""
-        return _moved(self.request.withheld, self.zero)
+        return _move(self.request.withheld, self.zero)
 
 
 def parse_withheld(text: str) -> Withheld:
@@ -169,15 +169,15 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     from graphnav.recording.formats import read
 
     timings: dict[str, float] = {}
-    with _timed(timings, "reading"):
+    with _measure_time(timings, "reading"):
         whole = read(request.source, request.topics)
     check_names(request.exported, whole.gps_zero)
     if request.point == "antenna" and whole.gnss is None:
         raise ConfigError("--point antenna: the recording has no GNSS")
-    recording = _cropped(whole, request)
+    recording = _crop(whole, request)
     zero = recording.start - whole.start if recording is not whole else 0.0
-    moved = _moved(request.withheld, zero)
-    with _timed(timings, "checks"):
+    moved = _move(request.withheld, zero)
+    with _measure_time(timings, "checks"):
         inspection = inspect(recording)
         inspection.refuse()
     recording = inspection.recording
@@ -200,7 +200,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     }
     solutions |= _beside(request, recording, solutions)
     spent: dict[str, float] = {}
-    with _timed(spent, "evaluation"):
+    with _measure_time(spent, "evaluation"):
         metrics, against, names = _score(recording, used, solutions, moved)
     for found in metrics.values():
         if found.notes:
@@ -208,9 +208,9 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
     checks = inspection.findings
     if doubts(solutions, errors):  # which costs too much to be asked where nothing is wrong
-        from graphnav.estimation.antenna import reversed_arms
+        from graphnav.estimation.antenna import find_reversed_arms
 
-        checks = (*reversed_arms(used), *checks)
+        checks = (*find_reversed_arms(used), *checks)
         findings = [*(f.sentence for f in checks), *findings]
     return Outcome(
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
@@ -270,20 +270,20 @@ def read_part(
     from graphnav.recording.formats import read
 
     whole = read(source, topics)
-    part = _cropped(whole, Request(source, (), start=start, end=end))
+    part = _crop(whole, Request(source, (), start=start, end=end))
     zero = part.start - whole.start if part is not whole else 0.0
-    return _withhold(part, _moved(withheld, zero), zero)[0]
+    return _withhold(part, _move(withheld, zero), zero)[0]
 
 
 @contextmanager
-def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+def _measure_time(timings: dict[str, float], stage: str) -> Iterator[None]:
     tell(stage)
     began = time.perf_counter()
     yield
     timings[stage] = time.perf_counter() - began
 
 
-def _cropped(whole: Recording, request: Request) -> Recording:
+def _crop(whole: Recording, request: Request) -> Recording:
     """The part of the recording that is asked for."""
     if (request.start or 0.0) >= whole.duration or (request.end is not None and request.end <= 0.0):
         option = f"--start {request.start:g}" if (request.start or 0.0) >= whole.duration else f"--end {request.end:g}"
@@ -291,7 +291,7 @@ def _cropped(whole: Recording, request: Request) -> Recording:
     return whole.crop(request.start, request.end)
 
 
-def _moved(withheld: tuple[Withheld, ...], by: float) -> tuple[Withheld, ...]:
+def _move(withheld: tuple[Withheld, ...], by: float) -> tuple[Withheld, ...]:
     return tuple((source, span and (span[0] - by, span[1] - by)) for source, span in withheld)
 
 
@@ -338,7 +338,7 @@ def _score(
     truth = recording.truth
     gnss_withheld = any(source == "gnss" for source, _ in withheld)
     if truth is not None and truth.closed_loop_sigma is not None:
-        if any("closed_loop" in solution.records for solution in own(solutions).values()):
+        if any("closed_loop" in solution.records for solution in own_solutions(solutions).values()):
             return {}, None, ()  # what was put in is no measure of what came out
         against, spans = "the start, where the loop ends", []
     elif truth is not None:
@@ -364,8 +364,8 @@ def _score(
     found = {}
     for name, solution in solutions.items():
         at = _epochs(solution, reference)
-        wanted = np.union1d(np.union1d(solution.t, at), _thinned(reference, solution, _MOST_TURNING)) if swings else at
-        track = _scored(solution, wanted, placed=used.gnss is not None)
+        wanted = np.union1d(np.union1d(solution.t, at), _thin(reference, solution, _MOST_TURNING)) if swings else at
+        track = _score_at(solution, wanted, placed=used.gnss is not None)
         metrics = evaluate_recording(track, recording, withheld=asked, at=at if len(at) else None)
         if metrics is None:
             return {}, None, ()
@@ -388,17 +388,17 @@ def _epochs(solution: Solution, truth: Array) -> Array:
         there = (np.minimum(np.abs(before), np.abs(after)) <= _SAME) | (before + after <= _NEAR)
         if there.sum() >= max(_ENOUGH, 0.8 * len(t)):
             return np.asarray(t[there])
-    return _thinned(truth, solution, _MOST)
+    return _thin(truth, solution, _MOST)
 
 
-def _thinned(t: Array, solution: Solution, most: int) -> Array:
+def _thin(t: Array, solution: Solution, most: int) -> Array:
     """At most so many of some times over the length of a solution, and none closer than `_DENSEST`."""
     spacing = max(_DENSEST, (solution.t[-1] - solution.t[0]) / most)
     _, apart = np.unique(np.floor(t / spacing), return_index=True)
     return np.asarray(t[apart])
 
 
-def _scored(solution: Solution, t: Array, placed: bool) -> Trajectory:
+def _score_at(solution: Solution, t: Array, placed: bool) -> Trajectory:
     """The solution at the times, or at all keyframes where these will do; in metres of its frame if not `placed`."""
     if isinstance(solution, Foreign):
         track = solution.track_at(t)

@@ -11,7 +11,7 @@ from graphnav.constraints.base import Constraint
 
 
 @cache
-def registered() -> tuple[type[Constraint], ...]:
+def list_constraints() -> tuple[type[Constraint], ...]:
     """All constraint classes, in the order of their names."""
     found = {}
     for module in pkgutil.iter_modules(__path__):

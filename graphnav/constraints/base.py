@@ -35,7 +35,7 @@ class Linearized:
 
 
 @dataclass(frozen=True)
-class Scene:
+class BuildContext:
     """What a constraint may look at to build its rows."""
 
     recording: Recording
@@ -45,7 +45,7 @@ class Scene:
     stationary: Array  # (M, 2) spans in which the platform stands still, s
     intervals: Intervals  # (K-1) between the keyframes
     speed: MeanSpeed | None = None  # of the odometer, where it is known already
-    usual: Array | None = None  # (M, 3) m, sigma that the fixes usually state, where it is known already
+    typical_sigmas: Array | None = None  # (M, 3) m, sigma that the fixes usually state, where it is known already
 
     @cached_property
     def made(self) -> dict[str, Any]:
@@ -115,7 +115,7 @@ class Constraint(ABC):
 
     @classmethod
     @abstractmethod
-    def build(cls, scene: Scene) -> Constraint | None:
+    def build(cls, scene: BuildContext) -> Constraint | None:
         """The rows for a recording, or None when it has nothing for this constraint."""
 
     @abstractmethod
@@ -135,7 +135,7 @@ def assemble(linearized: Linearized, parameters: dict[str, slice] | None = None,
     return H
 
 
-def weighted_sigma(rows: Constraint, sigma: Array, which: slice | Array = slice(None)) -> Array:
+def weigh_sigma(rows: Constraint, sigma: Array, which: slice | Array = slice(None)) -> Array:
     """(n, m) sigma of some rows with their weights in it: infinite where the weight is 0."""
     if rows.weight is None:
         return sigma

@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.base import Constraint, Linearized, Scene
+from graphnav.constraints.base import BuildContext, Constraint, Linearized
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.recording import Recording
@@ -33,7 +33,7 @@ class ClosedLoop(Constraint):
         return np.empty(0)  # the last keyframe is always there
 
     @classmethod
-    def build(cls, scene: Scene) -> ClosedLoop | None:
+    def build(cls, scene: BuildContext) -> ClosedLoop | None:
         sigma, gnss = scene.settings.foot.closed_loop, scene.recording.gnss
         if sigma is None or scene.recording.platform != "foot" or (gnss is not None and len(gnss.t)):
             return None

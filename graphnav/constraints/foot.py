@@ -4,7 +4,7 @@ Ren 2021 takes the IMU's velocity as zero in stance and its sideways velocity as
 are nearly true only, and what is missing is not noise. Over the floor a shoe rolls, from the heel at its landing to
 the toes where it takes off, and the IMU on top of it, 5 to 15 cm above the sole, goes forward meanwhile: at
 0.2 rad/s in the middle of a stance 2 cm/s, 1.5 % of the way of a walk. What does not move is where shoe and floor
-touch. So the rows of `Stance` say, of the mean over each interval within a stance (see `constraints.vehicle.Past`),
+touch. So the rows of `Stance` say, of the mean over each interval within a stance (see `constraints.vehicle.IntervalMotion`),
 
     mean of  v_b + omega_nb x (l + c d)  =  0          l: pivot,  d = (d_x, d_y, 0): its travel,  c: -1 ... 1
 
@@ -39,9 +39,9 @@ from typing import ClassVar
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.constraints.standstill import standing_intervals
-from graphnav.constraints.vehicle import Past
+from graphnav.constraints.vehicle import IntervalMotion
 from graphnav.core import rotation
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import Parameter, States
@@ -69,7 +69,7 @@ class Stance(Constraint):
     # decimetre per second that the foot does not have: linearised there, it believes to learn of the heading
     passes: ClassVar[int] = 2
 
-    past: Past | None = None
+    past: IntervalMotion | None = None
     phase: Array = field(default_factory=lambda: np.empty(0))  # (N,) c
     share: Array = field(default_factory=lambda: np.empty((0, len(_NODES))))  # of each node of the pattern
     sigma: Array = field(default_factory=lambda: np.empty((0, 3)))
@@ -86,7 +86,7 @@ class Stance(Constraint):
         return np.asarray((np.repeat(edges[:-1], parts) + within * step)[1:])
 
     @classmethod
-    def build(cls, scene: Scene) -> Stance | None:
+    def build(cls, scene: BuildContext) -> Stance | None:
         s, iv = scene.settings.foot, scene.intervals
         rows, stop = standing_intervals(scene)
         if scene.recording.platform != "foot" or not len(rows) or not s.stance:
@@ -94,7 +94,7 @@ class Stance(Constraint):
         span, t = scene.stationary[stop], 0.5 * (iv.t0 + iv.t1)[rows]
         half = np.minimum(0.5 * (span[:, 1] - span[:, 0]), s.half_stance)
         landed, leaves = np.minimum(t - span[:, 0], half) / half, np.minimum(span[:, 1] - t, half) / half
-        past = Past.of(iv, rows, scene.frame)
+        past = IntervalMotion.of(iv, rows, scene.frame)
         turning = np.linalg.norm(past.rate - np.median(past.rate, axis=0), axis=1)
         sigma = np.hypot(s.still, s.rolling * turning) * np.sqrt(np.maximum(1.0, s.correlation / iv.T[rows]))
         return cls(
@@ -133,7 +133,7 @@ def _shares(phase: Array) -> Array:
     return np.maximum(0.0, 1.0 - np.abs(phase[:, None] - _NODES) / (_NODES[1] - _NODES[0]))
 
 
-def _rolls(t: Array, span: Array, scene: Scene, lasts: float) -> Array:
+def _rolls(t: Array, span: Array, scene: BuildContext, lasts: float) -> Array:
     """(N,) 1 at times t (N,) for so long after landing and before leaving in their stances (N, 2), else 0.
 
     A recording neither begins with a landing nor ends with a leaving.
@@ -151,7 +151,7 @@ class FootLateral(Constraint):
     axes: ClassVar[tuple[str, ...]] = ("sideways",)
     unit: ClassVar[str] = "m/s"
 
-    past: Past | None = None
+    past: IntervalMotion | None = None
     sigma: Array = field(default_factory=lambda: np.empty((0, 1)))
 
     @classmethod
@@ -159,14 +159,14 @@ class FootLateral(Constraint):
         return np.empty(0)  # those of the stances will do
 
     @classmethod
-    def build(cls, scene: Scene) -> FootLateral | None:
+    def build(cls, scene: BuildContext) -> FootLateral | None:
         s, iv = scene.settings.foot, scene.intervals
         if scene.recording.platform != "foot" or not len(scene.stationary) or not s.lateral:
             return None
         moving = iv.T > _SHORTEST
         moving[standing_intervals(scene)[0]] = False
         rows = np.flatnonzero(moving)
-        past = Past.of(iv, rows, scene.frame)
+        past = IntervalMotion.of(iv, rows, scene.frame)
         # a swing lies between two stances; the heading changes in it by the integral of the turn rate about the
         # vertical, which the force points to in the mean of a swing
         swing = np.searchsorted(scene.stationary[:, 0], iv.t0[rows])
@@ -193,7 +193,7 @@ class FootLateral(Constraint):
         return Linearized(mv(axis, u), J, self.sigma[rows])
 
 
-def _turn(past: Past, T: Array, swing: Array) -> Array:
+def _turn(past: IntervalMotion, T: Array, swing: Array) -> Array:
     """Angle (M,) by which the foot's heading changes in each swing, rad, from the rates of its intervals (N,)."""
     count = int(swing.max()) + 1 if len(swing) else 0
     total = np.zeros((count, 2, 3))

@@ -28,7 +28,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.core import earth, rotation
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import NODE_SPACING, SECONDS, Parameter, States
@@ -60,7 +60,7 @@ def _usable(recording: Recording) -> Array:
     return (t >= recording.start - SAME_TIME) & (t <= recording.end + SAME_TIME)
 
 
-def _common(scene: Scene, offset: str) -> dict[str, Any]:
+def _common(scene: BuildContext, offset: str) -> dict[str, Any]:
     """Parameters and what the solvers want to know, from the settings."""
     settings, gnss = scene.settings.gnss, scene.recording.gnss
     assert gnss is not None
@@ -120,7 +120,7 @@ class GnssPosition(Constraint):
         return recording.gnss.t[_usable(recording)]
 
     @classmethod
-    def build(cls, scene: Scene) -> GnssPosition | None:
+    def build(cls, scene: BuildContext) -> GnssPosition | None:
         gnss = scene.recording.gnss
         tight = scene.recording.tight(scene.settings.raw_gnss.coupling)
         if gnss is None or not scene.settings.gnss.position or tight:
@@ -149,8 +149,10 @@ class GnssPosition(Constraint):
             p_n=scene.frame.from_llh(llh),
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
             sigma=sd,
-            unit_error=_running_median(gnss.t[used], sd) if scene.usual is None else scene.usual[used],
-            usual_error=np.median(sd if scene.usual is None else scene.usual, axis=0),
+            unit_error=_running_median(gnss.t[used], sd)
+            if scene.typical_sigmas is None
+            else scene.typical_sigmas[used],
+            usual_error=np.median(sd if scene.typical_sigmas is None else scene.typical_sigmas, axis=0),
             type=kinds,
             lever_arm=gnss.lever_arm,
             gyro=around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
@@ -235,7 +237,7 @@ class GnssVelocity(Constraint):
         return gnss.t[_usable(recording) & np.isfinite(gnss.v).all(axis=1)]
 
     @classmethod
-    def build(cls, scene: Scene) -> GnssVelocity | None:
+    def build(cls, scene: BuildContext) -> GnssVelocity | None:
         gnss = scene.recording.gnss
         tight = scene.recording.tight(scene.settings.raw_gnss.coupling)
         if gnss is None or gnss.v is None or gnss.sd_v is None or not scene.settings.gnss.velocity or tight:

@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.base import Constraint, Linearized, Scene
+from graphnav.constraints.base import BuildContext, Constraint, Linearized
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
@@ -36,7 +36,7 @@ class InitialPrior(Constraint):
         return np.empty(0)
 
     @classmethod
-    def build(cls, scene: Scene) -> InitialPrior | None:
+    def build(cls, scene: BuildContext) -> InitialPrior | None:
         return None  # comes from the alignment, not from the recording
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:

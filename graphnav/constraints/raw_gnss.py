@@ -25,13 +25,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.constraints.gnss import LEVER_ARM, TIMES, antenna_velocity, around, node_spacing, period
 from graphnav.core import earth, rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.gnss.atmosphere import obliquity
-from graphnav.gnss.ephemeris import turned
+from graphnav.gnss.ephemeris import rotate_earth
 from graphnav.gnss.series import RawGnss, primary
 from graphnav.gnss.sigmas import code_sigma, rate_sigma
 from graphnav.gnss.signals import L1, NAMES, C, signal_name
@@ -103,14 +103,14 @@ class _Prepared:
     spacing: float  # s from node to node of whatever changes slowly
 
 
-def _prepare(scene: Scene) -> _Prepared | None:
+def _prepare(scene: BuildContext) -> _Prepared | None:
     if "raw_gnss" not in scene.made:
         scene.made["raw_gnss"] = _prepare_rows(scene)
     found: _Prepared | None = scene.made["raw_gnss"]
     return found
 
 
-def _prepare_rows(scene: Scene) -> _Prepared | None:
+def _prepare_rows(scene: BuildContext) -> _Prepared | None:
     raw = _select(scene.recording, scene.settings)
     if raw is None:
         return None
@@ -127,7 +127,7 @@ def _prepare_rows(scene: Scene) -> _Prepared | None:
         raw=raw,
         keyframe=keyframe,
         s_n=(geometry.s - frame.r_e) @ frame.R_ne.T,
-        v_n=turned(raw.v, geometry.distance / C) @ frame.R_ne.T,
+        v_n=rotate_earth(raw.v, geometry.distance / C) @ frame.R_ne.T,
         R_ln=earth.enu_axes(earth.ecef_to_llh(raw.antenna)) @ frame.R_ne.T,
         elevation=geometry.elevation,
         known=geometry.distance + geometry.ionosphere + geometry.troposphere,
@@ -141,7 +141,7 @@ def _prepare_rows(scene: Scene) -> _Prepared | None:
     )
 
 
-def _common(scene: Scene, found: _Prepared) -> dict[str, Any]:
+def _common(scene: BuildContext, found: _Prepared) -> dict[str, Any]:
     settings, raw = scene.settings, found.raw
     parameters: tuple[Parameter, ...] = (found.clock,)
     if settings.gnss.lever_arm_sigma is not None:
@@ -223,7 +223,7 @@ class GnssCode(_Satellites):
         return np.empty(0) if raw is None else np.unique(raw.t)
 
     @classmethod
-    def build(cls, scene: Scene) -> GnssCode | None:
+    def build(cls, scene: BuildContext) -> GnssCode | None:
         found = _prepare(scene) if scene.settings.raw_gnss.code else None
         if found is None:
             return None
@@ -328,7 +328,7 @@ class GnssDoppler(_Satellites):
         return np.empty(0) if raw is None else np.unique(raw.t[np.isfinite(raw.range_rate)])
 
     @classmethod
-    def build(cls, scene: Scene) -> GnssDoppler | None:
+    def build(cls, scene: BuildContext) -> GnssDoppler | None:
         found = _prepare(scene) if scene.settings.raw_gnss.doppler else None
         if found is None:
             return None

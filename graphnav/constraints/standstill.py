@@ -23,7 +23,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.core import rotation
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import Parameter, States
@@ -40,7 +40,7 @@ _STANDING = 0.6  # s; in a walk no stance is that quiet for so long
 _I3 = np.eye(3)
 
 
-def standing_intervals(scene: Scene) -> tuple[Array, Array]:
+def standing_intervals(scene: BuildContext) -> tuple[Array, Array]:
     """Indices of the intervals inside stationary spans, and of the span each lies in."""
     iv, spans = scene.intervals, scene.stationary
     if not len(spans):
@@ -51,7 +51,7 @@ def standing_intervals(scene: Scene) -> tuple[Array, Array]:
     return rows, stop[rows]
 
 
-def _unmoved(scene: Scene, rows: Array, stop: Array) -> tuple[Array, Array]:
+def _unmoved(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array, Array]:
     """Those of the intervals in which a foot does not roll over its stance but stands, and in which standing.
 
     They last together for longer than any stance of a walk is that quiet, at less than the rate of the slowest rolling.
@@ -93,7 +93,7 @@ def _swaying(rate: Array, T: Array, run: Array) -> Array:
     return out
 
 
-def unrest(scene: Scene, rows: Array, stop: Array) -> tuple[Array, Array]:
+def unrest(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array, Array]:
     """Scatter (N, 3) of force (m/s^2) and rate (rad/s) around each interval, sensors' own noise not included."""
     iv, noise = scene.intervals, scene.recording.imu.noise
     T = iv.T[rows][:, None]
@@ -131,7 +131,7 @@ class ZeroVelocity(_Standing):
     sigma: Array = field(default_factory=lambda: np.empty((0, 3)))
 
     @classmethod
-    def build(cls, scene: Scene) -> ZeroVelocity | None:
+    def build(cls, scene: BuildContext) -> ZeroVelocity | None:
         rows, stop = standing_intervals(scene)
         if not len(rows) or not scene.settings.standstill.zero_velocity or scene.recording.platform == "foot":
             return None
@@ -157,7 +157,7 @@ class ZeroRate(_Standing):
     sigma: Array = field(default_factory=lambda: np.empty((0, 3)))
 
     @classmethod
-    def build(cls, scene: Scene) -> ZeroRate | None:
+    def build(cls, scene: BuildContext) -> ZeroRate | None:
         rows, stop = standing_intervals(scene)
         if scene.recording.platform == "foot":
             rows, stop = _unmoved(scene, rows, stop)
@@ -192,7 +192,7 @@ class HeldPosition(_Standing):
     sigma: Array = field(default_factory=lambda: np.empty((0, 3)))
 
     @classmethod
-    def build(cls, scene: Scene) -> HeldPosition | None:
+    def build(cls, scene: BuildContext) -> HeldPosition | None:
         rows, stop = standing_intervals(scene)
         if not len(rows) or not scene.settings.standstill.held_position or scene.recording.platform == "foot":
             return None
@@ -213,7 +213,7 @@ class HeldPosition(_Standing):
         return Linearized(states.p - parameters[PLACE], {"p": one, PLACE: -one}, self.sigma[rows])
 
 
-def _places(scene: Scene, stops: Array) -> Parameter:
+def _places(scene: BuildContext, stops: Array) -> Parameter:
     """One unknown place per stop: about where the fixes around it say, as far off as a vehicle can go meanwhile."""
     begins = scene.stationary[stops, 0]
     gnss = scene.recording.gnss

@@ -32,7 +32,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array, columns, mv
@@ -63,7 +63,7 @@ _BY_AXLE = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])  # ome
 
 
 @dataclass(frozen=True)
-class Past:
+class IntervalMotion:
     """Mean velocity and force over the intervals that end at some keyframes, as a function of the state there.
 
     Six numbers and their derivatives by what they are made of, velocity first.
@@ -84,7 +84,7 @@ class Past:
         return {}
 
     @classmethod
-    def of(cls, intervals: Intervals, rows: Array, frame: LocalFrame) -> Past:
+    def of(cls, intervals: Intervals, rows: Array, frame: LocalFrame) -> IntervalMotion:
         """The past of the intervals `rows`."""
         iv, n = intervals, len(rows)
         by_seen, by_ba = np.zeros((n, 6, 9)), np.empty((n, 6, 3))
@@ -132,7 +132,7 @@ class Past:
         return found, -seen[:, 2], J
 
 
-def _turned(u: Array, mounting: Array) -> tuple[Array, Array, Array]:
+def _rotate_to_vehicle(u: Array, mounting: Array) -> tuple[Array, Array, Array]:
     """R_vb u (N, 3), R_vb (N, 3, 3), and the derivative of R_vb u by the mounting angles (N, 3, 2)."""
     (ca, cb), (sa, sb) = np.cos(mounting).T, np.sin(mounting).T
     zero = np.zeros_like(ca)
@@ -148,7 +148,7 @@ class Wheels(Constraint):
 
     looks_ahead: ClassVar[bool] = False
 
-    past: Past | None = None
+    past: IntervalMotion | None = None
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
@@ -170,7 +170,7 @@ class Wheels(Constraint):
             return asked["found"]  # type: ignore[no-any-return]
         lever = self.lever_arm + (parameters[AXLE] * _E_Y if AXLE in parameters else np.zeros((len(states), 3)))
         y, omega, J = self.past.velocity(states, parameters, rows, lever)
-        u, R, by_mounting = _turned(y[:, :3], parameters.get(MOUNTING, np.zeros((len(states), 2))))
+        u, R, by_mounting = _rotate_to_vehicle(y[:, :3], parameters.get(MOUNTING, np.zeros((len(states), 2))))
         found = _Velocity(u, omega, y[:, 4], R, by_mounting, J)
         if len(states) == 1 and isinstance(rows, slice):
             asked |= {"states": states, "rows": rows, "values": values, "lever": self.lever_arm, "found": found}
@@ -204,23 +204,23 @@ class _Velocity:
         return out
 
 
-def moving_rows(scene: Scene) -> Array:
+def moving_rows(scene: BuildContext) -> Array:
     """Indices of the intervals in which the vehicle does not stand, long enough to mean something."""
     if "moving" not in scene.made:
         scene.made["moving"] = _moving_rows(scene)
     return np.asarray(scene.made["moving"])
 
 
-def shared_past(scene: Scene) -> Past:
+def share_interval_motion(scene: BuildContext) -> IntervalMotion:
     """Of the intervals `moving_rows`."""
     if "past" not in scene.made:
-        scene.made["past"] = Past.of(scene.intervals, moving_rows(scene), scene.frame)
+        scene.made["past"] = IntervalMotion.of(scene.intervals, moving_rows(scene), scene.frame)
     past = scene.made["past"]
-    assert isinstance(past, Past)
+    assert isinstance(past, IntervalMotion)
     return past
 
 
-def _moving_rows(scene: Scene) -> Array:
+def _moving_rows(scene: BuildContext) -> Array:
     t0, t1 = scene.intervals.t0, scene.intervals.t1
     usable = t1 - t0 >= _SHORTEST
     for begin, end in scene.stationary:
@@ -228,15 +228,15 @@ def _moving_rows(scene: Scene) -> Array:
     return np.flatnonzero(usable)
 
 
-def shared_parameters(scene: Scene) -> dict[str, Any]:
+def share_parameters(scene: BuildContext) -> dict[str, Any]:
     """Lever arm of the point that does not slip, and the parameters both constraints depend on."""
     if "wheels" not in scene.made:
-        scene.made["wheels"] = _shared_parameters(scene)
+        scene.made["wheels"] = _share_parameters(scene)
     lever, parameters = scene.made["wheels"]
     return {"lever_arm": lever, "parameters": list(parameters)}
 
 
-def _shared_parameters(scene: Scene) -> tuple[Array, list[Parameter]]:
+def _share_parameters(scene: BuildContext) -> tuple[Array, list[Parameter]]:
     s, odometer = scene.settings.vehicle, scene.recording.odometer
     parameters = list(scale_parameter(scene.recording))
     lever = np.zeros(3) if odometer is None else odometer.lever_arm
@@ -251,7 +251,7 @@ def _shared_parameters(scene: Scene) -> tuple[Array, list[Parameter]]:
     return lever, parameters
 
 
-def lasting_error(name: str, density: Array, kind: type[Wheels]) -> Parameter:
+def slow_error_parameter(name: str, density: Array, kind: type[Wheels]) -> Parameter:
     """Gauss-Markov process (k,) of what wheels are wrong by for seconds: camber, wind, load, slip.
 
     Over long times it is worth white noise of the density given (m/s/sqrt(Hz)), the variance of which is 2 T sigma^2
@@ -276,19 +276,19 @@ class NonHolonomic(Wheels):
     sigma: Array = field(default_factory=lambda: np.empty((0, 2)))
 
     @classmethod
-    def build(cls, scene: Scene) -> NonHolonomic | None:
+    def build(cls, scene: BuildContext) -> NonHolonomic | None:
         s = scene.settings.vehicle
         if scene.recording.platform != "vehicle" or not s.nhc:
             return None
         rows = moving_rows(scene)
-        shared = shared_parameters(scene)
+        shared = share_parameters(scene)
         if s.body_sigma > 0:
             shared["parameters"].append(
                 Parameter(BODY, np.zeros(2), np.full(2, s.body_sigma), "rad s^2/m, of lateral and forward acceleration")
             )
         shared["parameters"] = tuple(shared["parameters"])
-        shared["processes"] = (lasting_error(NHC_ERROR, np.asarray(s.nhc_density), cls),)
-        past = shared_past(scene)
+        shared["processes"] = (slow_error_parameter(NHC_ERROR, np.asarray(s.nhc_density), cls),)
+        past = share_interval_motion(scene)
         density = np.asarray(s.nhc_density) / np.sqrt(scene.intervals.T[rows])[:, None]
         beyond = np.maximum(np.abs(past.force[:, 0]) - _LINEAR, 0.0)
         right = np.hypot(_BEYOND * beyond, _AXLE_LEFT * past.rate[:, 2])
@@ -351,21 +351,21 @@ class OdometerSpeed(Wheels):
     sigma: Array = field(default_factory=lambda: np.empty((0, 1)))
 
     @classmethod
-    def build(cls, scene: Scene) -> OdometerSpeed | None:
+    def build(cls, scene: BuildContext) -> OdometerSpeed | None:
         s, odometer = scene.settings.vehicle, scene.recording.odometer
         if scene.recording.platform != "vehicle" or odometer is None or not s.odometer:
             return None
         speed = scene.speed or _speed_of(odometer, scene.recording.imu)
-        rows, past = moving_rows(scene), shared_past(scene)
+        rows, past = moving_rows(scene), share_interval_motion(scene)
         begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
         reach = REACH * odometer.delay_sigma
         good = np.all([np.isfinite(speed(begin, end, d)[0]) for d in {-reach, 0.0, reach}], axis=0)
         if not good.all():
             rows, begin, end = rows[good], begin[good], end[good]
-            past = Past.of(scene.intervals, rows, scene.frame)
+            past = IntervalMotion.of(scene.intervals, rows, scene.frame)
         if not len(rows):
             return None
-        shared = shared_parameters(scene)
+        shared = share_parameters(scene)
         walk = s.scale_walk / np.sqrt(60.0)
         shared["parameters"].append(
             Parameter(ODOMETER_SCALE, np.zeros(1), np.full(1, odometer.scale_sigma), "1", walk=walk)
@@ -374,7 +374,7 @@ class OdometerSpeed(Wheels):
             shared["parameters"].append(Parameter(ODOMETER_DELAY, np.zeros(1), np.full(1, odometer.delay_sigma), "s"))
         density = np.atleast_1d(np.hypot(s.odometer_density, np.median(speed.sigma(begin, end) * np.sqrt(end - begin))))
         shared["parameters"] = tuple(shared["parameters"])
-        shared["processes"] = (lasting_error(ODOMETER_ERROR, density, cls),)
+        shared["processes"] = (slow_error_parameter(ODOMETER_ERROR, density, cls),)
         sigma = np.hypot(speed.sigma(begin, end), s.odometer_density / np.sqrt(end - begin))
         return cls(
             keyframe=rows + 1,

@@ -67,10 +67,10 @@ def complaint(source: str | Path, error: ValidationError, model: type[BaseModel]
     loc = tuple(str(part) for part in first["loc"])
     line = _line_of(text, loc)
     where = f"{source}, line {line}: " if line else f"{source}: "
-    return where + _WORD.sub(lambda word: f"{word[0][:_SHOWN]}...", _said_of(first, loc, model))
+    return where + _WORD.sub(lambda word: f"{word[0][:_SHOWN]}...", _describe(first, loc, model))
 
 
-def _said_of(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> str:
+def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> str:
     key = ".".join(loc)
     if first["type"] == "extra_forbidden":
         return f"unknown key '{key}'{_suggestion(loc, model)}"
@@ -82,10 +82,10 @@ def _said_of(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> str:
     if first["type"] in ("model_type", "model_attributes_type"):
         return f"'{key}' must be a table: [{key}]"
     what = f"{first['msg'][0].lower()}{first['msg'][1:]}{_meaning(loc, model)}"
-    return f"'{key}' = {shortened(first['input'])}: {what}"
+    return f"'{key}' = {shorten(first['input'])}: {what}"
 
 
-def shortened(value: Any) -> str:
+def shorten(value: Any) -> str:
     """A value as it stands in a file, no longer than people look at."""
     text = repr(value)
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
@@ -99,7 +99,7 @@ def nearest(name: str, known: Sequence[str]) -> str:
     return f"known: {', '.join(known[:_NAMES]) or 'none'}{', ...' * (len(known) > _NAMES)}"
 
 
-def listed(text: str, known: Sequence[str], option: str, what: str) -> tuple[str, ...]:
+def split_names(text: str, known: Sequence[str], option: str, what: str) -> tuple[str, ...]:
     """The names of an option with commas between, each once.
 
     Raises

@@ -4,7 +4,7 @@ Whatever goes wrong with a file, be it that it is a pipe or a device, that its c
 unpacks to more than anybody meant, is one sentence in the caller's own kind of error. The limits are
 `GRAPHNAV_MAX_FILE_MB` and `GRAPHNAV_MAX_LINE_KB` of the environment; docs/formats.md has their defaults.
 
-What a file names in its turn is read only from its own folder and those in it, unless `outside_allowed`.
+What a file names in its turn is read only from its own folder and those in it, unless `permit_outside`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _outside: ContextVar[bool] = ContextVar("outside", default=False)
 
 
 @contextmanager
-def outside_allowed(allowed: bool = True) -> Iterator[None]:
+def permit_outside(allowed: bool = True) -> Iterator[None]:
     """Files named in other files may lie anywhere as long as this lasts, if `allowed`."""
     before = _outside.set(allowed or _outside.get())
     try:

@@ -122,7 +122,7 @@ def yaw_matrix(yaw: float) -> Array:
     return rotation.exp(np.array([0.0, 0.0, yaw]))
 
 
-def placed(trajectory: Trajectory, frame: LocalFrame, yaw: float, offset: Array) -> Trajectory:
+def place_on_earth(trajectory: Trajectory, frame: LocalFrame, yaw: float, offset: Array) -> Trajectory:
     """A trajectory of a local frame put on the Earth: p_n = Rz(yaw) p + offset in `frame`."""
     R_nm = yaw_matrix(yaw)
     p_n = trajectory.llh @ R_nm.T + offset

@@ -15,7 +15,7 @@ from graphnav.core.errors import ConfigError, PartlyWrittenError
 
 
 @contextmanager
-def staged(folder: Path) -> Iterator[Path]:
+def stage_results(folder: Path) -> Iterator[Path]:
     """A folder to write into, whose files move to `folder` at the end; if that is not reached, nothing of them is left.
 
     It lies inside `folder`, which is made if need be and taken away again if nothing came of it, so that moving is
@@ -38,7 +38,7 @@ def staged(folder: Path) -> Iterator[Path]:
                 yield part
             except PartlyWrittenError as error:
                 failed = error
-            with uninterrupted():
+            with defer_interrupts():
                 for file in sorted(path for path in part.rglob("*") if path.is_file()):
                     target = folder / file.relative_to(part)
                     target.parent.mkdir(parents=True, exist_ok=True)
@@ -60,7 +60,7 @@ def staged(folder: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def uninterrupted() -> Iterator[None]:
+def defer_interrupts() -> Iterator[None]:
     """Ctrl-C waits until the end of what is inside, which is to be short."""
     if threading.current_thread() is not threading.main_thread():  # which alone may say so, and alone is interrupted
         yield
@@ -80,6 +80,6 @@ def _missing(folder: Path) -> list[Path]:
     return [path for path in (folder, *folder.parents) if not path.exists()]
 
 
-def moved(files: list[Path], part: Path, folder: Path) -> list[Path]:
+def final_path(files: list[Path], part: Path, folder: Path) -> list[Path]:
     """Where files of a staged folder are in the end; others stay where they are."""
     return [folder / file.relative_to(part) if file.is_relative_to(part) else file for file in files]

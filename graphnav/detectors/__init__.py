@@ -16,20 +16,20 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.config.detectors import FUSED
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, without
+from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, subtract_spans
 from graphnav.detectors.fusion import Decision, decide, decide_fused, merge_decisions
 from graphnav.detectors.glrt import STATISTICS, glrt_statistic
 from graphnav.detectors.scene import Detector, Scene
 from graphnav.detectors.stance import detect_stances
 from graphnav.recording import Recording
 
-__all__ = ["Detection", "Detections", "Detector", "detect", "glrt_statistic", "registered", "stops"]
+__all__ = ["Detection", "Detections", "Detector", "detect", "glrt_statistic", "list_detectors", "stops"]
 
 _SHORTEST = 3.0  # s, of a recording in which anything can be told
 
 
 @cache
-def registered() -> dict[str, type[Detector]]:
+def list_detectors() -> dict[str, type[Detector]]:
     """All detector classes by their names, in the order of these."""
     found = {}
     for module in pkgutil.iter_modules(__path__):
@@ -54,7 +54,7 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
         return Detections(NONE, (), (*d.notes, f"no detection: the recording is shorter than {_SHORTEST:g} s"))
     if not len(scene.low.t):
         return Detections(NONE, (), (*d.notes, f"no detection: an IMU at {1.0 / scene.period:.3g} Hz is too slow"))
-    found = _decided(scene)
+    found = _decide(scene)
     reference = found.found[0]
     mask = inside(reference.t, found.spans)
     answer = Detection(
@@ -64,11 +64,11 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
     return Detections(found.spans, (*found.found, answer), (*d.notes, *found.notes))
 
 
-def _decided(scene: Scene, shown: bool = True) -> Decision:
+def _decide(scene: Scene, shown: bool = True) -> Decision:
     """What the detectors that fire come to."""
     if scene.settings.fire == (FUSED,):
-        return decide_fused(scene, registered(), shown)
-    return merge_decisions([decide(scene, registered()[name], shown) for name in scene.settings.fire])
+        return decide_fused(scene, list_detectors(), shown)
+    return merge_decisions([decide(scene, list_detectors()[name], shown) for name in scene.settings.fire])
 
 
 def stops(
@@ -86,7 +86,7 @@ def stops(
     if not recording.duration >= _SHORTEST or not scene.period > 0.0:
         return NONE
     certain = scene.certain
-    left = longer_than(without(np.array([[recording.start, recording.end]]), certain), d.fusion.min_duration)
+    left = longer_than(subtract_spans(np.array([[recording.start, recording.end]]), certain), d.fusion.min_duration)
     before = np.clip(before, since, until)
     doubted = any(((certain[:, 0] < b) & (certain[:, 1] > a)).any() for a, b in before if b > a)
     if not doubted and not ((left[:, 0] < until) & (left[:, 1] > new)).any():
@@ -96,5 +96,5 @@ def stops(
             until = max(min(until, float(one.t[-1]) - one.half), since)
     if not len(scene.low.t):
         return NONE
-    spans = np.clip(_decided(scene, shown=False).spans, since, until)
+    spans = np.clip(_decide(scene, shown=False).spans, since, until)
     return np.asarray(spans[spans[:, 1] > spans[:, 0]])

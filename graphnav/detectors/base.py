@@ -56,10 +56,10 @@ def spans_of(mask: Mask, t: Array, half: float = 0.0) -> Array:
     padded[1:-1] = mask
     edges = np.flatnonzero(padded[1:] != padded[:-1])
     first, last = edges[::2], edges[1::2] - 1
-    return merged(columns(t[first] - half, t[last] + half)) if len(first) else NONE
+    return merge_spans(columns(t[first] - half, t[last] + half)) if len(first) else NONE
 
 
-def merged(spans: Array, gap: float = 0.0) -> Array:
+def merge_spans(spans: Array, gap: float = 0.0) -> Array:
     """Spans in order, those that overlap or lie at most `gap` seconds apart as one."""
     if not len(spans):
         return NONE
@@ -74,7 +74,7 @@ def merged(spans: Array, gap: float = 0.0) -> Array:
     return out
 
 
-def without(spans: Array, taken: Array) -> Array:
+def subtract_spans(spans: Array, taken: Array) -> Array:
     """The spans less what lies in `taken`; both in order and without overlap."""
     if not len(spans) or not len(taken):
         return spans
@@ -122,4 +122,4 @@ def seconds_in(spans: Array, of: Array) -> Array:
 
 def union(parts: Sequence[Array]) -> Array:
     """All spans of several sets, merged."""
-    return merged(np.concatenate(parts)) if parts else NONE
+    return merge_spans(np.concatenate(parts)) if parts else NONE

@@ -20,7 +20,7 @@ import numpy as np
 
 from graphnav.config.detectors import FusionSettings
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, longer_than, merged, spans_of, union, within, without
+from graphnav.detectors.base import NONE, Detection, longer_than, merge_spans, spans_of, subtract_spans, union, within
 from graphnav.detectors.chain import Link, at_rest_until, link, moving_by_chain
 from graphnav.detectors.low_band import Scale, low_band
 from graphnav.detectors.motion import Speeds
@@ -108,10 +108,10 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
     spans = edges(b, found.intervals, low_band(scene)[1], limit)
     if not by_rows:
         spans = _without_speed(b, spans, scene.settings.fusion)
-    spans = merged(longer_than(spans, 3.0 * b.period))
+    spans = merge_spans(longer_than(spans, 3.0 * b.period))
     if not len(spans):
         return NONE, certain, ()
-    certain = _felt(b, spans, speeds, certain)
+    certain = _certain_motion(b, spans, speeds, certain)
     known = np.array([_known_speed(speeds, span) for span in spans])
     moves = moving_by_chain([link(b, one, next_one) for one, next_one in pairwise(spans)], known)
     notes = []
@@ -128,13 +128,13 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
             f"{100.0 * share:.0f} % of the seconds in certain motion are as still as a stop (a simulation without "
             f"road?): a stop needs a measured speed as well, which {_count(int(unseen.sum()))} without"
         )
-    spans = without(spans[~moves], certain)
+    spans = subtract_spans(spans[~moves], certain)
     if not by_rows and len(certain):  # ends that certain motion has made are no better than it is timed
         spans = _without_speed(b, spans, scene.settings.fusion)
     return spans, certain, tuple(notes)
 
 
-def _felt(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array) -> Array:
+def _certain_motion(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array) -> Array:
     """Spans of certain motion without those in the midst of a still stretch whose speed the force does not lead to.
 
     They begin and end where nothing changes: it is the fixes, or the wheels, that are wrong.
@@ -175,7 +175,7 @@ def _known_speed(speeds: list[Speeds], span: Array) -> float:
     return float(np.nanmax(found)) if not np.isnan(found).all() else float("nan")
 
 
-def bridged(b: Blocks, spans: Array, certain: Array, settings: FusionSettings) -> Array:
+def bridge_disturbances(b: Blocks, spans: Array, certain: Array, settings: FusionSettings) -> Array:
     """The spans with the disturbances between them filled where the vehicle did not move."""
     out = list(spans[:1])
     for span in spans[1:]:
@@ -196,7 +196,7 @@ def _shaken_only(one: Link, settings: FusionSettings) -> bool:
     return one.peak < settings.bridge_speed and not away and abs(one.change) < one.tolerance
 
 
-def joined(b: Blocks, spans: Array, idling: Array, settings: FusionSettings) -> Array:
+def join_idling(b: Blocks, spans: Array, idling: Array, settings: FusionSettings) -> Array:
     """The spans with what the FFT detector calls stationary at their ends, as far as the force says rest as well."""
     out = spans.copy()
     limit = 0.5 * settings.bridge_speed
@@ -210,22 +210,22 @@ def joined(b: Blocks, spans: Array, idling: Array, settings: FusionSettings) -> 
             # a second is left to the push that the integral has only begun to feel
             if way * (until - span[side]) > _WORTH:
                 out[k, side] = until - way * _WORTH
-    return merged(out)
+    return merge_spans(out)
 
 
 def fuse(b: Blocks, spans: Array, idling: Array, certain: Array, settings: FusionSettings) -> tuple[Array, Array]:
     """Stationary intervals from candidates and the FFT detector's answer, and what in them is disturbed."""
     still = spans
     if len(spans) and len(idling):
-        spans = without(joined(b, spans, idling, settings), certain)
-    spans = bridged(b, spans, certain, settings)
+        spans = subtract_spans(join_idling(b, spans, idling, settings), certain)
+    spans = bridge_disturbances(b, spans, certain, settings)
     if len(spans):
         # a recording that begins or ends in a stop has no edge there
         first = np.where(spans[:, 0] - b.t[0] < _REACH, b.t[0], spans[:, 0] + settings.margin)
         last = np.where(b.end[-1] - spans[:, 1] < _REACH, b.end[-1], spans[:, 1] - settings.margin)
         spans = np.stack([first, last], -1)
     spans = longer_than(spans, settings.min_duration)
-    return spans, longer_than(without(spans, still), settings.margin + _REACH)
+    return spans, longer_than(subtract_spans(spans, still), settings.margin + _REACH)
 
 
 @dataclass(frozen=True)

@@ -152,7 +152,7 @@ class _Windowed(Detector):
         sigma_a, sigma_w = noise.accel_noise_density * per_row, noise.gyro_noise_density * per_row
         reference = _quietest(m) if labels is None else within(m.t, labels.still, m.half)
         at_rest = bool(reference.any())
-        means, g = _centred(m.rows, reference if at_rest else np.ones(len(m.t), dtype=bool), scene.gravity, at_rest)
+        means, g = _centre(m.rows, reference if at_rest else np.ones(len(m.t), dtype=bool), scene.gravity, at_rest)
         values = np.where(m.whole, STATISTICS[name](means, sigma_a, sigma_w, g), np.nan)
         threshold = least
         notes: tuple[str, ...] = ()
@@ -192,7 +192,7 @@ class AngularRateEnergy(_Windowed):
     name = "angular_rate_energy"
 
 
-def _centred(rows: Array, reference: Array, g: float, at_rest: bool) -> tuple[Array, float]:
+def _centre(rows: Array, reference: Array, g: float, at_rest: bool) -> tuple[Array, float]:
     """The means without the rate that `reference` windows have, and gravity as these read it if they are at rest."""
     means = rows.copy()
     bias = np.median(means[reference, 3:6], axis=0)

@@ -13,7 +13,7 @@ import numpy as np
 
 from graphnav.config.detectors import FusionSettings
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, merged, spans_of, union
+from graphnav.detectors.base import NONE, merge_spans, spans_of, union
 from graphnav.detectors.windows import share_of
 from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.recording.checks.crosschecks import local_positions
@@ -84,7 +84,7 @@ def moving(found: list[Speeds]) -> Array:
         if len(one):
             one = one + np.array([s.half, -s.half - s.late])
             parts.append(one[one[:, 1] > one[:, 0]])
-    return merged(np.concatenate(parts)) if parts else NONE
+    return merge_spans(np.concatenate(parts)) if parts else NONE
 
 
 def of_three(a: Array, b: Array, c: Array) -> Array:

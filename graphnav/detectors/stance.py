@@ -31,7 +31,7 @@ import numpy as np
 from graphnav.config.detectors import FUSED, StanceSettings
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, merged, spans_of, union
+from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, merge_spans, spans_of, union
 from graphnav.detectors.glrt import glrt_statistic
 from graphnav.detectors.windows import running, unbroken
 from graphnav.recording import Imu
@@ -83,7 +83,7 @@ def _below(name: str, e: Array, imu: Imu, period: float, window: int, settings: 
     whole = unbroken(np.r_[True, np.diff(imu.t) < period + settings.bridge], window)
     e = np.where(whole, e, np.nan)
     below = e < settings.threshold
-    spans = longer_than(merged(spans_of(below, t, 0.5 * period), settings.bridge), settings.shortest)
+    spans = longer_than(merge_spans(spans_of(below, t, 0.5 * period), settings.bridge), settings.shortest)
     # windows begin and end inside the recording: its first and last stance reach to its ends
     half = 0.5 * window * period
     if len(spans) and spans[0, 0] < imu.t[0] + half:

@@ -22,7 +22,7 @@ from graphnav.estimation.alignment import align
 from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.pipeline import origin
-from graphnav.estimation.problem import pose
+from graphnav.estimation.problem import build_problem
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.recording import Recording, rows_of
@@ -76,7 +76,7 @@ def find_antenna(recording: Recording) -> Antenna:
     return _estimate(recording)[0]
 
 
-def reversed_arms(recording: Recording) -> list[Finding]:
+def find_reversed_arms(recording: Recording) -> list[Finding]:
     """Parts of lever arms whose sign the drive denies: it finds them where the opposite sign would put them.
 
     Of a vehicle with fixes that are precise enough to tell, by the part of the drive that turns most; else nothing.
@@ -144,7 +144,7 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
     unknown = {"gnss": {"lever_arm_sigma": _UNKNOWN}, "vehicle": {"axle_sigma": _UNKNOWN}}
     sections = {name: getattr(settings, name).model_copy(update=values) for name, values in unknown.items()}
     settings = settings.model_copy(update=sections)
-    problem = pose(recording, settings, frame, aligned.state, aligned.sigma, still, parts_of_noise=True)
+    problem = build_problem(recording, settings, frame, aligned.state, aligned.sigma, still, parts_of_noise=True)
     tell("noise")
     problem = with_noise(problem, estimate_noise(problem, aligned.until).noise)
     tell("filter")

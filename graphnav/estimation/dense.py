@@ -16,7 +16,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
-from graphnav.imu.dynamics import Motion, as_biases
+from graphnav.imu.dynamics import ImuFactors, as_biases
 from graphnav.imu.preintegration import Intervals, within
 from graphnav.imu.samples import Samples
 
@@ -72,11 +72,11 @@ class Dense:
         if self.smooth:
             predicted = ahead[np.searchsorted(targets, ends)]
             miss = self.states[touched + 1].minus(predicted)[np.searchsorted(touched, k[moved])]
-            reached = reached.plus(_laid(miss, s[moved, None], T[moved, None]))
+            reached = reached.plus(_distribute(miss, s[moved, None], T[moved, None]))
         else:
             exact = np.isclose(s[moved], 1.0, rtol=0.0, atol=1e-9)
             reached = _choose(exact, self.states[k[moved] + 1], reached)
-        states = _choose(moved, _spread(reached, moved, states), states)
+        states = _choose(moved, _scatter(reached, moved, states), states)
         w = s[:, None, None]
         before, after = self.covariance[k, :size, :size], self.covariance[k + 1, :size, :size]
         return states, (1.0 - w) * before + w * after
@@ -98,10 +98,10 @@ class Dense:
             np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 0, 0)), np.zeros((n, 0, 0, 0)), none, none,
             np.zeros((n, 3)), none,
         )  # fmt: skip
-        return Motion(intervals, self.frame).propagate(slice(None), start, linear=False)[0]
+        return ImuFactors(intervals, self.frame).propagate(slice(None), start, linear=False)[0]
 
 
-def _laid(miss: Array, s: Array, T: Array) -> Array:
+def _distribute(miss: Array, s: Array, T: Array) -> Array:
     """The share (M, 15) of a miss at the fraction s of intervals T long."""
     out = miss * s
     p, v = miss[:, 3:6], miss[:, 6:9]
@@ -118,7 +118,7 @@ def _choose(mask: Array, yes: States, no: States) -> States:
     )
 
 
-def _spread(rows: States, mask: Array, like: States) -> States:
+def _scatter(rows: States, mask: Array, like: States) -> States:
     """`rows` put where `mask` is true; elsewhere as in `like`."""
     out = like[np.arange(len(like))]
     for name in ("R_nb", "p", "v", "ba", "bg"):

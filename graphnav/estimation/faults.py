@@ -9,11 +9,11 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solution import Fault
-from graphnav.estimation.solvers.passes import Smoothed, residual_record
+from graphnav.estimation.solution import ExcludedSpan
+from graphnav.estimation.solvers.passes import SmootherPass, residual_record
 
 
-def spans(problem: Problem, smoothed: Smoothed | None = None) -> tuple[Fault, ...]:
+def fault_spans(problem: Problem, smoothed: SmootherPass | None = None) -> tuple[ExcludedSpan, ...]:
     """The rows of weight 0, by constraint and in order of time; with a smoothed solution, what is wrong with them."""
     out = []
     for rows in problem.constraints:
@@ -31,11 +31,11 @@ def spans(problem: Problem, smoothed: Smoothed | None = None) -> tuple[Fault, ..
                 reason = f"{np.median(off[run]):.2g} {rows.unit} from where everything else puts it"
                 if len(run) > 1:
                     reason += f", {np.max(off[run]):.2g} at most"
-            out.append(Fault(rows.name, float(t[run[0]]), float(t[run[-1]]), len(run), reason))
+            out.append(ExcludedSpan(rows.name, float(t[run[0]]), float(t[run[-1]]), len(run), reason))
     return tuple(out)
 
 
-def notes(faults: tuple[Fault, ...], problem: Problem) -> tuple[str, ...]:
+def describe_faults(faults: tuple[ExcludedSpan, ...], problem: Problem) -> tuple[str, ...]:
     """A sentence for each kind of measurement that some are left out of."""
     out = []
     for rows in problem.constraints:
@@ -50,7 +50,7 @@ def notes(faults: tuple[Fault, ...], problem: Problem) -> tuple[str, ...]:
     return tuple(out)
 
 
-def weighted(problem: Problem, weights: Mapping[str, Array]) -> Problem:
+def weigh_rows(problem: Problem, weights: Mapping[str, Array]) -> Problem:
     """A problem with its rows weighted, (N,) by constraint."""
     constraints = (replace(c, weight=weights[c.name]) if c.name in weights else c for c in problem.constraints)
     return replace(problem, constraints=tuple(constraints))

@@ -17,11 +17,11 @@ from graphnav.core.errors import ConfigError, EstimationError
 from graphnav.core.progress import Progress, listening, tell
 from graphnav.detectors import detect
 from graphnav.estimation import faults
-from graphnav.estimation.noise.imu_floor import with_own_noise
+from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.preparation import prepare, start_sigma
-from graphnav.estimation.solution import Solution, joined
+from graphnav.estimation.solution import Solution, join_solutions
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.imu.onboard_offset import without_onboard_offset
@@ -96,17 +96,17 @@ def _run(
         try:
             # matrices here have thirty rows: threads for them cost more than the work, twenty times on a busy machine
             with threadpool_limits(limits=1, user_api="blas"):
-                found.append(_solved(piece, settings, frame, solvers, progress, noise))
+                found.append(_solve_with_retry(piece, settings, frame, solvers, progress, noise))
         except EstimationError as error:
             if len(pieces) == 1:
                 raise
             notes.append(f"{_span(recording, piece)} left out: {error}")
     if not found:
         raise EstimationError(f"'{recording.name}': no piece between its IMU gaps can be solved")
-    return {name: joined([one[name] for one in found], tuple(notes)) for name in solvers}
+    return {name: join_solutions([one[name] for one in found], tuple(notes)) for name in solvers}
 
 
-def _solved(
+def _solve_with_retry(
     recording: Recording,
     settings: Settings,
     frame: LocalFrame,
@@ -136,17 +136,24 @@ def _solve(
 ) -> dict[str, Solution]:
     began = time.perf_counter()
     recording, undone = without_onboard_offset(recording, settings)
-    recording, shown = with_own_noise(recording, settings)
+    recording, shown = with_measured_floor(recording, settings)
     tell("detection")
     detected = detect(recording, settings)
     detection = time.perf_counter() - began
     found = prepare(recording, settings, frame, detected, noise, progress)
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
-    wrong = faults.spans(problem, smoothed)
-    notes = (*found.start.notes, *undone, *shown, *found.detections.notes, *found.notes, *faults.notes(wrong, problem))
+    wrong = faults.fault_spans(problem, smoothed)
+    notes = (
+        *found.start.notes,
+        *undone,
+        *shown,
+        *found.detections.notes,
+        *found.notes,
+        *faults.describe_faults(wrong, problem),
+    )
     notes = (*notes, *describe_far(problem, smoothed))
     start, passes = smoothed, Counter(found.passes)
-    if found.astray:
+    if found.diverged:
         prior = InitialPrior(
             keyframe=problem.prior.keyframe, mean=found.start.state, sigma=start_sigma(found.start)[None]
         )
@@ -164,7 +171,7 @@ def _solve(
         out["batch"] = batch(problem, start.states, start.nodes(problem), progress=progress)
         # what it took to get there is part of it
         out["batch"] = replace(out["batch"], timings={**forward.solution.timings, **out["batch"].timings})
-    begin = found.aligned.state if found.astray else None
+    begin = found.aligned.state if found.diverged else None
     if "incremental" in solvers:
         from graphnav.estimation.solvers.incremental import incremental
 

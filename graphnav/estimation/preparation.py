@@ -26,16 +26,23 @@ from graphnav.estimation.alignment import Alignment, align, with_known_heading
 from graphnav.estimation.alignment.first import some
 from graphnav.estimation.noise.apply import with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.exclusion import estimate_without_faults, share_left_out, without_excluded
+from graphnav.estimation.noise.exclusion import estimate_without_faults, excluded_share, without_excluded
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe
-from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.near import near
-from graphnav.estimation.solvers.passes import Filtered, Smoothed, about_solved, near_to, points_of, values_of
+from graphnav.estimation.solvers.passes import (
+    FilterPass,
+    SmootherPass,
+    near_to,
+    points_of,
+    points_of_solution,
+    values_of,
+)
 from graphnav.estimation.solvers.rts import backward
 from graphnav.recording import Recording
 
@@ -55,16 +62,16 @@ class Prepared:
     start: Alignment  # of the prior: with the heading that the user states
     aligned: Alignment  # as found
     detections: Detections
-    forward: Filtered
-    smoothed: Smoothed
+    forward: FilterPass
+    smoothed: SmootherPass
     notes: tuple[str, ...]
     timings: dict[str, float]
     passes: Counter[str] = field(default_factory=Counter)
 
     @property
-    def astray(self) -> bool:
+    def diverged(self) -> bool:
         """Whether the stated start is so far from the one found that a filter from there is astray for a while."""
-        return _astray(self.aligned, self.start)
+        return _has_diverged(self.aligned, self.start)
 
 
 def prepare(
@@ -105,7 +112,9 @@ def prepare(
     def build(at: Alignment, found: Detections, parts: bool) -> Problem:
         tell("preintegration")
         since, start = time.perf_counter(), _start(at, with_known_heading(at, settings))
-        problem = pose(used, settings, frame, start.state, start_sigma(start), found.stationary, parts_of_noise=parts)
+        problem = build_problem(
+            used, settings, frame, start.state, start_sigma(start), found.stationary, parts_of_noise=parts
+        )
         booked("preintegration", since)
         return problem
 
@@ -138,14 +147,14 @@ def prepare(
     if noise is None:
         since = time.perf_counter()
         tell("noise")
-        best = _estimated(base, aligned, settings, progress, passes)
-        if share_left_out(base, best.noise) > _MOST:
+        best = _estimate(base, aligned, settings, progress, passes)
+        if excluded_share(base, best.noise) > _MOST:
             # most fixes contradict what came of the start: it is looked for in what follows
             try:
                 later = aligned_by(_after(recording, aligned), detections.stationary)
                 other = build(later, detections, parts=True)
-                again = _estimated(other, later, settings, progress, passes)
-                if share_left_out(other, again.noise) < share_left_out(base, best.noise):
+                again = _estimate(other, later, settings, progress, passes)
+                if excluded_share(other, again.noise) < excluded_share(base, best.noise):
                     aligned, base, best = later, other, again
             except EstimationError:
                 pass  # nothing moves later on
@@ -182,7 +191,7 @@ def prepare(
     )
 
 
-def _estimated(
+def _estimate(
     base: Problem, aligned: Alignment, settings: Settings, progress: Progress | None, passes: Counter[str]
 ) -> NoiseEstimate:
     """The noise model, with spans of wrong measurements left out if they are to be."""
@@ -218,10 +227,10 @@ def _explains_more(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bo
 
 def _start(found: Alignment, stated: Alignment) -> Alignment:
     """Where estimation sets out: the stated start, unless a filter from there would be astray."""
-    return found if _astray(found, stated) else stated
+    return found if _has_diverged(found, stated) else stated
 
 
-def _astray(found: Alignment, stated: Alignment) -> bool:
+def _has_diverged(found: Alignment, stated: Alignment) -> bool:
     turn = found.state.minus(stated.state)[0, :3]
     return found.motion is not None and bool(np.linalg.norm(turn) > _FAR)
 
@@ -230,11 +239,11 @@ def _find_way(
     problem: Problem,
     aligned: Alignment,
     known: Points | None,
-    forward: Filtered,
-    smoothed: Smoothed,
+    forward: FilterPass,
+    smoothed: SmootherPass,
     progress: Progress | None,
     passes: Counter[str],
-) -> tuple[Filtered, Smoothed]:
+) -> tuple[FilterPass, SmootherPass]:
     """Filter and smooth about better points where the filter was too far off for a smoother to rest on it.
 
     These are `known`, from the estimation of the noise, where it came about; else those of a batch solution.
@@ -257,16 +266,16 @@ def _find_way(
         states = backward(free, ekf(free, progress, aligned.until)).states
         states = batch(free, states, wanted=(), reintegrate=False).states
     solved = batch(problem, states, wanted=(), reintegrate=False)
-    about = about_solved(problem, solved, smoothed)
+    about = points_of_solution(problem, solved, smoothed)
     _, smoothed = near(problem, about, aligned.until, progress)
     passes.update(filter=3, smoother=2)
     return ekf(problem, progress, aligned.until, known=smoothed), smoothed
 
 
-def _without_refused(problem: Problem, forward: Filtered) -> Problem:
+def _without_refused(problem: Problem, forward: FilterPass) -> Problem:
     """The problem without the rows that a gate refused in the filter: no solver uses them."""
     refused = {c.name: forward.records[c.name].decided for c in problem.constraints if c.gate is not None}
-    return faults.weighted(problem, refused) if refused else problem
+    return faults.weigh_rows(problem, refused) if refused else problem
 
 
 def _differ(a: Array, b: Array) -> bool:

@@ -9,14 +9,14 @@ from functools import cached_property
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints import registered
-from graphnav.constraints.base import SAME_TIME, Constraint, Scene
+from graphnav.constraints import list_constraints
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, Parameter, States
 from graphnav.imu.clipping import with_whole_peaks
-from graphnav.imu.dynamics import Motion, scale_parameter
+from graphnav.imu.dynamics import ImuFactors, scale_parameter
 from graphnav.imu.preintegration import Intervals, preintegrate, preintegrate_unknown
 from graphnav.imu.samples import Samples, bridge_gaps
 from graphnav.imu.unresolved import with_coning, with_unresolved_motion
@@ -49,7 +49,7 @@ class Problem:
     t: Array  # (K,) keyframe times, s
     samples: Samples
     intervals: Intervals
-    motion: Motion
+    motion: ImuFactors
     prior: InitialPrior
     constraints: tuple[Constraint, ...]
     notes: tuple[str, ...] = ()
@@ -79,20 +79,22 @@ class Problem:
     def completed(self, recording: Recording, usual: Array | None = None) -> Problem:
         """With the constraints that look ahead, from a recording that reaches as far as they look.
 
-        `usual` as for `pose`.
+        `usual` as for `build_problem`.
         """
-        scene = Scene(recording, self.settings, self.frame, self.t, np.empty((0, 2)), self.intervals, usual=usual)
-        rows = (*self.constraints, *_built(scene, True))
+        scene = BuildContext(
+            recording, self.settings, self.frame, self.t, np.empty((0, 2)), self.intervals, typical_sigmas=usual
+        )
+        rows = (*self.constraints, *_build_constraints(scene, True))
         return replace(self, recording=recording, constraints=tuple(sorted(rows, key=lambda c: c.name)))
 
-    def reintegrated(self, ba: Array, bg: Array) -> Problem:
+    def reintegrate(self, ba: Array, bg: Array) -> Problem:
         """The same problem with its intervals integrated anew about better biases, (K-1, 3) each."""
         imu = replace(self.recording.imu, noise=self.imu_noise)
         intervals = preintegrate(self.samples, imu, self.t, ba, bg)
-        return replace(self, intervals=intervals, motion=Motion(intervals, self.frame))
+        return replace(self, intervals=intervals, motion=ImuFactors(intervals, self.frame))
 
 
-def pose(
+def build_problem(
     recording: Recording,
     settings: Settings,
     frame: LocalFrame,
@@ -102,7 +104,7 @@ def pose(
     times: Array | None = None,
     speed: MeanSpeed | None = None,
     usual: Array | None = None,
-    known: Mapping[float, Motion] | None = None,
+    known: Mapping[float, ImuFactors] | None = None,
     highest: Array | None = None,
     complete: bool = True,
     parts_of_noise: bool = False,
@@ -124,7 +126,7 @@ def pose(
     """
     stops = to_samples(stationary, recording)
     if times is None:
-        wanted = [cls.epochs(recording, settings, stops) for cls in registered()]
+        wanted = [cls.epochs(recording, settings, stops) for cls in list_constraints()]
         epochs = np.concatenate([*wanted, np.empty(0)])
         times = keyframe_times(recording.start, recording.end, epochs, settings.keyframes.rate)
     t = times
@@ -138,10 +140,10 @@ def pose(
     if motion is None or motion.intervals.t0[0] != t[0]:
         before = {end: one.intervals for end, one in (known or {}).items()}
         intervals = preintegrate_unknown(samples, recording.imu, t, start.ba[0], start.bg[0], before, parts_of_noise)
-        motion = Motion(intervals, frame)
+        motion = ImuFactors(intervals, frame)
     intervals = motion.intervals
-    scene = Scene(recording, settings, frame, t, stops, intervals, speed, usual)
-    built = _built(scene, None if complete else False)
+    scene = BuildContext(recording, settings, frame, t, stops, intervals, speed, usual)
+    built = _build_constraints(scene, None if complete else False)
     prior = InitialPrior(keyframe=np.zeros(1, dtype=int), mean=start, sigma=np.asarray(sigma)[None])
     return Problem(
         recording=recording,
@@ -158,9 +160,9 @@ def pose(
     )
 
 
-def _built(scene: Scene, ahead: bool | None) -> tuple[Constraint, ...]:
+def _build_constraints(scene: BuildContext, ahead: bool | None) -> tuple[Constraint, ...]:
     """The constraints of a scene: those that look ahead, those that do not, or all (None)."""
-    classes = (cls for cls in registered() if ahead is None or cls.looks_ahead == ahead)
+    classes = (cls for cls in list_constraints() if ahead is None or cls.looks_ahead == ahead)
     return tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
 
 
@@ -196,7 +198,7 @@ def _chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterChain, 
         if p.begins is not None:
             nodes, mean, sigma, decay = p.begins, p.initial, p.sigma, np.zeros(len(p.begins))
         else:
-            nodes = t[:1] if p.constant else _apart(t, p.spacing)
+            nodes = t[:1] if p.constant else _keep_apart(t, p.spacing)
             ahead, added = p.step(np.diff(nodes))
             mean = np.tile(p.initial, (len(nodes), 1))
             sigma, decay = np.concatenate([p.sigma[None], added]), np.concatenate([[0.0], ahead])
@@ -205,7 +207,7 @@ def _chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterChain, 
     return tuple(chains)
 
 
-def _apart(t: Array, spacing: float) -> Array:
+def _keep_apart(t: Array, spacing: float) -> Array:
     """Those of the keyframes that lie so far apart at least; the same ones however long the drive goes on."""
     out = [float(t[0])]
     for x in t.tolist():

@@ -73,7 +73,7 @@ class ParameterEstimate:
 
 
 @dataclass(frozen=True)
-class Fault:
+class ExcludedSpan:
     """Consecutive rows of one constraint that no solver uses."""
 
     kind: str  # name of the constraint
@@ -101,7 +101,7 @@ class Solution:
     timings: dict[str, float] = field(default_factory=dict)  # s by stage
     notes: tuple[str, ...] = ()
     detections: tuple[Detection, ...] = ()  # where the platform was found to stand, the fused answer last
-    excluded: tuple[Fault, ...] = ()  # spans of measurements found to be wrong, which no solver used
+    excluded: tuple[ExcludedSpan, ...] = ()  # spans of measurements found to be wrong, which no solver used
     noise: NoiseModel = STATED  # that all solvers used
     passes: Mapping[str, int] = field(default_factory=dict)  # over all keyframes, before the solver's own
     between: tuple[Between, ...] = ()  # gives states between keyframes, one for each piece of the recording
@@ -167,7 +167,7 @@ def to_trajectory(name: str, frame: LocalFrame, t: Array, states: States, covari
     )
 
 
-def joined(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:
+def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:
     """Solutions of the pieces of one recording, put end to end in one frame."""
     first = parts[0]
     if len(parts) == 1:
@@ -192,8 +192,8 @@ def joined(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:
         covariance=np.concatenate([p.covariance for p in parts]),
         parameters=parameters,
         records={name: rows(name) for name in dict.fromkeys(key for part in parts for key in part.records)},
-        counts=_summed([p.counts for p in parts]),
-        timings=_summed([p.timings for p in parts]),
+        counts=_add_counts([p.counts for p in parts]),
+        timings=_add_counts([p.timings for p in parts]),
         iterations=sum(p.iterations for p in parts),
         cost=sum(p.cost for p in parts),
         stopped="; ".join(dict.fromkeys(p.stopped for p in parts)),
@@ -201,7 +201,7 @@ def joined(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:
         detections=tuple(d for p in parts for d in p.detections),
         excluded=tuple(f for p in parts for f in p.excluded),
         noise=_noise_of_all([p.noise for p in parts]),
-        passes=_summed([dict(p.passes) for p in parts]),
+        passes=_add_counts([dict(p.passes) for p in parts]),
         between=tuple(b for p in parts for b in p.between),
     )
 
@@ -217,5 +217,5 @@ def _noise_of_all(parts: list[NoiseModel]) -> NoiseModel:
     return replace(parts[0], weights=weights, excluded=excluded)
 
 
-def _summed(tables: list[dict[str, Any]]) -> dict[str, Any]:
+def _add_counts(tables: list[dict[str, Any]]) -> dict[str, Any]:
     return {key: sum(table.get(key, 0) for table in tables) for key in dict.fromkeys(k for t in tables for k in t)}

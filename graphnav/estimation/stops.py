@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.config.detectors import FUSED
-from graphnav.constraints import registered
+from graphnav.constraints import list_constraints
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import Detection, seconds_in
@@ -44,7 +44,7 @@ def stops_of(found: Sequence[Detection], records: Mapping[str, ConstraintRecord]
     spans = _spans(found, FUSED)
     names = dict.fromkeys(d.name for d in found if d.name != FUSED)
     seconds = {name: seconds_in(_spans(found, name), spans) for name in names}
-    made = {kind.name for kind in registered() if kind.of_stops}
+    made = {kind.name for kind in list_constraints() if kind.of_stops}
     used = {name: np.sort(record.t[record.weight > 0.0]) for name, record in (records or {}).items() if name in made}
     out = []
     for k, (start, end) in enumerate(spans):

@@ -16,7 +16,7 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
-from graphnav.core.interpolation import fit_yaw, interpolate, placed
+from graphnav.core.interpolation import fit_yaw, interpolate, place_on_earth
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.core.timescales import LEAP, NEAR, between_clocks
@@ -66,7 +66,7 @@ class Foreign(Solution):
         return track.t, _states(self.frame, track), np.full((len(track), DIM, DIM), np.nan)
 
 
-def own(solutions: Mapping[str, Solution]) -> dict[str, Solution]:
+def own_solutions(solutions: Mapping[str, Solution]) -> dict[str, Solution]:
     """The solutions that are ours."""
     return {name: s for name, s in solutions.items() if not isinstance(s, Foreign)}
 
@@ -106,7 +106,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
     if track.frame == "local":
         at = track.t[inside]
         yaw, offset = fit_yaw(track.llh[inside], reference.at(at)[1].p)
-        track = placed(track, reference.frame, yaw, offset)
+        track = place_on_earth(track, reference.frame, yaw, offset)
         notes.append(f"{asked.path.name}: metres of a frame of its own, turned by {np.degrees(yaw):.1f} deg onto ours")
     arm = asked.point
     if isinstance(arm, str):

@@ -43,7 +43,7 @@ def after_fit(cov: Array, p: Array, v: Array | None) -> tuple[Array, float]:
     n = len(p)
     v = np.zeros((n, 3)) if v is None else np.nan_to_num(v)
     a = p - p.mean(axis=0)
-    turned, turned_v = _turned(a), _turned(v)
+    turned, turned_v = _rotate(a), _rotate(v)
     size = float(np.sum(a[:, :2] ** 2))
     G = np.zeros((n, 4, 3))
     G[:, :3] = np.eye(3) / n
@@ -52,7 +52,7 @@ def after_fit(cov: Array, p: Array, v: Array | None) -> tuple[Array, float]:
     B[:, :3, :3], B[:, :3, 3], B[:, 3:6, 3], B[:, _HEADING, 3] = np.eye(3), turned, turned_v, -1.0
     sign = np.array([1.0, 1.0, 1.0, -1.0])  # a yaw is anticlockwise, a heading clockwise
     stated = cov[:, _STATE][:, :, _STATE] * sign[:, None] * sign
-    X = _reckoned(stated, turned)
+    X = _dead_reckon(stated, turned)
     cov = cov.copy()
     cov[np.ix_(range(n), _STATE, _STATE)] = X * sign[:, None] * sign
     # epochs from i on: those after it carry its error
@@ -72,7 +72,7 @@ def after_fit(cov: Array, p: Array, v: Array | None) -> tuple[Array, float]:
     return rest, float(np.sqrt(horizontal[0] / horizontal[1])) if horizontal[1] > 0.0 else 1.0
 
 
-def _reckoned(X: Array, turned: Array) -> Array:
+def _dead_reckon(X: Array, turned: Array) -> Array:
     """Covariances (N, 4, 4) of place and yaw that dead reckoning can have, nowhere below the stated ones."""
     out = X.copy()
     F = np.eye(4)
@@ -86,7 +86,7 @@ def _reckoned(X: Array, turned: Array) -> Array:
     return out
 
 
-def _turned(x: Array) -> Array:
+def _rotate(x: Array) -> Array:
     """(N, 3) turned a quarter anticlockwise over the horizontal."""
     return np.column_stack([-x[:, 1], x[:, 0], np.zeros(len(x))])
 

@@ -254,32 +254,32 @@ def summary(metrics: Metrics) -> dict[str, Any]:
     out: dict[str, Any] = {
         "n": metrics.n,
         "epochs": metrics.epochs,
-        "duration_s": _rounded(metrics.duration),
-        "distance_m": _rounded(metrics.distance),
+        "duration_s": _round(metrics.duration),
+        "distance_m": _round(metrics.distance),
     }
     for key, s in metrics.components.items():
         unit = COMPONENTS[key][1]
-        out |= {f"{key}_{what}_{unit}": _rounded(getattr(s, what)) for what in ("rms", "p95", "max", "mean")}
+        out |= {f"{key}_{what}_{unit}": _round(getattr(s, what)) for what in ("rms", "p95", "max", "mean")}
     for key, nees in metrics.nees.items():
-        out[f"nees_{key}"] = _rounded(nees.mean)
-        out[f"nees_{key}_inside_95"] = _rounded(nees.inside)
-        out[f"nees_{key}_band_if_independent"] = [_rounded(nees.low), _rounded(nees.high)]
-        out[f"nees_{key}_band"] = [_rounded(x) for x in chi_square_band(nees.dof, nees.effective)]
+        out[f"nees_{key}"] = _round(nees.mean)
+        out[f"nees_{key}_inside_95"] = _round(nees.inside)
+        out[f"nees_{key}_band_if_independent"] = [_round(nees.low), _round(nees.high)]
+        out[f"nees_{key}_band"] = [_round(x) for x in chi_square_band(nees.dof, nees.effective)]
     if metrics.closure is not None:
         c = metrics.closure
         out |= {
-            "closure_h_m": _rounded(c.horizontal),
-            "closure_up_m": _rounded(c.vertical),
-            "closure_distance_m": _rounded(c.distance),
-            "closure_percent": _rounded(c.percent),
+            "closure_h_m": _round(c.horizontal),
+            "closure_up_m": _round(c.vertical),
+            "closure_distance_m": _round(c.distance),
+            "closure_percent": _round(c.percent),
         }
     if metrics.spans:
         out["spans"] = [
             {
-                "start_s": s.start, "end_s": s.end, "n": s.n, "distance_m": _rounded(s.distance),
-                "end_h_m": _rounded(s.end_h), "end_3d_m": _rounded(s.end_3d), "max_h_m": _rounded(s.max_h),
-                "max_up_m": _rounded(s.max_up), "drift_mps": _rounded(s.drift),
-                "drift_percent": _rounded(s.drift_percent), "nees_p": _rounded(s.nees),
+                "start_s": s.start, "end_s": s.end, "n": s.n, "distance_m": _round(s.distance),
+                "end_h_m": _round(s.end_h), "end_3d_m": _round(s.end_3d), "max_h_m": _round(s.max_h),
+                "max_up_m": _round(s.max_up), "drift_mps": _round(s.drift),
+                "drift_percent": _round(s.drift_percent), "nees_p": _round(s.nees),
             }
             for s in metrics.spans
         ]  # fmt: skip
@@ -346,7 +346,7 @@ def write_comparison_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) ->
         writer.writerows(dict(row) for row in rows)
 
 
-def _rounded(x: float) -> float | None:
+def _round(x: float) -> float | None:
     return float(f"{x:.5g}") if math.isfinite(x) else None
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame, enu_axes, llh_to_ecef
 from graphnav.core.errors import RecordingError
-from graphnav.core.interpolation import fit_yaw, full_covariance, interpolate, placed
+from graphnav.core.interpolation import fit_yaw, full_covariance, interpolate, place_on_earth
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.evaluation.fitted import after_fit
@@ -68,9 +68,9 @@ def errors(
     fitted = "local" in (trajectory.frame, truth.frame)
     from_start = fitted and (trajectory.frame == "local" if from_start is None else from_start)
     if trajectory.frame == "local" or truth.frame == "local":
-        trajectory, truth = _fitted(trajectory, truth, lever_arm, max_gap, at, notes)
-    estimate, seen, travel, epochs = _paired(trajectory, truth, lever_arm, max_gap, at)
-    if _spacing(truth) < _spacing(trajectory) if at is None else _apart(seen.t, truth.t):
+        trajectory, truth = _fit(trajectory, truth, lever_arm, max_gap, at, notes)
+    estimate, seen, travel, epochs = _pair(trajectory, truth, lever_arm, max_gap, at)
+    if _spacing(truth) < _spacing(trajectory) if at is None else _lie_apart(seen.t, truth.t):
         notes.append("compared at the estimate's own epochs, to which the denser truth is interpolated")
 
     R_le = enu_axes(seen.llh)
@@ -119,7 +119,7 @@ def errors(
         nees_axis=np.where(np.isfinite(per_axis), per_axis, np.nan),
         nees_v=_nees(v, cov[:, 3:6, 3:6]),
         nees_rph=nees_rph,
-        distance=travelled(seen.t, seen.llh),
+        distance=distance_travelled(seen.t, seen.llh),
         dof_p=dof,
         epochs=epochs,
         notes=tuple(dict.fromkeys(notes)),
@@ -135,7 +135,7 @@ def closure(trajectory: Trajectory) -> Closure:
     return Closure(h, float(gap[2]), length, 100.0 * h / length if length > 0 else float("nan"))
 
 
-def travelled(t: Array, llh: Array) -> Array:
+def distance_travelled(t: Array, llh: Array) -> Array:
     """Horizontal distance (N,) m since the first of the points (N, 3), along points half a second apart.
 
     Summed over every point, the noise of a standing receiver would count as travel.
@@ -148,7 +148,7 @@ def travelled(t: Array, llh: Array) -> Array:
     return np.interp(t, t[knots], np.concatenate([[0.0], np.cumsum(np.sqrt(np.maximum(steps, 0.0)))]))
 
 
-def _fitted(
+def _fit(
     trajectory: Trajectory,
     truth: Trajectory,
     lever_arm: Array | None,
@@ -159,8 +159,8 @@ def _fitted(
     """Both on the Earth, the local one turned and moved onto the other (the truth onto the estimate if both are)."""
     if trajectory.frame == truth.frame:
         # Neither knows where it is: anywhere will do, and lengths stay what they are.
-        trajectory = placed(trajectory, LocalFrame(np.zeros(3)), 0.0, np.zeros(3))
-    estimate, seen, _, _ = _paired(trajectory, truth, lever_arm, max_gap, at)
+        trajectory = place_on_earth(trajectory, LocalFrame(np.zeros(3)), 0.0, np.zeros(3))
+    estimate, seen, _, _ = _pair(trajectory, truth, lever_arm, max_gap, at)
     mine, theirs = estimate.llh, seen.llh
     frame = LocalFrame(mine[0] if trajectory.frame == "geodetic" else theirs[0])
     truth_is_local = truth.frame == "local"
@@ -180,8 +180,8 @@ def _fitted(
             level = np.where(np.isnan(truth.llh), target[:, 2].mean(), truth.llh)
             truth = replace(truth, llh=np.column_stack([truth.llh[:, :2], level[:, 2]]))
             offset[2] = 0.0
-        return trajectory, placed(truth, frame, yaw, offset)
-    return placed(trajectory, frame, yaw, offset), truth
+        return trajectory, place_on_earth(truth, frame, yaw, offset)
+    return place_on_earth(trajectory, frame, yaw, offset), truth
 
 
 def _of_the_rest(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
@@ -195,11 +195,11 @@ def _of_the_rest(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
     return rest
 
 
-def _paired(
+def _pair(
     trajectory: Trajectory, truth: Trajectory, lever_arm: Array | None, max_gap: float, at: Array | None
 ) -> tuple[Trajectory, Trajectory, Array, int]:
     """Estimate and truth at the epochs they share, the truth's horizontal velocity there (N, 2), and of how many."""
-    moving = truth if truth.v is not None else replace(truth, v=_derived_velocity(truth, max_gap))
+    moving = truth if truth.v is not None else replace(truth, v=_differentiate(truth, max_gap))
     if at is not None:
         seen, _ = interpolate(moving, at[np.isin(at, trajectory.t)], max_gap=max_gap)
         epochs = len(at)
@@ -221,13 +221,13 @@ def _spacing(trajectory: Trajectory) -> float:
     return float(np.round(np.median(np.diff(trajectory.t)), 4)) if len(trajectory) > 1 else np.inf
 
 
-def _apart(t: Array, rows: Array) -> bool:
+def _lie_apart(t: Array, rows: Array) -> bool:
     """Whether some of the times are no row's, to 0.1 ms."""
     k = np.clip(np.searchsorted(rows, t), 1, len(rows) - 1) if len(rows) > 1 else np.zeros(len(t), dtype=int)
     return bool((np.minimum(np.abs(t - rows[k]), np.abs(t - rows[k - 1])) > 1e-4).any())
 
 
-def _derived_velocity(truth: Trajectory, max_gap: float) -> Array:
+def _differentiate(truth: Trajectory, max_gap: float) -> Array:
     """Velocity (N, 3) from positions by central differences, NaN beside a gap."""
     if len(truth) < 3:
         return np.full((len(truth), 3), np.nan)

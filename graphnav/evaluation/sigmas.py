@@ -15,7 +15,7 @@ _BY_CHANCE = 0.0027  # outside three standard deviations of a Gaussian
 
 
 @dataclass(frozen=True)
-class Judged:
+class BlockVerdict:
     """What one block of errors says of its sigma."""
 
     block: str  # position, velocity, attitude or heading
@@ -25,7 +25,7 @@ class Judged:
     verdict: str  # "too small", "unclear", "cautious" or "fits"
 
 
-def judge_sigmas(errors: Errors) -> tuple[Judged, ...]:
+def judge_sigmas(errors: Errors) -> tuple[BlockVerdict, ...]:
     """Block by block; those without errors or without sigmas are left out.
 
     Sigma is too small where errors are more than 1.5 times as large and chance does not do that (three standard
@@ -40,10 +40,10 @@ def judge_sigmas(errors: Errors) -> tuple[Judged, ...]:
         blocks[0] = ("position", size * errors.dof_p, errors.dof_p, p)
     if errors.nees_heading is not None:  # three angles together hide one
         blocks.append(("heading", errors.nees_heading, 1, rph[:, 2:]))
-    return tuple(_judged(name, x, dof, z) for name, x, dof, z in blocks if np.isfinite(x).any())
+    return tuple(_judge(name, x, dof, z) for name, x, dof, z in blocks if np.isfinite(x).any())
 
 
-def _judged(block: str, nees: Array, dof: int, over_sigma: Array) -> Judged:
+def _judge(block: str, nees: Array, dof: int, over_sigma: Array) -> BlockVerdict:
     known = np.isfinite(nees)
     nees, effective = nees[known], effective_epochs(over_sigma[known])
     size = float(np.sqrt(np.mean(nees) / dof))
@@ -52,4 +52,6 @@ def _judged(block: str, nees: Array, dof: int, over_sigma: Array) -> Judged:
         verdict = "too small" if size**2 > chi_square_band(dof, effective, _BY_CHANCE)[1] else "unclear"
     elif size < _CAUTIOUS:
         verdict = "cautious"
-    return Judged(block, size, float(np.mean(nees <= chi_square_quantile(1.0 - _BY_CHANCE, dof))), effective, verdict)
+    return BlockVerdict(
+        block, size, float(np.mean(nees <= chi_square_quantile(1.0 - _BY_CHANCE, dof))), effective, verdict
+    )

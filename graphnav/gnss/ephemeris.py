@@ -303,7 +303,7 @@ def _about_x(x: Array) -> Array:
     return np.stack([x[:, 0], c * x[:, 1] + s * x[:, 2], -s * x[:, 1] + c * x[:, 2]], -1)
 
 
-def turned(p: Array, seconds: Array) -> Array:
+def rotate_earth(p: Array, seconds: Array) -> Array:
     """Earth-fixed coordinates (N, 3) of one time in the Earth-fixed frame so many seconds (N,) later."""
     return _about_z(p, EARTH_RATE * seconds)
 

@@ -73,7 +73,7 @@ class Lines:
         return np.where(column < self.length[which][:, None], self.data[at], 32).astype(np.uint8)
 
 
-def moved(block: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def find_moved_points(block: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """(n, m) whether the decimal point of a field (n, m, width) stands elsewhere than in most of its column.
 
     In a line that has lost a character or has one more, fields are parts of two numbers.

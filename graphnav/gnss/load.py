@@ -17,7 +17,7 @@ from graphnav.gnss.placing import Corrected, place, with_own_stamps
 from graphnav.gnss.precise import Orbits, read_precise
 from graphnav.gnss.rinex_nav import read_navigation
 from graphnav.gnss.rinex_obs import parse_observations
-from graphnav.gnss.series import Observations, RawGnss, joined, primary
+from graphnav.gnss.series import Observations, RawGnss, join_files, primary
 from graphnav.gnss.signals import C
 from graphnav.gnss.single_point import SinglePoint, solve
 from graphnav.gnss.ubx import is_ubx, parse_ubx
@@ -63,7 +63,7 @@ def read_rover(paths: tuple[Path, ...]) -> tuple[Observations, Ephemerides | Non
         else:
             obs = parse_observations(data, path)
         parts.append(obs)
-    return joined(parts), sent
+    return join_files(parts), sent
 
 
 def load_raw(

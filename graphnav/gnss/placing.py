@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.gnss.ephemeris import Ephemerides, Placed, turned
+from graphnav.gnss.ephemeris import Ephemerides, Placed, rotate_earth
 from graphnav.gnss.precise import Orbits
 from graphnav.gnss.series import Observations, RawGnss, median_of_epochs
 from graphnav.gnss.signals import C, satellite_name
@@ -94,7 +94,7 @@ def with_own_stamps(
     epoch; codes are of its own stamp. So the milliseconds are those of its clock error, told by the codes themselves.
     """
     found = source.place(obs.satellite, obs.t - _FLIGHT, obs.zero)
-    away = np.linalg.norm(turned(found.p, np.full(len(obs), _FLIGHT)) - rover, axis=1)
+    away = np.linalg.norm(rotate_earth(found.p, np.full(len(obs), _FLIGHT)) - rover, axis=1)
     error = (obs.code - away) / C + (0.0 if corrected.clock else found.clock)
     off = median_of_epochs(obs.t, error)
     return replace(obs, t=obs.t + _TICK * np.round(np.nan_to_num(off) / _TICK))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import utc_to_gps
-from graphnav.gnss.ephemeris import Placed, turned
+from graphnav.gnss.ephemeris import Placed, rotate_earth
 from graphnav.gnss.files import Lines, calendar_days, numbers, read_bytes
 from graphnav.gnss.signals import SYSTEMS, C, Ids, satellite_id
 
@@ -192,7 +192,7 @@ def _polynomial(nodes: tuple[Array, Array], t: Array, zero: float) -> Array:
     exact = np.where(np.abs(x) < 1e-9, 1e-9, x)
     weight = np.prod(exact, axis=1)[:, None] / exact / np.prod(apart, axis=2)
     weight *= np.where(_NODES % 2 == 0, -1.0, 1.0)
-    placed = turned(p[use].reshape(-1, 3), -x.ravel()).reshape(len(t), _NODES, 3)
+    placed = rotate_earth(p[use].reshape(-1, 3), -x.ravel()).reshape(len(t), _NODES, 3)
     out = np.einsum("nk,nki->ni", weight, placed)
     usual = float(np.median(np.diff(at)))
     out[(t < at[0] - 1.0) | (t > at[-1] + 1.0) | (span > 2.0 * _NODES * usual)] = np.nan

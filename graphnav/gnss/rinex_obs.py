@@ -18,7 +18,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
-from graphnav.gnss.files import Lines, calendar_days, moved, numbers, read_bytes
+from graphnav.gnss.files import Lines, calendar_days, find_moved_points, numbers, read_bytes
 from graphnav.gnss.series import Observations, once
 from graphnav.gnss.signals import BEIDOU, GLONASS, GPS, QZSS, SYSTEMS, Ids, known_signal, satellite_id, signal_id
 
@@ -84,7 +84,7 @@ def parse_observations(data: bytes, path: Path) -> Observations:
         block = cells(own, len(types)).reshape(len(own), len(types), _WIDTH)
         try:
             value = numbers(block[:, :, :14].reshape(len(own), -1), 14)
-            if moved(block[:, :, :14]).any():
+            if find_moved_points(block[:, :, :14]).any():
                 raise ValueError
         except ValueError:
             raise _bad_field(rows, own, types, block[:, :, :14], path) from None
@@ -384,7 +384,7 @@ def _bad_field(
     rows: _Rows, own: NDArray[np.intp], types: list[str], block: NDArray[np.uint8], path: Path
 ) -> RecordingError:
     """For the first field that is no number, of those (n, m, 14) of some rows."""
-    for k, cells, elsewhere in zip(own, block, moved(block), strict=True):
+    for k, cells, elsewhere in zip(own, block, find_moved_points(block), strict=True):
         for name, cell, wrong in zip(types, cells, elsewhere, strict=True):
             text = bytes(cell).decode("latin-1").strip()
             where = f"{path}, line {rows.line[k] + 1}, {name}: '{text}'"

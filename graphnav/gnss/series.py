@@ -64,7 +64,7 @@ class Observations:
         return np.asarray(-self.doppler * C / self.frequency)
 
 
-def joined(parts: list[Observations]) -> Observations:
+def join_files(parts: list[Observations]) -> Observations:
     """Several files of one receiver as one series, in order of time; what two of them hold is taken once."""
     if len(parts) == 1:
         return parts[0]

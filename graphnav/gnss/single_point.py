@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from graphnav.core import earth
 from graphnav.core.rotation import Array
 from graphnav.gnss.atmosphere import NIGHT, directions, klobuchar, saastamoinen
-from graphnav.gnss.ephemeris import EARTH_RATE, turned
+from graphnav.gnss.ephemeris import EARTH_RATE, rotate_earth
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import code_sigma, rate_sigma
 from graphnav.gnss.signals import L1, C
@@ -74,7 +74,7 @@ def look(raw: RawGnss, antenna: Array, ionosphere: Array | None) -> Geometry:
     ionosphere : (2, 4) Klobuchar's coefficients; no delay without them.
     """
     flight = np.linalg.norm(raw.p - antenna, axis=1) / C
-    s = turned(raw.p, flight)
+    s = rotate_earth(raw.p, flight)
     away = s - antenna
     distance = np.linalg.norm(away, axis=1)
     azimuth, elevation = directions(antenna, s)
@@ -88,7 +88,7 @@ def look(raw: RawGnss, antenna: Array, ionosphere: Array | None) -> Geometry:
 
 def stretch(raw: RawGnss, geometry: Geometry) -> Array:
     """(N,) 1 + e.(v_s + omega x s) / c: by how much a range changes less than satellite and antenna move."""
-    moving = turned(raw.v, geometry.distance / C) + np.cross(_OMEGA, geometry.s)
+    moving = rotate_earth(raw.v, geometry.distance / C) + np.cross(_OMEGA, geometry.s)
     return np.asarray(1.0 + np.sum(geometry.e * moving, axis=1) / C)
 
 
@@ -188,7 +188,7 @@ def _velocities(
     antenna = x[of, :3]
     geometry = look(raw, antenna, None)
     scale = stretch(raw, geometry)
-    moving = turned(raw.v, geometry.distance / C)
+    moving = rotate_earth(raw.v, geometry.distance / C)
     sigma = rate_sigma(raw.cn0, np.maximum(geometry.elevation, 0.05))
     H = np.concatenate([-geometry.e / scale[:, None], np.ones((len(raw), 1))], axis=1)
     measured = raw.range_rate + np.nan_to_num(raw.drift) - np.sum(geometry.e * moving, axis=1) / scale

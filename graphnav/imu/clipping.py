@@ -43,7 +43,7 @@ class Peak:
     values: Array
 
 
-def cut_peaks(t: Array, x: Array, least: float, highest: Array | None = None) -> list[Peak]:
+def find_cut_peaks(t: Array, x: Array, least: float, highest: Array | None = None) -> list[Peak]:
     """The peaks above `least` of one axis (N,), read at times (N,) s, that were cut off.
 
     `highest` (2,) is what the sensor is known to have read at other times, up and down.
@@ -96,7 +96,7 @@ def first_not_cut(samples: Samples, R_bs: Array, before: Array, now: Array) -> f
     for k, name in enumerate(_LEAST):
         x = getattr(samples, name) @ R_bs
         for axis in range(3):
-            old, new = (cut_peaks(samples.t, x[:, axis], _LEAST[name], most[k, axis]) for most in (before, now))
+            old, new = (find_cut_peaks(samples.t, x[:, axis], _LEAST[name], most[k, axis]) for most in (before, now))
             still = {p.first for p in new}
             first = min([first, *(float(samples.t[p.first]) for p in old if p.first not in still)])
     return first
@@ -116,7 +116,7 @@ def with_whole_peaks(samples: Samples, R_bs: Array, known: Array | None = None) 
         x, cut = getattr(samples, name) @ R_bs, False
         extra = getattr(samples, f"extra_{name}").copy()
         for axis in range(3):
-            peaks = cut_peaks(samples.t, x[:, axis], _LEAST[name], None if known is None else known[k, axis])
+            peaks = find_cut_peaks(samples.t, x[:, axis], _LEAST[name], None if known is None else known[k, axis])
             if not peaks:
                 continue
             cut = True

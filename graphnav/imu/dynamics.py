@@ -68,7 +68,7 @@ def by_scale(by_bias: Array, mean: Array, k: int) -> Array:
     return np.asarray(by_bias[..., _TO[:k]] * mean[:, None, _FROM[:k]])
 
 
-class Motion:
+class ImuFactors:
     """Prediction over preintegrated intervals in a local frame; what does not depend on states is done once."""
 
     def __init__(self, intervals: Intervals, frame: LocalFrame) -> None:
@@ -105,7 +105,7 @@ class Motion:
         self.step = np.concatenate([intervals.dP, intervals.dV], axis=-1)
         self.expected = np.concatenate([intervals.ba, intervals.bg], axis=-1)
 
-    def prepared(self) -> Motion:
+    def prepared(self) -> ImuFactors:
         """The same, with all that is made when it is asked for first made already."""
         _ = self.whitener
         return self

@@ -193,7 +193,7 @@ def _cross(a: Array, b: Array) -> Array:
     return out
 
 
-def _turned(R: Array, x: Array) -> Array:
+def _rotate(R: Array, x: Array) -> Array:
     """Matrix times vector, (L, 3, 3, n) and (L, 3, n)."""
     return R[:, :, 0] * x[:, None, 0] + R[:, :, 1] * x[:, None, 1] + R[:, :, 2] * x[:, None, 2]
 
@@ -216,8 +216,8 @@ def _means(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Array]:
     R = np.ascontiguousarray(_products(turn).transpose(0, 2, 3, 1))
     one = _cross(phi, f)
     two = _cross(phi, one)
-    V = _summed(_turned(R[:-1], (f + b * one + c * two) * h))
-    P = _summed(V[:-1] * h + _turned(R[:-1], (0.5 * f + c * one + d * two) * (h * h)))
+    V = _running_sum(_rotate(R[:-1], (f + b * one + c * two) * h))
+    P = _running_sum(V[:-1] * h + _rotate(R[:-1], (0.5 * f + c * one + d * two) * (h * h)))
     return R, V, P
 
 
@@ -256,11 +256,11 @@ def _integrate(
     w, f = _less(samples.gyro, index, bg), _less(samples.accel, index, ba)
     R, V, P = _means(w, f, dt)
     T = dt.sum(0)
-    A = _summed((-0.5 * dt)[:, None, None] * (R[:-1] + R[1:]))
+    A = _running_sum((-0.5 * dt)[:, None, None] * (R[:-1] + R[1:]))
     # the rest in cells of a few pieces, within which A is a straight line
     cut = np.append(np.arange(0, L, _CELL if L >= MANY else 1), L)
     A, R, V, P = A[cut], R[cut], V[cut], P[cut]
-    edge = _summed(dt)[cut]
+    edge = _running_sum(dt)[cut]
     qg, qa = _white_noise(samples, imu, dt, index, edge, cut)
     h = (edge[1:] - edge[:-1])[:, None]
     # dV / d bg = -int [dV]x A, exactly for A linear in a cell: int (t - t_start) dV = h dV - int (V - V_start) dt
@@ -269,10 +269,10 @@ def _integrate(
     late = h * dv - gain
     h = h[:, None]
     slope = (A[1:] - A[:-1]) / np.maximum(h, 1e-12)
-    B = _summed(-_cross(dv, A[:-1]) - _cross(late, slope))
-    PA = _summed(0.5 * h * (A[:-1] + A[1:]))  # dP / d ba
+    B = _running_sum(-_cross(dv, A[:-1]) - _cross(late, slope))
+    PA = _running_sum(0.5 * h * (A[:-1] + A[1:]))  # dP / d ba
     # dP / d bg = int B, in a cell B_start h - int [(t_end - t) dV]x A
-    PB = _summed(h * B[:-1] - _cross(gain, A[:-1] + (h / 3.0) * slope))
+    PB = _running_sum(h * B[:-1] - _cross(gain, A[:-1] + (h / 3.0) * slope))
     left = T - edge  # time left at each edge
     a_edge = V[-1] - V
     b_edge = P[-1] - P - V * left[:, None]
@@ -295,11 +295,11 @@ def _integrate(
     mean_rate, mean_force = (np.sum(x * dt[:, None], axis=0).T / T[:, None] for x in (w, f))
     return Intervals(
         t[rows], t[rows + 1], dR, _last(V), _last(P), theta_bg, v_ba, v_bg, p_ba, p_bg,
-        np.array(ba), np.array(bg), mean_rate, mean_force, Q, parts, *_past(edge, R, V, A),
+        np.array(ba), np.array(bg), mean_rate, mean_force, Q, parts, *_mean_velocity_parts(edge, R, V, A),
     )  # fmt: skip
 
 
-def _past(edge: Array, R: Array, V: Array, A: Array) -> tuple[Array, Array, Array, Array]:
+def _mean_velocity_parts(edge: Array, R: Array, V: Array, A: Array) -> tuple[Array, Array, Array, Array]:
     """What the mean velocity over an interval is made of, seen from its end; by the trapezoidal rule."""
     T = edge[-1]
     h = edge[1:] - edge[:-1]
@@ -323,7 +323,7 @@ def _last(x: Array) -> Array:
     return np.ascontiguousarray(x.transpose(x.ndim - 1, *range(x.ndim - 1)))
 
 
-def _summed(terms: Array) -> Array:
+def _running_sum(terms: Array) -> Array:
     """Running sums along the first axis, from zero: one more than there are terms."""
     out = np.zeros((len(terms) + 1, *terms.shape[1:]))
     if out[0].size < 100:
@@ -339,8 +339,8 @@ def _white_noise(samples: Samples, imu: Imu, dt: Array, index: Array, edge: Arra
     h = edge[1:] - edge[:-1]
     qg, qa = imu.noise.gyro_noise_density**2 * h, imu.noise.accel_noise_density**2 * h
     if samples.extra_gyro.any() or samples.extra_accel.any():
-        qg += np.diff(_summed(samples.extra_gyro[index] * dt)[cut], axis=0)
-        qa += np.diff(_summed(samples.extra_accel[index] * dt)[cut], axis=0)
+        qg += np.diff(_running_sum(samples.extra_gyro[index] * dt)[cut], axis=0)
+        qa += np.diff(_running_sum(samples.extra_accel[index] * dt)[cut], axis=0)
     return qg, qa
 
 

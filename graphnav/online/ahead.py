@@ -13,7 +13,7 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import Dense
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.solvers.window import Message
-from graphnav.imu.dynamics import SCALE, Motion, as_biases
+from graphnav.imu.dynamics import SCALE, ImuFactors, as_biases
 from graphnav.imu.preintegration import NOISE_FIGURES, preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.online.sensors import Sensors
@@ -40,7 +40,7 @@ def live(newest: Message, T: float, frame: LocalFrame, sensors: Sensors, noise: 
         intervals = preintegrate(bridge_gaps(imu), imu, ends, state.ba[0], state.bg[0], differs)
         if differs:
             intervals = intervals.with_noise(factors)
-        motion, one = Motion(intervals, frame), slice(0, 1)
+        motion, one = ImuFactors(intervals, frame), slice(0, 1)
         scale = newest.value(SCALE) if SCALE in newest.columns else None
         ahead, F15 = motion.propagate(one, state, scale)
         F = np.zeros((DIM, len(P)))

@@ -19,12 +19,12 @@ from graphnav.core.state import Parameter
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solution import Fault
+from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.stages import Place, Step
 from graphnav.estimation.solvers.tree_window import TreeWindow
 from graphnav.estimation.solvers.watch import Verdicts, Watch
-from graphnav.estimation.solvers.window import Message, Smoothed, Window
+from graphnav.estimation.solvers.window import Message, SettledStates, Window
 from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.online.looks import Stops
 from graphnav.online.sensors import Sensors
@@ -75,7 +75,7 @@ class Chain:
         return np.concatenate([[self.head], t]) if self.opened else t
 
     @property
-    def excluded(self) -> tuple[Fault, ...]:
+    def excluded(self) -> tuple[ExcludedSpan, ...]:
         """Spans of fixes that are not used, whoever found them."""
         times, used = self.verdicts.times, self.verdicts.used
         left = {name: used[name] * (row_weights(t, self.noise, name) > 0.0) for name, t in times.items()}
@@ -184,7 +184,7 @@ class Chain:
         self.window.truncate(count)
         del self._nodes[count:]
 
-    def _leave(self, count: int) -> Smoothed:
+    def _leave(self, count: int) -> SettledStates:
         """Let the first keyframes settle."""
         self._head_nodes = self._nodes[count - 1]
         self.head, self.opened = float(self.window.t[count - 1]), True

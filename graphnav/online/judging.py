@@ -29,8 +29,8 @@ from graphnav.estimation.noise.exclusion import estimate_without_faults
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe
 from graphnav.estimation.preparation import start_sigma
-from graphnav.estimation.problem import Problem, pose
-from graphnav.estimation.solution import Fault
+from graphnav.estimation.problem import Problem, build_problem
+from graphnav.estimation.solution import ExcludedSpan
 from graphnav.online.sensors import Sensors, unit_of
 from graphnav.online.tracker import Tracker
 from graphnav.recording import Recording
@@ -45,7 +45,7 @@ class Answer:
     noise: NoiseModel
     notes: tuple[str, ...]
     stationary: Array  # (M, 2) s
-    excluded: tuple[Fault, ...]  # spans that the noise model leaves out
+    excluded: tuple[ExcludedSpan, ...]  # spans that the noise model leaves out
 
 
 class Judgement:
@@ -96,14 +96,14 @@ class Judgement:
         start = self.found
         try:
             stationary = detect(recording, settings).stationary
-            base = pose(
+            base = build_problem(
                 recording, settings, frame, start.state, start_sigma(start), stationary, times, parts_of_noise=True
             )  # fmt: skip
             base = _level(base)
             estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
             noise = estimate(base, start.until).noise
             used = with_noise(base, noise)
-            said, wrong = describe(noise, used), faults.spans(used)
+            said, wrong = describe(noise, used), faults.fault_spans(used)
             self._answer = Answer(_in_unit(noise, base, unit), said, stationary, wrong)
         except (EstimationError, np.linalg.LinAlgError) as error:
             self._answer = EstimationError(str(error))
@@ -139,7 +139,7 @@ def _in_unit(noise: NoiseModel, base: Problem, unit: Array) -> NoiseModel:
     return replace(noise, figures=figures)
 
 
-class Again:
+class CatchUp:
     """A tracker that goes through the keyframes of another, which goes on meanwhile.
 
     Parameters

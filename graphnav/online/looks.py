@@ -12,7 +12,7 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.detectors import stops
-from graphnav.detectors.base import merged
+from graphnav.detectors.base import merge_spans
 from graphnav.online.sensors import Sensors
 from graphnav.recording.odometer import Figures, faults
 
@@ -61,7 +61,7 @@ class Stops:
 
     def add(self, spans: Array) -> None:
         """Know more spans, between keyframes already."""
-        self.spans = merged(np.concatenate([self.spans, spans]), gap=SAME_TIME)
+        self.spans = merge_spans(np.concatenate([self.spans, spans]), gap=SAME_TIME)
 
     def forget(self, t: float) -> None:
         """Those that ended before a time do not matter any more."""
@@ -77,7 +77,7 @@ class Stops:
         if found is None or (not len(found) and not len(self.spans)):
             return np.inf
         edges = np.unique(edges)
-        spans = merged(np.concatenate([clipped(self.spans, -np.inf, since), found]), gap=SAME_TIME)
+        spans = merge_spans(np.concatenate([clip_spans(self.spans, -np.inf, since), found]), gap=SAME_TIME)
         spans = spans[spans[:, 1] >= edges[0] - SAME_TIME] if len(spans) else spans
         aligned = []
         for begin, end in spans:
@@ -141,7 +141,7 @@ def _other(before: tuple[float, ...], now: tuple[float, ...]) -> bool:
     return any(abs(a - b) > _CLEARLY * max(a, b) for a, b in zip(before, now, strict=True))
 
 
-def clipped(spans: Array, begin: float, end: float) -> Array:
+def clip_spans(spans: Array, begin: float, end: float) -> Array:
     """The parts of spans between two times."""
     cut = np.clip(spans, begin, end)
     return np.asarray(cut[cut[:, 1] > cut[:, 0]])

@@ -108,7 +108,7 @@ class Sensors:
         self.counts["imu"] += 1
         return True
 
-    def usual(self, t: Array) -> Array:
+    def typical_sigmas(self, t: Array) -> Array:
         """(N, 6) sigmas that the fixes at some times usually state, m and m/s: the units of errors that last."""
         return self.gnss.rows[np.searchsorted(self.gnss.t, t - 1e-6), 13:19]
 

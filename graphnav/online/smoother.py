@@ -21,12 +21,12 @@ from graphnav.estimation.noise.exclusion import FIXES
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.pipeline import origin
 from graphnav.estimation.preparation import start_sigma
-from graphnav.estimation.solution import Fault, to_trajectory
+from graphnav.estimation.solution import ExcludedSpan, to_trajectory
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.watch import LONGEST
 from graphnav.estimation.solvers.window import first_message
 from graphnav.online.ahead import Live
-from graphnav.online.judging import Again, Judgement
+from graphnav.online.judging import CatchUp, Judgement
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import Tracker
@@ -62,13 +62,13 @@ class Smoother:
         self.notes: list[str] = []
         self.late: Counter[str] = Counter()  # rows that came after the keyframe they belong before, and were used
         self._judgement: Judgement | None = None  # being made
-        self._again: Again | None = None  # going through what has not settled with it
+        self._again: CatchUp | None = None  # going through what has not settled with it
         self._tentative = False  # nothing is to settle before the sensors have been judged once
         self._found: Alignment | None = None  # as long as the sensors are still to be judged by more rows
         self._said: tuple[str, ...] = ()  # of the notes, those about what the sensors are judged to be
         self._judged = 0.0  # s of rows that they were judged by
         self._times: list[float] = []  # s, of keyframes that have settled meanwhile
-        self._left_out: tuple[Fault, ...] = ()  # of other measurements than fixes
+        self._left_out: tuple[ExcludedSpan, ...] = ()  # of other measurements than fixes
         self._fixes: list[float] = []  # s, not yet in the graph
         self._began = -np.inf  # s, of what is being smoothed
         self._due = -np.inf  # s, of IMU time at which the next keyframes can be made
@@ -76,10 +76,10 @@ class Smoother:
         self._dirty = np.inf
         self._settled: list[Trajectory] = []
         self._last_settled = -np.inf
-        self._faults: tuple[Fault, ...] = ()  # found before the newest alignment
+        self._faults: tuple[ExcludedSpan, ...] = ()  # found before the newest alignment
 
     @property
-    def excluded(self) -> tuple[Fault, ...]:
+    def excluded(self) -> tuple[ExcludedSpan, ...]:
         """Spans of measurements found to be wrong, which were not used."""
         return self._faults + (self.tracker.excluded + self._left_out if self.tracker is not None else ())
 
@@ -107,7 +107,7 @@ class Smoother:
         if tracker is not None:
             self._awake = -np.inf
             if t < {"imu": before, "odometer": previous}.get(sensor, -np.inf):
-                tracker.came_late(sensor, t)
+                tracker.note_late_row(sensor, t)
             if sensor == "gnss" and t > tracker.newest + SAME_TIME:
                 self._fixes = sorted([*self._fixes, t])
                 self._due = min(self._due, t + AFTER)
@@ -134,10 +134,10 @@ class Smoother:
             self._go_through(self._again, tracker)
         elif self._judgement is not None and tracker.newest >= self._judgement.due:
             self._use(self._judgement, tracker)
-        elif tracker.spare(self.sensors, expected := self._expected(tracker), not self._tentative):
+        elif tracker.work_ahead(self.sensors, expected := self._expected(tracker), not self._tentative):
             self._collect(tracker)
         elif tracker.stale and not self._tentative:
-            self._again = Again(tracker.afresh(tracker.noise, self._setup))
+            self._again = CatchUp(tracker.afresh(tracker.noise, self._setup))
         else:
             if self._found is not None and self._judgement is None and not self._tentative:
                 self._judge_again(self._found, tracker)
@@ -264,13 +264,13 @@ class Smoother:
         self._say(found.notes)
         self._left_out = tuple(fault for fault in found.excluded if fault.kind not in FIXES)
         if tracker.opened:
-            self._again = Again(tracker.afresh(found.noise, self._setup))
+            self._again = CatchUp(tracker.afresh(found.noise, self._setup))
         else:
             again = self._track(judgement.found, self._began, found.noise)
-            again.knows(tracker, found.stationary, judgement.until)
-            self._again = Again(again)
+            again.adopt(tracker, found.stationary, judgement.until)
+            self._again = CatchUp(again)
 
-    def _go_through(self, again: Again, tracker: Tracker) -> None:
+    def _go_through(self, again: CatchUp, tracker: Tracker) -> None:
         """Some of it; what has caught up takes over."""
         if again.step(self.sensors, tracker):
             self.tracker, self._again, self._tentative = again.tracker, None, False

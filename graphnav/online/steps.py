@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints import registered
+from graphnav.constraints import list_constraints
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
 from graphnav.estimation.problem import keyframe_times, to_samples
 from graphnav.imu.clipping import first_not_cut, highest
 from graphnav.imu.samples import bridge_gaps
-from graphnav.online.looks import SURE, Stops, clipped
+from graphnav.online.looks import SURE, Stops, clip_spans
 from graphnav.online.sensors import Sensors
 
 _WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector sees, and the least
@@ -20,7 +20,7 @@ _SHORTEST = 0.05  # s between looks at a walk that are worth keyframes
 _STANDS = 3.0  # s, a stance as long as that is standing, and need not be over
 
 
-class Steps:
+class StepCutter:
     """Up to where a walk has been cut into steps, and what its IMU has read at most."""
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class Steps:
             return none
         rows = recording.imu.t  # keyframes stand where the stances will be said to begin and end
         limit = float(rows[max(int(np.searchsorted(rows, limit + SAME_TIME)) - 1, 0)])
-        spans = clipped(to_samples(detect(recording, settings).stationary, recording), T, limit)
+        spans = clip_spans(to_samples(detect(recording, settings).stationary, recording), T, limit)
         ongoing = bool(len(spans)) and spans[-1, 1] >= limit - SAME_TIME
         if not last and len(spans):
             if ongoing and limit - spans[-1, 0] < _STANDS:
@@ -60,8 +60,8 @@ class Steps:
         pieces, self._pieces = self._pieces, float(standing.spans[-1, 0]) if ongoing and not last else None
         self.over = pieces if pieces != self._pieces else None
         part = sensors.recording(min(begin, T), limit)
-        around = clipped(standing.spans, part.start, limit)
-        epochs = [cls.epochs(part, settings, around) for cls in registered()]
+        around = clip_spans(standing.spans, part.start, limit)
+        epochs = [cls.epochs(part, settings, around) for cls in list_constraints()]
         return keyframe_times(T, limit, np.concatenate([*epochs, none]), settings.keyframes.rate)
 
     def changed(self, sensors: Sensors, head: float) -> float:

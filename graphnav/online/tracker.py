@@ -1,6 +1,6 @@
 """The graph of a running drive: keyframes posed as they come, stops classified, the window kept and settled.
 
-New keyframes are posed like a recording (`graphnav.estimation.problem.pose`), from the rows around them: the same code builds
+New keyframes are posed like a recording (`graphnav.estimation.problem.build_problem`), from the rows around them: the same code builds
 the same rows as offline. Whatever changes the past inside the window (a fix that comes late, a stop that is
 recognised a second or two after it began) takes back the keyframes from there on and poses them again.
 
@@ -25,21 +25,21 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.findings import period_of
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.detectors.base import merged
+from graphnav.detectors.base import merge_spans
 from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel
-from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.stages import Place
-from graphnav.estimation.solvers.window import Message, Smoothed, turn_limit
-from graphnav.imu.dynamics import Motion
+from graphnav.estimation.solvers.window import Message, SettledStates, turn_limit
+from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import GAP, bridge_gaps
 from graphnav.online.ahead import Live, live, since
 from graphnav.online.chain import Chain
-from graphnav.online.looks import CONTEXT, SURE, Readings, clipped
+from graphnav.online.looks import CONTEXT, SURE, Readings, clip_spans
 from graphnav.online.sensors import Sensors
-from graphnav.online.steps import Steps
+from graphnav.online.steps import StepCutter
 from graphnav.recording import Recording
 from graphnav.recording.odometer import MeanSpeed
 
@@ -82,17 +82,17 @@ class Tracker(Chain):
         super().__init__(settings, message, t0, _turn(setup, noise), noise)
         self.frame, self.foot = frame, setup.platform == "foot"
         self._readings = Readings()
-        self._steps = Steps()
-        self.settled: list[Smoothed] = []
+        self._steps = StepCutter()
+        self.settled: list[SettledStates] = []
         self.in_force: dict[str, int] = {}  # rows of each constraint at the newest keyframe
         self.seconds: dict[str, float] = {}  # of its thread, by what the newest update did
-        self._motions: dict[float, Motion] = {}  # of intervals integrated already, by the time they end at
+        self._motions: dict[float, ImuFactors] = {}  # of intervals integrated already, by the time they end at
         self._dirty = np.inf  # s, from where on keyframes are to be redone with the next
         self._ahead: _Ahead | None = None
         self._tried = -np.inf  # s, the newest keyframe when some were to settle last
         self._settling = False  # whether some are to settle once they are linearised again
 
-    def came_late(self, sensor: str, t: float) -> None:
+    def note_late_row(self, sensor: str, t: float) -> None:
         """A row came after newer ones of its sensor: what was made of those beyond it is void."""
         self._ahead = None
         if sensor == "imu":
@@ -153,11 +153,11 @@ class Tracker(Chain):
             times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
         self._standing.forget(self.head - CONTEXT)
         dirty = self._steps.changed(sensors, self.head)
-        self.came_late("imu", dirty)
+        self.note_late_row("imu", dirty)
         self._dirty = min(self._dirty, dirty)
         return times[1:] if len(self.window) or self.opened else times
 
-    def spare(self, sensors: Sensors, expected: float = np.inf, settling: bool = True) -> bool:
+    def work_ahead(self, sensors: Sensors, expected: float = np.inf, settling: bool = True) -> bool:
         """Do one thing that need not wait for the next keyframe, or should not delay it; False if there is none.
 
         What comes out depends on the rows that have come when it is called, so it is called at certain rows.
@@ -200,7 +200,7 @@ class Tracker(Chain):
         imu = self._around(sensors, T, sensors.imu.newest).imu
         ends = np.array([T, expected])
         interval = preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0], self._judged_imu)
-        self._motions[expected] = Motion(interval, self.frame).prepared()
+        self._motions[expected] = ImuFactors(interval, self.frame).prepared()
 
     def _covered(self, sensors: Sensors, t: float) -> bool:
         """Whether the odometer has come as far as rows at a keyframe ask for."""
@@ -285,11 +285,11 @@ class Tracker(Chain):
         """Whether what has not settled was posed with figures of the odometer that are known better by now."""
         return self._readings.revised
 
-    def knows(self, other: Tracker, stationary: Array, until: float) -> None:
+    def adopt(self, other: Tracker, stationary: Array, until: float) -> None:
         """Take over what another has seen, but for the stops up to a time, which have been looked for anew."""
         self._standing, self._readings = copy.copy(other._standing), copy.copy(other._readings)
-        before, after = clipped(stationary, self.head, until - SURE), clipped(other.stops, until - SURE, np.inf)
-        self._standing.replace(merged(np.concatenate([before, after]), gap=SAME_TIME), other.times)
+        before, after = clip_spans(stationary, self.head, until - SURE), clip_spans(other.stops, until - SURE, np.inf)
+        self._standing.replace(merge_spans(np.concatenate([before, after]), gap=SAME_TIME), other.times)
 
     def back_to(self, t: float, other: Tracker) -> None:
         """Forget the keyframes from a time on, where another has redone them and sees stops otherwise."""
@@ -318,7 +318,7 @@ class Tracker(Chain):
         """The unit of the slow errors of a recording's fixes, m."""
         if recording.gnss is None:
             return None
-        return sensors.usual(recording.gnss.t)[:, :3]
+        return sensors.typical_sigmas(recording.gnss.t)[:, :3]
 
     def _pose(self, sensors: Sensors, times: Array, complete: bool = True) -> Problem:
         begin, stops = float(times[0]), self.stops
@@ -333,13 +333,13 @@ class Tracker(Chain):
         usual = self._usual(sensors, recording)
         found = ((t, self._motions.get(t)) for t in times[1:].tolist())
         known = {t: one for t, one in found if one is not None and not one.intervals.out_of_range(start.bg)[0]}
-        problem = pose(
+        problem = build_problem(
             recording, self.settings, self.frame, start, np.ones(DIM), stops, times, speed, usual, known,
             self._steps.highest, complete, self._judged_imu,
         )  # fmt: skip
         for k, t in enumerate(times[1:].tolist()):
             if t not in known:
-                self._motions[t] = Motion(problem.intervals[k : k + 1], self.frame)
+                self._motions[t] = ImuFactors(problem.intervals[k : k + 1], self.frame)
         return problem
 
     def _noisy(self, problem: Problem, sensors: Sensors, noise: NoiseModel | None = None) -> Problem:
@@ -352,7 +352,7 @@ class Tracker(Chain):
             if isinstance(c, GnssPosition):
                 c = replace(c, usual_error=sensors.unit())
             elif isinstance(c, GnssVelocity):
-                c = replace(c, unit_error=sensors.usual(problem.t[c.keyframe])[:, 3:])
+                c = replace(c, unit_error=sensors.typical_sigmas(problem.t[c.keyframe])[:, 3:])
             if isinstance(c, GnssPosition | GnssVelocity):
                 c = replace(c, processes=tuple(replace(p, spacing=spacing) for p in c.processes))
             rows.append(c)

@@ -16,7 +16,7 @@ from graphnav.report import pictures as pictures
 from graphnav.report import sentences as words
 from graphnav.report import summary as summary
 from graphnav.report import tables as tables
-from graphnav.report.names import named
+from graphnav.report.names import has_names
 from graphnav.report.plots import Shades, Spans
 from graphnav.report.provenance import provenance_tables
 from graphnav.report.tables import Withheld
@@ -63,7 +63,7 @@ def write_report(
     spans = _shades(solution, start, withheld, outages)
     if detectors is None:
         detectors = detector_pictures(recording, solution)
-    own, others = ({k: p for k, p in solution.parameters.items() if named(k) == of_it} for of_it in (True, False))
+    own, others = ({k: p for k, p in solution.parameters.items() if has_names(k) == of_it} for of_it in (True, False))
     sections: Sections = [
         (
             "Trajectory",
@@ -102,7 +102,7 @@ def write_report(
                 *_gallery(pictures.timeline_picture(solution, recording, spans)),
                 *tables.constraint_table(solution),
                 *tables.rejected_table(solution, start),
-                *_folded("Residuals of each", _gallery(pictures.record_pictures(solution, start, end, spans))),
+                *_fold("Residuals of each", _gallery(pictures.record_pictures(solution, start, end, spans))),
             ],
         ),
         (
@@ -110,7 +110,7 @@ def write_report(
             [
                 *tables.noise_tables(noise, solution),
                 *tables.excluded_table(solution, start),
-                *_folded(
+                *_fold(
                     "Noise processes, node by node",
                     [
                         *tables.parameter_table(others),
@@ -250,8 +250,8 @@ def _gallery(images: Sequence[page.Raw]) -> list[str]:
     return [page.gallery(images)] if images else []
 
 
-def _folded(title: str, parts: Sequence[str]) -> list[str]:
-    return [page.folded(title, "".join(parts))] if parts else []
+def _fold(title: str, parts: Sequence[str]) -> list[str]:
+    return [page.fold(title, "".join(parts))] if parts else []
 
 
 def _write(path: str | Path, html: str) -> Path:

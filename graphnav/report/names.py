@@ -58,7 +58,7 @@ _NAMED = {
 }
 
 
-def named(name: str) -> bool:
+def has_names(name: str) -> bool:
     """Whether a parameter is of the calibration, and its numbers have names."""
     return name in _NAMED or name == "imu_scale"
 

@@ -54,7 +54,7 @@ def number(value: float, digits: int = 4) -> str:
     return f"{value:.{min(places, digits)}f}"
 
 
-def measured(value: float, sigma: float) -> str:
+def format_measured(value: float, sigma: float) -> str:
     """A value with as many places as its sigma gives sense to."""
     if not (math.isfinite(value) and math.isfinite(sigma)) or sigma <= 0:
         return number(value)
@@ -159,7 +159,7 @@ def picture(figure: Figure, title: str, note: str = "", kind: str = "") -> Raw:
     parts = [
         f"<figcaption>{text(title)}</figcaption>",
         f'<div class="plot" role="img" aria-label="{escape(title)}"{time} style="height:{figure.height}px"></div>',
-        f'<script type="{_PACKED}">{_deflated(data)}</script>',
+        f'<script type="{_PACKED}">{_deflate(data)}</script>',
         f'<p class="note">{text(note)}</p>' if note else "",
     ]
     mark = f' class="{kind}"' if kind else ""
@@ -186,7 +186,7 @@ def code(words: str, key: str) -> Raw:
     return Raw(f'<pre id="{key}">{escape(words)}</pre>')
 
 
-def folded(title: str, content: str) -> Raw:
+def fold(title: str, content: str) -> Raw:
     """Content that opens on demand."""
     return Raw(f"<details><summary>{text(title)}</summary>{content}</details>")
 
@@ -244,8 +244,8 @@ def _library() -> str:
     found = importlib.util.find_spec("plotly")
     if found is None or found.origin is None:
         raise ModuleNotFoundError("plotly is not installed")
-    return _deflated((Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes())
+    return _deflate((Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes())
 
 
-def _deflated(content: bytes) -> str:
+def _deflate(content: bytes) -> str:
     return base64.b64encode(zlib.compress(content, 6)).decode("ascii")

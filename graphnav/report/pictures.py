@@ -13,7 +13,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors.base import Detection
 from graphnav.estimation.solution import ParameterEstimate, Solution
-from graphnav.evaluation.against import own
+from graphnav.evaluation.against import own_solutions
 from graphnav.recording import FIX_TYPES, Recording
 from graphnav.report import page, plots
 from graphnav.report.names import components
@@ -109,11 +109,11 @@ def _truth(recording: Recording, solutions: Mapping[str, Solution]) -> tuple[Arr
     if truth is not None and truth.llh is not None:
         return truth.t, first.frame.from_llh(truth.llh)
     if truth is not None and truth.xyz is not None:
-        return truth.t, _laid_on(truth.t, truth.xyz, list(own(solutions).values())[-1])
+        return truth.t, _lay_on(truth.t, truth.xyz, list(own_solutions(solutions).values())[-1])
     return None
 
 
-def _laid_on(t: Array, xyz: Array, solution: Solution) -> Array:
+def _lay_on(t: Array, xyz: Array, solution: Solution) -> Array:
     """A truth (M, 2 or 3) in a frame of its own, turned and moved onto a solution, (N, 2)."""
     shared = (t >= solution.t[0]) & (t <= solution.t[-1]) & np.isfinite(xyz).all(axis=1)
     p = solution.at(t[shared])[1].p
@@ -207,7 +207,7 @@ def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spa
     place = {name: Series(s.t - start, s.states.p + base, tracks[name].sd_p) for name, s in solutions.items()}
     speed = {name: Series(t.t - start, t.v, t.sd_v) for name, t in tracks.items() if t.v is not None}
     turned = {
-        name: Series(t.t - start, _unwrapped(t.rph), None if t.sd_rph is None else DEG * t.sd_rph)
+        name: Series(t.t - start, _unwrap(t.rph), None if t.sd_rph is None else DEG * t.sd_rph)
         for name, t in tracks.items() if t.rph is not None
     }  # fmt: skip
     out = []
@@ -225,7 +225,7 @@ def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spa
     return out
 
 
-def _unwrapped(rph: Array) -> Array:
+def _unwrap(rph: Array) -> Array:
     """Roll, pitch, heading (N, 3) in deg; the heading, from 0 to 360 at first, without a jump."""
     out = np.degrees(rph)
     known = np.isfinite(out[:, 2])
@@ -279,7 +279,7 @@ def zoom_pictures(errors: Mapping[str, Errors], start: float, spans: Spans, what
 
 def difference_pictures(solutions: Mapping[str, Solution], start: float, end: float, spans: Shades) -> list[Raw]:
     """How far the solvers are from the last of them, at the keyframes they share."""
-    name, reference = list(own(solutions).items())[-1]
+    name, reference = list(own_solutions(solutions).items())[-1]
     series = {}
     for key, s in solutions.items():
         if key == name:

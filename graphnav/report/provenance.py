@@ -27,7 +27,7 @@ def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any]
     if toml:
         data = base64.b64encode(toml.encode()).decode("ascii")
         link = Raw(f'<p><a download="{SETTINGS}" href="data:text/plain;base64,{data}">Save as {SETTINGS}</a></p>')
-        out.append(page.folded("Settings as resolved", link + page.code(toml, "settings")))
+        out.append(page.fold("Settings as resolved", link + page.code(toml, "settings")))
     inputs = provenance.pop("inputs", {})
     if provenance:
         listed = [f"{key} {page.text(value)}" for key, value in page.flat(provenance).items()]

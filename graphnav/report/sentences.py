@@ -9,7 +9,7 @@ import numpy as np
 
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.against import own
+from graphnav.evaluation.against import own_solutions
 from graphnav.evaluation.segments import rms
 from graphnav.recording import Recording
 from graphnav.report import page
@@ -31,7 +31,7 @@ def doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> t
     from graphnav.evaluation.sigmas import judge_sigmas
 
     out = []
-    solutions = own(solutions)
+    solutions = own_solutions(solutions)
     errors = {name: e for name, e in errors.items() if name in solutions}
     for solution in solutions.values():
         fixes = solution.records.get("gnss_position")
@@ -81,8 +81,8 @@ def what_was_done(recording: Recording, solutions: Mapping[str, Solution], withh
         sources.append(f"{len(used.gnss.t)} GNSS fixes")
     if used.odometer is not None:
         sources.append(f"{len(used.odometer.t)} odometer rows")
-    others = [name for name in solutions if name not in own(solutions)]
-    solutions = own(solutions)
+    others = [name for name in solutions if name not in own_solutions(solutions)]
+    solutions = own_solutions(solutions)
     solution = next(iter(solutions.values()))
     several = len(solutions) > 1
     who = f"The solvers {page.and_list(list(solutions))}" if several else f"The {solution.solver} solver"

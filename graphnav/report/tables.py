@@ -11,7 +11,7 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.estimation.stops import stops_of_solution
-from graphnav.evaluation.against import own
+from graphnav.evaluation.against import own_solutions
 from graphnav.evaluation.segments import rms
 from graphnav.recording import Recording
 from graphnav.report import page
@@ -242,7 +242,7 @@ def excluded_table(solution: Solution, start: float) -> list[Raw]:
     head = ["when", "what", "rows", "why"]
     out = [page.heading("What was excluded"), page.table(head, rows[:_SHOWN])]
     if len(rows) > _SHOWN:
-        out.append(page.folded(f"{len(rows) - _SHOWN} more", page.table(head, rows[_SHOWN:])))
+        out.append(page.fold(f"{len(rows) - _SHOWN} more", page.table(head, rows[_SHOWN:])))
     return out
 
 
@@ -265,7 +265,7 @@ def rejected_table(solution: Solution, start: float) -> list[Raw]:
     words = f"{many} rejected measurement{'s' if many > 1 else ''}"
     if many > _LISTED:
         words += f", the {_LISTED} farthest off"
-    return [page.folded(words, table)]
+    return [page.fold(words, table)]
 
 
 def nees_table(errors: Mapping[str, Errors]) -> list[Raw]:
@@ -303,7 +303,7 @@ def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Raw]:
             value, sigma = one.scale * float(p.value[-1, k]), one.scale * float(p.sigma[-1, k])
             known = "yes" if p.observable[k] else "no: mostly the prior"
             before = one.scale * float(p.prior_sigma[k])
-            said = [Raw(page.measured(value, sigma)), Raw(page.measured(sigma, sigma)), before]
+            said = [Raw(page.format_measured(value, sigma)), Raw(page.format_measured(sigma, sigma)), before]
             rows.append([one.words, *said, one.unit, known])
     head = ["parameter", "value", "sigma", "sigma before", "unit", "seen by the data"]
     return [page.table(head, rows)] if rows else []
@@ -311,7 +311,7 @@ def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Raw]:
 
 def run_table(solutions: Mapping[str, Solution]) -> list[Raw]:
     """Seconds by stage, iterations and cost, a column per solver; why each stopped."""
-    every, solutions = solutions, own(solutions)
+    every, solutions = solutions, own_solutions(solutions)
     stages = list(dict.fromkeys(stage for s in solutions.values() for stage in s.timings))
 
     def seconds(solution: Solution, stage: str) -> Raw | None:
@@ -341,7 +341,7 @@ def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Raw
     spans = metrics.get("spans")
     if isinstance(spans, Sequence) and spans and isinstance(spans[0], Mapping):
         inner = Raw(inner + page.table(list(spans[0]), [[s.get(k) for k in spans[0]] for s in spans]))
-    return [page.folded(f"All measures{' of ' if name else ''}{name}", inner)]
+    return [page.fold(f"All measures{' of ' if name else ''}{name}", inner)]
 
 
 def stop_table(solution: Solution, start: float) -> list[Raw]:

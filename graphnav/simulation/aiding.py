@@ -9,7 +9,7 @@ import numpy as np
 from graphnav.core.earth import E2, A
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Odometer
-from graphnav.simulation.kinematics import Motion, Mount
+from graphnav.simulation.kinematics import Mount, TrueMotion
 from graphnav.simulation.motion import SLIP, Path
 from graphnav.simulation.splines import stream
 from graphnav.simulation.vibration import gauss_markov
@@ -19,7 +19,7 @@ Three = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Fault:
+class SimulatedFault:
     """A span in which fixes go wrong while their stated sigmas stay: times are the motion's, s."""
 
     start: float
@@ -45,9 +45,9 @@ class GnssModel:
     lever_arm: Three = (0.0, 0.5, 0.1)  # m, IMU to antenna, IMU's axes
     outages: tuple[Span, ...] = ()
     dropouts: float = 0.0  # share of single fixes that are missing
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[SimulatedFault, ...] = ()
 
-    def read(self, motion: Motion, seed: int) -> Gnss:
+    def read(self, motion: TrueMotion, seed: int) -> Gnss:
         """The fixes of a drive."""
         t0, t1 = motion.t[0], motion.t[-1]
         t = t0 + self.phase + np.arange(int((t1 - t0 - self.phase) * self.rate + 1e-6) + 1) / self.rate
@@ -70,7 +70,7 @@ class GnssModel:
         sd = np.tile(np.hypot(self.white, self.slow), (len(t), 1))
         return Gnss(
             t[kept],
-            shifted(llh, error)[kept],
+            displace(llh, error)[kept],
             sd[kept],
             None if velocity is None else velocity[kept],
             None if self.velocity is None else np.tile(self.velocity, (len(t), 1))[kept],
@@ -78,7 +78,7 @@ class GnssModel:
         )
 
 
-def shifted(llh: Array, enu: Array) -> Array:
+def displace(llh: Array, enu: Array) -> Array:
     """Places (n, 3) displaced by metres east, north, up, by the ellipsoid's radii there."""
     w = 1.0 - E2 * np.sin(llh[:, 0]) ** 2
     north, east = A * (1.0 - E2) / w**1.5 + llh[:, 2], A / np.sqrt(w) + llh[:, 2]

@@ -55,7 +55,7 @@ def rectangle(perimeter: float, laps: int, corner: float = 0.6, ratio: float = 0
 
 
 @dataclass(frozen=True)
-class Steps:
+class Footprints:
     """K footprints of one foot; the first begins before the walk does, the last never ends."""
 
     place: Array  # (K, 2) m, east and north: the ball of the foot on the floor
@@ -92,7 +92,7 @@ class Cadence:
 def footsteps(
     along: Way, cadence: Cadence, start: float, walked: float, end: float, rng: np.random.Generator, *,
     side: float = 0.08, toe_out: float = 6.0, closed: bool = False,
-) -> Steps:  # fmt: skip
+) -> Footprints:  # fmt: skip
     """Footprints of a foot `side` m right of the way, which walks from `start` for `walked` s of a recording to `end`.
 
     It begins and ends with strides of some two thirds, standing beside the other foot; strides are shorter in
@@ -119,4 +119,6 @@ def footsteps(
         place[-1] = place[0]
         psi[-1] = psi[0] + along.heading[-1] - along.heading[0]
     onward = np.diff(psi, append=psi[-1])
-    return Steps(place, psi, psi + 0.33 * onward, np.concatenate([[0.0], lift + swing]), np.concatenate([lift, [end]]))
+    return Footprints(
+        place, psi, psi + 0.33 * onward, np.concatenate([[0.0], lift + swing]), np.concatenate([lift, [end]])
+    )

@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.special import logsumexp
 
 from graphnav.core.rotation import Array
-from graphnav.simulation.footsteps import Steps
+from graphnav.simulation.footsteps import Footprints
 from graphnav.simulation.splines import centres, spline
 
 STEP = 0.005  # s between coefficients: a shock lasts some 15 ms
@@ -108,7 +108,7 @@ _FLAT, _HEEL_OFF = 0.17, 0.58
 _ROLLING = ((_FLAT, 1.6), (0.38, -0.3), (_HEEL_OFF, -2.6), (0.74, -6.5), (0.88, -17.0))
 
 
-def walk(steps: Steps, style: Style, sole: Sole, end: float, rng: np.random.Generator) -> Foot:
+def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random.Generator) -> Foot:
     """The foot's motion from 0 to `end` s over its footprints.
 
     The first stance is rest until the heel lifts, the last is rest from the slap on.
@@ -163,7 +163,7 @@ def _smooth(t: Array, knots: list[Array], values: list[Array]) -> Array:
     return gaussian_filter1d(out, _MUSCLE / STEP, mode="nearest")
 
 
-def _pitch(t: Array, steps: Steps, begun: Array, ended: Array, style: Style, vary: Array) -> Array:
+def _pitch(t: Array, steps: Footprints, begun: Array, ended: Array, style: Style, vary: Array) -> Array:
     K, D = len(steps), ended - begun
     knots, values = [steps.strike[1:]], [style.strike_pitch * vary[1:, 3]]
     for share, value in _ROLLING:
@@ -181,7 +181,7 @@ def _pitch(t: Array, steps: Steps, begun: Array, ended: Array, style: Style, var
     return np.deg2rad(_smooth(t, knots, values))
 
 
-def _heading(t: Array, steps: Steps, begun: Array, style: Style, vary: Array) -> Array:
+def _heading(t: Array, steps: Footprints, begun: Array, style: Style, vary: Array) -> Array:
     """Turning on the floor with the heel's rising, the rest in the air with a little swing of the toes."""
     S = steps.strike[1:] - steps.off[:-1]
     D = steps.off - begun
@@ -193,7 +193,7 @@ def _heading(t: Array, steps: Steps, begun: Array, style: Style, vary: Array) ->
     return _smooth(t, knots, values)
 
 
-def _roll(t: Array, steps: Steps, begun: Array, style: Style, vary: Array) -> Array:
+def _roll(t: Array, steps: Footprints, begun: Array, style: Style, vary: Array) -> Array:
     """On the outer edge at the strike, level on the floor, inward at lift-off, outward in the air."""
     S = steps.strike[1:] - steps.off[:-1]
     D = steps.off - begun

@@ -51,7 +51,7 @@ class Mount:
 
 
 @dataclass(frozen=True)
-class Motion:
+class TrueMotion:
     """The IMU's true motion at N + 1 times and its N error-free samples, one for each period between them."""
 
     t: Array  # (N + 1,) s
@@ -135,7 +135,7 @@ def _level(felt: _Felt, lat: Array, h: Array) -> tuple[Array, Array, Array, Arra
     return V_l, rotation.mv(to_body, V_l), omega, rotation.mv(to_body, earth), rotation.mv(to_body, g_l)
 
 
-def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Shake, rate: float) -> Motion:
+def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Shake, rate: float) -> TrueMotion:
     """Drive `path` from `origin` (deg, deg, m; where the rear axle starts) with an IMU of `rate` Hz.
 
     Two hours at 200 Hz take some fifteen seconds.
@@ -169,7 +169,7 @@ def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Sh
     llh, v, R_lb = np.empty_like(axle), np.empty_like(axle), np.empty_like(R)
     for a in range(0, count + 1, _CHUNK):
         rows = slice(a, a + _CHUNK)
-        llh[rows], turn = _moved(axle[rows], arm[rows])
+        llh[rows], turn = _move(axle[rows], arm[rows])
         v[rows], R_lb[rows] = rotation.mv(turn, V[rows]), turn @ R[rows] @ R_vb
 
     def point(times: Array, lever_arm_b: Array) -> tuple[Array, Array]:
@@ -185,10 +185,10 @@ def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Sh
         V_l, _, omega, _, _ = _level(felt, place[:, 0], place[:, 2])
         lever = R_vb @ np.asarray(lever_arm_b, dtype=float)
         offset = rotation.mv(felt.R_base, felt.arm) + felt.R_lv @ lever
-        llh, turn = _moved(place, offset)
+        llh, turn = _move(place, offset)
         return llh, rotation.mv(turn, V_l + rotation.mv(felt.R_lv, np.cross(omega, lever)))
 
-    return Motion(t, llh, v, R_lb, omega_eb @ R_vb, gyro @ R_vb, accel @ R_vb, axle, point)
+    return TrueMotion(t, llh, v, R_lb, omega_eb @ R_vb, gyro @ R_vb, accel @ R_vb, axle, point)
 
 
 def _means(x: Array) -> Array:
@@ -211,7 +211,7 @@ def _travel(start: Array, v: Array, dt: float) -> Array:
     return llh[1:]
 
 
-def _moved(llh: Array, offset_l: Array) -> tuple[Array, Array]:
+def _move(llh: Array, offset_l: Array) -> tuple[Array, Array]:
     """Points moved by vectors in their local ENU: (llh (n, 3), new local ENU from the old (n, 3, 3))."""
     R_le = enu_axes(llh)
     moved = ecef_to_llh(llh_to_ecef(llh) + rotation.mv(np.swapaxes(R_le, -1, -2), offset_l))

@@ -122,13 +122,13 @@ def drive(
 
     turned = heading + np.cumsum([m.turn for m in manoeuvres])
     psi = np.deg2rad(along(list(turned), heading))
-    slope = np.arctan(along(_kept([m.grade for m in manoeuvres]), 0.0))
-    bank = np.deg2rad(along(_kept([m.bank for m in manoeuvres]), 0.0))
+    slope = np.arctan(along(_fill([m.grade for m in manoeuvres]), 0.0))
+    bank = np.deg2rad(along(_fill([m.bank for m in manoeuvres]), 0.0))
     slip = slip_per_accel * speed * np.gradient(psi, STEP)
     return Path(spline(start, STEP, np.column_stack([speed, psi, slope, bank, slip]), DEGREE), start, float(edges[-1]))
 
 
-def _kept(values: Sequence[float | None]) -> list[float]:
+def _fill(values: Sequence[float | None]) -> list[float]:
     """Values with None replaced by the one before, 0 at first."""
     out, last = [], 0.0
     for value in values:

@@ -10,7 +10,7 @@ from scipy import signal
 
 from graphnav.core.rotation import Array
 from graphnav.simulation.motion import Path
-from graphnav.simulation.vibration import UP, Part, oscillator, sampled, shake_times, swayed
+from graphnav.simulation.vibration import UP, Part, oscillator, sample_movement, shake_times, sway
 
 # What a passenger of 75 kg does to a car on its springs (100 kN/m in heave, some 40 kNm/rad in roll and 100 in
 # pitch; the seat 0.4 m to the side and 0.3 m from the middle): the static answer, m and rad.
@@ -63,9 +63,9 @@ def movement(
     swung = np.zeros_like(push)
     for k, (hz, damping) in enumerate(((1.4, 0.3), (1.6, 0.3), (1.8, 0.25))):
         swung[:, k] = signal.lfilter(*oscillator(hz, damping), push[:, k])
-    out = swayed(swung[:, 1], swung[:, 2], pivot_to_imu)
+    out = sway(swung[:, 1], swung[:, 2], pivot_to_imu)
     out[:, UP] += swung[:, 0]
-    return sampled(path, out)
+    return sample_movement(path, out)
 
 
 def _step(t: Array, at: float, width: float) -> Array:

@@ -25,7 +25,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Imu, Recording, Truth
 from graphnav.simulation.gait import HEADING, PITCH, PLACE, ROLL, STEP, Foot
 from graphnav.simulation.inertial import ImuModel
-from graphnav.simulation.kinematics import Motion
+from graphnav.simulation.kinematics import TrueMotion
 from graphnav.simulation.result import Simulated, rounded
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
@@ -54,7 +54,7 @@ def _felt(foot: Foot, R_fb: Array, t: Array) -> _Felt:
 
 def move_foot(
     foot: Foot, origin: tuple[float, float, float], R_fb: Array, rate: float, compensated: bool = False
-) -> Motion:
+) -> TrueMotion:
     """Walk from `origin` (deg, deg, m; the floor) with an IMU of `rate` Hz, turned by R_fb against the foot.
 
     Samples are means over their periods; `compensated` ones are the constant rate and force that lead to the same
@@ -99,7 +99,7 @@ def move_foot(
         return frame.to_llh(p), mv(frame.R_ln(p), felt.v + mv(felt.R_nb, np.cross(felt.omega, arm)))
 
     llh = frame.to_llh(ends.p)
-    return Motion(t, llh, mv(R_ln, ends.v), R_ln @ ends.R_nb, ends.omega, gyro, accel, llh, point)
+    return TrueMotion(t, llh, mv(R_ln, ends.v), R_ln @ ends.R_nb, ends.omega, gyro, accel, llh, point)
 
 
 def record_walk(

@@ -11,10 +11,10 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Imu, Recording, Truth
-from graphnav.recording.formats.writing import rounded, write_facts, write_folder
+from graphnav.recording.formats.writing import round_recording, write_facts, write_folder
 from graphnav.simulation.aiding import GnssModel, OdometerModel
 from graphnav.simulation.inertial import ImuModel
-from graphnav.simulation.kinematics import Motion, Mount, move
+from graphnav.simulation.kinematics import Mount, TrueMotion, move
 from graphnav.simulation.motion import Path
 from graphnav.simulation.vibration import Shake
 
@@ -27,7 +27,7 @@ class Simulated:
     truth: Trajectory  # of the IMU at the start and every sample, biases included (of the period that ends there)
     stops: Array  # (M, 2) s: the wheels do not turn
     facts: dict[str, Any] = field(default_factory=dict)  # what was put in, for JSON
-    motion: Motion | None = field(default=None, repr=False)  # with the error-free samples
+    motion: TrueMotion | None = field(default=None, repr=False)  # with the error-free samples
 
     def text(self) -> str:
         """One line for people."""
@@ -86,4 +86,4 @@ def record(
         motion.t, motion.llh, motion.v, rph, name="truth",
         gyro_bias=np.vstack([b_g[:1], b_g]), accel_bias=np.vstack([b_a[:1], b_a]),
     )  # fmt: skip
-    return Simulated(rounded(recording), truth, path.stops(), known, motion)
+    return Simulated(round_recording(recording), truth, path.stops(), known, motion)

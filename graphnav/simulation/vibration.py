@@ -53,11 +53,11 @@ class Sampled:
 
 
 def shake_times(path: Path) -> Array:
-    """The times (J,) at which `sampled` wants its movement."""
+    """The times (J,) at which `sample_movement` wants its movement."""
     return centres(path.start, path.end, STEP, DEGREE)
 
 
-def sampled(path: Path, movement: Array) -> Sampled:
+def sample_movement(path: Path, movement: Array) -> Sampled:
     """A part from the movement (J, 5) at `shake_times`."""
     value = spline(path.start, STEP, movement, DEGREE)
     return Sampled(value, value.derivative())
@@ -191,12 +191,12 @@ def road_noise(path: Path, rng: np.random.Generator, size: float = 1.0, modes: S
     swallows what is shorter than itself, which at 0.2 m/s is all of it.
     """
     v = np.abs(path.speed(shake_times(path)))
-    return sampled(path, _swing(modes, size * np.sqrt(v / 14.0) * v / (v + 2.0), rng))
+    return sample_movement(path, _swing(modes, size * np.sqrt(v / 14.0) * v / (v + 2.0), rng))
 
 
 def idle_floor(path: Path, rng: np.random.Generator, size: float = 1.0, modes: Sequence[Mode] = FLOOR) -> Part:
     """The coloured floor below 10 Hz of a body with a running engine."""
-    return sampled(path, _swing(modes, np.full(len(shake_times(path)), size), rng))
+    return sample_movement(path, _swing(modes, np.full(len(shake_times(path)), size), rng))
 
 
 def _swing(modes: Sequence[Mode], envelope: Array, rng: np.random.Generator) -> Array:
@@ -246,10 +246,10 @@ class Springs:
         pitch = signal.lfilter(b, a, np.deg2rad(self.pitch_per_accel) * dx[:, SPEED])
         # an acceleration to the right lowers the left side
         roll = signal.lfilter(b, a, -np.deg2rad(self.roll_per_accel) * x[:, SPEED] * dx[:, HEADING])
-        return sampled(path, swayed(pitch, roll, (0.0, 0.0, self.height)))
+        return sample_movement(path, sway(pitch, roll, (0.0, 0.0, self.height)))
 
 
-def swayed(pitch: Array, roll: Array, pivot_to_imu: tuple[float, float, float]) -> Array:
+def sway(pitch: Array, roll: Array, pivot_to_imu: tuple[float, float, float]) -> Array:
     """(J, 5): turns (J,) about a point of the body and the movement they give the IMU, first order."""
     right, forward, up = pivot_to_imu
     out = np.zeros((len(pitch), 5))

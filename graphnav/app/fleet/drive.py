@@ -22,9 +22,9 @@ from graphnav.app.stored import sha256
 from graphnav.app.workflow import Outcome, Request, parse_noise, parse_withheld, read_part, run_request
 from graphnav.config.files import settings_from
 from graphnav.core.errors import GraphnavError
-from graphnav.core.files import check_regular, outside_allowed, parse_json, read_text
+from graphnav.core.files import check_regular, parse_json, permit_outside, read_text
 from graphnav.core.jsonable import peak_memory_mb, write_json
-from graphnav.core.staging import staged
+from graphnav.core.staging import stage_results
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
@@ -46,12 +46,12 @@ def solve_drive(task: Task) -> Row:
     key = ""
     _forget_peak()
     try:
-        with outside_allowed(task.outside):
+        with permit_outside(task.outside):
             key = key_of(task)
-            if not task.again and (there := stored_row(folder, key)) is not None:
+            if not task.again and (there := read_row(folder, key)) is not None:
                 return {**there, "drive": task.name, "source": task.source, "skipped": True}
             outcome = run_request(_request(task))
-            with staged(folder) as part:
+            with stage_results(folder) as part:
                 outputs.write_run(outcome, part, task.pages)
             if not task.pages:
                 outputs.remove_pages(folder)
@@ -80,11 +80,11 @@ def lost_row(task: Task, status: str, error: str, seconds: float) -> Row:
 
 def keep_row(folder: Path, key: str, row: Mapping[str, Any]) -> None:
     """Write the row beside the drive's results; a folder that cannot be written to has no other place to say so."""
-    with suppress(GraphnavError), staged(folder) as part:
+    with suppress(GraphnavError), stage_results(folder) as part:
         write_json(part / NAME, {"key": key, "row": row})
 
 
-def stored_row(folder: Path, key: str | None = None) -> Row | None:
+def read_row(folder: Path, key: str | None = None) -> Row | None:
     """The row of a drive that was done before with the same key; with any, if `key` is None."""
     try:
         values = parse_json(read_text(folder / NAME))
@@ -178,7 +178,7 @@ def _figures(outcome: Outcome) -> Row:
         "keyframes": len(solution.t),
         "against": outcome.against,
         **{key: measured.get(key) for key in MEASURED},
-        **{key: _short(value) for key, value in outputs.stated(solution).items()},
+        **{key: _short(value) for key, value in outputs.median_sigmas(solution).items()},
         "spans": len(ends),
         "span_end_h_median_m": _short(float(np.median(ends))) if ends else None,
         "span_end_h_max_m": max(ends, default=None),

@@ -220,7 +220,7 @@ def _drive(source: Path, where: str, row: Mapping[str, Any], asked: Asked) -> tu
             except (TypeError, ValueError):
                 raise ConfigError(f"{where}, '{key}': {value!r} is not a number of seconds") from None
         elif key == "settings" and isinstance(value, Mapping):
-            said[key] = _written(value)
+            said[key] = _write(value)
         elif key == "without" and isinstance(value, list):
             said[key] = " ".join(map(str, value))
         elif isinstance(value, str):
@@ -261,15 +261,13 @@ def _toml(text: str) -> dict[str, Any]:
         raise ConfigError(f"settings {text!r}: {error}; write key = value, with semicolons between") from None
 
 
-def _written(values: Mapping[str, Any], at: str = "") -> str:
+def _write(values: Mapping[str, Any], at: str = "") -> str:
     """A table of settings as lines of dotted keys."""
     from graphnav.config.files import toml_value
 
     lines = []
     for key, value in values.items():
-        lines.append(
-            _written(value, f"{at}{key}.") if isinstance(value, Mapping) else f"{at}{key} = {toml_value(value)}"
-        )
+        lines.append(_write(value, f"{at}{key}.") if isinstance(value, Mapping) else f"{at}{key} = {toml_value(value)}")
     return "\n".join(lines)
 
 

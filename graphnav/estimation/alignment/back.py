@@ -18,7 +18,7 @@ from graphnav.recording import Imu, Recording
 _BASE = 5.0  # s between fixes that tell the first velocity
 
 
-def carried_back(
+def carry_back(
     recording: Recording,
     settings: Settings,
     solution: Solution,

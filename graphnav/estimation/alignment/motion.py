@@ -15,11 +15,11 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.detectors.base import NONE, inside
-from graphnav.estimation.alignment.back import carried_back
+from graphnav.estimation.alignment.back import carry_back
 from graphnav.estimation.alignment.course import COURSE_SIGMA, with_course
 from graphnav.estimation.alignment.first import Alignment, level, some
-from graphnav.estimation.alignment.travel import across, travel, turned
-from graphnav.estimation.problem import Problem, pose
+from graphnav.estimation.alignment.travel import across, integrate_yaw, travel
+from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.imu.preintegration import prefix
 from graphnav.imu.samples import bridge_gaps
@@ -63,12 +63,12 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
     used = (gnss.t >= recording.start) & (gnss.t <= recording.end)
     if np.count_nonzero(used) < _FEWEST:
         return None
-    gnss = _thinned(gnss, recording.start, recording.end)
+    gnss = _thin(gnss, recording.start, recording.end)
     if len(gnss.t) < _FEWEST:
         return None
     t, p = gnss.t, LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
     if recording.platform == "vehicle":
-        yaw, still = turned(recording.imu, t, _usual_rate(recording.imu)), inside(t, stationary)
+        yaw, still = integrate_yaw(recording.imu, t, _usual_rate(recording.imu)), inside(t, stationary)
     else:  # a foot turns about every axis
         yaw, still = np.zeros(len(t)), np.zeros(len(t), dtype=bool)
     sd = across(gnss.sd)
@@ -96,7 +96,7 @@ def in_motion(
     begin, end = max(span[0], recording.start), span[1]
     part = replace(
         recording.crop(begin - recording.start, end - recording.start),
-        gnss=_thinned(gnss, begin, end),
+        gnss=_thin(gnss, begin, end),
     )
     bias = _usual_rate(imu)
     rp = level(recording, begin)
@@ -124,7 +124,7 @@ def in_motion(
         f"{np.degrees(own[:2].max()):.2g} deg, heading to {np.degrees(own[2]):.2g} deg",
         *said,
     )
-    return carried_back(recording, settings, best, R, wide, own, begin, notes)
+    return carry_back(recording, settings, best, R, wide, own, begin, notes)
 
 
 def _heading_of_accelerations(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> float:
@@ -153,7 +153,7 @@ def _usual_rate(imu: Imu) -> Array:
     return np.clip(np.median(imu.gyro, axis=0), -limit, limit)
 
 
-def _thinned(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
+def _thin(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
     """Fixes of a span at most about one a second: enough to align, and quick."""
     inside = np.flatnonzero((gnss.t >= begin) & (gnss.t <= end))
     keep, last = [], -np.inf
@@ -183,7 +183,7 @@ def _try(part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoothe
     # one bad fix or a burst must not decide the heading
     robust = settings.gnss.model_copy(update={"robust": "cauchy", "lever_arm_sigma": None, "time_offset_sigma": 0.0})
     # what the wheels say of the heading is brought in by `_with_course`
-    problem = pose(part, settings.without_wheels().model_copy(update={"gnss": robust}), frame, start, sigma)
+    problem = build_problem(part, settings.without_wheels().model_copy(update={"gnss": robust}), frame, start, sigma)
     dR, _, _ = prefix(problem.samples, problem.t[0], problem.t[1:], np.zeros(3), bias)
     t = problem.t
     p = np.stack([np.interp(t, gnss.t, fixes[:, k]) for k in range(3)], -1)

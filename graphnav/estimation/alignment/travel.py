@@ -71,7 +71,7 @@ def across(sd: Array) -> Array:
     return np.sqrt(np.mean(sd[:, :2] ** 2, axis=1))
 
 
-def turned(imu: Imu, t: Array, bias: Array) -> Array:
+def integrate_yaw(imu: Imu, t: Array, bias: Array) -> Array:
     """(N,) rad, what the body has turned about up since the first of the times `t`, counter-clockwise, by the gyro.
 
     Up is the mean specific force from each time to the next: what a vehicle accelerates by leans it by a few degrees,

@@ -12,7 +12,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.problem import Problem
-from graphnav.imu.dynamics import Motion
+from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import NOISE_FIGURES
 
 
@@ -33,7 +33,7 @@ def with_noise(problem: Problem, noise: NoiseModel) -> Problem:
         problem = replace(
             problem,
             intervals=intervals,
-            motion=Motion(intervals, problem.frame),
+            motion=ImuFactors(intervals, problem.frame),
             imu_noise=replace(problem.imu_noise, **figures),
         )
     return replace(
@@ -62,13 +62,13 @@ def _rows(problem: Problem, rows: Constraint, noise: NoiseModel) -> Constraint:
     names, index = rows.noise_groups()
     if names:
         root = np.sqrt([noise.factor(name, 1.0) for name in names])
-        changed["sigma"] = _scaled(rows, np.where(index >= 0, root[index], 1.0))
+        changed["sigma"] = _scale_sigma(rows, np.where(index >= 0, root[index], 1.0))
     if rows.name in noise.weights or rows.name in noise.excluded:
         changed["weight"] = row_weights(problem.t[rows.keyframe], noise, rows.name)
     return replace(rows, **changed)
 
 
-def _scaled(rows: Constraint, root: Array) -> Array:
+def _scale_sigma(rows: Constraint, root: Array) -> Array:
     """(N, m) sigmas times the roots of variance factors, but for the part that has none."""
     sigma: Array = rows.sigma  # type: ignore[attr-defined]
     if rows.unscaled is None:
@@ -105,4 +105,4 @@ def without_parts(problem: Problem) -> Problem:
     """The same without what each noise figure contributes, which takes room and nobody asks for any more."""
     n, _, *size = problem.intervals.parts.shape
     intervals = replace(problem.intervals, parts=np.empty((n, 0, *size)))
-    return replace(problem, intervals=intervals, motion=Motion(intervals, problem.frame))
+    return replace(problem, intervals=intervals, motion=ImuFactors(intervals, problem.frame))

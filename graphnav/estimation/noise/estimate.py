@@ -34,7 +34,7 @@ from graphnav.estimation.noise.priors import TIME_WITHIN, prior
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import Forward, Smoothed, points_of, values_of
+from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, points_of, values_of
 from graphnav.estimation.solvers.rts import backward
 from graphnav.imu.preintegration import NOISE_FIGURES
 
@@ -52,8 +52,8 @@ class NoiseEstimate:
     """A noise model, the points its last pass left, and how it came about."""
 
     noise: NoiseModel
-    points: Smoothed
-    forward: Forward
+    points: SmootherPass
+    forward: ForwardRecord
     log_posterior: float
     log_prior: float
     passes: int  # of filter and smoother
@@ -135,7 +135,7 @@ def estimate_noise(
     about = (
         _first_points(problem, figures, opening)
         if near is None
-        else _carried(*near, with_noise(problem, figures.model()))
+        else _carry(*near, with_noise(problem, figures.model()))
     )
     passes, total = int(near is None), len(problem.t)
     warm = start is not None and bool(start.figures)
@@ -153,7 +153,7 @@ def estimate_noise(
             if progress is not None:
                 progress("noise", (k + 1) / rounds)
             _improve(figures, used, forward, smoothed, end)
-            about = _spliced(about, smoothed)
+            about = _splice(about, smoothed)
             # a tenth of what chance makes as many figures gain
             if k > 1 and abs(now - before) < 0.05 * len(figures.log):
                 break
@@ -180,11 +180,11 @@ def _first_points(problem: Problem, figures: _Figures, opening: float | None) ->
     return backward(used, ekf(used, opening=opening))
 
 
-def _carried(points: Points, before: Problem, after: Problem) -> Points:
+def _carry(points: Points, before: Problem, after: Problem) -> Points:
     return points_of(after, points.states, values_of(before, points))
 
 
-def _spliced(about: Points, part: Points) -> Points:
+def _splice(about: Points, part: Points) -> Points:
     """Points with the first of them replaced."""
     n = len(part.values)
     if n == len(about.values):
@@ -193,12 +193,12 @@ def _spliced(about: Points, part: Points) -> Points:
     return Points(states, np.concatenate([part.values, about.values[n:]]))
 
 
-def _pass(problem: Problem, about: Points, end: int) -> tuple[Forward, Smoothed]:
+def _pass(problem: Problem, about: Points, end: int) -> tuple[ForwardRecord, SmootherPass]:
     forward = refilter(problem, about.first(end))
     return forward, backward(problem, forward)
 
 
-def _capped(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, float]:
+def _cap(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, float]:
     """Sums of squares and of redundancies; no square counts for more than chance allows, made up for in the mean.
 
     For z^2 chi-square with m degrees of freedom and the limit q, E[min(z^2, q)] = m P(chi2_m+2 < q) + q P(chi2_m > q).
@@ -208,11 +208,11 @@ def _capped(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, flo
     return float(np.sum(np.minimum(A, most / freedom * B))) * freedom / mean, float(np.sum(B))
 
 
-def _improve(figures: _Figures, problem: Problem, forward: Forward, smoothed: Smoothed, end: int) -> None:
+def _improve(figures: _Figures, problem: Problem, forward: ForwardRecord, smoothed: SmootherPass, end: int) -> None:
     """One step for all figures and weights."""
     A, B = imu_moments(problem, forward, smoothed)
     for i, name in enumerate(NOISE_FIGURES):
-        figures.update(f"imu.{name}", *_capped(A[:, i], B[:, i], 3, _CHANCE))
+        figures.update(f"imu.{name}", *_cap(A[:, i], B[:, i], 3, _CHANCE))
     driven: dict[str, tuple[Array, Array, Array]] = {}
     for chain in problem.chains:
         if chain.parameter.noise_groups:
@@ -229,7 +229,7 @@ def _improve(figures: _Figures, problem: Problem, forward: Forward, smoothed: Sm
         for i, name in enumerate(names):
             own = index[:n] == i
             if own.any():
-                figures.update(name, *_capped(found.A[own], found.B[own], 1, _USUAL))
+                figures.update(name, *_cap(found.A[own], found.B[own], 1, _USUAL))
         _weigh(figures, problem, rows, np.maximum(found.left_out.sum(axis=1), found.whole.sum(axis=1)), n)
 
 
@@ -238,7 +238,7 @@ def _improve_process(figures: _Figures, chain: ParameterChain, moments: tuple[Ar
     groups = np.array(chain.parameter.noise_groups)
     for group in dict.fromkeys(chain.parameter.noise_groups):
         own = groups == group
-        figures.update(group, *_capped(A[:, own], B[:, own], 1, _USUAL))
+        figures.update(group, *_cap(A[:, own], B[:, own], 1, _USUAL))
 
 
 def _improve_time(figures: _Figures, chain: ParameterChain, lags: tuple[Array, ...]) -> None:

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME, Constraint, Linearized, Scene
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.estimation import faults
@@ -35,7 +35,7 @@ from graphnav.estimation.noise.apply import row_weights, with_noise
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.model import NoiseModel, RowWeights
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solution import Fault
+from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import points_of, values_of
@@ -71,7 +71,7 @@ class _Shifted(Constraint):
         return np.empty(0)
 
     @classmethod
-    def build(cls, scene: Scene) -> None:
+    def build(cls, scene: BuildContext) -> None:
         return None
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -173,7 +173,7 @@ def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[t
     open_ = with_noise(base, replace(noise, weights={k: w for k, w in noise.weights.items() if k not in FIXES}))
     known = values_of(with_noise(base, found.noise), found.points)
     watched = refilter(open_, points_of(open_, found.points.states, known), watch=True)
-    return join_spans(faults.spans(faults.weighted(open_, watched.weights)))
+    return join_spans(faults.fault_spans(faults.weigh_rows(open_, watched.weights)))
 
 
 def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]) -> Explained:
@@ -204,7 +204,7 @@ def _outside(some: RowWeights, spans: list[tuple[float, float]]) -> RowWeights:
     return RowWeights(some.t[keep], some.weight[keep])
 
 
-def share_left_out(problem: Problem, noise: NoiseModel) -> float:
+def excluded_share(problem: Problem, noise: NoiseModel) -> float:
     """Share of the information of the positions that a noise model leaves out."""
     rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
     return 0.0 if rows is None else 1.0 - float(np.mean(row_weights(problem.t[rows.keyframe], noise, rows.name)))
@@ -234,7 +234,7 @@ def evidence(problem: Problem, about: Points, spans: list[tuple[float, float]]) 
     return before, np.array(found).T
 
 
-def join_spans(found: tuple[Fault, ...]) -> list[tuple[float, float]]:
+def join_spans(found: tuple[ExcludedSpan, ...]) -> list[tuple[float, float]]:
     """Spans (s) of some faults, those that touch in one; a single fix is no span, its weight says what it is worth."""
     out: list[tuple[float, float]] = []
     for a, b in sorted((fault.t_start, fault.t_end) for fault in found if fault.count > 1):

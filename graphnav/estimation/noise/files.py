@@ -26,7 +26,7 @@ from typing import Any, get_args
 import numpy as np
 
 from graphnav.config.settings import NoiseSettings
-from graphnav.constraints import registered
+from graphnav.constraints import list_constraints
 from graphnav.constraints.gnss import ERRORS, OFFSETS, STAMP_ERROR, STAMPS, TIMES, VELOCITY_ERROR
 from graphnav.constraints.raw_gnss import CODE_ERRORS, RATE_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
@@ -108,7 +108,7 @@ def read_noise_and_mode(path: str | Path) -> tuple[NoiseModel, str]:
 def known_groups() -> tuple[str, ...]:
     """Names of all variance components that a recording can have."""
     out = [*(f"imu.{name}" for name in NOISE_FIGURES), STAMPS, *OFFSETS]
-    for cls in registered():
+    for cls in list_constraints():
         axes = dict.fromkeys(cls.noise_axes)
         kinds = ["", *(f".{kind}" for kind in FIX_TYPES.values())] if cls.name == "gnss_position" else [""]
         out += [
@@ -136,7 +136,7 @@ class _Reader:
         mode = values.get("mode", "estimated")
         if mode not in MODES:
             raise self.error("noise.mode", mode, f"must be one of {', '.join(MODES)}")
-        constraints = [cls.name for cls in registered()]
+        constraints = [cls.name for cls in list_constraints()]
         return NoiseModel(
             self.each(values, "figures", known_groups(), self.figure),
             self.each(values, "correlation_times", _known_processes(), self.time),

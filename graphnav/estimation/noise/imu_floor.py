@@ -33,7 +33,7 @@ _WORDS = {"gyro_noise_density": "gyro", "accel_noise_density": "accelerometer"}
 _UNITS = {"gyro_noise_density": "rad/s/sqrt(Hz)", "accel_noise_density": "m/s^2/sqrt(Hz)"}
 
 
-def with_own_noise(recording: Recording, settings: Settings) -> tuple[Recording, tuple[str, ...]]:
+def with_measured_floor(recording: Recording, settings: Settings) -> tuple[Recording, tuple[str, ...]]:
     """A walk with noise densities no larger than its quietest stretch shows, and a sentence on those lowered.
 
     Other recordings, and figures to be taken as stated, are as they were.

@@ -25,7 +25,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import linearise
-from graphnav.estimation.solvers.passes import Forward, Smoothed, values_of
+from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, values_of
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class RowMoments:
     whole: Array  # (N, m) squared whole error, what lasts included, against its steady variance
 
 
-def imu_moments(problem: Problem, forward: Forward, smoothed: Smoothed) -> tuple[Array, Array]:
+def imu_moments(problem: Problem, forward: ForwardRecord, smoothed: SmootherPass) -> tuple[Array, Array]:
     """A and B (K-1, 4) of `NOISE_FIGURES`, by interval."""
     start = forward.predicted_from.R_nb
     L = problem.motion.frames(slice(0, len(start)), start)
@@ -51,7 +51,7 @@ def imu_moments(problem: Problem, forward: Forward, smoothed: Smoothed) -> tuple
 
 
 def process_moments(
-    problem: Problem, chain: ParameterChain, smoothed: Smoothed, end: int
+    problem: Problem, chain: ParameterChain, smoothed: SmootherPass, end: int
 ) -> tuple[Array, Array, Array]:
     """Keyframes (n,) at which a process is driven, and A and B (n, k) there; the first is its steady variance."""
     at = problem.columns[chain.parameter.name]
@@ -61,7 +61,7 @@ def process_moments(
     return k, q * smoothed.r[k, at] ** 2, q * np.maximum(N, 0.0)
 
 
-def row_moments(problem: Problem, rows: Constraint, smoothed: Smoothed, n: int) -> RowMoments:
+def row_moments(problem: Problem, rows: Constraint, smoothed: SmootherPass, n: int) -> RowMoments:
     """Of the first n rows of a constraint."""
     at, which = rows.keyframe[:n], slice(0, n)
     values = values_of(problem, smoothed)
@@ -85,7 +85,7 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: Smoothed, n: int) 
 
 
 def lag_moments(
-    problem: Problem, chain: ParameterChain, forward: Forward, smoothed: Smoothed, end: int
+    problem: Problem, chain: ParameterChain, forward: ForwardRecord, smoothed: SmootherPass, end: int
 ) -> tuple[Array, Array, Array, Array]:
     """Of a process, from node to node: times between (n,), E[c' c'], E[c' c] and E[c c] (n, k), c' the later."""
     at = problem.columns[chain.parameter.name]

@@ -25,9 +25,18 @@ from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.estimation.solvers.graph import Eliminated, LinearGraph
-from graphnav.estimation.solvers.passes import Progress, integrated_again, residual_record
+from graphnav.estimation.solvers.passes import Progress, integrate_again, residual_record
 from graphnav.estimation.solvers.robust import REDESCENDING
-from graphnav.estimation.solvers.rows import Layout, Point, Rows, Values, column_norms, cost, promised, whitened
+from graphnav.estimation.solvers.rows import (
+    Iterate,
+    Layout,
+    Rows,
+    Values,
+    column_norms,
+    cost,
+    predicted_decrease,
+    whiten,
+)
 
 _GRADUATION = 1.4  # by which mu grows from step to step
 _SHARP = 100.0  # mu from which on the kernel bends within half a per cent of its scale
@@ -49,7 +58,7 @@ def batch(
     """
     began = time.perf_counter()
     values = {c.parameter.name: c.mean for c in problem.chains} | (values or {})
-    point, notes = Point(start, values), []
+    point, notes = Iterate(start, values), []
     if any(c.robust in REDESCENDING and c.robust != "gnc" for c in problem.constraints):
         # such a kernel gives up on whatever is far from the start; Cauchy's never quite does, and leads there
         rows = (replace(c, robust="cauchy") if c.robust in REDESCENDING else c for c in problem.constraints)
@@ -93,7 +102,7 @@ def batch(
 @dataclass(frozen=True)
 class _Minimum:
     problem: Problem  # with intervals integrated about the final biases
-    point: Point
+    point: Iterate
     layout: Layout
     eliminated: Eliminated | None  # undamped, at the point; None where the iterations were limited
     cost: float
@@ -102,7 +111,7 @@ class _Minimum:
     notes: tuple[str, ...]
 
 
-def _graduated(problem: Problem, point: Point) -> Iterator[Problem]:
+def _graduated(problem: Problem, point: Iterate) -> Iterator[Problem]:
     """The problem with its "gnc" kernels convex at first and then ever less so, for a step each."""
     mu: dict[str, float] = {}
     points = point.points(problem)
@@ -118,14 +127,14 @@ def _graduated(problem: Problem, point: Point) -> Iterator[Problem]:
 
 
 def _minimise(
-    problem: Problem, point: Point, progress: Progress | None, reintegrate: bool, iterations: int | None = None
+    problem: Problem, point: Iterate, progress: Progress | None, reintegrate: bool, iterations: int | None = None
 ) -> _Minimum:
     settings = problem.settings.solver
     if iterations is not None:
         settings = settings.model_copy(update={"max_iterations": iterations})
     renewed = refused = 0
     if reintegrate:
-        problem, renewed = integrated_again(problem, point.states, point.scale)
+        problem, renewed = integrate_again(problem, point.states, point.scale)
     layout = Layout(problem)
     now = cost(problem, point, layout)
     damping, gentlest = 0.0, _MIN_DAMPING
@@ -136,11 +145,11 @@ def _minimise(
         iteration += 1
         if progress is not None:
             progress("batch", iteration / settings.max_iterations)
-        rows = whitened(problem, point, layout)
+        rows = whiten(problem, point, layout)
         while True:
             eliminated = _eliminate(rows, layout, damping)
             step = layout.unpack(eliminated.solve(layout.keys))
-            gain = promised(rows, layout, step)
+            gain = predicted_decrease(rows, layout, step)
             candidate = point.moved(step)
             ahead = cost(problem, candidate, layout)
             if ahead < now or gain < settings.tolerance:
@@ -148,7 +157,7 @@ def _minimise(
             if damping == 0.0:
                 # an early heading swings all that comes after it along tangents, off the track by the square of
                 # the angle; the step after this one takes that back, and only then is it seen what both bring
-                second = layout.unpack(_eliminate(whitened(problem, candidate, layout), layout, 0.0).solve(layout.keys))
+                second = layout.unpack(_eliminate(whiten(problem, candidate, layout), layout, 0.0).solve(layout.keys))
                 beyond = candidate.moved(second)
                 behind = cost(problem, beyond, layout)
                 if behind < now:
@@ -174,13 +183,13 @@ def _minimise(
             gentlest /= 10.0  # more would have been possible: a long valley is not crept along
         damping = 0.0 if damping <= _MIN_DAMPING or gain < settings.tolerance else damping / 10.0
         if reintegrate:
-            problem, again = integrated_again(problem, point.states, point.scale)
+            problem, again = integrate_again(problem, point.states, point.scale)
             if again:
                 layout = Layout(problem)
                 now = cost(problem, point, layout)
                 renewed += again
     if eliminated is None and iterations is None:
-        eliminated = _eliminate(whitened(problem, point, layout), layout, 0.0)
+        eliminated = _eliminate(whiten(problem, point, layout), layout, 0.0)
     notes = []
     if refused:
         stopped += f" ({refused} steps taken back and damped)"
@@ -202,7 +211,7 @@ def _eliminate(rows: Rows, layout: Layout, damping: float) -> Eliminated:
 
 
 def _estimates(
-    problem: Problem, layout: Layout, point: Point, covariances: dict[int, Array]
+    problem: Problem, layout: Layout, point: Iterate, covariances: dict[int, Array]
 ) -> dict[str, ParameterEstimate]:
     out = {}
     for chain in problem.chains:

@@ -39,18 +39,18 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.linearise import Points, scale_at
 from graphnav.estimation.solvers.passes import (
-    Filtered,
-    Forward,
+    FilterPass,
+    ForwardRecord,
     Gain,
     Progress,
-    joined,
-    moved,
+    join_passes,
+    move_points,
     parameters_of,
 )
-from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate, about_own
-from graphnav.estimation.solvers.robust import PASSES, softened, weight_and_cost
+from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate, move_covariance
+from graphnav.estimation.solvers.robust import PASSES, soften, weight_and_cost
 from graphnav.estimation.solvers.rts import backward
-from graphnav.estimation.solvers.stack import Innovations, Stack, Together
+from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
 from graphnav.estimation.solvers.watch import Bank, Verdicts
 
 _NONE = 1e-12  # weight of a row that is not used beside others of its keyframe
@@ -63,7 +63,7 @@ def ekf(
     opening: float | None = None,
     watch: bool = False,
     known: Points | None = None,
-) -> Filtered:
+) -> FilterPass:
     """Run the filter over all keyframes.
 
     Parameters
@@ -83,7 +83,7 @@ def ekf(
     if about is not None:
         n = len(about.values) - 1
         P = P.copy()
-        P[:n] = about_own(P[:n], one.errors[:n])
+        P[:n] = move_covariance(P[:n], one.errors[:n])
     solution = Solution(
         solver="ekf",
         frame=problem.frame,
@@ -99,10 +99,10 @@ def ekf(
         notes=problem.notes,
         between=(dense(problem, filtered, P, scale_at(problem.columns, one.values), smooth=False),),
     )
-    return Filtered(**vars(one), solution=solution)
+    return FilterPass(**vars(one), solution=solution)
 
 
-def refilter(problem: Problem, about: Points, progress: Progress | None = None, watch: bool = False) -> Forward:
+def refilter(problem: Problem, about: Points, progress: Progress | None = None, watch: bool = False) -> ForwardRecord:
     """Run the filter over the first keyframes, linearised at given points; several times as fast as `ekf`.
 
     Parameters
@@ -119,7 +119,7 @@ def _forward(
     about: Points | None = None,
     progress: Progress | None = None,
     watch: bool = False,
-) -> Forward:
+) -> ForwardRecord:
     """Filter the first K keyframes, of which the first n are linearised at given points."""
     n = 0 if about is None else len(about.values)
     D = DIM + sum(c.parameter.size for c in problem.chains)
@@ -193,13 +193,13 @@ def _forward(
             progress("filter", k / K)
         k += 1
         if about is not None and k == n:  # from here on linearised where the filter is
-            all_P[k - 1] = P = about_own(P, x[:3])
+            all_P[k - 1] = P = move_covariance(P, x[:3])
             x = own.plus(_one(about, k - 1), x)
     stack.finish()
     weights = {c.name: records[c.name].decided for c in fixes}
     errors, errors_ahead = np.array(found[:n]).reshape(n, D), np.array(ahead[:n]).reshape(n, D)
     filtered, predicted = _points(about, errors, found[n:]), _points(about, errors_ahead, ahead[n:])
-    return Forward(
+    return ForwardRecord(
         filtered.states,
         filtered.values,
         all_P,
@@ -236,14 +236,14 @@ def _one(points: Points, k: int) -> Estimate:
 
 def _points(about: Points | None, errors: Array, own: list[Estimate]) -> Points:
     """Errors about given points, and the estimates that follow, as points."""
-    parts = [] if about is None else [moved(about, errors)]
+    parts = [] if about is None else [move_points(about, errors)]
     if own:
         parts.append(Points(States.stack([one.state for one in own]), np.array([one.values for one in own])))
-    return joined(parts)
+    return join_passes(parts)
 
 
 def _update(
-    some: Together, x: Any, P: Array, where: Any, stack: Stack, bank: Bank | None, taken: list[Gain] | None
+    some: RowBlock, x: Any, P: Array, where: Any, stack: Stack, bank: Bank | None, taken: list[Gain] | None
 ) -> tuple[Any, Array, float | None]:
     """One measurement update, added to what the keyframe has taken in; when a fault began comes last."""
     D, (rows, lo, hi) = len(P), some.parts[0]
@@ -306,7 +306,7 @@ def _weights(record: Innovations, lo: int, hi: int) -> tuple[float, float | Arra
     return weight, np.repeat(np.sqrt(np.maximum(used, _NONE)), len(record.rows.axes))
 
 
-def _solve(HPHt: Array, sigma: Array, right: Array, some: Together) -> tuple[Array, Array]:
+def _solve(HPHt: Array, sigma: Array, right: Array, some: RowBlock) -> tuple[Array, Array]:
     """The upper root of S = H P H^T + R, and S^-1 times the right sides."""
     S = HPHt.copy()
     S.flat[:: len(S) + 1] += sigma * sigma
@@ -318,7 +318,7 @@ def _solve(HPHt: Array, sigma: Array, right: Array, some: Together) -> tuple[Arr
     return root, solved
 
 
-def _robust(HPHt: Array, sigma: Array, right: Array, solved: Array, some: Together) -> tuple[Array, Array, float]:
+def _robust(HPHt: Array, sigma: Array, right: Array, solved: Array, some: RowBlock) -> tuple[Array, Array, float]:
     """Sigmas with a kernel's weights in them, S^-1 times the right sides with these, and the least weight.
 
     As the incremental smoother does with a new keyframe: none at first, then by what the update leaves, a few times.
@@ -328,7 +328,7 @@ def _robust(HPHt: Array, sigma: Array, right: Array, solved: Array, some: Togeth
     for _ in range(PASSES - 1):
         left = (right[:, 0] - HPHt @ solved[:, 0]) / stated
         s = np.linalg.norm(left.reshape(hi - lo, -1), axis=1)
-        weight = np.maximum(weight_and_cost(softened(rows.robust), s, rows.scale_of(slice(lo, hi)))[0], 1e-12)
+        weight = np.maximum(weight_and_cost(soften(rows.robust), s, rows.scale_of(slice(lo, hi)))[0], 1e-12)
         sigma = stated / np.repeat(np.sqrt(weight), len(stated) // (hi - lo))
         _, solved = _solve(HPHt, sigma, right, some)
     return sigma, solved, float(np.min(weight))

@@ -21,7 +21,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.robust import PASSES
-from graphnav.estimation.solvers.stages import Columns, Measured, Message, Place, Stage, turned, width
+from graphnav.estimation.solvers.stages import Columns, Measured, Message, Place, Stage, rotate_columns, width
 from graphnav.estimation.solvers.watch import Watch
 
 _BLOCK = 8  # reflectors that tpqrt applies at once
@@ -125,7 +125,7 @@ def predict(
     g[DIM:] = values[: D0 - DIM] - before.values
     G[lost], g[lost] = -root @ R[:E, E : E + D], root @ R[:E, E + D]
     if np.any(apart):
-        G[:DIM] = turned(G[:DIM], rotation.right_jacobian_inverse(apart[None, :3])[0])
+        G[:DIM] = rotate_columns(G[:DIM], rotation.right_jacobian_inverse(apart[None, :3])[0])
         g[:DIM] += apart
     return Predicted(before, place, state, values, columns, link, top, G, g, lost, root @ root.T, tuple(rows))
 

@@ -21,7 +21,7 @@ from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import Progress, residual_record
 from graphnav.estimation.solvers.rows import cost_at
 from graphnav.estimation.solvers.stages import Place, Step
-from graphnav.estimation.solvers.window import Smoothed, Window, first_message, turn_limit
+from graphnav.estimation.solvers.window import SettledStates, Window, first_message, turn_limit
 from graphnav.imu.dynamics import SCALE
 
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
@@ -40,7 +40,7 @@ class Incremental:
 
     window: Window
     lag: float = 120.0
-    settled: list[Smoothed] = field(default_factory=list)  # whoever reads them may clear them
+    settled: list[SettledStates] = field(default_factory=list)  # whoever reads them may clear them
 
     def add(self, place: Place) -> None:
         """Take in one more keyframe."""
@@ -66,7 +66,7 @@ class Incremental:
 
 
 @dataclass(frozen=True)
-class Replayed:
+class Replay:
     """A whole problem solved incrementally: what settled, what was known live, and what each keyframe took."""
 
     settled: Solution
@@ -79,7 +79,7 @@ def incremental(
     lag: float = 120.0,
     progress: Progress | None = None,
     start: States | None = None,
-) -> Replayed:
+) -> Replay:
     """Solve a problem keyframe by keyframe.
 
     Parameters
@@ -110,22 +110,22 @@ def incremental(
     solver.finish()
     spent = time.perf_counter() - began
     live_states, values = States.stack(live), np.array(live_values)
-    found = replayed(problem, "incremental", solver.settled, live_states, live_P, values, seconds, spent, lag)
+    found = replay(problem, "incremental", solver.settled, live_states, live_P, values, seconds, spent, lag)
     notes = (*found.settled.notes, f"{solver.window.relinearized} were linearised again")
     return replace(found, settled=replace(found.settled, notes=notes))
 
 
-def replayed(
+def replay(
     problem: Problem,
     solver: str,
-    parts: list[Smoothed],
+    parts: list[SettledStates],
     live: States,
     live_P: Array,
     live_values: Array,
     seconds: Array,
     spent: float,
     lag: float,
-) -> Replayed:
+) -> Replay:
     """What an incremental solver has found, as solutions.
 
     Parameters
@@ -158,7 +158,7 @@ def replayed(
         cost=cost_at(problem, points),
         stopped=f"every keyframe settled with {whole}",
         timings={solver: spent},
-        notes=(*problem.notes, said(seconds) if np.isinf(lag) else f"lag {lag:g} s: {said(seconds)}"),
+        notes=(*problem.notes, describe(seconds) if np.isinf(lag) else f"lag {lag:g} s: {describe(seconds)}"),
         between=(dense(problem, states, covariance, _scale(at, values), smooth=True),),
     )
     now = replace(
@@ -171,7 +171,7 @@ def replayed(
         stopped="each keyframe as it was known when it came",
         between=(dense(problem, live, live_P, _scale(at, live_values), smooth=False),),
     )
-    return Replayed(settled, now, seconds)
+    return Replay(settled, now, seconds)
 
 
 def node_steps(problem: Problem) -> dict[int, tuple[Step, ...]]:
@@ -211,7 +211,7 @@ def _parameters(problem: Problem, at: dict[str, slice], values: Array, sigma: Ar
     return out
 
 
-def said(seconds: Array) -> str:
+def describe(seconds: Array) -> str:
     """What a keyframe took, in words."""
     middle, high, most = 1e3 * np.quantile(seconds, [0.5, 0.99, 1.0])
     return f"a keyframe took {middle:.1f} ms (median), {high:.1f} ms (99 %), {most:.0f} ms (most)"

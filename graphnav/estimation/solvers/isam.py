@@ -13,12 +13,12 @@ import numpy as np
 
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.incremental import Replayed, node_steps, replayed
+from graphnav.estimation.solvers.incremental import Replay, node_steps, replay
 from graphnav.estimation.solvers.passes import Progress
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import newest_covariance, smoothed
-from graphnav.estimation.solvers.window import Smoothed, first_message, turn_limit
+from graphnav.estimation.solvers.tree_marginals import newest_covariance, smooth_keyframes
+from graphnav.estimation.solvers.window import SettledStates, first_message, turn_limit
 
 _SKIP = 10  # keyframes between two looks at what has moved, as GTSAM's relinearizeSkip
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long, as in the window
@@ -31,7 +31,7 @@ def isam2(
     lag: float = np.inf,
     progress: Progress | None = None,
     start: States | None = None,
-) -> Replayed:
+) -> Replay:
     """Solve a problem keyframe by keyframe with iSAM2.
 
     Parameters
@@ -47,7 +47,7 @@ def isam2(
     if start is not None:
         prior = prior.moved(start.minus(mean)[0])
     tree = Tree(prior, turn_limit(problem.imu_noise))
-    settled: list[Smoothed] = []
+    settled: list[SettledStates] = []
     live, P, values = [], np.empty((K, DIM, DIM)), []
     seconds = np.empty(K)
     for k in range(K):
@@ -60,7 +60,7 @@ def isam2(
         if t - oldest > lag * (1.0 + 1.0 / _PORTIONS):
             count = int(np.searchsorted(problem.t[:k], t - lag)) - tree.keyframes[0].place.k
             problem, _ = tree.integrate_again(problem)
-            settled.append(smoothed(tree, count))
+            settled.append(smooth_keyframes(tree, count))
             tree.marginalise(count)
         newest = tree.newest
         live.append(newest.state)
@@ -73,8 +73,8 @@ def isam2(
         problem, again = tree.integrate_again(problem)
         if not tree.relinearise(_FINE) and not again:
             break
-    settled.append(smoothed(tree, len(tree)))
+    settled.append(smooth_keyframes(tree, len(tree)))
     spent = time.perf_counter() - began
-    found = replayed(problem, "isam2", settled, States.stack(live), P, np.array(values), seconds, spent, lag)
+    found = replay(problem, "isam2", settled, States.stack(live), P, np.array(values), seconds, spent, lag)
     notes = (*found.settled.notes, f"{tree.relinearised} keyframes were linearised again")
     return replace(found, settled=replace(found.settled, notes=notes))

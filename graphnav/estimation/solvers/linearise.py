@@ -11,12 +11,12 @@ from functools import cached_property
 
 import numpy as np
 
-from graphnav.constraints.base import Constraint, Linearized, assemble, weighted_sigma
+from graphnav.constraints.base import Constraint, Linearized, assemble, weigh_sigma
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.robust import weight_and_cost
-from graphnav.imu.dynamics import SCALE, Motion
+from graphnav.imu.dynamics import SCALE, ImuFactors
 
 Columns = dict[str, slice]
 
@@ -61,7 +61,7 @@ class Rows:
     @cached_property
     def sigma(self) -> Array:
         """(n, m) sigmas with the rows' weights in them: infinite where a row is not used."""
-        return weighted_sigma(self.constraint, self.linear.sigma, self.which)
+        return weigh_sigma(self.constraint, self.linear.sigma, self.which)
 
     @cached_property
     def H(self) -> Array:
@@ -96,7 +96,7 @@ def linearise(
     return Rows(constraint, which, constraint.linearize(states, given, which), columns, DIM + values.shape[1])
 
 
-def linearise_links(motion: Motion, states: States, scale: Array | None) -> tuple[Array, Array, Array, Array]:
+def linearise_links(motion: ImuFactors, states: States, scale: Array | None) -> tuple[Array, Array, Array, Array]:
     """Whitened rows of intervals between K states: A (K-1, 15, 15) of both ends, S (K-1, 15, k) of the scale, and b.
 
     A_start d_start + A_end d_end + S d_scale = b

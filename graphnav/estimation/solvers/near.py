@@ -5,7 +5,7 @@ from __future__ import annotations
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import Forward, Progress, Smoothed, near_to
+from graphnav.estimation.solvers.passes import ForwardRecord, Progress, SmootherPass, near_to
 from graphnav.estimation.solvers.rts import backward
 
 _PASSES = 4
@@ -13,7 +13,7 @@ _PASSES = 4
 
 def near(
     problem: Problem, about: Points, opening: float | None = None, progress: Progress | None = None
-) -> tuple[Forward, Smoothed]:
+) -> tuple[ForwardRecord, SmootherPass]:
     """Filter and smooth about points, and again about where that leads, until attitudes stay (Bell 1994).
 
     Where they do not, from the start as a filter would, with `opening` as for `ekf`.

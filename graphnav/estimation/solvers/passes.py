@@ -23,7 +23,7 @@ Gain = tuple[Array, Array, Array, Array]  # of an update: K (D, m), H (m, D), S^
 
 
 @dataclass(frozen=True)
-class Smoothed(Points):
+class SmootherPass(Points):
     """A backward pass: states, parameter values and their joint covariance at every keyframe."""
 
     P: Array  # (K, D, D)
@@ -33,7 +33,7 @@ class Smoothed(Points):
 
 
 @dataclass(frozen=True)
-class Forward(Points):
+class ForwardRecord(Points):
     """A forward pass over the first K keyframes, with what the backward pass needs."""
 
     P: Array  # (K, D, D) filtered
@@ -62,22 +62,22 @@ class Forward(Points):
         if self.about is None:
             return self.predicted
         n = len(self.about.values)
-        return joined([self.about, Points(self.predicted.states[n:], self.predicted.values[n:])])
+        return join_passes([self.about, Points(self.predicted.states[n:], self.predicted.values[n:])])
 
 
 @dataclass(frozen=True)
-class Filtered(Forward):
+class FilterPass(ForwardRecord):
     """A forward pass over the whole problem."""
 
     solution: Solution
 
 
-def moved(points: Points, errors: Array) -> Points:
+def move_points(points: Points, errors: Array) -> Points:
     """Points moved by error states (K, D)."""
     return Points(points.states.plus(errors[:, :DIM]), points.values + errors[:, DIM:])
 
 
-def joined(parts: list[Points]) -> Points:
+def join_passes(parts: list[Points]) -> Points:
     """One after the other."""
     return Points(States.stack([part.states for part in parts]), np.concatenate([part.values for part in parts]))
 
@@ -88,7 +88,7 @@ def near_to(points: Points, about: Points, turn: float = _TURN) -> bool:
     return float(np.max(np.sum(turned * turned, axis=1))) < turn**2
 
 
-def about_solved(problem: Problem, solved: Solution, before: Points) -> Points:
+def points_of_solution(problem: Problem, solved: Solution, before: Points) -> Points:
     """Points of a solution of a problem; what it does not tell, places of stops, as before: rows are linear in them."""
     told = {
         c.parameter.name: solved.parameters[c.parameter.name].value[c.node]
@@ -115,7 +115,7 @@ def residual_record(problem: Problem, rows: Constraint, points: Points, robust: 
     return ConstraintRecord("residual", t, linear.residual, linear.stated, nis, weight, rows.axes, rows.unit)
 
 
-def integrated_again(problem: Problem, states: States, scale: Array | None, first: int = 0) -> tuple[Problem, int]:
+def integrate_again(problem: Problem, states: States, scale: Array | None, first: int = 0) -> tuple[Problem, int]:
     """The problem integrated about the present biases where the first-order correction no longer holds, and how often.
 
     Parameters
@@ -131,7 +131,7 @@ def integrated_again(problem: Problem, states: States, scale: Array | None, firs
         of_accel, of_gyro = as_biases(scale, problem.intervals.force[rows], problem.intervals.rate[rows])
         ba[rows], bg[rows] = ba[rows] + of_accel, bg[rows] + of_gyro
     far = problem.intervals.out_of_range(bg)
-    return (problem.reintegrated(ba, bg), int(far.sum())) if far.any() else (problem, 0)
+    return (problem.reintegrate(ba, bg), int(far.sum())) if far.any() else (problem, 0)
 
 
 def values_of(problem: Problem, points: Points) -> dict[str, Array]:

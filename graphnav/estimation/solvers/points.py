@@ -22,7 +22,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import Points, linearise, shift, stepping
-from graphnav.estimation.solvers.stack import Stack, Together
+from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.imu.dynamics import SCALE
 
 Rows = tuple[Array, Array, Array]  # residuals (m,), Jacobian (m, D) and sigmas (m,)
@@ -72,7 +72,7 @@ class AtEstimate:
                 added[column] = chain.sigma[j] ** 2
         return Estimate(ahead, values), F, motion.noise(at, x.state.R_nb)[0], added
 
-    def rows(self, some: Together, at: Estimate) -> Rows:
+    def rows(self, some: RowBlock, at: Estimate) -> Rows:
         """Rows of one constraint linearised at an estimate."""
         ((rows, lo, hi),) = some.parts
         here = Points(at.state, at.values[None])
@@ -85,7 +85,7 @@ class AtEstimate:
         return x, None
 
     @staticmethod
-    def passes(some: Together) -> int:
+    def passes(some: RowBlock) -> int:
         """How often the rows of an update are linearised."""
         return some.parts[0][0].passes
 
@@ -156,7 +156,7 @@ class AtPoints:
         F = self.F[k - 1]
         return self._gap[k - 1] + F @ x, F, self._Q[k - 1], self._added[k] if self._steps[k] else None
 
-    def rows(self, some: Together, at: None) -> Rows:
+    def rows(self, some: RowBlock, at: None) -> Rows:
         """As `AtEstimate.rows`, linearised at the points."""
         at_k = some.at
         return self._r[at_k], self._H[at_k], self._sigma[at_k]
@@ -167,7 +167,7 @@ class AtPoints:
         return None, x
 
     @staticmethod
-    def passes(some: Together) -> int:
+    def passes(some: RowBlock) -> int:
         """The points stay."""
         return 1
 
@@ -181,7 +181,7 @@ class AtPoints:
         return float(self._speed[k])
 
 
-def about_own(P: Array, e: Array) -> Array:
+def move_covariance(P: Array, e: Array) -> Array:
     """Covariances (..., D, D) of errors about points turned into those about states e away from them.
 
     Exp(e + x) = Exp(e) Exp(J_r(e) x) to first order in x.

@@ -68,10 +68,10 @@ class Revision:
         moves = [np.zeros(len(message.z)), *means]
         states = States.stack([m.state for m in around]).plus(np.array([e[:DIM] for e in moves]))
         points = [
-            Point(states[k : k + 1], m.values + e[DIM:], m.columns)
+            LinearisationPoint(states[k : k + 1], m.values + e[DIM:], m.columns)
             for k, (m, e) in enumerate(zip(around, moves, strict=True))
         ]
-        return remade(replace(message, tests=None), points, places)
+        return remake(replace(message, tests=None), points, places)
 
 
 def _is(stages: Sequence[Stage], k: int, was: Stage | Message) -> bool:
@@ -80,7 +80,7 @@ def _is(stages: Sequence[Stage], k: int, was: Stage | Message) -> bool:
 
 
 @dataclass(frozen=True)
-class Point:
+class LinearisationPoint:
     """Where rows are linearised: one state, parameter values and where they stand."""
 
     state: States
@@ -88,7 +88,7 @@ class Point:
     columns: Columns
 
 
-def remade(before: Message, points: Sequence[Point], places: Sequence[Place]) -> list[Stage]:
+def remake(before: Message, points: Sequence[LinearisationPoint], places: Sequence[Place]) -> list[Stage]:
     """Stages about given points; `points[0]` is that of the message before them."""
     out: list[Stage] = []
     for run in _runs(points, places):
@@ -109,7 +109,7 @@ def remade(before: Message, points: Sequence[Point], places: Sequence[Place]) ->
     return out
 
 
-def _runs(points: Sequence[Point], places: Sequence[Place]) -> list[list[int]]:
+def _runs(points: Sequence[LinearisationPoint], places: Sequence[Place]) -> list[list[int]]:
     """Indices of places that can be linearised together: one problem, keyframe after keyframe, the same columns."""
     runs: list[list[int]] = []
     for k, place in enumerate(places):

@@ -16,7 +16,7 @@ PASSES = 4  # of re-weighting where a measurement is met for the first time
 REDESCENDING = ("geman-mcclure", "tukey", "welsch", "gnc")
 
 
-def softened(kernel: str) -> str:
+def soften(kernel: str) -> str:
     """What stands for a kernel where nothing given up can be taken back: such as never quite gives up."""
     return "cauchy" if kernel in REDESCENDING else kernel
 

@@ -22,7 +22,7 @@ Step = tuple[Array, Values]  # (K, 15) and per parameter
 
 
 @dataclass(frozen=True)
-class Point:
+class Iterate:
     """States of all keyframes and values of all parameter nodes."""
 
     states: States
@@ -33,9 +33,9 @@ class Point:
         """The scale errors of the IMU, (6,), where they are parameters."""
         return self.values[SCALE][0] if SCALE in self.values else None
 
-    def moved(self, step: Step) -> Point:
+    def moved(self, step: Step) -> Iterate:
         """Move by a step."""
-        return Point(self.states.plus(step[0]), {name: v + step[1][name] for name, v in self.values.items()})
+        return Iterate(self.states.plus(step[0]), {name: v + step[1][name] for name, v in self.values.items()})
 
     def points(self, problem: Problem) -> Points:
         """The same with the parameters' values at every keyframe."""
@@ -114,7 +114,7 @@ class Layout:
         return blocks
 
 
-def whitened(problem: Problem, point: Point, layout: Layout) -> Rows:
+def whiten(problem: Problem, point: Iterate, layout: Layout) -> Rows:
     """All factors at a point."""
     first = np.arange(layout.K - 1)
     start, end, S, b = linearise_links(problem.motion, point.states, point.scale)
@@ -135,7 +135,7 @@ def whitened(problem: Problem, point: Point, layout: Layout) -> Rows:
     return out
 
 
-def cost(problem: Problem, point: Point, layout: Layout) -> float:
+def cost(problem: Problem, point: Iterate, layout: Layout) -> float:
     """Half the squared whitened residuals of everything, through the robust kernels."""
     points, r = point.points(problem), problem.motion.residual(point.states, point.scale)
     total = 0.5 * float(np.sum(mv(problem.motion.whitener, r) ** 2))
@@ -149,10 +149,10 @@ def cost(problem: Problem, point: Point, layout: Layout) -> float:
 
 def cost_at(problem: Problem, points: Points) -> float:
     """`cost` at points of all keyframes."""
-    return cost(problem, Point(points.states, points.nodes(problem)), Layout(problem))
+    return cost(problem, Iterate(points.states, points.nodes(problem)), Layout(problem))
 
 
-def promised(rows: Rows, layout: Layout, step: Step) -> float:
+def predicted_decrease(rows: Rows, layout: Layout, step: Step) -> float:
     """How much the quadratic model falls by a step."""
     flat = layout.flat(step)
     gain = 0.0

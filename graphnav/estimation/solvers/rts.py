@@ -28,17 +28,17 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.linearise import scale_at
 from graphnav.estimation.solvers.passes import (
-    Filtered,
-    Forward,
+    FilterPass,
+    ForwardRecord,
     Progress,
-    Smoothed,
-    moved,
+    SmootherPass,
+    move_points,
     parameters_of,
     residual_record,
 )
 
 
-def backward(problem: Problem, forward: Forward, progress: Progress | None = None) -> Smoothed:
+def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None = None) -> SmootherPass:
     """Smooth a forward pass: keyframes linearised where the filter was, and before them those at given points."""
     K, D = forward.P.shape[:2]
     n = 0 if forward.about is None else len(forward.about.values)
@@ -62,14 +62,14 @@ def backward(problem: Problem, forward: Forward, progress: Progress | None = Non
         smoothed = ahead - ahead @ N[:end] @ ahead
         P[:end] = 0.5 * (smoothed + np.swapaxes(smoothed, -1, -2))
         errors = forward.errors_predicted[:end] + (ahead @ r[:end, :, None])[..., 0]
-        first = moved(forward.about.first(end), errors)
+        first = move_points(forward.about.first(end), errors)
         values[:end] = first.values
         states = [first.states, *states]
-    return Smoothed(States.stack(states), values, P, r, N)
+    return SmootherPass(States.stack(states), values, P, r, N)
 
 
 def _smooth_filtered(
-    problem: Problem, forward: Forward, end: int, all_values: Array, all_P: Array, progress: Progress | None
+    problem: Problem, forward: ForwardRecord, end: int, all_values: Array, all_P: Array, progress: Progress | None
 ) -> States:
     """States from keyframe `end` on, with values and covariances in their places."""
     K, before = len(forward.P), forward.predicted
@@ -93,7 +93,7 @@ def _smooth_filtered(
     return States.stack(states[::-1])
 
 
-def _find_disturbances(forward: Forward, end: int, r: Array, N: Array, progress: Progress | None) -> None:
+def _find_disturbances(forward: ForwardRecord, end: int, r: Array, N: Array, progress: Progress | None) -> None:
     """r and N before keyframes 0 to `end`, that of `end` known if there is one."""
     K, D = forward.P.shape[:2]
     r_k, N_k = (r[end], N[end]) if end < len(r) else (np.zeros(D), np.zeros((D, D)))
@@ -116,7 +116,7 @@ def _breakdown(problem: Problem, k: int) -> EstimationError:
     return EstimationError(f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas")
 
 
-def rts(problem: Problem, forward: Filtered, found: Smoothed | None = None) -> Solution:
+def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None) -> Solution:
     """The smoothed solution; residuals are its own. `found` is the backward pass where it was done before."""
     began = time.perf_counter()
     found = found or backward(problem, forward)

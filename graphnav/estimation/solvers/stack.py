@@ -47,7 +47,7 @@ class Innovations:
 
 
 @dataclass(slots=True)
-class Together:
+class RowBlock:
     """Rows of a keyframe that are taken in at once, numbers `begin` to `end` of those it has."""
 
     k: int
@@ -88,12 +88,12 @@ class Stack:
                 self.records[c.name].weight[:n] = c.weight[:n]
         self._root, self._solved = np.zeros((K, self.M, self.M)), np.zeros((K, self.M))
 
-    def together(self, k: int, alone: Sequence[bool]) -> Iterator[Together]:
+    def together(self, k: int, alone: Sequence[bool]) -> Iterator[RowBlock]:
         """All rows of a keyframe, in the order of the constraints.
 
         `alone` says of each constraint whether its rows are taken in without others; those of weight 0 are anyway.
         """
-        some: Together | None = None
+        some: RowBlock | None = None
         end = 0
         for c, first, weights, apart in zip(self._constraints, self._first, self._weights, alone, strict=True):
             lo, hi = first[k], first[k + 1]
@@ -107,14 +107,14 @@ class Stack:
                 continue
             if some is not None:
                 yield some
-            some = Together(k, begin, end, [(c, lo, hi)], apart)
+            some = RowBlock(k, begin, end, [(c, lo, hi)], apart)
             if apart:
                 yield some
                 some = None
         if some is not None:
             yield some
 
-    def seen(self, rows: Together, root: Array, solved: Array) -> None:
+    def seen(self, rows: RowBlock, root: Array, solved: Array) -> None:
         """Rows have had an innovation r: the upper root of its covariance S, below it anything, and S^-1 r."""
         k, at = rows.at
         self._root[k, at, at], self._solved[k, at] = root, solved

@@ -31,9 +31,9 @@ from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Columns, Points, linearise, linearise_links, scale_at, shift
-from graphnav.estimation.solvers.robust import softened, weight_and_cost
+from graphnav.estimation.solvers.robust import soften, weight_and_cost
 from graphnav.estimation.solvers.watch import Watch
-from graphnav.imu.dynamics import SCALE, Motion
+from graphnav.imu.dynamics import SCALE, ImuFactors
 
 _I = np.eye(DIM)
 
@@ -92,7 +92,7 @@ class Message:
         """The same about the point moved by the error state e (D,); J is Jr^-1 of its turn, if known."""
         J = rotation.right_jacobian_inverse(e[None, :3])[0] if J is None else J
         state, values = self.state.plus(e[None, :DIM]), self.values + e[DIM:]
-        return Message(state, values, self.columns, turned(self.R, J), self.z - self.R @ e, self.tests)
+        return Message(state, values, self.columns, rotate_columns(self.R, J), self.z - self.R @ e, self.tests)
 
     def value(self, name: str) -> Array:
         """A parameter at the point."""
@@ -137,7 +137,7 @@ class Stage:
     def moved(self, e: Array) -> Stage:
         """The same about the point moved by the error state e."""
         J = rotation.right_jacobian_inverse(e[None, :3])[0]
-        message, G, g = self.message.moved(e, J), turned(self.G, J), self.g + self.G @ e
+        message, G, g = self.message.moved(e, J), rotate_columns(self.G, J), self.g + self.G @ e
         return Stage(self.place, message, G, g, self.lost, self.C, self.measured, self.fault)
 
     @property
@@ -154,7 +154,7 @@ class Stage:
         return np.asarray(out)
 
 
-def turned(A: Array, J: Array) -> Array:
+def rotate_columns(A: Array, J: Array) -> Array:
     """Columns about a point turned by e, of which J is Jr^-1: log(Exp(e) Exp(d)) = e + Jr^-1(e) d."""
     out = A.copy()
     out[:, :3] = A[:, :3] @ J
@@ -169,7 +169,7 @@ class Linear:
     measured: tuple[Measured, ...]
 
 
-def extended(columns: Columns, steps: Sequence[Step]) -> Columns:
+def append_columns(columns: Columns, steps: Sequence[Step]) -> Columns:
     """The columns with those of parameters that begin behind them."""
     out, at = dict(columns), max((s.stop for s in columns.values()), default=DIM)
     for step in steps:
@@ -184,9 +184,9 @@ def width(columns: Columns) -> int:
     return max((s.stop for s in columns.values()), default=DIM)
 
 
-def predicted(before: Message, place: Place) -> tuple[States, Array, Columns, Array | None]:
+def predict_stage(before: Message, place: Place) -> tuple[States, Array, Columns, Array | None]:
     """State, parameter values, columns and whitened link rows at a new keyframe, from the point of a message."""
-    columns = extended(before.columns, place.steps)
+    columns = append_columns(before.columns, place.steps)
     D = width(columns)
     values = np.zeros(D - DIM)
     values[: len(before.values)] = before.values
@@ -213,7 +213,7 @@ def predicted(before: Message, place: Place) -> tuple[States, Array, Columns, Ar
     return ahead, values, columns, (W @ motion.body_rows(link, before.state.R_nb, row))[0]
 
 
-def measured(place: Place, state: States, values: Array, columns: Columns, late: bool | None = None) -> Linear:
+def measure(place: Place, state: States, values: Array, columns: Columns, late: bool | None = None) -> Linear:
     """The rows of a keyframe's measurements at a point, without a link; with `late` only those that `waits` says."""
     assert place.problem is not None
     rows = place.problem.constraints
@@ -246,7 +246,7 @@ def at_points(
     links: list[Array | None] = [None] * n
     if linked:
         scale = scale_at(columns, values[0])
-        motion = Motion(problem.intervals[slice(first - 1, first - 1 + n)], problem.frame)
+        motion = ImuFactors(problem.intervals[slice(first - 1, first - 1 + n)], problem.frame)
         link = np.zeros((n, DIM, DIM + D + 1))
         link[:, :, :DIM], link[:, :, DIM : 2 * DIM], S, link[:, :, -1] = linearise_links(motion, states, scale)
         if scale is not None:
@@ -266,7 +266,7 @@ def at_points(
         for i in np.flatnonzero(np.diff(edge)):
             own = slice(edge[i], edge[i + 1])
             c = constraint
-            kernel = softened(c.robust) if c.robust == "gnc" else c.robust
+            kernel = soften(c.robust) if c.robust == "gnc" else c.robust
             parts[i].append(
                 Measured(c.name, H[own], b[own], sigma[own], kernel, c.scale_of(slice(lo + own.start, lo + own.stop)))
             )

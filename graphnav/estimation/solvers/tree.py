@@ -28,7 +28,7 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.linearise import shift
-from graphnav.estimation.solvers.passes import integrated_again
+from graphnav.estimation.solvers.passes import integrate_again
 from graphnav.estimation.solvers.revision import Renewed
 from graphnav.estimation.solvers.robust import PASSES
 from graphnav.estimation.solvers.stages import (
@@ -37,10 +37,10 @@ from graphnav.estimation.solvers.stages import (
     Message,
     Place,
     Step,
+    append_columns,
     at_points,
-    extended,
-    measured,
-    predicted,
+    measure,
+    predict_stage,
 )
 from graphnav.estimation.solvers.tree_nodes import (
     LINK,
@@ -50,11 +50,11 @@ from graphnav.estimation.solvers.tree_nodes import (
     file,
     fresh_isam,
     is_constant,
-    read_again,
-    turned,
+    read_factors,
+    rotate_columns,
     units_of,
-    updated,
-    written,
+    update_isam,
+    write_factors,
 )
 from graphnav.estimation.solvers.window import limits
 from graphnav.imu.dynamics import SCALE
@@ -109,8 +109,8 @@ class Tree:
         if not self.keyframes and place.linked:
             self._begin(place)
         if ahead is None:
-            state, values, columns, link = predicted(self.newest, place)
-            rows = measured(place, state, values, columns).measured
+            state, values, columns, link = predict_stage(self.newest, place)
+            rows = measure(place, state, values, columns).measured
         else:
             state, values, columns, link = ahead.state, ahead.values, ahead.columns, ahead.link
         graph, new = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -131,7 +131,7 @@ class Tree:
         made: list[tuple[str, Any]] = []
         if link is not None:
             last = self.keyframes[-1]
-            blocks = [(last.state, turned(link[:, :DIM], last.state.delta)), (x, link[:, DIM : 2 * DIM])]
+            blocks = [(last.state, rotate_columns(link[:, :DIM], last.state.delta)), (x, link[:, DIM : 2 * DIM])]
             made.append((LINK, self._about(link[:, DIM:-1], link[:, -1], blocks, last.columns, last.nodes)))
         made += [(one.name, self._rows(keyframe, one, weighted=False)) for one in rows]
         self.keyframes.append(keyframe)
@@ -143,7 +143,7 @@ class Tree:
         groups = gtsam.KeyGroupMap()
         for variable in self._recent():
             groups.insert2(variable.key, max(variable.last - self._number + most, 0))
-        result = updated(self.isam, place.t, graph, new, [], groups)
+        result = update_isam(self.isam, place.t, graph, new, [], groups)
         self._number += 1
         file(keyframe, made, list(result.getNewFactorsIndices())[begin:])
         self._read([x, *(node for node, _ in nodes.values())])
@@ -171,7 +171,7 @@ class Tree:
             if name in prior.columns and p.constant:
                 self._constant.add(name)
                 self._first_sigma[name] = p.sigma
-        updated(self.isam, place.t, graph, new)
+        update_isam(self.isam, place.t, graph, new)
         self._in_force = nodes
         before = Place(place.t, None)
         self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, {}))
@@ -213,7 +213,7 @@ class Tree:
             widths = [len(s.mean) for s in own_steps]
             edge = np.concatenate([[0], np.cumsum(widths)])
             node = self._variable(np.zeros(edge[-1]), np.ones(edge[-1]), place.t)
-            node.limit = limits(extended({}, own_steps), units_of(place))[1]
+            node.limit = limits(append_columns({}, own_steps), units_of(place))[1]
             old = self.variables.get(old_key)
             own_A, old_A = np.zeros((edge[-1], edge[-1])), np.zeros((edge[-1], 0 if old is None else len(old.unit)))
             for step, lo, hi in zip(own_steps, edge[:-1], edge[1:], strict=True):
@@ -257,7 +257,7 @@ class Tree:
         """A factor of measurements linearised where keyframe and parameters are now."""
         H, b, _ = one.weighted(np.zeros(one.H.shape[-1]), int(weighted))
         H, x = H.reshape(-1, H.shape[-1]), keyframe.state
-        return self._about(H, b.ravel(), [(x, turned(H[:, :DIM], x.delta))], keyframe.columns, keyframe.nodes)
+        return self._about(H, b.ravel(), [(x, rotate_columns(H[:, :DIM], x.delta))], keyframe.columns, keyframe.nodes)
 
     def _update(self, made: Sequence[tuple[Keyframe, str, Any]], gone: list[int], first: int) -> None:
         """Have factors in place of others, on keyframes from one on."""
@@ -276,7 +276,7 @@ class Tree:
         for variable in late:
             groups.insert2(variable.key, variable.last - first)
         t = self.keyframes[-1].place.t
-        result = updated(self.isam, t, graph, gtsam.Values(), gone, groups, None, every)
+        result = update_isam(self.isam, t, graph, gtsam.Values(), gone, groups, None, every)
         for (keyframe, name, _), index in zip(made, result.getNewFactorsIndices(), strict=True):
             keyframe.slots.setdefault(name, []).append(index)
 
@@ -334,7 +334,7 @@ class Tree:
         if SCALE in own[-1].nodes:
             node, at = own[-1].nodes[SCALE]
             scale = node.value[at]
-        problem, count = integrated_again(problem, states, scale, own[0].place.k)
+        problem, count = integrate_again(problem, states, scale, own[0].place.k)
         if count:
             for k in own:
                 k.place = replace(k.place, problem=problem)
@@ -367,8 +367,8 @@ class Tree:
                 if i in links:
                     assert linear.link is not None
                     last, link = self.keyframes[i - 1], linear.link
-                    blocks = [(last.state, turned(link[:, :DIM], last.state.delta)),
-                              (keyframe.state, turned(link[:, DIM : 2 * DIM], keyframe.state.delta))]  # fmt: skip
+                    blocks = [(last.state, rotate_columns(link[:, :DIM], last.state.delta)),
+                              (keyframe.state, rotate_columns(link[:, DIM : 2 * DIM], keyframe.state.delta))]  # fmt: skip
                     made.append((keyframe, LINK, self._about(
                         link[:, DIM:-1], link[:, -1], blocks, last.columns, last.nodes)))  # fmt: skip
                     gone += keyframe.slots.pop(LINK)
@@ -432,12 +432,12 @@ class Tree:
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the tree itself, which is made again from its factors."""
-        return {**self.__dict__, "isam": written(self.isam, self.variables.values())}
+        return {**self.__dict__, "isam": write_factors(self.isam, self.variables.values())}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         rows = state.pop("isam")
         self.__dict__.update(state)
-        self.isam, now = read_again(rows, {x: x.last for x in self.variables.values()})
+        self.isam, now = read_factors(rows, {x: x.last for x in self.variables.values()})
         for k in self.keyframes:
             k.slots = {name: [now[i] for i in own] for name, own in k.slots.items()}
 

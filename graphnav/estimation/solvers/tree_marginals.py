@@ -9,16 +9,16 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.linearise import Columns, shift
-from graphnav.estimation.solvers.points import about_own
+from graphnav.estimation.solvers.points import move_covariance
 from graphnav.estimation.solvers.tree import Tree
 from graphnav.estimation.solvers.tree_nodes import Variable
-from graphnav.estimation.solvers.window import Smoothed
+from graphnav.estimation.solvers.window import SettledStates
 
 
 def newest_covariance(tree: Tree) -> Array:
     """(15, 15) of the newest state."""
     last = tree.keyframes[-1]
-    return about_own(_marginal(tree, last.state, last.place.t), last.state.delta)
+    return move_covariance(_marginal(tree, last.state, last.place.t), last.state.delta)
 
 
 def newest_root(tree: Tree, columns: Columns) -> Array:
@@ -44,7 +44,7 @@ def newest_root(tree: Tree, columns: Columns) -> Array:
     return np.asarray((V / np.sqrt(np.maximum(w, np.finfo(float).eps))).T / sd)
 
 
-def smoothed(tree: Tree, count: int, first: int = 0) -> Smoothed:
+def smooth_keyframes(tree: Tree, count: int, first: int = 0) -> SettledStates:
     """The first `count` keyframes of a tree as they are known now, or those of them from `first` on."""
     own = tree.keyframes[first:count]
     marginal: dict[int, Array] = {}
@@ -53,7 +53,7 @@ def smoothed(tree: Tree, count: int, first: int = 0) -> Smoothed:
             if x.key not in marginal:
                 marginal[x.key] = _marginal(tree, x, k.place.t)
     delta = np.array([k.state.delta for k in own])
-    covariance = about_own(np.stack([marginal[k.state.key] for k in own]), delta)
+    covariance = move_covariance(np.stack([marginal[k.state.key] for k in own]), delta)
     sigma = []
     for k in own:
         out = np.zeros(len(k.values))
@@ -61,7 +61,7 @@ def smoothed(tree: Tree, count: int, first: int = 0) -> Smoothed:
             node, part = k.nodes[name]
             out[shift(at)] = np.sqrt(np.maximum(np.diag(marginal[node.key])[part], 0.0))
         sigma.append(out)
-    return Smoothed(
+    return SettledStates(
         t=np.array([k.place.t for k in own]),
         states=States.stack([k.anchor for k in own]).plus(delta),
         covariance=covariance,

@@ -16,7 +16,7 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.graph import jacobian_factor
 from graphnav.estimation.solvers.linearise import Columns, shift
 from graphnav.estimation.solvers.stages import Place
-from graphnav.estimation.solvers.stages import turned as turned_by
+from graphnav.estimation.solvers.stages import rotate_columns as turned_by
 
 LINK = "imu"  # among the constraints of a keyframe: the interval before it
 _WILDFIRE = 1e-3  # of the variables' units: less is not passed on to older ones
@@ -82,7 +82,7 @@ def fresh_isam() -> gtsam.ISAM2:
     return gtsam.ISAM2(parameters)
 
 
-def updated(isam: gtsam.ISAM2, t: float, *change: Any) -> Any:
+def update_isam(isam: gtsam.ISAM2, t: float, *change: Any) -> Any:
     try:
         return isam.update(*change)
     except RuntimeError as error:  # GTSAM's for a variable that nothing determines
@@ -94,7 +94,7 @@ def factor(blocks: Sequence[tuple[Variable, Array]], b: Array) -> Any:
     return gtsam.LinearContainerFactor(jacobian_factor([(x.key, A * x.unit) for x, A in blocks], b))
 
 
-def turned(A: Array, d: Array) -> Array:
+def rotate_columns(A: Array, d: Array) -> Array:
     """Columns of rows about the anchor moved by d, as columns of the errors about the anchor itself."""
     return turned_by(A, rotation.right_jacobian(d[None, :3])[0]) if d[:3].any() else A
 
@@ -110,7 +110,7 @@ def units_of(place: Place) -> dict[str, str]:
     return {name: p.unit for name, p in place.problem.parameters.items()}
 
 
-def written(isam: gtsam.ISAM2, variables: Iterable[Variable]) -> list[tuple[int, str]]:
+def write_factors(isam: gtsam.ISAM2, variables: Iterable[Variable]) -> list[tuple[int, str]]:
     """The factors of a tree by their indices, as text with all digits."""
     factors, none = isam.getFactorsUnsafe(), gtsam.Values()
     for x in variables:
@@ -119,7 +119,7 @@ def written(isam: gtsam.ISAM2, variables: Iterable[Variable]) -> list[tuple[int,
     return [(i, gtsam.JacobianFactor(factors.at(i).linearize(none)).serialize()) for i in alive]
 
 
-def read_again(rows: Sequence[tuple[int, str]], order: Mapping[Variable, int]) -> tuple[gtsam.ISAM2, dict[int, int]]:
+def read_factors(rows: Sequence[tuple[int, str]], order: Mapping[Variable, int]) -> tuple[gtsam.ISAM2, dict[int, int]]:
     """A tree made from what was written, and where each factor is now.
 
     Parameters

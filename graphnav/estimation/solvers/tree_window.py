@@ -18,8 +18,8 @@ from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.revision import Renewed
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import newest_root, smoothed
-from graphnav.estimation.solvers.window import Smoothed, Window
+from graphnav.estimation.solvers.tree_marginals import newest_root, smooth_keyframes
+from graphnav.estimation.solvers.window import SettledStates, Window
 
 _ROUNDS = 5
 _FINE = 0.02  # of the usual limits, within which the last window is converged
@@ -123,14 +123,14 @@ class TreeWindow(Window):
         if self.stages:
             self._adopt(full=True)
 
-    def settle(self, count: int) -> Smoothed:
+    def settle(self, count: int) -> SettledStates:
         """Let the first `count` stages go, as the tree knows them."""
         assert self.tree is not None or not count
         gone = self.stages[:count]
         if self.tree is None or not gone:
             return super().settle(0)
         self.tree.read()
-        out = smoothed(self.tree, self._before + count, self._before)
+        out = smooth_keyframes(self.tree, self._before + count, self._before)
         self.head = gone[-1].message
         del self.stages[:count]
         self._gone += count

@@ -28,7 +28,7 @@ from scipy.special import chdtri, gammaincinv
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
-from graphnav.estimation.solution import Fault
+from graphnav.estimation.solution import ExcludedSpan
 
 _PATIENCE = 60.0  # s
 _CHANCE = 3  # fixes that agree after a fault, below which the next that does not says that they did by chance
@@ -53,7 +53,7 @@ class _Slots:
         self.one = np.eye(m)
         self.score, self.info = np.zeros((L, m)), np.tile(self.one, (L, 1, 1))
         self.seen = 0
-        self.usual = _Usual(m)
+        self.typical_sigmas = _InnovationLevel(m)
 
     def copy(self) -> _Slots:
         other = object.__new__(_Slots)
@@ -89,12 +89,12 @@ class _Slots:
         self.info += G3.swapaxes(1, 2) @ S3
         b = np.linalg.solve(self.info, self.score[..., None])[..., 0]
         T = np.einsum("lm,lm->l", self.score, b) / self.threshold
-        if T.max() <= self.usual.factor:
+        if T.max() <= self.typical_sigmas.factor:
             return None
         allowed = self.stated**2 + (_CLOCKS * speed if self.moves else _CLOCKS * _BRAKING) ** 2
         T = np.where(np.sum(b**2 / allowed, axis=1) > LARGE**2, T, 0.0)
         worst = int(np.argmax(T))
-        return float(self.first[worst]) if T[worst] > self.usual.factor else None
+        return float(self.first[worst]) if T[worst] > self.typical_sigmas.factor else None
 
 
 def _slots(constraints: Iterable[Constraint], t: Array | None, period: float) -> dict[str, _Slots]:
@@ -112,7 +112,7 @@ def _slots(constraints: Iterable[Constraint], t: Array | None, period: float) ->
     return out
 
 
-class _Usual:
+class _InnovationLevel:
     """By how much the innovations of a kind are usually larger than the filter says; all copies of a bank share it.
 
     What half of all fixes do, those not used included, is no fault: the filter has lost its way. But for those of a
@@ -194,7 +194,7 @@ class Bank:
     def seen(self, name: str, k: int, nis: float, used: bool) -> None:
         """The filter has seen an innovation of so many squared sigmas, used or not."""
         if slots := self._slots.get(name):
-            slots.usual.add(float(self._t[k]), nis, used)
+            slots.typical_sigmas.add(float(self._t[k]), nis, used)
 
     def taken(self, K: Array, H: Array) -> None:
         """The filter has used rows H with the gain K that are not tested."""
@@ -271,7 +271,7 @@ class Watch:
     def found(self, name: str, t: float, rho: Array, Gamma: Array, speed: float) -> float | None:
         """When a fault began, or None, by what a fix has left behind: rho (n m,) and Gamma (n m, L m) of its kind."""
         slots = self._slots[name]
-        slots.usual.add(t, float(rho @ rho))
+        slots.typical_sigmas.add(t, float(rho @ rho))
         return slots.found(rho @ Gamma, Gamma, Gamma, speed)
 
 
@@ -298,13 +298,13 @@ class Verdicts:
         """The largest share of a kind that is not used."""
         return max((float(np.mean(used == 0.0)) for used in self.used.values() if len(used)), default=0.0)
 
-    def faults(self) -> tuple[Fault, ...]:
+    def faults(self) -> tuple[ExcludedSpan, ...]:
         """Spans of fixes that are not used."""
         out = []
         for name, t in self.times.items():
             lost = np.flatnonzero(self.used[name] == 0.0)
             for run in np.split(lost, np.flatnonzero(np.diff(lost) > 1) + 1) if len(lost) else []:
-                out.append(Fault(name, float(t[run[0]]), float(t[run[-1]]), len(run)))
+                out.append(ExcludedSpan(name, float(t[run[0]]), float(t[run[-1]]), len(run)))
         return tuple(sorted(out, key=lambda fault: fault.t_start))
 
     def weights(self, name: str, t: Array) -> Array:

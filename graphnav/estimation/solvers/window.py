@@ -18,16 +18,16 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.elimination import Predicted, predict, update
-from graphnav.estimation.solvers.points import about_own
+from graphnav.estimation.solvers.points import move_covariance
 from graphnav.estimation.solvers.revision import Renewed, Revision
 from graphnav.estimation.solvers.stages import (
     Columns,
     Message,
     Place,
     Stage,
-    extended,
-    measured,
-    predicted,
+    append_columns,
+    measure,
+    predict_stage,
     width,
 )
 from graphnav.estimation.solvers.watch import Watch
@@ -45,7 +45,7 @@ _LIMITS = {"rad": 1e-2, "s": _DELAY}
 
 
 @dataclass(frozen=True)
-class Smoothed:
+class SettledStates:
     """Some keyframes with all that the window knows: states, covariances, and the parameters there."""
 
     t: Array  # (n,)
@@ -113,8 +113,8 @@ class Window:
 
     def expect(self, place: Place) -> Predicted:
         """A keyframe, linearised at its prediction, with the rows of its problem that need not be waited for."""
-        state, values, columns, link = predicted(self.newest, place)
-        rows = measured(place, state, values, columns, late=False).measured
+        state, values, columns, link = predict_stage(self.newest, place)
+        rows = measure(place, state, values, columns, late=False).measured
         return predict(self.newest, place, link, rows, state, values, columns)
 
     def push(self, place: Place, ahead: Predicted | None = None) -> float:
@@ -125,7 +125,7 @@ class Window:
         """
         ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
         columns = ahead.columns
-        stage, e = update(ahead, measured(place, ahead.state, ahead.values, columns, late=True).measured)
+        stage, e = update(ahead, measure(place, ahead.state, ahead.values, columns, late=True).measured)
         self.stages.append(stage.moved(e))
         self._means = None
         if columns != self._limit[0]:
@@ -182,7 +182,7 @@ class Window:
             self._means = out[::-1]
         return self._means
 
-    def settle(self, count: int) -> Smoothed:
+    def settle(self, count: int) -> SettledStates:
         """Smooth the window and let its first `count` stages go."""
         gone, means = self.stages[:count], self.means()[1 : count + 1]
         self._revision, self._rounds = None, 0
@@ -196,14 +196,14 @@ class Window:
         states = self.head.state[:0]
         if gone:
             moved = np.array([e[:DIM] for e in means])
-            states, covariance = States.stack(rows).plus(moved), about_own(covariance, moved)
+            states, covariance = States.stack(rows).plus(moved), move_covariance(covariance, moved)
             self.head = gone[-1].message
             del self.stages[:count]
             self._gone += count
             self._means = None
             if not self.stages:
                 self.head = self.head.moved(self.head.estimate)
-        return Smoothed(
+        return SettledStates(
             t=np.array([stage.place.t for stage in gone]),
             states=states,
             covariance=covariance,
@@ -330,4 +330,4 @@ def limits(columns: Columns, units: dict[str, str]) -> tuple[Columns, Array]:
     return columns, limit
 
 
-__all__ = ["Message", "Place", "Smoothed", "Window", "extended", "first_message"]
+__all__ = ["Message", "Place", "SettledStates", "Window", "append_columns", "first_message"]

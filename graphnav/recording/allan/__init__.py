@@ -26,7 +26,7 @@ _TURNS, _PUSHES = np.radians(1.0), 0.1  # rad/s, m/s^2: more than this from the 
 
 
 @dataclass(frozen=True)
-class Noise:
+class AllanFigures:
     """Figures of one sensor per axis (3,): of a gyro rad/s/sqrt(Hz), rad/s, rad/s/sqrt(s); with m/s^2 of forces."""
 
     white: Array  # N, angle or velocity random walk
@@ -42,8 +42,8 @@ class Allan:
     tau: Array  # (M,) s
     gyro: Array  # (M, 3) rad/s
     accel: Array  # (M, 3) m/s^2
-    gyro_noise: Noise
-    accel_noise: Noise
+    gyro_noise: AllanFigures
+    accel_noise: AllanFigures
     duration: float  # s
     rate: float  # Hz
 
@@ -118,7 +118,7 @@ def deviations(x: Array, period: float, m: Array) -> Array:
     return out
 
 
-def _fit(tau: Array, deviation: Array, count: int) -> Noise:
+def _fit(tau: Array, deviation: Array, count: int) -> AllanFigures:
     """N, B and K of each axis."""
     from scipy.optimize import nnls
 
@@ -132,7 +132,7 @@ def _fit(tau: Array, deviation: Array, count: int) -> Noise:
         found, _ = nnls(scaled / size, weight)
         out.append(np.sqrt(found / size))
     white, instability, walk = np.array(out).T
-    return Noise(white, instability, walk, tau[np.argmin(deviation, axis=0)])
+    return AllanFigures(white, instability, walk, tau[np.argmin(deviation, axis=0)])
 
 
 def _rms(x: Array) -> float:

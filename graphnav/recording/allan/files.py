@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.recording.allan import Allan, Noise
+from graphnav.recording.allan import Allan, AllanFigures
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73")  # x, y, z; Okabe and Ito (2008)
 
@@ -44,7 +44,7 @@ def _picture(result: Allan, path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-def _model(tau: Array, noise: Noise) -> Array:
+def _model(tau: Array, noise: AllanFigures) -> Array:
     """The fitted deviation, of the root mean square over the axes."""
     N2, B2, K2 = (np.mean(np.square(x)) for x in (noise.white, noise.instability, noise.walk))
     return np.asarray(np.sqrt(N2 / tau + B2 * 2.0 / np.pi * np.log(2.0) + K2 * tau / 3.0))

@@ -17,7 +17,7 @@ from graphnav.recording import odometer as wheels
 from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.clock import Clock
 from graphnav.recording.checks.crosschecks import Fit, Track
-from graphnav.recording.checks.stated import exchanged, exchanged_finding
+from graphnav.recording.checks.stated import exchange_lat_lon, exchanged_finding
 from graphnav.recording.formats.schema import TIME
 from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
 
@@ -151,7 +151,7 @@ def imu_clock(clock: Clock, odometer: Fit | None = None) -> Iterator[Finding]:
 
 def mirrored(recording: Recording) -> Iterator[Finding]:
     """Turns against the course that are those of the course with latitude and longitude exchanged."""
-    other = exchanged(recording.gnss) if recording.gnss is not None else None
+    other = exchange_lat_lon(recording.gnss) if recording.gnss is not None else None
     way = crosschecks.track(replace(other, v=None)) if other is not None else None
     yaw = crosschecks.yaw_fit(recording.imu, way) if way is not None else None
     if yaw is not None and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:

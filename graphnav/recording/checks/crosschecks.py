@@ -186,7 +186,7 @@ def _search(
         far = _peak(wide, correlations(few, wide))
         if abs(far) > 5.0 and correlation(far, few) > reached + 0.15:
             coarse = far
-    lag, spread = lags_of_clocks.refined(t, y, x_at, valid, many, coarse, MIN_PAIRS)
+    lag, spread = lags_of_clocks.refine_lag(t, y, x_at, valid, many, coarse, MIN_PAIRS)
     rows = every[valid(lag)]
     r, b = _regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
     return Fit(lag, spread, r, correlation(0.0, every), b)

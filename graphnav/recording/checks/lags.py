@@ -42,7 +42,7 @@ class _At:
         return float(np.log(max(self.e @ self.e / max(self.y @ self.y, 1e-300), 1e-12)))
 
 
-def refined(
+def refine_lag(
     t: Array, y: Array, x_at: Regressors, valid: Callable[[float], Array], rows: Index, guess: float, fewest: int
 ) -> tuple[float, float]:
     """The lag at which x explains y best, near a first guess, and its 1-sigma; both in s.

@@ -107,7 +107,7 @@ def velocities(gnss: Gnss) -> Iterator[Finding]:
     size = np.hypot(way[:, 0], way[:, 1])
     moving = real & (size > 2.0) & (size < 60.0 * dt)
     if moving.sum() >= crosschecks.MIN_PAIRS:
-        other = exchanged(gnss)
+        other = exchange_lat_lon(gnss)
         if other is not None:
             q = crosschecks.local_positions(other)
             off, mended = (
@@ -136,7 +136,7 @@ def velocities(gnss: Gnss) -> Iterator[Finding]:
             )
 
 
-def exchanged(gnss: Gnss) -> Gnss | None:
+def exchange_lat_lon(gnss: Gnss) -> Gnss | None:
     """The fixes with latitude and longitude exchanged; None where that is no place."""
     llh = gnss.llh[:, [1, 0, 2]]
     return replace(gnss, llh=llh) if np.nanmax(np.abs(llh[:, 0])) < 0.5 * np.pi else None
@@ -190,11 +190,13 @@ def truth_findings(recording: Recording) -> Iterator[Finding]:
         return
     frame = LocalFrame(truth.llh[0])
     true, fixes = frame.from_llh(truth.llh)[:, :2], frame.from_llh(gnss.llh)[:, :2]
-    off = _apart(truth, true, gnss, fixes, 0.0)
+    off = _median_distance(truth, true, gnss, fixes, 0.0)
     if off is None:
         return
     shifted = {
-        shift: found for shift in (-LEAP, LEAP) if (found := _apart(truth, true, gnss, fixes, shift)) is not None
+        shift: found
+        for shift in (-LEAP, LEAP)
+        if (found := _median_distance(truth, true, gnss, fixes, shift)) is not None
     }
     best = min(shifted, key=lambda shift: shifted[shift], default=0.0)
     if shifted and off > 5.0 and shifted[best] < 0.2 * off:
@@ -216,7 +218,7 @@ def truth_apart(recording: Recording) -> bool:
     return bool(t[-1] < recording.start or t[0] > recording.end)
 
 
-def _apart(truth: Truth, true: Array, gnss: Gnss, fixes: Array, shift: float) -> float | None:
+def _median_distance(truth: Truth, true: Array, gnss: Gnss, fixes: Array, shift: float) -> float | None:
     """Median horizontal distance (m) between fixes and a truth `shift` s later; None where too few are near in time."""
     t = truth.t + shift
     k = np.clip(np.searchsorted(t, gnss.t), 1, len(t) - 1)

@@ -19,7 +19,7 @@ from graphnav.recording.draft.agreement import CLEAR, FAIR, Agreement, compare
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.sources import JOINED, Source, fix_speed_unit, fixes, sources
 from graphnav.recording.formats.schema import FORCE, RATE, SPEED
-from graphnav.recording.formats.writer import quoted
+from graphnav.recording.formats.writer import quote
 
 __all__ = ["Draft", "draft"]
 
@@ -85,7 +85,7 @@ class _Writer:
         vehicle = "gnss" in found or "odometer" in found
         self.lines += [
             "# Drafted by graphnav init. Comments say why each line is what it is; look at those marked CHECK.",
-            'format = "graphnav-recording/1"', f"name = {quoted(name)}",
+            'format = "graphnav-recording/1"', f"name = {quote(name)}",
         ]  # fmt: skip
         why = "there are fixes or speeds" if vehicle else "CHECK: no fixes and no speed, so it is taken for a walk"
         self._key("platform", '"vehicle"' if vehicle else '"foot"', why)
@@ -248,17 +248,17 @@ class _Writer:
             self.made[relative] = source.values
             rates, forces = (path.name for path in source.joined_from)
             self.decisions.append(f"{relative}: made of {rates} and {forces}, the forces at the times of the rates")
-        self.lines.append(f"file = {quoted(relative)}")
+        self.lines.append(f"file = {quote(relative)}")
         if source.log is not None and (topics := source.log.topics.get(sensor, ())):
             others = f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}"
             if topics[0] in self.asked:
                 others = "as was asked"
-            self._key("topic", quoted(topics[0]), others if len(topics) > 1 else "the only one")
+            self._key("topic", quote(topics[0]), others if len(topics) > 1 else "the only one")
         if source.joined_from is None and not inside(source.path, self.folder):
             self.decisions.append(f"{relative}: lies outside the folder of this file; say --allow-outside to read it")
         names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
         if names:
-            pairs = ", ".join(f"{ours} = {quoted(theirs)}" for ours, theirs in names.items())
+            pairs = ", ".join(f"{ours} = {quote(theirs)}" for ours, theirs in names.items())
             self.lines.append(f"columns = {{ {pairs} }}")
 
     def _units(self, units: dict[str, Guess]) -> None:

@@ -122,7 +122,7 @@ def lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None, any
             if not np.isfinite(r).any():
                 return None
             best = int(np.nanargmax(np.abs(r)))
-            b = _trimmed(a, b, w, int(shifts[best]), slope[best])
+            b = _trim(a, b, w, int(shifts[best]), slope[best])
             r, slope = _lags(a, b, w, shifts)
     if not np.isfinite(r).any():
         return None
@@ -183,7 +183,7 @@ def _lags(a: Array, b: Array, w: Array, shifts: Array) -> tuple[Array, Array]:
     return r, slope
 
 
-def _trimmed(a: Array, b: Array, w: Array, shift: int, slope: complex) -> Array:
+def _trim(a: Array, b: Array, w: Array, shift: int, slope: complex) -> Array:
     """b without the samples that fit worst at a shift: beyond four robust sigmas of the weighted residuals."""
     x, y, v, at = _pairs(a, b, w, shift)
     factor = slope if np.iscomplexobj(y) else slope.real

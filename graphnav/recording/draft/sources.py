@@ -119,7 +119,7 @@ def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> Found:
         if "accel" not in sensors and "accel" in every and "gravity" in sensors:
             sensors["accel"] = _with_gravity(every["accel"][0], sensors["gravity"], left)
         if "accel" in sensors:
-            sensors["imu"] = _joined(sensors["gyro"], sensors["accel"])
+            sensors["imu"] = _join_imu(sensors["gyro"], sensors["accel"])
             if (pull := every.get("gravity")) and sensors["accel"] in every["accel"]:
                 left.append(f"{pull[0].path.name}: {sensors['accel'].path.name} has gravity in it")
         elif "accel" in every:
@@ -196,7 +196,7 @@ def _with_gravity(accel: Source, gravity: Source, left: list[str]) -> Source:
     return whole
 
 
-def _joined(gyro: Source, accel: Source) -> Source:
+def _join_imu(gyro: Source, accel: Source) -> Source:
     """One IMU of two files, as phones write them: the forces interpolated to the times of the rates, in s."""
     t, at = gyro.t, accel.t
     inside = (t >= at[0]) & (t <= at[-1])

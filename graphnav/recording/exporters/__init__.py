@@ -1,6 +1,6 @@
 """One module per output format, each with ``writing(path, name)``: a file that trajectories are added to in blocks.
 
-`write_all` writes what every run leaves, `write_as` one format by name, `written` any of them in one go.
+`write_all` writes what every run leaves, `write_as` one format by name, `write_parts` any of them in one go.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ def write_all(blocks: Trajectory | Iterable[Trajectory], folder: Path, name: str
     folder.mkdir(parents=True, exist_ok=True)
     if isinstance(blocks, Trajectory):
         name, blocks = (blocks.name if name is None else name), [blocks]
-    written(blocks, {one: folder / f"trajectory.{one}" for one in ("csv", "kml", "tum")}, name or "")
+    write_parts(blocks, {one: folder / f"trajectory.{one}" for one in ("csv", "kml", "tum")}, name or "")
 
 
-def written(
+def write_parts(
     blocks: Iterable[Trajectory],
     targets: Mapping[str, Path],
     name: str = "",
@@ -113,7 +113,7 @@ def write_as(name: str, trajectory: Trajectory, path: Path, utc: Array | None = 
     RecordingError
         If the format cannot hold this trajectory.
     """
-    written([trajectory], {name: path}, trajectory.name, None if utc is None else lambda t: np.asarray(utc))
+    write_parts([trajectory], {name: path}, trajectory.name, None if utc is None else lambda t: np.asarray(utc))
 
 
 def require_geodetic(trajectory: Trajectory, path: Path) -> None:

@@ -102,7 +102,7 @@ def _cell(x: Array, kind: str | None, places: int) -> _Cell | None:
     if (places != 6) if kind == "g" else (places > _MOST_PLACES):
         return None
     # %d knows no negative zero
-    cell = _general(x) if kind == "g" else _fixed(x if kind else np.trunc(x) + 0.0, places)
+    cell = _general(x) if kind == "g" else _format_fixed(x if kind else np.trunc(x) + 0.0, places)
     blank = np.isnan(x)
     if not blank.any():
         return cell
@@ -110,7 +110,7 @@ def _cell(x: Array, kind: str | None, places: int) -> _Cell | None:
     return _Cell(cell.width, words, cell.doubtful & ~blank)
 
 
-def _fixed(x: Array, places: int) -> _Cell:
+def _format_fixed(x: Array, places: int) -> _Cell:
     """``%.kf``."""
     size = np.abs(x)
     with np.errstate(invalid="ignore"):

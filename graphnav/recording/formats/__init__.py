@@ -12,7 +12,7 @@ from pathlib import Path
 
 from graphnav.core.complaints import nearest
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import exists, outside_allowed
+from graphnav.core.files import exists, permit_outside
 from graphnav.recording import Recording
 from graphnav.recording.formats.registry import Format, Log
 
@@ -47,7 +47,7 @@ def read(source: str | Path, topics: Sequence[str] = (), allow_outside: bool = F
     exists(Path(source))
     for candidate in known.values():
         if candidate.recognises(source):
-            with outside_allowed(allow_outside):
+            with permit_outside(allow_outside):
                 return _choose(candidate, source, topics).recording(source) if topics else candidate.read(source)
     raise _unknown(source, known)
 

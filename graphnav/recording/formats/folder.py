@@ -17,7 +17,7 @@ from graphnav.core.timescales import parse_clock
 from graphnav.gnss.series import RawGnss
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording, Truth
 from graphnav.recording.formats import schema
-from graphnav.recording.formats.pulses import counted
+from graphnav.recording.formats.pulses import count_pulses
 from graphnav.recording.formats.registry import Format, Log
 from graphnav.recording.formats.repair import (
     DEFAULT_SD,
@@ -230,7 +230,7 @@ def _odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odomete
     if d.metres_per_pulse is not None:
         if len(t) < 2:
             raise RecordingError(f"{rows.path}: {len(t)} usable row; pulses need at least 2 to make a speed")
-        way = d.metres_per_pulse * counted(rows["pulses"], d.pulses, d.signed, remarks)
+        way = d.metres_per_pulse * count_pulses(rows["pulses"], d.pulses, d.signed, remarks)
         # over both neighbouring periods, so that it is the speed at t and not half a period before
         ahead, behind = np.minimum(np.arange(len(t)) + 1, len(t) - 1), np.maximum(np.arange(len(t)) - 1, 0)
         speed = (way[ahead] - way[behind]) / (t[ahead] - t[behind])
@@ -269,12 +269,12 @@ def _truth(d: schema.TruthTable, rows: Table, remarks: Remarks) -> Truth:
         xyz = rows.stack("x", "y", "z") if "z" in rows else rows.stack("x", "y")
     else:
         llh, rows = geodetic(rows, d.units.angle, "truth", remarks)
-    v = _partial(rows, ("ve", "vn", "vu"), schema.SPEED[d.units.speed])
-    rph = _partial(rows, ("roll", "pitch", "heading"), schema.ANGLE[d.units.angle or "deg"])
+    v = _read_part(rows, ("ve", "vn", "vu"), schema.SPEED[d.units.speed])
+    rph = _read_part(rows, ("roll", "pitch", "heading"), schema.ANGLE[d.units.angle or "deg"])
     return Truth(rows["t"], llh, xyz, v, rph, d.of)
 
 
-def _partial(rows: Table, names: tuple[str, ...], scale: float) -> Array | None:
+def _read_part(rows: Table, names: tuple[str, ...], scale: float) -> Array | None:
     """Columns of which some may be missing (NaN then); None if all are."""
     if not any(name in rows for name in names):
         return None

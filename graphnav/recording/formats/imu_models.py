@@ -53,7 +53,7 @@ def _sheet(
     return ImuModel(name, noise, source)
 
 
-def _tuned(
+def _from_tuning(
     name: str, source: str, white: tuple[str, str], bias: tuple[str, str], hours: float,
     scale: tuple[str, str] | None = None,
 ) -> ImuModel:  # fmt: skip
@@ -66,11 +66,11 @@ def _tuned(
 
 _GINS = "tuned on drives by the i2Nav group, README of awesome-gins-datasets, section 1"
 _ALL: tuple[ImuModel, ...] = (
-    _tuned("ICM20602", _GINS, ("0.2 deg/sqrt(h)", "0.2 m/s/sqrt(h)"), ("200 deg/h", "1000 mGal"), 1.0),
-    _tuned("ADIS16460", _GINS, ("0.2 deg/sqrt(h)", "0.1 m/s/sqrt(h)"), ("20 deg/h", "100 mGal"), 1.0),
-    _tuned("ADIS16465", _GINS, ("0.1 deg/sqrt(h)", "0.1 m/s/sqrt(h)"), ("25 deg/h", "200 mGal"), 1.0),
-    _tuned("HGuide-i300", _GINS, ("0.2 deg/sqrt(h)", "0.2 m/s/sqrt(h)"), ("15 deg/h", "150 mGal"), 1.0),
-    _tuned("Leador-A15", "settings of KF-GINS for its own demonstration drive, dataset/kf-gins.yaml",
+    _from_tuning("ICM20602", _GINS, ("0.2 deg/sqrt(h)", "0.2 m/s/sqrt(h)"), ("200 deg/h", "1000 mGal"), 1.0),
+    _from_tuning("ADIS16460", _GINS, ("0.2 deg/sqrt(h)", "0.1 m/s/sqrt(h)"), ("20 deg/h", "100 mGal"), 1.0),
+    _from_tuning("ADIS16465", _GINS, ("0.1 deg/sqrt(h)", "0.1 m/s/sqrt(h)"), ("25 deg/h", "200 mGal"), 1.0),
+    _from_tuning("HGuide-i300", _GINS, ("0.2 deg/sqrt(h)", "0.2 m/s/sqrt(h)"), ("15 deg/h", "150 mGal"), 1.0),
+    _from_tuning("Leador-A15", "settings of KF-GINS for its own demonstration drive, dataset/kf-gins.yaml",
            ("0.003 deg/sqrt(h)", "0.03 m/s/sqrt(h)"), ("0.027 deg/h", "15 mGal"), 4.0, ("300 ppm", "300 ppm")),
     ImuModel("ADIS16448",
              _figures({"noise_density": "1.6968e-4 rad/s/sqrt(Hz)", "bias_walk": "1.9393e-5 rad/s/sqrt(s)"},

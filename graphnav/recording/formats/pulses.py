@@ -12,7 +12,7 @@ from graphnav.recording.formats.repair import Remarks
 _MODULI = (2.0**8, 2.0**16, 2.0**32)
 
 
-def counted(
+def count_pulses(
     pulses: Array, kind: Literal["cumulative", "per_row"] | None, signed: bool | None, remarks: Remarks
 ) -> Array:
     """(M,) pulses since the first row.
@@ -30,10 +30,10 @@ def counted(
         )
     if kind == "per_row":  # those of row k came between the rows k-1 and k
         return np.cumsum(pulses) - pulses[0]
-    return np.r_[0.0, np.cumsum(_unwrapped(pulses, step, signed, remarks))]
+    return np.r_[0.0, np.cumsum(_unwrap(pulses, step, signed, remarks))]
 
 
-def _unwrapped(pulses: Array, step: Array, signed: bool | None, remarks: Remarks) -> Array:
+def _unwrap(pulses: Array, step: Array, signed: bool | None, remarks: Remarks) -> Array:
     """Steps between rows without the jumps of a counter that ran over, or began anew."""
     back = step < 0.0
     if not back.any() or pulses.min() < 0.0:

@@ -141,7 +141,7 @@ def _toml(log: Log) -> str:
     lines = [*(f"# {line}" for line in log.remarks), ""] if log.remarks else []
     lines += [
         'format = "graphnav-recording/1"',
-        f"name = {quoted(log.name)}",
+        f"name = {quote(log.name)}",
         f'platform = "{log.platform}"',
     ]
     if log.gps_zero is not None:
@@ -206,7 +206,7 @@ def _vector(values: Array) -> str:
     return "[" + ", ".join(repr(float(x)) for x in values) + "]"
 
 
-def quoted(text: str) -> str:
+def quote(text: str) -> str:
     """A TOML string."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     return '"' + "".join(c if c.isprintable() else " " for c in escaped) + '"'

@@ -15,13 +15,13 @@ from graphnav.recording import Recording
 from graphnav.recording.formats.schema import ANGLE
 from graphnav.recording.formats.writer import write_folder
 
-__all__ = ["rounded", "write_facts", "write_folder"]
+__all__ = ["round_recording", "write_facts", "write_folder"]
 
 # digits after the point, each far below what any sensor resolves
 _T, _RATE, _FORCE, _LAT_LON, _M, _M_S, _DEG = 6, 9, 7, 10, 4, 5, 7
 
 
-def rounded(recording: Recording) -> Recording:
+def round_recording(recording: Recording) -> Recording:
     """The recording with the digits that a file of it should have: what is written is what is read again."""
     imu = recording.imu
     imu = replace(imu, t=_cut(imu.t, _T), gyro=_cut(imu.gyro, _RATE), accel=_cut(imu.accel, _FORCE))

@@ -73,7 +73,7 @@ def faults(
 
 
 @dataclass(frozen=True)
-class _Motion:
+class _InertialMotion:
     """What the IMU knows at the odometer's times."""
 
     force: Array  # (M,) m/s, forward force integrated, slope and bias taken off
@@ -90,7 +90,7 @@ def _ahead_up(imu: Imu) -> tuple[Array, Array]:
     return ahead / max(float(np.linalg.norm(ahead)), 1e-9), up
 
 
-def _motion(odometer: Odometer, imu: Imu, known: float | None) -> _Motion | None:
+def _motion(odometer: Odometer, imu: Imu, known: float | None) -> _InertialMotion | None:
     t, speed = odometer.t, odometer.speed
     dt = np.diff(imu.t, prepend=2 * imu.t[0] - imu.t[1])
     ahead, up = _ahead_up(imu)
@@ -128,10 +128,10 @@ def _motion(odometer: Odometer, imu: Imu, known: float | None) -> _Motion | None
     hole = holes[np.clip(np.searchsorted(imu.t, at), 0, len(imu.t))]
     inside = (at >= imu.t[0]) & (at <= imu.t[-1])
     # a different number of holes before two readings: the force between them is not known. A step no speed makes
-    return _Motion(np.interp(at, imu.t, gained) + np.interp(at, ends, drift) + 1e6 * hole, inside, lag)
+    return _InertialMotion(np.interp(at, imu.t, gained) + np.interp(at, ends, drift) + 1e6 * hole, inside, lag)
 
 
-def _breaks(odometer: Odometer, motion: _Motion | None, figures: Figures) -> list[tuple[int, int]]:
+def _breaks(odometer: Odometer, motion: _InertialMotion | None, figures: Figures) -> list[tuple[int, int]]:
     """Pairs of readings between which x changes by more than it can, the closest pairs that show it, in order."""
     t, v = odometer.t, odometer.speed
     error = figures.step + 6.0 * figures.sigma
@@ -180,7 +180,7 @@ def _closest(i: NDArray[np.intp], j: NDArray[np.intp], found: list[tuple[int, in
 
 
 def _wrong(
-    odometer: Odometer, imu: Imu | None, motion: _Motion | None, figures: Figures
+    odometer: Odometer, imu: Imu | None, motion: _InertialMotion | None, figures: Figures
 ) -> list[tuple[float, float, str]]:
     t, v = odometer.t, odometer.speed
     breaks = _breaks(odometer, motion, figures)
@@ -194,10 +194,10 @@ def _wrong(
         bad += _moves(odometer, imu, motion.lag, stays)
     bad += _islands(t, v, motion, breaks, stays, _ISLAND)
     bad += [(k + 1, max(m, k + 2), WILD) for k, m in breaks]  # nobody knows which side is right
-    return _merged(t, bad)
+    return _merge(t, bad)
 
 
-def _agree(t: Array, v: Array, motion: _Motion | None, i: int, j: int) -> bool:
+def _agree(t: Array, v: Array, motion: _InertialMotion | None, i: int, j: int) -> bool:
     """Whether the motion can have led from one reading to another."""
     apart = t[j] - t[i]
     gained = 0.0 if motion is None else motion.force[j] - motion.force[i]
@@ -209,7 +209,7 @@ def _agree(t: Array, v: Array, motion: _Motion | None, i: int, j: int) -> bool:
 def _islands(
     t: Array,
     v: Array,
-    motion: _Motion | None,
+    motion: _InertialMotion | None,
     breaks: list[tuple[int, int]],
     stays: list[tuple[int, int]],
     longest: float,
@@ -228,7 +228,7 @@ def _islands(
 
 
 def _stuck(
-    t: Array, v: Array, motion: _Motion | None, breaks: list[tuple[int, int]], stays: list[tuple[int, int]]
+    t: Array, v: Array, motion: _InertialMotion | None, breaks: list[tuple[int, int]], stays: list[tuple[int, int]]
 ) -> list[tuple[int, int, str]]:
     """Equal readings with a break at either end or within; the breaks are taken off the list."""
     out = []
@@ -302,7 +302,7 @@ def _moves(odometer: Odometer, imu: Imu, lag: float, stays: list[tuple[int, int]
     return out
 
 
-def _merged(t: Array, bad: list[tuple[int, int, str]]) -> list[tuple[float, float, str]]:
+def _merge(t: Array, bad: list[tuple[int, int, str]]) -> list[tuple[float, float, str]]:
     """As times, with what overlaps in one; the reason is that of the longest part."""
     out: list[tuple[int, int, str, int]] = []
     for begin, end, reason in sorted(bad):

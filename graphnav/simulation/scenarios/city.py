@@ -75,7 +75,7 @@ def _town(
     if idle_hz:
         motor = Engine(FOUR_CYLINDERS, idle_hz, ORDERS, wander_hz=0.06)
         parts += [motor.lines(path, rate, stream(seed, "engine")), idle_floor(path, stream(seed, "idling"))]
-    gaps = spread(path, tunnels, (20.0, 45.0), stream(seed, "tunnels"))
+    gaps = spread_gaps(path, tunnels, (20.0, 45.0), stream(seed, "tunnels"))
     receiver = replace(RTK if gnss == "rtk" else SINGLE, outages=gaps, dropouts=0.01)
     return record(
         name, seed, path,
@@ -93,7 +93,7 @@ def _sitting(path: Path, seed: int) -> list[Boarding | Fidget]:
     return [*fidgets, Boarding(path.end - 9.0, -1.0, -1.0, 1.0)]
 
 
-def spread(path: Path, count: int, length: Span, rng: np.random.Generator) -> tuple[Span, ...]:
+def spread_gaps(path: Path, count: int, length: Span, rng: np.random.Generator) -> tuple[Span, ...]:
     """`count` gaps over the drive, each where the vehicle moves most, of a length between the two given, s."""
     t = np.arange(path.start, path.end)
     moved: Array = np.abs(path.speed(t))

@@ -10,7 +10,7 @@ from graphnav.simulation.inertial import MEMS
 from graphnav.simulation.kinematics import Mount
 from graphnav.simulation.motion import Manoeuvre, Path, drive
 from graphnav.simulation.result import Simulated, record
-from graphnav.simulation.scenarios.city import FOUR_CYLINDERS, ORDERS, RTK, SINGLE, spread
+from graphnav.simulation.scenarios.city import FOUR_CYLINDERS, ORDERS, RTK, SINGLE, spread_gaps
 from graphnav.simulation.scenarios.registry import Scenario
 from graphnav.simulation.splines import stream
 from graphnav.simulation.vibration import Engine, Shake, Springs, idle_floor, road_noise
@@ -48,7 +48,7 @@ def motorway(seed: int, *, duration: float = 1500.0, exact: bool = False, rate: 
     plan += [Manoeuvre(left, 28.0, 0.0, 0.0), Manoeuvre(15.0, 13.0), Manoeuvre(10.0, 10.0, -70.0)]
     plan += [Manoeuvre(10.0, 0.0), Manoeuvre(30.0, 0.0)]
     path = drive(plan, heading=float(rng.uniform(0.0, 360.0)), slip_per_accel=0.005)
-    gaps = spread(path, 2, (8.0, 25.0), stream(seed, "tunnels"))
+    gaps = spread_gaps(path, 2, (8.0, 25.0), stream(seed, "tunnels"))
     return record(
         "motorway", seed, path,
         origin=(48.35, 11.79, 20.0), imu=MEMS.at(rate), mount=_MOUNT, shake=_shake(path, seed, rate, 1.0), exact=exact,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from graphnav.core.errors import ConfigError
-from graphnav.simulation.aiding import Fault, GnssModel, OdometerModel, Span
+from graphnav.simulation.aiding import GnssModel, OdometerModel, SimulatedFault, Span
 from graphnav.simulation.inertial import ImuModel, accelerometer, gyroscope
 from graphnav.simulation.kinematics import Mount
 from graphnav.simulation.motion import Manoeuvre, drive
@@ -41,15 +41,15 @@ def run(
     `odometer` adds wheel speeds, which the paper has not.
     """
     outages: tuple[Span, ...] = ()
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[SimulatedFault, ...] = ()
     if fault == "outage":
         outages = FAULTS
     elif fault == "noise":
-        faults = tuple(Fault(a, b, noise=100.0) for a, b in FAULTS)
+        faults = tuple(SimulatedFault(a, b, noise=100.0) for a, b in FAULTS)
     elif fault == "growing":
         rise = (0.7071 * growth, 0.7071 * growth, 0.0)
         drift = rise if growth_in_velocity else (0.0, 0.0, 0.0)
-        faults = tuple(Fault(a, b, growth=rise, velocity=drift) for a, b in FAULTS)
+        faults = tuple(SimulatedFault(a, b, growth=rise, velocity=drift) for a, b in FAULTS)
     elif fault != "none":
         raise ConfigError(f"fault = '{fault}': must be none, noise, growing or outage")
     if stops_every and stops_every < 4.0:
