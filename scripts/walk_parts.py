@@ -45,7 +45,8 @@ CASES: dict[str, tuple[Mapping[str, Any], dict[str, Any]]] = {
     "no zero rate": ({"standstill": {"zero_rate": False}}, {}),
     "noise as stated": ({"noise": {"mode": "stated"}}, {}),
     "offset as the unit left it": ({"imu": {"onboard_offset": False}}, {}),
-    "no noise of heel strikes": ({}, {"graphnav.estimation.problem.with_unresolved_motion": lambda samples, noise: samples}),
+    "no noise of heel strikes": (
+        {}, {"graphnav.estimation.problem.with_unresolved_motion": lambda samples, noise: samples}),
     "axes taken as square": ({}, {"graphnav.imu.dynamics._scale_parameter": lambda noise, _: _square(noise, 3)}),
     "peaks left cut off": ({}, {"graphnav.estimation.problem.with_whole_peaks": lambda samples, *_: (samples, ())}),
     "no coning": ({"imu": {"coning": False}}, {}),

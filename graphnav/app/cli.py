@@ -1,4 +1,4 @@
-"""The program `graphnav`. Commands read their options here; `graphnav.app.workflow` and `graphnav.app.outputs` do the work.
+"""The program `graphnav`. Commands read their options here; `workflow` and `outputs` beside it do the work.
 
 Nothing heavy is imported before a command runs, so that help comes at once.
 """
@@ -252,7 +252,7 @@ def _usage(error: Any) -> str:
 def _internal(error: Exception) -> str:
     """The error and the last line of graphnav that led to it."""
     frames = traceback.extract_tb(error.__traceback__)
-    package = Path(__file__).parent
+    package = Path(__file__).parents[1]
     at = ([frame for frame in frames if package in Path(frame.filename).parents] or list(frames))[-1]
     return (
         f"internal error: {type(error).__name__}: {error} in {Path(at.filename).name}:{at.lineno}; "

@@ -1,4 +1,4 @@
-"""Commands that make or describe recordings: `convert`, `init`, `allan`, `simulate`. `graphnav.app.cli` has the others."""
+"""Commands that make or describe recordings: `convert`, `init`, `allan`, `simulate`. `cli` has the others."""
 
 from __future__ import annotations
 

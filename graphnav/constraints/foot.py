@@ -4,7 +4,8 @@ Ren 2021 takes the IMU's velocity as zero in stance and its sideways velocity as
 are nearly true only, and what is missing is not noise. Over the floor a shoe rolls, from the heel at its landing to
 the toes where it takes off, and the IMU on top of it, 5 to 15 cm above the sole, goes forward meanwhile: at
 0.2 rad/s in the middle of a stance 2 cm/s, 1.5 % of the way of a walk. What does not move is where shoe and floor
-touch. So the rows of `Stance` say, of the mean over each interval within a stance (see `constraints.vehicle.IntervalMotion`),
+touch. So the rows of `Stance` say, of the mean over each interval within a stance (see
+`constraints.vehicle.IntervalMotion`),
 
     mean of  v_b + omega_nb x (l + c d)  =  0          l: pivot,  d = (d_x, d_y, 0): its travel,  c: -1 ... 1
 

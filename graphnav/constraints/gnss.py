@@ -15,8 +15,8 @@ e is the time-correlated part of a position's error: fixes of one receiver secon
 of them are not worth a thousand. It is the sum of three Gauss-Markov processes in units of the stated sigma: one of
 seconds (reflections), one of minutes (multipath as satellites move, satellites coming and going) and one of hours
 (orbits, atmosphere, the base's coordinates). The stated sigma itself is that of the white part. How much of each there
-is, the noise model says (`graphnav.estimation.noise`), for each type of fix where there are several: what fixed and single-point
-fixes are wrong by has nothing to do with each other. With stated noise there is the white part alone.
+is, the noise model says (`graphnav.estimation.noise`), for each type of fix where there are several: what fixed and
+single-point fixes are wrong by has nothing to do with each other. With stated noise there is the white part alone.
 """
 
 from __future__ import annotations

@@ -122,7 +122,8 @@ def build_problem(
     known : what intervals between keyframes say that were integrated before, by the time they end at.
     highest : what the IMU has read at other times, as `graphnav.imu.clipping.highest` says.
     complete : False leaves out the constraints that look ahead, for `Problem.completed`.
-    parts_of_noise : keep what each noise figure contributes to the intervals' covariances, for `graphnav.estimation.noise`.
+    parts_of_noise : keep what each noise figure contributes to the intervals' covariances, for
+    `graphnav.estimation.noise`.
     """
     stops = to_samples(stationary, recording)
     if times is None:

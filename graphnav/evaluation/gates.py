@@ -101,7 +101,7 @@ def _full(name: str, text: str) -> str:
 
 
 def judge(requirements: Sequence[Requirement], rows: Sequence[Mapping[str, Any]]) -> list[Verdict]:
-    """The verdicts on rows of numbers, one row a solver, as `graphnav.evaluation.metrics.comparison_rows` makes them."""
+    """The verdicts on rows of numbers, one row a solver, as `metrics.comparison_rows` makes them."""
     verdicts = []
     for requirement in requirements:
         for row in rows:

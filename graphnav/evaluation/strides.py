@@ -1,9 +1,9 @@
 """How a walk without a place on the Earth is judged: by shape, strides, height and closure.
 
 A solution's position and heading count from zero at its start, a truth in a local frame from anywhere. For the shape,
-yaw and offset are fitted over all epochs, as in `graphnav.evaluation.scoring`. For consistency that would be wrong: the solution
-is certain of its start and says of all else how far from there it may be. So the truth is moved to the solution where
-it begins, and only the yaw is fitted.
+yaw and offset are fitted over all epochs, as in `graphnav.evaluation.scoring`. For consistency that would be wrong: the
+solution is certain of its start and says of all else how far from there it may be. So the truth is moved to the
+solution where it begins, and only the yaw is fitted.
 """
 
 from __future__ import annotations

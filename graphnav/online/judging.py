@@ -1,9 +1,9 @@
 """Estimating the noise model again by more rows, beside the drive: no keyframe waits for it.
 
-The estimate itself (`graphnav.estimation.noise`), which filters and smooths some minutes a dozen times, is made in a thread. Its
-answer is used at the first row after a fixed time of the drive, so that what comes out does not depend on how long it
-took. A second tracker then goes through what has not settled with the new model, some keyframes at a row, and takes the
-first one's place when it has caught up.
+The estimate itself (`graphnav.estimation.noise`), which filters and smooths some minutes a dozen times, is made in a
+thread. Its answer is used at the first row after a fixed time of the drive, so that what comes out does not depend on
+how long it took. A second tracker then goes through what has not settled with the new model, some keyframes at a row,
+and takes the first one's place when it has caught up.
 """
 
 from __future__ import annotations

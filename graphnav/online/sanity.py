@@ -1,7 +1,8 @@
 """Which rows of a live source cannot be right: beyond any sensor, out of reach, or of a clock that was set back.
 
-The judgements are those of a recording (`graphnav.recording.plausibility.screening`, `graphnav.recording.formats.repair`), made row by row: a row is
-left out as if it had never come, and counted. Rows that every sensor can have sent pass untouched.
+The judgements are those of a recording (`graphnav.recording.plausibility.screening`,
+`graphnav.recording.formats.repair`), made row by row: a row is left out as if it had never come, and counted. Rows that
+every sensor can have sent pass untouched.
 """
 
 from __future__ import annotations

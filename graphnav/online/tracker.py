@@ -1,8 +1,8 @@
 """The graph of a running drive: keyframes posed as they come, stops classified, the window kept and settled.
 
-New keyframes are posed like a recording (`graphnav.estimation.problem.build_problem`), from the rows around them: the same code builds
-the same rows as offline. Whatever changes the past inside the window (a fix that comes late, a stop that is
-recognised a second or two after it began) takes back the keyframes from there on and poses them again.
+New keyframes are posed like a recording (`graphnav.estimation.problem.build_problem`), from the rows around them: the
+same code builds the same rows as offline. Whatever changes the past inside the window (a fix that comes late, a stop
+that is recognised a second or two after it began) takes back the keyframes from there on and poses them again.
 
 `update` is what somebody waits for; `spare` does one thing at a time that nobody waits for. To that belongs all of the
 next keyframe but its fix: as soon as its interval is there it is posed and predicted. What was made so counts as long

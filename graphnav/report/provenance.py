@@ -39,7 +39,7 @@ def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any]
 
 
 def command(options: Mapping[str, Any], settings: bool = True) -> str:
-    """The call of the program for options as `graphnav.app.workflow.Request` keeps them, with `SETTINGS` if asked for."""
+    """The call of the program for options as `app.workflow.Request` keeps them, with `SETTINGS` if asked for."""
     given = dict(options)
     name = "compare" if "solvers" in given else "smooth"
     words = ["graphnav", name, str(given.pop("recording", "RECORDING"))]

@@ -23,10 +23,11 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array, mv
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Imu, Recording, Truth
+from graphnav.recording.formats.writing import round_recording
 from graphnav.simulation.gait import HEADING, PITCH, PLACE, ROLL, STEP, Foot
 from graphnav.simulation.inertial import ImuModel
 from graphnav.simulation.kinematics import TrueMotion
-from graphnav.simulation.result import Simulated, rounded
+from graphnav.simulation.result import Simulated
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 _CHUNK = 1 << 13  # samples at a time
@@ -136,4 +137,4 @@ def record_walk(
         "accel": int(np.sum(np.any(np.abs(motion.accel) > imu.accel.limit, axis=1))),
     }
     known["stances"], known["contacts"] = foot.stances.tolist(), foot.contacts.tolist()
-    return Simulated(rounded(recording), truth, foot.stances[[0, -1]], known, motion)
+    return Simulated(round_recording(recording), truth, foot.stances[[0, -1]], known, motion)

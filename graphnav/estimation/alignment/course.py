@@ -80,7 +80,7 @@ def _alike(turn: float, length: float, dt: float) -> float:
     """How many fixes in a row are worth one at worst, for what changes as quickly as a vehicle's motion.
 
     At a rate w (rad/s), errors of the variance s^2 that are white from fix to fix have the density s^2 dt; the worst
-    that last (`graphnav.estimation.alignment.travel`), s^2 / w. The rate is that of the turns (rad, in so many seconds), or one
-    turn in the stretch.
+    that last (`graphnav.estimation.alignment.travel`), s^2 / w. The rate is that of the turns (rad, in so many
+    seconds), or one turn in the stretch.
     """
     return max(1.0, length / (max(turn, 2.0 * np.pi) * dt))

@@ -54,8 +54,8 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
     """The stretch (s) to align over: from just before the first motion until enough of it was seen.
 
     It moves where it is farther away than the errors of the fixes can have brought it, over ground or in its own axes
-    (`graphnav.estimation.alignment.travel`); enough is seen once these errors leave little doubt of the direction. What the fixes
-    say of motion while a vehicle stands, `stationary` (N, 2) s, is none.
+    (`graphnav.estimation.alignment.travel`); enough is seen once these errors leave little doubt of the direction. What
+    the fixes say of motion while a vehicle stands, `stationary` (N, 2) s, is none.
     """
     gnss = recording.gnss
     if gnss is None:

@@ -1,8 +1,9 @@
 """Which measurements are wrong for a while: each span decided once, by evidence.
 
-The bank of likelihood-ratio tests (`graphnav.estimation.solvers.watch`) says in which spans fixes disagree with everything else by
-something that lasts. Who is wrong there is another question. With the noise model as it is, each span is put as several
-models, each with its own likelihood of the innovations from the span's beginning to that of the next one:
+The bank of likelihood-ratio tests (`graphnav.estimation.solvers.watch`) says in which spans fixes disagree with
+everything else by something that lasts. Who is wrong there is another question. With the noise model as it is, each
+span is put as several models, each with its own likelihood of the innovations from the span's beginning to that of the
+next one:
 
     neither     all is as the noise model has it
     fixes       positions, velocities or both have one unknown error in common in the span, which grows steadily

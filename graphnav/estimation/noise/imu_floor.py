@@ -1,11 +1,11 @@
 """The white noise that an IMU on a shoe has of its own, where the figures stated are larger than it shows.
 
 Figures written down for a foot are often generous, because heel strikes make more noise than any data sheet says. But
-those have their own place (`graphnav.imu.unresolved`), and a gyro that is called ten times noisier than it is leaves its
-bias ten times less known by the rests at both ends of a walk. So the quietest stretch of the recording is asked: means
-over `_CLUSTER`, and of them the second differences, in which a slow sway cancels. White noise of a density q leaves
-6 q^2 / `_CLUSTER` in each of their squares (Allan variance has first differences, 2 q^2 / `_CLUSTER`). A person who
-stands adds to that, so it is a bound from above; but the quietest of many stretches is quiet by chance as well, and
+those have their own place (`graphnav.imu.unresolved`), and a gyro that is called ten times noisier than it is leaves
+its bias ten times less known by the rests at both ends of a walk. So the quietest stretch of the recording is asked:
+means over `_CLUSTER`, and of them the second differences, in which a slow sway cancels. White noise of a density q
+leaves 6 q^2 / `_CLUSTER` in each of their squares (Allan variance has first differences, 2 q^2 / `_CLUSTER`). A person
+who stands adds to that, so it is a bound from above; but the quietest of many stretches is quiet by chance as well, and
 the figure is one that true noise would show less than in `_CHANCE` of them.
 
 A drive is not asked: while its engine runs it vibrates as it never does at rest. Nor is a walk that is still going on:

@@ -1,9 +1,10 @@
 """A keyframe enters the window in two steps, as in any filter: prediction, and the rows that had to be waited for.
 
 Prediction puts under the message of the keyframe before the rows of the interval, of parameters that move on, and of
-those measurements that the interval itself tells; QR eliminates what only they touch (see `graphnav.estimation.solvers.stages`).
-What smooths back is known from then on, because nothing that comes later touches the keyframe before. What is left is
-a triangle, and a fix adds a few rows under it: a QR of that shape (LAPACK's tpqrt) costs a fraction of the first.
+those measurements that the interval itself tells; QR eliminates what only they touch (see
+`graphnav.estimation.solvers.stages`). What smooths back is known from then on, because nothing that comes later touches
+the keyframe before. What is left is a triangle, and a fix adds a few rows under it: a QR of that shape (LAPACK's tpqrt)
+costs a fraction of the first.
 """
 
 from __future__ import annotations

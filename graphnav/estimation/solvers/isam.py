@@ -1,7 +1,7 @@
 """A recorded drive through GTSAM's iSAM2, keyframe by keyframe: its own answer, live and settled.
 
-The rows are those of every solver; the tree is that of `graphnav.estimation.solvers.tree`. With a lag, keyframes older than it
-are settled and marginalised; without one, the whole drive is relinearised until nothing moves any more.
+The rows are those of every solver; the tree is that of `graphnav.estimation.solvers.tree`. With a lag, keyframes older
+than it are settled and marginalised; without one, the whole drive is relinearised until nothing moves any more.
 """
 
 from __future__ import annotations

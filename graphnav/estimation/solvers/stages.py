@@ -12,8 +12,8 @@ with QR (Bierman 1977, ch. VI; Dellaert and Kaess 2006) what only they touch: x_
 For a chain this is the elimination that GTSAM does in the same order, on matrices that are dense anyway. Here are the
 rows and what comes of them; `graphnav.estimation.solvers.elimination` does it.
 
-A message may have tests beside it (`graphnav.estimation.solvers.watch`) that look for errors of fixes that last: more columns on
-the right, which go through the same QR.
+A message may have tests beside it (`graphnav.estimation.solvers.watch`) that look for errors of fixes that last: more
+columns on the right, which go through the same QR.
 """
 
 from __future__ import annotations

@@ -367,8 +367,10 @@ class Tree:
                 if i in links:
                     assert linear.link is not None
                     last, link = self.keyframes[i - 1], linear.link
-                    blocks = [(last.state, rotate_columns(link[:, :DIM], last.state.delta)),
-                              (keyframe.state, rotate_columns(link[:, DIM : 2 * DIM], keyframe.state.delta))]  # fmt: skip
+                    blocks = [
+                        (last.state, rotate_columns(link[:, :DIM], last.state.delta)),
+                        (keyframe.state, rotate_columns(link[:, DIM : 2 * DIM], keyframe.state.delta)),
+                    ]
                     made.append((keyframe, LINK, self._about(
                         link[:, DIM:-1], link[:, -1], blocks, last.columns, last.nodes)))  # fmt: skip
                     gone += keyframe.slots.pop(LINK)

@@ -1,4 +1,4 @@
-"""What a `graphnav.estimation.solvers.tree.Tree` is made of: variables about anchors, keyframes, factors, and their text."""
+"""What a `tree.Tree` is made of: variables about anchors, keyframes, factors, and their text."""
 
 from __future__ import annotations
 

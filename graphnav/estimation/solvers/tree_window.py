@@ -1,7 +1,7 @@
 """The window of an online run on GTSAM's iSAM2: its keyframes are smoothed, relinearised and marginalised in a tree.
 
-What enters is made as in `graphnav.estimation.solvers.window`: a keyframe is predicted, its innovations tested, robust rows
-weighed, all of it from a message of the newest keyframe. From there on the tree holds the rows. Live and settled
+What enters is made as in `graphnav.estimation.solvers.window`: a keyframe is predicted, its innovations tested, robust
+rows weighed, all of it from a message of the newest keyframe. From there on the tree holds the rows. Live and settled
 estimates are its own, and so is the message that the next keyframe is predicted from once the past has been linearised
 anew. The keyframe that settled last stays in the tree, so that all behind it can be taken back.
 """

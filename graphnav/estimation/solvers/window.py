@@ -1,9 +1,9 @@
 """A window over the newest keyframes: exact smoothing with bounded time and memory.
 
-Keyframes enter one by one (`graphnav.estimation.solvers.stages`); the newest message is what a filter would hold. Back through
-the stages go means and covariances (Rauch, Tung, Striebel in information form). A keyframe that is older than the
-lag leaves the window: its state is settled, and the message behind it is the marginal of all the past, a Gaussian on
-what the future still touches. Where a state has moved so far that its rows should be linearised anew, the stages
+Keyframes enter one by one (`graphnav.estimation.solvers.stages`); the newest message is what a filter would hold. Back
+through the stages go means and covariances (Rauch, Tung, Striebel in information form). A keyframe that is older than
+the lag leaves the window: its state is settled, and the message behind it is the marginal of all the past, a Gaussian
+on what the future still touches. Where a state has moved so far that its rows should be linearised anew, the stages
 from there on are made again about the smoothed states: Gauss-Newton on the window. A measurement that comes late
 does the same from its own time on. With a lag longer than the drive this is the batch solution.
 """

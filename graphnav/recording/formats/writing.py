@@ -1,4 +1,4 @@
-"""What a made recording keeps of its digits, and the facts beside it; `graphnav.recording.formats.writer` writes the folder."""
+"""What a made recording keeps of its digits, and the facts beside it; `writer` writes the folder."""
 
 from __future__ import annotations
 
