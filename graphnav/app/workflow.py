@@ -40,7 +40,7 @@ SOURCES = ("gnss", "odometer")
 _DENSEST, _MOST = 0.1, 5_000  # s between, and number of, the epochs of a truth that are met exactly
 _MOST_TURNING = 20_000  # the same where a point at the end of a lever arm swings between them
 _ENOUGH = 1000  # keyframes that make other epochs needless
-_SAME, _NEAR = 1e-4, 0.02  # s; between epochs that are one, and between rows where nothing else can happen
+_SAME, _BETWEEN_ROWS = 1e-4, 0.02  # s; between epochs that are one, and between rows where nothing else can happen
 OUTAGE = 10.0  # s; fixes further apart than this are an outage worth a line of its own
 
 
@@ -385,7 +385,7 @@ def _epochs(solution: Solution, truth: Array) -> Array:
         t = solution.t[(solution.t >= truth[0] - _SAME) & (solution.t <= truth[-1] + _SAME)]
         k = np.clip(np.searchsorted(truth, t), 1, len(truth) - 1)
         before, after = t - truth[k - 1], truth[k] - t
-        there = (np.minimum(np.abs(before), np.abs(after)) <= _SAME) | (before + after <= _NEAR)
+        there = (np.minimum(np.abs(before), np.abs(after)) <= _SAME) | (before + after <= _BETWEEN_ROWS)
         if there.sum() >= max(_ENOUGH, 0.8 * len(t)):
             return np.asarray(t[there])
     return _thin(truth, solution, _MOST)

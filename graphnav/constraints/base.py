@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from graphnav.config import Settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
+from graphnav.core.shared import Shared
 from graphnav.core.state import BLOCKS, DIM, Parameter, States
 from graphnav.imu.preintegration import Intervals
 from graphnav.recording import Recording
@@ -35,7 +35,7 @@ class Linearized:
 
 
 @dataclass(frozen=True)
-class BuildContext:
+class BuildContext(Shared):
     """What a constraint may look at to build its rows."""
 
     recording: Recording
@@ -46,11 +46,6 @@ class BuildContext:
     intervals: Intervals  # (K-1) between the keyframes
     speed: MeanSpeed | None = None  # of the odometer, where it is known already
     typical_sigmas: Array | None = None  # (M, 3) m, sigma that the fixes usually state, where it is known already
-
-    @cached_property
-    def made(self) -> dict[str, Any]:
-        """What several constraints need and one of them has made."""
-        return {}
 
     def keyframe_at(self, t: Array) -> Array:
         """Index of the keyframe at each time, -1 where there is none."""

@@ -104,13 +104,6 @@ class _Prepared:
 
 
 def _prepare(scene: BuildContext) -> _Prepared | None:
-    if "raw_gnss" not in scene.made:
-        scene.made["raw_gnss"] = _prepare_rows(scene)
-    found: _Prepared | None = scene.made["raw_gnss"]
-    return found
-
-
-def _prepare_rows(scene: BuildContext) -> _Prepared | None:
     raw = _select(scene.recording, scene.settings)
     if raw is None:
         return None
@@ -224,7 +217,7 @@ class GnssCode(_Satellites):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssCode | None:
-        found = _prepare(scene) if scene.settings.raw_gnss.code else None
+        found = scene.share(_prepare) if scene.settings.raw_gnss.code else None
         if found is None:
             return None
         raw, settings = found.raw, scene.settings
@@ -329,7 +322,7 @@ class GnssDoppler(_Satellites):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssDoppler | None:
-        found = _prepare(scene) if scene.settings.raw_gnss.doppler else None
+        found = scene.share(_prepare) if scene.settings.raw_gnss.doppler else None
         if found is None:
             return None
         raw, common = found.raw, _common(scene, found)

@@ -206,21 +206,6 @@ class _Velocity:
 
 def moving_rows(scene: BuildContext) -> Array:
     """Indices of the intervals in which the vehicle does not stand, long enough to mean something."""
-    if "moving" not in scene.made:
-        scene.made["moving"] = _moving_rows(scene)
-    return np.asarray(scene.made["moving"])
-
-
-def share_interval_motion(scene: BuildContext) -> IntervalMotion:
-    """Of the intervals `moving_rows`."""
-    if "past" not in scene.made:
-        scene.made["past"] = IntervalMotion.of(scene.intervals, moving_rows(scene), scene.frame)
-    past = scene.made["past"]
-    assert isinstance(past, IntervalMotion)
-    return past
-
-
-def _moving_rows(scene: BuildContext) -> Array:
     t0, t1 = scene.intervals.t0, scene.intervals.t1
     usable = t1 - t0 >= _SHORTEST
     for begin, end in scene.stationary:
@@ -228,15 +213,13 @@ def _moving_rows(scene: BuildContext) -> Array:
     return np.flatnonzero(usable)
 
 
-def share_parameters(scene: BuildContext) -> dict[str, Any]:
-    """Lever arm of the point that does not slip, and the parameters both constraints depend on."""
-    if "wheels" not in scene.made:
-        scene.made["wheels"] = _share_parameters(scene)
-    lever, parameters = scene.made["wheels"]
-    return {"lever_arm": lever, "parameters": list(parameters)}
+def interval_motion(scene: BuildContext) -> IntervalMotion:
+    """Of the intervals `moving_rows`."""
+    return IntervalMotion.of(scene.intervals, scene.share(moving_rows), scene.frame)
 
 
-def _share_parameters(scene: BuildContext) -> tuple[Array, list[Parameter]]:
+def wheel_parameters(scene: BuildContext) -> tuple[Array, list[Parameter]]:
+    """Lever arm (3,) of the point that does not slip, m, and the parameters both constraints depend on."""
     s, odometer = scene.settings.vehicle, scene.recording.odometer
     parameters = list(scale_parameter(scene.recording))
     lever = np.zeros(3) if odometer is None else odometer.lever_arm
@@ -280,15 +263,12 @@ class NonHolonomic(Wheels):
         s = scene.settings.vehicle
         if scene.recording.platform != "vehicle" or not s.nhc:
             return None
-        rows = moving_rows(scene)
-        shared = share_parameters(scene)
+        rows, past = scene.share(moving_rows), scene.share(interval_motion)
+        lever_arm, parameters = wheel_parameters(scene)
         if s.body_sigma > 0:
-            shared["parameters"].append(
+            parameters.append(
                 Parameter(BODY, np.zeros(2), np.full(2, s.body_sigma), "rad s^2/m, of lateral and forward acceleration")
             )
-        shared["parameters"] = tuple(shared["parameters"])
-        shared["processes"] = (slow_error_parameter(NHC_ERROR, np.asarray(s.nhc_density), cls),)
-        past = share_interval_motion(scene)
         density = np.asarray(s.nhc_density) / np.sqrt(scene.intervals.T[rows])[:, None]
         beyond = np.maximum(np.abs(past.force[:, 0]) - _LINEAR, 0.0)
         right = np.hypot(_BEYOND * beyond, _AXLE_LEFT * past.rate[:, 2])
@@ -298,8 +278,10 @@ class NonHolonomic(Wheels):
             past=past,
             sigma=np.hypot(density, columns(right, up)),
             unscaled=columns(right, up),
+            lever_arm=lever_arm,
+            parameters=tuple(parameters),
+            processes=(slow_error_parameter(NHC_ERROR, np.asarray(s.nhc_density), cls),),
             **s.outliers,
-            **shared,
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -356,7 +338,7 @@ class OdometerSpeed(Wheels):
         if scene.recording.platform != "vehicle" or odometer is None or not s.odometer:
             return None
         speed = scene.speed or _speed_of(odometer, scene.recording.imu)
-        rows, past = moving_rows(scene), share_interval_motion(scene)
+        rows, past = scene.share(moving_rows), scene.share(interval_motion)
         begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
         reach = REACH * odometer.delay_sigma
         good = np.all([np.isfinite(speed(begin, end, d)[0]) for d in {-reach, 0.0, reach}], axis=0)
@@ -365,16 +347,12 @@ class OdometerSpeed(Wheels):
             past = IntervalMotion.of(scene.intervals, rows, scene.frame)
         if not len(rows):
             return None
-        shared = share_parameters(scene)
+        lever_arm, parameters = wheel_parameters(scene)
         walk = s.scale_walk / np.sqrt(60.0)
-        shared["parameters"].append(
-            Parameter(ODOMETER_SCALE, np.zeros(1), np.full(1, odometer.scale_sigma), "1", walk=walk)
-        )
+        parameters.append(Parameter(ODOMETER_SCALE, np.zeros(1), np.full(1, odometer.scale_sigma), "1", walk=walk))
         if odometer.delay_sigma > 0:
-            shared["parameters"].append(Parameter(ODOMETER_DELAY, np.zeros(1), np.full(1, odometer.delay_sigma), "s"))
+            parameters.append(Parameter(ODOMETER_DELAY, np.zeros(1), np.full(1, odometer.delay_sigma), "s"))
         density = np.atleast_1d(np.hypot(s.odometer_density, np.median(speed.sigma(begin, end) * np.sqrt(end - begin))))
-        shared["parameters"] = tuple(shared["parameters"])
-        shared["processes"] = (slow_error_parameter(ODOMETER_ERROR, density, cls),)
         sigma = np.hypot(speed.sigma(begin, end), s.odometer_density / np.sqrt(end - begin))
         return cls(
             keyframe=rows + 1,
@@ -385,8 +363,10 @@ class OdometerSpeed(Wheels):
             signed=odometer.signed,
             sigma=sigma[:, None],
             reach=reach,
+            lever_arm=lever_arm,
+            parameters=tuple(parameters),
+            processes=(slow_error_parameter(ODOMETER_ERROR, density, cls),),
             **s.outliers,
-            **shared,
         )
 
     @cached_property

@@ -105,7 +105,7 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
     by_rows = found.name == LOW_BAND  # its windows are of the rows in which edges are sought
     # a threshold that the data moved up is for windows; an edge is where the noise and sway of a row end
     limit = min(float(np.max(found.threshold)), _EDGE) if by_rows else _EDGE
-    spans = edges(b, found.intervals, low_band(scene)[1], limit)
+    spans = edges(b, found.intervals, scene.share(low_band)[1], limit)
     if not by_rows:
         spans = _without_speed(b, spans, scene.settings.fusion)
     spans = merge_spans(longer_than(spans, 3.0 * b.period))
@@ -265,7 +265,7 @@ def decide_fused(scene: Scene, detectors: Mapping[str, type[Detector]], shown: b
     detectors : all, by their names; the others learn from these what standing looks like here.
     shown : whether the answers of those that decide nothing are wanted.
     """
-    low, _ = low_band(scene)
+    low, _ = scene.share(low_band)
     still, certain, notes = candidates(scene, low)
     half = 0.5 * scene.settings.low_band_glrt.window
     labels = Labels(still, spans_of(low.statistic > _CLEARLY * low.threshold, low.t, half))

@@ -127,6 +127,10 @@ def window_means(b: Blocks, length: float) -> Means | None:
     )
 
 
+def _means(scene: Scene) -> Means | None:
+    return window_means(scene.blocks, scene.settings.glrt.window)
+
+
 class _Windowed(Detector):
     """One statistic of the recording, with a threshold of its own.
 
@@ -141,9 +145,7 @@ class _Windowed(Detector):
     @classmethod
     def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
         name, settings, noise = cls.name, scene.settings.glrt, scene.recording.imu.noise
-        if "means" not in scene.made:
-            scene.made["means"] = window_means(scene.blocks, settings.window)
-        m: Means | None = scene.made["means"]
+        m = scene.share(_means)
         least = _AT_NOISE[name]
         if m is None:
             none = np.zeros(0)

@@ -41,17 +41,12 @@ class LowBandGlrt(Detector):
 
     @classmethod
     def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
-        return low_band(scene)[0]
+        return scene.share(low_band)[0]
 
 
 def low_band(scene: Scene) -> tuple[Detection, Scale]:
-    """Its answer, and the scale of a low-passed row at rest, which edges are found by; made once."""
-    if NAME not in scene.made:
-        scene.made[NAME] = detect_low_band(
-            scene.low, scene.recording.imu.noise, scene.settings.low_band_glrt, scene.certain
-        )
-    found: tuple[Detection, Scale] = scene.made[NAME]
-    return found
+    """Its answer, and the scale of a low-passed row at rest, which edges are found by; to be shared."""
+    return detect_low_band(scene.low, scene.recording.imu.noise, scene.settings.low_band_glrt, scene.certain)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from graphnav.config.detectors import DetectorSettings
 from graphnav.core.earth import gravity
 from graphnav.core.findings import period_of
 from graphnav.core.rotation import Array
+from graphnav.core.shared import Shared
 from graphnav.detectors.base import Detection
 from graphnav.detectors.motion import Speeds, moving, speeds
 from graphnav.detectors.windows import Blocks, LowPassed, blocks, low_pass
@@ -23,7 +24,7 @@ MG = 9.80665e-3  # m/s^2
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(Shared):
     """A recording, or a window of one, and what several detectors need of it."""
 
     recording: Recording
@@ -63,11 +64,6 @@ class Scene:
             if len(there):
                 return float(gravity(*gnss.llh[there[0], [0, 2]]))
         return _STANDARD_GRAVITY
-
-    @cached_property
-    def made(self) -> dict[str, Any]:
-        """What several detectors need and one of them has made."""
-        return {}
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ _QUIET = 1.0  # s; the quietest of the recording says what bias and gravity are
 _ENOUGH = 5  # spans, to say what is usual
 _LEAST_SPREAD = 0.3  # of log e, between the stances of the most even walk
 _SPREADS = 3.0
-_NEAR = 0.8  # s from an end of a span within which its quietest moment is looked for: twice what a slide lasts
+_EDGE_SEARCH = 0.8  # s from an end of a span within which its quietest moment is looked for: twice what a slide lasts
 _REACH = 0.2  # m, from an IMU on a shoe to where the shoe touches the floor, at most
 
 
@@ -137,7 +137,7 @@ def _without_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fa
     ways = []  # from a quiet moment outward: which span, which end of it, the window, the first row and how many
     for side, way in ((0, -1), (1, 1)):
         for n, (begin, end) in enumerate(spans):
-            lo, hi = (begin, min(begin + _NEAR, end)) if side == 0 else (max(end - _NEAR, begin), end)
+            lo, hi = (begin, min(begin + _EDGE_SEARCH, end)) if side == 0 else (max(end - _EDGE_SEARCH, begin), end)
             first, last = np.searchsorted(t, [lo, hi])
             if not np.isfinite(e[first:last]).any():
                 continue

@@ -25,7 +25,7 @@ from graphnav.core.rotation import Array
 from graphnav.imu.samples import Samples
 from graphnav.recording import Imu
 
-_NEAR = 0.95  # of the highest reading: a range that ends lower than that for some peaks is none
+_RANGE_END = 0.95  # of the highest reading: a range that ends lower than that for some peaks is none
 _BAND = 0.01  # b
 _SOFT_BAND = 0.03  # b, of an axis that is known to end: it does so softly
 _TOO_FLAT = 2.5  # q
@@ -60,7 +60,7 @@ def _flat(t: Array, x: Array, least: float, band: float, highest: Array) -> list
     found = []
     for sign, most in zip((1.0, -1.0), highest, strict=True):
         y = sign * x
-        limit = max(_NEAR * max(float(y.max(initial=0.0)), float(most)), least)
+        limit = max(_RANGE_END * max(float(y.max(initial=0.0)), float(most)), least)
         high = np.flatnonzero(np.diff(np.r_[False, y >= limit, False].astype(int)))
         for begin, end in zip(high[::2], high[1::2], strict=True):
             top = y[begin:end].max()

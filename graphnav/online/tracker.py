@@ -43,7 +43,7 @@ from graphnav.online.steps import StepCutter
 from graphnav.recording import Recording
 from graphnav.recording.odometer import MeanSpeed
 
-_NEAR = 2.0  # s of rows before a keyframe that its constraints look at where the IMU has no gap; else `CONTEXT`
+_ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints look at where the IMU has no gap; else `CONTEXT`
 _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
 _AT_A_ROW = 64  # keyframes that are linearised again at one row of the IMU
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
@@ -230,7 +230,7 @@ class Tracker(Chain):
         """What was prepared for a new keyframe with its fix, if it was."""
         if ahead is None or len(times) > 1 or len(ahead.problem.t) != len(before) + 1:
             return None
-        recording = sensors.recording(float(ahead.problem.t[0]) - _NEAR, float(times[-1]) + 0.1)
+        recording = sensors.recording(float(ahead.problem.t[0]) - _ROWS_BEFORE, float(times[-1]) + 0.1)
         problem = ahead.problem.completed(recording, self._usual(sensors, recording))
         known = {c.name for c in ahead.problem.constraints}
         late = replace(problem, constraints=tuple(c for c in problem.constraints if c.name not in known))
@@ -363,7 +363,7 @@ class Tracker(Chain):
 
         Only what gaps in the IMU hide is told by the signal of the last half minute.
         """
-        near = sensors.recording(begin - _NEAR, end)
+        near = sensors.recording(begin - _ROWS_BEFORE, end)
         t = near.imu.t
         whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < GAP * period_of(t)
         return near if whole else sensors.recording(begin - CONTEXT, end)

@@ -35,7 +35,7 @@ _ISOLATED = 0.01  # of the rows; what more of them have in common is no fault of
 _QUIET = 10.0  # percentile of the turn rate up to which a foot stands and a vehicle is calm
 # A factor of two is the smallest by which a scale is mistaken (the ranges of a sensor are that far apart): the middle.
 _SCALE = np.sqrt(2.0)
-_NEAR = 1.2  # between the force found and what a unit would give: a biased sensor among vibration
+_UNIT_RATIO = 1.2  # between the force found and what a unit would give: a biased sensor among vibration
 _DEAD = 10.0  # s; the longest that an axis repeats itself in thirty real recordings while others move is 0.08 s
 _MOVES = 20.0  # steps of its own resolution by which an axis has moved and not only flickered
 # What a carrier that moves exceeds by far: a thousandth of g, and the Earth's rate, which one at rest reads
@@ -155,12 +155,12 @@ def _scale(f: float) -> str | None:
              for name, size in FORCE.items() if name != "m/s2"}  # fmt: skip
     units[g * FORCE["g"]] = "the accelerometer seems to be in m/s2 already: leave out units.accel"
     near = min(units, key=lambda value: abs(np.log(max(f, 1e-9) / value)))
-    if 1.0 / _NEAR < f / near < _NEAR:
+    if 1.0 / _UNIT_RATIO < f / near < _UNIT_RATIO:
         return f"{units[near]} in [imu]"
     if f < g / FORCE["g"]:
         return "gravity seems to have been removed from the accelerometer; graphnav needs the raw force"
     step = round(float(np.log2(f / g))) if np.isfinite(f) else 0
-    if step and 1.0 / _NEAR < f / (g * 2.0**step) < _NEAR:
+    if step and 1.0 / _UNIT_RATIO < f / (g * 2.0**step) < _UNIT_RATIO:
         times = f"{2 ** abs(step)} times too {'large' if step > 0 else 'small'}"
         return (
             f"the accelerometer's scale is {times}, as of another full-scale range: no units.accel mends that, "
