@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -77,11 +77,6 @@ class IntervalMotion:
     bg: Array
     rate: Array  # (N, 3) mean rate and force, less those biases
     force: Array
-
-    @cached_property
-    def asked(self) -> dict[str, Any]:
-        """What was asked for one state last, and the answer."""
-        return {}
 
     @classmethod
     def of(cls, intervals: Intervals, rows: Array, frame: LocalFrame) -> IntervalMotion:
@@ -157,24 +152,10 @@ class Wheels(Constraint):
 
     def _velocity(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> _Velocity:
         assert self.past is not None
-        # both constraints on one keyframe ask the same, one after the other
-        asked = self.past.asked
-        values = [parameters[name] for name in (SCALE, MOUNTING, AXLE) if name in parameters]
-        known = isinstance(rows, slice) and asked.get("states") is states and asked["rows"] == rows
-        if (
-            known
-            and len(values) == len(asked["values"])
-            and all(map(np.array_equal, values, asked["values"]))
-            and asked["lever"] is self.lever_arm
-        ):
-            return asked["found"]  # type: ignore[no-any-return]
         lever = self.lever_arm + (parameters[AXLE] * _E_Y if AXLE in parameters else np.zeros((len(states), 3)))
         y, omega, J = self.past.velocity(states, parameters, rows, lever)
         u, R, by_mounting = _rotate_to_vehicle(y[:, :3], parameters.get(MOUNTING, np.zeros((len(states), 2))))
-        found = _Velocity(u, omega, y[:, 4], R, by_mounting, J)
-        if len(states) == 1 and isinstance(rows, slice):
-            asked |= {"states": states, "rows": rows, "values": values, "lever": self.lever_arm, "found": found}
-        return found
+        return _Velocity(u, omega, y[:, 4], R, by_mounting, J)
 
 
 @dataclass(frozen=True)
@@ -186,7 +167,7 @@ class _Velocity:
     forward: Array  # (N,) m/s^2, acceleration
     R_vb: Array
     by_mounting: Array  # (N, 3, 2)
-    J: dict[str, Array]  # (N, 6, k) `Past.velocity`
+    J: dict[str, Array]  # (N, 6, k) `IntervalMotion.velocity`
 
     def derivatives(self, A: Array, parameters: dict[str, Array], by_forward: Array | None = None) -> dict[str, Array]:
         """Of A u (N, m) for A (N, m, 3), plus `by_forward` (N, m) times the forward acceleration."""
