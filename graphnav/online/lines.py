@@ -22,7 +22,8 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_json, parse_number
 from graphnav.online.sensors import Row, rows_of
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
-from graphnav.recording.formats.schema import Noise, NotNegative, Positive, Vector
+from graphnav.recording.formats.schema import Noise
+from graphnav.sensors.tables import NotNegative, Positive, Vector
 
 HEAD = "graphnav-online/1"
 END = "E"

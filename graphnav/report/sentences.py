@@ -81,6 +81,7 @@ def what_was_done(recording: Recording, solutions: Mapping[str, Solution], withh
         sources.append(f"{len(used.gnss.t)} GNSS fixes")
     if used.odometer is not None:
         sources.append(f"{len(used.odometer.t)} odometer rows")
+    sources += [f"{len(series)} rows of {name}" for name, series in used.sensors.items()]
     others = [name for name in solutions if name not in own_solutions(solutions)]
     solutions = own_solutions(solutions)
     solution = next(iter(solutions.values()))
