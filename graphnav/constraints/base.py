@@ -23,6 +23,7 @@ from graphnav.core.state import BLOCKS, DIM, Parameter, States
 from graphnav.imu.preintegration import Intervals
 from graphnav.recording import Recording
 from graphnav.recording.odometer import MeanSpeed
+from graphnav.sensors import Series
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,11 @@ class BuildContext:
         """What several constraints need and one of them has made."""
         return {}
 
+    def series(self, name: str) -> Series | None:
+        """The rows of a sensor of `graphnav.sensors`; None where there are none, or the settings do not use it."""
+        series = self.recording.sensors.get(name)
+        return series if series is not None and len(series) and self.settings.sensor(name).use else None
+
     def keyframe_at(self, t: Array) -> Array:
         """Index of the keyframe at each time, -1 where there is none."""
         right = np.clip(np.searchsorted(self.t, t), 0, len(self.t) - 1)
@@ -75,6 +81,7 @@ class Constraint(ABC):
     passes: ClassVar[int] = 1  # of a filter's update; more for rows that are far from linear over its uncertainty
     noise_axes: ClassVar[tuple[str, ...]] = ()  # variance component of each axis; none: its sigmas are taken as stated
 
+    sensor: ClassVar[str] = ""  # of `graphnav.sensors` whose rows they are
     fix_of: ClassVar[str] = ""  # of a receiver's fixes: the block of the state that each gives, "p" or "v"
 
     keyframe: Array  # (N,) int, ascending
