@@ -10,6 +10,7 @@ their noise times a scale would draw it to whatever makes them small.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -35,6 +36,10 @@ class BarometricHeight(Constraint):
     noise_axes: ClassVar[tuple[str, ...]] = ("up",)
     unit: ClassVar[str] = "m"
     sensor: ClassVar[str] = SENSOR.name
+    words: ClassVar[Mapping[str, tuple[tuple[str, str, float], ...]]] = {
+        OFFSET: (("barometer above the standard atmosphere, offset", "m", 1.0),),
+        SCALE: (("barometer scale, by the temperature of the air", "%", 100.0),),
+    }
 
     height: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, mean of the readings
     late: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, mean of their times after the keyframe

@@ -9,6 +9,7 @@ With the baseline b in body axes, turned by what its direction is wrong by (delt
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
@@ -30,6 +31,10 @@ class Baseline(Constraint):
 
     unit: ClassVar[str] = "rad"
     sensor: ClassVar[str] = SENSOR.name
+    words: ClassVar[Mapping[str, tuple[tuple[str, str, float], ...]]] = {
+        f"{SENSOR.name}_{angle}_offset": ((f"baseline of the antennas, {angle}", "deg", 57.29577951308232),)
+        for angle in ("heading", "pitch")
+    }
     column: ClassVar[str] = ""
 
     measured: Array = field(default_factory=lambda: np.empty((0, 1)))  # rad

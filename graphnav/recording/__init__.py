@@ -117,6 +117,14 @@ class Truth:
 
 
 @dataclass(frozen=True)
+class Own:
+    """What a script solves a recording with beside what graphnav has, in the order of their names."""
+
+    constraints: tuple[type[Any], ...] = ()
+    detectors: tuple[type[Any], ...] = ()
+
+
+@dataclass(frozen=True)
 class Recording:
     """One drive or walk. `remarks` are sentences about what loading changed or found odd."""
 
@@ -133,6 +141,7 @@ class Recording:
     screened: bool = False  # whether `graphnav.recording.plausibility.screening.screen` has been over it
     raw_gnss: RawGnss | None = None  # observations of the antenna that `gnss` has fixes of
     sensors: Mapping[str, Series] = field(default_factory=dict)  # others (`graphnav.sensors`), by their names
+    own: Own = Own()  # as `graphnav.run` was given them
 
     @cached_property
     def start(self) -> float:
