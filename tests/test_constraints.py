@@ -251,7 +251,7 @@ def test_epochs_lie_within_the_imu(name: str, recording: Recording) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_recording_without_the_sensor_has_no_rows(name: str, recording: Recording) -> None:
     cls = next(c for c in list_constraints() if c.name == name)
-    bare = replace(recording, gnss=None, odometer=None, platform="foot")
+    bare = replace(recording, gnss=None, odometer=None, sensors={}, platform="foot")
     assert len(cls.epochs(bare, Settings(), np.empty((0, 2)))) == 0
     scene = scene_of(cls, bare, Settings(), LocalFrame(recording.gnss.llh[0]))
     assert cls.build(replace(scene, stationary=np.empty((0, 2)))) is None

@@ -18,8 +18,8 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
-from graphnav.core.earth import LocalFrame
-from graphnav.core.rotation import Array
+from graphnav.core.earth import A, LocalFrame
+from graphnav.core.rotation import Array, mv
 from graphnav.core.state import Parameter, States
 from graphnav.recording import Recording
 from graphnav.sensors.barometer import SENSOR, standard_height
@@ -80,12 +80,18 @@ class BarometricHeight(Constraint):
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         assert self.frame is not None
-        up = self.frame.R_ln(states.p)[:, 2:]  # (n, 1, 3) the vertical at the body
-        z, late = self.height[rows, None], self.late[rows, None]
-        h = self.frame.to_llh(states.p)[:, 2:] + np.einsum("nij,nj->ni", up, states.v) * late
-        residual, jacobians = h - z - parameters[OFFSET], {OFFSET: np.full((len(z), 1, 1), -1.0)}
+        C = self.frame.R_ln(states.p)
+        v, late = mv(C, states.v), self.late[rows, None]
+        h = self.frame.to_llh(states.p)[:, 2:] + v[:, 2:] * late
+        residual = h - self.height[rows, None] - parameters[OFFSET]
+        jacobians = {OFFSET: np.full((len(h), 1, 1), -1.0)}
+        gain = np.ones_like(h)
         if SCALE in parameters:
             above = h - self.frame.origin[2]
-            residual, up = residual + parameters[SCALE] * above, up * (1.0 + parameters[SCALE][..., None])
+            residual, gain = residual + parameters[SCALE] * above, gain + parameters[SCALE]
             jacobians[SCALE] = above[..., None]
-        return Linearized(residual, jacobians | {"p": up, "v": up * late[..., None]}, self.sigma[rows])
+        # the vertical turns with the place on a round Earth
+        level = (late * v[:, :2] / A)[:, None, :] @ C[:, :2]
+        jacobians["p"] = gain[..., None] * (C[:, 2:] + level)
+        jacobians["v"] = (gain * late)[..., None] * C[:, 2:]
+        return Linearized(residual, jacobians, self.sigma[rows])
