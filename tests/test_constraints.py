@@ -51,7 +51,8 @@ def recording() -> Recording:
 def readings(sensor: Sensor, recording: Recording) -> Series:
     """Numbers that a sensor can read, one row in 0.7 s."""
     rng, t = np.random.default_rng(4), np.arange(recording.start + 0.3, recording.end, 0.7)
-    return sensor.series(t, {c.name: rng.uniform(0.9 * c.lowest, 0.9 * c.highest, len(t)) for c in sensor.columns})
+    inside = {c.name: c.lowest + (c.highest - c.lowest) * rng.uniform(0.1, 0.9, len(t)) for c in sensor.columns}
+    return sensor.series(t, inside)
 
 
 def with_parameters() -> Settings:

@@ -26,7 +26,8 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.linearise import linearise_links
+from graphnav.estimation.solvers.linearise import linearise, linearise_links
+from graphnav.estimation.solvers.passes import points_of
 from graphnav.estimation.solvers.rows import Layout
 from graphnav.imu.dynamics import SCALE
 
@@ -58,6 +59,7 @@ class Exported:
             For a robust kernel that GTSAM does not have as a factor.
         """
         layout = Layout(self.problem)
+        known = _with_places(self.problem, self.states, self.values)
         values = gtsam.Values()
         states = self.states
         for k in range(len(states)):
@@ -66,7 +68,7 @@ class Exported:
             values.insert(_B(k), gtsam.imuBias.ConstantBias(states.ba[k], states.bg[k]))
         for group in layout.groups:
             for j, key in enumerate(group.keys.tolist()):
-                node = np.concatenate([self.values[name][j] for name in group.columns])
+                node = np.concatenate([known[name][j] for name in group.columns])
                 values.insert(_Q(key - layout.K), node)
         graph = gtsam.NonlinearFactorGraph()
         _add_intervals(graph, self.problem, layout)
@@ -75,6 +77,31 @@ class Exported:
         for factor in _parameter_factors(self.problem, layout):
             graph.push_back(factor)
         return graph, values
+
+
+def _with_places(problem: Problem, states: States, values: dict[str, Array]) -> dict[str, Array]:
+    """The values with those that solutions do not list, such as the places of stops: the best there are given the rest.
+
+    Rows are linear in them, or they are where one step of Gauss and Newton leads.
+    """
+    points = points_of(problem, states, {c.parameter.name: values[c.parameter.name][c.node] for c in problem.chains
+                                         if c.parameter.name in values})  # fmt: skip
+    out = dict(values)
+    for chain in problem.chains:
+        name = chain.parameter.name
+        if name in values:
+            continue
+        normal = np.stack([np.diag(s**-2.0) for s in chain.sigma])
+        right = np.zeros_like(chain.mean)
+        for rows in problem.constraints:
+            if name in {p.name for p in rows.parameters}:
+                linear = linearise(rows, points, problem.columns)
+                weight = linear.kernel()[0][:, None] / linear.sigma**2
+                H, node = linear.H[:, :, problem.columns[name]], chain.node[rows.keyframe]
+                np.add.at(normal, node, np.einsum("nmi,nm,nmj->nij", H, weight, H))
+                np.add.at(right, node, -np.einsum("nmi,nm,nm->ni", H, weight, linear.residual))
+        out[name] = chain.mean + np.linalg.solve(normal, right[..., None])[..., 0]
+    return out
 
 
 def state_at(values: gtsam.Values, k: int) -> States:
