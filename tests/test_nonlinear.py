@@ -17,6 +17,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError, EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
+from graphnav.detectors import detect
 from graphnav.detectors.base import Detection
 from graphnav.detectors.scene import Detector
 from graphnav.estimation.pipeline import run, with_own
@@ -39,7 +40,7 @@ def drive() -> Recording:
 
 
 def test_its_optimum_is_that_of_the_batch_solver(drive):
-    solution = run(drive, settings_from(STATED), ("batch",))["batch"]
+    solution = run(drive.crop(0.0, 16.0), settings_from(STATED), ("batch",))["batch"]
     graph, values = solution.to_gtsam()
     assert graph.error(values) == pytest.approx(solution.cost, rel=1e-9)
     rng, away = np.random.default_rng(2), gtsam.VectorValues()
@@ -111,9 +112,14 @@ def test_differences_do_what_jacobians_do(drive):
     assert any("differenced" in note for note in problem.notes)
 
 
-def test_an_own_detector_has_a_say(drive):
-    found = run(drive, settings_from(STATED), ("ekf",), detectors=[Beginning])["ekf"]
-    assert "beginning" in {d.name for d in found.detections}
+def test_an_own_detector_suffices_by_itself(drive):
+    # a threshold that no window is below leaves the other without a stop
+    settings = settings_from({"detectors": {"fire": ["glrt"], "glrt": {"threshold": 1e-12}}})
+    assert not len(detect(drive, settings).stationary)
+    found = detect(with_own(drive, detectors=[Beginning]), settings)
+    assert len(found.stationary)
+    assert found.stationary[-1, 1] <= drive.start + 11.0
+    assert {"glrt", "beginning"} <= {d.name for d in found.all}
 
 
 @pytest.mark.parametrize(
