@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import oracle
 import pytest
 
+from graphnav.app import cli
 from graphnav.app.convert import convert_log
 from graphnav.app.workflow import parse_withheld
 from graphnav.config import Settings, read_settings, settings_from, settings_text
@@ -143,3 +145,17 @@ def test_settings_of_a_sensor(tmp_path):
 def test_a_name_that_is_taken():
     with pytest.raises(RecordingError, match="gnss"):
         register(Sensor("gnss", "", registered()["barometer"].columns, (("height",),)))
+
+
+def test_a_command_with_a_sensor_withheld(drive, tmp_path, capsys):
+    t = np.arange(drive.start + 0.1, drive.end, 0.25)
+    flat = registered()["barometer"].series(t, {"height": np.full(len(t), 20.0)})
+    write_folder(replace(drive, sensors={"barometer": flat}), tmp_path / "in")
+    out = tmp_path / "out"
+    command = ["smooth", str(tmp_path / "in"), "-o", str(out), "--solver", "ekf", "--no-report", "--noise", "stated"]
+    assert cli.run([*command, "--without", "barometer:5-8"]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert 0 < summary["counts"]["barometer"] < summary["keyframes"] - 3  # that many fall into the span
+    assert "barometer_offset" in json.loads((out / "calibration.json").read_text())
+    assert cli.run([*command, "--without", "barometre"]) == 2
+    assert "barometer" in capsys.readouterr().err
