@@ -25,6 +25,8 @@ from graphnav.estimation.solvers.graph import LinearGraph
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Recording
+from graphnav.sensors import Sensor, Series
+from graphnav.sensors import registered as sensors
 
 STANDING = np.array([[3.0, 14.0], [88.0, 104.0]])  # parts of two stops of the path below, s
 ON_FOOT = {"stance", "foot_lateral", "closed_loop"}  # constraints that only a foot has
@@ -43,7 +45,14 @@ class Case:
 def recording() -> Recording:
     path = oracle.vehicle_path(180.0)
     made, _ = oracle.drive(path, seed=3, gnss_rate=2.0, gnss_velocity_sd=(0.05, 0.06, 0.1), odometer_rate=10.0)
-    return made
+    return replace(made, sensors={name: readings(sensor, made) for name, sensor in sensors().items()})
+
+
+def readings(sensor: Sensor, recording: Recording) -> Series:
+    """Numbers that a sensor can read, one row in 0.7 s."""
+    rng, t = np.random.default_rng(4), np.arange(recording.start + 0.3, recording.end, 0.7)
+    inside = {c.name: c.lowest + (c.highest - c.lowest) * rng.uniform(0.1, 0.9, len(t)) for c in sensor.columns}
+    return sensor.series(t, inside)
 
 
 def with_parameters() -> Settings:
@@ -243,7 +252,7 @@ def test_epochs_lie_within_the_imu(name: str, recording: Recording) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_recording_without_the_sensor_has_no_rows(name: str, recording: Recording) -> None:
     cls = next(c for c in list_constraints() if c.name == name)
-    bare = replace(recording, gnss=None, odometer=None, platform="foot")
+    bare = replace(recording, gnss=None, odometer=None, sensors={}, platform="foot")
     assert len(cls.epochs(bare, Settings(), np.empty((0, 2)))) == 0
     scene = scene_of(cls, bare, Settings(), LocalFrame(recording.gnss.llh[0]))
     assert cls.build(replace(scene, stationary=np.empty((0, 2)))) is None

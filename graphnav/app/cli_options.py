@@ -35,7 +35,7 @@ Without = Annotated[
     typer.Option(
         "--without",
         metavar="SOURCE[:FROM-TO]",
-        help="Withhold gnss or odometer, in a span in s from the start or throughout; may be repeated.",
+        help="Withhold gnss, odometer or another sensor, in a span in s from the start or throughout; may be repeated.",
     ),
 ]
 Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Output rate; default: at the keyframes.")]

@@ -266,15 +266,15 @@ def _run(source: Path) -> dict[str, Any]:
 def log_values(log: Log) -> dict[str, Any]:
     """What was read and what was assumed, for JSON."""
     sensors = {name: getattr(log, name) for name in ("imu", "gnss", "odometer", "truth")}
-    rows = {name: len(sensor.t) for name, sensor in sensors.items() if sensor is not None}
+    rows = {name: len(sensor.t) for name, sensor in {**sensors, **log.sensors}.items() if sensor is not None}
     return {"name": log.name, "platform": log.platform, "rows": rows, "assumed": log.remarks}
 
 
 def log_text(log: Log, files: Sequence[Path]) -> str:
     """What was read, what was assumed, and what was written."""
     held = []
-    for name, label in (("imu", "IMU"), ("gnss", "GNSS"), ("odometer", "odometer"), ("truth", "truth")):
-        sensor = getattr(log, name)
+    sensors = {"IMU": log.imu, "GNSS": log.gnss, "odometer": log.odometer, **log.sensors, "truth": log.truth}
+    for label, sensor in sensors.items():
         if sensor is not None and len(sensor.t):
             span = f"{sensor.t[0]:.3f} to {sensor.t[-1]:.3f} s"
             held.append(f"  {label:<9} {len(sensor.t)} rows, {span}")

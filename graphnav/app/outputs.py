@@ -297,7 +297,7 @@ def noise_rows(outcome: Outcome, solution: Solution) -> tuple[FigureRow, ...]:
 
     recording, settings = outcome.recording, outcome.request.settings
     for source, span in outcome.used_withheld:
-        if getattr(recording, source) is not None:
+        if source in recording.aiding:
             recording = recording.without(source, span)
     imu = None
     if recording.platform == "foot" and any(group.startswith("imu.") for group in solution.noise.figures):

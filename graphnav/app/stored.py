@@ -34,6 +34,7 @@ from graphnav.recording.checks.stated import truth_apart
 
 NAME = "run.npz"
 _FORM = "graphnav-run/1"
+_ANEW = ("between", "graphs")  # of a solution: what only solving again gives
 _PACKAGE = __name__.partition(".")[0]
 
 
@@ -158,7 +159,7 @@ def _pack(value: Any, arrays: list[Array]) -> Any:
         return {"tuple" if isinstance(value, tuple) else "list": [_pack(one, arrays) for one in value]}
     if not is_dataclass(value):
         raise TypeError(f"{type(value).__name__} cannot be kept")
-    kept = {f.name: getattr(value, f.name) for f in fields(value) if f.init and f.name != "between"}
+    kept = {f.name: getattr(value, f.name) for f in fields(value) if f.init and f.name not in _ANEW}
     out = {"class": f"{type(value).__module__}.{type(value).__qualname__}", "of": _pack(kept, arrays)}
     if isinstance(value, Solution):
         out["pieces"] = [[piece.start, piece.end] for piece in value.between]

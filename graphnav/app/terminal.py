@@ -92,6 +92,7 @@ def _read(outcome: Outcome) -> str:
         parts.append(f"GNSS {len(recording.gnss.t)} fixes")
     if recording.odometer is not None:
         parts.append(f"odometer {len(recording.odometer.t)} rows")
+    parts += [f"{name} {len(series)} rows" for name, series in recording.sensors.items()]
     if recording.truth is not None:
         parts.append("truth")
     return f"{recording.name} ({recording.platform}): {', '.join(parts)}"

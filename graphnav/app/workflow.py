@@ -27,7 +27,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.solution import Solution, to_trajectory
 from graphnav.evaluation.against import Against, Foreign, own_solutions, read_against, without_attitude
-from graphnav.recording import Recording
+from graphnav.recording import Recording, sources
 from graphnav.recording.exporters import check_names
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 Span = tuple[float, float]
 Withheld = tuple[str, Span | None]
 
-SOURCES = ("gnss", "odometer")
 _DENSEST, _MOST = 0.1, 5_000  # s between, and number of, the epochs of a truth that are met exactly
 _MOST_TURNING = 20_000  # the same where a point at the end of a lever arm swings between them
 _ENOUGH = 1000  # keyframes that make other epochs needless
@@ -107,14 +106,14 @@ def parse_withheld(text: str) -> Withheld:
     """
     found = re.fullmatch(r"([^:]*)(?::([^-]+)-([^-]+))?", text.strip())
     if re.fullmatch(r"[\d.]+-[\d.]+", text.strip()):
-        sensors = " or ".join(f"{source}:{text.strip()}" for source in SOURCES)
+        sensors = " or ".join(f"{source}:{text.strip()}" for source in sources())
         raise ConfigError(f"--without {text}: say of which sensor: {sensors}")
     usage = "write SOURCE or SOURCE:FROM-TO in seconds from the start, such as gnss:600-660"
     if found is None:
         raise ConfigError(f"--without {text}: not a source and a span; {usage}")
     source, first, last = found.groups()
-    if source not in SOURCES:
-        raise ConfigError(f"--without {text}: no source '{source}' can be withheld; {nearest(source, SOURCES)}")
+    if source not in sources():
+        raise ConfigError(f"--without {text}: no source '{source}' can be withheld; {nearest(source, sources())}")
     if first is None:
         return source, None
     try:
@@ -305,11 +304,11 @@ def _withhold(recording: Recording, withheld: tuple[Withheld, ...], zero: float)
                 f"--without {name}: lies outside '{recording.name}', which runs from {zero:.0f} to "
                 f"{zero + recording.duration:.1f} s"
             )
-        if getattr(recording, source) is not None and getattr(used, source) is None:
+        if source in recording.aiding and source not in used.aiding:
             continue  # all of it is gone already
         before = used
         used = used.without(source, span)
-        if span is not None and len(getattr(used, source).t) == len(getattr(before, source).t):
+        if span is not None and len(used.aiding[source].t) == len(before.aiding[source].t):
             notes.append(f"--without {name}: there was no {source} row in that span anyway")
     return used, notes
 

@@ -13,6 +13,7 @@ from graphnav.config.settings import PROFILES, Profile, Settings
 from graphnav.core.complaints import complaint, read_toml
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import parse_json, read_text
+from graphnav.sensors import registered
 
 
 def settings_from(values: Mapping[str, Any], source: str = "settings", text: str = "") -> Settings:
@@ -73,9 +74,12 @@ def settings_text(settings: Settings) -> str:
     lines: list[str] = []
 
     def table(section: BaseModel, at: str) -> None:
-        nested = {}
+        nested: dict[str, BaseModel] = {}
         for name, field in type(section).model_fields.items():
             value = getattr(section, name)
+            if name == "sensors":  # a table of each sensor, whether it is set or not
+                nested |= {f"{name}.{sensor}": settings.sensor(sensor) for sensor in registered()}
+                continue
             if isinstance(value, BaseModel):
                 nested[name] = value
                 continue

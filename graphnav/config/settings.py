@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from graphnav.config.detectors import DetectorSettings
 from graphnav.config.gnss import GnssSettings
 from graphnav.config.motion import FootSettings, StandstillSettings, VehicleSettings
+from graphnav.config.outliers import Outliers
 from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.config.section import Section
+from graphnav.core.complaints import nearest
+from graphnav.sensors import registered
 
 Profile = Literal["car", "car+odometer", "foot"]
 
@@ -90,6 +93,12 @@ class SolverSettings(Section):
     )
 
 
+class SensorSettings(Outliers):
+    """How a sensor beside IMU, GNSS and odometer is used."""
+
+    use: bool = Field(True, description="use its rows")
+
+
 class Settings(Section):
     """Everything that can be set; `Settings()` is the default, `Settings(profile="car")` one of `PROFILES`.
 
@@ -108,6 +117,19 @@ class Settings(Section):
     vehicle: VehicleSettings = VehicleSettings()
     foot: FootSettings = FootSettings()
     solver: SolverSettings = SolverSettings()
+    sensors: dict[str, SensorSettings] = Field({}, description="of other sensors by their names: [sensors.barometer]")
+
+    @field_validator("sensors")
+    @classmethod
+    def _known_sensors(cls, sensors: dict[str, SensorSettings]) -> dict[str, SensorSettings]:
+        for name in sensors:
+            if name not in registered():
+                raise ValueError(f"no sensor '{name}' is known; {nearest(name, tuple(registered()))}")
+        return sensors
+
+    def sensor(self, name: str) -> SensorSettings:
+        """How a sensor is used; as usual where nothing is set."""
+        return self.sensors.get(name, SensorSettings())
 
     @model_validator(mode="before")
     @classmethod

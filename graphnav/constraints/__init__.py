@@ -5,9 +5,12 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+from collections.abc import Sequence
 from functools import cache
 
 from graphnav.constraints.base import Constraint
+from graphnav.core.errors import ConfigError
+from graphnav.recording import Recording
 
 
 @cache
@@ -19,3 +22,33 @@ def list_constraints() -> tuple[type[Constraint], ...]:
             if isinstance(member, type) and issubclass(member, Constraint) and not inspect.isabstract(member):
                 found[member.name] = member
     return tuple(found[name] for name in sorted(found))
+
+
+def kinds_for(recording: Recording) -> tuple[type[Constraint], ...]:
+    """Those of graphnav and those that a script adds for a recording."""
+    return (*list_constraints(), *recording.own.constraints)
+
+
+def check_own(kinds: Sequence[type[Constraint]]) -> tuple[type[Constraint], ...]:
+    """Constraints of a script, in the order of their names.
+
+    Raises
+    ------
+    ConfigError
+        If one is no complete constraint, or has a name that is taken.
+    """
+    taken = {kind.name for kind in list_constraints()}
+    for kind in kinds:
+        if not (isinstance(kind, type) and issubclass(kind, Constraint)):
+            raise ConfigError(f"constraints: {kind!r} is no class derived from graphnav.constraints.base.Constraint")
+        what = f"constraints: {kind.__name__}"
+        missing = [name for name in ("name", "axes", "unit") if not hasattr(kind, name)]
+        missing += sorted(kind.__abstractmethods__)
+        if kind.linearize is Constraint.linearize and kind.residual is Constraint.residual:
+            missing.append("residual (or linearize)")
+        if missing:
+            raise ConfigError(f"{what} lacks {', '.join(missing)}")
+        if kind.name in taken:
+            raise ConfigError(f"{what}: there is a constraint '{kind.name}' already; choose another name")
+        taken.add(kind.name)
+    return tuple(sorted(kinds, key=lambda kind: kind.name))

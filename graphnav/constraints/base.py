@@ -10,6 +10,7 @@ filters or graphs, and no weights, gates or robust kernels: those belong to the 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -23,6 +24,7 @@ from graphnav.core.state import BLOCKS, DIM, Parameter, States
 from graphnav.imu.preintegration import Intervals
 from graphnav.recording import Recording
 from graphnav.recording.odometer import MeanSpeed
+from graphnav.sensors import Series
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,11 @@ class BuildContext(Shared):
     speed: MeanSpeed | None = None  # of the odometer, where it is known already
     typical_sigmas: Array | None = None  # (M, 3) m, sigma that the fixes usually state, where it is known already
 
+    def series(self, name: str) -> Series | None:
+        """The rows of a sensor of `graphnav.sensors`; None where there are none, or the settings do not use it."""
+        series = self.recording.sensors.get(name)
+        return series if series is not None and len(series) and self.settings.sensor(name).use else None
+
     def keyframe_at(self, t: Array) -> Array:
         """Index of the keyframe at each time, -1 where there is none."""
         right = np.clip(np.searchsorted(self.t, t), 0, len(self.t) - 1)
@@ -68,8 +75,12 @@ class Constraint(ABC):
     looks_ahead: ClassVar[bool] = True  # False: once the intervals and the odometer are there, rows can be built
     of_stops: ClassVar[bool] = False  # True: its rows are there because the platform stands
     passes: ClassVar[int] = 1  # of a filter's update; more for rows that are far from linear over its uncertainty
+    depends_on: ClassVar[tuple[str, ...]] = tuple(BLOCKS)  # blocks to differentiate by, where `linearize` does not say
+    words: ClassVar[Mapping[str, tuple[tuple[str, str, float], ...]]] = {}  # of its parameters' numbers, for people:
+    # what it is, a unit, and how many of these are one of the parameter's own
     noise_axes: ClassVar[tuple[str, ...]] = ()  # variance component of each axis; none: its sigmas are taken as stated
 
+    sensor: ClassVar[str] = ""  # of `graphnav.sensors` whose rows they are
     fix_of: ClassVar[str] = ""  # of a receiver's fixes: the block of the state that each gives, "p" or "v"
 
     keyframe: Array  # (N,) int, ascending
@@ -104,18 +115,52 @@ class Constraint(ABC):
         return self.robust_scale[rows] if isinstance(self.robust_scale, np.ndarray) else self.robust_scale
 
     @classmethod
-    @abstractmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        """Times (s) at which this constraint wants keyframes."""
+        """Times (s) at which this constraint wants keyframes; none unless it says so."""
+        return np.empty(0)
 
     @classmethod
     @abstractmethod
     def build(cls, scene: BuildContext) -> Constraint | None:
         """The rows for a recording, or None when it has nothing for this constraint."""
 
-    @abstractmethod
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        """Rows `rows` at `states` (one per row) and parameter values (n, k), one per row."""
+        """Rows `rows` at `states` (one per row) and parameter values (n, k), one per row.
+
+        One that gives no Jacobians has `residual` and a field `sigma` (N, m), and is differentiated numerically.
+        """
+
+        jacobians = {}
+        for block in self.depends_on:
+
+            def moved(step: Array, at: slice = BLOCKS[block]) -> Array:
+                delta = np.zeros((len(states), DIM))
+                delta[:, at] = step
+                return self.residual(states.plus(delta), parameters, rows)
+
+            jacobians[block] = _differences(moved, np.full(3, _STEPS[block]))
+        for p in self.parameters:
+
+            def along(step: Array, name: str = p.name) -> Array:
+                return self.residual(states, parameters | {name: parameters[name] + step}, rows)
+
+            jacobians[p.name] = _differences(along, 1e-3 * np.atleast_2d(p.sigma)[0])
+        sigma: Array = self.sigma  # type: ignore[attr-defined]
+        return Linearized(self.residual(states, parameters, rows), jacobians, sigma[rows])
+
+    def residual(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Array:
+        """(n, m) predicted minus measured, of a constraint that leaves its Jacobians to differences."""
+        raise NotImplementedError(f"{self.name}: has neither linearize nor residual")
+
+
+# rad, m, m/s, m/s^2, rad/s: central differences lose the square of a step and the digits of a residual over it
+_STEPS = {"theta": 1e-5, "p": 1e-1, "v": 1e-2, "ba": 1e-3, "bg": 1e-5}
+
+
+def _differences(f: Callable[[Array], Array], steps: Array) -> Array:
+    """(n, m, k) central differences of f (n, m) of a vector (k,) about zero."""
+    ways = np.diag(steps)
+    return np.stack([(f(d) - f(-d)) / (2.0 * h) for d, h in zip(ways, steps, strict=True)], -1)
 
 
 def assemble(linearized: Linearized, parameters: dict[str, slice] | None = None, width: int = DIM) -> Array:

@@ -9,12 +9,14 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
 
 from graphnav.config import Settings
 from graphnav.config.detectors import FUSED
+from graphnav.core.errors import ConfigError
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, subtract_spans
 from graphnav.detectors.fusion import Decision, decide, decide_fused, merge_decisions
@@ -48,6 +50,7 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
         fire = [name for name in (("glrt",) if d.fire == (FUSED,) else d.fire) if name in STATISTICS]
         idle = [name for name in d.fire if name not in fire and name != FUSED]
         stances = detect_stances(recording.imu, scene.period, d.stance, fire)
+        idle += [kind.name for kind in recording.own.detectors]
         more = (f"{', '.join(idle)}: of vehicles only, finds no stance",) if idle else ()
         return Detections(stances.stationary, stances.all, (*d.notes, *more, *stances.notes))
     if not recording.duration >= _SHORTEST or not scene.period > 0.0:
@@ -67,8 +70,32 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
 def _decide(scene: Scene, shown: bool = True) -> Decision:
     """What the detectors that fire come to."""
     if scene.settings.fire == (FUSED,):
-        return decide_fused(scene, list_detectors(), shown)
-    return merge_decisions([decide(scene, list_detectors()[name], shown) for name in scene.settings.fire])
+        found = [decide_fused(scene, list_detectors(), shown)]
+    else:
+        found = [decide(scene, list_detectors()[name], shown) for name in scene.settings.fire]
+    found += [decide(scene, kind, shown) for kind in scene.recording.own.detectors]
+    return found[0] if len(found) == 1 else merge_decisions(found)
+
+
+def check_own(kinds: Sequence[type[Detector]]) -> tuple[type[Detector], ...]:
+    """Detectors of a script, in the order of their names.
+
+    Raises
+    ------
+    ConfigError
+        If one is no complete detector, or has a name that is taken.
+    """
+    taken = {FUSED, *list_detectors()}
+    for kind in kinds:
+        if not (isinstance(kind, type) and issubclass(kind, Detector)):
+            raise ConfigError(f"detectors: {kind!r} is no class derived from graphnav.detectors.Detector")
+        missing = [*(["name"] if not hasattr(kind, "name") else []), *sorted(kind.__abstractmethods__)]
+        if missing:
+            raise ConfigError(f"detectors: {kind.__name__} lacks {', '.join(missing)}")
+        if kind.name in taken:
+            raise ConfigError(f"detectors: there is a detector '{kind.name}' already; choose another name")
+        taken.add(kind.name)
+    return tuple(sorted(kinds, key=lambda kind: kind.name))
 
 
 def stops(

@@ -5,27 +5,33 @@ from __future__ import annotations
 import itertools
 import time
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from graphnav.config import Settings
+from graphnav.constraints import check_own as check_constraints
+from graphnav.constraints.base import Constraint
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError, EstimationError
 from graphnav.core.progress import Progress, listening, tell
-from graphnav.detectors import detect
+from graphnav.detectors import Detector, detect
+from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation import faults
 from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.preparation import prepare, start_sigma
+from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution, join_solutions
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.imu.onboard_offset import without_onboard_offset
-from graphnav.recording import Recording
+from graphnav.recording import Own, Recording
 from graphnav.recording.plausibility.screening import screened
 
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
@@ -40,6 +46,8 @@ def run(
     solvers: tuple[str, ...] = SOLVERS,
     progress: Progress | None = None,
     noise: NoiseModel | None = None,
+    constraints: Sequence[type[Constraint]] = (),
+    detectors: Sequence[type[Detector]] = (),
 ) -> dict[str, Solution]:
     """Solve a recording with several solvers on exactly the same information.
 
@@ -55,6 +63,8 @@ def run(
         Called now and then with a stage and its share done, 0 to 1.
     noise
         How good the sensors are taken to be; estimated, or as `settings.noise` says, when None.
+    constraints, detectors
+        Classes of a script, beside those that graphnav has.
 
     Returns
     -------
@@ -68,13 +78,30 @@ def run(
     EstimationError
         If the recording does not determine a trajectory.
     ConfigError
-        If the settings' profile is of another platform.
+        If the settings' profile is of another platform, or a class of a script is not complete.
     """
     settings = settings or Settings()
+    recording = with_own(recording, constraints, detectors)
     recording, found = screened(recording)
     with listening(progress):
         solutions = _run(recording, settings, solvers, progress, noise)
     return {name: replace(one, notes=(*found, *one.notes)) for name, one in solutions.items()}
+
+
+def with_own(
+    recording: Recording, constraints: Sequence[type[Constraint]] = (), detectors: Sequence[type[Detector]] = ()
+) -> Recording:
+    """The recording, or the setup of a live source, with classes of a script to be solved with as well.
+
+    Raises
+    ------
+    ConfigError
+        If one of them is not complete, or has a name that is taken.
+    """
+    if not constraints and not detectors:
+        return recording
+    own = Own(check_constraints(constraints), check_detectors(detectors))
+    return replace(recording, own=own)
 
 
 def _run(
@@ -193,11 +220,24 @@ def _solve(
             detections=found.detections.all,
             excluded=wrong,
             noise=found.noise,
+            graphs=(_graph_of(problem, out[name]),),
             passes=dict(passes),
             timings={k: timings.get(k, 0.0) + out[name].timings.get(k, 0.0) for k in (*timings, *out[name].timings)},
         )
         for name in solvers
     }
+
+
+def _graph_of(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, Any]]:
+    """What makes the problem GTSAM's, with a solution's values of parameters."""
+
+    def made() -> tuple[Any, Any]:
+        from graphnav.estimation.solvers.nonlinear import Exported  # which needs GTSAM
+
+        values = {name: estimate.value for name, estimate in solution.parameters.items()}
+        return Exported(problem, solution.states, values)()
+
+    return made
 
 
 def fitting(recording: Recording, settings: Settings) -> list[str]:

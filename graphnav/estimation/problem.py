@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints import list_constraints
+from graphnav.constraints import kinds_for
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core.earth import LocalFrame
@@ -127,7 +127,7 @@ def build_problem(
     """
     stops = to_samples(stationary, recording)
     if times is None:
-        wanted = [cls.epochs(recording, settings, stops) for cls in list_constraints()]
+        wanted = [cls.epochs(recording, settings, stops) for cls in kinds_for(recording)]
         epochs = np.concatenate([*wanted, np.empty(0)])
         times = keyframe_times(recording.start, recording.end, epochs, settings.keyframes.rate)
     t = times
@@ -163,8 +163,14 @@ def build_problem(
 
 def _build_constraints(scene: BuildContext, ahead: bool | None) -> tuple[Constraint, ...]:
     """The constraints of a scene: those that look ahead, those that do not, or all (None)."""
-    classes = (cls for cls in list_constraints() if ahead is None or cls.looks_ahead == ahead)
-    return tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
+    classes = (cls for cls in kinds_for(scene.recording) if ahead is None or cls.looks_ahead == ahead)
+    rows = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
+    return tuple(_said(one) if type(one).linearize is Constraint.linearize else one for one in rows)
+
+
+def _said(rows: Constraint) -> Constraint:
+    note = f"{rows.name}: gives no Jacobians, so they are made of differences, which takes longer"
+    return replace(rows, notes=(*rows.notes, note))
 
 
 def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.core.trajectory import Trajectory
@@ -104,6 +105,7 @@ class Solution:
     excluded: tuple[ExcludedSpan, ...] = ()  # spans of measurements found to be wrong, which no solver used
     noise: NoiseModel = STATED  # that all solvers used
     passes: Mapping[str, int] = field(default_factory=dict)  # over all keyframes, before the solver's own
+    graphs: tuple[Callable[[], tuple[Any, Any]], ...] = ()  # makes what `to_gtsam` gives, for each piece
     between: tuple[Between, ...] = ()  # gives states between keyframes, one for each piece of the recording
 
     @property
@@ -111,6 +113,25 @@ class Solution:
         """(M, 2) s, where the platform stands."""
         spans = [d.intervals for d in self.detections if d.name == "fused"]
         return np.concatenate([np.empty((0, 2)), *spans])
+
+    def to_gtsam(self, piece: int = 0) -> tuple[Any, Any]:
+        """The problem as GTSAM's `NonlinearFactorGraph` and this solution as its `Values`.
+
+        Variables are X(k) Pose3, V(k) velocity, B(k) imuBias.ConstantBias of keyframe k, and Q(j) nodes of parameters
+        (`graphnav.estimation.solvers.nonlinear`). Sigmas and weights are those that were used.
+
+        Parameters
+        ----------
+        piece : of a recording that was cut where its IMU was silent for too long.
+
+        Raises
+        ------
+        EstimationError
+            If there is no such piece.
+        """
+        if not 0 <= piece < len(self.graphs):
+            raise EstimationError(f"to_gtsam: no piece {piece}; the solution has {len(self.graphs)}")
+        return self.graphs[piece]()
 
     def trajectory(self, rate: float | None = None) -> Trajectory:
         """In geodetic coordinates and local axes, with 9 x 9 covariances: at the keyframes, or at `rate` (Hz)."""
@@ -202,6 +223,7 @@ def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Soluti
         excluded=tuple(f for p in parts for f in p.excluded),
         noise=_noise_of_all([p.noise for p in parts]),
         passes=_add_counts([dict(p.passes) for p in parts]),
+        graphs=tuple(g for p in parts for g in p.graphs),
         between=tuple(b for p in parts for b in p.between),
     )
 

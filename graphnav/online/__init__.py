@@ -1,7 +1,7 @@
 """Smoothing while the drive happens: rows of sensors in, a live state and a settled trajectory out."""
 
 from graphnav.online.ahead import Live
-from graphnav.online.rows import Fix, ImuSample, WheelSpeed, live_setup, live_trajectory
+from graphnav.online.rows import Fix, ImuSample, Reading, WheelSpeed, live_setup, live_trajectory
 from graphnav.online.sensors import Row, Sensors, rows_of, without_rows
 from graphnav.online.session import Session
 from graphnav.online.steady import Online
@@ -12,6 +12,7 @@ __all__ = [
     "ImuSample",
     "Live",
     "Online",
+    "Reading",
     "Row",
     "Sensors",
     "Session",

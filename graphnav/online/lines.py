@@ -4,6 +4,7 @@ graphnav-online/1 {"platform": "vehicle", "imu": {"noise": {...}}, "gnss": {"lev
 I,t,gx,gy,gz,ax,ay,az
 G,t,lat,lon,h,sd_e,sd_n,sd_u[,ve,vn,vu,sd_ve,sd_vn,sd_vu]
 O,t,speed
+S,name,t,...                  another sensor (`graphnav.sensors`): its columns, in the units that are usual in files
 E
 """
 
@@ -12,17 +13,19 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
-from graphnav.core.complaints import complaint
+from graphnav.core.complaints import complaint, nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_json, parse_number
 from graphnav.online.sensors import Row, rows_of
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
-from graphnav.recording.formats.schema import Noise, NotNegative, Positive, Vector
+from graphnav.recording.formats.schema import Noise
+from graphnav.sensors import Column, Series, registered
+from graphnav.sensors.tables import NotNegative, Positive, Vector
 
 HEAD = "graphnav-online/1"
 END = "E"
@@ -69,10 +72,13 @@ def setup_of(line: str) -> Recording:
     word, _, text = line.strip().partition(" ")
     if word != HEAD:
         raise RecordingError(f"line 1: a live source begins with '{HEAD}' and a setup as JSON, not with '{line[:40]}'")
+    known = registered()
+    others: Any = {name: (sensor.figures | None, None) for name, sensor in known.items()}
+    model = create_model("_Setup", __base__=_Setup, **others)
     try:
-        found = _Setup.model_validate(parse_json(text or "{}"))
+        found = model.model_validate(parse_json(text or "{}"))
     except ValidationError as error:
-        raise RecordingError(complaint("line 1: setup", error, _Setup)) from None
+        raise RecordingError(complaint("line 1: setup", error, model)) from None
     except ValueError as error:
         raise RecordingError(f"line 1: the setup is not JSON ({error})") from None
     stated = found.imu.noise.model_dump(exclude_none=True)  # type: ignore[attr-defined]
@@ -85,7 +91,12 @@ def setup_of(line: str) -> Recording:
             signed=o.signed, speed_sigma=o.speed_sigma, delay_sigma=o.delay_sigma,
         )  # fmt: skip
     imu = Imu(_NONE, _ROWS, _ROWS, ImuNoise(**stated), noise_assumed=not stated)
-    return Recording(found.name, found.platform, imu, gnss, odometer)
+    sensors = {
+        name: Series(sensor, _NONE, np.empty((0, len(sensor.names))), figures)
+        for name, sensor in known.items()
+        if (figures := getattr(found, name)) is not None
+    }
+    return Recording(found.name, found.platform, imu, gnss, odometer, sensors=sensors)
 
 
 def row_of(line: str) -> Row | None:
@@ -100,6 +111,8 @@ def row_of(line: str) -> Row | None:
     if not line or line.startswith("#"):
         return None
     kind, *cells = line.split(",")
+    if kind == "S":
+        return _series_row(cells)
     try:
         numbers = [parse_number(cell) if cell.strip() else float("nan") for cell in cells]
     except ValueError:
@@ -117,6 +130,24 @@ def row_of(line: str) -> Row | None:
     )
 
 
+def _series_row(cells: list[str]) -> Row:
+    name, sensor = cells[0] if cells else "", registered().get(cells[0] if cells else "")
+    if sensor is None:
+        raise ValueError(f"no sensor '{name[:20]}' is known; {nearest(name, tuple(registered()))}")
+    if len(cells) != 2 + len(sensor.names):
+        raise ValueError(f"'S,{name}' needs {1 + len(sensor.names)} numbers, not {len(cells) - 1}")
+    try:
+        t, *numbers = (parse_number(cell) if cell.strip() else float("nan") for cell in cells[1:])
+    except ValueError:
+        raise ValueError(f"'S,{','.join(cells)[:40]}' holds something that is no number") from None
+    return name, t, tuple(x * _usual(c) for x, c in zip(numbers, sensor.columns, strict=True))
+
+
+def _usual(column: Column) -> float:
+    """Size in SI of the unit that is usual in files."""
+    return next(iter(column.units.values()))
+
+
 def head_of(recording: Recording) -> str:
     """The first line that describes the sensors of a recording."""
     setup: dict[str, object] = {"name": recording.name, "platform": recording.platform}
@@ -129,6 +160,7 @@ def head_of(recording: Recording) -> str:
             "lever_arm": o.lever_arm.tolist(), "scale_sigma": o.scale_sigma, "signed": o.signed,
             "speed_sigma": o.speed_sigma, "delay_sigma": o.delay_sigma,
         }  # fmt: skip
+    setup |= {name: series.figures.model_dump() for name, series in recording.sensors.items()}
     return f"{HEAD} {json.dumps(setup)}"
 
 
@@ -139,6 +171,10 @@ def line_of(row: Row) -> str:
         return f"I,{t!r}," + ",".join(map(repr, values))
     if sensor == "odometer":
         return f"O,{t!r},{values[0]!r}"
+    if sensor != "gnss":
+        columns = registered()[sensor].columns
+        numbers = [x / _usual(column) for x, column in zip(values, columns, strict=True)]
+        return f"S,{sensor},{t!r}," + ",".join("" if np.isnan(x) else repr(x) for x in numbers)
     lat, lon = float(np.degrees(values[0])), float(np.degrees(values[1]))
     rest = values[2:6] if np.isnan(values[6]) else values[2:]
     return f"G,{t!r},{lat!r},{lon!r}," + ",".join("" if np.isnan(x) else repr(x) for x in rest)

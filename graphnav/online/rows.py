@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.core.complaints import nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.solution import to_trajectory
@@ -18,6 +19,7 @@ from graphnav.online.steady import Online
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
 from graphnav.recording.plausibility.fixes import FASTEST
 from graphnav.recording.plausibility.screening import ACCEL_RANGE, GYRO_RANGE
+from graphnav.sensors import Sensor, Series
 
 _NONE, _ROWS = np.empty(0), np.empty((0, 3))
 _BLANK = (float("nan"),) * 3
@@ -116,12 +118,35 @@ class WheelSpeed(_Row):
         return super().__new__(cls, ("odometer", _time(cls, t), (value, *_BLANK, *_BLANK[:2])))
 
 
+class Reading(_Row):
+    """What another sensor (`graphnav.sensors`) read at `t` (s): its columns by their names, in SI.
+
+    Raises
+    ------
+    RecordingError
+        If the sensor has no such column, one that it needs is missing, or a value lies beyond its bounds.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, t: float, sensor: Sensor, **columns: float) -> Reading:
+        for name in columns:
+            if name not in sensor.names:
+                raise RecordingError(f"Reading of {sensor.name} at t = {t}: {nearest(name, sensor.names)}")
+        values = np.array([_number(cls, t, n, columns[n]) if n in columns else np.nan for n in sensor.names])
+        if not sensor.usable(sensor.within_bounds(values)[None])[0]:
+            wanted = " or ".join(" and ".join(some) for some in sensor.needs)
+            raise RecordingError(f"Reading of {sensor.name} at t = {t}: needs {wanted}, in SI and within its bounds")
+        return super().__new__(cls, (sensor.name, _time(cls, t), tuple(values.tolist())))
+
+
 def live_setup(
     noise: ImuNoise | None = None,
     antenna: Sequence[float] | None = (0.0, 0.0, 0.0),
     axle: Sequence[float] | None = None,
     platform: str = "vehicle",
     name: str = "live",
+    sensors: Sequence[Series] = (),
 ) -> Recording:
     """What `Online` must know before the first row: a recording without rows.
 
@@ -131,6 +156,7 @@ def live_setup(
     antenna, axle : (3,) m from the IMU to the antenna and to the point that does not slip, right, forward, up; None
         where there is no GNSS, no odometer.
     platform : "vehicle" or "foot".
+    sensors : others that there are, without rows: ``SENSOR.series([], {}, sigma=0.3)``.
 
     Raises
     ------
@@ -144,7 +170,7 @@ def live_setup(
             for what, arm in (("antenna", antenna), ("axle", axle))]  # fmt: skip
     gnss = None if arms[0] is None else Gnss(_NONE, _ROWS, _ROWS, lever_arm=arms[0])
     odometer = None if arms[1] is None else Odometer(_NONE, _NONE, arms[1])
-    return Recording(name, platform, imu, gnss, odometer)
+    return Recording(name, platform, imu, gnss, odometer, sensors={s.sensor.name: s for s in sensors})
 
 
 def live_trajectory(online: Online) -> Trajectory | None:

@@ -37,6 +37,7 @@ class Sensors:
     imu: Buffer = field(default_factory=lambda: Buffer(_WIDTH["imu"]))
     gnss: Buffer = field(default_factory=lambda: Buffer(_WIDTH["gnss"]))
     odometer: Buffer = field(default_factory=lambda: Buffer(_WIDTH["odometer"]))
+    others: dict[str, Buffer] = field(init=False)  # of the sensors of `Recording.sensors`
     oldest: float = -np.inf  # s; rows up to here come too late
     _unit: Array | None = None  # `unit`, once asked for
     _means: dict[str, tuple[float, tuple[float, ...]]] = field(default_factory=dict)  # usual sigmas, and since when
@@ -48,12 +49,31 @@ class Sensors:
     _reach: Reach = field(default_factory=Reach)
     _before: set[tuple[str | float, ...]] = field(default_factory=set)  # fixes and readings of the clock before
 
+    def __post_init__(self) -> None:
+        self.others = {name: Buffer(len(series.sensor.names)) for name, series in self.setup.sensors.items()}
+
+    @property
+    def aiding(self) -> dict[str, Buffer]:
+        """The buffers of all sensors but the IMU, by their names."""
+        return {"gnss": self.gnss, "odometer": self.odometer, **self.others}
+
+    def newest(self, sensor: str) -> float:
+        """Newest time of a sensor, s."""
+        return self.imu.newest if sensor == "imu" else self.aiding[sensor].newest
+
+    def anchors(self, sensor: str) -> bool:
+        """Whether each row of a sensor wants a keyframe."""
+        return sensor == "gnss" or (sensor in self.others and self.setup.sensors[sensor].sensor.keyframes)
+
     def add(self, sensor: str, t: float, values: tuple[float, ...]) -> bool:
         """Take in a row; False if it is of no use (`counts` says why).
 
         The values are gyro and force of an IMU (rad/s, m/s^2); latitude, longitude (rad), height, three sigmas,
-        velocity and its sigmas (NaN where there is none) of a fix; speed, way counted and four wheels of an odometer.
+        velocity and its sigmas (NaN where there is none) of a fix; speed, way counted and four wheels of an odometer;
+        of other sensors their columns in SI, NaN where there is none.
         """
+        if sensor in self.others:
+            return self._add_other(sensor, t, values)
         known = values[: 6 if sensor != "odometer" else 1]
         if not math.isfinite(sum(known)) or not abs(t) <= LATEST or (sensor == "gnss" and min(values[3:6]) <= 0.0):
             self.counts[f"{sensor}: not a number"] += 1
@@ -64,17 +84,7 @@ class Sensors:
         buffer: Buffer = getattr(self, sensor)
         if sensor == "imu":
             return self._add_imu(t, values)
-        if (sensor, t, *values[: _TOLD[sensor]]) in self._before:  # a sender that begins again before that step
-            self.counts[f"{sensor}: repeated"] += 1
-            return False
-        if self._clock.behind and t < self.imu.newest - self.longest_gap:
-            self._clock.hold((sensor, t, values))  # until it shows what the IMU's rows before it are
-            return False
-        if t <= self.oldest:
-            self.counts[f"{sensor}: too late"] += 1
-            return False
-        if len(self.imu) and t > self.imu.newest + AHEAD:
-            self.counts[f"{sensor}: stamp in the future"] += 1
+        if not self._in_time(sensor, t, values, (sensor, t, *values[: _TOLD[sensor]])):
             return False
         if sensor == "gnss":
             values, without = with_sane_velocity(values)
@@ -96,6 +106,37 @@ class Sensors:
             return False
         self.counts[sensor] += 1
         return True
+
+    def _in_time(self, sensor: str, t: float, values: tuple[float, ...], told: tuple[str | float, ...]) -> bool:
+        """Whether a row comes when it can be used; `told` is by what it is known again."""
+        if told in self._before:  # a sender that begins again before that step
+            self.counts[f"{sensor}: repeated"] += 1
+            return False
+        if self._clock.behind and t < self.imu.newest - self.longest_gap:
+            self._clock.hold((sensor, t, values))  # until it shows what the IMU's rows before it are
+            return False
+        if t <= self.oldest:
+            self.counts[f"{sensor}: too late"] += 1
+            return False
+        if len(self.imu) and t > self.imu.newest + AHEAD:
+            self.counts[f"{sensor}: stamp in the future"] += 1
+            return False
+        return True
+
+    def _add_other(self, name: str, t: float, values: tuple[float, ...]) -> bool:
+        sensor = self.setup.sensors[name].sensor
+        row = np.array(values, dtype=float)[None]
+        why = None
+        if row.shape[1] != len(sensor.names) or not abs(t) <= LATEST or not sensor.usable(row)[0]:
+            why = "not a number"
+        elif not sensor.usable(row := sensor.within_bounds(row))[0]:
+            why = "beyond any sensor"
+        elif not self._in_time(name, t, values, _known(name, t, values)):
+            return False
+        elif not self.others[name].add(t, tuple(row[0].tolist())):
+            why = "repeated"
+        self.counts[name if why is None else f"{name}: {why}"] += 1
+        return why is None
 
     def add_next(self, t: float, values: tuple[float, ...], newest: float) -> bool:
         """Take in an IMU row if nothing is odd about it; False leaves it to `add`. `newest` is the time before it."""
@@ -152,6 +193,9 @@ class Sensors:
                 for name, width in _TOLD.items():
                     rows = getattr(self, name).rows[:, : width + 1].tolist()
                     self._before = {one for one in self._before if one[0] != name} | {(name, *row) for row in rows}
+                for name, buffer in self.others.items():
+                    again = {_known(name, t, tuple(values)) for t, *values in buffer.rows.tolist()}
+                    self._before = {one for one in self._before if one[0] != name} | again
             return False
         if len(self.imu) and t > self.imu.newest + self.longest_gap:
             held = self._clock.hold_ahead(t, values)
@@ -182,14 +226,20 @@ class Sensors:
 
     def drop_before(self, t: float) -> None:
         """Forget rows before a time."""
-        for buffer in (self.imu, self.gnss, self.odometer):
+        for buffer in (self.imu, *self.aiding.values()):
             buffer.drop_before(t)
 
     def recording(self, begin: float = -np.inf, end: float = np.inf) -> Recording:
         """The rows between two times as a recording."""
         rows = self.imu.between(begin, end)
         imu = replace(self.setup.imu, t=rows[:, 0], gyro=rows[:, 1:4], accel=rows[:, 4:7])
-        return replace(self.setup, imu=imu, gnss=self._gnss(begin, end), odometer=self._odometer(begin, end))
+        sensors = {}
+        for name, buffer in self.others.items():
+            rows = buffer.between(begin, end)
+            sensors[name] = replace(self.setup.sensors[name], t=rows[:, 0], values=rows[:, 1:])
+        return replace(
+            self.setup, imu=imu, gnss=self._gnss(begin, end), odometer=self._odometer(begin, end), sensors=sensors
+        )
 
     def _gnss(self, begin: float, end: float) -> Gnss | None:
         rows = self.gnss.between(begin, end)
@@ -209,6 +259,11 @@ class Sensors:
         return replace(self.setup.odometer, t=rows[:, 0], speed=rows[:, 1], way=way, wheels=wheels)
 
 
+def _known(name: str, t: float, values: tuple[float, ...]) -> tuple[str | float, ...]:
+    """By what a row of another sensor is known again."""
+    return (name, t, *(x for x in values if math.isfinite(x)))
+
+
 def unit_of(sd: Array) -> Array:
     """(3,) median of stated sigmas (N, 3), one for both horizontal axes: their errors have one figure in common."""
     east, north, up = np.median(sd, axis=0)
@@ -226,6 +281,7 @@ def without_rows(recording: Recording) -> Recording:
         gnss=gnss and replace(gnss, t=none, llh=rows, sd=rows, v=None, sd_v=None, type=None),
         odometer=odometer and replace(odometer, t=none, speed=none, way=None, wheels=None),
         truth=None,
+        sensors={name: replace(s, t=none, values=s.values[:0]) for name, s in recording.sensors.items()},
     )
 
 
@@ -248,6 +304,7 @@ def rows_of(recording: Recording) -> tuple[Array, list[Row]]:
         if g.v is not None and g.sd_v is not None:
             blank[:, 6:9], blank[:, 9:] = g.v, g.sd_v
         parts.append((g.t, "gnss", blank))
+    parts += [(series.t, name, series.values) for name, series in recording.sensors.items()]
     parts.append((recording.imu.t, "imu", np.concatenate([recording.imu.gyro, recording.imu.accel], axis=1)))
     t = np.concatenate([part[0] for part in parts])
     order = np.argsort(t, kind="stable")

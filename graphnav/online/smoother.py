@@ -69,7 +69,7 @@ class Smoother:
         self._judged = 0.0  # s of rows that they were judged by
         self._times: list[float] = []  # s, of keyframes that have settled meanwhile
         self._left_out: tuple[ExcludedSpan, ...] = ()  # of other measurements than fixes
-        self._fixes: list[float] = []  # s, not yet in the graph
+        self._fixes: list[float] = []  # s, rows that want a keyframe and are not yet in the graph
         self._began = -np.inf  # s, of what is being smoothed
         self._due = -np.inf  # s, of IMU time at which the next keyframes can be made
         self._awake = -np.inf  # s, at which there is anything to do
@@ -92,11 +92,12 @@ class Smoother:
         """Take in one row: sensor, time and values as in `graphnav.online.sensors.Sensors.add`."""
         sensor, t, values = row
         sensors = self.sensors
-        before, previous = sensors.imu.newest, sensors.odometer.newest
+        before = sensors.imu.newest
         if sensor == "imu" and sensors.add_next(t, values, before):  # as all but a few do
             if t >= self._awake:
                 self._look()
             return
+        previous = sensors.newest(sensor)
         if not sensors.add(sensor, t, values):
             return
         if sensor == "imu":
@@ -106,14 +107,14 @@ class Smoother:
         tracker = self.tracker
         if tracker is not None:
             self._awake = -np.inf
-            if t < {"imu": before, "odometer": previous}.get(sensor, -np.inf):
+            if sensor != "gnss" and t < previous:
                 tracker.note_late_row(sensor, t)
-            if sensor == "gnss" and t > tracker.newest + SAME_TIME:
+            if sensors.anchors(sensor) and t > tracker.newest + SAME_TIME:
                 self._fixes = sorted([*self._fixes, t])
                 self._due = min(self._due, t + AFTER)
             elif t <= tracker.newest + SAME_TIME:
                 self.late[sensor] += 1
-                if sensor == "gnss":
+                if sensors.anchors(sensor):
                     self._fixes = sorted([*self._fixes, t])
                 self._dirty = min(self._dirty, t)
             elif sensor == "odometer" and previous < tracker.newest - SAME_TIME:
@@ -207,7 +208,8 @@ class Smoother:
         told = found.motion is not None and self.settings.gnss.position and recording.platform != "foot"
         if told and self.settings.noise.mode == "estimated":
             self._found, self._tentative = found, True
-        self._fixes = [t for t in sensors.gnss.t.tolist() if t >= recording.start - SAME_TIME]
+        anchors = [buffer.t for name, buffer in sensors.aiding.items() if sensors.anchors(name)]
+        self._fixes = [t for t in np.unique(np.concatenate(anchors)).tolist() if t >= recording.start - SAME_TIME]
         self._began, self._judged = recording.start, recording.duration
         sensors.oldest = recording.start
         self._advance(tracker)
@@ -292,7 +294,7 @@ class Smoother:
         sensors = self.sensors
         self.notes.append(f"{why}: aligning anew")
         after = sensors.imu.rows[sensors.imu.t > before].copy()
-        later = {name: getattr(sensors, name).rows.copy() for name in ("gnss", "odometer")}
+        later = {name: buffer.rows.copy() for name, buffer in sensors.aiding.items()}
         if self.tracker is not None:
             sensors.imu.drop_after(before)
             self._judged_at_last()
@@ -305,7 +307,7 @@ class Smoother:
             sensors.imu.add(float(row[0]), tuple(row[1:]))
         for name, rows in later.items():
             for row in rows[rows[:, 0] > before]:
-                getattr(sensors, name).add(float(row[0]), tuple(row[1:]))
+                sensors.aiding[name].add(float(row[0]), tuple(row[1:]))
         self._due = self._awake = sensors.imu.newest + _TRY
 
     def _begin_anew(self, oldest: float) -> None:

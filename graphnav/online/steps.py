@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints import list_constraints
+from graphnav.constraints import kinds_for
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
@@ -61,7 +61,7 @@ class StepCutter:
         self.over = pieces if pieces != self._pieces else None
         part = sensors.recording(min(begin, T), limit)
         around = clip_spans(standing.spans, part.start, limit)
-        epochs = [cls.epochs(part, settings, around) for cls in list_constraints()]
+        epochs = [cls.epochs(part, settings, around) for cls in kinds_for(part)]
         return keyframe_times(T, limit, np.concatenate([*epochs, none]), settings.keyframes.rate)
 
     def changed(self, sensors: Sensors, head: float) -> float:

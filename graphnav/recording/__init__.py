@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.gnss.series import RawGnss
+from graphnav.sensors import Series, registered
 
 
 @dataclass(frozen=True)
@@ -115,6 +117,14 @@ class Truth:
 
 
 @dataclass(frozen=True)
+class Own:
+    """What a script solves a recording with beside what graphnav has, in the order of their names."""
+
+    constraints: tuple[type[Any], ...] = ()
+    detectors: tuple[type[Any], ...] = ()
+
+
+@dataclass(frozen=True)
 class Recording:
     """One drive or walk. `remarks` are sentences about what loading changed or found odd."""
 
@@ -130,6 +140,8 @@ class Recording:
     remarks: tuple[str, ...] = ()
     screened: bool = False  # whether `graphnav.recording.plausibility.screening.screen` has been over it
     raw_gnss: RawGnss | None = None  # observations of the antenna that `gnss` has fixes of
+    sensors: Mapping[str, Series] = field(default_factory=dict)  # others (`graphnav.sensors`), by their names
+    own: Own = Own()  # as `graphnav.run` was given them
 
     @cached_property
     def start(self) -> float:
@@ -147,6 +159,12 @@ class Recording:
         """Seconds covered by the IMU."""
         return self.end - self.start
 
+    @property
+    def aiding(self) -> dict[str, Any]:
+        """GNSS, odometer and the other sensors that there are, by their names."""
+        own = {"gnss": self.gnss, "odometer": self.odometer, **self.sensors}
+        return {name: sensor for name, sensor in own.items() if sensor is not None}
+
     def tight(self, coupling: str) -> bool:
         """Whether raw observations are used in place of the fixes, by `raw_gnss.coupling` of the settings."""
         if self.raw_gnss is None or coupling == "loose":
@@ -161,15 +179,18 @@ class Recording:
         RecordingError
             If the recording has no such source.
         """
-        if source not in ("gnss", "odometer"):
-            raise RecordingError(f"cannot withhold '{source}': only 'gnss' or 'odometer' can be withheld")
-        sensor = getattr(self, source)
+        if source not in sources():
+            raise RecordingError(f"cannot withhold '{source}': only {', '.join(sources())} can be withheld")
+        sensor = self.aiding.get(source)
         if sensor is None:
             raise RecordingError(f"cannot withhold '{source}': the recording '{self.name}' has none")
         left = None
         if span is not None:
             t = sensor.t - self.start
             left = rows_of(sensor, ~((t >= span[0]) & (t <= span[1])))
+        if source in self.sensors:
+            rest = {name: series for name, series in self.sensors.items() if name != source}
+            return replace(self, sensors=rest if left is None else {**self.sensors, source: left})
         changed: dict[str, Any] = {source: left}
         if source == "gnss" and self.raw_gnss is not None:  # whose fixes they are
             raw = self.raw_gnss.t - self.start
@@ -188,6 +209,9 @@ class Recording:
             for name in ("imu", "gnss", "odometer", "raw_gnss")
             if (sensor := getattr(self, name)) is not None
         }
+        parts["sensors"] = {
+            name: rows_of(series, (series.t >= lo) & (series.t <= hi)) for name, series in self.sensors.items()
+        }
         if len(parts["imu"].t) < 2:
             raise RecordingError(f"nothing is left of '{self.name}' between {start} and {end} s")
         if (
@@ -197,6 +221,11 @@ class Recording:
         ):
             parts["truth"] = None  # a part of a loop is none
         return replace(self, **parts)
+
+
+def sources() -> tuple[str, ...]:
+    """Names of what can be withheld."""
+    return ("gnss", "odometer", *registered())
 
 
 def rows_of(sensor: Any, mask: NDArray[np.bool_]) -> Any:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
+from graphnav.constraints import list_constraints
 from graphnav.estimation.solution import ParameterEstimate
 
 _AXES = ("right", "forward", "up")
@@ -60,13 +62,19 @@ _NAMED = {
 
 def has_names(name: str) -> bool:
     """Whether a parameter is of the calibration, and its numbers have names."""
-    return name in _NAMED or name == "imu_scale"
+    return name in _NAMED or name == "imu_scale" or name in _by_constraints()
+
+
+@cache
+def _by_constraints() -> dict[str, list[Component]]:
+    """What constraints say of their parameters themselves."""
+    return {name: [Component(*one) for one in each] for kind in list_constraints() for name, each in kind.words.items()}
 
 
 def components(name: str, estimate: ParameterEstimate) -> list[Component]:
     """One for each of a parameter's numbers; those without a name are counted."""
     size = estimate.value.shape[1]
-    known = _scales(size // 2) if name == "imu_scale" else _NAMED.get(name, [])
+    known = _scales(size // 2) if name == "imu_scale" else (_NAMED | _by_constraints()).get(name, [])
     if len(known) == size:
         return known
     unit = estimate.unit or "-"

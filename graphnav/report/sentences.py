@@ -73,7 +73,7 @@ def what_was_done(recording: Recording, solutions: Mapping[str, Solution], withh
     """The run in a few sentences."""
     used = recording
     for source, span in withheld:
-        if getattr(used, source, None) is not None:
+        if source in used.aiding:
             used = used.without(source, span)
     rate = 1.0 / float(np.median(np.diff(used.imu.t)))
     sources = [f"{len(used.imu.t)} IMU rows at {rate:.4g} Hz"]
@@ -81,6 +81,7 @@ def what_was_done(recording: Recording, solutions: Mapping[str, Solution], withh
         sources.append(f"{len(used.gnss.t)} GNSS fixes")
     if used.odometer is not None:
         sources.append(f"{len(used.odometer.t)} odometer rows")
+    sources += [f"{len(series)} rows of {name}" for name, series in used.sensors.items()]
     others = [name for name in solutions if name not in own_solutions(solutions)]
     solutions = own_solutions(solutions)
     solution = next(iter(solutions.values()))

@@ -18,8 +18,8 @@ from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.clock import Clock
 from graphnav.recording.checks.crosschecks import Fit, Track
 from graphnav.recording.checks.stated import exchange_lat_lon, exchanged_finding
-from graphnav.recording.formats.schema import TIME
 from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
+from graphnav.sensors.tables import TIME
 
 _SURE = 4.0  # sigmas
 _NO_BETTER = 0.05  # of a correlation

@@ -37,6 +37,7 @@ from graphnav.recording.checks.imu import (
     saturation,
 )
 from graphnav.recording.checks.raw import raw_facts, raw_findings
+from graphnav.recording.checks.series import series_facts, series_findings
 from graphnav.recording.checks.stated import (
     fix_types,
     lever_arms,
@@ -118,8 +119,8 @@ def inspect(recording: Recording) -> Inspection:
     recording = whole.recording
     findings = [Finding("note", remark) for remark in recording.remarks]
     findings += whole.findings
-    for name in ("gnss", "odometer"):
-        if (sensor := getattr(recording, name)) is not None and not len(sensor.t):
+    for name, sensor in recording.aiding.items():
+        if not len(sensor.t):
             findings.append(Finding("warning", f"[{name}] holds no rows in this part of the recording"))
             recording = recording.without(name)
     known = {f.key for f in whole.findings}
@@ -171,6 +172,8 @@ def inspect(recording: Recording) -> Inspection:
         facts["odometer"]["distance_m"] = round(float(np.sum(0.5 * (speed[1:] + speed[:-1]) * step)), 1)
         facts["odometer"]["max_speed_mps"] = float(np.abs(recording.odometer.speed).max())
         findings += odometer_findings(recording, track, facts["odometer"])
+    facts |= {name: series_facts(series) for name, series in recording.sensors.items()}
+    findings += series_findings(recording)
     if recording.truth is not None:
         facts["truth"] = {"rows": len(recording.truth.t), "of": recording.truth.of}
         if recording.truth.closed_loop_sigma:

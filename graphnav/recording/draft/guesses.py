@@ -10,7 +10,8 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.recording.draft import motion
-from graphnav.recording.formats.schema import FORCE, RATE, SPEED, TIME, rotation_from_letters
+from graphnav.recording.formats.schema import FORCE, RATE, SPEED, rotation_from_letters
+from graphnav.sensors.tables import TIME
 
 _G = 9.80665
 _LASTING = 0.5  # of the usual force is in its mean, even of a foot that swings

@@ -17,8 +17,9 @@ from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.formats import formats
 from graphnav.recording.formats.folder import other_log
 from graphnav.recording.formats.registry import Log
-from graphnav.recording.formats.schema import ANGLE, SPEED, TIME, WHEELS
+from graphnav.recording.formats.schema import SPEED, WHEELS
 from graphnav.recording.formats.table import first_rows, read_header, read_table
+from graphnav.sensors.tables import ANGLE, TIME
 
 JOINED = "imu.csv.gz"  # the file that is made of a gyro's and an accelerometer's
 

@@ -80,8 +80,9 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
         return chosen.load(source)
     r = chosen.read(source)
     return Log(
-        r.name, r.imu, r.gnss, r.odometer, r.truth, r.platform, gps_zero=r.gps_zero, files=r.files, remarks=r.remarks
-    )
+        r.name, r.imu, r.gnss, r.odometer, r.truth, r.platform, gps_zero=r.gps_zero, files=r.files, remarks=r.remarks,
+        sensors=r.sensors,
+    )  # fmt: skip
 
 
 def _choose(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,8 @@ from graphnav.recording.formats.repair import (
 )
 from graphnav.recording.formats.table import Table, read_table
 from graphnav.recording.formats.trajectories import read_trajectory
+from graphnav.sensors import Sensor, Series, registered
+from graphnav.sensors.tables import ANGLE
 
 _RAW_FILES = ("rover", "nav", "sp3", "clk", "base")
 
@@ -53,7 +56,8 @@ def read_folder(source: str | Path) -> Recording:
     logs: dict[str, Log | None] = {}  # by file; one log may hold several sensors
     zeros: list[float] = []  # of their clocks
     topics: dict[str, tuple[str, ...]] = {}  # asked for of each file
-    for section in (d.imu, d.gnss, d.odometer):
+    known = registered()
+    for section in (d.imu, d.gnss, d.odometer, *(getattr(d, name) for name in known)):
         if section is not None:
             topics[section.file] = (*topics.get(section.file, ()), *section.topic)
 
@@ -70,6 +74,8 @@ def read_folder(source: str | Path) -> Recording:
             required = (*required, *section.readings(tuple(rows.columns)))
             if not all(column in rows for column in required):
                 read_table(file, required, (), section.columns)  # says what is missing
+        if name in known:
+            required = (*required, *_needed(known[name], rows))
         return usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
 
     def sensor(name: str, of_table: Callable[[Any, Table, Remarks], Any], of_log: Callable[[Any, Any], Any]) -> Any:
@@ -85,7 +91,8 @@ def read_folder(source: str | Path) -> Recording:
         if log is None:
             return of_table(section, table(name), remarks)
         files.extend(file for file in log.files if file not in files)
-        if getattr(log, name) is None:
+        held = log.sensors.get(name) if name in known else getattr(log, name)
+        if held is None:
             raise RecordingError(f"{path}: '{name}.file': {section.file} holds no {name}")
         for key in ("columns", "units", "keep"):
             if key in section.model_fields_set:
@@ -93,11 +100,16 @@ def read_folder(source: str | Path) -> Recording:
         remarks.extend(r for r in log.remarks if r not in remarks)
         if log.gps_zero is not None:
             zeros.append(log.gps_zero - section.time_offset)
-        return of_log(section, getattr(log, name))
+        return of_log(section, held)
 
     imu = sensor("imu", _imu, _imu_of)
     gnss = sensor("gnss", _gnss, _gnss_of)
     odometer = sensor("odometer", _odometer, _odometer_of)
+    sensors = {
+        name: sensor(name, partial(_series, one), lambda _, held: held)
+        for name, one in known.items()
+        if getattr(d, name) is not None
+    }
     gps_zero = parse_clock(d.clock, float(imu.t[0])) if d.clock else next(iter(zeros), None)
     raw = None
     if d.raw_gnss is not None:
@@ -115,7 +127,18 @@ def read_folder(source: str | Path) -> Recording:
         truth = _truth(d.truth, table("truth"), remarks)
     name = d.name or (path.resolve().parent.name if path.name == "recording.toml" else path.stem)
     return Recording(
-        name, d.platform, imu, gnss, odometer, truth, path, tuple(files), gps_zero, tuple(remarks), raw_gnss=raw
+        name,
+        d.platform,
+        imu,
+        gnss,
+        odometer,
+        truth,
+        path,
+        tuple(files),
+        gps_zero,
+        tuple(remarks),
+        raw_gnss=raw,
+        sensors=sensors,
     )
 
 
@@ -165,7 +188,7 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
             v = sd_v = None
             remarks.add("the GNSS velocity columns are blank throughout: no velocities")
     elif "speed" in rows and "course" in rows:
-        course = rows["course"] * schema.ANGLE[d.units.angle or "deg"]
+        course = rows["course"] * ANGLE[d.units.angle or "deg"]
         v, sd_v, sentence = horizontal_velocity(
             rows["speed"] * schema.SPEED[d.units.speed], course, d.sd_v or DEFAULT_SD_V
         )
@@ -251,6 +274,33 @@ def _odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odomete
     )
 
 
+def _needed(sensor: Sensor, rows: Table) -> tuple[str, ...]:
+    """The columns that every row must have: the first of the sets that the file has.
+
+    Raises
+    ------
+    RecordingError
+        If it has none of them.
+    """
+    for some in sensor.needs:
+        if all(name in rows for name in some):
+            # of several sets a row may have any, which `Sensor.usable` looks at
+            return some if len([s for s in sensor.needs if all(name in rows for name in s)]) == 1 else ()
+    sets = " or ".join(" and ".join(some) for some in sensor.needs)
+    raise RecordingError(f'{rows.path}: no column {sets}; if it has another name, say columns = {{ name = "..." }}')
+
+
+def _series(sensor: Sensor, d: Any, rows: Table, remarks: Remarks) -> Series:
+    absent = np.full(len(rows), np.nan)
+    sizes = [column.units[getattr(d.units, column.name)] for column in sensor.columns]
+    values = np.stack([rows.get(name, absent) * size for name, size in zip(sensor.names, sizes, strict=True)], -1)
+    figures = sensor.figures(**{name: getattr(d, name) for name in sensor.figures.model_fields})
+    whole = sensor.usable(values)
+    if not whole.all():
+        remarks.add(f"{(~whole).sum()} {sensor.name} rows without a measurement dropped")
+    return Series(sensor, rows["t"][whole], values[whole], figures)
+
+
 def _truth_of_log(d: schema.TruthTable, file: Path, remarks: Remarks) -> Truth:
     """The truth from a trajectory file of another program."""
     for key in ("columns", "units", "keep"):
@@ -270,7 +320,7 @@ def _truth(d: schema.TruthTable, rows: Table, remarks: Remarks) -> Truth:
     else:
         llh, rows = geodetic(rows, d.units.angle, "truth", remarks)
     v = _read_part(rows, ("ve", "vn", "vu"), schema.SPEED[d.units.speed])
-    rph = _read_part(rows, ("roll", "pitch", "heading"), schema.ANGLE[d.units.angle or "deg"])
+    rph = _read_part(rows, ("roll", "pitch", "heading"), ANGLE[d.units.angle or "deg"])
     return Truth(rows["t"], llh, xyz, v, rph, d.of)
 
 

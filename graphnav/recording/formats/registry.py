@@ -13,6 +13,7 @@ from pathlib import Path
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import check_regular, exists
 from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth, rows_of
+from graphnav.sensors import Series
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Log:
     mount_known: bool = True  # whether the IMU's axes are by definition those of the vehicle
     files: tuple[Path, ...] = ()
     remarks: tuple[str, ...] = ()  # sentences about what was assumed
+    sensors: Mapping[str, Series] = field(default_factory=dict)  # others, by their names
     topics: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # sensor -> that used, then those it could be
 
     def recording(self, source: str | Path) -> Recording:
@@ -47,7 +49,7 @@ class Log:
             )
         return Recording(
             self.name, self.platform, self.imu, self.gnss, self.odometer, self.truth,
-            Path(source), self.files, self.gps_zero, self.remarks,
+            Path(source), self.files, self.gps_zero, self.remarks, sensors=self.sensors,
         )  # fmt: skip
 
 

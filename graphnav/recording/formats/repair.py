@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.recording import FIX_TYPES, fix_types
-from graphnav.recording.formats.schema import TIME, Keep
 from graphnav.recording.formats.table import Mask, Table
+from graphnav.sensors.tables import TIME, Keep
 
 _LABEL = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"}
 LATEST = 1e11  # s, either way: three thousand years
@@ -52,7 +52,7 @@ def usable_rows(
         For infinite values but in an odometer's log, if too few rows are left, if the time steps cannot be seconds, or
         if the stamps run over the same times twice.
     """
-    label = _LABEL[sensor]
+    label = _LABEL.get(sensor, sensor)
     with np.errstate(over="ignore"):
         t = rows["t"] * TIME[unit] + offset
     # a stamp of thousands of years is none, as an infinite one

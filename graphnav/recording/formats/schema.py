@@ -10,10 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import (
-    AfterValidator,
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     ValidationError,
     create_model,
@@ -29,98 +26,39 @@ from graphnav.core.timescales import parse_clock
 from graphnav.recording import ImuNoise
 from graphnav.recording.formats.figures import parse_figure
 from graphnav.recording.formats.imu_models import MODELS, find_model
-
-_SMALLEST, _LARGEST = 1e-15, 1e9  # of a figure: squares of it are numbers
-_LONGEST = 1e7  # of the components of a vector: m, from the Earth's centre at most, or of a direction
-
-Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
-
-
-def _usable(value: float) -> float:
-    if value and not _SMALLEST <= abs(value) <= _LARGEST:
-        raise ValueError(f"{value:g} must lie between {_SMALLEST:g} and {_LARGEST:g}")
-    return value
-
-
-Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0), AfterValidator(_usable)]
-
-NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0), AfterValidator(_usable)]
-
-
-def _three_numbers(value: Any) -> Any:
-    if not isinstance(value, list | tuple) or len(value) != 3:
-        raise ValueError("must be three numbers in brackets")
-    if any(isinstance(x, bool) or not isinstance(x, int | float) or not np.isfinite(x) for x in value):
-        raise ValueError("must be three numbers in brackets")
-    if any(abs(x) > _LONGEST for x in value):
-        raise ValueError(f"must be three numbers in brackets, none beyond {_LONGEST:g}")
-    return tuple(float(x) for x in value)
+from graphnav.sensors import registered
+from graphnav.sensors.tables import (
+    NotNegative,
+    Number,
+    Positive,
+    SensorTable,
+    TimeUnit,
+    TomlTable,
+    Vector,
+    three_numbers,
+)
 
 
 def _three_positive(value: Any) -> Any:
-    value = _three_numbers(value)
+    value = three_numbers(value)
     if min(value) <= 0:
         raise ValueError("must be three numbers above zero: a 1-sigma each for east, north, up")
     return value
 
 
-Vector = Annotated[tuple[float, float, float], BeforeValidator(_three_numbers)]
 Sigmas = Annotated[tuple[float, float, float], BeforeValidator(_three_positive)]
 
-TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-ANGLE = {"deg": np.pi / 180.0, "rad": 1.0}
 RATE = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180e3}
 FORCE = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ft/s2": 0.3048}  # standard gravity, by definition
 SPEED = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600}
 
-TimeUnit = Literal["s", "ms", "us", "ns"]
 AngleUnit = Literal["deg", "rad"]
 SpeedUnit = Literal["m/s", "km/h", "mph", "knots"]
 
 _LETTERS = {"R": (1, 0, 0), "L": (-1, 0, 0), "F": (0, 1, 0), "B": (0, -1, 0), "U": (0, 0, 1), "D": (0, 0, -1)}
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-def _one_or_more(value: Any) -> Any:
-    return (value,) if isinstance(value, str) else value
-
-
-Topics = Annotated[tuple[str, ...], BeforeValidator(_one_or_more)]
-
-
-class Keep(_Section):
-    """Rows to use: those whose column holds at least this."""
-
-    column: str
-    at_least: Number
-
-
-class _Sensor(_Section):
-    """What every sensor's table may hold."""
-
-    required: ClassVar[tuple[str, ...]] = ()
-    optional: ClassVar[tuple[str, ...]] = ()
-
-    file: str = Field(min_length=1)
-    columns: dict[str, str] = Field({}, description="our name = the file's")
-    time_offset: Number = Field(0.0, description="s, added to the file's stamps")
-    keep: Keep | None = None
-    topic: Topics = Field((), description="of a ROS bag, or several: a fix's and a velocity's")
-
-    @field_validator("columns")
-    @classmethod
-    def _known_columns(cls, columns: dict[str, str]) -> dict[str, str]:
-        known = (*cls.required, *cls.optional)
-        for name in columns:
-            if name not in known:
-                raise ValueError(f"'{name}' is not one of graphnav's columns; {nearest(name, known)}")
-        return columns
-
-
-class ImuUnits(_Section):
+class ImuUnits(TomlTable):
     """Units of imu.csv."""
 
     t: TimeUnit = "s"
@@ -128,7 +66,7 @@ class ImuUnits(_Section):
     accel: Literal["m/s2", "g", "mg", "ft/s2"] = "m/s2"
 
 
-class GnssUnits(_Section):
+class GnssUnits(TomlTable):
     """Units of gnss.csv; `angle` is that of lat and lon, None: degrees unless they look like radians."""
 
     t: TimeUnit = "s"
@@ -142,7 +80,7 @@ class FixUnits(GnssUnits):
     type: Literal["rtklib", "nmea"] = "rtklib"
 
 
-class OdometerUnits(_Section):
+class OdometerUnits(TomlTable):
     """Units of odometer.csv."""
 
     t: TimeUnit = "s"
@@ -166,12 +104,12 @@ NOISE_UNITS = {
 }  # fmt: skip
 Noise = create_model(  # type: ignore[call-overload]
     "Noise",
-    __base__=_Section,
+    __base__=TomlTable,
     **{f.name: (_figure(f.name), Field(None, description=NOISE_UNITS[f.name])) for f in fields(ImuNoise)},
 )
 
 
-class ImuTable(_Sensor):
+class ImuTable(SensorTable):
     """[imu]"""
 
     required = ("t", "gx", "gy", "gz", "ax", "ay", "az")
@@ -213,7 +151,7 @@ class ImuTable(_Sensor):
         return rotation_from_letters(self.axes or "RFU")
 
 
-class GnssTable(_Sensor):
+class GnssTable(SensorTable):
     """[gnss]"""
 
     required = ("t", "lat", "lon", "h")
@@ -235,7 +173,7 @@ def _names(value: Any) -> Any:
 Files = Annotated[tuple[str, ...], BeforeValidator(_names)]
 
 
-class RawGnssTable(_Section):
+class RawGnssTable(TomlTable):
     """[raw_gnss]: observations of a receiver, and what places its satellites"""
 
     columns_known: ClassVar[tuple[str, ...]] = (
@@ -274,7 +212,7 @@ class RawGnssTable(_Section):
 WHEELS = ("speed_fl", "speed_fr", "speed_rl", "speed_rr")
 
 
-class OdometerTable(_Sensor):
+class OdometerTable(SensorTable):
     """[odometer]: a speed, or pulses counted, or the speeds of the wheels"""
 
     required = ("t",)
@@ -309,7 +247,7 @@ class OdometerTable(_Sensor):
         return ("speed",)
 
 
-class TruthTable(_Sensor):
+class TruthTable(SensorTable):
     """[truth]"""
 
     required = ("t",)
@@ -330,7 +268,7 @@ class TruthTable(_Sensor):
         return self
 
 
-class RecordingFile(_Section):
+class RecordingFile(TomlTable):
     """The whole of recording.toml."""
 
     format: Literal["graphnav-recording/1"]
@@ -386,6 +324,12 @@ def rotation_from_vectors(forward: Sequence[float], up: Sequence[float]) -> Arra
     return np.stack([np.cross(f, u), f, u])
 
 
+def recording_file() -> type[RecordingFile]:
+    """The whole of recording.toml, with the tables of all sensors that are known."""
+    tables: dict[str, Any] = {name: (sensor.table | None, None) for name, sensor in registered().items()}
+    return create_model("RecordingFile", __base__=RecordingFile, **tables)
+
+
 def read_description(path: Path) -> RecordingFile:
     """Read and validate a recording's .toml.
 
@@ -395,10 +339,11 @@ def read_description(path: Path) -> RecordingFile:
         Naming the file and the key, and the nearest known key for an unknown one.
     """
     values, text = read_toml(path, RecordingError)
+    model = recording_file()
     try:
-        description = RecordingFile.model_validate(values)
+        description = model.model_validate(values)
     except ValidationError as error:
-        raise RecordingError(complaint(path, error, RecordingFile, text)) from None
+        raise RecordingError(complaint(path, error, model, text)) from None
     try:
         _ = description.imu.R_bs
     except ValueError as error:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gzip
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from graphnav.core.timescales import clock_words
 from graphnav.recording import ImuNoise, Odometer, Recording
 from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.schema import NOISE_UNITS, WHEELS
+from graphnav.sensors import Series
 
 _DEG = np.pi / 180.0
 
@@ -32,7 +35,11 @@ def write_recording(log: Log, folder: Path) -> list[Path]:
     Without an IMU the folder is no recording yet: its recording.toml names an imu.csv that has to be put there.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    files = [f for f in (_imu(log), _gnss(log), _odometer(log), _truth(log)) if f is not None]
+    files = [
+        f
+        for f in (_imu(log), _gnss(log), _odometer(log), *map(_series, log.sensors.values()), _truth(log))
+        if f is not None
+    ]
     for file in files:
         write_csv(folder / file.name, file.header, file.columns)
     path = folder / "recording.toml"
@@ -43,7 +50,17 @@ def write_recording(log: Log, folder: Path) -> list[Path]:
 def write_folder(recording: Recording, folder: str | Path, notes: Sequence[str] = ()) -> list[Path]:
     """Write a recording; `notes` become comments of recording.toml."""
     r = recording
-    log = Log(r.name, r.imu, r.gnss, r.odometer, r.truth, r.platform, gps_zero=r.gps_zero, remarks=tuple(notes))
+    log = Log(
+        r.name,
+        r.imu,
+        r.gnss,
+        r.odometer,
+        r.truth,
+        r.platform,
+        gps_zero=r.gps_zero,
+        remarks=tuple(notes),
+        sensors=r.sensors,
+    )
     return write_recording(log, Path(folder))
 
 
@@ -103,6 +120,17 @@ def _odometer(log: Log) -> _File | None:
     if odometer.wheels is not None:
         header, columns = [*header, *WHEELS], [*columns, *odometer.wheels.T]
     return _File("odometer.csv.gz", header, columns)
+
+
+def _series(series: Series) -> _File:
+    """Its columns in the units that are usual in files; those that no row has are left out."""
+    header, columns = ["t"], [series.t]
+    for column in series.sensor.columns:
+        values, size = series[column.name], next(iter(column.units.values()))
+        if np.isfinite(values).any():
+            columns.append(degrees(values) if size == _DEG else values / size)
+            header.append(column.name)
+    return _File(f"{series.sensor.name}.csv.gz", header, columns)
 
 
 def _truth(log: Log) -> _File | None:
@@ -165,6 +193,12 @@ def _toml(log: Log) -> str:
         lines += ["", "[odometer]", 'file = "odometer.csv.gz"       # t,speed; s, m/s, forward positive']
         lines += [f"lever_arm = {_vector(log.odometer.lever_arm)}    # to the point that does not slip sideways, m"]
         lines += _odometer_keys(log.odometer)
+    for name, series in log.sensors.items():
+        units = ", ".join(f"{c.name} in {next(iter(c.units))}" for c in series.sensor.columns)
+        lines += ["", f"[{name}]", f'file = "{name}.csv.gz"'.ljust(31) + f"# t in s; {units}"]
+        lines += [
+            f"{key} = {_toml_value(value)}" for key, value in series.figures.model_dump(exclude_none=True).items()
+        ]
     if log.truth is not None:
         lines += ["", "[truth]                        # only for evaluation"]
         if log.truth.closed_loop_sigma is not None:
@@ -200,6 +234,11 @@ def _noise(noise: ImuNoise, assumed: bool) -> list[str]:
         value = float(getattr(noise, f.name))
         lines.append(f"{f.name} = {value!r}".ljust(48) + f"# {NOISE_UNITS[f.name]}")
     return lines
+
+
+def _toml_value(value: Any) -> str:
+    """JSON's numbers, texts and lists are TOML's as well."""
+    return quote(value) if isinstance(value, str) else json.dumps(value)
 
 
 def _vector(values: Array) -> str:

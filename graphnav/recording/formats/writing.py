@@ -12,8 +12,8 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.recording import Recording
-from graphnav.recording.formats.schema import ANGLE
 from graphnav.recording.formats.writer import write_folder
+from graphnav.sensors.tables import ANGLE
 
 __all__ = ["round_recording", "write_facts", "write_folder"]
 

@@ -22,6 +22,7 @@ from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.aiding import imu_axes, imu_clock, overlap_s
 from graphnav.recording.checks.clock import clock_of
 from graphnav.recording.checks.crosschecks import Fit, Track
+from graphnav.recording.checks.series import screen_series
 from graphnav.recording.formats.schema import FORCE
 from graphnav.recording.plausibility import fixes as plausibility_gnss
 from graphnav.recording.plausibility import odometer as plausibility_odometer
@@ -88,6 +89,8 @@ def screen(recording: Recording) -> Screened:
     findings += spikes
     recording = replace(recording, imu=imu, screened=True)
     findings += dead_axes(recording)
+    recording, said = screen_series(recording)
+    findings += said
     track = None
     if recording.gnss is not None and len(recording.gnss.t):
         recording, said = plausibility_gnss.screen(recording)

@@ -1,0 +1,124 @@
+"""Heading and pitch of the line between two antennas.
+
+With the baseline b in body axes, turned by what its direction is wrong by (delta), and d = R_ln R_nb b::
+
+    heading:   atan2(d_east, d_north) - psi + delta_heading            from -pi to pi
+    pitch:     atan2(d_up, |d_east, d_north|) - theta + delta_pitch
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
+from graphnav.core import rotation
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.core.state import Parameter, States
+from graphnav.recording import Recording
+from graphnav.sensors.dual_antenna import SENSOR
+
+
+@dataclass(frozen=True)
+class Baseline(Constraint):
+    """What both angles share."""
+
+    unit: ClassVar[str] = "rad"
+    sensor: ClassVar[str] = SENSOR.name
+    words: ClassVar[Mapping[str, tuple[tuple[str, str, float], ...]]] = {
+        f"{SENSOR.name}_{angle}_offset": ((f"baseline of the antennas, {angle}", "deg", 57.29577951308232),)
+        for angle in ("heading", "pitch")
+    }
+    column: ClassVar[str] = ""
+
+    measured: Array = field(default_factory=lambda: np.empty((0, 1)))  # rad
+    sigma: Array = field(default_factory=lambda: np.empty((0, 1)))
+    baseline: Array = field(default_factory=lambda: np.array([0.0, 1.0, 0.0]))
+    frame: LocalFrame | None = None
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        series = recording.sensors.get(SENSOR.name)
+        if series is None or not settings.sensor(SENSOR.name).use:
+            return np.empty(0)
+        inside = (series.t >= recording.start - SAME_TIME) & (series.t <= recording.end + SAME_TIME)
+        return series.t[inside & np.isfinite(series[cls.column])]
+
+    @classmethod
+    def build(cls, scene: BuildContext) -> Self | None:
+        series, s = scene.series(SENSOR.name), scene.settings.sensor(SENSOR.name)
+        if series is None:
+            return None
+        keyframe = scene.keyframe_at(series.t)
+        used = (keyframe >= 0) & np.isfinite(series[cls.column])
+        if not used.any():
+            return None
+        figures = series.figures
+        wrong = Parameter(cls._wrong(), np.zeros(1), np.full(1, np.radians(figures.baseline_sigma)), "rad")
+        return cls(
+            keyframe=keyframe[used],
+            measured=series[cls.column][used, None],
+            sigma=series.sigma(cls.column, np.radians(figures.sigma))[used, None],
+            baseline=np.array(figures.baseline),
+            frame=scene.frame,
+            parameters=(wrong,) if figures.baseline_sigma > 0.0 else (),
+            **s.outliers,
+        )
+
+    @classmethod
+    def _wrong(cls) -> str:
+        """Name of what the baseline's direction is wrong by."""
+        return f"{SENSOR.name}_{cls.column}_offset"
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        assert self.frame is not None
+        C = self.frame.R_ln(states.p) @ states.R_nb
+        d = C @ self.baseline
+        angle, by_d = self.angle(d)
+        residual = angle - self.measured[rows]
+        jacobians: dict[str, Any] = {"theta": -by_d[:, None, :] @ C @ rotation.skew(self.baseline)}
+        if self._wrong() in parameters:
+            residual = residual + parameters[self._wrong()]
+            jacobians[self._wrong()] = np.ones((len(residual), 1, 1))
+        return Linearized((residual + np.pi) % (2.0 * np.pi) - np.pi, jacobians, self.sigma[rows])
+
+    @abstractmethod
+    def angle(self, d: Array) -> tuple[Array, Array]:
+        """The angle (n, 1) of directions d (n, 3) in local axes, and its derivative by them (n, 3)."""
+
+
+@dataclass(frozen=True)
+class DualHeading(Baseline):
+    """The second antenna lies in a direction from the first."""
+
+    name: ClassVar[str] = "dual_antenna_heading"
+    axes: ClassVar[tuple[str, ...]] = ("heading",)
+    noise_axes: ClassVar[tuple[str, ...]] = ("heading",)
+    column: ClassVar[str] = "heading"
+
+    def angle(self, d: Array) -> tuple[Array, Array]:
+        e, n = d[:, 0], d[:, 1]
+        level2 = e * e + n * n
+        return np.arctan2(e, n)[:, None], np.stack([n / level2, -e / level2, np.zeros_like(e)], -1)
+
+
+@dataclass(frozen=True)
+class DualPitch(Baseline):
+    """And so much above it."""
+
+    name: ClassVar[str] = "dual_antenna_pitch"
+    axes: ClassVar[tuple[str, ...]] = ("pitch",)
+    noise_axes: ClassVar[tuple[str, ...]] = ("pitch",)
+    column: ClassVar[str] = "pitch"
+
+    def angle(self, d: Array) -> tuple[Array, Array]:
+        e, n, u = d.T
+        level = np.hypot(e, n)
+        whole = level * level + u * u
+        return np.arctan2(u, level)[:, None], np.stack([-e * u / level, -n * u / level, level], -1) / whole[:, None]

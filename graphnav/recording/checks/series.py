@@ -1,0 +1,81 @@
+"""What the declaration of a sensor tells of its rows: which cannot have been measured, and what there is of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from graphnav.core.findings import Finding, period_of
+from graphnav.recording import Recording, rows_of
+from graphnav.sensors import Series
+
+_ISOLATED = 0.01  # of the rows; what more of them have in common is no fault of single rows
+_SAME = 10.0  # s that a sensor which measures all the time is not seen to read the same number while others move
+
+
+def screen_series(recording: Recording) -> tuple[Recording, list[Finding]]:
+    """The recording without values beyond the bounds of their sensors, and what was found."""
+    kept, findings = {}, []
+    for name, series in recording.sensors.items():
+        kept[name], found = _screened(series)
+        findings += found
+    return (replace(recording, sensors=kept) if kept else recording), findings
+
+
+def _screened(series: Series) -> tuple[Series, list[Finding]]:
+    sensor, before = series.sensor, np.isfinite(series.values)
+    values = sensor.within_bounds(series.values)
+    findings = []
+    for column, there, left in zip(sensor.columns, before.T, np.isfinite(values).T, strict=True):
+        lost = int(there.sum() - left.sum())
+        if not lost:
+            continue
+        size, unit = next(iter(column.units.values())), next(iter(column.units))
+        said = (
+            f"[{sensor.name}]: {lost} of {int(there.sum())} values of {column.name} lie outside "
+            f"{column.lowest / size:g} to {column.highest / size:g} {unit}"
+        )
+        needed = any(column.name in some for some in sensor.needs)
+        if needed and lost > max(_ISOLATED * there.sum(), 1):
+            hint = f"say units = {{ {column.name} = ... }}, one of {', '.join(column.units)}"
+            findings.append(Finding("refused", f"{said}: if it is another unit, {hint}", f"{sensor.name}.unit"))
+        else:
+            findings.append(Finding("note", f"{said}: left out", f"{sensor.name}.bounds"))
+    if not findings:
+        return series, []
+    return rows_of(replace(series, values=values), sensor.usable(values)), findings
+
+
+def series_facts(series: Series) -> dict[str, Any]:
+    """Rows, rate, span and the least and largest value of each column, in the units of files."""
+    facts: dict[str, Any] = {"rows": len(series)}
+    if len(series) > 1:
+        facts |= {"rate_hz": round(1.0 / period_of(series.t), 3), "span_s": round(float(np.ptp(series.t)), 3)}
+    for column in series.sensor.columns:
+        unit, size = next(iter(column.units.items()))
+        values = series[column.name] / size
+        if np.isfinite(values).any():
+            facts[f"{column.name}_{unit}"] = [float(f"{x:.6g}") for x in (np.nanmin(values), np.nanmax(values))]
+    return facts
+
+
+def series_findings(recording: Recording) -> Iterator[Finding]:
+    """Sensors that are on another clock, and that stand still while all else goes on."""
+    for name, series in recording.sensors.items():
+        if not len(series):
+            continue
+        if series.t[-1] < recording.start or series.t[0] > recording.end:
+            yield Finding(
+                "warning",
+                f"[{name}] has no row while the IMU runs: are they on one clock? time_offset moves its stamps",
+                f"{name}.apart",
+            )
+        for some in series.sensor.needs:
+            for column in some:
+                values = series[column]
+                known = np.isfinite(values)
+                if known.sum() > 1 and np.ptp(series.t[known]) > _SAME and np.ptp(values[known]) == 0.0:
+                    yield Finding("warning", f"[{name}]: {column} reads the same all the time", f"{name}.stuck")

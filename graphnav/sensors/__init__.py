@@ -1,0 +1,44 @@
+"""Sensors beside IMU, GNSS and odometer; one file each, with a module-level ``SENSOR = Sensor(...)``.
+
+A sensor of a script is made known with `register` before its recording is read.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from functools import cache
+
+from graphnav.core.errors import RecordingError
+from graphnav.sensors.base import Column, Sensor, Series
+
+__all__ = ["Column", "Sensor", "Series", "register", "registered"]
+
+_TAKEN = {"imu", "gnss", "raw_gnss", "odometer", "truth", "name", "platform", "format", "clock"}  # of recording.toml
+_own: dict[str, Sensor] = {}
+
+
+@cache
+def _found() -> dict[str, Sensor]:
+    modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
+    sensors = [m.SENSOR for m in modules if isinstance(getattr(m, "SENSOR", None), Sensor)]
+    return {s.name: s for s in sorted(sensors, key=lambda s: s.name)}
+
+
+def registered() -> dict[str, Sensor]:
+    """All sensors that are known, by their names."""
+    return _found() | _own
+
+
+def register(sensor: Sensor) -> Sensor:
+    """Make a sensor known, so that recordings, settings and the line protocol may name it; returns it.
+
+    Raises
+    ------
+    RecordingError
+        If something else has that name.
+    """
+    if sensor.name in _TAKEN or sensor.name in _found():
+        raise RecordingError(f"sensor '{sensor.name}': graphnav has one of that name; choose another")
+    _own[sensor.name] = sensor
+    return sensor

@@ -1,0 +1,130 @@
+"""How a sensor is declared, once for everything that reads, cuts, checks, sends and writes its rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import create_model
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.sensors.tables import SensorTable, TimeUnit, TomlTable
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a sensor's file.
+
+    `units` are those of files, each with its size in SI; the first is usual, and is what recordings are written in.
+    A value outside `lowest` to `highest` (SI) cannot have been measured, and counts as absent.
+    """
+
+    name: str
+    units: Mapping[str, float]
+    lowest: float
+    highest: float
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor beside IMU, GNSS and odometer, whose rows are a time and some numbers.
+
+    `needs` are sets of columns one of which a row must have whole; the others are optional. `figures` are the keys of
+    its table in recording.toml beside those that all sensors have. With `keyframes` a state is wanted at each row.
+    """
+
+    name: str
+    about: str  # one sentence
+    columns: tuple[Column, ...]
+    needs: tuple[tuple[str, ...], ...]
+    figures: type[TomlTable] = TomlTable
+    keyframes: bool = False
+
+    def __post_init__(self) -> None:
+        names = {c.name for c in self.columns}
+        if not self.name.isidentifier():
+            raise RecordingError(f"sensor '{self.name}': its name is to be one word of letters, digits and _")
+        if not self.needs or not all(set(some) <= names for some in self.needs):
+            raise RecordingError(f"sensor '{self.name}': needs names columns that it does not have")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the columns, without t."""
+        return tuple(c.name for c in self.columns)
+
+    @cached_property
+    def table(self) -> type[SensorTable]:
+        """The table of recording.toml."""
+        make: Any = create_model  # whose fields are not known before
+        kinds: dict[str, Any] = {c.name: (Literal[tuple(c.units)], next(iter(c.units))) for c in self.columns}
+        units = make(f"{self.name}_units", __base__=TomlTable, t=(TimeUnit, "s"), **kinds)
+        bases = (SensorTable,) if self.figures is TomlTable else (self.figures, SensorTable)
+        made = make(f"{self.name}_table", __base__=bases, units=(units, units()))
+        made.required, made.optional = ("t",), self.names
+        return made  # type: ignore[no-any-return]
+
+    def usable(self, values: Array) -> NDArray[np.bool_]:
+        """(N,) which rows (N, k) have all columns of one of the sets that are needed."""
+        there, out = np.isfinite(values), np.zeros(len(values), dtype=bool)
+        for some in self.needs:
+            out |= there[:, [self.names.index(name) for name in some]].all(axis=1)
+        return out
+
+    def within_bounds(self, values: Array) -> Array:
+        """Rows (N, k) with NaN in place of what cannot have been measured."""
+        lowest, highest = np.array([(c.lowest, c.highest) for c in self.columns]).T
+        with np.errstate(invalid="ignore"):
+            return np.where((values >= lowest) & (values <= highest), values, np.nan)
+
+    def series(self, t: Array, columns: Mapping[str, Array], **figures: Any) -> Series:
+        """Rows made in a script.
+
+        Parameters
+        ----------
+        t : (N,) s, ascending.
+        columns : (N,) each, in SI; NaN where a row has none.
+        figures : keys of its table in recording.toml, such as ``sigma=0.3``.
+
+        Raises
+        ------
+        RecordingError
+            For columns it does not have, of another length, or times that do not ascend.
+        """
+        t = np.asarray(t, dtype=float)
+        for name, values in columns.items():
+            if name not in self.names:
+                raise RecordingError(f"{self.name}: no column '{name}'; known: {', '.join(self.names)}")
+            if np.shape(values) != t.shape:
+                raise RecordingError(f"{self.name}: column '{name}' has not the length of t")
+        if np.any(np.diff(t) <= 0.0):
+            raise RecordingError(f"{self.name}: t does not ascend")
+        absent = np.full(len(t), np.nan)
+        values = np.stack([np.asarray(columns.get(name, absent), dtype=float) for name in self.names], -1)
+        return Series(self, t, values, self.figures(**figures))
+
+
+@dataclass(frozen=True)
+class Series:
+    """What a sensor said: rows of numbers in SI, NaN where a row has none."""
+
+    sensor: Sensor
+    t: Array  # (N,) s, strictly increasing
+    values: Array  # (N, k), in the order of the sensor's columns
+    figures: Any = field(default_factory=TomlTable)  # a `Sensor.figures`
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, column: str) -> Array:
+        """(N,) of one column."""
+        return np.asarray(self.values[:, self.sensor.names.index(column)])
+
+    def sigma(self, column: str, otherwise: float) -> Array:
+        """(N,) 1-sigma that the rows state in the column ``sd_...``, and what stands for it where they state none."""
+        stated = self[f"sd_{column}"]
+        return np.where(np.isfinite(stated), stated, otherwise)

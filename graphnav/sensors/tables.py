@@ -1,0 +1,88 @@
+"""What tables of a recording.toml are made of: numbers that can be used, units, and what every sensor's table holds."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator
+from pydantic.types import Strict
+
+from graphnav.core.complaints import nearest
+
+_SMALLEST, _LARGEST = 1e-15, 1e9  # of a figure: squares of it are numbers
+_LONGEST = 1e7  # of the components of a vector: m, from the Earth's centre at most, or of a direction
+
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+
+
+def _usable(value: float) -> float:
+    if value and not _SMALLEST <= abs(value) <= _LARGEST:
+        raise ValueError(f"{value:g} must lie between {_SMALLEST:g} and {_LARGEST:g}")
+    return value
+
+
+Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0), AfterValidator(_usable)]
+
+NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0), AfterValidator(_usable)]
+
+
+def three_numbers(value: Any) -> Any:
+    """A vector; ValueError if the value is none."""
+    if not isinstance(value, list | tuple) or len(value) != 3:
+        raise ValueError("must be three numbers in brackets")
+    if any(isinstance(x, bool) or not isinstance(x, int | float) or not np.isfinite(x) for x in value):
+        raise ValueError("must be three numbers in brackets")
+    if any(abs(x) > _LONGEST for x in value):
+        raise ValueError(f"must be three numbers in brackets, none beyond {_LONGEST:g}")
+    return tuple(float(x) for x in value)
+
+
+Vector = Annotated[tuple[float, float, float], BeforeValidator(three_numbers)]
+
+TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+ANGLE = {"deg": np.pi / 180.0, "rad": 1.0}
+
+TimeUnit = Literal["s", "ms", "us", "ns"]
+
+
+class TomlTable(BaseModel):
+    """A table: unknown keys and changes are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def _one_or_more(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+Topics = Annotated[tuple[str, ...], BeforeValidator(_one_or_more)]
+
+
+class Keep(TomlTable):
+    """Rows to use: those whose column holds at least this."""
+
+    column: str
+    at_least: Number
+
+
+class SensorTable(TomlTable):
+    """What every sensor's table may hold."""
+
+    required: ClassVar[tuple[str, ...]] = ()
+    optional: ClassVar[tuple[str, ...]] = ()
+
+    file: str = Field(min_length=1)
+    columns: dict[str, str] = Field({}, description="our name = the file's")
+    time_offset: Number = Field(0.0, description="s, added to the file's stamps")
+    keep: Keep | None = None
+    topic: Topics = Field((), description="of a ROS bag, or several: a fix's and a velocity's")
+
+    @field_validator("columns")
+    @classmethod
+    def _known_columns(cls, columns: dict[str, str]) -> dict[str, str]:
+        known = (*cls.required, *cls.optional)
+        for name in columns:
+            if name not in known:
+                raise ValueError(f"'{name}' is not one of graphnav's columns; {nearest(name, known)}")
+        return columns

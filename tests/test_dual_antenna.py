@@ -1,0 +1,57 @@
+"""A second antenna, simulated on the truth of a drive, through every solver and as the drive happens."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from series_drive import SETTINGS, along_truth, errors, rms, shared_drive, smoothed_online, with_series
+
+from graphnav.core import rotation
+from graphnav.core.errors import RecordingError
+from graphnav.estimation.pipeline import run
+from graphnav.recording import Recording
+from graphnav.sensors.dual_antenna import SENSOR, Figures
+
+SIGMA, TURNED = np.radians(0.2), np.radians(0.6)
+BASELINE = (1.0, 0.0, 0.05)  # across the roof
+
+
+@pytest.fixture(scope="module")
+def drive(shared_data) -> Recording:
+    recording = shared_drive(shared_data)
+    t, truth = along_truth(recording, 1.0)
+    d = rotation.from_rph(truth.rph) @ np.array(BASELINE)
+    white = np.random.default_rng(3).standard_normal((2, len(t)))
+    heading = np.arctan2(d[:, 0], d[:, 1]) + TURNED + SIGMA * white[0]
+    pitch = np.arctan2(d[:, 2], np.hypot(d[:, 0], d[:, 1])) + SIGMA * white[1]
+    pitch[::3] = np.nan  # as of a receiver that does not always tell it
+    columns = {"heading": heading % (2.0 * np.pi), "pitch": pitch, "sd_heading": np.full(len(t), SIGMA)}
+    return with_series(recording, SENSOR.series(t, columns, baseline=BASELINE, sigma=0.2))
+
+
+def test_heading_holds_without_fixes(drive):
+    solvers = ("ekf", "rts", "batch", "isam2")
+    found = run(drive, SETTINGS, solvers)
+    without = run(drive.without(SENSOR.name), SETTINGS, ("ekf", "rts"))
+    rows = len(drive.sensors[SENSOR.name])
+    for name in solvers:
+        solution, other = found[name], without["ekf" if name == "ekf" else "rts"]
+        assert solution.counts["dual_antenna_heading"] == rows, name
+        assert solution.counts["dual_antenna_pitch"] == rows - len(range(0, rows, 3)), name
+        heading, loose = (errors(one.trajectory(), drive)[1] for one in (solution, other))
+        assert rms(heading) < 0.5 * rms(loose), name
+        offset = solution.parameters["dual_antenna_heading_offset"]
+        assert abs(offset.value[-1, 0] - TURNED) < 4.0 * offset.sigma[-1, 0], name
+        assert offset.sigma[-1, 0] < offset.prior_sigma[0], name
+
+
+def test_heading_holds_as_the_drive_happens(drive):
+    # what is not known of the mounting comes on top of the receiver's noise
+    assert rms(np.concatenate([errors(track, drive)[1] for track in smoothed_online(drive)])) < np.radians(1.0)
+
+
+def test_a_baseline_that_stands_upright_is_refused():
+    with pytest.raises(ValueError, match="upright"):
+        Figures(baseline=(0.0, 0.0, 1.0))
+    with pytest.raises(RecordingError, match="roll"):
+        SENSOR.series(np.arange(2.0), {"roll": np.zeros(2)})
