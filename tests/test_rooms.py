@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "graphnav"
 
 # Modules and packages of graphnav, left to right. A new one needs a place here, as far left as it can stand.
 ROOMS = [
-    "errors", "files", "complaints", "plain", "progress", "rotation", "timescales", "earth", "raw", "state", "config",
+    "errors", "notes", "files", "complaints", "plain", "progress", "rotation", "timescales", "earth", "raw", "state", "config",
     "recording", "trajectory", "findings", "sample_size", "formats", "allan", "lags", "crosschecks", "clock", "draft",
     "simulation", "wheels", "checks_imu", "checks_stated", "checks_aiding", "checks_raw", "plausibility_gnss",
     "plausibility_odometer", "plausibility", "checks", "detectors", "samples", "noise_model",

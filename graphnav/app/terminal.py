@@ -13,6 +13,7 @@ import numpy as np
 from graphnav.app.outputs import median_sigmas
 from graphnav.app.workflow import Outcome
 from graphnav.constraints.gnss import TIMES
+from graphnav.core.notes import key_of
 from graphnav.core.progress import Progress
 from graphnav.core.staging import defer_interrupts
 from graphnav.estimation.solution import Solution
@@ -39,8 +40,8 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     lines += [f"  {said}" for said in _noise(outcome)]
     severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
-        if note.startswith("noise model, "):
-            continue  # of one sensor: the report has the table
+        if key_of(note) in ("noise.imu", "noise.rows"):
+            continue  # the report has the table
         lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
     lines += _whole(outcome)

@@ -15,6 +15,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.config.detectors import FUSED
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, subtract_spans
 from graphnav.detectors.fusion import Decision, decide, decide_fused, merge_decisions
@@ -48,12 +49,22 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
         fire = [name for name in (("glrt",) if d.fire == (FUSED,) else d.fire) if name in STATISTICS]
         idle = [name for name in d.fire if name not in fire and name != FUSED]
         stances = detect_stances(recording.imu, scene.period, d.stance, fire)
-        more = (f"{', '.join(idle)}: of vehicles only, finds no stance",) if idle else ()
+        more = (
+            (Note("detectors.vehicles_only", f"{', '.join(idle)}: of vehicles only, finds no stance"),) if idle else ()
+        )
         return Detections(stances.stationary, stances.all, (*d.notes, *more, *stances.notes))
     if not recording.duration >= _SHORTEST or not scene.period > 0.0:
-        return Detections(NONE, (), (*d.notes, f"no detection: the recording is shorter than {_SHORTEST:g} s"))
+        return Detections(
+            NONE,
+            (),
+            (*d.notes, Note("detectors.too_short", f"no detection: the recording is shorter than {_SHORTEST:g} s")),
+        )
     if not len(scene.low.t):
-        return Detections(NONE, (), (*d.notes, f"no detection: an IMU at {1.0 / scene.period:.3g} Hz is too slow"))
+        return Detections(
+            NONE,
+            (),
+            (*d.notes, Note("detectors.too_slow", f"no detection: an IMU at {1.0 / scene.period:.3g} Hz is too slow")),
+        )
     found = _decide(scene)
     reference = found.found[0]
     mask = inside(reference.t, found.spans)

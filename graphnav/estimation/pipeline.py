@@ -14,6 +14,7 @@ from graphnav.config import Settings
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError, EstimationError
+from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, listening, tell
 from graphnav.detectors import detect
 from graphnav.estimation import faults
@@ -100,7 +101,7 @@ def _run(
         except EstimationError as error:
             if len(pieces) == 1:
                 raise
-            notes.append(f"{_span(recording, piece)} left out: {error}")
+            notes.append(Note("pieces.left_out", f"{_span(recording, piece)} left out: {error}"))
     if not found:
         raise EstimationError(f"'{recording.name}': no piece between its IMU gaps can be solved")
     return {name: join_solutions([one[name] for one in found], tuple(notes)) for name in solvers}
@@ -122,7 +123,7 @@ def _solve_with_retry(
             raise
         still = settings.standstill.model_copy(update={"held_position": False})
         again = _solve(recording, settings.model_copy(update={"standstill": still}), frame, solvers, progress, noise)
-        note = f"places of stops are not held: with them, {error}"
+        note = Note("standstill.not_held", f"places of stops are not held: with them, {error}")
         return {name: replace(one, notes=(note, *one.notes)) for name, one in again.items()}
 
 
@@ -183,8 +184,12 @@ def _solve(
         out["isam2"] = one = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin).settled
         best = cost_at(problem, smoothed)
         if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY:
-            note = "isam2 ended in an optimum that explains the data worse than rts does: do not trust it"
-            out["isam2"] = replace(one, notes=(f"{note} (half chi-square {one.cost:.0f}, not {best:.0f})", *one.notes))
+            note = Note(
+                "solver.worse_optimum",
+                "isam2 ended in an optimum that explains the data worse than rts does: do not trust it "
+                f"(half chi-square {one.cost:.0f}, not {best:.0f})",
+            )
+            out["isam2"] = replace(one, notes=(note, *one.notes))
     timings = {"detection": detection, **found.timings}
     return {
         name: replace(
@@ -216,7 +221,12 @@ def fitting(recording: Recording, settings: Settings) -> list[str]:
             f"profile '{profile}': but '{recording.name}' says platform = \"{recording.platform}\"; change one of them"
         )
     if profile == "car+odometer" and recording.odometer is None:
-        return [f"profile '{profile}': there is no odometer in '{recording.name}', so it is solved without"]
+        return [
+            Note(
+                "settings.no_odometer",
+                f"profile '{profile}': there is no odometer in '{recording.name}', so it is solved without",
+            )
+        ]
     return []
 
 
@@ -235,8 +245,12 @@ def _pieces(recording: Recording, settings: Settings) -> tuple[list[Recording], 
     cuts = np.flatnonzero(np.diff(t) > settings.keyframes.bridge)
     if not len(cuts):
         return [recording], []
-    notes = [
-        f"IMU gap of {t[i + 1] - t[i]:.1f} s at {t[i] - recording.start:.1f} s: cut there, the parts are solved apart"
+    notes: list[str] = [
+        Note(
+            "pieces.cut",
+            f"IMU gap of {t[i + 1] - t[i]:.1f} s at {t[i] - recording.start:.1f} s: cut there, the parts are solved "
+            "apart",
+        )
         for i in cuts
     ]
     edges = np.concatenate([[-1], cuts, [len(t) - 1]])
@@ -244,7 +258,11 @@ def _pieces(recording: Recording, settings: Settings) -> tuple[list[Recording], 
     for lo, hi in itertools.pairwise(edges):
         begin, end = t[lo + 1] - recording.start, t[hi] - recording.start
         if end - begin < _SHORTEST:
-            notes.append(f"{begin:.1f} to {end:.1f} s left out: too short between two gaps to be aligned")
+            notes.append(
+                Note(
+                    "pieces.too_short", f"{begin:.1f} to {end:.1f} s left out: too short between two gaps to be aligned"
+                )
+            )
         else:
             pieces.append(recording.crop(begin - 1e-9, end + 1e-9))
     return pieces, notes

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import GPS_TO_UNIX, LEAP
 from graphnav.core.trajectory import Trajectory
@@ -97,7 +98,7 @@ def withheld_truth(
     truth = Trajectory(
         gnss.t[mask], gnss.llh[mask], v=None if gnss.v is None else gnss.v[mask], sd_p=gnss.sd[mask],
         sd_v=None if gnss.sd_v is None else gnss.sd_v[mask], name="withheld GNSS",
-        notes=("the truth is the withheld GNSS itself",),
+        notes=(Note("truth.withheld_gnss", "the truth is the withheld GNSS itself"),),
     )  # fmt: skip
     return truth, gnss.lever_arm
 
@@ -121,7 +122,7 @@ def evaluate_recording(
     found = truth_of(recording)
     if found is None and recording.truth is not None and recording.truth.closed_loop_sigma is not None:
         sigma = recording.truth.closed_loop_sigma
-        note = f"the only truth is that the end is the start, to {sigma:g} m"
+        note = Note("truth.closed_loop", f"the only truth is that the end is the start, to {sigma:g} m")
         return Metrics(trajectory.name, closure=closure(trajectory), notes=(*trajectory.notes, note))
     if found is None and gnss_spans and recording.gnss is not None:
         found = withheld_truth(recording, "gnss", gnss_spans)
@@ -213,7 +214,11 @@ def _leap_hint(
         after = float(np.sqrt(np.nanmean(moved.horizontal**2)))
         if len(moved) > 0.5 * len(found) and after < 0.2 * before:
             return (
-                f"shifted by {shift:+.0f} s the horizontal error would fall from {before:.2f} to {after:.2f} m rms: "
-                "one file may be in UTC and the other in GPS time",
+                Note(
+                    "truth.leap_seconds",
+                    f"shifted by {shift:+.0f} s the horizontal error would fall from {before:.2f} to {after:.2f} m "
+                    "rms: "
+                    "one file may be in UTC and the other in GPS time",
+                ),
             )
     return ()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from graphnav.core.notes import Note
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import own_solutions
@@ -37,10 +38,8 @@ def doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> t
         fixes = solution.records.get("gnss_position")
         left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
         if left_out > _MOST:
-            out.append(
-                f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest and "
-                "is left out"
-            )
+            said = f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest "
+            out.append(Note("doubt.left_out", said + "and is left out"))
             break  # all solvers use the same noise model
     wrong = []
     for name, e in errors.items():
@@ -55,7 +54,7 @@ def doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> t
             if used >= _FEWEST and size > _TOO_LARGE[kind]:
                 wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")
     if wrong:
-        out.append(f"The stated sigma cannot be trusted: {'; '.join(wrong)}")
+        out.append(Note("doubt.sigma", f"The stated sigma cannot be trusted: {'; '.join(wrong)}"))
     return tuple(out)
 
 

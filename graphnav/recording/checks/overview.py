@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.findings import SEVERITIES, Finding, period_of, runs_of
+from graphnav.core.notes import key_of
 from graphnav.core.rotation import Array
 from graphnav.recording import Recording
 from graphnav.recording.checks import crosschecks
@@ -116,11 +117,13 @@ def inspect(recording: Recording) -> Inspection:
     """
     whole = screen(recording)
     recording = whole.recording
-    findings = [Finding("note", remark) for remark in recording.remarks]
+    findings = [Finding("note", remark, key_of(remark) or "recording.remark") for remark in recording.remarks]
     findings += whole.findings
     for name in ("gnss", "odometer"):
         if (sensor := getattr(recording, name)) is not None and not len(sensor.t):
-            findings.append(Finding("warning", f"[{name}] holds no rows in this part of the recording"))
+            findings.append(
+                Finding("warning", f"[{name}] holds no rows in this part of the recording", f"{name}.empty")
+            )
             recording = recording.without(name)
     known = {f.key for f in whole.findings}
     facts: dict[str, dict[str, Any]] = {"imu": _imu_facts(recording)}

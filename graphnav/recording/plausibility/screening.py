@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from graphnav.core.earth import gravity
 from graphnav.core.errors import RecordingError
 from graphnav.core.findings import Finding, period_of, runs_of
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, rows_of
 from graphnav.recording.checks import crosschecks
@@ -75,7 +76,7 @@ def screened(recording: Recording) -> tuple[Recording, list[str]]:
     """
     found = screen(recording)
     refuse(recording, found.findings)
-    return found.recording, [f.sentence for f in found.findings]
+    return found.recording, [Note(f.key, f.sentence) for f in found.findings]
 
 
 def screen(recording: Recording) -> Screened:
