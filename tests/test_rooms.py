@@ -13,14 +13,14 @@ PACKAGE = Path(__file__).resolve().parents[1] / "graphnav"
 
 # Modules and packages of graphnav, left to right. A new one needs a place here, as far left as it can stand.
 ROOMS = [
-    "errors", "notes", "files", "complaints", "plain", "progress", "rotation", "timescales", "earth", "raw", "state", "config",
-    "recording", "trajectory", "findings", "sample_size", "formats", "allan", "lags", "crosschecks", "clock", "draft",
-    "simulation", "wheels", "checks_imu", "checks_stated", "checks_aiding", "checks_raw", "plausibility_gnss",
+    "errors", "notes", "files", "complaints", "plain", "progress", "rotation", "timescales", "earth", "raw", "state",
+    "config", "recording", "trajectory", "findings", "sample_size", "formats", "allan", "lags", "crosschecks", "clock",
+    "draft", "simulation", "wheels", "checks_imu", "checks_stated", "checks_aiding", "checks_raw", "plausibility_gnss",
     "plausibility_odometer", "plausibility", "checks", "detectors", "samples", "noise_model",
     "preintegration", "own_noise", "unresolved", "clipping", "dynamics", "constraints", "problem", "solution", "stops",
-    "alignment", "dense", "solvers", "faults", "noise", "onboard_offset", "preparation", "pipeline", "lever_arm",
-    "interpolation", "metrics", "sigmas", "gates", "fitted", "scoring", "strides", "evaluation", "against", "exporters",
-    "online",
+    "separation", "alignment", "dense", "solvers", "faults", "noise", "onboard_offset", "preparation", "pipeline",
+    "lever_arm", "interpolation", "metrics", "sigmas", "gates", "fitted", "scoring", "strides", "evaluation", "against",
+    "exporters", "online",
     "plots", "page", "report_names", "segments", "report_tables", "report_words", "report_pictures", "report_summary",
     "report_provenance", "report",
     "workflow", "stored", "staging", "outputs", "convert", "fleet", "terminal", "detection_report",

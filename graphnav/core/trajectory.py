@@ -31,6 +31,7 @@ class Trajectory:
     accel_bias: Array | None = None  # (K, 3) m/s^2, RFU
     covariance: Array | None = None  # (K, 9, 9)
     fix_type: Array | None = None  # (K,) where it is of a receiver: its numbers, NaN where unknown
+    satellites: Array | None = None  # (K,) the same: how many it used
     frame: str = "geodetic"  # "local": llh then holds metres x, y, z of unknown origin and yaw
     name: str = ""
     notes: tuple[str, ...] = field(default=())

@@ -16,12 +16,14 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError, EstimationError
 from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, listening, tell
+from graphnav.core.state import BLOCKS
 from graphnav.detectors import detect
 from graphnav.estimation import faults
 from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.preparation import prepare, start_sigma
+from graphnav.estimation.separation import separation
 from graphnav.estimation.solution import Solution, join_solutions
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import backward, rts
@@ -191,6 +193,11 @@ def _solve(
             )
             out["isam2"] = replace(one, notes=(note, *one.notes))
     timings = {"detection": detection, **found.timings}
+    place = BLOCKS["p"]
+    apart = separation(
+        frame, problem.t, forward.solution.states.p, forward.solution.covariance[:, place, place],
+        smoothed.states.p, smoothed.P[:, place, place],
+    )  # fmt: skip
     return {
         name: replace(
             out[name],
@@ -199,6 +206,7 @@ def _solve(
             excluded=wrong,
             noise=found.noise,
             passes=dict(passes),
+            separation=apart,
             timings={k: timings.get(k, 0.0) + out[name].timings.get(k, 0.0) for k in (*timings, *out[name].timings)},
         )
         for name in solvers

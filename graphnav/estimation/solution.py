@@ -84,6 +84,15 @@ class ExcludedSpan:
 
 
 @dataclass(frozen=True)
+class Separation:
+    """Position of the forward filter less that of what comes after each keyframe (`graphnav.estimation.separation`)."""
+
+    t: Array  # (K,) s
+    value: Array  # (K, 3) m, east, north, up; NaN where what comes after tells nothing
+    sigma: Array  # (K, 3) m, 1-sigma of `value`
+
+
+@dataclass(frozen=True)
 class Solution:
     """One solver's answer. Covariance blocks are of the error state of `graphnav.core.state`, (K, 15, 15)."""
 
@@ -104,6 +113,7 @@ class Solution:
     excluded: tuple[ExcludedSpan, ...] = ()  # spans of measurements found to be wrong, which no solver used
     noise: NoiseModel = STATED  # that all solvers used
     passes: Mapping[str, int] = field(default_factory=dict)  # over all keyframes, before the solver's own
+    separation: Separation | None = None  # of the filter and its smoother, the same for all solvers
     between: tuple[Between, ...] = ()  # gives states between keyframes, one for each piece of the recording
 
     @property
@@ -202,6 +212,7 @@ def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Soluti
         excluded=tuple(f for p in parts for f in p.excluded),
         noise=_noise_of_all([p.noise for p in parts]),
         passes=_add_counts([dict(p.passes) for p in parts]),
+        separation=_separation_of_all([p.separation for p in parts]),
         between=tuple(b for p in parts for b in p.between),
     )
 
@@ -215,6 +226,13 @@ def _noise_of_all(parts: list[NoiseModel]) -> NoiseModel:
     names = dict.fromkeys(key for part in parts for key in part.excluded)
     excluded = {name: tuple(span for part in parts for span in part.excluded.get(name, ())) for name in names}
     return replace(parts[0], weights=weights, excluded=excluded)
+
+
+def _separation_of_all(parts: list[Separation | None]) -> Separation | None:
+    known = [part for part in parts if part is not None]
+    if not known:
+        return None
+    return Separation(*(np.concatenate([getattr(part, name) for part in known]) for name in ("t", "value", "sigma")))
 
 
 def _add_counts(tables: list[dict[str, Any]]) -> dict[str, Any]:

@@ -61,6 +61,7 @@ class Gnss:
     type: NDArray[np.intp] | None = None  # (M,) of FIX_TYPES; None: no fix says of what type it is
     type_assumed: bool = False  # True when they are a CSV file's numbers, which were taken for RTKLIB's
     derived: bool = False  # single-point positions computed from the recording's own raw observations
+    satellites: Array | None = None  # (M,) used in each fix, NaN where unknown; only shown
 
     @property
     def types(self) -> dict[str, int]:

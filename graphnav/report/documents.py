@@ -71,6 +71,7 @@ def write_report(
                 page.gallery([pictures.trajectory_picture(recording, only, spans)]),
                 page.gallery([pictures.profile_picture(recording, only)]),
                 *_gallery(pictures.motion_pictures(recording, only, spans)),
+                *_gallery(pictures.quality_pictures(recording, solution, spans)),
             ],
         ),
         (
@@ -79,6 +80,7 @@ def write_report(
                 *tables.accuracy_tables(every, withheld, start, outages),
                 *summary.relative_tables(every),
                 *tables.metric_tables(metrics),
+                *_gallery(pictures.separation_pictures(solution, start, end, spans)),
                 *_gallery(pictures.error_pictures(every, start, end, spans)),
             ],
         ),
@@ -132,7 +134,8 @@ def write_report(
         words.tiles(recording, only, every),
         *summary.links(beside),
         *summary.fix_table(recording, solution, withheld),
-        page.columns(["".join(summary.sigma_table(solution)), "".join(summary.left_out(solution, start))]),
+        page.columns(["".join(summary.sigma_table(solution)), "".join(summary.separation_table(solution))]),
+        *summary.left_out(solution, start),
     ]
     return _write(path, page.page(f"{recording.name}: {name}", lead, sections, _clocks(recording)))
 

@@ -238,6 +238,7 @@ def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Traject
         path, rows, t, position, notes,
         sd_p=take("sde", "sdn", "sdu"), v=take("ve", "vn", "vu"), sd_v=take("sdve", "sdvn", "sdvu"),
         fix_type=None if "Q" not in at else table[:, at["Q"]],
+        satellites=None if "ns" not in at else table[:, at["ns"]],
     )  # fmt: skip
 
 
