@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,9 @@ _ERRORS = (
     ("hor. rms", "h", "rms", "m"), ("hor. max", "h", "max", "m"), ("up rms", "up", "rms", "m"),
     ("roll rms", "roll", "rms", "deg"), ("pitch rms", "pitch", "rms", "deg"), ("head. rms", "heading", "rms", "deg"),
 )  # fmt: skip
+
+
+_WIDEST = 1000  # characters of a table
 
 
 def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
@@ -160,15 +164,19 @@ def _share(span: Span) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Columns aligned, the first to the left and numbers to the right."""
-    widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
-    return [
-        "  "
-        + "  ".join(
-            cell.ljust(w) if k == 0 else cell.rjust(w) for k, (cell, w) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in [head, *rows]
-    ]
+    """Lines of a table, the first column to the left and numbers to the right; as wide as it is."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="")
+    for k, title in enumerate(head):
+        grid.add_column(Text(title), justify="left" if k == 0 else "right", no_wrap=True)
+    for row in rows:
+        grid.add_row(*map(Text, row))
+    console = Console(file=StringIO(), color_system=None, width=_WIDEST)
+    console.print(grid)
+    return [f"  {line.rstrip()}" for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
 
 
 def short(x: float) -> str:

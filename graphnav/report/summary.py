@@ -135,7 +135,7 @@ def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> l
             gap = float(np.max(np.diff(fixes.t[used]), initial=0.0))
         rows.append([*cells, len(used), gap, largest, over, *_stated_of(recording, np.flatnonzero(of_it))])
     head = ["fixes", "count", "withheld", "left out", "used", "longest gap [s]", "largest residual [m]", "over sigma"]
-    head.append("stated 1-sigma hor. [m]")
+    head.append("stated [m]")
     if recording.gnss is not None and recording.gnss.satellites is not None:
         head += ["satellites", "fewest"]
     out = [page.heading("Fixes"), page.table(head, rows)]
