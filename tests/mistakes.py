@@ -26,13 +26,13 @@ Table = dict[str, Array]  # the columns of a CSV file by name
 HEAD = """\
 # What can go wrong
 
-Common mistakes and what graphnav prints for each, long lines shortened (...). The tests make each of them on `data/tokyo`.
+Common mistakes and what graphnav prints for each, long lines shortened (...). The tests make them on `data/tokyo`.
 
-A line that begins with *note*, *warning*, *untrusted* or *refused* is a finding of `graphnav info`, the gravest first; `smooth`,
-`compare` and the reports list them too. Results suffer from a *warning*; with an *untrusted* one they may be wrong whatever
-their sigmas say; with a *refused* one nothing is solved. All other lines are errors, exit code 2. Run `graphnav info` first and
-read from the top: the first finding may be the cause of the others. Scripts read the `key` of a finding (`--json`,
-`messages` in summary.json), which stays the same whatever its words.
+A line that begins with *note*, *warning*, *untrusted* or *refused* is a finding of `graphnav info`, the gravest first;
+`smooth`, `compare` and the reports list them too. Results suffer from a *warning*; with an *untrusted* one they may be
+wrong whatever their sigmas say; with a *refused* one nothing is solved. All other lines are errors, exit code 2. Run
+`graphnav info` first and read from the top: the first finding may be the cause of the others. Scripts read the `key` of
+a finding (`--json`, `messages` in summary.json), which stays the same whatever its words.
 """
 _SHOWN = 9  # words at either end of a line that is shortened
 

@@ -45,7 +45,18 @@ class Trajectory:
         return None if self.rph is None else rotation.from_rph(self.rph)
 
     def take(self, index: Array | slice) -> Trajectory:
-        """The rows of `index` (a mask, an index array or a slice)."""
+        """Some rows.
+
+        Parameters
+        ----------
+        index
+            A mask (K,), an index array or a slice.
+
+        Returns
+        -------
+        Trajectory
+            With the same parts.
+        """
         values: dict[str, Any] = {
             key: (value[index] if isinstance(value, np.ndarray) else value) for key, value in self.__dict__.items()
         }

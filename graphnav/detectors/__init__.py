@@ -42,7 +42,20 @@ def list_detectors() -> dict[str, type[Detector]]:
 
 
 def detect(recording: Recording, settings: Settings | None = None) -> Detections:
-    """Stationary intervals and the statistics they come from; never fails, and says what could not be done."""
+    """Stationary intervals and the statistics they come from. Never fails: a note says what could not be done.
+
+    Parameters
+    ----------
+    recording
+        As read.
+    settings
+        The defaults when None.
+
+    Returns
+    -------
+    Detections
+        The answer, (M, 2) s on the recording's clock, and that of each detector.
+    """
     d = (settings or Settings()).detectors
     scene = Scene(recording, d)
     if recording.platform == "foot" and scene.period > 0.0:

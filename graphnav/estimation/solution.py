@@ -123,14 +123,36 @@ class Solution:
         return np.concatenate([np.empty((0, 2)), *spans])
 
     def trajectory(self, rate: float | None = None) -> Trajectory:
-        """In geodetic coordinates and local axes, with 9 x 9 covariances: at the keyframes, or at `rate` (Hz)."""
+        """The solution in geodetic coordinates and local axes.
+
+        Parameters
+        ----------
+        rate
+            Hz, from the IMU's samples between the keyframes; at the keyframes when None.
+
+        Returns
+        -------
+        Trajectory
+            Of the IMU, with (K, 9, 9) covariances of position (m), velocity (m/s) and roll, pitch, heading (rad).
+        """
         t, states, covariance = self.t, self.states, self.covariance
         if rate is not None:
             t, states, covariance = self.at(np.concatenate([b.times(rate) for b in self.between]))
         return to_trajectory(self.solver, self.frame, t, states, covariance)
 
     def blocks(self, rate: float | None = None) -> Iterator[Trajectory]:
-        """`trajectory` in parts, one behind the other, so that only one of them need be in memory."""
+        """`trajectory` in parts, one behind the other, so that only one of them need be in memory.
+
+        Parameters
+        ----------
+        rate
+            As for `trajectory`.
+
+        Returns
+        -------
+        iterator of Trajectory
+            Of 4096 rows at most each; a single part at the keyframes.
+        """
         if rate is None:
             yield self.trajectory()
             return
@@ -141,7 +163,22 @@ class Solution:
                 yield to_trajectory(self.solver, self.frame, t, *piece(t, _OUT))
 
     def at(self, t: Array) -> tuple[Array, States, Array]:
-        """Times (M,), states and covariances (M, 15, 15) at ascending times; those in no piece are left out."""
+        """States between the keyframes.
+
+        Parameters
+        ----------
+        t
+            (N,) s, ascending.
+
+        Returns
+        -------
+        times : array
+            (M,) s, those of `t` that lie in a piece of the recording.
+        states : States
+            M states in the navigation frame.
+        covariance : array
+            (M, 15, 15) of the error state of `graphnav.core.state`.
+        """
         parts = []
         for piece in self.between:
             inside = t[(t >= piece.start) & (t <= piece.end)]

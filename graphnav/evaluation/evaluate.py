@@ -111,11 +111,31 @@ def evaluate_recording(
     max_gap: float = MAX_GAP,
     at: Array | None = None,
 ) -> Metrics | None:
-    """Metrics of a solution of `recording` (the full one, nothing withheld) against the best truth there is.
+    """Metrics of a solution against the best truth there is: the recording's own, a closed loop, or the withheld GNSS.
 
-    That is the recording's own truth, or the end being the start, or the GNSS that was withheld; None if
-    there is none of these. `withheld` holds (source, span in s from the start or None) as given to
-    `Recording.without`; each span of GNSS is reported by itself. `at` is that of `errors`.
+    Parameters
+    ----------
+    trajectory
+        Of the IMU.
+    recording
+        The full one, nothing withheld.
+    withheld
+        (source, span in s from the start or None) as given to `Recording.without`; each span of GNSS is scored by
+        itself.
+    max_gap
+        s, between neighbouring rows that are interpolated.
+    at
+        (N,) s, epochs to compare at; those of the sparser of both when None.
+
+    Returns
+    -------
+    Metrics or None
+        None where there is nothing to compare with.
+
+    Raises
+    ------
+    RecordingError
+        If the two share no epoch.
     """
     gnss_spans = [span for source, span in withheld if source == "gnss"]
     spans = [span for span in gnss_spans if span is not None]
@@ -144,8 +164,23 @@ def evaluate(
 ) -> Metrics:
     """Metrics of one file against another, each of any kind `read_trajectory` knows.
 
-    `truth_path` may also be a recording (a folder or a .toml), whose truth and lever arm are then used.
-    `spans` are in s on the files' clock.
+    Parameters
+    ----------
+    trajectory_path
+        The estimate.
+    truth_path
+        The truth, or a recording (a folder or a .toml), whose truth and lever arm are then used.
+    lever_arm
+        (3,) m from the estimate's point to the truth's, right, forward, up; that of the recording when None.
+    spans
+        s on the files' clock, each scored by itself.
+    max_gap
+        s, between neighbouring rows that are interpolated.
+
+    Returns
+    -------
+    Metrics
+        Errors in the local east, north and up at the epochs of the sparser of both.
 
     Raises
     ------

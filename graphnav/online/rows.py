@@ -148,7 +148,18 @@ def live_setup(
 
 
 def live_trajectory(online: Online) -> Trajectory | None:
-    """The state at the newest IMU row as a trajectory of one row; None while aligning."""
+    """The state at the newest IMU row.
+
+    Parameters
+    ----------
+    online
+        The smoother.
+
+    Returns
+    -------
+    Trajectory or None
+        Of one row, in geodetic coordinates and local axes with its covariance; None while aligning.
+    """
     now = online.live()
     if now is None or online.frame is None:
         return None

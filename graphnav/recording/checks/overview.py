@@ -111,9 +111,18 @@ def _show(name: str, value: Any) -> str:
 
 
 def inspect(recording: Recording) -> Inspection:
-    """Check a recording; see the module's head.
+    """Check a recording before solving.
 
-    Findings are in order of their severity, the gravest first, then of the checks, remarks of the loader first.
+    Parameters
+    ----------
+    recording
+        As read.
+
+    Returns
+    -------
+    Inspection
+        Facts by sensor, the recording without what cannot be right, and findings: the gravest first, then in the
+        order of the checks, the loader's remarks first.
     """
     whole = screen(recording)
     recording = whole.recording

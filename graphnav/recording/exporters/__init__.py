@@ -106,7 +106,18 @@ def check_names(names: Sequence[str], gps_zero: float | None) -> None:
 
 
 def write_as(name: str, trajectory: Trajectory, path: Path, utc: Array | None = None) -> None:
-    """Write one of `NAMES`; `utc` (K,), datetime64, where the clock is known.
+    """Write a trajectory in one of the formats `NAMES`.
+
+    Parameters
+    ----------
+    name
+        Of the format.
+    trajectory
+        What to write.
+    path
+        The file, replaced if it is there.
+    utc
+        (K,) datetime64, where the clock is known.
 
     Raises
     ------

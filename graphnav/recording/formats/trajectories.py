@@ -44,6 +44,17 @@ _GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 def read_trajectory(path: str | Path) -> Trajectory:
     """Read a trajectory file of any kind in the table above, gzipped or not.
 
+    Parameters
+    ----------
+    path
+        The file.
+
+    Returns
+    -------
+    Trajectory
+        Latitude and longitude in rad, height above the ellipsoid in m, or metres of a local frame (`frame`);
+        velocities in the local east, north, up, m/s; angles in rad.
+
     Raises
     ------
     RecordingError

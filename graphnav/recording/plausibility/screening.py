@@ -67,7 +67,19 @@ def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:
 
 
 def screened(recording: Recording) -> tuple[Recording, list[str]]:
-    """The recording without what cannot be right, and a sentence for everything found.
+    """The recording without what cannot be right.
+
+    Parameters
+    ----------
+    recording
+        As read.
+
+    Returns
+    -------
+    recording : Recording
+        Without rows that no sensor can have read.
+    notes : list of str
+        A sentence with a key for everything found.
 
     Raises
     ------
@@ -80,7 +92,18 @@ def screened(recording: Recording) -> tuple[Recording, list[str]]:
 
 
 def screen(recording: Recording) -> Screened:
-    """Look a recording over; one that was screened before is returned as it is, without findings."""
+    """Look a recording over for what cannot be right.
+
+    Parameters
+    ----------
+    recording
+        As read; one that was screened before is returned as it is, without findings.
+
+    Returns
+    -------
+    Screened
+        The recording without what cannot be right, and the findings.
+    """
     if recording.screened:
         return Screened(recording)
     findings = list(imu_scale(recording))
