@@ -23,7 +23,7 @@ from graphnav.core.state import States
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import Figure, NoiseModel, RowWeights
 from graphnav.estimation.noise.table import figure_rows
-from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution, join_solutions
+from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Separation, Solution, join_solutions
 from graphnav.evaluation.metrics import Errors
 from graphnav.evaluation.segments import relative_errors
 from graphnav.imu.dynamics import SCALE
@@ -212,7 +212,7 @@ def test_report_without_truth_shows_sigma_instead(tmp_path, recording):
     assert "1 sigma as stated" in text
     assert "there is no truth to compare with" in text
     # way, heights, position, velocity and attitude, three sigmas, two biases, what was used when, one constraint
-    assert len(parser.figures) == 12
+    assert len(parser.figures) == 13
 
 
 def test_report_of_next_to_nothing(tmp_path, recording):
@@ -398,7 +398,7 @@ def test_stops_and_outages_are_told(tmp_path, recording):
     assert "no GNSS fixes from 200 to 230 s" in text
     assert "What the detectors saw" in text
     assert "threshold: below it stands" in text
-    assert len(parser.figures) == 13
+    assert len(parser.figures) == 14
 
 
 @pytest.mark.parametrize(
@@ -590,3 +590,22 @@ def test_consistency_counts_and_judges():
     assert "wider" in consistency(record(0.5)).verdict
     assert "within" in consistency(record(0.5, "residual")).verdict
     assert "too small" in consistency(record(2.0, "residual")).verdict
+
+
+def test_separation_satellites_and_stated_accuracy_are_shown(tmp_path, recording):
+    found = solution()
+    three = np.ones((len(found.t), 3))
+    apart = Separation(found.t, 0.25 * three, 0.5 * three)
+    apart.value[-1] = np.nan
+    seen = replace(recording, gnss=replace(recording.gnss, satellites=np.full(len(recording.gnss.t), 17.0)))
+    _, text = checked(write_report(tmp_path / "r.html", seen, replace(found, separation=apart), settings={}))
+    assert "Combined separation and 3 sigma" in text
+    html = (tmp_path / "r.html").read_text()
+    rows = re.findall(r"<tr><td[^>]*>(east|north|up)</td>(.*?)</tr>", html)
+    assert [axis for axis, _ in rows] == ["east", "north", "up"]
+    for _, cells in rows:
+        assert [float(x) for x in re.findall(r">([\d.]+)<", cells)] == [0.25, 0.25, 0.25, 0.5]
+    assert "Fixes: stated accuracy and satellites" in text
+    assert re.search(
+        r">17<.*>17<", (tmp_path / "r.html").read_text().partition("Fixes</h3>")[2].partition("</table>")[0]
+    )
