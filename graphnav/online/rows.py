@@ -131,6 +131,12 @@ def live_setup(
     antenna, axle : (3,) m from the IMU to the antenna and to the point that does not slip, right, forward, up; None
         where there is no GNSS, no odometer.
     platform : "vehicle" or "foot".
+    name : of the recording.
+
+    Returns
+    -------
+    Recording
+        Without rows.
 
     Raises
     ------
