@@ -284,7 +284,7 @@ def test_fixes_are_counted_and_coloured_by_type(tmp_path, recording):
     size = np.linalg.norm(record().residual[used], axis=1).max()
     assert float(rows["all"][6]) == pytest.approx(size, rel=1e-3)
     path = write_report(tmp_path / "r.html", typed, found, settings={})
-    way_of_it = figures_of(path)["Seen from above"]["data"]
+    way_of_it = figures_of(path)["Plan view"]["data"]
     shown = {trace["name"]: trace for trace in way_of_it}
     colours = {name: shown[name]["marker"]["color"] for name in ("fixed", "float", "excluded fix")}
     assert len(set(colours.values())) == 3
@@ -396,7 +396,6 @@ def test_stops_and_outages_are_told(tmp_path, recording):
     parser, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}, outages=[(200.0, 230.0)]))
     assert "2 stops were found, 42 s in all" in text
     assert "no GNSS fixes from 200 to 230 s" in text
-    assert "What the detectors saw" in text
     assert "threshold: below it stands" in text
     assert len(parser.figures) == 14
 
@@ -550,7 +549,7 @@ def test_comparison_has_a_row_per_solver_and_span(tmp_path, recording):
     assert text.count("Withheld 100 to 160 s") == text.count("Withheld 250 to 350 s") == 1
     assert "batch: the stated sigma is too small" in text
     assert "rts: the stated sigma is cautious" in text
-    assert "ekf: the stated sigma can be believed" in text
+    assert "ekf: the stated sigma is consistent" in text
     assert parser.tags.count("table") >= 5
 
 
@@ -583,7 +582,7 @@ def test_consistency_counts_and_judges():
     used = np.arange(COUNT) != 50
     assert c.mean_nis == pytest.approx((white[used] ** 2).sum(1).mean(), rel=1e-12)
     assert c.outside == pytest.approx((np.abs(white[used]) > 3).mean(), rel=1e-12)
-    assert "can be believed" in c.verdict
+    assert "consistent" in c.verdict
     assert consistency(replace(record(), weight=np.zeros(COUNT))).verdict == "too few to judge"
     assert consistency(replace(record(), nis=np.full(COUNT, np.nan))).verdict == "too few to judge"
     assert "overconfident" in consistency(record(2.0)).verdict

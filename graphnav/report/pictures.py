@@ -48,7 +48,7 @@ def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], 
     where = f"North is up; the origin is latitude {lat:.6f}, longitude {lon:.6f} deg."
     if recording.gnss is None:
         where = "Nothing says where on the Earth this is: place and heading count from the start."
-    return page.picture(figure, "Seen from above", where, kind="large")
+    return page.picture(figure, "Plan view", where, kind="large")
 
 
 def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> Raw:
@@ -343,12 +343,12 @@ def timeline_picture(solution: Solution, recording: Recording, spans: Shades) ->
     if not records:
         return []
     figure = plots.timeline(records, recording.start, recording.duration, solution.solver, spans=spans)
-    return [page.picture(figure, "What was used when", kind="large")]
+    return [page.picture(figure, "Use of constraints over time", kind="large")]
 
 
 def detection_pictures(recording: Recording, found: Sequence[Detection]) -> list[Raw]:
-    """What the detectors saw."""
+    """Signals and statistics of the detectors."""
     if not found:
         return []
     note = "Tinted: the intervals in which it stands, all detectors together."
-    return [page.picture(plots.detections(recording, found), "What the detectors saw", note, kind="large")]
+    return [page.picture(plots.detections(recording, found), "Detectors", note, kind="large")]

@@ -175,7 +175,7 @@ def believe(name: str, errors: Errors) -> Raw:
     rest = f" Nothing is there to judge {page.and_list(unseen)} by." if unseen else ""
     if all(j.verdict == "cautious" for j in judged):
         return page.paragraph(f"{name}: the stated sigma is cautious: {measured}.{rest}", "verdict")
-    return page.paragraph(f"{name}: the stated sigma can be believed: {measured}.{rest}", "verdict good")
+    return page.paragraph(f"{name}: the stated sigma is consistent: {measured}.{rest}", "verdict good")
 
 
 def believe_without_truth(solution: Solution) -> Raw:
@@ -184,9 +184,7 @@ def believe_without_truth(solution: Solution) -> Raw:
     name = solution.solver
     missing = "there is no truth to compare with"
     if used < _FEWEST:
-        return page.paragraph(
-            f"{name}: no truth and too few measurements to say whether sigma can be believed.", "verdict"
-        )
+        return page.paragraph(f"{name}: no truth and too few measurements to judge sigma by.", "verdict")
     if kind == "innovation":
         measured = f"they are {size:.2f} times as large as predicted (RMS; 1 where sigma is true)"
         if size > _TOO_LARGE[kind]:

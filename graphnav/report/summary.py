@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 _LINES = 3  # of what was left out
 _SAYS = {
-    "fits": ("good", "sigma can be believed"),
+    "fits": ("good", "sigma is consistent"),
     "cautious": ("", "sigma is cautious"),
     "too small": ("bad", "sigma is too small"),
-    "unclear": ("", "open whether sigma can be believed: errors are alike for too long"),
+    "unclear": ("", "consistency of sigma is open: errors are correlated for too long"),
 }
 # by whose innovations or residuals a block is judged where there is no truth
 _SHOWS = {
@@ -37,7 +37,7 @@ _SHOWS = {
 
 
 def verdicts(solution: Solution, errors: Errors | None) -> Raw:
-    """Position, velocity and attitude: how good, and whether the stated sigma can be believed."""
+    """Position, velocity and attitude: how good, and whether the stated sigma is consistent."""
     judged = _by_records(solution) | ({} if errors is None else _by_truth(errors))
     cells = []
     for block in ("position", "velocity", "attitude"):
