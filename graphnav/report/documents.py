@@ -74,7 +74,6 @@ def write_report(
                 page.gallery([pictures.trajectory_picture(recording, only, spans)]),
                 page.gallery([pictures.profile_picture(recording, only)]),
                 *_gallery(pictures.motion_pictures(recording, only, spans)),
-                *_gallery(pictures.quality_pictures(recording, solution, spans)),
             ],
         ),
         (
@@ -83,7 +82,12 @@ def write_report(
                 *tables.accuracy_tables(every, withheld, start, outages),
                 *summary.relative_tables(every),
                 *tables.metric_tables(metrics),
-                *_gallery(pictures.separation_pictures(solution, start, end, spans)),
+                *_gallery(
+                    [
+                        *pictures.separation_pictures(solution, start, end, spans),
+                        *pictures.quality_pictures(recording, solution, spans),
+                    ]
+                ),
                 *_gallery(pictures.error_pictures(every, start, end, spans)),
             ],
         ),
