@@ -54,7 +54,7 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
     ),
     "satellites": (
         r"satellites",
-        r"(?:num|n|no|number_of|used)_?(?:sats?|sv|svs|satellites)(?:_used)?", r"(?:sats?|satellites)_?used|ns|sats?",
+        r"(?:num|n|no|number_of|used)_?(?:sats?|sv|svs|satellites)(?:_used)?", r"(?:sats?|satellites)_?used|sats?",
     ),
 }  # fmt: skip
 
