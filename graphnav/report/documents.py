@@ -82,17 +82,20 @@ def write_report(
                 *tables.accuracy_tables(every, withheld, start, outages),
                 *summary.relative_tables(every),
                 *tables.metric_tables(metrics),
-                *_gallery(
-                    [
-                        *pictures.separation_pictures(solution, start, end, spans),
-                        *pictures.quality_pictures(recording, solution, spans),
-                    ]
-                ),
                 *_gallery(pictures.error_pictures(every, start, end, spans)),
             ],
         ),
         ("Consistency of sigma", [*_verdicts(only, every), *_consistency(every, start, end, spans)]),
-        ("Uncertainty", _gallery(pictures.sigma_pictures({name: solution.trajectory()}, start, end, spans))),
+        (
+            "Uncertainty",
+            _gallery(
+                [
+                    *pictures.sigma_pictures({name: solution.trajectory()}, start, end, spans),
+                    *pictures.separation_pictures(solution, start, end, spans),
+                    *pictures.quality_pictures(recording, solution, spans),
+                ]
+            ),
+        ),
         (
             "Calibration",
             [
