@@ -26,16 +26,15 @@ Table = dict[str, Array]  # the columns of a CSV file by name
 HEAD = """\
 # What can go wrong
 
-What people get wrong, and the line that graphnav has for it. Each of these is made by the tests on the two minutes of
-Tokyo that come with the clone (`data/tokyo`), and the line is what was printed.
+Common mistakes and what graphnav prints for each, long lines shortened (...). The tests make them on `data/tokyo`.
 
-A line that begins with *note*, *warning*, *untrusted* or *refused* is one of several: the recording can be read, and
-`graphnav info` lists what is odd in it, the gravest first (so do `smooth` and `compare`, and the reports). Results
-suffer from a *warning*. With an *untrusted* one they may be wrong altogether, whatever their sigmas say. With a
-*refused* one nothing is solved: `smooth`, `compare` and `detect` end with that sentence and exit code 2, as all
-commands do with the lines that begin with none of these. Run `graphnav info` before anything else, and read from the
-top: the first may be the cause of the others.
+A line that begins with *note*, *warning*, *untrusted* or *refused* is a finding of `graphnav info`, the gravest first;
+`smooth`, `compare` and the reports list them too. Results suffer from a *warning*; with an *untrusted* one they may be
+wrong whatever their sigmas say; with a *refused* one nothing is solved. All other lines are errors, exit code 2. Run
+`graphnav info` first and read from the top: the first finding may be the cause of the others. Scripts read the `key` of
+a finding (`--json`, `messages` in summary.json), which stays the same whatever its words.
 """
+_SHOWN = 9  # words at either end of a line that is shortened
 
 
 @dataclass(frozen=True)
@@ -167,6 +166,9 @@ def row(mistake: Mistake, lines: list[str]) -> str:
     """The mistake's line of the page."""
     (line, *_) = said(mistake, lines) or lines or [""]
     line = line.removeprefix("graphnav: ").replace("|", "\\|").replace("<", "&lt;")
+    words = line.split()
+    if len(words) > 2 * _SHOWN + 2:
+        line = " ".join([*words[:_SHOWN], "...", *words[-_SHOWN:]])
     return f"| {mistake.what} | {line} |"
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import os
+import pkgutil
 import re
 import shlex
 import shutil
@@ -188,6 +190,24 @@ def test_the_site_builds_and_every_link_in_it_leads_somewhere(tmp_path):
     ):
         assert f'id="{name}"' in reference
     assert "(K, 3) latitude, longitude (rad), ellipsoidal height (m)" in reference  # units of the fields
+
+
+LISTED = re.findall(r"^::: ([\w.]+)", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", LISTED)
+def test_the_reference_says_what_goes_in_and_comes_out(name):
+    """Of every function: each parameter by its name, and what is returned; of every class and field: something."""
+    found = pkgutil.resolve_name(name)
+    own = [v for k, v in vars(found).items() if not k.startswith("_") and getattr(v, "__module__", "") == name]
+    for one in own if inspect.ismodule(found) else [found]:
+        text = inspect.getdoc(one) or ""
+        assert text, one
+        if inspect.isfunction(one):
+            signature = inspect.signature(one)
+            missing = [p for p in signature.parameters if not re.search(rf"^\*?\*?(?:\w+, )*{p}\b", text, re.MULTILINE)]
+            assert not missing, f"{one.__name__}: {missing}"
+            assert "Returns\n-------" in text or signature.return_annotation == "None", one.__name__
 
 
 def test_every_table_of_an_experiment_names_its_command_and_commit():

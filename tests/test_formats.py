@@ -359,3 +359,22 @@ def test_a_file_that_is_cut_off_is_read_to_there_or_refused_in_a_line(tmp_path, 
     else:
         sensor = log.imu if which == 0 else log.gnss
         assert 0 < len(sensor.t) <= len(RECORDING.imu.t)
+
+
+def test_satellites_are_read_and_kept(tmp_path):
+    recording, _ = logs.simulated(20.0)
+    fixes = zip(recording.gnss.t, recording.gnss.llh, recording.gnss.v, strict=True)
+    ubx = tmp_path / "a.ubx"
+    ubx.write_bytes(b"".join(logs.nav_pvt(logs.WEEK * 604800.0 + logs.TOW + t, llh, v) for t, llh, v in fixes))
+    kept = []
+    for path, many in (
+        (logs.write_nmea(tmp_path / "a.nmea", recording), 12), (logs.write_rtklib(tmp_path / "a.pos", recording), 20),
+        (ubx, 18),
+    ):  # fmt: skip
+        log = load(path)
+        assert (log.gnss.satellites == many).all(), path
+        kept.append(replace(log, imu=replace(recording.imu, t=logs.TOW + recording.imu.t)))
+    write_recording(kept[0], tmp_path / "out")
+    assert (read(tmp_path / "out").gnss.satellites == 12).all()
+    part = read(tmp_path / "out").crop(5.0, 10.0).gnss
+    assert len(part.satellites) == len(part.t) > 3

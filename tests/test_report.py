@@ -23,7 +23,7 @@ from graphnav.core.state import States
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import Figure, NoiseModel, RowWeights
 from graphnav.estimation.noise.table import figure_rows
-from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution, join_solutions
+from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Separation, Solution, join_solutions
 from graphnav.evaluation.metrics import Errors
 from graphnav.evaluation.segments import relative_errors
 from graphnav.imu.dynamics import SCALE
@@ -212,7 +212,7 @@ def test_report_without_truth_shows_sigma_instead(tmp_path, recording):
     assert "1 sigma as stated" in text
     assert "there is no truth to compare with" in text
     # way, heights, position, velocity and attitude, three sigmas, two biases, what was used when, one constraint
-    assert len(parser.figures) == 12
+    assert len(parser.figures) == 13
 
 
 def test_report_of_next_to_nothing(tmp_path, recording):
@@ -284,7 +284,7 @@ def test_fixes_are_counted_and_coloured_by_type(tmp_path, recording):
     size = np.linalg.norm(record().residual[used], axis=1).max()
     assert float(rows["all"][6]) == pytest.approx(size, rel=1e-3)
     path = write_report(tmp_path / "r.html", typed, found, settings={})
-    way_of_it = figures_of(path)["Seen from above"]["data"]
+    way_of_it = figures_of(path)["Plan view"]["data"]
     shown = {trace["name"]: trace for trace in way_of_it}
     colours = {name: shown[name]["marker"]["color"] for name in ("fixed", "float", "excluded fix")}
     assert len(set(colours.values())) == 3
@@ -396,9 +396,8 @@ def test_stops_and_outages_are_told(tmp_path, recording):
     parser, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}, outages=[(200.0, 230.0)]))
     assert "2 stops were found, 42 s in all" in text
     assert "no GNSS fixes from 200 to 230 s" in text
-    assert "What the detectors saw" in text
     assert "threshold: below it stands" in text
-    assert len(parser.figures) == 13
+    assert len(parser.figures) == 14
 
 
 @pytest.mark.parametrize(
@@ -550,7 +549,7 @@ def test_comparison_has_a_row_per_solver_and_span(tmp_path, recording):
     assert text.count("Withheld 100 to 160 s") == text.count("Withheld 250 to 350 s") == 1
     assert "batch: the stated sigma is too small" in text
     assert "rts: the stated sigma is cautious" in text
-    assert "ekf: the stated sigma can be believed" in text
+    assert "ekf: the stated sigma is consistent" in text
     assert parser.tags.count("table") >= 5
 
 
@@ -583,10 +582,29 @@ def test_consistency_counts_and_judges():
     used = np.arange(COUNT) != 50
     assert c.mean_nis == pytest.approx((white[used] ** 2).sum(1).mean(), rel=1e-12)
     assert c.outside == pytest.approx((np.abs(white[used]) > 3).mean(), rel=1e-12)
-    assert "can be believed" in c.verdict
+    assert "consistent" in c.verdict
     assert consistency(replace(record(), weight=np.zeros(COUNT))).verdict == "too few to judge"
     assert consistency(replace(record(), nis=np.full(COUNT, np.nan))).verdict == "too few to judge"
     assert "overconfident" in consistency(record(2.0)).verdict
     assert "wider" in consistency(record(0.5)).verdict
     assert "within" in consistency(record(0.5, "residual")).verdict
     assert "too small" in consistency(record(2.0, "residual")).verdict
+
+
+def test_separation_satellites_and_stated_accuracy_are_shown(tmp_path, recording):
+    found = solution()
+    three = np.ones((len(found.t), 3))
+    apart = Separation(found.t, 0.25 * three, 0.5 * three)
+    apart.value[-1] = np.nan
+    seen = replace(recording, gnss=replace(recording.gnss, satellites=np.full(len(recording.gnss.t), 17.0)))
+    _, text = checked(write_report(tmp_path / "r.html", seen, replace(found, separation=apart), settings={}))
+    assert "Combined separation and 3 sigma" in text
+    html = (tmp_path / "r.html").read_text()
+    rows = re.findall(r"<tr><td[^>]*>(east|north|up)</td>(.*?)</tr>", html)
+    assert [axis for axis, _ in rows] == ["east", "north", "up"]
+    for _, cells in rows:
+        assert [float(x) for x in re.findall(r">([\d.]+)<", cells)] == [0.25, 0.25, 0.25, 0.5]
+    assert "Fixes: stated accuracy and satellites" in text
+    assert re.search(
+        r">17<.*>17<", (tmp_path / "r.html").read_text().partition("Fixes</h3>")[2].partition("</table>")[0]
+    )

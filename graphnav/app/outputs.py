@@ -20,7 +20,9 @@ from graphnav.app.stored import attach_recording, sha256, write_outcome
 from graphnav.app.workflow import Outcome, outages
 from graphnav.core.errors import ConfigError, PartlyWrittenError
 from graphnav.core.files import exists
+from graphnav.core.findings import Finding
 from graphnav.core.jsonable import peak_memory_mb, write_json
+from graphnav.core.notes import key_of
 from graphnav.core.timescales import gps_to_utc
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.estimation.stops import detections_text, stops_of_solution
@@ -250,6 +252,8 @@ def solver_summary(
         errors = {key: value for key, value in errors.items() if key not in nees}
     doubted = doubts({name: solution}, {} if metrics is None or metrics.errors is None else {name: metrics.errors})
     timings = {**solution.timings, "evaluation": outcome.timings["evaluation"], **spent}
+    said = [Finding("untrusted", doubt, key_of(doubt)) for doubt in doubted]
+    messages = dict.fromkeys([*said, *outcome.checks, *(Finding("note", note, key_of(note)) for note in notes)])
     rejected = {key: int(np.sum(r.weight <= 1e-9)) for key, r in solution.records.items()}
     return {
         "solver": name,
@@ -286,6 +290,7 @@ def solver_summary(
         "notes": list(dict.fromkeys(notes)),
         "remarks": list(outcome.findings),
         "checks": [f.values() for f in outcome.checks],
+        "messages": [f.values() for f in messages],
         "settings": outcome.request.settings.model_dump(),
         "provenance": provenance,
     }

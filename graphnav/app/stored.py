@@ -24,6 +24,7 @@ from graphnav.config import Settings
 from graphnav.core import rotation
 from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.files import check_regular, check_size, exists, parse_json
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import times_between
@@ -138,6 +139,8 @@ def sha256(path: Path) -> str:
 
 def _pack(value: Any, arrays: list[Array]) -> Any:
     """A value as JSON holds it, one key telling what it is; arrays go into the list."""
+    if isinstance(value, Note):
+        return {"note": [value.key, str(value)]}
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.generic):
@@ -170,6 +173,8 @@ def _unpack(value: Any, arrays: list[Array]) -> Any:
     """The opposite of `_pack`."""
     if not isinstance(value, dict):
         return value
+    if "note" in value:
+        return Note(*value["note"])
     if "array" in value:
         return arrays[value["array"]]
     if "settings" in value:

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from graphnav.app.outputs import median_sigmas
 from graphnav.app.workflow import Outcome
 from graphnav.constraints.gnss import TIMES
+from graphnav.core.notes import key_of
 from graphnav.core.progress import Progress
 from graphnav.core.staging import defer_interrupts
 from graphnav.estimation.solution import Solution
@@ -29,6 +31,9 @@ _ERRORS = (
 )  # fmt: skip
 
 
+_WIDEST = 1000  # characters of a table
+
+
 def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     """What was read, what is worth knowing, how good it is, and where to look."""
     lines = [f"warning: {said[0].lower()}{said[1:]}" for said in _doubts(outcome)]
@@ -39,8 +44,8 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     lines += [f"  {said}" for said in _noise(outcome)]
     severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
-        if note.startswith("noise model, "):
-            continue  # of one sensor: the report has the table
+        if key_of(note) in ("noise.imu", "noise.rows"):
+            continue  # the report has the table
         lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
     lines += _whole(outcome)
@@ -160,15 +165,19 @@ def _share(span: Span) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Columns aligned, the first to the left and numbers to the right."""
-    widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
-    return [
-        "  "
-        + "  ".join(
-            cell.ljust(w) if k == 0 else cell.rjust(w) for k, (cell, w) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in [head, *rows]
-    ]
+    """Lines of a table, the first column to the left and numbers to the right; as wide as it is."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="")
+    for k, title in enumerate(head):
+        grid.add_column(Text(title), justify="left" if k == 0 else "right", no_wrap=True)
+    for row in rows:
+        grid.add_row(*map(Text, row))
+    console = Console(file=StringIO(), color_system=None, width=_WIDEST)
+    console.print(grid)
+    return [f"  {line.rstrip()}" for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
 
 
 def short(x: float) -> str:

@@ -21,6 +21,7 @@ from graphnav.core import rotation
 from graphnav.core.complaints import nearest
 from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.findings import Finding
+from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, listening, tell
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
@@ -232,8 +233,9 @@ def unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
     """Sentences on what a noise model says of measurements that a solution has not."""
     have = {name: record.t for name, record in solution.records.items()}
     named = {group.split(".")[0] for group in noise.figures} - {"imu"} | set(noise.weights) | set(noise.excluded)
-    notes = [
-        f"noise model: it has figures of {name}, of which nothing is used here" for name in sorted(named - set(have))
+    notes: list[str] = [
+        Note("noise.file.unused", f"noise model: it has figures of {name}, of which nothing is used here")
+        for name in sorted(named - set(have))
     ]
     for name, some in noise.weights.items():
         if name in have and len(some.t):
@@ -242,12 +244,20 @@ def unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
             near = np.minimum(np.abs(t[k - 1] - some.t), np.abs(t[np.minimum(k, len(t) - 1)] - some.t))
             lost = int(np.sum(near > SAME_TIME))
             if lost:
-                notes.append(f"noise model: {lost} of the {len(some.t)} rows of {name} that it weighs are not here")
+                notes.append(
+                    Note(
+                        "noise.file.rows",
+                        f"noise model: {lost} of the {len(some.t)} rows of {name} that it weighs are not here",
+                    )
+                )
     for name, spans in noise.excluded.items():
         lost = sum(not np.any((have[name] >= a) & (have[name] <= b)) for a, b in spans) if name in have else 0
         if lost:
             notes.append(
-                f"noise model: {lost} of the {len(spans)} spans of {name} that it leaves out hold nothing here"
+                Note(
+                    "noise.file.spans",
+                    f"noise model: {lost} of the {len(spans)} spans of {name} that it leaves out hold nothing here",
+                )
             )
     return notes
 
@@ -296,7 +306,8 @@ def _move(withheld: tuple[Withheld, ...], by: float) -> tuple[Withheld, ...]:
 
 def _withhold(recording: Recording, withheld: tuple[Withheld, ...], zero: float) -> tuple[Recording, list[str]]:
     """The recording without what is withheld (s from its start), and sentences about what that did not change."""
-    used, notes = recording, []
+    used = recording
+    notes: list[str] = []
     for source, span in withheld:
         name = source if span is None else f"{source}:{span[0] + zero:g}-{span[1] + zero:g}"
         if span is not None and (span[1] <= 0.0 or span[0] >= recording.duration):
@@ -309,7 +320,7 @@ def _withhold(recording: Recording, withheld: tuple[Withheld, ...], zero: float)
         before = used
         used = used.without(source, span)
         if span is not None and len(used.aiding[source].t) == len(before.aiding[source].t):
-            notes.append(f"--without {name}: there was no {source} row in that span anyway")
+            notes.append(Note("withheld.nothing", f"--without {name}: there was no {source} row in that span anyway"))
     return used, notes
 
 

@@ -8,6 +8,7 @@ from typing import Any, Final, Literal
 from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, field_validator, model_validator
 
 from graphnav.config.section import Section
+from graphnav.core.notes import Note
 
 
 class StanceSettings(Section):
@@ -109,5 +110,8 @@ class DetectorSettings(Section):
                 raise ValueError(f"[detectors.{name}] is [detectors.{_OLD[name]}] now: give one of them")
             values = {_OLD.get(key, key): value for key, value in values.items()}
         found = handler(values)
-        found._notes = tuple(f"settings: [detectors.{name}] is called [detectors.{_OLD[name]}] now" for name in old)
+        found._notes = tuple(
+            Note("settings.renamed", f"settings: [detectors.{name}] is called [detectors.{_OLD[name]}] now")
+            for name in old
+        )
         return found

@@ -40,6 +40,11 @@ def read_settings(path: str | Path | None = None, profile: str | None = None) ->
     profile
         One of `PROFILES`; it goes before the file's own.
 
+    Returns
+    -------
+    Settings
+        All of them, defaults included.
+
     Raises
     ------
     ConfigError

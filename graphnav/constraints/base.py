@@ -164,7 +164,22 @@ def _differences(f: Callable[[Array], Array], steps: Array) -> Array:
 
 
 def assemble(linearized: Linearized, parameters: dict[str, slice] | None = None, width: int = DIM) -> Array:
-    """(N, m, width) Jacobian over the error state, with parameters in the columns given."""
+    """The Jacobian over a whole error state.
+
+    Parameters
+    ----------
+    linearized
+        N rows of m numbers.
+    parameters
+        Columns of each parameter; they are left out when None.
+    width
+        Of the error state with its parameters.
+
+    Returns
+    -------
+    array
+        (N, m, width), zero where a block is not touched.
+    """
     n, m = linearized.residual.shape
     H = np.zeros((n, m, width))
     for key, J in linearized.jacobians.items():
@@ -176,7 +191,22 @@ def assemble(linearized: Linearized, parameters: dict[str, slice] | None = None,
 
 
 def weigh_sigma(rows: Constraint, sigma: Array, which: slice | Array = slice(None)) -> Array:
-    """(n, m) sigma of some rows with their weights in it: infinite where the weight is 0."""
+    """Sigmas with the weights of their rows in them.
+
+    Parameters
+    ----------
+    rows
+        The constraint, whose `weight` is used.
+    sigma
+        (n, m) as stated.
+    which
+        The n rows that they are of.
+
+    Returns
+    -------
+    array
+        (n, m), infinite where the weight is 0.
+    """
     if rows.weight is None:
         return sigma
     with np.errstate(divide="ignore"):

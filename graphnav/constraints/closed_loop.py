@@ -13,6 +13,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import BuildContext, Constraint, Linearized
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.recording import Recording
@@ -37,7 +38,10 @@ class ClosedLoop(Constraint):
         sigma, gnss = scene.settings.foot.closed_loop, scene.recording.gnss
         if sigma is None or scene.recording.platform != "foot" or (gnss is not None and len(gnss.t)):
             return None
-        note = f"the end is set to be the start, to {sigma:g} m (closed_loop): the closure is no measure"
+        note = Note(
+            "closed_loop.set",
+            f"the end is set to be the start, to {sigma:g} m (closed_loop): the closure is no measure",
+        )
         return cls(keyframe=np.array([len(scene.t) - 1]), sigma=np.full((1, 3), sigma), notes=(note,))
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:

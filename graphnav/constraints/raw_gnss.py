@@ -28,6 +28,7 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.constraints.gnss import LEVER_ARM, TIMES, antenna_velocity, around, node_spacing, period
 from graphnav.core import earth, rotation
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.gnss.atmosphere import obliquity
@@ -269,7 +270,7 @@ class GnssCode(_Satellites):
             sigma=sigma[:, None],
             which=which,
             processes=processes,
-            notes=(note,),
+            notes=(Note("gnss_code.systems", note),),
             **common,
         )
 

@@ -23,13 +23,28 @@ _SAME_TIME = 1e-6  # s; what a text file rounds a time stamp to
 def interpolate(
     trajectory: Trajectory, t: Array, *, max_gap: float = 3.0, lever_arm: Array | None = None
 ) -> tuple[Trajectory, Array]:
-    """The trajectory at the times `t` (N,) it can be interpolated to, and the mask (N,) of those times.
+    """The trajectory at other times, never outside it, and never across a gap.
 
-    Never outside the trajectory, and never between two of its rows more than `max_gap` s apart; a time
-    that falls on a row needs no neighbour. With `lever_arm` (3,), m, RFU, the position, velocity and
-    covariance are those of the point at its end; rows without attitude stay where they are, and
-    without an attitude sigma the sigmas stay what they are. Biases are dropped.
-    Without a covariance one is made of the sigmas (NaN where there are none).
+    Without a covariance one is made of the sigmas (NaN where there are none). Biases are dropped.
+
+    Parameters
+    ----------
+    trajectory
+        What to interpolate.
+    t
+        (N,) s.
+    max_gap
+        s, between two of its rows that are interpolated; a time that falls on a row needs no neighbour.
+    lever_arm
+        (3,) m, right, forward, up: position, velocity and covariance are then those of the point at its end. Rows
+        without attitude stay where they are, and without an attitude sigma the sigmas stay what they are.
+
+    Returns
+    -------
+    trajectory : Trajectory
+        At M of the times.
+    mask : array of bool
+        (N,), which those are.
     """
     k, s, ok = _bracket(trajectory.t, np.asarray(t, dtype=float), max_gap)
     k, s, t = k[ok], s[ok, None], np.asarray(t, dtype=float)[ok]

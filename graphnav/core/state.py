@@ -86,7 +86,18 @@ class States:
         return States(self.R_nb[index], self.p[index], self.v[index], self.ba[index], self.bg[index])
 
     def plus(self, delta: Array) -> States:
-        """Move by error states (K, 15)."""
+        """Move by error states: ``R_nb Exp(theta)``, the rest added.
+
+        Parameters
+        ----------
+        delta
+            (K, 15) theta (rad, body), p (m), v (m/s) in n, b_a (m/s^2), b_g (rad/s).
+
+        Returns
+        -------
+        States
+            K states.
+        """
         return States(
             self.R_nb @ rotation.exp(delta[:, 0:3]),
             self.p + delta[:, 3:6],
@@ -96,7 +107,18 @@ class States:
         )
 
     def minus(self, other: States) -> Array:
-        """The error states (K, 15) with ``other.plus(d) == self``."""
+        """The error states between two.
+
+        Parameters
+        ----------
+        other
+            K states.
+
+        Returns
+        -------
+        array
+            (K, 15) with ``other.plus(d) == self``, in the order and units of `plus`.
+        """
         return np.concatenate(
             [
                 rotation.log(np.swapaxes(other.R_nb, -1, -2) @ self.R_nb),

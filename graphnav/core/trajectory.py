@@ -31,6 +31,7 @@ class Trajectory:
     accel_bias: Array | None = None  # (K, 3) m/s^2, RFU
     covariance: Array | None = None  # (K, 9, 9)
     fix_type: Array | None = None  # (K,) where it is of a receiver: its numbers, NaN where unknown
+    satellites: Array | None = None  # (K,) the same: how many it used
     frame: str = "geodetic"  # "local": llh then holds metres x, y, z of unknown origin and yaw
     name: str = ""
     notes: tuple[str, ...] = field(default=())
@@ -44,7 +45,18 @@ class Trajectory:
         return None if self.rph is None else rotation.from_rph(self.rph)
 
     def take(self, index: Array | slice) -> Trajectory:
-        """The rows of `index` (a mask, an index array or a slice)."""
+        """Some rows.
+
+        Parameters
+        ----------
+        index
+            A mask (K,), an index array or a slice.
+
+        Returns
+        -------
+        Trajectory
+            With the same parts.
+        """
         values: dict[str, Any] = {
             key: (value[index] if isinstance(value, np.ndarray) else value) for key, value in self.__dict__.items()
         }

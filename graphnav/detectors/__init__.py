@@ -17,6 +17,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.config.detectors import FUSED
 from graphnav.core.errors import ConfigError
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, subtract_spans
 from graphnav.detectors.fusion import Decision, decide, decide_fused, merge_decisions
@@ -43,7 +44,20 @@ def list_detectors() -> dict[str, type[Detector]]:
 
 
 def detect(recording: Recording, settings: Settings | None = None) -> Detections:
-    """Stationary intervals and the statistics they come from; never fails, and says what could not be done."""
+    """Stationary intervals and the statistics they come from. Never fails: a note says what could not be done.
+
+    Parameters
+    ----------
+    recording
+        As read.
+    settings
+        The defaults when None.
+
+    Returns
+    -------
+    Detections
+        The answer, (M, 2) s on the recording's clock, and that of each detector.
+    """
     d = (settings or Settings()).detectors
     scene = Scene(recording, d)
     if recording.platform == "foot" and scene.period > 0.0:
@@ -51,12 +65,22 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
         idle = [name for name in d.fire if name not in fire and name != FUSED]
         stances = detect_stances(recording.imu, scene.period, d.stance, fire)
         idle += [kind.name for kind in recording.own.detectors]
-        more = (f"{', '.join(idle)}: of vehicles only, finds no stance",) if idle else ()
+        more = (
+            (Note("detectors.vehicles_only", f"{', '.join(idle)}: of vehicles only, finds no stance"),) if idle else ()
+        )
         return Detections(stances.stationary, stances.all, (*d.notes, *more, *stances.notes))
     if not recording.duration >= _SHORTEST or not scene.period > 0.0:
-        return Detections(NONE, (), (*d.notes, f"no detection: the recording is shorter than {_SHORTEST:g} s"))
+        return Detections(
+            NONE,
+            (),
+            (*d.notes, Note("detectors.too_short", f"no detection: the recording is shorter than {_SHORTEST:g} s")),
+        )
     if not len(scene.low.t):
-        return Detections(NONE, (), (*d.notes, f"no detection: an IMU at {1.0 / scene.period:.3g} Hz is too slow"))
+        return Detections(
+            NONE,
+            (),
+            (*d.notes, Note("detectors.too_slow", f"no detection: an IMU at {1.0 / scene.period:.3g} Hz is too slow")),
+        )
     found = _decide(scene)
     reference = found.found[0]
     mask = inside(reference.t, found.spans)

@@ -21,6 +21,7 @@ from itertools import pairwise
 import numpy as np
 
 from graphnav.config.detectors import FftSettings
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Mask, spans_of, within
 from graphnav.detectors.motion import Speeds
@@ -64,7 +65,15 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     t = 0.5 * (t_first + t_last) - 0.5 * period
     if not w.count or rate < _SLOWEST:
         reason = "the recording is shorter than a window" if rate >= _SLOWEST else f"{rate:.3g} Hz are too few"
-        return Detection("fft", t, np.full(len(t), np.nan), 1.0, t < t, NONE, (f"no FFT detection: {reason}",))
+        return Detection(
+            "fft",
+            t,
+            np.full(len(t), np.nan),
+            1.0,
+            t < t,
+            NONE,
+            (Note("detectors.fft.not_possible", f"no FFT detection: {reason}"),),
+        )
     whole = t_last - t_first < (1.0 + _STRETCH) * length * period
     half = 0.5 * length * period
     calm = _calm(w, settings) if labels is None and settings.find_line else np.zeros(w.count)
@@ -72,18 +81,18 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     line = idle_line(w, np.flatnonzero(inner)) if settings.find_line else None
     notes: list[str] = []
     if settings.find_line and line is None:
-        notes.append(_no_line(int(inner.sum()), settings, labels is None))
+        notes.append(Note("detectors.fft.no_line", _no_line(int(inner.sum()), settings, labels is None)))
         if not shown:
             return Detection("fft", t, np.full(w.count, np.nan), 1.0, t < t, NONE, tuple(notes))
     factor = 1.0 if line is None else line.frequency / LINE_OF_THE_PAPER
     bands, clipped = _bands(settings, factor, w.frequencies)
     if clipped:
-        notes.append(clipped)
+        notes.append(Note("detectors.fft.bands_cut", clipped))
     height, where, picture = _measure(w, bands)
     quotient = _quotients(height, settings)
     asked: Mask = np.asarray(np.isfinite(quotient).any(axis=0))
     if line is not None:
-        notes.append(_found(line))
+        notes.append(Note("detectors.fft.line", _found(line)))
         idling = inner & _shows(height, where, line)
         met = np.asarray((quotient[idling] < 1.0).mean(axis=0) >= _MET) if idling.any() else asked
         if labels is None:
@@ -93,7 +102,12 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
         quotient = np.column_stack([quotient, _off_line(where, asked, line)])
         asked = np.append(asked, True)
         if left_out:
-            notes.append(f"not asked for, because this engine does not meet it at idle: {', '.join(left_out)}")
+            notes.append(
+                Note(
+                    "detectors.fft.conditions",
+                    f"not asked for, because this engine does not meet it at idle: {', '.join(left_out)}",
+                )
+            )
     usable = asked[3:8].any() and (line is not None or not settings.find_line)
     found = np.full(w.count, np.nan)
     if usable:

@@ -19,6 +19,7 @@ from itertools import pairwise
 import numpy as np
 
 from graphnav.config.detectors import FusionSettings
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, longer_than, merge_spans, spans_of, subtract_spans, union, within
 from graphnav.detectors.chain import Link, at_rest_until, link, moving_by_chain
@@ -117,16 +118,29 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
     notes = []
     measured = int((np.nan_to_num(known) > 0.0).sum())
     if measured:
-        notes.append(f"{_count(measured)} smooth but no stop: odometer or GNSS say that the vehicle moved")
+        notes.append(
+            Note(
+                "detectors.speed_known",
+                f"{_count(measured)} smooth but no stop: odometer or GNSS say that the vehicle moved",
+            )
+        )
     if moves.sum() > measured:
-        notes.append(f"{_count(int(moves.sum()) - measured)} smooth but no stop: the force before or after shows speed")
+        notes.append(
+            Note(
+                "detectors.speed_felt",
+                f"{_count(int(moves.sum()) - measured)} smooth but no stop: the force before or after shows speed",
+            )
+        )
     share = _still_in_motion(found, certain)
     if share > _BLIND:
         unseen = ~moves & np.isnan(known) & np.array([not _zero(speeds, span) for span in spans])
         moves |= unseen
         notes.append(
-            f"{100.0 * share:.0f} % of the seconds in certain motion are as still as a stop (a simulation without "
-            f"road?): a stop needs a measured speed as well, which {_count(int(unseen.sum()))} without"
+            Note(
+                "detectors.still_in_motion",
+                f"{100.0 * share:.0f} % of the seconds in certain motion are as still as a stop (a simulation without "
+                f"road?): a stop needs a measured speed as well, which {_count(int(unseen.sum()))} without",
+            )
         )
     spans = subtract_spans(spans[~moves], certain)
     if not by_rows and len(certain):  # ends that certain motion has made are no better than it is timed

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.config.detectors import LowBandSettings
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, longer_than, spans_of, within
 from graphnav.detectors.scene import Detector, Labels, Scene
@@ -131,7 +132,12 @@ def _threshold(
     if s.overstated and np.mean(found < settings.threshold) < 0.5:
         # noise that hides so much is not believed, and no population stands out: what is left is 3 sigma of the sway
         start = min(start, float(np.log10(9.0 * swaying)))
-        notes = ("the IMU's stated noise is too large to tell stops by it: only the stillest stretches count",)
+        notes = (
+            Note(
+                "detectors.low_band.noise",
+                "the IMU's stated noise is too large to tell stops by it: only the stillest stretches count",
+            ),
+        )
     if label.sum() * period >= _MOVING:
         # some of these windows may be mislabelled; the threshold keeps clear of the others
         start = min(start, max(float(np.quantile(x[label], MISTAKEN)) - np.log10(2.0), start - _DOWN))

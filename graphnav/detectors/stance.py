@@ -30,6 +30,7 @@ import numpy as np
 
 from graphnav.config.detectors import FUSED, StanceSettings
 from graphnav.core import rotation
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, merge_spans, spans_of, union
 from graphnav.detectors.glrt import glrt_statistic
@@ -54,7 +55,9 @@ def detect_stances(imu: Imu, period: float, settings: StanceSettings, which: Seq
     """
     window = max(3, round(settings.window / period))
     if len(imu.t) < window:
-        return Detections(NONE, (), ("no detection: the recording is shorter than a window",))
+        return Detections(
+            NONE, (), (Note("detectors.too_short", "no detection: the recording is shorter than a window"),)
+        )
     bias, g = _quietest(imu, period)
     found: list[Detection] = []
     kept, notes = [], []
@@ -65,7 +68,11 @@ def detect_stances(imu: Imu, period: float, settings: StanceSettings, which: Seq
         deep = one.intervals[_as_deep_as_others(one.intervals, one.t, one.statistic, settings.threshold)]
         if len(deep) < len(one.intervals):
             notes.append(
-                f"{len(one.intervals) - len(deep)} short lulls that do not reach as deep as the stances were left out"
+                Note(
+                    "detectors.stance.lulls",
+                    f"{len(one.intervals) - len(deep)} short lulls that do not reach as deep as the stances were left "
+                    "out",
+                )
             )
         kept.append(_without_sliding(deep, imu, one.t, one.statistic, bias, settings.threshold * _REACH))
     if not found:

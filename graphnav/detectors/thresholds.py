@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import within
 from graphnav.detectors.scene import Scene
@@ -95,7 +96,12 @@ def own_threshold(
         return float(np.clip(0.5 * 10.0 ** np.quantile(x[moves], MISTAKEN), least, most)), ()
     if scene.known:
         return most, ()
-    return least, (f"{name}: nothing tells standing from moving windows, so only its sensors' noise counts as rest",)
+    return least, (
+        Note(
+            "detectors.threshold",
+            f"{name}: nothing tells standing from moving windows, so only its sensors' noise counts as rest",
+        ),
+    )
 
 
 def fewest_errors(still: Array, moving: Array, least: float) -> tuple[float, float]:

@@ -56,12 +56,15 @@ class Antenna:
         stated = ", ".join(f"{x:.2f}" for x in self.stated)
         if self.agrees:
             return Finding(
-                "note", f"antenna: the drive finds it at [{found}] m, which agrees with [{stated}] as stated"
+                "note",
+                f"antenna: the drive finds it at [{found}] m, which agrees with [{stated}] as stated",
+                "gnss.lever_arm_agrees",
             )
         return Finding(
             "warning",
             f"antenna: the drive finds it at [{found}] m and not at [{stated}] as stated: look at lever_arm in [gnss] "
             "(right, forward, up of the IMU) and its signs, or let gnss.lever_arm_sigma estimate it",
+            "gnss.lever_arm",
         )
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
@@ -44,8 +45,12 @@ def describe_faults(faults: tuple[ExcludedSpan, ...], problem: Problem) -> tuple
             longest = max(own, key=lambda f: f.t_end - f.t_start)
             begin = longest.t_start - problem.recording.start
             out.append(
-                f"{rows.name}: {sum(f.count for f in own)} of {len(rows)} are wrong and left out, in {len(own)} spans; "
-                f"the longest, from {begin:.1f} s for {longest.t_end - longest.t_start:.1f} s, is {longest.reason}"
+                Note(
+                    "gnss.excluded",
+                    f"{rows.name}: {sum(f.count for f in own)} of {len(rows)} are wrong and left out, in {len(own)} "
+                    "spans; "
+                    f"the longest, from {begin:.1f} s for {longest.t_end - longest.t_start:.1f} s, is {longest.reason}",
+                )
             )
     return tuple(out)
 

@@ -18,7 +18,9 @@ from graphnav.constraints.base import Constraint
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError, EstimationError
+from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, listening, tell
+from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation import faults
@@ -27,6 +29,7 @@ from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.preparation import prepare, start_sigma
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.separation import separation
 from graphnav.estimation.solution import Solution, join_solutions
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import backward, rts
@@ -127,7 +130,7 @@ def _run(
         except EstimationError as error:
             if len(pieces) == 1:
                 raise
-            notes.append(f"{_span(recording, piece)} left out: {error}")
+            notes.append(Note("pieces.left_out", f"{_span(recording, piece)} left out: {error}"))
     if not found:
         raise EstimationError(f"'{recording.name}': no piece between its IMU gaps can be solved")
     return {name: join_solutions([one[name] for one in found], tuple(notes)) for name in solvers}
@@ -149,7 +152,7 @@ def _solve_with_retry(
             raise
         still = settings.standstill.model_copy(update={"held_position": False})
         again = _solve(recording, settings.model_copy(update={"standstill": still}), frame, solvers, progress, noise)
-        note = f"places of stops are not held: with them, {error}"
+        note = Note("standstill.not_held", f"places of stops are not held: with them, {error}")
         return {name: replace(one, notes=(note, *one.notes)) for name, one in again.items()}
 
 
@@ -210,9 +213,18 @@ def _solve(
         out["isam2"] = one = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin).settled
         best = cost_at(problem, smoothed)
         if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY:
-            note = "isam2 ended in an optimum that explains the data worse than rts does: do not trust it"
-            out["isam2"] = replace(one, notes=(f"{note} (half chi-square {one.cost:.0f}, not {best:.0f})", *one.notes))
+            note = Note(
+                "solver.worse_optimum",
+                "isam2 ended in an optimum that explains the data worse than rts does: do not trust it "
+                f"(half chi-square {one.cost:.0f}, not {best:.0f})",
+            )
+            out["isam2"] = replace(one, notes=(note, *one.notes))
     timings = {"detection": detection, **found.timings}
+    place = BLOCKS["p"]
+    apart = separation(
+        frame, problem.t, forward.solution.states.p, forward.solution.covariance[:, place, place],
+        smoothed.states.p, smoothed.P[:, place, place],
+    )  # fmt: skip
     return {
         name: replace(
             out[name],
@@ -222,6 +234,7 @@ def _solve(
             noise=found.noise,
             graphs=(_graph_of(problem, out[name]),),
             passes=dict(passes),
+            separation=apart,
             timings={k: timings.get(k, 0.0) + out[name].timings.get(k, 0.0) for k in (*timings, *out[name].timings)},
         )
         for name in solvers
@@ -256,7 +269,12 @@ def fitting(recording: Recording, settings: Settings) -> list[str]:
             f"profile '{profile}': but '{recording.name}' says platform = \"{recording.platform}\"; change one of them"
         )
     if profile == "car+odometer" and recording.odometer is None:
-        return [f"profile '{profile}': there is no odometer in '{recording.name}', so it is solved without"]
+        return [
+            Note(
+                "settings.no_odometer",
+                f"profile '{profile}': there is no odometer in '{recording.name}', so it is solved without",
+            )
+        ]
     return []
 
 
@@ -275,8 +293,12 @@ def _pieces(recording: Recording, settings: Settings) -> tuple[list[Recording], 
     cuts = np.flatnonzero(np.diff(t) > settings.keyframes.bridge)
     if not len(cuts):
         return [recording], []
-    notes = [
-        f"IMU gap of {t[i + 1] - t[i]:.1f} s at {t[i] - recording.start:.1f} s: cut there, the parts are solved apart"
+    notes: list[str] = [
+        Note(
+            "pieces.cut",
+            f"IMU gap of {t[i + 1] - t[i]:.1f} s at {t[i] - recording.start:.1f} s: cut there, the parts are solved "
+            "apart",
+        )
         for i in cuts
     ]
     edges = np.concatenate([[-1], cuts, [len(t) - 1]])
@@ -284,7 +306,11 @@ def _pieces(recording: Recording, settings: Settings) -> tuple[list[Recording], 
     for lo, hi in itertools.pairwise(edges):
         begin, end = t[lo + 1] - recording.start, t[hi] - recording.start
         if end - begin < _SHORTEST:
-            notes.append(f"{begin:.1f} to {end:.1f} s left out: too short between two gaps to be aligned")
+            notes.append(
+                Note(
+                    "pieces.too_short", f"{begin:.1f} to {end:.1f} s left out: too short between two gaps to be aligned"
+                )
+            )
         else:
             pieces.append(recording.crop(begin - 1e-9, end + 1e-9))
     return pieces, notes

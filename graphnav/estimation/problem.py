@@ -13,6 +13,7 @@ from graphnav.constraints import kinds_for
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core.earth import LocalFrame
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, Parameter, States
 from graphnav.imu.clipping import with_whole_peaks
@@ -229,7 +230,10 @@ def _notes(samples: Samples, recording: Recording) -> tuple[str, ...]:
     length = samples.bridged[:, 1] - samples.bridged[:, 0]
     worst = int(np.argmax(length))
     return (
-        f"{len(length)} gaps in the IMU bridged ({length.sum():.2f} s in all, longest {length[worst]:.2f} s at "
-        f"{samples.bridged[worst, 0] - recording.start:.1f} s): uncertainty grows there by what the signal usually "
-        "changes in such a time",
+        Note(
+            "imu.gaps_bridged",
+            f"{len(length)} gaps in the IMU bridged ({length.sum():.2f} s in all, longest {length[worst]:.2f} s at "
+            f"{samples.bridged[worst, 0] - recording.start:.1f} s): uncertainty grows there by what the signal usually "
+            "changes in such a time",
+        ),
     )

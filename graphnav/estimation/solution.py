@@ -85,6 +85,15 @@ class ExcludedSpan:
 
 
 @dataclass(frozen=True)
+class Separation:
+    """Position of the forward filter less that of what comes after each keyframe (`graphnav.estimation.separation`)."""
+
+    t: Array  # (K,) s
+    value: Array  # (K, 3) m, east, north, up; NaN where what comes after tells nothing
+    sigma: Array  # (K, 3) m, 1-sigma of `value`
+
+
+@dataclass(frozen=True)
 class Solution:
     """One solver's answer. Covariance blocks are of the error state of `graphnav.core.state`, (K, 15, 15)."""
 
@@ -106,6 +115,7 @@ class Solution:
     noise: NoiseModel = STATED  # that all solvers used
     passes: Mapping[str, int] = field(default_factory=dict)  # over all keyframes, before the solver's own
     graphs: tuple[Callable[[], tuple[Any, Any]], ...] = ()  # makes what `to_gtsam` gives, for each piece
+    separation: Separation | None = None  # of the filter and its smoother, the same for all solvers
     between: tuple[Between, ...] = ()  # gives states between keyframes, one for each piece of the recording
 
     @property
@@ -134,14 +144,36 @@ class Solution:
         return self.graphs[piece]()
 
     def trajectory(self, rate: float | None = None) -> Trajectory:
-        """In geodetic coordinates and local axes, with 9 x 9 covariances: at the keyframes, or at `rate` (Hz)."""
+        """The solution in geodetic coordinates and local axes.
+
+        Parameters
+        ----------
+        rate
+            Hz, from the IMU's samples between the keyframes; at the keyframes when None.
+
+        Returns
+        -------
+        Trajectory
+            Of the IMU, with (K, 9, 9) covariances of position (m), velocity (m/s) and roll, pitch, heading (rad).
+        """
         t, states, covariance = self.t, self.states, self.covariance
         if rate is not None:
             t, states, covariance = self.at(np.concatenate([b.times(rate) for b in self.between]))
         return to_trajectory(self.solver, self.frame, t, states, covariance)
 
     def blocks(self, rate: float | None = None) -> Iterator[Trajectory]:
-        """`trajectory` in parts, one behind the other, so that only one of them need be in memory."""
+        """`trajectory` in parts, one behind the other, so that only one of them need be in memory.
+
+        Parameters
+        ----------
+        rate
+            As for `trajectory`.
+
+        Returns
+        -------
+        iterator of Trajectory
+            Of 4096 rows at most each; a single part at the keyframes.
+        """
         if rate is None:
             yield self.trajectory()
             return
@@ -152,7 +184,22 @@ class Solution:
                 yield to_trajectory(self.solver, self.frame, t, *piece(t, _OUT))
 
     def at(self, t: Array) -> tuple[Array, States, Array]:
-        """Times (M,), states and covariances (M, 15, 15) at ascending times; those in no piece are left out."""
+        """States between the keyframes.
+
+        Parameters
+        ----------
+        t
+            (N,) s, ascending.
+
+        Returns
+        -------
+        times : array
+            (M,) s, those of `t` that lie in a piece of the recording.
+        states : States
+            M states in the navigation frame.
+        covariance : array
+            (M, 15, 15) of the error state of `graphnav.core.state`.
+        """
         parts = []
         for piece in self.between:
             inside = t[(t >= piece.start) & (t <= piece.end)]
@@ -224,6 +271,7 @@ def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Soluti
         noise=_noise_of_all([p.noise for p in parts]),
         passes=_add_counts([dict(p.passes) for p in parts]),
         graphs=tuple(g for p in parts for g in p.graphs),
+        separation=_separation_of_all([p.separation for p in parts]),
         between=tuple(b for p in parts for b in p.between),
     )
 
@@ -237,6 +285,13 @@ def _noise_of_all(parts: list[NoiseModel]) -> NoiseModel:
     names = dict.fromkeys(key for part in parts for key in part.excluded)
     excluded = {name: tuple(span for part in parts for span in part.excluded.get(name, ())) for name in names}
     return replace(parts[0], weights=weights, excluded=excluded)
+
+
+def _separation_of_all(parts: list[Separation | None]) -> Separation | None:
+    known = [part for part in parts if part is not None]
+    if not known:
+        return None
+    return Separation(*(np.concatenate([getattr(part, name) for part in known]) for name in ("t", "value", "sigma")))
 
 
 def _add_counts(tables: list[dict[str, Any]]) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import fit_yaw, interpolate, place_on_earth
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.core.timescales import LEAP, NEAR, between_clocks
@@ -91,7 +92,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
     notes = list(track.notes)
     if asked.shift is not None:
         track = replace(track, t=track.t + asked.shift)
-        notes.append(f"{asked.path.name}: {asked.shift:+g} s, as was asked")
+        notes.append(Note("against.shift", f"{asked.path.name}: {asked.shift:+g} s, as was asked"))
     else:
         shift, words = _shift(asked.path, track, recording, reference)
         track = replace(track, t=track.t + shift)
@@ -107,7 +108,12 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         at = track.t[inside]
         yaw, offset = fit_yaw(track.llh[inside], reference.at(at)[1].p)
         track = place_on_earth(track, reference.frame, yaw, offset)
-        notes.append(f"{asked.path.name}: metres of a frame of its own, turned by {np.degrees(yaw):.1f} deg onto ours")
+        notes.append(
+            Note(
+                "against.frame",
+                f"{asked.path.name}: metres of a frame of its own, turned by {np.degrees(yaw):.1f} deg onto ours",
+            )
+        )
     arm = asked.point
     if isinstance(arm, str):
         stated = antenna_lever_arm(recording, reference) if arm == "antenna" else np.zeros(3)
@@ -117,11 +123,16 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
     borrowed = track.rph is None
     if borrowed:
         track = _with_attitude(track, reference)
-        notes.append(f"{asked.path.name}: has no attitude; points of the body are placed by that of {reference.solver}")
+        notes.append(
+            Note(
+                "against.no_attitude",
+                f"{asked.path.name}: has no attitude; points of the body are placed by that of {reference.solver}",
+            )
+        )
     if np.any(arm):
         track = interpolate(track, track.t, max_gap=_MAX_GAP, lever_arm=-arm)[0]
         said = ", ".join(f"{x:.2f}" for x in arm)
-        notes.append(f"{asked.path.name}: moved to the IMU from [{said}] m (right, forward, up)")
+        notes.append(Note("against.point", f"{asked.path.name}: moved to the IMU from [{said}] m (right, forward, up)"))
     track = replace(track, name=name)
     _, known = interpolate(track, reference.t, max_gap=_MAX_GAP)
     t = reference.t[known]
@@ -134,23 +145,33 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
     """What to add to the stamps of a trajectory, s, and why."""
     known = between_clocks(recording.start, recording.gps_zero, float(track.t[0]), None)
     own_start = recording.start - float(track.t[0])
+    notes: list[str] = []
     if track.t[-1] > recording.start and track.t[0] < recording.end:
-        shift, notes = 0.0, []
+        shift = 0.0
     elif known is not None and abs(track.t[0] + known.offset - recording.start) < NEAR:
-        shift, notes = known.offset, [f"{path.name}: {known.offset:+.0f} s: {known.words}"]
+        shift, notes = known.offset, [Note("against.clock", f"{path.name}: {known.offset:+.0f} s: {known.words}")]
     elif abs(track.t[0]) < NEAR:
-        shift, notes = own_start, [f"{path.name}: {own_start:+.3f} s: it counts from a start of its own"]
+        shift, notes = (
+            own_start,
+            [Note("against.clock", f"{path.name}: {own_start:+.3f} s: it counts from a start of its own")],
+        )
     else:
         return 0.0, []  # said by the caller
     late = _late(replace(track, t=track.t + shift), reference)
     if late is None or abs(late) < 0.02:
         return shift, notes
     if abs(late) < _APPLIED and shift != own_start:
-        return shift, [*notes, f"{path.name}: its speed is {-late:+.3f} s late against ours: left as it is"]
+        return shift, [
+            *notes,
+            Note("against.late", f"{path.name}: its speed is {-late:+.3f} s late against ours: left as it is"),
+        ]
     leap = ""
     if abs(abs(late) - LEAP) < 0.1:
         late, leap = float(np.copysign(LEAP, late)), ": the leap seconds between UTC and GPS time"
-    return shift + late, [*notes, f"{path.name}: {late:+.3f} s more, by which its speed fits ours{leap}"]
+    return shift + late, [
+        *notes,
+        Note("against.late", f"{path.name}: {late:+.3f} s more, by which its speed fits ours{leap}"),
+    ]
 
 
 def _late(track: Trajectory, reference: Solution) -> float | None:

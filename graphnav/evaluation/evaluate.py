@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import GPS_TO_UNIX, LEAP
 from graphnav.core.trajectory import Trajectory
@@ -97,7 +98,7 @@ def withheld_truth(
     truth = Trajectory(
         gnss.t[mask], gnss.llh[mask], v=None if gnss.v is None else gnss.v[mask], sd_p=gnss.sd[mask],
         sd_v=None if gnss.sd_v is None else gnss.sd_v[mask], name="withheld GNSS",
-        notes=("the truth is the withheld GNSS itself",),
+        notes=(Note("truth.withheld_gnss", "the truth is the withheld GNSS itself"),),
     )  # fmt: skip
     return truth, gnss.lever_arm
 
@@ -110,18 +111,38 @@ def evaluate_recording(
     max_gap: float = MAX_GAP,
     at: Array | None = None,
 ) -> Metrics | None:
-    """Metrics of a solution of `recording` (the full one, nothing withheld) against the best truth there is.
+    """Metrics of a solution against the best truth there is: the recording's own, a closed loop, or the withheld GNSS.
 
-    That is the recording's own truth, or the end being the start, or the GNSS that was withheld; None if
-    there is none of these. `withheld` holds (source, span in s from the start or None) as given to
-    `Recording.without`; each span of GNSS is reported by itself. `at` is that of `errors`.
+    Parameters
+    ----------
+    trajectory
+        Of the IMU.
+    recording
+        The full one, nothing withheld.
+    withheld
+        (source, span in s from the start or None) as given to `Recording.without`; each span of GNSS is scored by
+        itself.
+    max_gap
+        s, between neighbouring rows that are interpolated.
+    at
+        (N,) s, epochs to compare at; those of the sparser of both when None.
+
+    Returns
+    -------
+    Metrics or None
+        None where there is nothing to compare with.
+
+    Raises
+    ------
+    RecordingError
+        If the two share no epoch.
     """
     gnss_spans = [span for source, span in withheld if source == "gnss"]
     spans = [span for span in gnss_spans if span is not None]
     found = truth_of(recording)
     if found is None and recording.truth is not None and recording.truth.closed_loop_sigma is not None:
         sigma = recording.truth.closed_loop_sigma
-        note = f"the only truth is that the end is the start, to {sigma:g} m"
+        note = Note("truth.closed_loop", f"the only truth is that the end is the start, to {sigma:g} m")
         return Metrics(trajectory.name, closure=closure(trajectory), notes=(*trajectory.notes, note))
     if found is None and gnss_spans and recording.gnss is not None:
         found = withheld_truth(recording, "gnss", gnss_spans)
@@ -143,8 +164,23 @@ def evaluate(
 ) -> Metrics:
     """Metrics of one file against another, each of any kind `read_trajectory` knows.
 
-    `truth_path` may also be a recording (a folder or a .toml), whose truth and lever arm are then used.
-    `spans` are in s on the files' clock.
+    Parameters
+    ----------
+    trajectory_path
+        The estimate.
+    truth_path
+        The truth, or a recording (a folder or a .toml), whose truth and lever arm are then used.
+    lever_arm
+        (3,) m from the estimate's point to the truth's, right, forward, up; that of the recording when None.
+    spans
+        s on the files' clock, each scored by itself.
+    max_gap
+        s, between neighbouring rows that are interpolated.
+
+    Returns
+    -------
+    Metrics
+        Errors in the local east, north and up at the epochs of the sparser of both.
 
     Raises
     ------
@@ -213,7 +249,11 @@ def _leap_hint(
         after = float(np.sqrt(np.nanmean(moved.horizontal**2)))
         if len(moved) > 0.5 * len(found) and after < 0.2 * before:
             return (
-                f"shifted by {shift:+.0f} s the horizontal error would fall from {before:.2f} to {after:.2f} m rms: "
-                "one file may be in UTC and the other in GPS time",
+                Note(
+                    "truth.leap_seconds",
+                    f"shifted by {shift:+.0f} s the horizontal error would fall from {before:.2f} to {after:.2f} m "
+                    "rms: "
+                    "one file may be in UTC and the other in GPS time",
+                ),
             )
     return ()

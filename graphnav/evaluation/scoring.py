@@ -10,6 +10,7 @@ from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame, enu_axes, llh_to_ecef
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import fit_yaw, full_covariance, interpolate, place_on_earth
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.evaluation.fitted import after_fit
@@ -59,11 +60,26 @@ def errors(
         lever_arm = None
     if lever_arm is not None and trajectory.rph is None:
         arm = float(np.linalg.norm(lever_arm))
-        notes.append(f"the estimate has no attitude, so the lever arm of {arm:.2f} m to the truth's point is left out")
+        notes.append(
+            Note(
+                "truth.lever_arm",
+                f"the estimate has no attitude, so the lever arm of {arm:.2f} m to the truth's point is left out",
+            )
+        )
     elif lever_arm is not None and trajectory.covariance is None and trajectory.sd_rph is None:
-        notes.append("the estimate has no attitude sigma, so the lever arm adds nothing to its position sigma")
+        notes.append(
+            Note(
+                "truth.lever_arm_sigma",
+                "the estimate has no attitude sigma, so the lever arm adds nothing to its position sigma",
+            )
+        )
     if trajectory.covariance is None and trajectory.sd_p is not None:
-        notes.append("NEES from the sigmas alone: the estimate comes without correlations between axes")
+        notes.append(
+            Note(
+                "nees.no_correlations",
+                "NEES from the sigmas alone: the estimate comes without correlations between axes",
+            )
+        )
     flat = truth.frame == "local" and bool(np.isnan(truth.llh[:, 2]).all())
     fitted = "local" in (trajectory.frame, truth.frame)
     from_start = fitted and (trajectory.frame == "local" if from_start is None else from_start)
@@ -71,7 +87,11 @@ def errors(
         trajectory, truth = _fit(trajectory, truth, lever_arm, max_gap, at, notes)
     estimate, seen, travel, epochs = _pair(trajectory, truth, lever_arm, max_gap, at)
     if _spacing(truth) < _spacing(trajectory) if at is None else _lie_apart(seen.t, truth.t):
-        notes.append("compared at the estimate's own epochs, to which the denser truth is interpolated")
+        notes.append(
+            Note(
+                "truth.interpolated", "compared at the estimate's own epochs, to which the denser truth is interpolated"
+            )
+        )
 
     R_le = enu_axes(seen.llh)
     p = np.einsum("kij,kj->ki", R_le, llh_to_ecef(estimate.llh) - llh_to_ecef(seen.llh))
@@ -100,7 +120,9 @@ def errors(
     with np.errstate(divide="ignore", invalid="ignore"):
         per_axis = p**2 / np.diagonal(cov, axis1=-2, axis2=-1)[:, :3]
     if truth.v is None:
-        notes.append("the truth has no velocity: its direction of travel is taken from its positions")
+        notes.append(
+            Note("truth.no_velocity", "the truth has no velocity: its direction of travel is taken from its positions")
+        )
     speed = np.linalg.norm(travel, axis=1)
     moving = speed > _SLOW
     along = np.where(moving[:, None], travel / np.where(moving, speed, 1.0)[:, None], np.nan)
@@ -172,8 +194,12 @@ def _fit(
         )
     yaw, offset = fit_yaw(source, target)
     notes.append(
-        f"{'truth' if truth_is_local else 'estimate'} in a local frame: fitted by {np.rad2deg(yaw):.2f} deg of yaw and "
-        f"an offset over {len(source)} epochs before scoring"
+        Note(
+            "truth.fitted",
+            f"{'truth' if truth_is_local else 'estimate'} in a local frame: fitted by {np.rad2deg(yaw):.2f} deg of "
+            "yaw and "
+            f"an offset over {len(source)} epochs before scoring",
+        )
     )
     if truth_is_local:
         if np.isnan(offset[2]):
@@ -187,11 +213,21 @@ def _fit(
 def _of_the_rest(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
     """The covariance (N, 9, 9) of what a fit leaves of errors that count from the estimate's own start."""
     if not np.isfinite(cov).all():
-        notes.append("NEES leaves the fit out of account: there is no covariance of place and heading at every epoch")
+        notes.append(
+            Note(
+                "nees.fit_unknown",
+                "NEES leaves the fit out of account: there is no covariance of place and heading at every epoch",
+            )
+        )
         return cov
     rest, larger = after_fit(cov, LocalFrame(estimate.llh[0]).from_llh(estimate.llh), estimate.v)
     by = f", which takes sigmas {larger:.2f} times as large as stated" if larger > _LARGER else ""
-    notes.append(f"NEES is of what the fit leaves, errors of place and heading taken to last as in dead reckoning{by}")
+    notes.append(
+        Note(
+            "nees.after_fit",
+            f"NEES is of what the fit leaves, errors of place and heading taken to last as in dead reckoning{by}",
+        )
+    )
     return rest
 
 

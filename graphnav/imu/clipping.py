@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.imu.samples import Samples
 from graphnav.recording import Imu
@@ -128,8 +129,12 @@ def with_whole_peaks(samples: Samples, R_bs: Array, known: Array | None = None) 
                 extra[rows] += (_DOUBT * added) ** 2 / T.sum()
                 x[rows, axis] = p.values
             notes.append(
-                f"{what} {'xyz'[axis]} (file axes) ends at {limit:.3g} {unit}: {len(peaks)} peaks were cut off and put "
-                "back by their sides"
+                Note(
+                    "imu.clipped",
+                    f"{what} {'xyz'[axis]} (file axes) ends at {limit:.3g} {unit}: {len(peaks)} peaks were cut off "
+                    "and put "
+                    "back by their sides",
+                )
             )
         if cut:
             x = x @ R_bs.T

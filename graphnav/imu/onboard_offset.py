@@ -22,6 +22,7 @@ from dataclasses import replace
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.sample_size import effective_size
 from graphnav.recording import Imu, Recording
@@ -46,7 +47,10 @@ def without_onboard_offset(recording: Recording, settings: Settings) -> tuple[Re
     if evidence(imu, offset) < 2.0 * np.log(_ODDS):
         return recording, ()
     most = 1e3 * float(np.abs(offset).max())
-    said = f"the unit corrected its gyro's offset while it rested, by up to {most:.1f} mrad/s: undone"
+    said = Note(
+        "imu.onboard_offset",
+        f"the unit corrected its gyro's offset while it rested, by up to {most:.1f} mrad/s: undone",
+    )
     return replace(recording, imu=replace(imu, gyro=imu.gyro + offset)), (said,)
 
 

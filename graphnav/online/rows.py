@@ -156,7 +156,13 @@ def live_setup(
     antenna, axle : (3,) m from the IMU to the antenna and to the point that does not slip, right, forward, up; None
         where there is no GNSS, no odometer.
     platform : "vehicle" or "foot".
+    name : of the recording.
     sensors : others that there are, without rows: ``SENSOR.series([], {}, sigma=0.3)``.
+
+    Returns
+    -------
+    Recording
+        Without rows.
 
     Raises
     ------
@@ -174,7 +180,18 @@ def live_setup(
 
 
 def live_trajectory(online: Online) -> Trajectory | None:
-    """The state at the newest IMU row as a trajectory of one row; None while aligning."""
+    """The state at the newest IMU row.
+
+    Parameters
+    ----------
+    online
+        The smoother.
+
+    Returns
+    -------
+    Trajectory or None
+        Of one row, in geodetic coordinates and local axes with its covariance; None while aligning.
+    """
     now = online.live()
     if now is None or online.frame is None:
         return None

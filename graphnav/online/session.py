@@ -8,6 +8,7 @@ from pathlib import Path
 
 from graphnav.config import Settings
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import key_of
 from graphnav.core.trajectory import Trajectory
 from graphnav.online.lines import END, row_of, setup_of
 from graphnav.online.sensors import Row, rows_of, without_rows
@@ -132,6 +133,7 @@ class Session:
                 {"kind": f.kind, "from_s": f.t_start, "to_s": f.t_end, "count": f.count} for f in online.excluded
             ],
             "notes": online.notes,
+            "messages": [{"key": key_of(note), "sentence": note} for note in online.notes],
             "lag_s": self.settings.solver.lag,
         }
 

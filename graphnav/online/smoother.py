@@ -14,6 +14,7 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
+from graphnav.core.notes import Note
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import Alignment, align, ready, with_known_heading
@@ -165,7 +166,7 @@ class Smoother:
             try:
                 self._align(last=True)
             except EstimationError as error:
-                self.notes.append(str(error))
+                self.notes.append(Note("online.not_aligned", str(error)))
         if self.tracker is not None:
             self._judged_at_last()
             self._advance(self.tracker, last=True)
@@ -201,7 +202,7 @@ class Smoother:
         except EstimationError as error:
             if last:
                 raise
-            self.notes.append(f"not aligned at {now:.1f} s: {error}")
+            self.notes.append(Note("online.not_aligned", f"not aligned at {now:.1f} s: {error}"))
             self._wait(now)
             return
         tracker = self.tracker = self._track(found, recording.start, STATED)
@@ -260,7 +261,7 @@ class Smoother:
         try:
             found = judgement.answer()
         except Exception as error:
-            self.notes.append(f"not judged again: {error}")
+            self.notes.append(Note("online.not_judged", f"not judged again: {error}"))
             self._tentative = False
             return
         self._say(found.notes)
@@ -292,7 +293,7 @@ class Smoother:
     def _restart(self, before: float, why: str) -> None:
         """What was up to a time (s) settles as it is, and an alignment begins anew."""
         sensors = self.sensors
-        self.notes.append(f"{why}: aligning anew")
+        self.notes.append(Note("online.anew", f"{why}: aligning anew"))
         after = sensors.imu.rows[sensors.imu.t > before].copy()
         later = {name: buffer.rows.copy() for name, buffer in sensors.aiding.items()}
         if self.tracker is not None:

@@ -6,6 +6,7 @@ import traceback
 from pathlib import Path
 
 from graphnav.config import Settings, settings_from
+from graphnav.core.notes import Note
 from graphnav.online.sensors import Row
 from graphnav.online.smoother import Smoother
 from graphnav.recording import Recording
@@ -64,8 +65,11 @@ class Online(Smoother):
         self.failures = [*self.failures[-_MOST:], said]
         since = self._last_settled
         self.notes.append(
-            f"at {now:.3f} s the smoother failed ({type(error).__name__}); what had not settled"
-            f"{f' since {since:.3f} s' if since > -1e300 else ''} is lost: aligning anew"
+            Note(
+                "online.failed",
+                f"at {now:.3f} s the smoother failed ({type(error).__name__}); what had not settled"
+                f"{f' since {since:.3f} s' if since > -1e300 else ''} is lost: aligning anew",
+            )
         )
         self.tracker = None
         self._begin_anew(now)
@@ -76,7 +80,12 @@ class Online(Smoother):
         rows, sensors.set_back = sensors.set_back, []
         first = next(t for sensor, t, _ in rows if sensor == "imu")
         before = sensors.imu.newest
-        self.notes.append(f"the clock of the IMU was set back from {before:.3f} to {first:.3f} s: aligning anew")
+        self.notes.append(
+            Note(
+                "online.clock_back",
+                f"the clock of the IMU was set back from {before:.3f} to {first:.3f} s: aligning anew",
+            )
+        )
         self.finish()  # no more rows of the old clock will come
         self._faults = self.excluded
         self.clocks += 1

@@ -63,6 +63,7 @@ class Gnss:
     type: NDArray[np.intp] | None = None  # (M,) of FIX_TYPES; None: no fix says of what type it is
     type_assumed: bool = False  # True when they are a CSV file's numbers, which were taken for RTKLIB's
     derived: bool = False  # single-point positions computed from the recording's own raw observations
+    satellites: Array | None = None  # (M,) used in each fix, NaN where unknown; only shown
 
     @property
     def types(self) -> dict[str, int]:
@@ -73,9 +74,19 @@ class Gnss:
 
 
 def fix_types(said: Array, numbers: dict[int, int] | None = None) -> NDArray[np.intp] | None:
-    """Types (N,) of what a log says, by its own numbers -> those of `FIX_TYPES`; None if it says nothing anywhere.
+    """Types of fixes by the numbers of `FIX_TYPES`.
 
-    Without `numbers` they are those of `FIX_TYPES`. Blanks (NaN) and numbers that mean none are 0.
+    Parameters
+    ----------
+    said
+        (N,) what a log says, NaN where it is blank.
+    numbers
+        The log's own numbers -> those of `FIX_TYPES`; these when None.
+
+    Returns
+    -------
+    array of int or None
+        (N,), 0 where a number is blank or means no type; None if no fix says its type.
     """
     numbers = {k: k for k in FIX_TYPES} if numbers is None else numbers
     found = np.zeros(len(said), dtype=np.intp)
@@ -172,7 +183,19 @@ class Recording:
         return coupling == "tight" or self.gnss is None or self.gnss.derived
 
     def without(self, source: str, span: tuple[float, float] | None = None) -> Recording:
-        """The recording with one source withheld, in a span in seconds from the start or throughout.
+        """The recording with one source withheld.
+
+        Parameters
+        ----------
+        source
+            "gnss" or "odometer".
+        span
+            s from the start; all of it when None.
+
+        Returns
+        -------
+        Recording
+            The same without those rows; without the sensor where `span` is None.
 
         Raises
         ------
@@ -199,7 +222,23 @@ class Recording:
         return replace(self, **changed)
 
     def crop(self, start: float | None = None, end: float | None = None) -> Recording:
-        """The part between two times in seconds from the start; the clock keeps its epoch."""
+        """A part of the recording; the clock keeps its epoch.
+
+        Parameters
+        ----------
+        start, end
+            s from the start of the recording; to its ends when None.
+
+        Returns
+        -------
+        Recording
+            With the rows between; a loop's truth is left out, as a part of a loop is none.
+
+        Raises
+        ------
+        RecordingError
+            If fewer than two rows of the IMU are left.
+        """
         if start is None and end is None:
             return self
         lo = -np.inf if start is None else self.start + start
@@ -229,7 +268,20 @@ def sources() -> tuple[str, ...]:
 
 
 def rows_of(sensor: Any, mask: NDArray[np.bool_]) -> Any:
-    """A sensor with only the rows of `mask`."""
+    """Some rows of a sensor.
+
+    Parameters
+    ----------
+    sensor
+        An `Imu`, `Gnss`, `Odometer` or the like.
+    mask
+        (N,) bool, which rows.
+
+    Returns
+    -------
+    The same kind of sensor
+        All its arrays by row cut; lever arms and axes as they are.
+    """
     parts = {
         key: value[mask]
         for key, value in sensor.__dict__.items()

@@ -40,8 +40,8 @@ def _page(recording: Recording, found: Detections) -> str:
     ]
     lead = [page.paragraph(line) for line in _words(recording, found)]
     sections = [
-        ("What they saw", [page.gallery(report_pictures.detection_pictures(recording, found.all))]),
-        ("Where it stands", [page.table(["from", "to", "for", "share by detector"], rows)] if rows else []),
+        ("Statistics", [page.gallery(report_pictures.detection_pictures(recording, found.all))]),
+        ("Stationary intervals", [page.table(["from", "to", "for", "share by detector"], rows)] if rows else []),
         ("Notes", [page.bullets(found.notes)] if found.notes else []),
     ]
     return page.page(f"{recording.name}: detectors", lead, sections)

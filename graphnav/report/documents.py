@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,6 +64,8 @@ def write_report(
     spans = _shades(solution, start, withheld, outages)
     if detectors is None:
         detectors = detector_pictures(recording, solution)
+    if recording.gnss is None and recording.raw_gnss is None:  # what comes after knows no place of its own
+        solution = replace(solution, separation=None)
     own, others = ({k: p for k, p in solution.parameters.items() if has_names(k) == of_it} for of_it in (True, False))
     sections: Sections = [
         (
@@ -82,8 +85,17 @@ def write_report(
                 *_gallery(pictures.error_pictures(every, start, end, spans)),
             ],
         ),
-        ("Can sigma be believed?", [*_verdicts(only, every), *_consistency(every, start, end, spans)]),
-        ("Uncertainty", _gallery(pictures.sigma_pictures({name: solution.trajectory()}, start, end, spans))),
+        ("Consistency of sigma", [*_verdicts(only, every), *_consistency(every, start, end, spans)]),
+        (
+            "Uncertainty",
+            _gallery(
+                [
+                    *pictures.sigma_pictures({name: solution.trajectory()}, start, end, spans),
+                    *pictures.separation_pictures(solution, start, end, spans),
+                    *pictures.quality_pictures(recording, solution, spans),
+                ]
+            ),
+        ),
         (
             "Calibration",
             [
@@ -120,8 +132,8 @@ def write_report(
             ],
         ),
         ("Detectors", [*_gallery(detectors), *tables.stop_table(solution, start)]),
-        ("What was odd", tables.odd(recording, findings)),
-        ("How it ran", tables.run_table(only)),
+        ("Findings", tables.odd(recording, findings)),
+        ("Run", tables.run_table(only)),
         ("Provenance", provenance_tables(settings, provenance)),
     ]
     lead = [
@@ -132,7 +144,8 @@ def write_report(
         words.tiles(recording, only, every),
         *summary.links(beside),
         *summary.fix_table(recording, solution, withheld),
-        page.columns(["".join(summary.sigma_table(solution)), "".join(summary.left_out(solution, start))]),
+        page.columns(["".join(summary.sigma_table(solution)), "".join(summary.separation_table(solution))]),
+        *summary.left_out(solution, start),
     ]
     return _write(path, page.page(f"{recording.name}: {name}", lead, sections, _clocks(recording)))
 
@@ -183,13 +196,13 @@ def write_comparison(
             ],
         ),
         ("Errors against truth", _gallery(pictures.error_pictures(every, start, end, spans))),
-        ("Where they differ", _gallery(pictures.difference_pictures(solutions, start, end, spans))),
-        ("Can sigma be believed?", _consistency(every, start, end, spans)),
+        ("Differences between solvers", _gallery(pictures.difference_pictures(solutions, start, end, spans))),
+        ("Consistency of sigma", _consistency(every, start, end, spans)),
         ("Uncertainty", _gallery(pictures.sigma_pictures(tracks, start, end, spans))),
         ("Constraints", [page.table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
         ("Noise model", [*tables.noise_tables(noise, first), *tables.excluded_table(first, start)]),
-        ("What was odd", tables.odd(recording, findings)),
-        ("How they ran", tables.run_table(solutions)),
+        ("Findings", tables.odd(recording, findings)),
+        ("Runs", tables.run_table(solutions)),
         ("Provenance", provenance_tables(settings, provenance)),
     ]
     lead = [
@@ -203,7 +216,7 @@ def write_comparison(
 
 
 def detector_pictures(recording: Recording, solution: Solution) -> list[page.Raw]:
-    """What the detectors saw, for `write_report`: the same for every solver of a recording."""
+    """The detectors' statistics, for `write_report`: the same for every solver of a recording."""
     return pictures.detection_pictures(recording, solution.detections)
 
 
@@ -230,7 +243,7 @@ def _doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> 
 
 
 def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[page.Raw]:
-    """Per solver, whether its sigma can be believed."""
+    """Per solver, whether its sigma is consistent with its errors."""
     if errors:
         return [words.believe(name, e) for name, e in errors.items()]
     # where there is no truth a filter's innovations judge the model that all share better than any residuals

@@ -48,7 +48,7 @@ def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], 
     where = f"North is up; the origin is latitude {lat:.6f}, longitude {lon:.6f} deg."
     if recording.gnss is None:
         where = "Nothing says where on the Earth this is: place and heading count from the start."
-    return page.picture(figure, "Seen from above", where, kind="large")
+    return page.picture(figure, "Plan view", where, kind="large")
 
 
 def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> Raw:
@@ -225,6 +225,36 @@ def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spa
     return out
 
 
+def separation_pictures(solution: Solution, start: float, end: float, spans: Shades) -> list[Raw]:
+    """Forward filter less what comes after each keyframe."""
+    found = solution.separation
+    if found is None or not np.isfinite(found.value).any():
+        return []
+    series = {"ekf": Series(found.t - start, found.value, found.sigma)}
+    note = "Position of the forward filter less that of all later measurements; it belongs inside the band."
+    return [page.picture(plots.bands(series, ENU, "m", end, spans=spans), "Combined separation and 3 sigma", note)]
+
+
+def quality_pictures(recording: Recording, solution: Solution, spans: Shades) -> list[Raw]:
+    """What fixes state of themselves: 1-sigma, horizontal and up, and satellites."""
+    gnss, fixes = recording.gnss, fixes_of(recording, solution)
+    if gnss is None or fixes is None or not len(gnss.t):
+        return []
+    seen = gnss.satellites is not None
+    shown = np.column_stack([np.hypot(gnss.sd[:, 0], gnss.sd[:, 1]), gnss.sd[:, 2]])
+    titles, units, log = ["horizontal 1-sigma [m]", "up 1-sigma [m]"], ["m", "m"], [True, True]
+    limits = [plots.limits([np.log10(shown[:, k])], floor=0.5) for k in range(2)]
+    if gnss.satellites is not None:
+        shown = np.column_stack([shown, gnss.satellites])
+        titles, units, log = [*titles, "satellites"], [*units, ""], [*log, False]
+        limits.append(plots.limits([np.append(gnss.satellites, 0.0)], floor=1.0))
+    figure = plots.Figure(titles, (0.0, recording.duration), limits, units=units, log=log)
+    for k, panel in enumerate(figure.panels):
+        panel.shade(spans)
+        draw_fixes(panel, replace(fixes, enu=shown), k)
+    return [page.picture(figure, "Fixes: stated accuracy" + (" and satellites" if seen else ""))]
+
+
 def _unwrap(rph: Array) -> Array:
     """Roll, pitch, heading (N, 3) in deg; the heading, from 0 to 360 at first, without a jump."""
     out = np.degrees(rph)
@@ -313,12 +343,12 @@ def timeline_picture(solution: Solution, recording: Recording, spans: Shades) ->
     if not records:
         return []
     figure = plots.timeline(records, recording.start, recording.duration, solution.solver, spans=spans)
-    return [page.picture(figure, "What was used when", kind="large")]
+    return [page.picture(figure, "Use of constraints over time", kind="large")]
 
 
 def detection_pictures(recording: Recording, found: Sequence[Detection]) -> list[Raw]:
-    """What the detectors saw."""
+    """Signals and statistics of the detectors."""
     if not found:
         return []
     note = "Tinted: the intervals in which it stands, all detectors together."
-    return [page.picture(plots.detections(recording, found), "What the detectors saw", note, kind="large")]
+    return [page.picture(plots.detections(recording, found), "Detectors", note, kind="large")]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from graphnav.core.notes import Note
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import own_solutions
@@ -37,10 +38,8 @@ def doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> t
         fixes = solution.records.get("gnss_position")
         left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
         if left_out > _MOST:
-            out.append(
-                f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest and "
-                "is left out"
-            )
+            said = f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest "
+            out.append(Note("doubt.left_out", said + "and is left out"))
             break  # all solvers use the same noise model
     wrong = []
     for name, e in errors.items():
@@ -55,7 +54,7 @@ def doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> t
             if used >= _FEWEST and size > _TOO_LARGE[kind]:
                 wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")
     if wrong:
-        out.append(f"The stated sigma cannot be trusted: {'; '.join(wrong)}")
+        out.append(Note("doubt.sigma", f"The stated sigma cannot be trusted: {'; '.join(wrong)}"))
     return tuple(out)
 
 
@@ -177,7 +176,7 @@ def believe(name: str, errors: Errors) -> Raw:
     rest = f" Nothing is there to judge {page.and_list(unseen)} by." if unseen else ""
     if all(j.verdict == "cautious" for j in judged):
         return page.paragraph(f"{name}: the stated sigma is cautious: {measured}.{rest}", "verdict")
-    return page.paragraph(f"{name}: the stated sigma can be believed: {measured}.{rest}", "verdict good")
+    return page.paragraph(f"{name}: the stated sigma is consistent: {measured}.{rest}", "verdict good")
 
 
 def believe_without_truth(solution: Solution) -> Raw:
@@ -186,9 +185,7 @@ def believe_without_truth(solution: Solution) -> Raw:
     name = solution.solver
     missing = "there is no truth to compare with"
     if used < _FEWEST:
-        return page.paragraph(
-            f"{name}: no truth and too few measurements to say whether sigma can be believed.", "verdict"
-        )
+        return page.paragraph(f"{name}: no truth and too few measurements to judge sigma by.", "verdict")
     if kind == "innovation":
         measured = f"they are {size:.2f} times as large as predicted (RMS; 1 where sigma is true)"
         if size > _TOO_LARGE[kind]:

@@ -15,7 +15,7 @@ from graphnav.evaluation.segments import relative_errors, rms
 from graphnav.recording import Recording
 from graphnav.report import page
 from graphnav.report.page import Raw
-from graphnav.report.pictures import fixes_of
+from graphnav.report.pictures import ENU, fixes_of
 from graphnav.report.tables import Withheld, consistency
 
 if TYPE_CHECKING:
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 _LINES = 3  # of what was left out
 _SAYS = {
-    "fits": ("good", "sigma can be believed"),
+    "fits": ("good", "sigma is consistent"),
     "cautious": ("", "sigma is cautious"),
     "too small": ("bad", "sigma is too small"),
-    "unclear": ("", "open whether sigma can be believed: errors are alike for too long"),
+    "unclear": ("", "consistency of sigma is open: errors are correlated for too long"),
 }
 # by whose innovations or residuals a block is judged where there is no truth
 _SHOWS = {
@@ -37,7 +37,7 @@ _SHOWS = {
 
 
 def verdicts(solution: Solution, errors: Errors | None) -> Raw:
-    """Position, velocity and attitude: how good, and whether the stated sigma can be believed."""
+    """Position, velocity and attitude: how good, and whether the stated sigma is consistent."""
     judged = _by_records(solution) | ({} if errors is None else _by_truth(errors))
     cells = []
     for block in ("position", "velocity", "attitude"):
@@ -133,14 +133,47 @@ def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> l
             largest = float(np.nanmax(np.linalg.norm(residual, axis=1)))
             over = float(np.nanmax(np.abs(residual / record.sigma[at[used]])))
             gap = float(np.max(np.diff(fixes.t[used]), initial=0.0))
-        rows.append([*cells, len(used), gap, largest, over])
+        rows.append([*cells, len(used), gap, largest, over, *_stated_of(recording, np.flatnonzero(of_it))])
     head = ["fixes", "count", "withheld", "left out", "used", "longest gap [s]", "largest residual [m]", "over sigma"]
+    head.append("stated [m]")
+    if recording.gnss is not None and recording.gnss.satellites is not None:
+        head += ["satellites", "fewest"]
     out = [page.heading("Fixes"), page.table(head, rows)]
     if "gnss_code" in solution.records:
         out.append(page.paragraph("Raw observations are used in place of the fixes.", "soft"))
     elif any(row[4] < row[1] - row[3] for row in rows):
         out.append(page.paragraph("Of fixes that come more often than noise.spacing, the best one is used.", "soft"))
     return out
+
+
+def _stated_of(recording: Recording, rows: Array) -> list[Any]:
+    """Median horizontal sigma that fixes state (m) and, where they say it, satellites: the median and the fewest."""
+    gnss = recording.gnss
+    assert gnss is not None
+    out: list[Any] = [float(np.median(np.hypot(gnss.sd[rows, 0], gnss.sd[rows, 1])))]
+    if gnss.satellites is not None:
+        said = gnss.satellites[rows]
+        said = said[np.isfinite(said)]
+        out += [Raw(f"{x:.0f}") for x in (np.median(said), said.min())] if len(said) else ["-", "-"]
+    return out
+
+
+def separation_table(solution: Solution) -> list[Raw]:
+    """Forward filter less what comes after, per axis: its size, and that over its own sigma."""
+    if solution.separation is None:
+        return []
+    rows: list[list[Any]] = []
+    for k, axis in enumerate(ENU):
+        value, sigma = solution.separation.value[:, k], solution.separation.sigma[:, k]
+        known = np.isfinite(value)
+        if known.any():
+            size = np.abs(value[known])
+            rows.append([axis, *(float(np.quantile(size, q)) for q in (0.5, 0.95, 1.0)), rms(size / sigma[known])])
+    if not rows:
+        return []
+    note = "Forward filter less what comes after each keyframe; over its sigma it is 1 (rms) where sigma is true."
+    head = ["axis", "50 % [m]", "95 % [m]", "largest [m]", "over sigma, rms"]
+    return [page.heading("Combined separation"), page.table(head, rows), page.paragraph(note, "soft")]
 
 
 def _rows_at(t: Array, of: Array | None) -> np.ndarray:

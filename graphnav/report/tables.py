@@ -42,7 +42,7 @@ class Consistency:
 
     @property
     def verdict(self) -> str:
-        """One sentence: can sigma be believed?"""
+        """One sentence on the consistency of sigma."""
         if self.count - self.rejected < 10 or not np.isfinite(self.mean_nis):
             return "too few to judge"
         ratio = self.mean_nis / self.dof
@@ -55,7 +55,7 @@ class Consistency:
             return "innovations larger than predicted: the filter is overconfident"
         if ratio < 0.5:
             return "innovations smaller than predicted: sigma is wider than it need be"
-        return "innovations as large as predicted: sigma can be believed"
+        return "innovations as large as predicted: sigma is consistent"
 
 
 def consistency(record: ConstraintRecord) -> Consistency:
@@ -365,7 +365,7 @@ def stop_table(solution: Solution, start: float) -> list[Raw]:
 
 
 def odd(recording: Recording, findings: Sequence[str]) -> list[Raw]:
-    """What was odd in the recording, each said once."""
+    """Findings on the recording, each said once."""
     lines = list(dict.fromkeys([*recording.remarks, *findings]))
     if recording.imu.noise_assumed:
         lines.append("The recording states no IMU noise figures; consumer-grade ones were assumed.")

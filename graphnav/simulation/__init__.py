@@ -34,7 +34,21 @@ def scenario(name: str) -> Scenario:
 
 
 def simulate(name: str, seed: int = 0, **options: Any) -> Simulated:
-    """Run the scenario `name`; the same name, seed and options give the same recording.
+    """Run a scenario; the same name, seed and options give the same recording.
+
+    Parameters
+    ----------
+    name
+        Of the scenario: `graphnav simulate --list`.
+    seed
+        Of all random numbers.
+    options
+        The scenario's own.
+
+    Returns
+    -------
+    Simulated
+        The recording, the truth at every sample, the stops and what was put in.
 
     Raises
     ------

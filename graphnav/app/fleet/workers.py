@@ -162,7 +162,7 @@ def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limits: Limits) -> I
         from distributed import Client
         from distributed import as_completed as completed
     except ImportError:
-        raise ConfigError("--scheduler: needs Dask; pip install 'graphnav-ins[fleet]'") from None
+        raise ConfigError("--scheduler: needs Dask; pip install -e '.[fleet]' in the clone") from None
     try:
         client = Client(scheduler, timeout=10)
     except (OSError, ValueError, TimeoutError) as error:

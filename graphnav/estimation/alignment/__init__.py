@@ -21,6 +21,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment.course import COURSE_SIGMA
@@ -75,7 +76,10 @@ def with_known_heading(found: Alignment, settings: Settings) -> Alignment:
         sigma=sigma,
         notes=(
             *found.notes,
-            f"start heading stated: {known:g} deg, 1-sigma {settings.alignment.heading_sigma:g} deg "
-            f"(found: {np.degrees(found.rph[2]):.1f} deg)",
+            Note(
+                "alignment.heading_stated",
+                f"start heading stated: {known:g} deg, 1-sigma {settings.alignment.heading_sigma:g} deg "
+                f"(found: {np.degrees(found.rph[2]):.1f} deg)",
+            ),
         ),
     )

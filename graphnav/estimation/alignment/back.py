@@ -7,6 +7,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.estimation.alignment.first import Alignment
@@ -49,13 +50,22 @@ def carry_back(
             drift = sd_bg * back
             tilt = 9.8 * float(np.max(wide[:2] + drift[:2])) + float(np.max(sd[9:12]))
             sd_v, sd_p = sd_v + tilt * back, sd_p + sd_v * back + 0.5 * tilt * back**2
-            notes = (*notes, f"carried back {back:.1f} s by the gyro to the first sample")
+            notes = (
+                *notes,
+                Note("alignment.carried_back", f"carried back {back:.1f} s by the gyro to the first sample"),
+            )
         if stood > 0.0:
             rest = imu.t <= still
             bg = imu.gyro[rest].mean(axis=0) - solution.frame.omega_n @ R
             v, sd_v = np.zeros(3), np.minimum(sd_v, 0.5)
             drift = np.hypot(drift, noise.gyro_noise_density * np.sqrt(stood))
-            notes = (*notes, f"stands for the first {stood:.0f} s; the attitude is that of the first motion")
+            notes = (
+                *notes,
+                Note(
+                    "alignment.stands_first",
+                    f"stands for the first {stood:.0f} s; the attitude is that of the first motion",
+                ),
+            )
             sd_bg = np.full(3, noise.gyro_noise_density / np.sqrt(stood) + noise.gyro_bias_walk * np.sqrt(stood))
         p, sd_p, v, sd_v = _by_first_fixes(recording, solution.frame, R, (p, sd_p, v, sd_v))
         wide = np.hypot(wide, settings.alignment.prior_inflation * drift)

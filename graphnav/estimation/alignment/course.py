@@ -8,6 +8,7 @@ import numpy as np
 
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core import rotation
+from graphnav.core.notes import Note
 from graphnav.estimation.alignment.travel import across, travel
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Gnss
@@ -59,10 +60,20 @@ def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> 
     if for_forwards < -0.5 * _SIGMAS**2:
         off -= float(np.copysign(np.pi, off))
     elif for_forwards < 0.5 * _SIGMAS**2:
-        notes = ("accelerations are too weak to tell forwards from reverse: the first motion is taken to be forwards",)
+        notes = (
+            Note(
+                "alignment.reverse_open",
+                "accelerations are too weak to tell forwards from reverse: the first motion is taken to be forwards",
+            ),
+        )
     if abs(off) > _SIGMAS * np.hypot(course, own) or -0.5 * _SIGMAS**2 < for_forwards < -0.5 * _DOUBT**2:
         # the axes may be wrong, the accelerations or the course: a sigma has to cover them all
-        notes = (f"the body's forward axis is {abs(np.degrees(off)):.0f} deg from the course: check the IMU's axes",)
+        notes = (
+            Note(
+                "alignment.axes",
+                f"the body's forward axis is {abs(np.degrees(off)):.0f} deg from the course: check the IMU's axes",
+            ),
+        )
         return Heading(0.0, max(own, abs(off) / _SIGMAS), max(wide, abs(off) / _SIGMAS), notes)
     gain = wide**2 / (wide**2 + course**2)
     return Heading(gain * off, float(np.hypot((1.0 - gain) * own, gain * course)), float(np.sqrt(gain) * course), notes)

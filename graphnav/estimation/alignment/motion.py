@@ -12,6 +12,7 @@ from graphnav.config import Settings
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.detectors.base import NONE, inside
@@ -120,8 +121,11 @@ def in_motion(
         R = rotation.exp(np.array([0.0, 0.0, -found.turn])) @ R  # heading is clockwise, rotation about up is not
         own[2], wide[2], said = found.own, found.wide, found.notes
     notes = (
-        f"aligned over {begin - recording.start:.0f} to {end - recording.start:.0f} s: roll and pitch to "
-        f"{np.degrees(own[:2].max()):.2g} deg, heading to {np.degrees(own[2]):.2g} deg",
+        Note(
+            "alignment.motion",
+            f"aligned over {begin - recording.start:.0f} to {end - recording.start:.0f} s: roll and pitch to "
+            f"{np.degrees(own[:2].max()):.2g} deg, heading to {np.degrees(own[2]):.2g} deg",
+        ),
         *said,
     )
     return carry_back(recording, settings, best, R, wide, own, begin, notes)

@@ -7,6 +7,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.detectors.base import NONE
@@ -39,11 +40,11 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
     if gnss is None or not len(gnss.t):
         # without fixes the first pose defines the frame: position and heading are exact by definition
         p, sd_p, sd_heading = np.zeros(3), np.full(3, 1e-3), 1e-4
-        note = "no GNSS: levelled at the start, position and heading count from zero there"
+        note = Note("alignment.no_gnss", "no GNSS: levelled at the start, position and heading count from zero there")
     else:
         p = frame.from_llh(gnss.llh[0]) - R @ gnss.lever_arm
         sd_p, sd_heading = 10.0 * gnss.sd[0] + 1.0, np.pi
-        note = "no motion in the GNSS fixes: levelled at the start, heading unknown"
+        note = Note("alignment.no_motion", "no motion in the GNSS fixes: levelled at the start, heading unknown")
     state = States(
         R[None],
         p[None],

@@ -73,7 +73,27 @@ def noise_values(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
 
 
 def write_noise(path: str | Path, noise: NoiseModel, mode: str = "estimated") -> Path:
-    """Write a noise model as a file that `read_noise` reads."""
+    """Write a noise model as a file that `read_noise` reads.
+
+    Parameters
+    ----------
+    path
+        The file, replaced if it is there.
+    noise
+        As of `Solution.noise`.
+    mode
+        What the settings called for, "estimated" or "stated"; kept for `--noise`.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+    """
     path = Path(path)
     path.write_text(json.dumps({"noise": noise_values(noise, mode)}, indent=2) + "\n", encoding="utf-8")
     return path
@@ -81,6 +101,16 @@ def write_noise(path: str | Path, noise: NoiseModel, mode: str = "estimated") ->
 
 def read_noise(path: str | Path) -> NoiseModel:
     """The noise model of a file that `write_noise` wrote, or of the summary.json of a run.
+
+    Parameters
+    ----------
+    path
+        The file, JSON.
+
+    Returns
+    -------
+    NoiseModel
+        To be given to `graphnav.run` as `noise`.
 
     Raises
     ------

@@ -21,6 +21,7 @@ from scipy.special import gammaincinv  # scipy.stats would take half a second to
 
 from graphnav.config import Settings
 from graphnav.core.findings import period_of
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.windows import running
 from graphnav.recording import ImuNoise, Recording
@@ -54,7 +55,7 @@ def with_measured_floor(recording: Recording, settings: Settings) -> tuple[Recor
     )
     noise: ImuNoise = replace(imu.noise, **lower)
     return replace(recording, imu=replace(imu, noise=noise)), (
-        f"where it stands the IMU is quieter than stated: {said}",
+        Note("noise.imu.quieter", f"where it stands the IMU is quieter than stated: {said}"),
     )
 
 

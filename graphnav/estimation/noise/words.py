@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
+from graphnav.core.notes import Note
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, shift
@@ -33,9 +34,13 @@ def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
         if away[k] > _FAR:
             which = f" (number {k + 1} of {p.size})" if p.size > 1 else ""
             out.append(
-                f"{p.name}{which} comes out at {value[k]:.2g} {p.unit}, {away[k]:.0f} sigmas from the "
-                f"{p.initial[k]:.2g} +- {p.sigma[k]:.2g} that is stated of it: what is stated is wrong, or it stands "
-                "in for an error of another kind"
+                Note(
+                    "noise.far_from_stated",
+                    f"{p.name}{which} comes out at {value[k]:.2g} {p.unit}, {away[k]:.0f} sigmas from the "
+                    f"{p.initial[k]:.2g} +- {p.sigma[k]:.2g} that is stated of it: what is stated is wrong, or it "
+                    "stands "
+                    "in for an error of another kind",
+                )
             )
     return tuple(out)
 
@@ -47,7 +52,7 @@ def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
         f"{words} {np.sqrt(noise.figures[name].factor):.2g}" for name, words in _IMU.items() if name in noise.figures
     ]
     if imu:
-        out.append(f"noise model, IMU: stated figures multiplied by: {', '.join(imu)}")
+        out.append(Note("noise.imu", f"noise model, IMU: stated figures multiplied by: {', '.join(imu)}"))
     for rows in problem.constraints:
         names = [g for g in rows.noise_groups()[0] if g in noise.figures]
         errors = [
@@ -64,9 +69,11 @@ def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
         stamps = next((p for p in rows.parameters if p.name == STAMP_ERROR), None)
         if stamps is not None and rows.name == GnssPosition.name:
             parts.append(f"stamp of each fix {stamps.sigma[0]:.2g} s")
-        out.append(f"noise model, {rows.name}: white part in stated sigmas: {'; '.join(parts)}")
+        out.append(Note("noise.rows", f"noise model, {rows.name}: white part in stated sigmas: {'; '.join(parts)}"))
         some = noise.weights.get(rows.name)
         if some is not None and len(some.t):
             less = np.count_nonzero(some.weight < 1.0)
-            out.append(f"{rows.name}: {less} of {len(rows)} rows are outliers and have less weight")
+            out.append(
+                Note("noise.outliers", f"{rows.name}: {less} of {len(rows)} rows are outliers and have less weight")
+            )
     return tuple(out)

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import dense
@@ -80,7 +81,12 @@ def batch(
     for constraint in problem.constraints:
         record = records[constraint.name] = residual_record(problem, constraint, points, robust=True)
         if constraint.robust != "none" and np.mean(record.weight < 0.1) > 0.5:
-            notes.append(f"most rows of {constraint.name} were given up as outliers: do not trust this solution")
+            notes.append(
+                Note(
+                    "solver.outliers",
+                    f"most rows of {constraint.name} were given up as outliers: do not trust this solution",
+                )
+            )
     return Solution(
         solver="batch",
         frame=problem.frame,
@@ -194,7 +200,9 @@ def _minimise(
     if refused:
         stopped += f" ({refused} steps taken back and damped)"
     if renewed:
-        notes.append(f"{renewed} intervals integrated again because the gyro bias had moved")
+        notes.append(
+            Note("solver.integrated_again", f"{renewed} intervals integrated again because the gyro bias had moved")
+        )
     return _Minimum(problem, point, layout, eliminated, now, iteration, stopped, tuple(notes))
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import dense
@@ -111,7 +112,7 @@ def incremental(
     spent = time.perf_counter() - began
     live_states, values = States.stack(live), np.array(live_values)
     found = replay(problem, "incremental", solver.settled, live_states, live_P, values, seconds, spent, lag)
-    notes = (*found.settled.notes, f"{solver.window.relinearized} were linearised again")
+    notes = (*found.settled.notes, Note("solver.relinearised", f"{solver.window.relinearized} were linearised again"))
     return replace(found, settled=replace(found.settled, notes=notes))
 
 
@@ -158,7 +159,10 @@ def replay(
         cost=cost_at(problem, points),
         stopped=f"every keyframe settled with {whole}",
         timings={solver: spent},
-        notes=(*problem.notes, describe(seconds) if np.isinf(lag) else f"lag {lag:g} s: {describe(seconds)}"),
+        notes=(
+            *problem.notes,
+            Note("solver.step_times", describe(seconds) if np.isinf(lag) else f"lag {lag:g} s: {describe(seconds)}"),
+        ),
         between=(dense(problem, states, covariance, _scale(at, values), smooth=True),),
     )
     now = replace(

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphnav.core.notes import Note
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.incremental import Replay, node_steps, replay
@@ -76,5 +77,5 @@ def isam2(
     settled.append(smooth_keyframes(tree, len(tree)))
     spent = time.perf_counter() - began
     found = replay(problem, "isam2", settled, States.stack(live), P, np.array(values), seconds, spent, lag)
-    notes = (*found.settled.notes, f"{tree.relinearised} keyframes were linearised again")
+    notes = (*found.settled.notes, Note("solver.relinearised", f"{tree.relinearised} keyframes were linearised again"))
     return replace(found, settled=replace(found.settled, notes=notes))

@@ -70,11 +70,13 @@ def gnss_coverage(recording: Recording) -> Iterator[Finding]:
     gnss = recording.gnss
     assert gnss is not None
     if (sentence := gnss_apart(recording)) is not None:
-        yield Finding("warning", sentence)
+        yield Finding("warning", sentence, "gnss.clock")
         return
     for late, what in ((gnss.t[0] - recording.start, "starts"), (recording.end - gnss.t[-1], "ends")):
         if late > 5.0:
-            yield Finding("note", f"GNSS {what} {late:.1f} s {'after' if what == 'starts' else 'before'} the IMU")
+            yield Finding(
+                "note", f"GNSS {what} {late:.1f} s {'after' if what == 'starts' else 'before'} the IMU", "gnss.span"
+            )
     if len(gnss.t) < 3:
         return
     step = np.diff(gnss.t)
@@ -84,7 +86,9 @@ def gnss_coverage(recording: Recording) -> Iterator[Finding]:
         worst = gaps[np.argmax(step[gaps])]
         count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
         at = gnss.t[worst] - recording.start
-        yield Finding("note", f"{count} in GNSS, the longest {step[worst]:.1f} s at {at:.1f} s from the start")
+        yield Finding(
+            "note", f"{count} in GNSS, the longest {step[worst]:.1f} s at {at:.1f} s from the start", "gnss.gap"
+        )
 
 
 def gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Finding]:
@@ -115,6 +119,7 @@ def gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Finding]:
             "warning",
             f"{count} in GNSS position that the motion and the sigmas do not explain, the largest {size[worst]:.1f} m "
             f"at {at:.1f} s from the start; a robust kernel or a gate is advisable",
+            "gnss.jump",
         )
 
 
@@ -164,7 +169,7 @@ def imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Fin
     if up[2] > 0.8 and (forward is None or forward.correlation < 0.7):
         return
     if forward is None or forward.correlation < 0.7:
-        yield Finding("warning", f"the mean force points {_direction(up)}, not up: are the axes right?")
+        yield Finding("warning", f"the mean force points {_direction(up)}, not up: are the axes right?", "imu.up")
         return
     ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
     if up[2] > 0.8 and ahead[1] > 0.7:
@@ -179,6 +184,7 @@ def imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Fin
         "warning",
         f"the axes contradict the drive: forward by the GNSS speed is {_direction(ahead)}, up by gravity is "
         f"{_direction(up)} in the axes stated{hint}",
+        "imu.axes",
     )
 
 
@@ -203,12 +209,14 @@ def _letters(R_bs: Array, forward: Array, up: Array) -> str | None:
 def reversed_sign(imu: Imu) -> Iterator[Finding]:
     """The gyro about the mean force turns against the course: no choice of axes mends that."""
     if crosschecks.up_of(imu)[2] < 0:
-        sentence = (
-            "the accelerometer's sign is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
+        key, sentence = (
+            "imu.force_sign",
+            "the accelerometer's sign is reversed (gyro and course deny its up), it must read +9.8 upward at rest",
         )
     else:
+        key = "imu.gyro_sign"
         sentence = "the gyro's sign is reversed: it turns against the GNSS course while gravity points as stated"
-    yield Finding("warning", f"{sentence}; negate it in the file")
+    yield Finding("warning", f"{sentence}; negate it in the file", key)
 
 
 def yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
@@ -219,11 +227,18 @@ def yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "the gyro is 57 times too small for the GNSS course: it is in rad/s already, leave out units.gyro",
+            "imu.gyro_unit",
         )
     elif 1 / 80.0 < scale < 1 / 40.0:
-        yield Finding("warning", 'the gyro is 57 times too large for the GNSS course: say units = { gyro = "deg/s" }')
+        yield Finding(
+            "warning",
+            'the gyro is 57 times too large for the GNSS course: say units = { gyro = "deg/s" }',
+            "imu.gyro_unit",
+        )
     elif abs(scale - 1.0) > 0.1:
-        yield Finding("warning", f"the course turns {scale:.2f} times as much as the gyro about the vertical")
+        yield Finding(
+            "warning", f"the course turns {scale:.2f} times as much as the gyro about the vertical", "imu.gyro_scale"
+        )
 
 
 _WORD = {GAP: "gives no readings", STUCK: "is stuck at zero", FROZEN: "is frozen", WILD: "reads against the motion"}
@@ -243,9 +258,11 @@ def odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iterator[F
     if odometer.pulse:
         facts["pulse_m"] = odometer.pulse
     elif step > _COARSE:
-        yield Finding("note", f"the odometer reads in steps of {step:.3g} m/s")
+        yield Finding("note", f"the odometer reads in steps of {step:.3g} m/s", "odometer.steps")
     if not odometer.signed:
-        yield Finding("note", "the odometer never reads below zero: it is taken to read backward as forward")
+        yield Finding(
+            "note", "the odometer never reads below zero: it is taken to read backward as forward", "odometer.unsigned"
+        )
     found = wheels.faults(odometer, recording.imu)
     for reason in dict.fromkeys(found.reasons):
         spans = found.spans[[r == reason for r in found.reasons]]
@@ -254,7 +271,11 @@ def odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iterator[F
         where = f"for {size:.2f} s at {at:.1f} s from the start"
         if len(spans) > 1:
             where = f"in {len(spans)} spans, the longest of {size:.2f} s at {at:.1f} s from the start"
-        yield Finding("note" if reason == GAP else "warning", f"the odometer {_WORD[reason]} {where}: not used there")
+        yield Finding(
+            "note" if reason == GAP else "warning",
+            f"the odometer {_WORD[reason]} {where}: not used there",
+            f"odometer.{reason.replace(' ', '_')}",
+        )
     if odometer.wheels is not None:
         yield from _wheels_apart(odometer, recording.imu)
 
@@ -279,6 +300,7 @@ def _wheels_apart(odometer: Odometer, imu: Imu) -> Iterator[Finding]:
                 "warning",
                 f"the {name} wheel is {100 * abs(ratio - 1):.1f} % {more} than the others on the straight: "
                 "say use in [odometer], to leave its axle out",
+                "odometer.wheel",
             )
 
 
@@ -288,7 +310,7 @@ def odometer_findings(recording: Recording, track: Track | None, facts: dict[str
     if min(odometer.t[-1], recording.end) <= max(odometer.t[0], recording.start):
         unit = _unit_of_stamps(odometer.t, recording)
         hint = f'; its stamps are in {unit}: say units = {{ t = "{unit}" }} in [odometer]' if unit else ""
-        yield Finding("warning", f"odometer and IMU do not overlap in time{hint}")
+        yield Finding("warning", f"odometer and IMU do not overlap in time{hint}", "odometer.clock")
         return
     yield from odometer_readings(recording, facts)
     found = crosschecks.odometer_fit(odometer, track) if track is not None else None
@@ -307,20 +329,24 @@ def odometer_findings(recording: Recording, track: Track | None, facts: dict[str
                 if factor < 1
                 else f"the odometer is in {unit}"
             )
-            yield Finding("warning", f"GNSS speed is {scale:.3f} times the odometer's: {say}")
+            yield Finding("warning", f"GNSS speed is {scale:.3f} times the odometer's: {say}", "odometer.unit")
             break
     else:
         if scale < 0:
-            yield Finding("warning", f"the odometer's sign is reversed (GNSS speed is {scale:.3f} times it)")
+            yield Finding(
+                "warning", f"the odometer's sign is reversed (GNSS speed is {scale:.3f} times it)", "odometer.sign"
+            )
         elif abs(scale - 1.0) > max(2.0 * odometer.scale_sigma, 0.02):
             yield Finding(
                 "warning",
                 f"GNSS speed is {scale:.3f} times the odometer's, "
                 f"which scale_sigma = {odometer.scale_sigma:g} does not cover",
+                "odometer.scale",
             )
     if abs(fit.lag) > 0.1 + 4.0 * fit.spread:
         yield Finding(
             "warning",
             f"odometer stamps are {'late' if fit.lag > 0 else 'early'} against GNSS by {abs(fit.lag):.2f} s: "
             f"add {-fit.lag:+.2f} to time_offset in [odometer]",
+            "odometer.late",
         )

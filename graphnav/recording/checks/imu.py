@@ -23,12 +23,15 @@ def imu_time(imu: Imu) -> Iterator[Finding]:
         severity: Literal["note", "warning"] = "warning" if step[worst] > 0.2 else "note"
         count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
         after = imu.t[worst] - imu.t[0]
-        yield Finding(severity, f"{count} in the IMU, the longest {step[worst]:.3f} s at {after:.1f} s from the start")
+        yield Finding(
+            severity, f"{count} in the IMU, the longest {step[worst]:.3f} s at {after:.1f} s from the start", "imu.gap"
+        )
     uneven = float((np.abs(step - period) > 0.25 * period).mean())
     if uneven > 0.05:
         yield Finding(
             "note",
             f"IMU stamps are uneven: {100 * uneven:.0f} % of the steps differ by over 25 % from {1e3 * period:.4g} ms",
+            "imu.uneven",
         )
 
 
@@ -40,10 +43,16 @@ def repeats(imu: Imu) -> Iterator[Finding]:
     gyro, accel = imu.gyro[1:] == imu.gyro[:-1], imu.accel[1:] == imu.accel[:-1]
     same = np.logical_and.reduce([*gyro.T, *accel.T])
     if same.mean() > 0.002:
-        yield Finding("note", f"{same.sum()} IMU rows ({100 * same.mean():.1f} %) repeat the values of the row before")
+        yield Finding(
+            "note",
+            f"{same.sum()} IMU rows ({100 * same.mean():.1f} %) repeat the values of the row before",
+            "imu.repeats",
+        )
     stuck = max((b - a for a, b in runs_of(same)), default=0) * period_of(imu.t)
     if stuck > 0.5:
-        yield Finding("warning", f"the IMU repeats one value for {stuck:.1f} s: it was stuck or its log was filled")
+        yield Finding(
+            "warning", f"the IMU repeats one value for {stuck:.1f} s: it was stuck or its log was filled", "imu.stuck"
+        )
 
 
 def saturation(imu: Imu) -> Iterator[Finding]:
@@ -62,6 +71,7 @@ def saturation(imu: Imu) -> Iterator[Finding]:
                         "warning",
                         f"{what} {'xyz'[axis]} (file axes) is saturated: "
                         f"{sum(runs)} rows stay at {sign * top:.4g} {unit}",
+                        "imu.saturated",
                     )
 
 
@@ -74,6 +84,7 @@ def gyro_unit(recording: Recording) -> Iterator[Finding]:
             "warning",
             f"the gyro reaches {rate:.3g} rad/s, too fast for a {recording.platform}: if it is deg/s, "
             'say units = { gyro = "deg/s" }' + ('; if it is on a foot, platform = "foot"' if rate < 35.0 else ""),
+            "imu.gyro_fast",
         )
 
 
@@ -93,6 +104,7 @@ def force_at_rest(recording: Recording, rest: Array, facts: dict[str, Any]) -> I
         yield Finding(
             "note" if not covered else "warning",
             f"at rest the force is {f:.3f} m/s2 where gravity is {g:.3f} ({100 * off:+.1f} %){covered}",
+            "imu.gravity",
         )
 
 
@@ -114,5 +126,7 @@ def noise_at_rest(imu: Imu, rest: Array) -> Iterator[Finding]:
         allan = float(np.max(np.median(np.abs(steps), axis=0))) / 0.6745 / np.sqrt(2.0)
         if allan > 4.0 * stated:
             yield Finding(
-                "warning", f"{what} = {stated:.2g} is small: at rest the noise is {allan:.2g} (Allan deviation at 1 s)"
+                "warning",
+                f"{what} = {stated:.2g} is small: at rest the noise is {allan:.2g} (Allan deviation at 1 s)",
+                "imu.noise_small",
             )

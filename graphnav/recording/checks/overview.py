@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.findings import SEVERITIES, Finding, period_of, runs_of
+from graphnav.core.notes import key_of
 from graphnav.core.rotation import Array
 from graphnav.recording import Recording
 from graphnav.recording.checks import crosschecks
@@ -111,17 +112,28 @@ def _show(name: str, value: Any) -> str:
 
 
 def inspect(recording: Recording) -> Inspection:
-    """Check a recording; see the module's head.
+    """Check a recording before solving.
 
-    Findings are in order of their severity, the gravest first, then of the checks, remarks of the loader first.
+    Parameters
+    ----------
+    recording
+        As read.
+
+    Returns
+    -------
+    Inspection
+        Facts by sensor, the recording without what cannot be right, and findings: the gravest first, then in the
+        order of the checks, the loader's remarks first.
     """
     whole = screen(recording)
     recording = whole.recording
-    findings = [Finding("note", remark) for remark in recording.remarks]
+    findings = [Finding("note", remark, key_of(remark) or "recording.remark") for remark in recording.remarks]
     findings += whole.findings
     for name, sensor in recording.aiding.items():
         if not len(sensor.t):
-            findings.append(Finding("warning", f"[{name}] holds no rows in this part of the recording"))
+            findings.append(
+                Finding("warning", f"[{name}] holds no rows in this part of the recording", f"{name}.empty")
+            )
             recording = recording.without(name)
     known = {f.key for f in whole.findings}
     facts: dict[str, dict[str, Any]] = {"imu": _imu_facts(recording)}

@@ -37,6 +37,7 @@ def stated_noise(noise: ImuNoise) -> Iterator[Finding]:
             yield Finding(
                 "warning",
                 f'{key} = {value:g} {unit} is more than any IMU has; if it is {meant}, say "{value:g} {meant}"',
+                "imu.noise_unit",
             )
 
 
@@ -45,7 +46,11 @@ def lever_arms(recording: Recording) -> Iterator[Finding]:
     for name in ("gnss", "odometer"):
         sensor = getattr(recording, name)
         if sensor is not None and (length := float(np.linalg.norm(sensor.lever_arm))) > _LONG:
-            yield Finding("warning", f"the lever arm in [{name}] is {length:.3g} m long: it is to be in metres")
+            yield Finding(
+                "warning",
+                f"the lever arm in [{name}] is {length:.3g} m long: it is to be in metres",
+                f"{name}.lever_arm_unit",
+            )
 
 
 def too_fast_for_a_foot(recording: Recording, track: Track | None) -> Iterator[Finding]:
@@ -56,6 +61,7 @@ def too_fast_for_a_foot(recording: Recording, track: Track | None) -> Iterator[F
             yield Finding(
                 "warning",
                 f'the fixes move at {speed:.3g} m/s, too fast for a foot: if it is a car, say platform = "vehicle"',
+                "recording.platform",
             )
 
 
@@ -74,6 +80,7 @@ def rounded_positions(gnss: Gnss) -> Iterator[Finding]:
                     "warning",
                     f"positions are rounded to {10.0**-digits:g} deg, {step:.2g} m, and their 1-sigma is {sd:.2g} m: "
                     "log more digits, or state a larger sd",
+                    "gnss.rounded",
                 )
             return
 
@@ -88,7 +95,7 @@ def fix_types(gnss: Gnss) -> Iterator[Finding]:
         sentence = (
             f'types of the fixes look like GGA\'s qualities: {guess.why}; say units = {{ type = "nmea" }} in [gnss]'
         )
-        yield Finding("warning", sentence)
+        yield Finding("warning", sentence, "gnss.type_numbers")
 
 
 def velocities(gnss: Gnss) -> Iterator[Finding]:
@@ -133,6 +140,7 @@ def velocities(gnss: Gnss) -> Iterator[Finding]:
                 "warning",
                 f"the upward velocity goes down where the heights go up (correlation {alike:.2f}): if it is downward, "
                 "name its column vd",
+                "gnss.velocity_down",
             )
 
 
@@ -170,7 +178,7 @@ def _horizontal(way: Array, said: Array) -> Iterator[Finding]:
     misses = [miss(change) for change, _ in changes]
     best = int(np.argmin(misses))
     if misses[best] < 0.3 * miss(np.eye(2)) and misses[best] < 0.2 * float(np.median(np.linalg.norm(way, axis=1))):
-        yield Finding("warning", f"by the positions {changes[best][1]}")
+        yield Finding("warning", f"by the positions {changes[best][1]}", "gnss.velocity_axes")
 
 
 def truth_findings(recording: Recording) -> Iterator[Finding]:
@@ -184,6 +192,7 @@ def truth_findings(recording: Recording) -> Iterator[Finding]:
             f"the truth ({truth.t[0]:.3f} to {truth.t[-1]:.3f} s) and the IMU ({recording.start:.3f} to "
             f"{recording.end:.3f} s) do not overlap in time: is it of another day, or on another clock (time_offset in "
             "[truth])? It is not used",
+            "truth.clock",
         )
         return
     if truth.llh is None or gnss is None:
@@ -204,10 +213,13 @@ def truth_findings(recording: Recording) -> Iterator[Finding]:
             "warning",
             f"the truth fits the fixes {best:+.0f} s later, the leap seconds between GPS time and UTC: add {best:+.0f} "
             "to time_offset in [truth]",
+            "truth.leap_seconds",
         )
     elif off > 100.0 + 10.0 * float(np.median(gnss.sd[:, :2])):
         metres = ', or in metres (name the columns x and y, say frame = "local")' if off > 1e6 else ""
-        yield Finding("warning", f"the truth lies {off / 1e3:.3g} km from the fixes: is it of this drive{metres}?")
+        yield Finding(
+            "warning", f"the truth lies {off / 1e3:.3g} km from the fixes: is it of this drive{metres}?", "truth.far"
+        )
 
 
 def truth_apart(recording: Recording) -> bool:

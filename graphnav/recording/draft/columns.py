@@ -52,6 +52,10 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
         r"type", r"q", r"(?:.*_)?(?:fix|gps|gnss|gga|nmea|sol|solution|rtk)_?(?:q|qual\w*|type|status|flag)",
         r"quality|q_?flag",
     ),
+    "satellites": (
+        r"satellites",
+        r"(?:num|n|no|number_of|used)_?(?:sats?|sv|svs|satellites)(?:_used)?", r"(?:sats?|satellites)_?used|sats?",
+    ),
 }  # fmt: skip
 
 UNITS = {

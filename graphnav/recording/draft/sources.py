@@ -27,7 +27,23 @@ _WANTED = {
     "imu": ("t", "gx", "gy", "gz", "ax", "ay", "az"),
     "gyro": ("t", "gx", "gy", "gz"),
     "accel": ("t", "ax", "ay", "az"),
-    "gnss": ("t", "lat", "lon", "h", "sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "vd", "speed", "course", "type"),
+    "gnss": (
+        "t",
+        "lat",
+        "lon",
+        "h",
+        "sd_e",
+        "sd_n",
+        "sd_u",
+        "ve",
+        "vn",
+        "vu",
+        "vd",
+        "speed",
+        "course",
+        "type",
+        "satellites",
+    ),
     "odometer": ("t", "speed", *WHEELS),
     "gravity": ("t", "pull_x", "pull_y", "pull_z"),
 }
@@ -306,8 +322,9 @@ def _read(path: Path, columns: matching.Columns, role: str) -> Source:
     """The columns of one sensor, rows that hold all it needs, in order of time."""
     wanted = _WANTED[role]
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in wanted}
-    if "type" in names and not _numbers(path, names["type"]):
-        del names["type"]
+    for extra in ("type", "satellites"):
+        if extra in names and not _numbers(path, names[extra]):
+            del names[extra]
     table = read_table(path, tuple(names), (), names)
     needed = [n for n in wanted[: _NEEDED.get(role, len(wanted))] if n in names]
     whole = np.isfinite(table.stack(*needed)).all(-1)

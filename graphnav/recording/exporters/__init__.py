@@ -102,11 +102,22 @@ def check_names(names: Sequence[str], gps_zero: float | None) -> None:
             "--export nmea: needs the time of day, and what t counts from is not known; say clock in recording.toml"
         )
     if "parquet" in names and find_spec("pyarrow") is None:
-        raise RecordingError("--export parquet: needs pyarrow; pip install 'graphnav-ins[parquet]'")
+        raise RecordingError("--export parquet: needs pyarrow; pip install -e '.[parquet]' in the clone")
 
 
 def write_as(name: str, trajectory: Trajectory, path: Path, utc: Array | None = None) -> None:
-    """Write one of `NAMES`; `utc` (K,), datetime64, where the clock is known.
+    """Write a trajectory in one of the formats `NAMES`.
+
+    Parameters
+    ----------
+    name
+        Of the format.
+    trajectory
+        What to write.
+    path
+        The file, replaced if it is there.
+    utc
+        (K,) datetime64, where the clock is known.
 
     Raises
     ------

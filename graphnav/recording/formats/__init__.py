@@ -27,7 +27,7 @@ def formats() -> dict[str, Format]:
 
 
 def read(source: str | Path, topics: Sequence[str] = (), allow_outside: bool = False) -> Recording:
-    """A recording from a folder holding recording.toml, a .toml of that form, or a built-in name.
+    """A recording from a folder with recording.toml, a .toml of that form, a log of a known kind, or a built-in name.
 
     Parameters
     ----------
@@ -37,6 +37,11 @@ def read(source: str | Path, topics: Sequence[str] = (), allow_outside: bool = F
         Of a ROS bag: those to use, each for the sensor that its type is of; the others are found.
     allow_outside
         Whether files that are named in it may lie outside its folder.
+
+    Returns
+    -------
+    Recording
+        In SI units, body axes right-forward-up and seconds on one clock.
 
     Raises
     ------
@@ -57,10 +62,17 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
 
     Parameters
     ----------
+    source
+        A path, or a built-in name.
     name
         The format to read it as; found from the content if None.
     topics
         As for `read`.
+
+    Returns
+    -------
+    Log
+        The sensors that are there, in SI units and body axes right-forward-up; None for the others.
 
     Raises
     ------

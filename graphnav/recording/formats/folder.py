@@ -196,9 +196,10 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     elif there:
         remarks.add(f"GNSS velocities need ve, vn and vu; only {', '.join(there)} is there, so none are used")
     kinds = fixes_by_type(rows, d.units.type) if "type" in rows else None
-    return Gnss(
+    gnss = Gnss(
         rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds, kinds is not None and d.units.type == "rtklib"
     )
+    return replace(gnss, satellites=rows["satellites"]) if "satellites" in rows else gnss
 
 
 def _raw_gnss(

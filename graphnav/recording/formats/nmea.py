@@ -96,7 +96,8 @@ def load(path: Path) -> Log:
         remarks.add(f"{len(t) - len(order)} fixes without a height or with the time of another were left out")
     kinds = fix_types(np.array([e.gga.quality for e in fixes])[order], NMEA_TYPES)
     v, sd_v = (None if x is None else x[order] for x in (v, sd_v))
-    gnss = Gnss(t[order], llh[order], sd[order], v, sd_v, type=kinds)
+    satellites = np.array([_number(e.gga.numSV) for e in fixes])[order]
+    gnss = Gnss(t[order], llh[order], sd[order], v, sd_v, type=kinds, satellites=satellites)
     remarks.add("GNSS: position of the antenna; its lever arm is not in the log and taken as zero")
     return Log(path.stem, gnss=gnss, gps_zero=zero, remarks=tuple(remarks))
 

@@ -63,7 +63,8 @@ def load(path: Path) -> Log:
     kinds = None if track.fix_type is None else fix_types(track.fix_type)
     remarks.add("GNSS: position of the antenna; its lever arm is not in the file and taken as zero")
     remarks.add("clock: seconds of the GPS week of the first row")
-    return Log(path.stem, gnss=Gnss(t, track.llh, sd, v, sd_v, type=kinds), gps_zero=zero, remarks=tuple(remarks))
+    gnss = Gnss(t, track.llh, sd, v, sd_v, type=kinds, satellites=track.satellites)
+    return Log(path.stem, gnss=gnss, gps_zero=zero, remarks=tuple(remarks))
 
 
 def _week_of(path: Path, fields: list[str]) -> float:

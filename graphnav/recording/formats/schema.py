@@ -155,7 +155,10 @@ class GnssTable(SensorTable):
     """[gnss]"""
 
     required = ("t", "lat", "lon", "h")
-    optional = ("sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu", "vd", "speed", "course", "type")
+    optional = (
+        "sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu", "vd", "speed", "course", "type",
+        "satellites",
+    )  # fmt: skip
 
     units: FixUnits = FixUnits()
     lever_arm: Vector = Field((0.0, 0.0, 0.0), description="m from the IMU: right, forward, up")

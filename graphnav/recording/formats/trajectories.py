@@ -24,6 +24,7 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording.formats.repair import LATEST
@@ -42,6 +43,17 @@ _GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 
 def read_trajectory(path: str | Path) -> Trajectory:
     """Read a trajectory file of any kind in the table above, gzipped or not.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Returns
+    -------
+    Trajectory
+        Latitude and longitude in rad, height above the ellipsoid in m, or metres of a local frame (`frame`);
+        velocities in the local east, north, up, m/s; angles in rad.
 
     Raises
     ------
@@ -103,9 +115,14 @@ def _build(
     usable = np.isfinite(position[:, :2]).all(1) if local else np.isfinite(position).all(1)
     fresh = np.concatenate([[True], np.diff(t) > 0])
     if not usable.all():
-        notes.append(f"{path.name}: {np.sum(~usable)} rows without a position left out")
+        notes.append(Note("trajectory.no_position", f"{path.name}: {np.sum(~usable)} rows without a position left out"))
     if not fresh.all():
-        notes.append(f"{path.name}: {np.sum(~fresh)} rows that repeat the time of the row before left out")
+        notes.append(
+            Note(
+                "trajectory.repeated",
+                f"{path.name}: {np.sum(~fresh)} rows that repeat the time of the row before left out",
+            )
+        )
     keep = usable & fresh
     if not keep.any():
         raise RecordingError(f"{path}: no row has a position")
@@ -200,13 +217,20 @@ def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Traject
     separator = "," if "," in rows[0][1] else None
     columns = re.findall(r"[A-Za-z]+(?=\(|\s|$|,)", titles.strip().lstrip("%"))[1:]
     names = ["date", "time", *columns]
-    notes = []
+    notes: list[str] = []
     if scale_name != "GPST":
-        notes.append(f"{path.name}: times are in {scale_name}, not GPS time (18 s ahead of UTC since 2017)")
+        notes.append(
+            Note(
+                "trajectory.time_scale",
+                f"{path.name}: times are in {scale_name}, not GPS time (18 s ahead of UTC since 2017)",
+            )
+        )
     if any("lat/lon/height=Tokyo" in line for line in head):
         raise RecordingError(f"{path}: coordinates on the Tokyo datum; write it again with out-datum=wgs84")
     if any("lat/lon/height=WGS84/geodetic" in line for line in head):
-        notes.append(f"{path.name}: heights are above mean sea level, not above the ellipsoid")
+        notes.append(
+            Note("trajectory.height", f"{path.name}: heights are above mean sea level, not above the ellipsoid")
+        )
     dated = "/" in rows[0][1].split(separator)[0]
     t, numeric = _rtklib_times(path, rows, separator) if dated else (None, rows)
     table = number_table(path, numeric, names, separator)
@@ -225,6 +249,7 @@ def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Traject
         path, rows, t, position, notes,
         sd_p=take("sde", "sdn", "sdu"), v=take("ve", "vn", "vu"), sd_v=take("sdve", "sdvn", "sdvu"),
         fix_type=None if "Q" not in at else table[:, at["Q"]],
+        satellites=None if "ns" not in at else table[:, at["ns"]],
     )  # fmt: skip
 
 

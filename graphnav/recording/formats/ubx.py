@@ -173,7 +173,8 @@ def _gnss(fixes: list[Any], content: _Content, remarks: Remarks) -> Gnss:
         remarks.add("some fixes are of GNSS and dead reckoning combined: they already have the receiver's IMU in them")
     remarks.add("GNSS: position of the antenna; its lever arm is not in the log and taken as zero")
     kinds = np.array([_type(m) for m in fixes])[order]
-    return Gnss(t[order], llh[order], sd[order], v[order], sd_v[order], type=fix_types(kinds))
+    used = np.array([float(m.numSV) for m in fixes])[order]
+    return Gnss(t[order], llh[order], sd[order], v[order], sd_v[order], type=fix_types(kinds), satellites=used)
 
 
 def _type(message: Any) -> int:

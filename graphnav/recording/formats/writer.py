@@ -107,6 +107,8 @@ def _gnss(log: Log) -> _File | None:
             header += ["sd_ve", "sd_vn", "sd_vu"]
     if gnss.type is not None:
         columns, header = [*columns, np.where(gnss.type > 0, gnss.type, np.nan)], [*header, "type"]
+    if gnss.satellites is not None:
+        columns, header = [*columns, gnss.satellites], [*header, "satellites"]
     return _File("gnss.csv.gz", header, columns)
 
 

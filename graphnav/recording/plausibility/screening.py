@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from graphnav.core.earth import gravity
 from graphnav.core.errors import RecordingError
 from graphnav.core.findings import Finding, period_of, runs_of
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, rows_of
 from graphnav.recording.checks import crosschecks
@@ -67,7 +68,19 @@ def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:
 
 
 def screened(recording: Recording) -> tuple[Recording, list[str]]:
-    """The recording without what cannot be right, and a sentence for everything found.
+    """The recording without what cannot be right.
+
+    Parameters
+    ----------
+    recording
+        As read.
+
+    Returns
+    -------
+    recording : Recording
+        Without rows that no sensor can have read.
+    notes : list of str
+        A sentence with a key for everything found.
 
     Raises
     ------
@@ -76,11 +89,22 @@ def screened(recording: Recording) -> tuple[Recording, list[str]]:
     """
     found = screen(recording)
     refuse(recording, found.findings)
-    return found.recording, [f.sentence for f in found.findings]
+    return found.recording, [Note(f.key, f.sentence) for f in found.findings]
 
 
 def screen(recording: Recording) -> Screened:
-    """Look a recording over; one that was screened before is returned as it is, without findings."""
+    """Look a recording over for what cannot be right.
+
+    Parameters
+    ----------
+    recording
+        As read; one that was screened before is returned as it is, without findings.
+
+    Returns
+    -------
+    Screened
+        The recording without what cannot be right, and the findings.
+    """
     if recording.screened:
         return Screened(recording)
     findings = list(imu_scale(recording))

@@ -1,4 +1,4 @@
-"""Whether sigma can be believed: whitened residuals, NIS and NEES with their chi-square bands; what was used when."""
+"""Consistency of sigma: whitened residuals, NIS and NEES with their chi-square bands; what was used when."""
 
 from __future__ import annotations
 

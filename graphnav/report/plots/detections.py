@@ -1,4 +1,4 @@
-"""What the detectors saw: force, rate, speed, the statistics with their thresholds, the spectrogram."""
+"""Signals of the detectors: force, rate, speed, the statistics with their thresholds, the spectrogram."""
 
 from __future__ import annotations
 
