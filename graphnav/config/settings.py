@@ -125,7 +125,8 @@ class Settings(Section):
         for name in sensors:
             if name not in registered():
                 raise ValueError(f"no sensor '{name}' is known; {nearest(name, tuple(registered()))}")
-        return sensors
+        usual = SensorSettings()  # which need not be kept
+        return {name: one for name, one in sensors.items() if one != usual}
 
     def sensor(self, name: str) -> SensorSettings:
         """How a sensor is used; as usual where nothing is set."""
