@@ -48,11 +48,12 @@ class Sensors:
     _reach: Reach = field(default_factory=Reach)
     _before: set[tuple[str | float, ...]] = field(default_factory=set)  # fixes and readings of the clock before
 
-    def add(self, sensor: str, t: float, values: tuple[float, ...]) -> bool:
-        """Take in a row; False if it is of no use (`counts` says why).
+    def add(self, sensor: str, t: float, values: tuple[float, ...], released: bool = False) -> bool:
+        """Take in a row; False if it is of no use (`counts` says why), or is held until an IMU row tells its clock.
 
         The values are gyro and force of an IMU (rad/s, m/s^2); latitude, longitude (rad), height, three sigmas,
         velocity and its sigmas (NaN where there is none) of a fix; speed, way counted and four wheels of an odometer.
+        Rows of `released` were held before and are not held again.
         """
         known = values[: 6 if sensor != "odometer" else 1]
         if not math.isfinite(sum(known)) or not abs(t) <= LATEST or (sensor == "gnss" and min(values[3:6]) <= 0.0):
@@ -67,13 +68,15 @@ class Sensors:
         if (sensor, t, *values[: _TOLD[sensor]]) in self._before:  # a sender that begins again before that step
             self.counts[f"{sensor}: repeated"] += 1
             return False
-        if self._clock.behind and t < self.imu.newest - self.longest_gap:
-            self._clock.hold((sensor, t, values))  # until it shows what the IMU's rows before it are
+        far_ahead = bool(len(self.imu)) and t > self.imu.newest + AHEAD
+        if not released and (far_ahead or t < self.imu.newest - self.longest_gap):
+            (self._clock.hold_early if far_ahead else self._clock.hold)((sensor, t, values))
+            self._sort_out()
             return False
         if t <= self.oldest:
             self.counts[f"{sensor}: too late"] += 1
             return False
-        if len(self.imu) and t > self.imu.newest + AHEAD:
+        if far_ahead:
             self.counts[f"{sensor}: stamp in the future"] += 1
             return False
         if sensor == "gnss":
@@ -101,7 +104,7 @@ class Sensors:
         """Take in an IMU row if nothing is odd about it; False leaves it to `add`. `newest` is the time before it."""
         if self._suspect is not None or not newest + SAME < t <= newest + self.longest_gap or t <= self.oldest:
             return False
-        if len(values) != _WIDTH["imu"] or not imu_reads(values) or self._clock.behind:
+        if len(values) != _WIDTH["imu"] or not imu_reads(values) or self._clock.behind or self._clock.ahead:
             return False
         self._clock.remember(t, values)
         self.imu.append(t, values)
@@ -132,6 +135,19 @@ class Sensors:
         self._means[kind] = max(t, last), mean
         return mean
 
+    def release(self) -> None:
+        """No more IMU rows will come: what was held is to be taken in now."""
+        self._clock.go_on()
+        self._sort_out()
+
+    def _sort_out(self) -> None:
+        """What was held and is known by now."""
+        clock = self._clock
+        for sensor, _, _ in clock.known:
+            self.counts[f"{sensor}: repeated"] += 1
+        self.released += clock.released
+        clock.known, clock.released = [], []
+
     def forget_time(self) -> None:
         """Another clock: what was noted of the times of rows holds no more."""
         self._means, self._suspect, self._reach = {}, None, Reach()
@@ -152,6 +168,7 @@ class Sensors:
                 for name, width in _TOLD.items():
                     rows = getattr(self, name).rows[:, : width + 1].tolist()
                     self._before = {one for one in self._before if one[0] != name} | {(name, *row) for row in rows}
+            self._sort_out()
             return False
         if len(self.imu) and t > self.imu.newest + self.longest_gap:
             held = self._clock.hold_ahead(t, values)
@@ -159,8 +176,6 @@ class Sensors:
                 self.counts["imu: repeated"] += 1 - len(held)
                 self.released += held
                 return False
-        if t > self.imu.newest:
-            self.released += self._clock.go_on()
         if len(self.imu) and t > self.imu.newest + self.longest_gap:
             # the next row tells whether this stamp was wrong or the IMU away
             before, self._suspect = self._suspect, (t, values)
@@ -174,6 +189,8 @@ class Sensors:
         self._suspect = None
         if t > self.imu.newest:
             self._clock.remember(t, values)
+            self._clock.go_on()
+            self._sort_out()
         if not self.imu.add(t, values):
             self.counts["imu: repeated"] += 1
             return False

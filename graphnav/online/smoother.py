@@ -88,8 +88,8 @@ class Smoother:
         """ "aligning" or "running"."""
         return "aligning" if self.tracker is None else "running"
 
-    def add(self, row: Row) -> None:
-        """Take in one row: sensor, time and values as in `graphnav.online.sensors.Sensors.add`."""
+    def add(self, row: Row, released: bool = False) -> None:
+        """Take in one row: sensor, time, values and whether it was held as in `graphnav.online.sensors.Sensors.add`."""
         sensor, t, values = row
         sensors = self.sensors
         before, previous = sensors.imu.newest, sensors.odometer.newest
@@ -97,7 +97,7 @@ class Smoother:
             if t >= self._awake:
                 self._look()
             return
-        if not sensors.add(sensor, t, values):
+        if not sensors.add(sensor, t, values, released):
             return
         if sensor == "imu":
             newest = sensors.imu.newest
