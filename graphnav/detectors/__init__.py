@@ -40,14 +40,17 @@ def list_detectors() -> dict[str, type[Detector]]:
     return dict(sorted(found.items()))
 
 
-def detect(recording: Recording, settings: Settings | None = None) -> Detections:
-    """Stationary intervals and the statistics they come from; never fails, and says what could not be done."""
+def detect(recording: Recording, settings: Settings | None = None, since: float = -np.inf) -> Detections:
+    """Stationary intervals and the statistics they come from; never fails, and says what could not be done.
+
+    Of stances that are over by `since` (s), where they begin and end need not be known as well.
+    """
     d = (settings or Settings()).detectors
     scene = Scene(recording, d)
     if recording.platform == "foot" and scene.period > 0.0:
         fire = [name for name in (("glrt",) if d.fire == (FUSED,) else d.fire) if name in STATISTICS]
         idle = [name for name in d.fire if name not in fire and name != FUSED]
-        stances = detect_stances(recording.imu, scene.period, d.stance, fire)
+        stances = detect_stances(recording.imu, scene.period, d.stance, fire, since)
         more = (f"{', '.join(idle)}: of vehicles only, finds no stance",) if idle else ()
         return Detections(stances.stationary, stances.all, (*d.notes, *more, *stances.notes))
     if not recording.duration >= _SHORTEST or not scene.period > 0.0:

@@ -44,13 +44,16 @@ _NEAR = 0.8  # s from an end of a span within which its quietest moment is looke
 _REACH = 0.2  # m, from an IMU on a shoe to where the shoe touches the floor, at most
 
 
-def detect_stances(imu: Imu, period: float, settings: StanceSettings, which: Sequence[str] = ("glrt",)) -> Detections:
+def detect_stances(
+    imu: Imu, period: float, settings: StanceSettings, which: Sequence[str] = ("glrt",), since: float = -np.inf
+) -> Detections:
     """Stances of a foot, and e with the threshold they come from.
 
     Parameters
     ----------
     period : s between rows.
     which : of Skog's four statistics, all in the units of e; a stance is one if any of them says so.
+    since : s; stances that are over by then are not cut where the foot slides.
     """
     window = max(3, round(settings.window / period))
     if len(imu.t) < window:
@@ -67,7 +70,9 @@ def detect_stances(imu: Imu, period: float, settings: StanceSettings, which: Seq
             notes.append(
                 f"{len(one.intervals) - len(deep)} short lulls that do not reach as deep as the stances were left out"
             )
-        kept.append(_without_sliding(deep, imu, one.t, one.statistic, bias, settings.threshold * _REACH))
+        begin = int(np.searchsorted(deep[:, 1], since)) if len(deep) else 0
+        cut = _without_sliding(deep[begin:], imu, one.t, one.statistic, bias, settings.threshold * _REACH)
+        kept.append(np.concatenate([deep[:begin], cut]))
     if not found:
         return Detections(NONE, (), ())
     spans = union(kept) if len(kept) > 1 else kept[0]

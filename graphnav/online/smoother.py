@@ -30,6 +30,7 @@ from graphnav.online.judging import CatchUp, Judgement
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import Tracker
+from graphnav.online.walker import Walker
 from graphnav.recording import Recording
 
 AFTER = 0.05  # s of IMU after a keyframe that a fix may look at
@@ -106,6 +107,8 @@ class Smoother:
         tracker = self.tracker
         if tracker is not None:
             self._awake = -np.inf
+            if isinstance(tracker, Walker):
+                tracker.finish_entering(sensors)
             if t < {"imu": before, "odometer": previous}.get(sensor, -np.inf):
                 tracker.note_late_row(sensor, t)
             if sensor == "gnss" and t > tracker.newest + SAME_TIME:
@@ -127,6 +130,9 @@ class Smoother:
         if tracker is None:
             self._align()
             self._awake = self._due if self.tracker is None else now
+        elif isinstance(tracker, Walker) and tracker.busy:
+            tracker.go_on(self.sensors)
+            self._awake = now
         elif now >= self._due:
             self._advance(tracker)
             self._awake = now
@@ -220,7 +226,8 @@ class Smoother:
         stated = with_known_heading(found, self.settings)
         self.notes += [note for note in stated.notes if note not in self.notes]
         message = first_message(stated.state, start_sigma(stated))
-        tracker = Tracker(self.settings, self.frame, message, start, self._setup, noise)
+        kind = Walker if self._setup.platform == "foot" else Tracker
+        tracker = kind(self.settings, self.frame, message, start, self._setup, noise)
         if found is not stated:
             tracker.window.head = message.moved(found.state.minus(stated.state)[0])
         return tracker
@@ -326,8 +333,11 @@ class Smoother:
         odometer = sensors.odometer.newest
         if not last and now - odometer < _SILENT:
             limit = min(limit, max(odometer, now - _ODOMETER))
-        if tracker.foot:
-            self._walk(tracker, now if last else now - SURE, last)
+        if isinstance(tracker, Walker):
+            newest = tracker.take_steps(sensors, now if last else now - SURE, last, self._fixes, self._dirty)
+            if newest > -np.inf:
+                self._dirty, self._fixes = np.inf, [t for t in self._fixes if t > newest + SAME_TIME]
+            self._due = now + _STEP
             return
         T = tracker.newest
         begun = bool(len(tracker.window)) or tracker.opened
@@ -362,17 +372,6 @@ class Smoother:
                 return
         T = tracker.newest
         self._due = min([T + period, *(t for t in self._fixes if t > T)]) + AFTER
-
-    def _walk(self, tracker: Tracker, limit: float, last: bool) -> None:
-        """Make the keyframes of the steps that are over."""
-        times = tracker.steps_until(self.sensors, limit, last)
-        late = [t for t in self._fixes if t <= tracker.newest + SAME_TIME]
-        if len(times) or (late and len(tracker.window)):
-            dirty, self._dirty = min([self._dirty, *late]), np.inf
-            tracker.update(self.sensors, np.union1d(times, late), dirty)
-            self._collect(tracker)
-            self._fixes = [t for t in self._fixes if t > tracker.newest + SAME_TIME]
-        self._due = self.sensors.imu.newest + _STEP
 
     def _collect(self, tracker: Tracker) -> None:
         for part in tracker.settled:
