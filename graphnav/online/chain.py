@@ -111,11 +111,11 @@ class Chain:
     # ------------------------------------------------------------------------------------------ entering, leaving
     def _watch(self, problem: Problem, sensors: Sensors) -> None:
         """Have the fixes watched for errors that last, as soon as some tell how often they come."""
-        if self.window.newest.tests is not None or self.settings.gnss.faults == "off" or len(sensors.gnss) < _FIXES:
+        if self.window.newest.tests is not None or self.settings.gnss.faults == "off" or len(sensors.fixes) < _FIXES:
             return
         watched = [c for c in problem.constraints if c.watched and c.fix_of]
         if watched:
-            period = float(np.median(np.diff(sensors.gnss.t)))
+            period = float(np.median(np.diff(sensors.fixes)))
             self.window.watch(Watch(watched, period, len(self.window.newest.z)))
 
     def _weighed(self, problem: Problem) -> Problem:

@@ -8,14 +8,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from graphnav.constraints.gnss import period
 from graphnav.core.rotation import Array
+from graphnav.estimation.noise.spacing import best_fixes, grid_start
 from graphnav.online.buffers import SAME, Buffer
 from graphnav.online.sanity import Clock, Reach, Row, fix_odds, imu_reads, odometer_reads, with_sane_velocity
 from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.recording.formats.repair import LATEST
 
 AHEAD = 60.0  # s; stamps of other sensors further than this before the IMU's are wrong
-_WIDTH = {"imu": 6, "gnss": 18, "odometer": 6}  # the last six of a fix: usual sigmas of place and velocity
+_WIDTH = {"imu": 6, "gnss": 19, "odometer": 6}  # the last of a fix: six usual sigmas, and whether it is used
+_USED = 19
 _TOLD = {"gnss": 3, "odometer": 1}  # values by which a row is known again
 _USUAL = 60.0  # s over which the usual sigma of fixes is averaged
 _NAN = float("nan")
@@ -44,6 +47,8 @@ class Sensors:
     set_back: list[Row] = field(default_factory=list)  # the first rows of a clock that was set back
     moved: tuple[float, int] | None = None  # since when (s), and how many fixes are elsewhere than all before
     released: list[Row] = field(default_factory=list)  # rows that were held and are to be taken in now
+    left: list[float] = field(default_factory=list)  # s, fixes that were used until better ones of their span came
+    _grid: tuple[float, float] | None = None  # begin and length of the spans, s, of which the best fix is used
     _clock: Clock = field(default_factory=Clock)
     _reach: Reach = field(default_factory=Reach)
     _before: set[tuple[str | float, ...]] = field(default_factory=set)  # fixes and readings of the clock before
@@ -93,11 +98,18 @@ class Sensors:
                 self.gnss.drop_before(np.inf)
                 self._means, self.moved, self.released = {}, (others[0][1], len(others)), others
                 return False
-            values = (*values, *self._usually("position", t, values[3:6]), *self._usually("velocity", t, values[9:12]))
+            values = (
+                *values,
+                *self._usually("position", t, values[3:6]),
+                *self._usually("velocity", t, values[9:12]),
+                1.0,
+            )
         if not buffer.add(t, values):
             self.counts[f"{sensor}: repeated"] += 1
             return False
         self.counts[sensor] += 1
+        if sensor == "gnss" and self._grid is not None:
+            return self._choose(t, *self._grid)
         return True
 
     def add_next(self, t: float, values: tuple[float, ...], newest: float) -> bool:
@@ -111,6 +123,36 @@ class Sensors:
         self.counts["imu"] += 1
         return True
 
+    @property
+    def fixes(self) -> Array:
+        """(N,) s, those that are used."""
+        return self.gnss.rows[self.gnss.rows[:, _USED] > 0.0, 0]
+
+    def space(self, spacing: float) -> None:
+        """Use the best fix of every span of `spacing` (s), as `graphnav.estimation.noise.spacing` has it; 0: use all."""
+        self.gnss.rows[:, _USED], self._grid, self.left = 1.0, None, []
+        gnss = self._gnss(-np.inf, np.inf)
+        if not spacing or gnss is None or len(gnss.t) < 2 or period(gnss.t) > 0.5 * spacing:
+            return
+        begin = grid_start(gnss)
+        self._grid = begin, spacing
+        self.gnss.rows[:, _USED] = 0.0
+        self.gnss.rows[best_fixes(gnss, np.floor((gnss.t - begin) / spacing)), _USED] = 1.0
+
+    def _choose(self, t: float, begin: float, spacing: float) -> bool:
+        """Whether the fix at a time is one of the best of its span; those that no longer are go to `left`."""
+        span = np.floor((t - begin) / spacing)
+        near = self.gnss.rows[slice(*np.searchsorted(self.gnss.t, [t - 1.1 * spacing, t + 1.1 * spacing]))]
+        rows = np.flatnonzero(np.floor((near[:, 0] - begin) / spacing) == span)
+        gnss = self._as_gnss(near[rows])
+        assert gnss is not None
+        best = rows[best_fixes(gnss, np.zeros(len(rows)))]
+        others = np.setdiff1d(rows, best)
+        self.left += [float(x) for x in near[others[near[others, _USED] > 0.0], 0] if x != t]
+        near[rows, _USED] = 0.0
+        near[best, _USED] = 1.0
+        return bool(np.any(near[best, 0] == t))
+
     def typical_sigmas(self, t: Array) -> Array:
         """(N, 6) sigmas that the fixes at some times usually state, m and m/s: the units of errors that last."""
         return self.gnss.rows[np.searchsorted(self.gnss.t, t - 1e-6), 13:19]
@@ -118,7 +160,7 @@ class Sensors:
     def unit(self) -> Array:
         """(3,) m, in which errors of the fixes that last for minutes and hours are told, from the first question on."""
         if self._unit is None:
-            self._unit = unit_of(self.gnss.rows[:, 4:7])
+            self._unit = unit_of(self.gnss.rows[self.gnss.rows[:, _USED] > 0.0, 4:7])
         return self._unit
 
     def _usually(self, kind: str, t: float, sd: tuple[float, ...]) -> tuple[float, ...]:
@@ -202,14 +244,18 @@ class Sensors:
         for buffer in (self.imu, self.gnss, self.odometer):
             buffer.drop_before(t)
 
-    def recording(self, begin: float = -np.inf, end: float = np.inf) -> Recording:
-        """The rows between two times as a recording."""
+    def recording(self, begin: float = -np.inf, end: float = np.inf, every: bool = False) -> Recording:
+        """The rows between two times as a recording; with `every` the fixes that are not used, too."""
         rows = self.imu.between(begin, end)
         imu = replace(self.setup.imu, t=rows[:, 0], gyro=rows[:, 1:4], accel=rows[:, 4:7])
-        return replace(self.setup, imu=imu, gnss=self._gnss(begin, end), odometer=self._odometer(begin, end))
+        gnss = self._gnss(begin, end, every)
+        return replace(self.setup, imu=imu, gnss=gnss, odometer=self._odometer(begin, end))
 
-    def _gnss(self, begin: float, end: float) -> Gnss | None:
+    def _gnss(self, begin: float, end: float, every: bool = False) -> Gnss | None:
         rows = self.gnss.between(begin, end)
+        return self._as_gnss(rows if every else rows[rows[:, _USED] > 0.0])
+
+    def _as_gnss(self, rows: Array) -> Gnss | None:
         if self.setup.gnss is None or not len(rows):
             return None
         v = sd_v = None

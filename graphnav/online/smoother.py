@@ -111,6 +111,9 @@ class Smoother:
                 tracker.finish_entering(sensors)
             if t < {"imu": before, "odometer": previous}.get(sensor, -np.inf):
                 tracker.note_late_row(sensor, t)
+            if sensors.left:
+                self._fixes = [x for x in self._fixes if x not in sensors.left]
+                self._dirty, sensors.left = min([self._dirty, *sensors.left]), []
             if sensor == "gnss" and t > tracker.newest + SAME_TIME:
                 self._fixes = sorted([*self._fixes, t])
                 self._due = min(self._due, t + AFTER)
@@ -213,7 +216,8 @@ class Smoother:
         told = found.motion is not None and self.settings.gnss.position and recording.platform != "foot"
         if told and self.settings.noise.mode == "estimated":
             self._found, self._tentative = found, True
-        self._fixes = [t for t in sensors.gnss.t.tolist() if t >= recording.start - SAME_TIME]
+            sensors.space(self.settings.noise.spacing)
+        self._fixes = [t for t in sensors.fixes.tolist() if t >= recording.start - SAME_TIME]
         self._began, self._judged = recording.start, recording.duration
         sensors.oldest = recording.start
         self._advance(tracker)
@@ -243,9 +247,8 @@ class Smoother:
         Up to `_FIXES` fixes in motion.
         """
         assert found.motion is not None
-        assert self.frame is not None
         span = tracker.newest - self._began
-        enough = np.count_nonzero(self.sensors.gnss.t > found.motion) >= _FIXES or span > _JUDGED_UNTIL
+        enough = np.count_nonzero(self.sensors.fixes > found.motion) >= _FIXES or span > _JUDGED_UNTIL
         if not enough and span < max(min(self.settings.solver.lag, _JUDGED), 2.0 * self._judged):
             return
         self._judged = span
@@ -255,9 +258,10 @@ class Smoother:
     def _have_judged(self, found: Alignment, tracker: Tracker) -> None:
         assert self.frame is not None
         times = np.concatenate([self._times, tracker.window.t])
-        recording = self.sensors.recording(-np.inf, tracker.newest + AFTER)
+        until = tracker.newest + AFTER
+        recording, every = (self.sensors.recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
         due = tracker.newest + min(_THINKING * self.settings.solver.lag, _LONGEST_THOUGHT)
-        self._judgement = Judgement(recording, self.settings, self.frame, found, times, self.sensors.unit(), due)
+        self._judgement = Judgement(recording, every, self.settings, self.frame, found, times, self.sensors.unit(), due)
 
     def _use(self, judgement: Judgement, tracker: Tracker) -> None:
         """Begin to go through what has not settled with what the sensors were judged to be."""
@@ -313,6 +317,7 @@ class Smoother:
         for name, rows in later.items():
             for row in rows[rows[:, 0] > before]:
                 getattr(sensors, name).add(float(row[0]), tuple(row[1:]))
+        sensors.space(0.0)  # all of them, until there is a start again
         self._due = self._awake = sensors.imu.newest + _TRY
 
     def _begin_anew(self, oldest: float) -> None:
@@ -320,6 +325,7 @@ class Smoother:
         self.tracker = self._found = self._judgement = self._again = None
         self._tentative, self._times, self._left_out = False, [], ()
         self.sensors.drop_before(np.inf)
+        self.sensors.space(0.0)
         self.sensors.oldest = oldest
         self._fixes, self._dirty = [], np.inf
         self._due = self._awake = oldest + _TRY
@@ -354,12 +360,10 @@ class Smoother:
                 at = anchor
                 times.append(at)
         late = [t for t in self._fixes if t <= T + SAME_TIME]
-        if late and begun:
-            # a keyframe of its own, and those after it again
+        if late and begun:  # a keyframe of its own, and those after it again
             self._dirty = min(self._dirty, *late)
             times = sorted({*times, *late})
-        enough = len(times) > 1 or begun
-        if (times and enough) or (last and self._dirty < np.inf):
+        if (times and (len(times) > 1 or begun)) or (last and self._dirty < np.inf):
             dirty, self._dirty = self._dirty, np.inf
             self._fixes = [t for t in self._fixes if t > limit and t > T + SAME_TIME]
             redone = tracker.update(sensors, np.array(times), dirty)

@@ -349,7 +349,7 @@ class Tracker(Chain):
 
         A few keyframes do not tell how often fixes come, nor what they usually state.
         """
-        spacing, rows = node_spacing(self.settings.gnss.slow_times, period(sensors.gnss.t)), []
+        spacing, rows = node_spacing(self.settings.gnss.slow_times, period(sensors.fixes)), []
         for c in problem.constraints:
             if isinstance(c, GnssPosition):
                 c = replace(c, usual_error=sensors.unit())
