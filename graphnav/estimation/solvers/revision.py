@@ -55,7 +55,7 @@ class Revision:
             return False
         # what an error of the fixes does to the estimate is the same to first order
         stages = [
-            replace(new, message=replace(new.message, tests=now.message.tests))
+            new if now.message.tests is None else replace(new, message=replace(new.message, tests=now.message.tests))
             for now, (_, new) in zip(window.stages[self.first :], made, strict=True)
         ]
         window.replace_from(self.first, self._before, stages)
