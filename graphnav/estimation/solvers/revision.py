@@ -61,6 +61,14 @@ class Revision:
         window.replace_from(self.first, self._before, stages)
         return True
 
+    def forget(self) -> None:
+        """Stages made so far need not know where their rows came from: each would keep the rows of all around it."""
+        for k in range(len(self._made) - 1, -1, -1):
+            was, stage = self._made[k]
+            if stage.place.problem is None:
+                break  # nor do those before it
+            self._made[k] = was, replace(stage, place=replace(stage.place, problem=None))
+
     def _again(self, old: Sequence[Stage], means: Sequence[Array], places: Sequence[Place]) -> list[Stage]:
         before = self._made[-1][1] if self._made else self._before
         message = before.message if isinstance(before, Stage) else before
