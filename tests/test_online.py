@@ -22,7 +22,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import graphnav
-from graphnav.app import cli
+from graphnav.app import cli, cli_online
 from graphnav.config import Settings, settings_from
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.core.trajectory import Trajectory
@@ -555,12 +555,24 @@ def test_bad_usage_is_one_line_and_code_two(
         (["no-such-thing"], "no-such-thing"),
         (["-", "--resume"], "say which folder"),
         (["-", "--lag", "0"], "at least 1 s"),
+        (["-", "--detectors", "no-such-thing"], "no-such-thing"),
+        (["-", "--detectors", "fused,fft"], "name it alone"),
         (["tcp:x"], "cannot listen"),
     ):
         assert cli.run(["online", *arguments]) == 2
         error = capsys.readouterr().err
         assert reason in error
         assert error.count("\n") == 1
+
+
+def test_the_detectors_that_decide_can_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    fired = []
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(cli_online, "follow", lambda session, *_: fired.append(session.settings.detectors.fire))
+    monkeypatch.setattr(Session, "require_settled", lambda _: None)
+    for more in ([], ["--detectors", "fft,glrt"]):
+        assert cli.run(["online", "-", "--quiet", *more]) == 0
+    assert fired == [("fused",), ("fft", "glrt")]
 
 
 def test_a_source_without_its_first_line_is_refused() -> None:

@@ -106,8 +106,8 @@ def test_a_clock_that_is_set_back_begins_a_piece(
 ) -> None:
     """By an hour in the middle, and the drive from its start follows: both are as they would be alone."""
     lines = [line for _, line in lines_of(drive[0])]
-    first = next(k for k, row in enumerate(rows) if row[0] == "imu")  # what comes before it is of no clock yet
-    back = [(sensor, t - 3600.0, values) for sensor, t, values in rows[first:]]
+    assert rows[0][0] != "imu"  # what the first instant of the new clock shows waits for the IMU to tell that it is one
+    back = [(sensor, t - 3600.0, values) for sensor, t, values in rows]
     later = [line_of(row) for row in [*back[:3], back[2], *back[3:]]]  # one of them comes twice
     session = Session(QUICK, "-", tmp_path / "out")
     session.add_lines([*lines[:-1], *later])
@@ -121,6 +121,39 @@ def test_a_clock_that_is_set_back_begins_a_piece(
         np.testing.assert_allclose(track.t, other.t, atol=1e-6)
         np.testing.assert_allclose((track.llh - other.llh) * [6.4e6, 6.4e6, 1.0], 0.0, atol=1e-3)
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["clocks"] == 2
+
+
+@pytest.mark.parametrize("step", [-3600.0, 3600.0])
+def test_a_fix_before_the_first_imu_row_of_another_clock_counts(
+    drive: tuple[Recording, Trajectory], rows: list[Row], step: float
+) -> None:
+    """Whether it comes once or is sent again after that row: set back or set ahead, a clock loses nothing."""
+    old = [row for row in rows if row[1] <= 24.0]
+    first = next(k for k, row in enumerate(rows) if row[0] == "gnss" and row[1] > 24.0)
+    assert rows[first + 1][0] == "imu"
+    new = [(sensor, t + step, values) for sensor, t, values in rows[first:]]
+    once = Online(without_rows(drive[0]), QUICK)
+    twice = Online(without_rows(drive[0]), QUICK)
+    for online, sent in ((once, [*old, *new[:300]]), (twice, [*old, *new[:2], new[0], *new[2:300]])):
+        for row in sent:
+            online.add(row)
+        assert online.sensors.gnss.t[0 if step < 0 else -1] >= new[0][1]
+        assert new[0][1] in online.sensors.gnss.t
+        assert online.sensors.counts["gnss: stamp in the future"] == 0
+        assert online.sensors.counts["gnss: too late"] == 0
+    assert twice.sensors.gnss.t.tolist() == once.sensors.gnss.t.tolist()
+    assert twice.sensors.counts["gnss: repeated"] == 1
+
+
+def test_a_late_fix_that_is_the_last_row_is_used(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    """No IMU row follows that could tell of which clock it is."""
+    some = [row for row in rows if row[1] <= 26.0]
+    late = [row for row in some if row[0] == "gnss"][-4]
+    online = Online(without_rows(drive[0]), QUICK)
+    for row in (*(row for row in some if row is not late), late):
+        online.add(row)
+    online.finish()
+    assert late[1] in online.sensors.gnss.t
 
 
 def test_a_clock_set_back_before_there_is_any_state(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from graphnav.app.cli_options import AllowOutside, Config, Profile, Quiet, Topic
+from graphnav.app.cli_options import AllowOutside, Config, Fire, Profile, Quiet, Topic, firing
 from graphnav.app.talk import Interrupted, say
 from graphnav.core.errors import ConfigError
 
@@ -51,6 +51,7 @@ def online(
     engine: Annotated[
         str | None, typer.Option("--engine", metavar="NAME", help="What smooths: window, or isam2 (GTSAM's).")
     ] = None,
+    detectors: Fire = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in OUT.")] = False,
     send: Annotated[bool, typer.Option("--send", help="Print the recording as lines instead of smoothing it.")] = False,
     profile: Profile = None,
@@ -68,7 +69,7 @@ def online(
     if send:
         _send(source, topic or [], allow_outside, speed)
         return
-    settings = _override(read_settings(config, profile), lag, engine)
+    settings = firing(_override(read_settings(config, profile), lag, engine), detectors)
     if resume and out is None:
         raise ConfigError("--resume: say which folder to go on in: -o OUT")
     folder = None if out is None else output_folder(out)

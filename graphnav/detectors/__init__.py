@@ -43,7 +43,7 @@ def list_detectors() -> dict[str, type[Detector]]:
     return dict(sorted(found.items()))
 
 
-def detect(recording: Recording, settings: Settings | None = None) -> Detections:
+def detect(recording: Recording, settings: Settings | None = None, since: float = -np.inf) -> Detections:
     """Stationary intervals and the statistics they come from. Never fails: a note says what could not be done.
 
     Parameters
@@ -52,6 +52,8 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
         As read.
     settings
         The defaults when None.
+    since
+        s; of stances that are over by then, where they begin and end need not be known.
 
     Returns
     -------
@@ -63,7 +65,7 @@ def detect(recording: Recording, settings: Settings | None = None) -> Detections
     if recording.platform == "foot" and scene.period > 0.0:
         fire = [name for name in (("glrt",) if d.fire == (FUSED,) else d.fire) if name in STATISTICS]
         idle = [name for name in d.fire if name not in fire and name != FUSED]
-        stances = detect_stances(recording.imu, scene.period, d.stance, fire)
+        stances = detect_stances(recording.imu, scene.period, d.stance, fire, since)
         idle += [kind.name for kind in recording.own.detectors]
         more = (
             (Note("detectors.vehicles_only", f"{', '.join(idle)}: of vehicles only, finds no stance"),) if idle else ()

@@ -45,13 +45,16 @@ _EDGE_SEARCH = 0.8  # s from an end of a span within which its quietest moment i
 _REACH = 0.2  # m, from an IMU on a shoe to where the shoe touches the floor, at most
 
 
-def detect_stances(imu: Imu, period: float, settings: StanceSettings, which: Sequence[str] = ("glrt",)) -> Detections:
+def detect_stances(
+    imu: Imu, period: float, settings: StanceSettings, which: Sequence[str] = ("glrt",), since: float = -np.inf
+) -> Detections:
     """Stances of a foot, and e with the threshold they come from.
 
     Parameters
     ----------
     period : s between rows.
     which : of Skog's four statistics, all in the units of e; a stance is one if any of them says so.
+    since : s; stances that are over by then are not cut where the foot slides.
     """
     window = max(3, round(settings.window / period))
     if len(imu.t) < window:
@@ -74,7 +77,9 @@ def detect_stances(imu: Imu, period: float, settings: StanceSettings, which: Seq
                     "out",
                 )
             )
-        kept.append(_without_sliding(deep, imu, one.t, one.statistic, bias, settings.threshold * _REACH))
+        begin = int(np.searchsorted(deep[:, 1], since)) if len(deep) else 0
+        cut = _without_sliding(deep[begin:], imu, one.t, one.statistic, bias, settings.threshold * _REACH)
+        kept.append(np.concatenate([deep[:begin], cut]))
     if not found:
         return Detections(NONE, (), ())
     spans = union(kept) if len(kept) > 1 else kept[0]

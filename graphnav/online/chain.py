@@ -7,7 +7,7 @@ since then leave again and enter without those.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,17 @@ from graphnav.online.sensors import Sensors
 _PLACE_SIGMA = 1000.0  # m, of where a stop may be
 _FIXES = 5  # that tell how often they come
 _ENGINES: dict[str, type[Window]] = {"window": Window, "isam2": TreeWindow}
+
+
+@dataclass(frozen=True)
+class Posed:
+    """Keyframes that are to enter, in a problem from its keyframe `first` on."""
+
+    problem: Problem
+    first: int
+    times: Array  # (K,) s
+    redone: float  # s, the first of them that was in the window before
+    ahead: Predicted | None  # what was expected of the first
 
 
 class Chain:
@@ -100,11 +111,11 @@ class Chain:
     # ------------------------------------------------------------------------------------------ entering, leaving
     def _watch(self, problem: Problem, sensors: Sensors) -> None:
         """Have the fixes watched for errors that last, as soon as some tell how often they come."""
-        if self.window.newest.tests is not None or self.settings.gnss.faults == "off" or len(sensors.gnss) < _FIXES:
+        if self.window.newest.tests is not None or self.settings.gnss.faults == "off" or len(sensors.fixes) < _FIXES:
             return
         watched = [c for c in problem.constraints if c.watched and c.fix_of]
         if watched:
-            period = float(np.median(np.diff(sensors.gnss.t)))
+            period = float(np.median(np.diff(sensors.fixes)))
             self.window.watch(Watch(watched, period, len(self.window.newest.z)))
 
     def _weighed(self, problem: Problem) -> Problem:
@@ -118,13 +129,15 @@ class Chain:
             rows.append(c)
         return replace(problem, constraints=tuple(rows))
 
-    def _add(self, posed: Problem, first: int, ahead: Predicted | None = None) -> float | None:
-        """Add the keyframes of a problem from one on; the time before them to go on from, if a fault is found.
+    def _add(
+        self, posed: Problem, first: int, ahead: Predicted | None = None, begin: int = 0, end: int | None = None
+    ) -> float | None:
+        """Add the keyframes of a problem from `first` on; the time before them to go on from, if a fault is found.
 
-        `ahead` is what was expected of the first of them, if that still holds.
+        `ahead` is what was expected of the first of them, if that still holds; `begin` and `end` are of a portion.
         """
-        problem, k, turn = self._weighed(posed), first, 0.0
-        while k < len(problem.t):
+        problem, k, turn = self._weighed(posed), max(first, begin), 0.0
+        while k < (len(problem.t) if end is None else end):
             turn = max(turn, self._push(problem, k, ahead))
             ahead = None
             fault = self.window.stages[-1].fault

@@ -53,6 +53,7 @@ class Judgement:
 
     Parameters
     ----------
+    every : that with the fixes, too, that are not used.
     times : (K,) s, keyframes, the first at the start of the recording: weights of rows hold at these.
     unit : (3,) m, in which the answer is to tell errors of the fixes that last for minutes and hours.
     due : s, when the answer is to be used.
@@ -61,6 +62,7 @@ class Judgement:
     def __init__(
         self,
         recording: Recording,
+        every: Recording,
         settings: Settings,
         frame: LocalFrame,
         found: Alignment,
@@ -69,7 +71,7 @@ class Judgement:
         due: float,
     ) -> None:
         self.found, self.due, self.until = found, due, float(times[-1])
-        self._asked = recording, settings, frame, times, unit
+        self._asked = recording, every, settings, frame, times, unit
         self._begin()
 
     def answer(self) -> Answer:
@@ -92,10 +94,10 @@ class Judgement:
         self._thread.start()
 
     def _work(self) -> None:
-        recording, settings, frame, times, unit = self._asked
+        recording, every, settings, frame, times, unit = self._asked
         start = self.found
         try:
-            stationary = detect(recording, settings).stationary
+            stationary = detect(every, settings).stationary
             base = build_problem(
                 recording, settings, frame, start.state, start_sigma(start), stationary, times, parts_of_noise=True
             )  # fmt: skip

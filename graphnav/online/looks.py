@@ -51,7 +51,7 @@ class Stops:
         if now - self._reviewed >= _REVIEW - SAME_TIME:
             self._reviewed, answered = now, since
         self.looked = now
-        recording = sensors.recording(-np.inf if whole else now - _LOOK, now)
+        recording = sensors.recording(-np.inf if whole else now - _LOOK, now, every=True)
         self._seen = since, stops(recording, settings, since, now - SURE, self.spans, answered)
 
     def replace(self, spans: Array, edges: Array) -> None:

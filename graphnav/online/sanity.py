@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -113,12 +114,16 @@ class Clock:
     Rows at times that have passed are late, or sent again, or of a clock that was set back. Late ones fill a hole,
     those sent again are as they were (a row of every second is remembered), and neither goes on and on. A sender that
     begins again before such a step sends rows of the clock before, too, which need not lie in the past of the new one.
+    Fixes and readings far from the newest IMU row wait for the next one, which tells whether the clock was set.
     """
 
     _seconds: dict[int, tuple[float, ...]] = field(default_factory=dict)  # the first row of each second
     _second: int = -(2**62)
     behind: list[Row] = field(default_factory=list)  # rows at times that have passed, held until it shows what they are
-    _again: bool = False  # whether these are known
+    ahead: list[Row] = field(default_factory=list)  # fixes and readings far ahead of the IMU, held likewise
+    released: list[Row] = field(default_factory=list)  # that were held and turned out to be of the clock as it is
+    known: list[Row] = field(default_factory=list)  # that were held and turned out to be of a clock before
+    _again: Literal["", "this", "before"] = ""  # of which clock the rows behind are known, if they are
     _before: dict[int, tuple[float, ...]] = field(default_factory=dict)  # as `_seconds`, of the clocks before
     _ahead: list[Row] = field(default_factory=list)  # rows far ahead at times of a clock before, held likewise
     _sent_again: bool = False  # whether these are known
@@ -153,14 +158,28 @@ class Clock:
             if t in times:
                 return False  # sent twice
             if times and t < max(times) - _LASTING:  # behind these, too
-                self.behind, self._again, times = [one for one in self.behind if one[0] != "imu"][-_HELD:], False, []
-            self._again |= (t, *values) in (self._seconds.get(int(t)), self._before.get(int(t)))
+                self.behind, self._again, times = [one for one in self.behind if one[0] != "imu"], "", []
+            second = int(t)
+            if (t, *values) == self._seconds.get(second):
+                self._again = "this"
+            elif (t, *values) == self._before.get(second):
+                self._again = "before"
             times.append(t)
         self.behind.append(row)
         if self._again:
+            others = [one for one in self.behind if one[0] != "imu"]
             self.behind = [row] if sensor == "imu" else []
+            (self.released if self._again == "this" else self.known).extend(others)
             return False
+        if len(self.behind) - len(times) > _HELD:  # the IMU says nothing
+            self.released.append(self.behind.pop(next(k for k, one in enumerate(self.behind) if one[0] != "imu")))
         return len(times) >= _SET_BACK and max(times) - min(times) >= _LASTING
+
+    def hold_early(self, row: Row) -> None:
+        """Hold a fix or reading far ahead of the IMU: the clock may have been set ahead, which IMU rows will tell."""
+        self.ahead.append(row)
+        if len(self.ahead) > _HELD:
+            self.released.append(self.ahead.pop(0))
 
     def hold_ahead(self, t: float, values: tuple[float, ...]) -> list[Row] | None:
         """Hold an IMU row far ahead, if it may be one of a clock before that is sent again; None if not.
@@ -176,15 +195,14 @@ class Clock:
         rows, self._ahead, self._new = self._ahead, [], True
         return rows
 
-    def go_on(self) -> list[Row]:
-        """Time goes on as before: the fixes and readings that were held, to be taken in now."""
-        held = [row for row in self.behind if row[0] != "imu"]
-        self.behind, self._again = [], False
-        return held
+    def go_on(self) -> None:
+        """Time goes on: the fixes and readings that were held are of this clock, or of none."""
+        self.released += [row for row in self.behind if row[0] != "imu"] + self.ahead
+        self.behind, self.ahead, self._again = [], [], ""
 
     def set_back(self) -> list[Row]:
         """The rows of the new clock; what is remembered is of the old one from now on."""
-        held, self.behind, self._again = self.behind, [], False
+        held, self.behind, self._again = self.behind, [], ""
         self._before |= self._seconds
         for second in list(self._before)[:-_REMEMBERED]:
             del self._before[second]

@@ -8,14 +8,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from graphnav.constraints.gnss import period
 from graphnav.core.rotation import Array
+from graphnav.estimation.noise.spacing import best_fixes, grid_start
 from graphnav.online.buffers import SAME, Buffer
 from graphnav.online.sanity import Clock, Reach, Row, fix_odds, imu_reads, odometer_reads, with_sane_velocity
 from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.recording.formats.repair import LATEST
 
 AHEAD = 60.0  # s; stamps of other sensors further than this before the IMU's are wrong
-_WIDTH = {"imu": 6, "gnss": 18, "odometer": 6}  # the last six of a fix: usual sigmas of place and velocity
+_WIDTH = {"imu": 6, "gnss": 19, "odometer": 6}  # the last of a fix: six usual sigmas, and whether it is used
+_USED = 19
 _TOLD = {"gnss": 3, "odometer": 1}  # values by which a row is known again
 _USUAL = 60.0  # s over which the usual sigma of fixes is averaged
 _NAN = float("nan")
@@ -45,6 +48,8 @@ class Sensors:
     set_back: list[Row] = field(default_factory=list)  # the first rows of a clock that was set back
     moved: tuple[float, int] | None = None  # since when (s), and how many fixes are elsewhere than all before
     released: list[Row] = field(default_factory=list)  # rows that were held and are to be taken in now
+    left: list[float] = field(default_factory=list)  # s, fixes that were used until better ones of their span came
+    _grid: tuple[float, float] | None = None  # begin and length of the spans, s, of which the best fix is used
     _clock: Clock = field(default_factory=Clock)
     _reach: Reach = field(default_factory=Reach)
     _before: set[tuple[str | float, ...]] = field(default_factory=set)  # fixes and readings of the clock before
@@ -65,15 +70,16 @@ class Sensors:
         """Whether each row of a sensor wants a keyframe."""
         return sensor == "gnss" or (sensor in self.others and self.setup.sensors[sensor].sensor.keyframes)
 
-    def add(self, sensor: str, t: float, values: tuple[float, ...]) -> bool:
-        """Take in a row; False if it is of no use (`counts` says why).
+    def add(self, sensor: str, t: float, values: tuple[float, ...], released: bool = False) -> bool:
+        """Take in a row; False if it is of no use (`counts` says why), or is held until an IMU row tells its clock.
 
         The values are gyro and force of an IMU (rad/s, m/s^2); latitude, longitude (rad), height, three sigmas,
         velocity and its sigmas (NaN where there is none) of a fix; speed, way counted and four wheels of an odometer;
-        of other sensors their columns in SI, NaN where there is none.
+        of other sensors their columns in SI, NaN where there is none. Rows of `released` were held before and are not
+        held again.
         """
         if sensor in self.others:
-            return self._add_other(sensor, t, values)
+            return self._add_other(sensor, t, values, released)
         known = values[: 6 if sensor != "odometer" else 1]
         if not math.isfinite(sum(known)) or not abs(t) <= LATEST or (sensor == "gnss" and min(values[3:6]) <= 0.0):
             self.counts[f"{sensor}: not a number"] += 1
@@ -84,7 +90,7 @@ class Sensors:
         buffer: Buffer = getattr(self, sensor)
         if sensor == "imu":
             return self._add_imu(t, values)
-        if not self._in_time(sensor, t, values, (sensor, t, *values[: _TOLD[sensor]])):
+        if not self._in_time(sensor, t, values, (sensor, t, *values[: _TOLD[sensor]]), released):
             return False
         if sensor == "gnss":
             values, without = with_sane_velocity(values)
@@ -100,30 +106,41 @@ class Sensors:
                 self.gnss.drop_before(np.inf)
                 self._means, self.moved, self.released = {}, (others[0][1], len(others)), others
                 return False
-            values = (*values, *self._usually("position", t, values[3:6]), *self._usually("velocity", t, values[9:12]))
+            values = (
+                *values,
+                *self._usually("position", t, values[3:6]),
+                *self._usually("velocity", t, values[9:12]),
+                1.0,
+            )
         if not buffer.add(t, values):
             self.counts[f"{sensor}: repeated"] += 1
             return False
         self.counts[sensor] += 1
+        if sensor == "gnss" and self._grid is not None:
+            return self._choose(t, *self._grid)
         return True
 
-    def _in_time(self, sensor: str, t: float, values: tuple[float, ...], told: tuple[str | float, ...]) -> bool:
+    def _in_time(
+        self, sensor: str, t: float, values: tuple[float, ...], told: tuple[str | float, ...], released: bool
+    ) -> bool:
         """Whether a row comes when it can be used; `told` is by what it is known again."""
         if told in self._before:  # a sender that begins again before that step
             self.counts[f"{sensor}: repeated"] += 1
             return False
-        if self._clock.behind and t < self.imu.newest - self.longest_gap:
-            self._clock.hold((sensor, t, values))  # until it shows what the IMU's rows before it are
+        far_ahead = bool(len(self.imu)) and t > self.imu.newest + AHEAD
+        if not released and (far_ahead or t < self.imu.newest - self.longest_gap):
+            (self._clock.hold_early if far_ahead else self._clock.hold)((sensor, t, values))
+            self._sort_out()
             return False
         if t <= self.oldest:
             self.counts[f"{sensor}: too late"] += 1
             return False
-        if len(self.imu) and t > self.imu.newest + AHEAD:
+        if far_ahead:
             self.counts[f"{sensor}: stamp in the future"] += 1
             return False
         return True
 
-    def _add_other(self, name: str, t: float, values: tuple[float, ...]) -> bool:
+    def _add_other(self, name: str, t: float, values: tuple[float, ...], released: bool) -> bool:
         sensor = self.setup.sensors[name].sensor
         row = np.array(values, dtype=float)[None]
         why = None
@@ -131,7 +148,7 @@ class Sensors:
             why = "not a number"
         elif not sensor.usable(row := sensor.within_bounds(row))[0]:
             why = "beyond any sensor"
-        elif not self._in_time(name, t, values, _known(name, t, values)):
+        elif not self._in_time(name, t, values, _known(name, t, values), released):
             return False
         elif not self.others[name].add(t, tuple(row[0].tolist())):
             why = "repeated"
@@ -142,12 +159,42 @@ class Sensors:
         """Take in an IMU row if nothing is odd about it; False leaves it to `add`. `newest` is the time before it."""
         if self._suspect is not None or not newest + SAME < t <= newest + self.longest_gap or t <= self.oldest:
             return False
-        if len(values) != _WIDTH["imu"] or not imu_reads(values) or self._clock.behind:
+        if len(values) != _WIDTH["imu"] or not imu_reads(values) or self._clock.behind or self._clock.ahead:
             return False
         self._clock.remember(t, values)
         self.imu.append(t, values)
         self.counts["imu"] += 1
         return True
+
+    @property
+    def fixes(self) -> Array:
+        """(N,) s, those that are used."""
+        return self.gnss.rows[self.gnss.rows[:, _USED] > 0.0, 0]
+
+    def space(self, spacing: float) -> None:
+        """Use the best fix of every span of `spacing` (s), as `estimation.noise.spacing` has it; 0: use all."""
+        self.gnss.rows[:, _USED], self._grid, self.left = 1.0, None, []
+        gnss = self._gnss(-np.inf, np.inf)
+        if not spacing or gnss is None or len(gnss.t) < 2 or period(gnss.t) > 0.5 * spacing:
+            return
+        begin = grid_start(gnss)
+        self._grid = begin, spacing
+        self.gnss.rows[:, _USED] = 0.0
+        self.gnss.rows[best_fixes(gnss, np.floor((gnss.t - begin) / spacing)), _USED] = 1.0
+
+    def _choose(self, t: float, begin: float, spacing: float) -> bool:
+        """Whether the fix at a time is one of the best of its span; those that no longer are go to `left`."""
+        span = np.floor((t - begin) / spacing)
+        near = self.gnss.rows[slice(*np.searchsorted(self.gnss.t, [t - 1.1 * spacing, t + 1.1 * spacing]))]
+        rows = np.flatnonzero(np.floor((near[:, 0] - begin) / spacing) == span)
+        gnss = self._as_gnss(near[rows])
+        assert gnss is not None
+        best = rows[best_fixes(gnss, np.zeros(len(rows)))]
+        others = np.setdiff1d(rows, best)
+        self.left += [float(x) for x in near[others[near[others, _USED] > 0.0], 0] if x != t]
+        near[rows, _USED] = 0.0
+        near[best, _USED] = 1.0
+        return bool(np.any(near[best, 0] == t))
 
     def typical_sigmas(self, t: Array) -> Array:
         """(N, 6) sigmas that the fixes at some times usually state, m and m/s: the units of errors that last."""
@@ -156,7 +203,7 @@ class Sensors:
     def unit(self) -> Array:
         """(3,) m, in which errors of the fixes that last for minutes and hours are told, from the first question on."""
         if self._unit is None:
-            self._unit = unit_of(self.gnss.rows[:, 4:7])
+            self._unit = unit_of(self.gnss.rows[self.gnss.rows[:, _USED] > 0.0, 4:7])
         return self._unit
 
     def _usually(self, kind: str, t: float, sd: tuple[float, ...]) -> tuple[float, ...]:
@@ -172,6 +219,19 @@ class Sensors:
         mean = tuple(float(m + gain * (s - m)) for m, s in zip(mean, sd, strict=True))
         self._means[kind] = max(t, last), mean
         return mean
+
+    def release(self) -> None:
+        """No more IMU rows will come: what was held is to be taken in now."""
+        self._clock.go_on()
+        self._sort_out()
+
+    def _sort_out(self) -> None:
+        """What was held and is known by now."""
+        clock = self._clock
+        for sensor, _, _ in clock.known:
+            self.counts[f"{sensor}: repeated"] += 1
+        self.released += clock.released
+        clock.known, clock.released = [], []
 
     def forget_time(self) -> None:
         """Another clock: what was noted of the times of rows holds no more."""
@@ -196,6 +256,7 @@ class Sensors:
                 for name, buffer in self.others.items():
                     again = {_known(name, t, tuple(values)) for t, *values in buffer.rows.tolist()}
                     self._before = {one for one in self._before if one[0] != name} | again
+            self._sort_out()
             return False
         if len(self.imu) and t > self.imu.newest + self.longest_gap:
             held = self._clock.hold_ahead(t, values)
@@ -203,8 +264,6 @@ class Sensors:
                 self.counts["imu: repeated"] += 1 - len(held)
                 self.released += held
                 return False
-        if t > self.imu.newest:
-            self.released += self._clock.go_on()
         if len(self.imu) and t > self.imu.newest + self.longest_gap:
             # the next row tells whether this stamp was wrong or the IMU away
             before, self._suspect = self._suspect, (t, values)
@@ -218,6 +277,8 @@ class Sensors:
         self._suspect = None
         if t > self.imu.newest:
             self._clock.remember(t, values)
+            self._clock.go_on()
+            self._sort_out()
         if not self.imu.add(t, values):
             self.counts["imu: repeated"] += 1
             return False
@@ -229,20 +290,22 @@ class Sensors:
         for buffer in (self.imu, *self.aiding.values()):
             buffer.drop_before(t)
 
-    def recording(self, begin: float = -np.inf, end: float = np.inf) -> Recording:
-        """The rows between two times as a recording."""
+    def recording(self, begin: float = -np.inf, end: float = np.inf, every: bool = False) -> Recording:
+        """The rows between two times as a recording; with `every` the fixes that are not used, too."""
         rows = self.imu.between(begin, end)
         imu = replace(self.setup.imu, t=rows[:, 0], gyro=rows[:, 1:4], accel=rows[:, 4:7])
         sensors = {}
         for name, buffer in self.others.items():
             rows = buffer.between(begin, end)
             sensors[name] = replace(self.setup.sensors[name], t=rows[:, 0], values=rows[:, 1:])
-        return replace(
-            self.setup, imu=imu, gnss=self._gnss(begin, end), odometer=self._odometer(begin, end), sensors=sensors
-        )
+        gnss = self._gnss(begin, end, every)
+        return replace(self.setup, imu=imu, gnss=gnss, odometer=self._odometer(begin, end), sensors=sensors)
 
-    def _gnss(self, begin: float, end: float) -> Gnss | None:
+    def _gnss(self, begin: float, end: float, every: bool = False) -> Gnss | None:
         rows = self.gnss.between(begin, end)
+        return self._as_gnss(rows if every else rows[rows[:, _USED] > 0.0])
+
+    def _as_gnss(self, rows: Array) -> Gnss | None:
         if self.setup.gnss is None or not len(rows):
             return None
         v = sd_v = None

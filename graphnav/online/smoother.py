@@ -31,6 +31,7 @@ from graphnav.online.judging import CatchUp, Judgement
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import Tracker
+from graphnav.online.walker import Walker
 from graphnav.recording import Recording
 
 AFTER = 0.05  # s of IMU after a keyframe that a fix may look at
@@ -89,8 +90,8 @@ class Smoother:
         """ "aligning" or "running"."""
         return "aligning" if self.tracker is None else "running"
 
-    def add(self, row: Row) -> None:
-        """Take in one row: sensor, time and values as in `graphnav.online.sensors.Sensors.add`."""
+    def add(self, row: Row, released: bool = False) -> None:
+        """Take in one row: sensor, time, values and whether it was held as in `graphnav.online.sensors.Sensors.add`."""
         sensor, t, values = row
         sensors = self.sensors
         before = sensors.imu.newest
@@ -99,7 +100,7 @@ class Smoother:
                 self._look()
             return
         previous = sensors.newest(sensor)
-        if not sensors.add(sensor, t, values):
+        if not sensors.add(sensor, t, values, released):
             return
         if sensor == "imu":
             newest = sensors.imu.newest
@@ -108,8 +109,13 @@ class Smoother:
         tracker = self.tracker
         if tracker is not None:
             self._awake = -np.inf
+            if isinstance(tracker, Walker):
+                tracker.finish_entering(sensors)
             if sensor != "gnss" and t < previous:
                 tracker.note_late_row(sensor, t)
+            if sensors.left:
+                self._fixes = [x for x in self._fixes if x not in sensors.left]
+                self._dirty, sensors.left = min([self._dirty, *sensors.left]), []
             if sensors.anchors(sensor) and t > tracker.newest + SAME_TIME:
                 self._fixes = sorted([*self._fixes, t])
                 self._due = min(self._due, t + AFTER)
@@ -129,6 +135,9 @@ class Smoother:
         if tracker is None:
             self._align()
             self._awake = self._due if self.tracker is None else now
+        elif isinstance(tracker, Walker) and tracker.busy:
+            tracker.go_on(self.sensors)
+            self._awake = now
         elif now >= self._due:
             self._advance(tracker)
             self._awake = now
@@ -209,7 +218,8 @@ class Smoother:
         told = found.motion is not None and self.settings.gnss.position and recording.platform != "foot"
         if told and self.settings.noise.mode == "estimated":
             self._found, self._tentative = found, True
-        anchors = [buffer.t for name, buffer in sensors.aiding.items() if sensors.anchors(name)]
+            sensors.space(self.settings.noise.spacing)
+        anchors = [sensors.fixes, *(b.t for name, b in sensors.others.items() if sensors.anchors(name))]
         self._fixes = [t for t in np.unique(np.concatenate(anchors)).tolist() if t >= recording.start - SAME_TIME]
         self._began, self._judged = recording.start, recording.duration
         sensors.oldest = recording.start
@@ -223,7 +233,8 @@ class Smoother:
         stated = with_known_heading(found, self.settings)
         self.notes += [note for note in stated.notes if note not in self.notes]
         message = first_message(stated.state, start_sigma(stated))
-        tracker = Tracker(self.settings, self.frame, message, start, self._setup, noise)
+        kind = Walker if self._setup.platform == "foot" else Tracker
+        tracker = kind(self.settings, self.frame, message, start, self._setup, noise)
         if found is not stated:
             tracker.window.head = message.moved(found.state.minus(stated.state)[0])
         return tracker
@@ -239,9 +250,8 @@ class Smoother:
         Up to `_FIXES` fixes in motion.
         """
         assert found.motion is not None
-        assert self.frame is not None
         span = tracker.newest - self._began
-        enough = np.count_nonzero(self.sensors.gnss.t > found.motion) >= _FIXES or span > _JUDGED_UNTIL
+        enough = np.count_nonzero(self.sensors.fixes > found.motion) >= _FIXES or span > _JUDGED_UNTIL
         if not enough and span < max(min(self.settings.solver.lag, _JUDGED), 2.0 * self._judged):
             return
         self._judged = span
@@ -251,9 +261,10 @@ class Smoother:
     def _have_judged(self, found: Alignment, tracker: Tracker) -> None:
         assert self.frame is not None
         times = np.concatenate([self._times, tracker.window.t])
-        recording = self.sensors.recording(-np.inf, tracker.newest + AFTER)
+        until = tracker.newest + AFTER
+        recording, every = (self.sensors.recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
         due = tracker.newest + min(_THINKING * self.settings.solver.lag, _LONGEST_THOUGHT)
-        self._judgement = Judgement(recording, self.settings, self.frame, found, times, self.sensors.unit(), due)
+        self._judgement = Judgement(recording, every, self.settings, self.frame, found, times, self.sensors.unit(), due)
 
     def _use(self, judgement: Judgement, tracker: Tracker) -> None:
         """Begin to go through what has not settled with what the sensors were judged to be."""
@@ -309,6 +320,7 @@ class Smoother:
         for name, rows in later.items():
             for row in rows[rows[:, 0] > before]:
                 sensors.aiding[name].add(float(row[0]), tuple(row[1:]))
+        sensors.space(0.0)  # all of them, until there is a start again
         self._due = self._awake = sensors.imu.newest + _TRY
 
     def _begin_anew(self, oldest: float) -> None:
@@ -316,6 +328,7 @@ class Smoother:
         self.tracker = self._found = self._judgement = self._again = None
         self._tentative, self._times, self._left_out = False, [], ()
         self.sensors.drop_before(np.inf)
+        self.sensors.space(0.0)
         self.sensors.oldest = oldest
         self._fixes, self._dirty = [], np.inf
         self._due = self._awake = oldest + _TRY
@@ -329,8 +342,11 @@ class Smoother:
         odometer = sensors.odometer.newest
         if not last and now - odometer < _SILENT:
             limit = min(limit, max(odometer, now - _ODOMETER))
-        if tracker.foot:
-            self._walk(tracker, now if last else now - SURE, last)
+        if isinstance(tracker, Walker):
+            newest = tracker.take_steps(sensors, now if last else now - SURE, last, self._fixes, self._dirty)
+            if newest > -np.inf:
+                self._dirty, self._fixes = np.inf, [t for t in self._fixes if t > newest + SAME_TIME]
+            self._due = now + _STEP
             return
         T = tracker.newest
         begun = bool(len(tracker.window)) or tracker.opened
@@ -347,12 +363,10 @@ class Smoother:
                 at = anchor
                 times.append(at)
         late = [t for t in self._fixes if t <= T + SAME_TIME]
-        if late and begun:
-            # a keyframe of its own, and those after it again
+        if late and begun:  # a keyframe of its own, and those after it again
             self._dirty = min(self._dirty, *late)
             times = sorted({*times, *late})
-        enough = len(times) > 1 or begun
-        if (times and enough) or (last and self._dirty < np.inf):
+        if (times and (len(times) > 1 or begun)) or (last and self._dirty < np.inf):
             dirty, self._dirty = self._dirty, np.inf
             self._fixes = [t for t in self._fixes if t > limit and t > T + SAME_TIME]
             redone = tracker.update(sensors, np.array(times), dirty)
@@ -365,17 +379,6 @@ class Smoother:
                 return
         T = tracker.newest
         self._due = min([T + period, *(t for t in self._fixes if t > T)]) + AFTER
-
-    def _walk(self, tracker: Tracker, limit: float, last: bool) -> None:
-        """Make the keyframes of the steps that are over."""
-        times = tracker.steps_until(self.sensors, limit, last)
-        late = [t for t in self._fixes if t <= tracker.newest + SAME_TIME]
-        if len(times) or (late and len(tracker.window)):
-            dirty, self._dirty = min([self._dirty, *late]), np.inf
-            tracker.update(self.sensors, np.union1d(times, late), dirty)
-            self._collect(tracker)
-            self._fixes = [t for t in self._fixes if t > tracker.newest + SAME_TIME]
-        self._due = self.sensors.imu.newest + _STEP
 
     def _collect(self, tracker: Tracker) -> None:
         for part in tracker.settled:

@@ -34,24 +34,28 @@ class Online(Smoother):
         self.clocks = 1  # how many there have been: the times of each go on by themselves
         self.failures: list[str] = []  # why pieces were given up
 
-    def add(self, row: Row) -> None:
-        """Take in one row: sensor, time and values as in `graphnav.online.sensors.Sensors.add`."""
-        sensors, rows = self.sensors, [row]
+    def add(self, row: Row, released: bool = False) -> None:
+        """Take in one row: sensor, time, values and whether it was held as in `graphnav.online.sensors.Sensors.add`."""
+        sensors, rows = self.sensors, [(row, released)]
         while rows:
-            one = rows.pop(0)
             try:
-                super().add(one)
+                super().add(*rows.pop(0))
             except Exception as error:  # whatever it is, rows go on coming
                 self._give_up(error)
             if sensors.set_back:
-                rows += self._go_back()
+                rows += [(one, False) for one in self._go_back()]
             elif sensors.moved is not None:
                 self._go_elsewhere(*sensors.moved)
             if sensors.released:
-                rows, sensors.released = [*rows, *sensors.released], []
+                rows += [(one, True) for one in sensors.released]
+                sensors.released = []
 
     def finish(self) -> None:
         """Nothing more will come: settle all."""
+        self.sensors.release()
+        held, self.sensors.released = self.sensors.released, []
+        for row in held:
+            self.add(row, released=True)
         try:
             super().finish()
         except Exception as error:

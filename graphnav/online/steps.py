@@ -17,6 +17,7 @@ from graphnav.online.sensors import Sensors
 
 _WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector sees, and the least
 _SHORTEST = 0.05  # s between looks at a walk that are worth keyframes
+_EDGE = 0.1  # s by which a stance ends elsewhere once it is told by rows: several periods
 _STANDS = 3.0  # s, a stance as long as that is standing, and need not be over
 
 
@@ -41,7 +42,7 @@ class StepCutter:
             return none
         rows = recording.imu.t  # keyframes stand where the stances will be said to begin and end
         limit = float(rows[max(int(np.searchsorted(rows, limit + SAME_TIME)) - 1, 0)])
-        spans = clip_spans(to_samples(detect(recording, settings).stationary, recording), T, limit)
+        spans = clip_spans(to_samples(detect(recording, settings, T - _EDGE).stationary, recording), T, limit)
         ongoing = bool(len(spans)) and spans[-1, 1] >= limit - SAME_TIME
         if not last and len(spans):
             if ongoing and limit - spans[-1, 0] < _STANDS:

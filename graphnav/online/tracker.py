@@ -36,7 +36,7 @@ from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import GAP, bridge_gaps
 from graphnav.online.ahead import Live, live, since
-from graphnav.online.chain import Chain
+from graphnav.online.chain import Chain, Posed
 from graphnav.online.looks import CONTEXT, SURE, Readings, clip_spans
 from graphnav.online.sensors import Sensors
 from graphnav.online.steps import StepCutter
@@ -45,7 +45,6 @@ from graphnav.recording.odometer import MeanSpeed
 
 _ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints look at where the IMU has no gap; else `CONTEXT`
 _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
-_AT_A_ROW = 64  # keyframes that are linearised again at one row of the IMU
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
 _LATEST = 0.5  # of the lag by which they may be late for it, where states still move
 
@@ -69,6 +68,8 @@ class Tracker(Chain):
     setup : of the sensors.
     noise : how good they are taken to be.
     """
+
+    at_a_row = 64  # keyframes that are linearised again at one row of the IMU
 
     def __init__(
         self,
@@ -116,9 +117,22 @@ class Tracker(Chain):
                 self._readings.look(sensors, now)
         dirty, self._dirty = min(dirty, self._dirty), np.inf
         clock.append(time.thread_time())
+        posed = self._begin(sensors, new, dirty)
+        if posed is None:
+            return np.inf
+        clock.append(time.thread_time())
+        back = self._add(posed.problem, posed.first, posed.ahead)
+        self._done()
+        clock.append(time.thread_time())
+        if len(new):
+            self.seconds = dict(zip(("looking", "posing", "solving"), np.diff(clock).tolist(), strict=True))
+        return posed.redone if back is None else min(posed.redone, self._go_back(sensors, posed, back))
+
+    def _begin(self, sensors: Sensors, new: Array, dirty: float) -> Posed | None:
+        """Pose the keyframes at the times `new` and those from `dirty` (s) on, which leave; None without any."""
         again = [stage.place.t for stage in self.window.since(dirty - SAME_TIME)]
         if not again and not len(new):
-            return np.inf
+            return None
         times = new
         if again or len(new) > 1:
             times = np.unique(np.concatenate([again, new]))
@@ -130,32 +144,20 @@ class Tracker(Chain):
         problem = self._completed(ahead, sensors, before, times)
         if problem is None:
             problem, ahead = self._noisy(self._pose(sensors, np.concatenate([before, times])), sensors), None
-        clock.append(time.thread_time())
         self._parameters |= problem.parameters
         self._watch(problem, sensors)
-        back = self._add(problem, len(before), None if ahead is None else ahead.keyframe)
+        redone = again[0] if again else np.inf
+        return Posed(problem, len(before), times, redone, None if ahead is None else ahead.keyframe)
+
+    def _done(self) -> None:
+        """Keyframes have entered."""
         self.in_force = {rows.name: len(rows.b) for rows in self.window.stages[-1].measured if rows.H.any()}
         self._forget()
-        clock.append(time.thread_time())
-        if len(new):
-            self.seconds = dict(zip(("looking", "posing", "solving"), np.diff(clock).tolist(), strict=True))
-        redone = again[0] if again else np.inf
-        if back is None:
-            return redone
-        rest = times[times > self.newest + SAME_TIME]
-        return min(redone, back, self.update(sensors, rest, back))
 
-    def steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
-        """Keyframes of a walk that can be made by now, and what they change of those before."""
-        times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
-        if (stood := self._steps.over) is not None:  # how much a foot sways is told from all of its standing
-            self._keep(len(self.window) - len(self.window.since(stood + SAME_TIME)))
-            times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
-        self._standing.forget(self.head - CONTEXT)
-        dirty = self._steps.changed(sensors, self.head)
-        self.note_late_row("imu", dirty)
-        self._dirty = min(self._dirty, dirty)
-        return times[1:] if len(self.window) or self.opened else times
+    def _go_back(self, sensors: Sensors, posed: Posed, back: float) -> float:
+        """Redo keyframes from a time on, in which a fault was found; the first that was redone, s."""
+        rest = posed.times[posed.times > self.newest + SAME_TIME]
+        return min(back, self.update(sensors, rest, back))
 
     def work_ahead(self, sensors: Sensors, expected: float = np.inf, settling: bool = True) -> bool:
         """Do one thing that need not wait for the next keyframe, or should not delay it; False if there is none.
@@ -240,7 +242,7 @@ class Tracker(Chain):
 
     def _revise(self, sensors: Sensors, always: bool = False) -> bool:
         """Linearise again as much as there is time for at a row; False once there is nothing left to do."""
-        more = self.window.revise(_AT_A_ROW, lambda *which: self._renewed(sensors, *which), always)
+        more = self.window.revise(self.at_a_row, lambda *which: self._renewed(sensors, *which), always)
         self._forget()
         return more
 
@@ -347,7 +349,7 @@ class Tracker(Chain):
 
         A few keyframes do not tell how often fixes come, nor what they usually state.
         """
-        spacing, rows = node_spacing(self.settings.gnss.slow_times, period(sensors.gnss.t)), []
+        spacing, rows = node_spacing(self.settings.gnss.slow_times, period(sensors.fixes)), []
         for c in problem.constraints:
             if isinstance(c, GnssPosition):
                 c = replace(c, usual_error=sensors.unit())

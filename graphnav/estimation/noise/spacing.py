@@ -14,7 +14,7 @@ import numpy as np
 from graphnav.constraints.gnss import period
 from graphnav.core.rotation import Array
 from graphnav.estimation.alignment.first import some
-from graphnav.recording import Recording
+from graphnav.recording import Gnss, Recording
 
 
 def space_fixes(recording: Recording, spacing: float) -> Recording:
@@ -26,14 +26,23 @@ def space_fixes(recording: Recording, spacing: float) -> Recording:
     gnss = recording.gnss
     if gnss is None or len(gnss.t) < 2 or period(gnss.t) > 0.5 * spacing:
         return recording
-    which = np.floor((gnss.t - gnss.t[0] + 0.5 * period(gnss.t)) / spacing).astype(int)
+    return replace(recording, gnss=some(gnss, best_fixes(gnss, np.floor((gnss.t - grid_start(gnss)) / spacing))))
+
+
+def grid_start(gnss: Gnss) -> float:
+    """Where the grid of spans begins of which the fixes are the best, s: between two rows of a steady receiver."""
+    return float(gnss.t[0] - 0.5 * period(gnss.t))
+
+
+def best_fixes(gnss: Gnss, which: Array) -> Array:
+    """The rows that `space_fixes` keeps of each span; `which` (N,) says what span a fix is of."""
     keep = _best(which, np.linalg.norm(gnss.sd, axis=1))
     if gnss.v is not None and gnss.sd_v is not None:
         moves = np.asarray(np.isfinite(gnss.v).all(axis=1))
         best = _best(which, np.where(moves, np.linalg.norm(gnss.sd_v, axis=1), np.inf))
         without = np.isin(which[best], which[keep[~moves[keep]]])
         keep = np.union1d(keep, best[without & moves[best]])
-    return replace(recording, gnss=some(gnss, keep))
+    return keep
 
 
 def _best(which: Array, size: Array) -> Array:

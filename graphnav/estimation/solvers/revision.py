@@ -55,11 +55,19 @@ class Revision:
             return False
         # what an error of the fixes does to the estimate is the same to first order
         stages = [
-            replace(new, message=replace(new.message, tests=now.message.tests))
+            new if now.message.tests is None else replace(new, message=replace(new.message, tests=now.message.tests))
             for now, (_, new) in zip(window.stages[self.first :], made, strict=True)
         ]
         window.replace_from(self.first, self._before, stages)
         return True
+
+    def forget(self) -> None:
+        """Stages made so far need not know where their rows came from: each would keep the rows of all around it."""
+        for k in range(len(self._made) - 1, -1, -1):
+            was, stage = self._made[k]
+            if stage.place.problem is None:
+                break  # nor do those before it
+            self._made[k] = was, replace(stage, place=replace(stage.place, problem=None))
 
     def _again(self, old: Sequence[Stage], means: Sequence[Array], places: Sequence[Place]) -> list[Stage]:
         before = self._made[-1][1] if self._made else self._before

@@ -306,6 +306,8 @@ class Window:
             self._revision, self._rounds = Revision(self, first), self._rounds + 1
         if self._revision.step(count, renewed):
             self._revision = None
+        else:
+            self._revision.forget()
         return True
 
 

@@ -1,0 +1,159 @@
+"""The graph of a walk that goes on: what a step adds is done a portion at a row of the IMU.
+
+A step has some twenty keyframes, and its detector sees half a minute. Done at one row they take several periods of an
+IMU, and whoever reads its rows waits. So a row looks for steps, one poses the keyframes of those that are over, and a
+few keyframes enter at each of the next. Until all have, the state now is predicted from the keyframe before them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from graphnav.constraints.base import SAME_TIME
+from graphnav.core.rotation import Array
+from graphnav.core.state import States
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.solvers.stages import Place
+from graphnav.estimation.solvers.window import Message
+from graphnav.online.ahead import Live, live, since
+from graphnav.online.chain import Posed
+from graphnav.online.looks import CONTEXT
+from graphnav.online.sensors import Sensors
+from graphnav.online.tracker import Tracker
+from graphnav.recording import Recording
+
+_ENTERING = 4  # keyframes that enter at a row: half of the 4 ms that pass to the next of an IMU at 250 Hz
+_AGAIN = 8  # that are linearised again at a row, by the same measure
+_RENEWED = 64  # that are posed again at once for that: those around them, which come with them, are twelve
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What is left of a step: first to pose keyframes, then to let them enter."""
+
+    new: Array  # (K,) s
+    dirty: float  # s, from where on keyframes are redone
+    shown: tuple[Message, float]  # the keyframe, and its time, that the state now is predicted from meanwhile
+    posed: Posed | None = None
+    entered: int = 0  # of the problem's keyframes, those before included
+
+
+@dataclass(frozen=True)
+class _Renewal:
+    """Places posed again, by their time, as long as the stops are these."""
+
+    stops: Array = field(default_factory=lambda: np.empty((0, 2)))
+    places: dict[float, Place] = field(default_factory=dict)
+
+
+class Walker(Tracker):
+    """Keyframes of a walk."""
+
+    at_a_row = _AGAIN
+    _work: _Work | None = None
+    _renewal = _Renewal()
+
+    @property
+    def busy(self) -> bool:
+        """Whether keyframes are entering."""
+        return self._work is not None
+
+    def take_steps(self, sensors: Sensors, limit: float, last: bool, fixes: list[float], dirty: float) -> float:
+        """Have the keyframes of the steps that are over by `limit` (s) enter at the rows to come, or now.
+
+        Parameters
+        ----------
+        last : no more rows will come.
+        fixes : s, which may be late.
+        dirty : s, from where on keyframes are to be redone.
+
+        Returns
+        -------
+        Up to when there will be keyframes, s; -inf where nothing is to be done.
+        """
+        self.finish_entering(sensors)
+        shown, begun = (self.window.newest, self.newest), bool(len(self.window)) or self.opened
+        times = self._steps_until(sensors, limit, last)
+        late = [t for t in fixes if t <= self.newest + SAME_TIME]
+        if not len(times) and not (late and len(self.window)):
+            return -np.inf
+        self._work = _Work(np.union1d(times, late), min([dirty, self._dirty, *late]), shown)
+        self._dirty = np.inf
+        newest = max([self.newest, *times.tolist()])
+        if last or not begun:
+            self.finish_entering(sensors)
+        return newest
+
+    def _steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
+        """Keyframes of a walk that can be made by now, and what they change of those before."""
+        times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
+        if (stood := self._steps.over) is not None:  # how much a foot sways is told from all of its standing
+            self._keep(len(self.window) - len(self.window.since(stood + SAME_TIME)))
+            times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
+        self._standing.forget(self.head - CONTEXT)
+        dirty = self._steps.changed(sensors, self.head)
+        self.note_late_row("imu", dirty)
+        self._dirty = min(self._dirty, dirty)
+        return times[1:] if len(self.window) or self.opened else times
+
+    def go_on(self, sensors: Sensors) -> None:
+        """A portion of what there is to do."""
+        work = self._work
+        assert work is not None
+        posed = work.posed
+        if posed is None:
+            if work.dirty < np.inf:
+                self._motions = {t: one for t, one in self._motions.items() if t < work.dirty}
+                self._renewal = _Renewal()
+            posed = self._begin(sensors, work.new, work.dirty)
+            self._work = None if posed is None else replace(work, posed=posed, entered=posed.first)
+            return
+        end = min(work.entered + _ENTERING, len(posed.problem.t))
+        back = self._add(posed.problem, posed.first, None, work.entered, end)
+        self._work = replace(work, entered=end)
+        if back is not None or end == len(posed.problem.t):
+            self._work = None
+            self._done()
+        if back is not None:
+            self._renewal = _Renewal()
+            self._go_back(sensors, posed, back)
+
+    def finish_entering(self, sensors: Sensors) -> None:
+        """All that is left to do, at once."""
+        while self._work is not None:
+            self.go_on(sensors)
+
+    def note_late_row(self, sensor: str, t: float) -> None:
+        super().note_late_row(sensor, t)
+        if np.isfinite(t):
+            self._renewal = _Renewal()
+
+    def afresh(self, noise: NoiseModel, setup: Recording) -> Tracker:
+        other = super().afresh(noise, setup)
+        assert isinstance(other, Walker)
+        other._work, other._renewal = None, _Renewal()
+        return other
+
+    def live(self, sensors: Sensors) -> Live:
+        """The state at the newest IMU row, by prediction from the newest keyframe before those that are entering."""
+        return live(*self._shown, self.frame, sensors, self.noise)
+
+    def since(self, sensors: Sensors) -> tuple[Array, States, Array]:
+        """Times (M,), states and covariances (M, 15, 15) at every IMU row since that keyframe."""
+        return since(*self._shown, self.frame, sensors, self.noise)
+
+    @property
+    def _shown(self) -> tuple[Message, float]:
+        return (self.window.newest, self.newest) if self._work is None else self._work.shown
+
+    def _renewed(self, sensors: Sensors, first: int, end: int) -> list[Place]:
+        """As of `Tracker`; what is posed for some stages is kept for those that follow."""
+        stages, known = self.window.stages[first:end], self._renewal
+        if known.stops is not self.stops or not {stage.place.t for stage in stages} <= known.places.keys():
+            until = max(end, min(first + _RENEWED, len(self.window)))
+            places = super()._renewed(sensors, first, until)
+            known = self._renewal = _Renewal(self.stops, {place.t: place for place in places})
+        fresh = [known.places[stage.place.t] for stage in stages]
+        return [replace(stage.place, problem=one.problem, k=one.k) for stage, one in zip(stages, fresh, strict=True)]

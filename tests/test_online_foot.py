@@ -1,0 +1,74 @@
+"""A walk as it goes on: the work of a step is spread over rows of the IMU, and what comes out is as if it were not."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from test_online import joined, same
+
+from graphnav.config import settings_from
+from graphnav.core.trajectory import Trajectory
+from graphnav.detectors import detect
+from graphnav.online import Online, Row, rows_of, walker, without_rows
+from graphnav.online.walker import Walker
+from graphnav.recording import Recording
+from graphnav.simulation import simulate
+
+QUICK = settings_from({"solver": {"lag": 4.0}})
+
+
+@pytest.fixture(scope="module")
+def walk() -> Recording:
+    return simulate("gait", 1, duration=20.0, rate=100.0).recording
+
+
+@pytest.fixture(scope="module")
+def rows(walk: Recording) -> list[Row]:
+    return rows_of(walk)[1]
+
+
+def walked(walk: Recording, rows: list[Row]) -> Trajectory:
+    online = Online(without_rows(walk), QUICK)
+    for row in rows:
+        online.add(row)
+    online.finish()
+    return joined(online.settled())
+
+
+def test_a_step_is_spread_over_rows_and_nothing_else_changes(
+    walk: Recording, rows: list[Row], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Through a checkpoint while keyframes enter, too; and the state now never goes back to an older keyframe."""
+    online, entered, parts, kept, keyframe = Online(without_rows(walk), QUICK), [], [], False, -np.inf
+    for row in rows:
+        running, before = online.tracker, 0 if online.tracker is None else online.tracker.newest
+        made = 0 if running is None else len(running.window)
+        online.add(row)
+        tracker = online.tracker
+        if running is tracker and isinstance(tracker, Walker):
+            if tracker.newest > before and len(tracker.window) > made:
+                entered.append(len(tracker.window) - made)
+            if tracker.busy:
+                now = online.live()
+                assert now is not None
+                assert now.t == row[1]
+                assert now.keyframe >= keyframe
+                keyframe = now.keyframe
+                if not kept and tracker.settled == [] and len(entered) > 20:
+                    online, kept = pickle.loads(pickle.dumps(online)), True
+        parts += online.settled()
+    online.finish()
+    assert kept
+    assert max(entered) <= walker._ENTERING
+    monkeypatch.setattr(walker, "_ENTERING", 1000)
+    same(joined([*parts, *online.settled()]), walked(walk, rows))
+
+
+def test_what_is_over_is_not_searched_for_slides_and_the_rest_is_as_it_was(walk: Recording) -> None:
+    spans = detect(walk).stationary
+    since = walk.start + 10.0
+    late = detect(walk, since=since).stationary
+    np.testing.assert_array_equal(late[late[:, 1] > since], spans[spans[:, 1] > since])
+    assert len(late) == len(spans)
