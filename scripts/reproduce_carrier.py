@@ -29,7 +29,8 @@ from graphnav.config import settings_from
 from graphnav.core import earth
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
-from graphnav.gnss.carrier import consecutive, half_cycle_errors
+from graphnav.gnss.arcs import find_arcs
+from graphnav.gnss.carrier import consecutive
 from graphnav.gnss.load import Sources, load_raw
 from graphnav.gnss.series import RawGnss, primary
 from graphnav.gnss.sigmas import carrier_sigma
@@ -69,19 +70,18 @@ def increments(data: Path) -> None:
     level = geometry.distance - geometry.ionosphere + geometry.troposphere - raw.clock
     level -= raw.carrier * C / raw.frequency
     change = level[after] - level[before]
-    wrong = half_cycle_errors(of[after], geometry.e[after], change, C / raw.frequency[after])
     sigma = np.hypot(*(carrier_sigma(raw.cn0[k], geometry.elevation[k], C / raw.frequency[k]) for k in (before, after)))
     off = np.full((len(epochs), 3), np.nan)
-    used = after[~wrong]
     for k in range(1, len(epochs)):
-        own = np.flatnonzero((of[after] == k) & ~wrong)
+        own = np.flatnonzero(of[after] == k)
         if len(own) < 6:
             continue
         H = np.column_stack([-geometry.e[after[own]], np.ones(len(own))]) / sigma[own, None]
         off[k] = np.linalg.lstsq(H, -change[own] / sigma[own], rcond=None)[0][:3]
     d = np.einsum("nij,nj->ni", earth.enu_axes(earth.ecef_to_llh(true)), off)
     h, up = np.hypot(d[:, 0], d[:, 1]), np.abs(d[:, 2])
-    print(f"{len(used)} changes of carriers, {wrong.sum()} let go of by the others; {np.isfinite(h).sum()} epochs")
+    slips = find_arcs(whole).slips
+    print(f"{len(after)} changes of carriers, {slips} slips without a flag, {np.isfinite(h).sum()} epochs")
     print("mm against the reference's increments: 50 %, 95 %, 99 %, rms")
     for name, x in (("horizontal", h), ("up", up)):
         at = [*np.nanpercentile(x, [50, 95, 99]), np.sqrt(np.nanmean(x**2))]

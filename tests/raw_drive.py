@@ -55,10 +55,13 @@ def observe(llh_of, t: Array, above: Array, k: int) -> tuple[Array, Array, Array
     return C * tau, fixed(sent), (fixed(sent + 0.5) - fixed(sent - 0.5))
 
 
-def with_observations(recording: Recording, path: ExactPath, noise: float = 0.0, seed: int = 0) -> Recording:
+def with_observations(
+    recording: Recording, path: ExactPath, noise: float = 0.0, seed: int = 0, carrier: float | None = None
+) -> Recording:
     """The recording with raw observations at the times of its fixes, and these said to be derived from them.
 
-    `noise` is that of the codes, m; that of range rates is a twentieth of it, m/s.
+    `noise` is that of the codes, m; that of range rates is a twentieth of it, m/s; `carrier` that of carriers, m, each
+    with cycles of its own, and none without.
     """
     gnss = recording.gnss
     t, lever = gnss.t, tuple(float(x) for x in gnss.lever_arm)
@@ -80,12 +83,16 @@ def with_observations(recording: Recording, path: ExactPath, noise: float = 0.0,
         rate = (observe(llh_of, inside + h, above, k)[0] - observe(llh_of, inside - h, above, k)[0]) / (2.0 * h)
         azimuth, elevation = directions(antenna, p)
         delay = klobuchar(NIGHT, np.mod(t, 604800.0), llh, azimuth, elevation)
-        n, white = len(t), noise * rng.standard_normal(len(t))
+        n, noisy = len(t), noise * rng.standard_normal(len(t))
         bias = BIAS if name[0] == "E" else 0.0
+        phase = np.full(n, np.nan)
+        if carrier is not None:
+            white = carrier * np.random.default_rng([seed, k]).standard_normal(n)
+            phase = (distance + clock + bias - delay + white) * L1 / C + 1000.0 * k
         own = {
-            "t": t, "satellite": np.full(n, satellite_id(name), dtype=np.int16),
+            "t": t, "carrier": phase, "satellite": np.full(n, satellite_id(name), dtype=np.int16),
             "signal": np.full(n, signal_id("1C"), dtype=np.int16),
-            "code": distance + clock + bias + delay + white, "p": p, "v": v,
+            "code": distance + clock + bias + delay + noisy, "p": p, "v": v,
             "range_rate": rate + drift + 0.05 * noise * rng.standard_normal(n),
             "high": elevation,
         }  # fmt: skip
@@ -98,7 +105,7 @@ def with_observations(recording: Recording, path: ExactPath, noise: float = 0.0,
     n, at = len(order), np.searchsorted(t, whole["t"])
     rough = antenna + 20.0 * np.random.default_rng(1).standard_normal(antenna.shape)
     raw = RawGnss(
-        **whole, carrier=np.full(n, np.nan), cn0=np.full(n, 45.0), slip=np.zeros(n, dtype=bool),
+        **whole, cn0=np.full(n, 45.0), slip=np.zeros(n, dtype=bool),
         half=np.zeros(n, dtype=bool), frequency=np.full(n, L1), clock=np.zeros(n), drift=np.zeros(n),
         difference=np.full(n, np.nan), zero=ZERO, place=tuple(above), troposphere=True, antenna=rough[at],
         receiver_clock=np.stack([clock + 5.0, drift], -1)[at], lever_arm=gnss.lever_arm,

@@ -28,7 +28,7 @@ from graphnav.recording import Recording
 
 STANDING = np.array([[3.0, 14.0], [88.0, 104.0]])  # parts of two stops of the path below, s
 ON_FOOT = {"stance", "foot_lateral", "closed_loop"}  # constraints that only a foot has
-RAW = {"gnss_code", "gnss_doppler"}  # of single satellites
+RAW = {"gnss_code", "gnss_doppler", "gnss_carrier", "gnss_antenna_clone"}  # of single satellites
 SIGMA = np.repeat([0.05, 1.0, 0.5, 0.05, 1e-3], 3)
 
 
@@ -54,7 +54,7 @@ def with_parameters() -> Settings:
 def seen_by(name: str, recording: Recording) -> Recording:
     """The drive as the constraint sees it: for those of a foot it is a foot's."""
     if name in RAW:
-        return raw_drive.with_observations(recording, oracle.vehicle_path(180.0))
+        return raw_drive.with_observations(recording, oracle.vehicle_path(180.0), carrier=0.003)
     return replace(recording, platform="foot", gnss=None, odometer=None) if name in ON_FOOT else recording
 
 

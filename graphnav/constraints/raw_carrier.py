@@ -12,8 +12,8 @@ that begins anew at every other epoch, two of them in turn, and is tied to the s
 (stochastic cloning: Roumeliotis and Burdick 2002), so that a row knows both places, both attitudes through the lever
 arm and how far each is certain, in every solver.
 
-Slips are looked for by the receiver's flags and by the other satellites of the epoch; one that neither tells meets the
-kernel, which judges it by what all other rows and the IMU say.
+Slips end an arc (`graphnav.gnss.arcs`), by the receiver's flags and by the other satellites of the epoch; one that
+neither tells meets the kernel, which judges it by what all other rows and the IMU say.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 
 from graphnav.config import Settings
 from graphnav.constraints.base import BuildContext, Constraint, Linearized
-from graphnav.constraints.gnss import LEVER_ARM, period
+from graphnav.constraints.gnss import LEVER_ARM
 from graphnav.constraints.raw_gnss import _AXES, _common, _prepare, _Prepared, _Satellites, _select
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
-from graphnav.gnss.carrier import consecutive, half_cycle_errors
+from graphnav.gnss.carrier import consecutive
 from graphnav.gnss.series import median_of_epochs
 from graphnav.gnss.sigmas import carrier_sigma
 from graphnav.gnss.signals import C
@@ -43,7 +43,7 @@ DRIFT = "gnss_carrier_drift"
 _CHANGE_SIGMA = 100.0  # m, about the median over the satellites at places that may be that far off
 _ANYWHERE = 1e3  # m, 1-sigma of an antenna's place before its tie: nothing known
 _TIE = 5e-4  # m, a tenth of what a carrier's change is good to
-# m/s, 1-sigma: what the ionosphere and broadcast clocks change by (Klobuchar's delay goes from 1.5 to 10 m in six hours)
+# m/s, 1-sigma, of the ionosphere and broadcast clocks: Klobuchar's delay goes from 1.5 to 10 m in six hours
 _DRIFT = np.array([5e-4, 5e-4, 1e-3])
 
 
@@ -58,6 +58,11 @@ class _Pairs:
     first: NDArray[np.intp]  # (E,) a prepared row of each epoch
     change: Array  # (N,) m, all that does not depend on the estimate
     clock: Array  # (E,) m, of the receiver since the epoch before, roughly
+
+
+def _epochs(recording: Recording, settings: Settings) -> Array:
+    raw = _select(recording, settings) if settings.raw_gnss.differences else None
+    return np.empty(0) if raw is None else np.unique(raw.t[np.isfinite(raw.carrier)])
 
 
 def _pairs(scene: BuildContext) -> tuple[_Prepared, _Pairs] | None:
@@ -79,13 +84,8 @@ def _find_pairs(scene: BuildContext) -> tuple[_Prepared, _Pairs] | None:
     # of a phase the ionosphere's delay is negative
     level = found.known - 2.0 * found.ionosphere - raw.clock - raw.carrier * C / raw.frequency
     change = level[after] - level[before]
-    t = raw.t[after]
-    wrong = half_cycle_errors(of[after], found.e[after], change, C / raw.frequency[after])
-    before, after, change, t = before[~wrong], after[~wrong], change[~wrong], t[~wrong]
-    if not len(after):
-        return None
     clock = np.zeros(len(epochs))
-    clock[of[after]] = -median_of_epochs(t, change)
+    clock[of[after]] = -median_of_epochs(raw.t[after], change)
     return found, _Pairs(before, after, of[after], epochs, first, change, clock)
 
 
@@ -112,7 +112,7 @@ class GnssAntennaClone(Constraint):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        return np.empty(0)  # those of the carriers
+        return _epochs(recording, settings)
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssAntennaClone | None:
@@ -120,7 +120,7 @@ class GnssAntennaClone(Constraint):
         if both is None:
             return None
         found, pairs = both
-        own = np.unique(pairs.epoch - 1)
+        own = np.arange(len(pairs.epochs))
         parameters = [p for p in _common(scene, found)["parameters"] if p.name == LEVER_ARM]
         return cls(
             keyframe=found.keyframe[pairs.first[own]],
@@ -162,8 +162,7 @@ class GnssCarrier(_Satellites):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        raw = _select(recording, settings) if settings.raw_gnss.differences else None
-        return np.empty(0) if raw is None else np.unique(raw.t[np.isfinite(raw.carrier)])
+        return _epochs(recording, settings)
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssCarrier | None:

@@ -94,7 +94,6 @@ class _Prepared:
     s_n: Array  # (N, 3) m, satellites
     v_n: Array  # (N, 3) m/s
     R_ln: Array  # (N, 3, 3)
-    e: Array  # (N, 3) unit vectors to the satellites from the nominal antenna, in n
     elevation: Array  # (N,) rad
     known: Array  # (N,) m, distance from the nominal antenna with the delays of the atmosphere
     nominal: Array  # (N, 3) m
@@ -130,7 +129,6 @@ def _prepare_rows(scene: BuildContext) -> _Prepared | None:
         s_n=(geometry.s - frame.r_e) @ frame.R_ne.T,
         v_n=rotate_earth(raw.v, geometry.distance / C) @ frame.R_ne.T,
         R_ln=earth.enu_axes(earth.ecef_to_llh(raw.antenna)) @ frame.R_ne.T,
-        e=geometry.e @ frame.R_ne.T,
         elevation=geometry.elevation,
         known=geometry.distance + geometry.ionosphere + geometry.troposphere,
         nominal=(raw.antenna - frame.r_e) @ frame.R_ne.T,
