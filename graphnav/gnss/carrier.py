@@ -39,8 +39,8 @@ def consecutive(raw: RawGnss, whole: RawGnss) -> tuple[NDArray[np.intp], NDArray
     limit = _JUMP + _THIRD * dt**3
     same = (np.linalg.norm(off, axis=1) < limit) & (np.abs(clock) < limit)
     j, k = j[same], k[same]
-    order = np.lexsort((j, k))
-    return j[order], k[order]
+    sort = np.lexsort((j, k))
+    return j[sort], k[sort]
 
 
 def rows_in(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
@@ -49,9 +49,8 @@ def rows_in(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
 
     def keys(one: RawGnss) -> NDArray[np.int64]:
         epoch = np.searchsorted(epochs, one.t).astype(np.int64)
-        return (epoch << 32) + (one.satellite.astype(np.int64) << 16) + one.signal
+        return np.asarray((epoch << 32) + (one.satellite.astype(np.int64) << 16) + one.signal, dtype=np.int64)
 
     all_keys = keys(whole)
     order: NDArray[np.intp] = np.argsort(all_keys)
-    found: NDArray[np.intp] = order[np.searchsorted(all_keys[order], keys(raw))]
-    return found
+    return order[np.searchsorted(all_keys[order], keys(raw))]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
+from graphnav.gnss.antex import Antennas
 from graphnav.gnss.signals import C, Ids, frequencies
 
 _FARTHEST = 1e9  # m, of a code: satellites are 4.3e7 m away at most, and no clock of a receiver is seconds off
@@ -151,6 +152,8 @@ class RawGnss:
     receiver_clock: Array = field(default_factory=lambda: np.empty((0, 2)))  # (N, 2) m and m/s, single-point
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
     files: tuple[str, ...] = ()
+    precise: bool = False  # placed by precise orbits and clocks
+    antennas: Antennas = field(default_factory=dict)  # of the satellites, where an ANTEX file is given
 
     def __len__(self) -> int:
         return len(self.t)

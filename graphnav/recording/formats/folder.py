@@ -34,7 +34,7 @@ from graphnav.recording.formats.repair import (
 from graphnav.recording.formats.table import Table, read_table
 from graphnav.recording.formats.trajectories import read_trajectory
 
-_RAW_FILES = ("rover", "nav", "sp3", "clk", "base")
+_RAW_FILES = ("rover", "nav", "sp3", "clk", "antex", "base")
 
 
 def read_folder(source: str | Path) -> Recording:
