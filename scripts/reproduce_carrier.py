@@ -151,7 +151,9 @@ def masked(recording: Recording, spans: list[tuple[float, float]], left: int) ->
     kept, fixes = np.ones(len(raw), dtype=bool), np.ones(len(gnss.t), dtype=bool)
     for a, b in spans:
         inside = (raw.t - recording.start > a) & (raw.t - recording.start < b)
-        seen, many = np.unique(raw.satellite[inside & np.isfinite(raw.carrier)], return_counts=True)
+        seen, many = np.unique(
+            raw.satellite[inside & np.isfinite(raw.carrier) & np.isfinite(elevation)], return_counts=True
+        )
         height = [np.median(elevation[inside & (raw.satellite == s)]) for s in seen[many > 0.9 * SPAN]]
         best = seen[many > 0.9 * SPAN][np.argsort(height)[::-1][:left]]
         kept &= ~inside | np.isin(raw.satellite, best)

@@ -33,9 +33,12 @@ from graphnav.gnss.signals import C, satellite_name
 from graphnav.recording import Recording
 
 WET = "gnss_wet_delay"
+ORBITS = "gnss_satellite_orbits"
 _WET, _WET_WALK = 0.1, 1.7e-4  # m, of a standard atmosphere's; m/sqrt(s): 1 cm in an hour (Kouba and Heroux 2001)
 _CODE_BIAS = 1.0  # m: a code's differential bias, half a nanosecond or two, in the combination
 _BIAS_WALK = 1e-5  # m/sqrt(s), a millimetre in three hours
+# m, towards a satellite, for hours: final orbits are good to 2.5 cm (IGS, "Products"), antennas' patterns to a centimetre
+_ORBIT = 0.025
 _AMBIGUITY = 30.0  # m, about what the first code says: next to nothing known
 
 
@@ -212,6 +215,12 @@ class GnssPppCarrier(_Ppp):
             for name, at in zip(names, begins_at, strict=True)
             if len(at)
         )  # fmt: skip
+        size, hours = len(names), scene.settings.gnss.slow_times[1]
+        common["parameters"] += (
+            Parameter(
+                ORBITS, np.zeros(size), np.full(size, _ORBIT), "m", correlation_time=hours, spacing=free.found.spacing
+            ),
+        )
         if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
             common["robust"] = "cauchy"
         sigma = rows.growth[used] * carrier_sigma(raw.cn0, rows.geometry.elevation[used], C / raw.frequency)
@@ -219,9 +228,11 @@ class GnssPppCarrier(_Ppp):
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         residual, J = self._ranges(states, parameters, rows)
+        own = (self.which[rows][:, None] == np.arange(len(self.ambiguities))).astype(float)
+        residual = residual + np.sum(own * parameters[ORBITS], axis=1)
+        J[ORBITS] = own[:, None]
         for k, name in enumerate(self.ambiguities):
             if name in parameters:
-                own = (self.which[rows] == k).astype(float)
-                residual = residual + own * parameters[name][:, 0]
-                J[name] = own[:, None, None]
+                residual = residual + own[:, k] * parameters[name][:, 0]
+                J[name] = own[:, None, k, None]
         return Linearized(residual[:, None], J, self.sigma[rows])
