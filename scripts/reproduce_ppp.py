@@ -22,13 +22,13 @@ from graphnav.gnss.load import Sources, load_raw
 from graphnav.recording import Gnss, Imu, ImuNoise, Recording
 
 Array = np.ndarray
-# m in e, of the marker in IGS14 on that day. The header's place is of NAD 83 (2011), 1.8 m from it. Of the daily series
-# of the station (UNAVCO, SLAC.cwu.rapid_nam14.pos, release of 2022-07-06): its reference position at 2010.0 and that of
+# m in e, of the marker in IGS14 on that day. The header's place is of NAD 83 (2011), 1.8 m from it. Of the station's
+# daily series (UNAVCO, SLAC.cwu.rapid_nam14.pos, release of 2022-07-06): its reference position at 2010.0 and that of
 # 2022-06-19, interpolated, turned from the North American plate to IGS14 by the pole of Altamimi et al. 2017 (0.024,
 # -0.694, -0.063 mas a year). Good to a few centimetres
 MARKER = np.array([-2703116.3143, -4291766.7591, 3854248.0714])
-# m, up, of the phase centre of the ionosphere-free combination over the marker: the antenna stands 8 mm over it, and its
-# centres (TRM59800.80 NONE, igs14.atx) are 89.51 and 117.13 mm over its reference point
+# m, up, of the phase centre of the ionosphere-free combination over the marker: the antenna stands 8 mm over it, and
+# its centres (TRM59800.80 NONE, igs14.atx) are 89.51 and 117.13 mm over its reference point
 ANTENNA = 0.0083 + 2.5457 * 0.08951 - 1.5457 * 0.11713
 DAY = 2155 * 604800.0 + 3 * 86400.0  # s since the GPS epoch
 BEGIN, END = DAY + 19.5 * 3600.0, DAY + 20.5 * 3600.0  # of the clocks that come with the data

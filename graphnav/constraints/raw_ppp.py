@@ -37,7 +37,7 @@ ORBITS = "gnss_satellite_orbits"
 _WET, _WET_WALK = 0.1, 1.7e-4  # m, of a standard atmosphere's; m/sqrt(s): 1 cm in an hour (Kouba and Heroux 2001)
 _CODE_BIAS = 1.0  # m: a code's differential bias, half a nanosecond or two, in the combination
 _BIAS_WALK = 1e-5  # m/sqrt(s), a millimetre in three hours
-# m, towards a satellite, for hours: final orbits are good to 2.5 cm (IGS, "Products"), antennas' patterns to a centimetre
+# m, towards a satellite, for hours: final orbits are good to 2.5 cm (IGS, "Products")
 _ORBIT = 0.025
 _AMBIGUITY = 30.0  # m, about what the first code says: next to nothing known
 

@@ -81,6 +81,8 @@ def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
     utc = gps_to_utc(gps)
     day = (utc - utc.astype("datetime64[Y]")) / np.timedelta64(1, "D")
     dry, wet = zenith_delays(place)
+    if raw.troposphere:  # is taken off already
+        dry, wet = np.zeros(len(one)), np.zeros(len(one))
     by_dry, by_wet = niell(place, geometry.elevation, day)
     carrier = free(one.carrier * C / f1, other.carrier * C / f2) + one.clock
     carrier -= wind_up(one.satellite, one.t, axes, geometry.e, enu) * C / (f1 + f2)
