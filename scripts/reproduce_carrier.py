@@ -5,7 +5,7 @@
 
 `increments` solves the displacement of each epoch from the carriers' changes alone and compares it with the truth's.
 `canyon` takes satellites away by a mask: in ten spans of 60 s the 4, 3, 2, 1, 0 highest are left, and the table has the
-horizontal errors in the spans, of filter, smoother and batch, with carriers and without.
+horizontal errors in the spans, of filter, smoother and batch, with changes of carriers and without.
 
 The recording has no IMU. Its samples are SIMULATED: a spline through the reference positions is the motion, level but
 for the slope, heading along the way; errors are those of a low-cost MEMS (the figures of data/tokyo_raw). Carriers,
@@ -19,7 +19,6 @@ import gzip
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pyins import sim
@@ -162,33 +161,43 @@ def masked(recording: Recording, spans: list[tuple[float, float]], left: int) ->
     return replace(recording, raw_gnss=raw.take(kept), gnss=replace(gnss, **some))
 
 
-def errors(solution: Solution, recording: Recording, spans: list[tuple[float, float]]) -> Array:
-    """(n,) m, horizontal, at the reference's epochs in the spans."""
+def errors(solution: Solution, recording: Recording, spans: list[tuple[float, float]]) -> tuple[Array, Array]:
+    """(n,) m, horizontal, at the reference's epochs in the spans: whole, and less that of the span's first epoch."""
     truth = recording.truth
     assert truth is not None
     assert truth.llh is not None
-    t = truth.t - recording.start
-    inside = np.any([(t > a) & (t < b) for a, b in spans], axis=0) & (truth.t <= solution.t[-1])
-    p = np.stack([np.interp(truth.t[inside], solution.t, solution.states.p[:, i]) for i in range(3)], -1)
-    e = p - solution.frame.from_llh(truth.llh[inside])
-    return np.hypot(e[:, 0], e[:, 1])
+    whole, drift = [], []
+    for a, b in spans:
+        inside = (truth.t - recording.start > a) & (truth.t - recording.start < b) & (truth.t <= solution.t[-1])
+        p = np.stack([np.interp(truth.t[inside], solution.t, solution.states.p[:, i]) for i in range(3)], -1)
+        e = (p - solution.frame.from_llh(truth.llh[inside]))[:, :2]
+        whole.append(np.hypot(*e.T))
+        drift.append(np.hypot(*(e - e[0]).T))
+    return np.concatenate(whole), np.concatenate(drift)
 
 
-def canyon(data: Path, end: float, counts: list[int], chosen: dict[str, Any]) -> None:
+def canyon(data: Path, end: float, counts: list[int], solvers: tuple[str, ...]) -> None:
     whole = recording_of(data).crop(0.0, end)
     spans = canyons(whole, end)
-    print(f"{len(spans)} spans of {SPAN:.0f} s, IMU simulated; horizontal errors in the spans, m")
-    print(f"{'satellites':>10} {'carriers':>8} {'solver':6} {'H50':>6} {'H95':>6} {'max':>7} {'rms':>6}")
+    print(
+        f"{len(spans)} spans of {SPAN:.0f} s, IMU simulated; horizontal errors in the spans, m; drift: since they began"
+    )
+    print(
+        f"{'satellites':>10} {'carriers':>8} {'solver':6} {'H50':>6} {'H95':>6} {'max':>6} {'rms':>6} {'drift50':>7} "
+        f"{'drift95':>7} {'rms':>6}"
+    )
     for left in counts:
         recording = masked(whole, spans, left)
         for differences in (True, False):
-            settings = settings_from({"raw_gnss": {"coupling": "tight", "differences": differences, **chosen}})
+            settings = settings_from({"raw_gnss": {"coupling": "tight", "differences": differences}})
             began = time.process_time()
-            solutions = run(recording, settings, SOLVERS)
+            solutions = run(recording, settings, solvers)
             seconds = time.process_time() - began
             for solver, one in solutions.items():
-                h = errors(one, whole, spans)
+                h, d = errors(one, whole, spans)
                 cells = " ".join(f"{x:6.2f}" for x in (*np.percentile(h, [50, 95, 100]), np.sqrt(np.mean(h**2))))
+                cells += " " + " ".join(f"{x:7.2f}" for x in np.percentile(d, [50, 95]))
+                cells += f" {np.sqrt(np.mean(d**2)):6.2f}"
                 print(f"{left:10} {'yes' if differences else 'no':>8} {solver:6} {cells}", flush=True)
             print(f"{'':26} {seconds:.0f} s of processor time", flush=True)
 
@@ -199,11 +208,12 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--end", type=float, default=np.inf)
     parser.add_argument("--satellites", type=int, nargs="+", default=[4, 3, 2, 1, 0])
+    parser.add_argument("--solver", action="append", default=[], help="repeatable; all three without")
     given = parser.parse_args()
     if given.what == "increments":
         increments(given.data)
     else:
-        canyon(given.data, given.end, given.satellites, {})
+        canyon(given.data, given.end, given.satellites, tuple(given.solver) or SOLVERS)
 
 
 if __name__ == "__main__":
