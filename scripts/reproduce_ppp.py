@@ -7,7 +7,7 @@
 daily series, east, north, up, over time. Its IMU at rest is SIMULATED, with the errors of a low-cost MEMS.
 
 `li`: the experiment of Li 2024, PPP and IMU coupled tightly with zero velocity where the spectrum of the idling engine
-says that the vehicle stands, on the simulated drive of `scripts/reproduce_li2024.py` (stops of 60, 120 and 90 s). Orbits
+says that the vehicle stands, on the simulated drive of `scripts/reproduce_li2024.py`, stops of 60, 120 and 90 s. Orbits
 and clocks are CODE's of that day; observations of two signals are SIMULATED along the drive, with noise, an ionosphere,
 a wet delay that differs from the standard one, satellites 2.5 cm off and ambiguities; the models of tide, wind-up and
 antenna are those of the estimate. Each stop is run by itself, with GNSS gone from its first second. Printed are the
@@ -204,13 +204,13 @@ def li(data: Path, solvers: tuple[str, ...], stops: int) -> None:
     made = simulate("li2024", 0, short=True)
     some = sources(data)
     recording = observed(made, read_precise(list(some.sp3), list(some.clk)))
-    rates = detection(replace(made, recording=recording), ["fft"])
+    rates = detection(replace(made, recording=recording), ["fused", "fft"])
     print("Table 5: % of stopped seconds found, by stop and in all; the paper's, and ours (simulated)")
     print("paper", *TABLE_5)
     for name, row in rates.items():
         print(f"{name}:", " ".join(f"{x:.2f}" for x in row[:4]), f"false alarms {row[4]:.2f} % of moving seconds")
     print("\nTable 6: change of position in a stop, cm, east north up; PPP before it, no GNSS in it")
-    print("paper, mean of its stops", {name: row for name, row in TABLE_6.items()})
+    print("paper, mean of its stops", TABLE_6)
     for number, stop in enumerate(stops_of(made)[:stops]):
         part = without_gnss(recording.crop(0.0, stop[1] - recording.start), [(stop[0] - 0.5, stop[1] + 1.0)])
         for fire in ("fft", "fused"):
