@@ -20,6 +20,7 @@ from graphnav.recording import Recording
 
 RADIUS, MU = 2.656e7, 3.986004418e14
 SATELLITES = [f"G{k:02d}" for k in range(1, 8)] + [f"E{k:02d}" for k in range(1, 6)]
+BANDS = {"G": ((L1, "1C"), (1227.6e6, "2W")), "E": ((L1, "1C"), (1176.45e6, "5Q"))}
 BIAS = 7.0  # m, of Galileo's signal
 ZERO = 2200 * 604800.0
 
@@ -55,10 +56,14 @@ def observe(llh_of, t: Array, above: Array, k: int) -> tuple[Array, Array, Array
     return C * tau, fixed(sent), (fixed(sent + 0.5) - fixed(sent - 0.5))
 
 
-def with_observations(recording: Recording, path: ExactPath, noise: float = 0.0, seed: int = 0) -> Recording:
+def with_observations(
+    recording: Recording, path: ExactPath, noise: float = 0.0, seed: int = 0, carrier: float | None = None,
+    second: bool = False,
+) -> Recording:  # fmt: skip
     """The recording with raw observations at the times of its fixes, and these said to be derived from them.
 
-    `noise` is that of the codes, m; that of range rates is a twentieth of it, m/s.
+    `noise` is that of the codes, m; that of range rates is a twentieth of it, m/s; `carrier` that of carriers, m, each
+    with cycles of its own, and none without. `second` adds a second signal of each satellite.
     """
     gnss = recording.gnss
     t, lever = gnss.t, tuple(float(x) for x in gnss.lever_arm)
@@ -80,27 +85,33 @@ def with_observations(recording: Recording, path: ExactPath, noise: float = 0.0,
         rate = (observe(llh_of, inside + h, above, k)[0] - observe(llh_of, inside - h, above, k)[0]) / (2.0 * h)
         azimuth, elevation = directions(antenna, p)
         delay = klobuchar(NIGHT, np.mod(t, 604800.0), llh, azimuth, elevation)
-        n, white = len(t), noise * rng.standard_normal(len(t))
+        n, noisy = len(t), noise * rng.standard_normal(len(t))
         bias = BIAS if name[0] == "E" else 0.0
-        own = {
-            "t": t, "satellite": np.full(n, satellite_id(name), dtype=np.int16),
-            "signal": np.full(n, signal_id("1C"), dtype=np.int16),
-            "code": distance + clock + bias + delay + white, "p": p, "v": v,
-            "range_rate": rate + drift + 0.05 * noise * rng.standard_normal(n),
-            "high": elevation,
-        }  # fmt: skip
-        for key, value in own.items():
-            parts.setdefault(key, []).append(value)
+        for frequency, signal in BANDS[name[0]][: 1 + second]:
+            phase = np.full(n, np.nan)
+            slower = delay * (L1 / frequency) ** 2
+            if carrier is not None:
+                white = carrier * np.random.default_rng([seed, k]).standard_normal(n)
+                phase = (distance + clock + bias - slower + white) * frequency / C + 1000.0 * k
+            own = {
+                "t": t, "carrier": phase, "satellite": np.full(n, satellite_id(name), dtype=np.int16),
+                "signal": np.full(n, signal_id(signal), dtype=np.int16), "frequency": np.full(n, frequency),
+                "code": distance + clock + bias + slower + noisy, "p": p, "v": v,
+                "range_rate": rate + drift + 0.05 * noise * rng.standard_normal(n),
+                "high": elevation,
+            }  # fmt: skip
+            for key, value in own.items():
+                parts.setdefault(key, []).append(value)
     whole = {key: np.concatenate(value) for key, value in parts.items()}
-    order = np.lexsort((whole["satellite"], whole["t"]))
+    order = np.lexsort((whole["signal"], whole["satellite"], whole["t"]))
     order = order[whole.pop("high")[order] > np.radians(10.0)]
     whole = {key: value[order] for key, value in whole.items()}
     n, at = len(order), np.searchsorted(t, whole["t"])
     rough = antenna + 20.0 * np.random.default_rng(1).standard_normal(antenna.shape)
     raw = RawGnss(
-        **whole, carrier=np.full(n, np.nan), cn0=np.full(n, 45.0), slip=np.zeros(n, dtype=bool),
-        half=np.zeros(n, dtype=bool), frequency=np.full(n, L1), clock=np.zeros(n), drift=np.zeros(n),
+        **whole, cn0=np.full(n, 45.0), slip=np.zeros(n, dtype=bool),
+        half=np.zeros(n, dtype=bool), clock=np.zeros(n), drift=np.zeros(n),
         difference=np.full(n, np.nan), zero=ZERO, place=tuple(above), troposphere=True, antenna=rough[at],
-        receiver_clock=np.stack([clock + 5.0, drift], -1)[at], lever_arm=gnss.lever_arm,
+        receiver_clock=np.stack([clock + 5.0, drift], -1)[at], lever_arm=gnss.lever_arm, precise=True,
     )  # fmt: skip
     return replace(recording, gnss=replace(gnss, derived=True), raw_gnss=raw)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from graphnav.config.outliers import Outliers
 
@@ -19,9 +20,23 @@ class RawGnssSettings(Outliers):
     )
     code: bool = Field(True, description="use the codes")
     doppler: bool = Field(True, description="use the Doppler shifts")
+    differences: bool = Field(True, description="use what the carriers change by from epoch to epoch")
+    ppp: bool = Field(
+        False,
+        description="precise point positioning: codes and carriers of two signals, by precise orbits and clocks, in "
+        "place of single codes and changes of carriers",
+    )
     elevation: float = Field(10.0, ge=0, lt=90, description="deg, below which satellites are not used")
     cn0: float = Field(30.0, ge=0, description="dB-Hz, below which signals are not used: most are reflections")
     period: float = Field(1.0, ge=0, description="s between the epochs that are used, at least; 0 = all")
     bias_sigma: float = Field(
         30.0, gt=0, description="m, 1-sigma of the bias of another system's signals against the first's"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_ppp(cls, values: Any) -> Any:
+        """Precise point positioning has the codes and the carriers in it: they are not used twice."""
+        if isinstance(values, Mapping) and values.get("ppp") is True:
+            return {"code": False, "differences": False, **values}
+        return values

@@ -68,3 +68,55 @@ def saastamoinen(llh: Array, elevation: Array) -> Array:
         wet = 0.002277 * (1255.0 / kelvin + 0.05) * vapour / np.cos(down)
     inside = (elevation > 0.0) & (llh[:, 2] > -100.0) & (llh[:, 2] < 10000.0)
     return np.asarray(np.where(inside, dry + wet, 0.0))
+
+
+# Niell (1996), "Global mapping functions for the atmosphere delay at radio wavelengths", tables 3 and 4: a, b, c by
+# latitudes of 15, 30, 45, 60, 75 degrees; of the dry part its mean and how far it goes with the season, and the wet
+_LATITUDES = np.array([15.0, 30.0, 45.0, 60.0, 75.0])
+_DRY_MEAN = np.array([
+    [1.2769934e-3, 1.2683230e-3, 1.2465397e-3, 1.2196049e-3, 1.2045996e-3],
+    [2.9153695e-3, 2.9152299e-3, 2.9288445e-3, 2.9022565e-3, 2.9024912e-3],
+    [62.610505e-3, 62.837393e-3, 63.721774e-3, 63.824265e-3, 64.258455e-3],
+])  # fmt: skip
+_DRY_SEASON = np.array([
+    [0.0, 1.2709626e-5, 2.6523662e-5, 3.4000452e-5, 4.1202191e-5],
+    [0.0, 2.1414979e-5, 3.0160779e-5, 7.2562722e-5, 11.723375e-5],
+    [0.0, 9.0128400e-5, 4.3497037e-5, 84.795348e-5, 170.37206e-5],
+])  # fmt: skip
+_WET = np.array([
+    [5.8021897e-4, 5.6794847e-4, 5.8118019e-4, 5.9727542e-4, 6.1641693e-4],
+    [1.4275268e-3, 1.5138625e-3, 1.4572752e-3, 1.5007428e-3, 1.7599082e-3],
+    [4.3472961e-2, 4.6729510e-2, 4.3908931e-2, 4.4626982e-2, 5.4736038e-2],
+])  # fmt: skip
+_HEIGHT = np.array([2.53e-5, 5.49e-3, 1.14e-3])
+_YEAR, _COLDEST = 365.25, 28.0  # days; of the year, on the northern half
+
+
+def zenith_delays(llh: Array) -> tuple[Array, Array]:
+    """Delays (N,) of the dry and the wet troposphere at the zenith, m, as `saastamoinen` has them."""
+    upright = np.full(len(llh), np.pi / 2.0)
+    whole = saastamoinen(llh, upright)
+    height = np.clip(llh[:, 2], 0.0, 10000.0)
+    pressure = 1013.25 * (1.0 - 2.2557e-5 * height) ** 5.2568
+    dry = 0.0022768 * pressure / (1.0 - 0.00266 * np.cos(2.0 * llh[:, 0]) - 0.00028 * height / 1e3)
+    return dry, whole - dry
+
+
+def niell(llh: Array, elevation: Array, day: Array) -> tuple[Array, Array]:
+    """How the dry and the wet delay (N,) grow from the zenith to elevations (N,), rad; `day` (N,) of the year."""
+    lat = np.degrees(np.abs(llh[:, 0]))
+    season = np.cos(2.0 * np.pi * ((day - _COLDEST) / _YEAR + np.where(llh[:, 0] < 0.0, 0.5, 0.0)))
+    sin = np.sin(np.maximum(elevation, np.radians(1.0)))
+
+    def at(table: Array) -> Array:
+        return np.stack([np.interp(lat, _LATITUDES, row) for row in table])
+
+    dry = _continued(sin, at(_DRY_MEAN) - at(_DRY_SEASON) * season)
+    higher = (1.0 / sin - _continued(sin, _HEIGHT[:, None])) * llh[:, 2] / 1e3
+    return dry + higher, _continued(sin, at(_WET))
+
+
+def _continued(sin: Array, coefficients: Array) -> Array:
+    """Marini's continued fraction, 1 at the zenith."""
+    a, b, c = coefficients
+    return np.asarray((1.0 + a / (1.0 + b / (1.0 + c))) / (sin + a / (sin + b / (sin + c))))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
+from graphnav.gnss.antex import read_antex
 from graphnav.gnss.differential import with_differences
 from graphnav.gnss.ephemeris import Ephemerides
 from graphnav.gnss.files import read_bytes
@@ -34,6 +35,7 @@ class Sources:
     nav: tuple[Path, ...] = ()
     sp3: tuple[Path, ...] = ()
     clk: tuple[Path, ...] = ()
+    antex: tuple[Path, ...] = ()
     base: tuple[Path, ...] = ()
     base_position: tuple[float, float, float] | None = None  # m in e; that of the file's header when None
     corrected: Corrected = field(default_factory=Corrected)
@@ -43,7 +45,7 @@ class Sources:
     @property
     def files(self) -> tuple[Path, ...]:
         """All of them."""
-        return (*self.rover, *self.nav, *self.sp3, *self.clk, *self.base)
+        return (*self.rover, *self.nav, *self.sp3, *self.clk, *self.antex, *self.base)
 
 
 def read_rover(paths: tuple[Path, ...]) -> tuple[Observations, Ephemerides | None]:
@@ -95,7 +97,10 @@ def load_raw(
     if sources.nominal_stamps:
         obs = with_own_stamps(obs, precise or nav, rover, corrected)  # type: ignore[arg-type]
     raw, remarks = place(obs, nav, precise, rover, corrected)
-    raw = replace(raw, lever_arm=np.array(sources.lever_arm))
+    antennas = {satellite: some for path in sources.antex for satellite, some in read_antex(path).items()}
+    raw = replace(
+        raw, lever_arm=np.array(sources.lever_arm), precise=precise is not None, antennas=antennas if precise else {}
+    )
     one = primary(raw) & np.isfinite(raw.p[:, 0])
     if not one.any():
         raise RecordingError(f"{sources.rover[0]}: none of its satellites has an ephemeris at its times")

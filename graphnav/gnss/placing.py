@@ -60,11 +60,18 @@ def place(
     if nav is not None:
         delay = nav.delay(obs.satellite, obs.signal, frequency, obs.t, obs.zero)
     clock = np.where(np.isfinite(placed.clock), 0.0, np.nan) if corrected.clock else C * (placed.clock - delay)
+    clock[np.isnan(frequency)] = np.nan  # nothing of the ionosphere can be said without
     remarks = [*(nav.remarks if nav is not None else ()), *(precise.remarks if precise is not None else ())]
     lost = {int(s) for s in np.unique(obs.satellite[told[np.isnan(placed.p[told, 0])]])}
     lost_all = sorted(s for s in lost if not np.isfinite(placed.p[(obs.satellite == s), 0]).any())
     ill = sorted(set(lost_all) & (nav.unhealthy if nav is not None and precise is None else set()))
     without = [s for s in lost_all if s not in ill]
+    mute = sorted({int(x) for x in np.unique(obs.satellite[np.isnan(frequency)])} - lost)
+    if mute:
+        names = ", ".join(satellite_name(x) for x in mute)
+        remarks.append(
+            f"no frequency channel for {names}: their observations are not used; a GLONASS nav file tells it"
+        )
     if without:
         names = ", ".join(satellite_name(s) for s in without)
         remarks.append(f"no ephemeris for {names}: their observations are not used")
@@ -80,7 +87,7 @@ def place(
         p=placed.p, v=placed.v, clock=clock, drift=C * placed.drift, difference=np.full(len(obs), np.nan),
         zero=obs.zero, place=(float(rover[0]), float(rover[1]), float(rover[2])),
         klobuchar=None if nav is None or nav.klobuchar is None else tuple(map(tuple, nav.klobuchar.tolist())),
-        troposphere=corrected.troposphere, files=obs.files,
+        troposphere=corrected.troposphere, lock=obs.lock, files=obs.files,
     )  # fmt: skip
     return raw, tuple(remarks)
 

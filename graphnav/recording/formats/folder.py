@@ -37,7 +37,7 @@ from graphnav.recording.formats.trajectories import read_trajectory
 from graphnav.sensors import Sensor, Series, registered
 from graphnav.sensors.tables import ANGLE
 
-_RAW_FILES = ("rover", "nav", "sp3", "clk", "base")
+_RAW_FILES = ("rover", "nav", "sp3", "clk", "antex", "base")
 
 
 def read_folder(source: str | Path) -> Recording:

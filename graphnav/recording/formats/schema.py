@@ -187,6 +187,7 @@ class RawGnssTable(TomlTable):
     nav: Files | None = Field(None, description="RINEX navigation files; UBX files may hold what they would")
     sp3: Files | None = Field(None, description="precise orbits")
     clk: Files | None = Field(None, description="precise clocks")
+    antex: Files | None = Field(None, description="antennas of the satellites, for precise orbits")
     base: Files | None = Field(None, description="RINEX observations of a base station")
     base_position: Vector | None = Field(None, description="m, Earth-centred, of its antenna")
     lever_arm: Vector = Field((0.0, 0.0, 0.0), description="m from the IMU: right, forward, up")
@@ -209,6 +210,8 @@ class RawGnssTable(TomlTable):
     def _check_place(self) -> RawGnssTable:
         if self.clk is not None and self.sp3 is None:
             raise ValueError("clk says nothing without sp3")
+        if self.antex is not None and self.sp3 is None:
+            raise ValueError("antex says nothing without sp3")
         return self
 
 

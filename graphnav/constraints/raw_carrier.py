@@ -1,0 +1,233 @@
+"""What carriers of single satellites change by from one epoch to the next: range differences to millimetres.
+
+A carrier counts cycles from an unknown number on; between two epochs without a slip that number stays and the change is
+a range change (van Graas and Soloviev 2004, "Precise velocity estimation using a stand-alone GPS receiver"). With a the
+place of the antenna at the epoch before and p_a = p + R_nb l that of now::
+
+    r = |s - p_a| - |s' - a| + w + [T - I - dt] - e_l.g (t - t') - lambda [phi]
+
+[x] is the change of x, w that of the receiver's clock, which is anew at every epoch, g what the atmosphere, satellites'
+clocks and orbits do to all of them together over minutes, as a velocity in east, north, up. The place a is a parameter
+that begins anew at every other epoch, two of them in turn, and is tied to the state of its own epoch by rows of its own
+(stochastic cloning: Roumeliotis and Burdick 2002), so that a row knows both places, both attitudes through the lever
+arm and how far each is certain, in every solver.
+
+Slips end an arc (`graphnav.gnss.arcs`), by the receiver's flags and by the other satellites of the epoch; one that
+neither tells meets the kernel, which judges it by what all other rows and the IMU say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.config import Settings
+from graphnav.constraints.base import BuildContext, Constraint, Linearized
+from graphnav.constraints.gnss import LEVER_ARM
+from graphnav.constraints.raw_gnss import _AXES, _common, _prepare, _Prepared, _Satellites, _select
+from graphnav.core import rotation
+from graphnav.core.rotation import Array
+from graphnav.core.state import Parameter, States
+from graphnav.gnss.carrier import consecutive
+from graphnav.gnss.series import median_of_epochs
+from graphnav.gnss.sigmas import carrier_sigma
+from graphnav.gnss.signals import C
+from graphnav.recording import Recording
+
+CHANGE = "receiver_clock_change"
+CLONES = ("gnss_antenna_of_even_epochs", "gnss_antenna_of_odd_epochs")
+DRIFT = "gnss_carrier_drift"
+_CHANGE_SIGMA = 100.0  # m, about the median over the satellites at places that may be that far off
+_ANYWHERE = 1e3  # m, 1-sigma of an antenna's place before its tie: nothing known
+_TIE = 5e-4  # m, a tenth of what a carrier's change is good to
+# m/s, 1-sigma, of the ionosphere and broadcast clocks: Klobuchar's delay goes from 1.5 to 10 m in six hours
+_DRIFT = np.array([5e-4, 5e-4, 1e-3])
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Rows of one satellite and signal at two epochs next to each other, made once for a scene."""
+
+    before: NDArray[np.intp]  # (N,) of the prepared rows
+    after: NDArray[np.intp]
+    epoch: NDArray[np.intp]  # (N,) of `after`, number of the epoch
+    epochs: Array  # (E,) s
+    first: NDArray[np.intp]  # (E,) a prepared row of each epoch
+    change: Array  # (N,) m, all that does not depend on the estimate
+    clock: Array  # (E,) m, of the receiver since the epoch before, roughly
+
+
+def _epochs(recording: Recording, settings: Settings) -> Array:
+    raw = _select(recording, settings) if settings.raw_gnss.differences else None
+    return np.empty(0) if raw is None else np.unique(raw.t[np.isfinite(raw.carrier)])
+
+
+def _pairs(scene: BuildContext) -> tuple[_Prepared, _Pairs] | None:
+    if "raw_carrier" not in scene.made:
+        scene.made["raw_carrier"] = _find_pairs(scene) if scene.settings.raw_gnss.differences else None
+    found: tuple[_Prepared, _Pairs] | None = scene.made["raw_carrier"]
+    return found
+
+
+def _find_pairs(scene: BuildContext) -> tuple[_Prepared, _Pairs] | None:
+    found, whole = _prepare(scene), scene.recording.raw_gnss
+    if found is None or whole is None or not np.isfinite(found.raw.carrier).any():
+        return None
+    raw = found.raw
+    before, after = consecutive(raw, whole)
+    if not len(after):
+        return None
+    epochs, first, of = np.unique(raw.t, return_index=True, return_inverse=True)
+    # of a phase the ionosphere's delay is negative
+    level = found.known - 2.0 * found.ionosphere - raw.clock - raw.carrier * C / raw.frequency
+    change = level[after] - level[before]
+    clock = np.zeros(len(epochs))
+    clock[of[after]] = -median_of_epochs(raw.t[after], change)
+    return found, _Pairs(before, after, of[after], epochs, first, change, clock)
+
+
+def _clones(found: _Prepared, pairs: _Pairs) -> tuple[Parameter, ...]:
+    return tuple(
+        Parameter(
+            name, found.nominal[pairs.first[k::2]], np.full((len(pairs.epochs[k::2]), 3), _ANYWHERE), "m",
+            begins=pairs.epochs[k::2],
+        )
+        for k, name in enumerate(CLONES)
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class GnssAntennaClone(Constraint):
+    """The antenna's place at an epoch, kept for the next."""
+
+    name: ClassVar[str] = "gnss_antenna_clone"
+    axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
+    unit: ClassVar[str] = "m"
+
+    lever_arm: Array = field(default_factory=lambda: np.zeros(3))
+    odd: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) which of `CLONES`
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        return _epochs(recording, settings)
+
+    @classmethod
+    def build(cls, scene: BuildContext) -> GnssAntennaClone | None:
+        both = _pairs(scene)
+        if both is None:
+            return None
+        found, pairs = both
+        own = np.arange(len(pairs.epochs))
+        parameters = [p for p in _common(scene, found)["parameters"] if p.name == LEVER_ARM]
+        return cls(
+            keyframe=found.keyframe[pairs.first[own]],
+            lever_arm=found.raw.lever_arm,
+            odd=own % 2,
+            parameters=(*parameters, *_clones(found, pairs)),
+        )
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        lever = parameters.get(LEVER_ARM, self.lever_arm)
+        odd = self.odd[rows][:, None]
+        kept = np.where(odd == 0, parameters[CLONES[0]], parameters[CLONES[1]])
+        I3 = np.broadcast_to(np.eye(3), (len(states), 3, 3))
+        J = {
+            "theta": -states.R_nb @ rotation.skew(lever),
+            "p": I3,
+            CLONES[0]: -I3 * (odd == 0)[..., None],
+            CLONES[1]: -I3 * (odd == 1)[..., None],
+        }
+        if LEVER_ARM in parameters:
+            J[LEVER_ARM] = states.R_nb
+        antenna = states.p + rotation.mv(states.R_nb, lever)
+        return Linearized(antenna - kept, J, np.full((len(states), 3), _TIE))
+
+
+@dataclass(frozen=True)
+class GnssCarrier(_Satellites):
+    """A satellite's carrier has counted on since the epoch before."""
+
+    name: ClassVar[str] = "gnss_carrier"
+    unit: ClassVar[str] = "m"
+
+    change: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, all that does not depend on the estimate
+    nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m, antenna
+    s_before: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m, satellite at the epoch before
+    nominal_before: Array = field(default_factory=lambda: np.empty((0, 3)))
+    time: Array = field(default_factory=lambda: np.empty(0))  # (N,) s since the epoch before
+    odd: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) which of `CLONES` is of that epoch
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        return _epochs(recording, settings)
+
+    @classmethod
+    def build(cls, scene: BuildContext) -> GnssCarrier | None:
+        both = _pairs(scene)
+        if both is None:
+            return None
+        found, pairs = both
+        raw, j, k = found.raw, pairs.before, pairs.after
+        common: dict[str, Any] = _common(scene, found)
+        common |= {name: common[name][k] for name in ("keyframe", "s_n", "R_ln", "satellite", "elevation", "level")}
+        if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
+            common["robust"] = "cauchy"
+        E = len(pairs.epochs)
+        common["parameters"] = (
+            Parameter(CHANGE, pairs.clock[:, None], np.full((E, 1), _CHANGE_SIGMA), "m", begins=pairs.epochs),
+            *_clones(found, pairs),
+        )
+        minutes = scene.settings.gnss.slow_times[0]
+        drift = Parameter(
+            DRIFT, np.zeros(3), _DRIFT, "m/s", correlation_time=minutes, spacing=found.spacing,
+            noise_groups=tuple(f"{cls.name}.minutes.{axis}" for axis in _AXES),
+        )  # fmt: skip
+        sigma = np.hypot(
+            carrier_sigma(raw.cn0[j], found.elevation[j], C / raw.frequency[j]),
+            carrier_sigma(raw.cn0[k], found.elevation[k], C / raw.frequency[k]),
+        )
+        return cls(
+            change=pairs.change,
+            nominal=found.nominal[k],
+            s_before=found.s_n[j],
+            nominal_before=found.nominal[j],
+            time=raw.t[k] - raw.t[j],
+            odd=(pairs.epoch - 1) % 2,
+            sigma=sigma[:, None],
+            processes=(drift,),
+            **common,
+        )
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        antenna, lever = self._antenna(states, parameters)
+        odd = self.odd[rows]
+        before = np.where(odd[:, None] == 0, parameters[CLONES[0]], parameters[CLONES[1]])
+        nearer, e = _nearer(self.s_n[rows], antenna, self.nominal[rows])
+        nearer_before, e_before = _nearer(self.s_before[rows], before, self.nominal_before[rows])
+        residual = nearer - nearer_before + self.change[rows] + parameters[CHANGE][:, 0]
+        J = {
+            "theta": (e[:, None] @ states.R_nb) @ rotation.skew(lever),
+            "p": -e[:, None],
+            CLONES[0]: (e_before * (odd == 0)[:, None])[:, None],
+            CLONES[1]: (e_before * (odd == 1)[:, None])[:, None],
+            CHANGE: np.ones((len(e), 1, 1)),
+        }
+        if LEVER_ARM in parameters:
+            J[LEVER_ARM] = -e[:, None] @ states.R_nb
+        if DRIFT in parameters:
+            shift, more = self._lasting(parameters, (DRIFT,), rows, e)
+            time = self.time[rows]
+            residual, J = residual + shift * time, J | {DRIFT: more[DRIFT] * time[:, None, None]}
+        return Linearized(residual[:, None], J, self.sigma[rows])
+
+
+def _nearer(s: Array, antenna: Array, nominal: Array) -> tuple[Array, Array]:
+    """|s - antenna| - |s - nominal| (n,) without the digits that a difference of distances loses, and directions."""
+    away, from_nominal = s - antenna, s - nominal
+    moved = antenna - nominal
+    distance = np.linalg.norm(away, axis=1)
+    nearer = np.sum(moved * (moved - 2.0 * from_nominal), axis=1) / (distance + np.linalg.norm(from_nominal, axis=1))
+    return nearer, away / distance[:, None]

@@ -1,0 +1,238 @@
+"""Precise point positioning, with float ambiguities: codes and carriers of two signals, without the ionosphere.
+
+With the models of `graphnav.gnss.ppp` and z the wet delay at the zenith, a random walk, m how it grows, q what a
+satellite's codes are wrong by (its code biases), N the ambiguity of a carrier's arc::
+
+    r_code    = |s - p_a| + b + b_s + m z + q + [...] - dt - P
+    r_carrier = |s - p_a| + b + b_s + m z + N + [...] - dt - Phi
+
+Clock b, lever arm and ambiguities are parameters as those of `graphnav.constraints.raw_gnss`; the bias of another
+system is a constant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.config import Settings
+from graphnav.constraints.ambiguities import ambiguity_name
+from graphnav.constraints.base import BuildContext, Linearized
+from graphnav.constraints.gnss import LEVER_ARM
+from graphnav.constraints.raw_gnss import BIASES, CLOCK, SATELLITES, _common, _prepare, _Prepared, _Satellites, _select
+from graphnav.core import rotation
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.core.state import Parameter, States
+from graphnav.gnss.ppp import IonosphereFree, ionosphere_free
+from graphnav.gnss.sigmas import carrier_sigma, code_sigma
+from graphnav.gnss.signals import C, satellite_name
+from graphnav.recording import Recording
+
+WET = "gnss_wet_delay"
+ORBITS = "gnss_satellite_orbits"
+_WET, _WET_WALK = 0.1, 1.7e-4  # m, of a standard atmosphere's; m/sqrt(s): 1 cm in an hour (Kouba and Heroux 2001)
+_CODE_BIAS = 1.0  # m: a code's differential bias, half a nanosecond or two, in the combination
+_BIAS_WALK = 1e-5  # m/sqrt(s), a millimetre in three hours
+# m, towards a satellite, for hours: final orbits are good to 2.5 cm (IGS, "Products")
+_ORBIT = 0.025
+_AMBIGUITY = 30.0  # m, about what the first code says: next to nothing known
+
+
+@dataclass(frozen=True)
+class _Free:
+    """What both kinds of rows need; made once for a scene."""
+
+    found: _Prepared
+    rows: IonosphereFree
+    s_n: Array  # (N, 3) m
+    satellites: NDArray[np.int16]  # those that have rows
+    which: NDArray[np.intp]  # (N,) satellite
+    group: NDArray[np.intp]  # (N,) system, 0 that with most rows
+    groups: int
+
+
+def _free(scene: BuildContext) -> _Free | None:
+    if "raw_ppp" not in scene.made:
+        scene.made["raw_ppp"] = _prepare_rows(scene) if scene.settings.raw_gnss.ppp else None
+    found: _Free | None = scene.made["raw_ppp"]
+    return found
+
+
+def _prepare_rows(scene: BuildContext) -> _Free | None:
+    found, whole = _prepare(scene), scene.recording.raw_gnss
+    if found is None or whole is None:
+        return None
+    if not whole.precise:
+        raise RecordingError(
+            f"{scene.recording.name}: raw_gnss.ppp needs precise orbits and clocks; say sp3 and clk in the recording's "
+            "[raw_gnss]"
+        )
+    rows = ionosphere_free(found.raw, whole)
+    if rows is None:
+        raise RecordingError(
+            f"{scene.recording.name}: raw_gnss.ppp needs two signals of a satellite (GPS L1 and L2, Galileo E1 and "
+            "E5a); this receiver has one"
+        )
+    satellites, which = np.unique(found.raw.satellite[rows.which], return_inverse=True)
+    systems, group, many = np.unique(satellites[which] // 100, return_inverse=True, return_counts=True)
+    rank = np.empty(len(systems), dtype=np.intp)
+    rank[np.argsort(-many, kind="stable")] = np.arange(len(systems))
+    return _Free(found, rows, found.s_n[rows.which], satellites, which, rank[group], len(systems))
+
+
+@dataclass(frozen=True)
+class _Ppp(_Satellites):
+    """Rows of single satellites without the ionosphere."""
+
+    offset: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, all that does not depend on the estimate
+    nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m
+    wet: Array = field(default_factory=lambda: np.empty(0))  # (N,)
+    group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) system, 0 the reference
+    which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        raw = _select(recording, settings) if settings.raw_gnss.ppp else None
+        return np.empty(0) if raw is None else np.unique(raw.t)
+
+    @staticmethod
+    def _shared(scene: BuildContext, free: _Free, used: NDArray[np.intp]) -> dict[str, Any]:
+        rows, common = free.rows, _common(scene, free.found)
+        at = rows.which[used]
+        common |= {name: common[name][at] for name in ("keyframe", "R_ln", "satellite", "elevation", "level")}
+        common["parameters"] += (
+            Parameter(WET, np.zeros(1), np.full(1, _WET), "m", _WET_WALK, spacing=free.found.spacing),
+        )
+        if free.groups > 1:
+            size, sigma = free.groups - 1, scene.settings.raw_gnss.bias_sigma
+            common["parameters"] += (
+                Parameter(BIASES, np.zeros(size), np.full(size, sigma), "m", _BIAS_WALK, spacing=free.found.spacing),
+            )
+        return common | {
+            "s_n": free.s_n[used],
+            "nominal": free.found.nominal[at],
+            "wet": rows.wet[used],
+            "group": free.group[used],
+            "which": free.which[used],
+        }
+
+    def _ranges(
+        self, states: States, parameters: dict[str, Array], rows: slice | Array
+    ) -> tuple[Array, dict[str, Array]]:
+        """Residuals (n,) without ambiguities and code biases, and Jacobians."""
+        antenna, lever = self._antenna(states, parameters)
+        away, before = self.s_n[rows] - antenna, self.s_n[rows] - self.nominal[rows]
+        moved = antenna - self.nominal[rows]
+        distance = np.linalg.norm(away, axis=1)
+        nearer = np.sum(moved * (moved - 2.0 * before), axis=1) / (distance + np.linalg.norm(before, axis=1))
+        e, wet = away / distance[:, None], self.wet[rows]
+        residual = nearer + self.offset[rows] + parameters[CLOCK][:, 0] + wet * parameters[WET][:, 0]
+        J = {
+            "theta": (e[:, None] @ states.R_nb) @ rotation.skew(lever),
+            "p": -e[:, None],
+            CLOCK: np.broadcast_to(np.array([[1.0, 0.0]]), (len(e), 1, 2)),
+            WET: wet[:, None, None],
+        }
+        if LEVER_ARM in parameters:
+            J[LEVER_ARM] = -e[:, None] @ states.R_nb
+        if BIASES in parameters:
+            own = self.group[rows][:, None] == np.arange(1, parameters[BIASES].shape[1] + 1)
+            residual = residual + np.sum(own * parameters[BIASES], axis=1)
+            J[BIASES] = own[:, None].astype(float)
+        return residual, J
+
+
+@dataclass(frozen=True)
+class GnssPppCode(_Ppp):
+    """Codes of two signals of a satellite were received by the antenna."""
+
+    name: ClassVar[str] = "gnss_ppp_code"
+    unit: ClassVar[str] = "m"
+
+    @classmethod
+    def build(cls, scene: BuildContext) -> GnssPppCode | None:
+        free = _free(scene)
+        if free is None:
+            return None
+        rows, raw = free.rows, free.found.raw.take(free.rows.which)
+        common = cls._shared(scene, free, np.arange(len(rows.which)))
+        size, hours = len(free.satellites), scene.settings.gnss.slow_times[1]
+        common["parameters"] += (
+            Parameter(
+                SATELLITES, np.zeros(size), np.full(size, _CODE_BIAS), "m", correlation_time=hours,
+                spacing=free.found.spacing,
+            ),
+        )  # fmt: skip
+        sigma = rows.growth * code_sigma(raw.cn0, rows.geometry.elevation, np.zeros(len(raw)))
+        return cls(offset=rows.known - rows.code, sigma=sigma[:, None], **common)
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        residual, J = self._ranges(states, parameters, rows)
+        own = self.which[rows][:, None] == np.arange(parameters[SATELLITES].shape[1])
+        residual = residual + np.sum(own * parameters[SATELLITES], axis=1)
+        J[SATELLITES] = own[:, None].astype(float)
+        return Linearized(residual[:, None], J, self.sigma[rows])
+
+
+@dataclass(frozen=True)
+class GnssPppCarrier(_Ppp):
+    """Carriers of two signals of a satellite were received by the antenna."""
+
+    name: ClassVar[str] = "gnss_ppp_carrier"
+    unit: ClassVar[str] = "m"
+
+    ambiguities: tuple[str, ...] = ()  # (S,) names of the parameters, by satellite
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        return np.empty(0)  # those of the codes
+
+    @classmethod
+    def build(cls, scene: BuildContext) -> GnssPppCarrier | None:
+        free = _free(scene)
+        if free is None:
+            return None
+        rows = free.rows
+        used = np.flatnonzero((rows.arc >= 0) & np.isfinite(rows.carrier))
+        if not len(used):
+            return None
+        raw = free.found.raw.take(rows.which[used])
+        common = cls._shared(scene, free, used)
+        names = tuple(ambiguity_name(f"{satellite_name(s)}.free") for s in free.satellites)
+        begins_at: list[NDArray[np.intp]] = []
+        for k in range(len(names)):
+            own = used[free.which[used] == k]
+            begins_at.append(own[np.sort(np.unique(rows.arc[own], return_index=True)[1])])
+        common["parameters"] += tuple(
+            Parameter(
+                name, (rows.carrier - rows.code)[at, None], np.full((len(at), 1), _AMBIGUITY), "m",
+                begins=free.found.raw.t[rows.which[at]],
+            )
+            for name, at in zip(names, begins_at, strict=True)
+            if len(at)
+        )  # fmt: skip
+        size, hours = len(names), scene.settings.gnss.slow_times[1]
+        common["parameters"] += (
+            Parameter(
+                ORBITS, np.zeros(size), np.full(size, _ORBIT), "m", correlation_time=hours, spacing=free.found.spacing
+            ),
+        )
+        if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
+            common["robust"] = "cauchy"
+        sigma = rows.growth[used] * carrier_sigma(raw.cn0, rows.geometry.elevation[used], C / raw.frequency)
+        return cls(offset=(rows.known - rows.carrier)[used], sigma=sigma[:, None], ambiguities=names, **common)
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        residual, J = self._ranges(states, parameters, rows)
+        own = (self.which[rows][:, None] == np.arange(len(self.ambiguities))).astype(float)
+        residual = residual + np.sum(own * parameters[ORBITS], axis=1)
+        J[ORBITS] = own[:, None]
+        for k, name in enumerate(self.ambiguities):
+            if name in parameters:
+                residual = residual + own[:, k] * parameters[name][:, 0]
+                J[name] = own[:, None, k, None]
+        return Linearized(residual[:, None], J, self.sigma[rows])

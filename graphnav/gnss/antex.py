@@ -1,0 +1,140 @@
+"""Antennas of satellites by ANTEX 1.4: where their phase centres are from the centre of mass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.gnss.files import calendar_days, read_bytes
+from graphnav.gnss.signals import SYSTEMS, C, Ids, satellite_id
+
+_ALWAYS = 1e12  # s
+
+
+@dataclass(frozen=True)
+class SatelliteAntenna:
+    """Of one satellite in one time, by its band."""
+
+    begin: float  # s since the GPS epoch
+    end: float
+    offset: dict[int, Array]  # (3,) m, in the satellite's axes
+
+
+Antennas = dict[int, tuple[SatelliteAntenna, ...]]
+
+
+def read_antex(path: Path) -> Antennas:
+    """The satellites of an ANTEX file.
+
+    Raises
+    ------
+    RecordingError
+        If it is none, or a field cannot be read, naming the line.
+    """
+    lines = read_bytes(path).decode("latin-1").splitlines()
+    if not lines or "ANTEX VERSION" not in lines[0]:
+        raise RecordingError(f"{path}: not an ANTEX file; its first line names no version")
+    out: dict[int, list[SatelliteAntenna]] = {}
+    name, begin, end, band = "", -_ALWAYS, _ALWAYS, 0
+    offset: dict[int, Array] = {}
+    for number, line in enumerate(lines, 1):
+        label = line[60:].strip()
+        try:
+            if label == "START OF ANTENNA":
+                name, begin, end, offset = "", -_ALWAYS, _ALWAYS, {}
+            elif label == "TYPE / SERIAL NO":
+                name = line[20:23].strip()
+            elif label == "VALID FROM":
+                begin = _date(line)
+            elif label == "VALID UNTIL":
+                end = _date(line)
+            elif label == "START OF FREQUENCY":
+                band = int(line[4:6])
+            elif label == "NORTH / EAST / UP":
+                offset[band] = 1e-3 * np.array([line[0:10], line[10:20], line[20:30]], dtype=float)
+            elif label == "END OF ANTENNA" and len(name) == 3 and name[0] in SYSTEMS and name[1:].isdigit():
+                out.setdefault(satellite_id(name), []).append(SatelliteAntenna(begin, end, offset))
+        except ValueError:
+            raise RecordingError(f"{path}, line {number}: '{line[:60].strip()}' cannot be read as {label}") from None
+    if not out:
+        raise RecordingError(f"{path}: holds no antennas of satellites")
+    return {one: tuple(many) for one, many in out.items()}
+
+
+def ionosphere_free_offset(
+    antennas: Antennas, satellite: Ids, first: Array, second: Array, bands: Array, gps: Array
+) -> Array:
+    """(N, 3) m, in the satellites' axes, of the combination of two signals; NaN where a file says nothing of it.
+
+    Parameters
+    ----------
+    first, second : (N,) Hz.
+    bands : (N, 2) of RINEX.
+    gps : (N,) s since the GPS epoch.
+    """
+    out = np.full((len(satellite), 3), np.nan)
+    for one, many in antennas.items():
+        for antenna in many:
+            own = (satellite == one) & (gps >= antenna.begin) & (gps <= antenna.end)
+            for a, b in np.unique(bands[own], axis=0):
+                if a in antenna.offset and b in antenna.offset:
+                    some = np.flatnonzero(own & (bands[:, 0] == a) & (bands[:, 1] == b))
+                    alpha = (first[some] ** 2 / (first[some] ** 2 - second[some] ** 2))[:, None]
+                    out[some] = alpha * antenna.offset[a] - (alpha - 1.0) * antenna.offset[b]
+    return out
+
+
+def satellite_axes(place: Array, sun: Array) -> Array:
+    """(N, 3, 3) unit vectors x, y, z, as rows, of satellites that keep their panels to the Sun; m in e (N, 3) each."""
+    z = -place / np.linalg.norm(place, axis=1)[:, None]
+    to = sun - place
+    y = np.cross(z, to)
+    y /= np.linalg.norm(y, axis=1)[:, None]
+    return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def wind_up(satellite: Ids, epoch: Array, axes: Array, e: Array, enu: Array) -> Array:
+    """(N,) cycles by which carriers have been wound up (Wu et al. 1993), continuous for each satellite.
+
+    The receiver's own turning is left out: it is the same for all and goes into its clock.
+
+    Parameters
+    ----------
+    epoch : (N,) s.
+    axes : (N, 3, 3) of the satellites, rows.
+    e : (N, 3) unit vectors from the antenna to the satellites.
+    enu : (N, 3, 3) east, north, up at the antenna, rows.
+    """
+    k = -e
+    x, y = axes[:, 0], axes[:, 1]
+    north, west = enu[:, 1], -enu[:, 0]
+    sent = x - k * np.sum(k * x, axis=1)[:, None] - np.cross(k, y)
+    received = north - k * np.sum(k * north, axis=1)[:, None] + np.cross(k, west)
+    cosine = np.sum(sent * received, axis=1) / np.linalg.norm(sent, axis=1) / np.linalg.norm(received, axis=1)
+    cycles = np.arccos(np.clip(cosine, -1.0, 1.0)) / (2.0 * np.pi)
+    cycles *= np.sign(np.sum(k * np.cross(sent, received), axis=1))
+    for one in np.unique(satellite):
+        own = np.flatnonzero(satellite == one)
+        own = own[np.argsort(epoch[own], kind="stable")]
+        cycles[own] = np.unwrap(cycles[own], period=1.0)
+    return cycles
+
+
+def bent(satellite: Array, antenna: Array) -> Array:
+    """(N,) m by which the Earth's gravity lengthens ranges (Shapiro; IERS Conventions 2010, equation 11.17)."""
+    r, s = np.linalg.norm(antenna, axis=1), np.linalg.norm(satellite, axis=1)
+    between = np.linalg.norm(satellite - antenna, axis=1)
+    return np.asarray(2.0 * 3.986004418e14 / C**2 * np.log((r + s + between) / (r + s - between)))
+
+
+def _date(line: str) -> float:
+    fields = np.array([line[:43].split()[:6]], dtype=float)
+    days, good = calendar_days(fields)
+    if not good.all():
+        raise ValueError
+    since = float((days - np.datetime64("1980-01-06", "D")).astype(np.int64)[0]) * 86400.0
+    return since + float(fields[0, 3:] @ np.array([3600.0, 60.0, 1.0]))

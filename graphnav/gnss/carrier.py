@@ -1,0 +1,56 @@
+"""Carriers from epoch to epoch: which pairs of observations are of one count of cycles and one ephemeris."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.gnss.arcs import find_arcs
+from graphnav.gnss.series import RawGnss
+from graphnav.gnss.signals import C
+
+_APART = 2.5  # periods, at most: beyond it is a gap
+# m and m/s^3, of a satellite's way between epochs against the mean of its velocities: rounding, and a third derivative
+# of 1e-4 m/s^3 over 12; more is another ephemeris, whose orbit and clock are apart from those before
+_JUMP, _THIRD = 2e-3, 1e-5
+
+
+def consecutive(raw: RawGnss, whole: RawGnss) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows (N,) and (N,) of an arc at one epoch and the next.
+
+    Parameters
+    ----------
+    raw : some of the rows of `whole`, with epochs left out or all.
+    whole : all that the receiver had: a slip at an epoch that is left out counts.
+    """
+    arcs, at = find_arcs(whole), rows_in(raw, whole)
+    (epochs, of), arc, slot = raw.epochs, arcs.arc[at], arcs.slot[at]
+    good = np.isfinite(raw.carrier) & np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock) & ~raw.half & (arc >= 0)
+    order = np.flatnonzero(good)
+    order = order[np.lexsort((of[order], slot[order]))]
+    j, k = order[:-1], order[1:]
+    usual = float(np.median(np.diff(epochs))) if len(epochs) > 1 else 1.0
+    kept = (slot[j] == slot[k]) & (arc[j] == arc[k]) & (of[k] - of[j] == 1) & (raw.t[k] - raw.t[j] <= _APART * usual)
+    j, k = j[kept], k[kept]
+    dt = raw.t[k] - raw.t[j]
+    sent = dt - (raw.code[k] - raw.code[j]) / C + (raw.receiver_clock[k, 0] - raw.receiver_clock[j, 0]) / C
+    off = raw.p[k] - raw.p[j] - 0.5 * (raw.v[j] + raw.v[k]) * sent[:, None]
+    clock = raw.clock[k] - raw.clock[j] - 0.5 * (raw.drift[j] + raw.drift[k]) * sent
+    limit = _JUMP + _THIRD * dt**3
+    same = (np.linalg.norm(off, axis=1) < limit) & (np.abs(clock) < limit)
+    j, k = j[same], k[same]
+    sort = np.lexsort((j, k))
+    return j[sort], k[sort]
+
+
+def rows_in(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
+    """(N,) where in a series the rows of a part of it are."""
+    epochs = np.unique(whole.t)
+
+    def keys(one: RawGnss) -> NDArray[np.int64]:
+        epoch = np.searchsorted(epochs, one.t).astype(np.int64)
+        return np.asarray((epoch << 32) + (one.satellite.astype(np.int64) << 16) + one.signal, dtype=np.int64)
+
+    all_keys = keys(whole)
+    order: NDArray[np.intp] = np.argsort(all_keys)
+    return order[np.searchsorted(all_keys[order], keys(raw))]

@@ -1,0 +1,130 @@
+"""Codes and carriers of two signals as one without the ionosphere, with all that is known to centimetres taken off.
+
+The ionosphere delays codes, and advances carriers, by the inverse square of the frequency, so that of two signals
+f1^2 / (f1^2 - f2^2) times the first less f2^2 / (f1^2 - f2^2) times the second has none of it. What is modelled, beside
+distance and clocks: where the satellites' antennas are (ANTEX), wind-up, the solid Earth's tide, the bending of signals
+by the Earth, the dry troposphere, and the wet one of a standard atmosphere (Kouba and Heroux 2001, "Precise point
+positioning using IGS orbit and clock products").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core import earth
+from graphnav.core.rotation import Array
+from graphnav.core.timescales import gps_to_utc
+from graphnav.gnss.antex import bent, ionosphere_free_offset, satellite_axes, wind_up
+from graphnav.gnss.arcs import Arcs, find_arcs
+from graphnav.gnss.atmosphere import niell, zenith_delays
+from graphnav.gnss.carrier import rows_in
+from graphnav.gnss.series import RawGnss
+from graphnav.gnss.signals import GALILEO, GPS, QZSS, C
+from graphnav.gnss.single_point import Geometry, look
+from graphnav.gnss.tides import solid_tide, sun_and_moon
+
+# the second band, whose combination with the first the clocks of precise products are of; of BeiDou and GLONASS these
+# are combinations of other signals from product to product
+SECOND = {GPS: 2, GALILEO: 5, QZSS: 2}
+
+
+@dataclass(frozen=True)
+class IonosphereFree:
+    """N rows: those of a first signal that have a second one beside them."""
+
+    which: NDArray[np.intp]  # (N,) of the rows given
+    geometry: Geometry
+    known: Array  # (N,) m, distance from the nominal antenna, with all that is modelled
+    code: Array  # (N,) m, with the satellite's clock
+    carrier: Array  # (N,) m, with the satellite's clock; NaN where one of the two carriers is missing
+    wet: Array  # (N,) how the wet delay grows from the zenith
+    growth: Array  # (N,) of white noise that is alike on both signals
+    arc: NDArray[np.intp]  # (N,) number of the arc, over all satellites; -1 without a carrier
+
+
+def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
+    """The combinations of the rows of a first band.
+
+    Parameters
+    ----------
+    raw : a row for each satellite and epoch, of its first signal.
+    whole : all that the receiver has, with the second ones.
+    """
+    second = _second(raw, whole)
+    which = np.flatnonzero(second >= 0)
+    if not len(which):
+        return None
+    one, other = raw.take(which), whole.take(second[which])
+    arcs, first_rows = find_arcs(whole), rows_in(one, whole)
+    f1, f2 = one.frequency, other.frequency
+    alpha = f1**2 / (f1**2 - f2**2)
+    beta = alpha - 1.0
+
+    def free(a: Array, b: Array) -> Array:
+        return np.asarray(alpha * a - beta * b)
+
+    geometry = look(one, one.antenna, None)
+    gps = one.t + one.zero
+    sun, moon = sun_and_moon(gps)
+    place = earth.ecef_to_llh(one.antenna)
+    enu = earth.enu_axes(place)
+    axes = satellite_axes(geometry.s, sun)
+    extra = bent(geometry.s, one.antenna) - np.sum(geometry.e * solid_tide(one.antenna, sun, moon), axis=1)
+    if raw.antennas:
+        bands = np.stack([one.signal // 100, other.signal // 100], -1)
+        offset = ionosphere_free_offset(raw.antennas, one.satellite, f1, f2, bands, gps)
+        told = np.einsum("ni,nij,nj->n", offset, axes, geometry.e)
+        extra = extra + np.nan_to_num(told)
+    utc = gps_to_utc(gps)
+    day = (utc - utc.astype("datetime64[Y]")) / np.timedelta64(1, "D")
+    dry, wet = zenith_delays(place)
+    if raw.troposphere:  # is taken off already
+        dry, wet = np.zeros(len(one)), np.zeros(len(one))
+    by_dry, by_wet = niell(place, geometry.elevation, day)
+    carrier = free(one.carrier * C / f1, other.carrier * C / f2) + one.clock
+    carrier -= wind_up(one.satellite, one.t, axes, geometry.e, enu) * C / (f1 + f2)
+    good = (arcs.arc[first_rows] >= 0) & (arcs.arc[second[which]] >= 0) & ~one.half & ~other.half
+    return IonosphereFree(
+        which=which,
+        geometry=geometry,
+        known=geometry.distance + extra + dry * by_dry + wet * by_wet,
+        code=free(one.code, other.code) + free(one.clock, other.clock),
+        carrier=np.where(good, carrier, np.nan),
+        wet=by_wet,
+        growth=np.hypot(alpha, beta),
+        arc=_joint_arcs(arcs, first_rows, second[which], good),
+    )
+
+
+def _second(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
+    """(N,) the row of `whole` with the second signal of each row; -1 where there is none.
+
+    Of several signals of a band that of which there are most carriers, for each satellite one throughout.
+    """
+    out = np.full(len(raw), -1, dtype=np.intp)
+    epochs = np.unique(whole.t)
+    useful = np.isfinite(whole.carrier) & np.isfinite(whole.code) & np.isfinite(whole.clock)
+    for one in np.unique(raw.satellite):
+        band = SECOND.get(int(one) // 100)
+        own = np.flatnonzero((whole.satellite == one) & useful & (whole.signal // 100 == (band or -1)))
+        if not len(own):
+            continue
+        signals, many = np.unique(whole.signal[own], return_counts=True)
+        own = own[whole.signal[own] == signals[np.argmax(many)]]
+        at = np.full(len(epochs), -1, dtype=np.intp)
+        at[np.searchsorted(epochs, whole.t[own])] = own
+        rows = np.flatnonzero((raw.satellite == one) & (raw.signal // 100 == 1))
+        out[rows] = at[np.searchsorted(epochs, raw.t[rows])]
+    return out
+
+
+def _joint_arcs(
+    arcs: Arcs, first: NDArray[np.intp], second: NDArray[np.intp], good: NDArray[np.bool_]
+) -> NDArray[np.intp]:
+    """(N,) numbers of arcs in which neither signal has slipped."""
+    pairs = np.stack([arcs.slot[first], arcs.arc[first], arcs.slot[second], arcs.arc[second]], -1)
+    number = np.unique(pairs, axis=0, return_inverse=True)[1].reshape(-1)
+    return np.where(good, number, -1)

@@ -1,0 +1,220 @@
+"""What carriers of single satellites tell from epoch to epoch, on ucr_riverside_20200712 with a simulated IMU.
+
+    python scripts/reproduce_carrier.py increments ../shared/data/ucr_riverside_20200712
+    python scripts/reproduce_carrier.py canyon ../shared/data/ucr_riverside_20200712 -o build/carrier
+
+`increments` solves the displacement of each epoch from the carriers' changes alone and compares it with the truth's.
+`canyon` takes satellites away by a mask: in ten spans of 60 s the 4, 3, 2, 1, 0 highest are left, and the table has the
+horizontal errors in the spans, of filter, smoother and batch, with changes of carriers and without.
+
+The recording has no IMU. Its samples are SIMULATED: a spline through the reference positions is the motion, level but
+for the slope, heading along the way; errors are those of a low-cost MEMS (the figures of data/tokyo_raw). Carriers,
+codes and Doppler shifts are the receiver's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pyins import sim
+from scipy.interpolate import CubicSpline, PchipInterpolator
+
+from graphnav.config import settings_from
+from graphnav.core import earth
+from graphnav.estimation.pipeline import run
+from graphnav.estimation.solution import Solution
+from graphnav.gnss.arcs import find_arcs
+from graphnav.gnss.carrier import consecutive
+from graphnav.gnss.load import Sources, load_raw
+from graphnav.gnss.series import RawGnss, primary
+from graphnav.gnss.sigmas import carrier_sigma
+from graphnav.gnss.signals import C
+from graphnav.gnss.single_point import SinglePoint, coefficients, look
+from graphnav.recording import Gnss, Imu, ImuNoise, Recording, Truth
+
+Array = np.ndarray
+ZERO = 2114 * 604800.0 + 5784.0  # s since the GPS epoch of the reference's first row
+RATE = 100.0  # Hz of the simulated IMU
+MEMS = ImuNoise(1.5e-4, 4e-3, 5e-6, 2e-4, 2e-3, 0.1)
+SPAN, SPANS, FIRST, APART = 60.0, 10, 150.0, 210.0  # s: of a canyon, how many, where the first begins, and the others
+SOLVERS = ("ekf", "rts", "batch")
+MOVING = 1.0  # m/s, from which on a heading is that of the way
+
+
+def observations(data: Path) -> tuple[RawGnss, SinglePoint, Array]:
+    """The rover's series, its single-point fixes, and the reference (2400, 3), m in e, one row a second."""
+    raw, fixes, _ = load_raw(Sources((data / "rover.obs.gz",), (data / "nav.gz",)), ZERO)
+    with gzip.open(data / "truth.csv.gz", "rt") as file:
+        rows = np.genfromtxt(file, delimiter=",", names=True)
+    return raw, fixes, np.stack([rows["x"], rows["y"], rows["z"]], -1)
+
+
+def increments(data: Path) -> None:
+    """Displacements from epoch to epoch by carriers alone against those of the reference."""
+    raw, _, truth = observations(data)
+    whole = raw
+    raw = raw.take(primary(raw) & np.isfinite(raw.p[:, 0]) & ~(raw.cn0 < 30.0))
+    epochs, of = raw.epochs
+    true = truth[np.clip(np.round(epochs).astype(int), 0, len(truth) - 1)]
+    geometry = look(raw, true[of], coefficients(raw))
+    high = geometry.elevation > np.radians(10.0)
+    raw, of = raw.take(high), of[high]
+    geometry = look(raw, true[of], coefficients(raw))
+    before, after = consecutive(raw, whole)
+    level = geometry.distance - geometry.ionosphere + geometry.troposphere - raw.clock
+    level -= raw.carrier * C / raw.frequency
+    change = level[after] - level[before]
+    sigma = np.hypot(*(carrier_sigma(raw.cn0[k], geometry.elevation[k], C / raw.frequency[k]) for k in (before, after)))
+    off = np.full((len(epochs), 3), np.nan)
+    for k in range(1, len(epochs)):
+        own = np.flatnonzero(of[after] == k)
+        if len(own) < 6:
+            continue
+        H = np.column_stack([-geometry.e[after[own]], np.ones(len(own))]) / sigma[own, None]
+        off[k] = np.linalg.lstsq(H, -change[own] / sigma[own], rcond=None)[0][:3]
+    d = np.einsum("nij,nj->ni", earth.enu_axes(earth.ecef_to_llh(true)), off)
+    h, up = np.hypot(d[:, 0], d[:, 1]), np.abs(d[:, 2])
+    slips = find_arcs(whole).slips
+    print(f"{len(after)} changes of carriers, {slips} slips without a flag, {np.isfinite(h).sum()} epochs")
+    print("mm against the reference's increments: 50 %, 95 %, 99 %, rms")
+    for name, x in (("horizontal", h), ("up", up)):
+        at = [*np.nanpercentile(x, [50, 95, 99]), np.sqrt(np.nanmean(x**2))]
+        print(f"{name:10} " + " ".join(f"{1e3 * v:6.1f}" for v in at))
+
+
+def simulated_imu(t: Array, place: Array, seed: int = 0) -> tuple[Imu, Array, Array, Array]:
+    """An IMU (RFU, at the antenna) on the spline through places (n, 3), m in e, at times t (n,), and its motion.
+
+    Times (m,), places (m, 3) in rad, rad, m, and velocities (m, 3) in east, north, up, of the motion come after it.
+    """
+    llh = earth.ecef_to_llh(place)
+    at = np.linspace(t[0], t[-1], round((t[-1] - t[0]) * RATE) + 1)
+    curve = CubicSpline(t, llh)
+    way = curve(at)
+    enu = np.einsum("nij,nj->ni", earth.enu_axes(llh), CubicSpline(t, place)(t, 1))
+    speed = np.hypot(enu[:, 0], enu[:, 1])
+    moving = speed > MOVING
+    heading = PchipInterpolator(t[moving], np.unwrap(np.arctan2(enu[moving, 0], enu[moving, 1])))
+    pitch = PchipInterpolator(t[moving], np.arctan2(enu[moving, 2], speed[moving]))
+    inside = np.clip(at, t[moving][0], t[moving][-1])
+    rph = np.degrees(np.stack([np.zeros(len(at)), pitch(inside), heading(inside)], -1))
+    lla = np.column_stack([np.degrees(way[:, :2]), way[:, 2]])
+    found, imu = sim.generate_imu(at, lla, rph, None, "increment")
+    values, rows = imu.to_numpy()[1:], found.to_numpy()
+    period = np.diff(at)[:, None]
+    gyro, accel = (values[:, k : k + 3][:, [1, 0, 2]] * (1.0, 1.0, -1.0) / period for k in (0, 3))
+    rng, dt = np.random.default_rng(seed), 1.0 / RATE
+    for x, density, walk, turn_on in (
+        (gyro, MEMS.gyro_noise_density, MEMS.gyro_bias_walk, MEMS.gyro_bias_sigma),
+        (accel, MEMS.accel_noise_density, MEMS.accel_bias_walk, MEMS.accel_bias_sigma),
+    ):
+        bias = turn_on * rng.standard_normal(3) + np.cumsum(walk * np.sqrt(dt) * rng.standard_normal(x.shape), axis=0)
+        x += bias + density / np.sqrt(dt) * rng.standard_normal(x.shape)
+    return Imu(at[1:], gyro, accel, MEMS), at, np.column_stack([np.radians(rows[:, :2]), rows[:, 2]]), rows[:, 3:6]
+
+
+def recording_of(data: Path) -> Recording:
+    """The drive with a simulated IMU; the reference is of the receiver's own epochs."""
+    raw, fixes, truth = observations(data)
+    epochs, _ = raw.epochs
+    place = truth[np.clip(np.round(epochs).astype(int), 0, len(truth) - 1)]
+    imu, *_ = simulated_imu(epochs, place)
+    good = np.isfinite(fixes.p[:, 0])
+    sd = np.sqrt(np.diagonal(fixes.covariance[good], axis1=1, axis2=2))
+    v = np.einsum("nij,nj->ni", earth.enu_axes(earth.ecef_to_llh(fixes.p[good])), fixes.v[good])
+    sd_v = np.sqrt(np.diagonal(fixes.covariance_v[good], axis1=1, axis2=2))
+    gnss = Gnss(fixes.t[good], earth.ecef_to_llh(fixes.p[good]), sd, v, sd_v, derived=True)
+    llh = earth.ecef_to_llh(place)
+    return Recording(
+        f"{data.name}, IMU simulated", "vehicle", imu, gnss, truth=Truth(epochs, llh), gps_zero=ZERO, raw_gnss=raw
+    )
+
+
+def canyons(recording: Recording, end: float) -> list[tuple[float, float]]:
+    """Spans of 60 s, in seconds from the start."""
+    begins = [FIRST + APART * k for k in range(SPANS)]
+    return [(b, b + SPAN) for b in begins if b + SPAN < min(end, recording.duration)]
+
+
+def masked(recording: Recording, spans: list[tuple[float, float]], left: int) -> Recording:
+    """With the highest `left` satellites of each span's middle, and no fixes in it."""
+    raw, gnss = recording.raw_gnss, recording.gnss
+    assert raw is not None
+    assert gnss is not None
+    elevation = look(raw, raw.antenna, None).elevation
+    kept, fixes = np.ones(len(raw), dtype=bool), np.ones(len(gnss.t), dtype=bool)
+    for a, b in spans:
+        inside = (raw.t - recording.start > a) & (raw.t - recording.start < b)
+        seen, many = np.unique(
+            raw.satellite[inside & np.isfinite(raw.carrier) & np.isfinite(elevation)], return_counts=True
+        )
+        height = [np.median(elevation[inside & (raw.satellite == s)]) for s in seen[many > 0.9 * SPAN]]
+        best = seen[many > 0.9 * SPAN][np.argsort(height)[::-1][:left]]
+        kept &= ~inside | np.isin(raw.satellite, best)
+        fixes &= (gnss.t - recording.start < a) | (gnss.t - recording.start > b)
+    some = {name: getattr(gnss, name)[fixes] for name in ("t", "llh", "sd", "v", "sd_v")}
+    return replace(recording, raw_gnss=raw.take(kept), gnss=replace(gnss, **some))
+
+
+def errors(solution: Solution, recording: Recording, spans: list[tuple[float, float]]) -> tuple[Array, Array]:
+    """(n,) m, horizontal, at the reference's epochs in the spans: whole, and less that of the span's first epoch."""
+    truth = recording.truth
+    assert truth is not None
+    assert truth.llh is not None
+    whole, drift = [], []
+    for a, b in spans:
+        inside = (truth.t - recording.start > a) & (truth.t - recording.start < b) & (truth.t <= solution.t[-1])
+        p = np.stack([np.interp(truth.t[inside], solution.t, solution.states.p[:, i]) for i in range(3)], -1)
+        e = (p - solution.frame.from_llh(truth.llh[inside]))[:, :2]
+        whole.append(np.hypot(*e.T))
+        drift.append(np.hypot(*(e - e[0]).T))
+    return np.concatenate(whole), np.concatenate(drift)
+
+
+def canyon(data: Path, end: float, counts: list[int], solvers: tuple[str, ...]) -> None:
+    whole = recording_of(data).crop(0.0, end)
+    spans = canyons(whole, end)
+    print(
+        f"{len(spans)} spans of {SPAN:.0f} s, IMU simulated; horizontal errors in the spans, m; drift: since they began"
+    )
+    print(
+        f"{'satellites':>10} {'carriers':>8} {'solver':6} {'H50':>6} {'H95':>6} {'max':>6} {'rms':>6} {'drift50':>7} "
+        f"{'drift95':>7} {'rms':>6}"
+    )
+    for left in counts:
+        recording = masked(whole, spans, left)
+        for differences in (True, False):
+            settings = settings_from({"raw_gnss": {"coupling": "tight", "differences": differences}})
+            began = time.process_time()
+            solutions = run(recording, settings, solvers)
+            seconds = time.process_time() - began
+            for solver, one in solutions.items():
+                h, d = errors(one, whole, spans)
+                cells = " ".join(f"{x:6.2f}" for x in (*np.percentile(h, [50, 95, 100]), np.sqrt(np.mean(h**2))))
+                cells += " " + " ".join(f"{x:7.2f}" for x in np.percentile(d, [50, 95]))
+                cells += f" {np.sqrt(np.mean(d**2)):6.2f}"
+                print(f"{left:10} {'yes' if differences else 'no':>8} {solver:6} {cells}", flush=True)
+            print(f"{'':26} {seconds:.0f} s of processor time", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("increments", "canyon"))
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--end", type=float, default=np.inf)
+    parser.add_argument("--satellites", type=int, nargs="+", default=[4, 3, 2, 1, 0])
+    parser.add_argument("--solver", action="append", default=[], help="repeatable; all three without")
+    given = parser.parse_args()
+    if given.what == "increments":
+        increments(given.data)
+    else:
+        canyon(given.data, given.end, given.satellites, tuple(given.solver) or SOLVERS)
+
+
+if __name__ == "__main__":
+    main()

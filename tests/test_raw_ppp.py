@@ -1,0 +1,198 @@
+"""Precise point positioning: its models against RTKLIB, ANTEX, and a station whose place is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import oracle
+import pytest
+import raw_drive
+
+from graphnav.config import settings_from
+from graphnav.core import earth
+from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
+from graphnav.estimation.pipeline import run
+from graphnav.gnss.antex import read_antex, satellite_axes, wind_up
+from graphnav.gnss.atmosphere import niell
+from graphnav.gnss.load import Sources, load_raw
+from graphnav.gnss.ppp import ionosphere_free
+from graphnav.gnss.series import primary
+from graphnav.gnss.signals import L1, C, satellite_id, satellite_name
+from graphnav.gnss.tides import solid_tide, sun_and_moon
+from graphnav.recording import Gnss, Imu, ImuNoise, Recording
+
+DAY = 2155 * 604800.0 + 3 * 86400.0  # 2021-04-28, s since the GPS epoch
+PLACES = np.array(
+    [[-2703116.3, -4291766.8, 3854248.1], [4027881.4, 306998.8, 4919499.0], [-901776.1, 2409383.2, -5816748.6]]
+)
+
+
+@pytest.fixture(scope="module")
+def rtklib():
+    return pytest.importorskip("pyrtklib")
+
+
+@pytest.mark.parametrize("hours", [0.0, 7.0, 19.5])
+def test_the_tide_is_rtklibs(rtklib, hours):
+    """Within what it leaves out: the terms out of phase and those that go with frequency."""
+    gps = np.full(len(PLACES), DAY + 3600.0 * hours)
+    found = solid_tide(PLACES, *sun_and_moon(gps))
+    time = rtklib.gpst2utc(rtklib.gpst2time(2155, 3 * 86400.0 + 3600.0 * hours))
+    for place, ours in zip(PLACES, found, strict=True):
+        at, out = rtklib.Arr1Ddouble(3), rtklib.Arr1Ddouble(3)
+        for i in range(3):
+            at[i] = float(place[i])
+        rtklib.tidedisp(time, at, 1, rtklib.erp_t(), rtklib.Arr1Ddouble(66), out)
+        theirs = np.array([out[i] for i in range(3)])
+        assert np.linalg.norm(theirs) > 0.02
+        assert np.linalg.norm(ours - theirs) < 0.015
+
+
+def test_the_mapping_function_is_rtklibs(rtklib):
+    time = rtklib.gpst2time(2155, 3 * 86400.0)
+    llh = earth.ecef_to_llh(PLACES)
+    for place in llh:
+        for degrees in (7.0, 20.0, 60.0):
+            pos, azel, wet = rtklib.Arr1Ddouble(3), rtklib.Arr1Ddouble(2), rtklib.Arr1Ddouble(1)
+            for i in range(3):
+                pos[i] = float(place[i])
+            azel[0], azel[1] = 0.3, float(np.radians(degrees))
+            dry = rtklib.tropmapf(time, pos, azel, wet)
+            ours = niell(place[None], np.radians([degrees]), np.array([117.0]))
+            np.testing.assert_allclose([ours[0][0], ours[1][0]], [dry, wet[0]], rtol=2e-4)
+
+
+def test_wind_up_follows_the_turn_of_a_satellite():
+    """A quarter turn of its antenna about its axis is a quarter of a cycle, and whole turns are counted on."""
+    n = 9
+    place = np.tile([2.6e7, 0.0, 0.0], (n, 1))
+    axes = satellite_axes(place, np.tile([0.0, 1.5e11, 3e10], (n, 1)))
+    assert np.allclose(axes @ np.swapaxes(axes, -1, -2), np.eye(3))
+    angle = 0.5 * np.pi * np.arange(n)
+    turned = axes.copy()
+    turned[:, 0] = np.cos(angle)[:, None] * axes[:, 0] + np.sin(angle)[:, None] * axes[:, 1]
+    turned[:, 1] = -np.sin(angle)[:, None] * axes[:, 0] + np.cos(angle)[:, None] * axes[:, 1]
+    e = np.tile([1.0, 0.0, 0.0], (n, 1))
+    enu = np.tile(earth.enu_axes(np.zeros((1, 3))), (n, 1, 1))
+    cycles = wind_up(np.ones(n, dtype=np.int16), np.arange(float(n)), turned, e, enu)
+    np.testing.assert_allclose(np.abs(np.diff(cycles)), 0.25, atol=1e-9)
+    assert abs(cycles[-1] - cycles[0]) == pytest.approx(2.0)
+
+
+ANTEX = """     1.4            M                                       ANTEX VERSION / SYST
+                                                            START OF ANTENNA
+BLOCK IIF           G01                 G063      2011-036A TYPE / SERIAL NO
+  2011     7    16     0     0    0.0000000                 VALID FROM
+   G01                                                      START OF FREQUENCY
+    394.00      0.00   1500.00                              NORTH / EAST / UP
+   G01                                                      END OF FREQUENCY
+   G02                                                      START OF FREQUENCY
+    394.00      0.00   1600.00                              NORTH / EAST / UP
+   G02                                                      END OF FREQUENCY
+                                                            END OF ANTENNA
+                                                            START OF ANTENNA
+SOME RECEIVER   NONE                                        TYPE / SERIAL NO
+   G01                                                      START OF FREQUENCY
+      0.10      0.20     89.50                              NORTH / EAST / UP
+   G01                                                      END OF FREQUENCY
+                                                            END OF ANTENNA
+"""
+
+
+def test_satellites_antennas_bring_them_nearer(tmp_path):
+    """By what the file has along the line from the centre of mass to the receiver."""
+    path = tmp_path / "some.atx"
+    path.write_text(ANTEX)
+    antennas = read_antex(path)
+    assert set(antennas) == {satellite_id("G01")}
+    drive = oracle.vehicle_path(120.0)
+    made = raw_drive.with_observations(oracle.drive(drive)[0], drive, carrier=0.0, second=True).crop(0.0, 5.0)
+    raw = replace(made.raw_gnss, zero=DAY + 3600.0)
+    plain = ionosphere_free(raw.take(primary(raw)), raw)
+    first = replace(raw, antennas=antennas)
+    known = ionosphere_free(first.take(primary(first)), first)
+    satellite = raw.take(primary(raw)).satellite[plain.which]
+    nearer = plain.known - known.known
+    one = satellite == satellite_id("G01")
+    alpha = 1575.42**2 / (1575.42**2 - 1227.6**2)
+    along = alpha * 1.5 - (alpha - 1.0) * 1.6
+    assert np.all(nearer[~one] == 0.0)
+    assert np.all(nearer[one] < np.hypot(along, 0.394) + 1e-6)
+    assert np.all(nearer[one] > 0.95 * along - 0.394 * 0.25)
+    path.write_text(ANTEX.replace("1600.00", "16x0.00"))
+    with pytest.raises(RecordingError, match="line 9"):
+        read_antex(path)
+
+
+def test_the_combination_has_no_ionosphere_and_counts_arcs_of_both():
+    drive = oracle.vehicle_path(120.0)
+    made = raw_drive.with_observations(oracle.drive(drive)[0], drive, carrier=0.0, second=True).crop(0.0, 20.0)
+    raw = made.raw_gnss
+    free = ionosphere_free(raw.take(primary(raw)), raw)
+    rows = raw.take(primary(raw)).take(free.which)
+    names = [satellite_name(x) for x in rows.satellite]
+    cycles = 1000.0 * np.array([raw_drive.SATELLITES.index(x) for x in names])
+    f2 = np.array([raw_drive.BANDS[x[0]][1][0] for x in names])
+    alpha = L1**2 / (L1**2 - f2**2)
+    # the ionosphere, metres of the opposite sign in codes and carriers, is gone; wind-up is a cycle of 0.11 m at most
+    ambiguity = free.carrier - free.code - cycles * C * (alpha / L1 - (alpha - 1.0) / f2)
+    assert np.abs(ambiguity).max() < 0.12
+    assert np.ptp(ambiguity[rows.satellite == rows.satellite[0]]) < 1e-2
+    second = np.flatnonzero((raw.satellite == rows.satellite[0]) & (raw.signal // 100 != 1))
+    slip = np.zeros(len(raw), dtype=bool)
+    slip[second[8]] = True
+    slipped = replace(raw, slip=slip)
+    arcs = ionosphere_free(slipped.take(primary(slipped)), slipped)
+    own = rows.satellite == rows.satellite[0]
+    assert len(np.unique(arcs.arc[own])) == len(np.unique(free.arc[own])) + 1
+
+
+def test_ppp_says_what_it_lacks():
+    assert not settings_from({"raw_gnss": {"ppp": True}}).raw_gnss.code
+    with pytest.raises(ConfigError):
+        settings_from({"raw_gnss": {"ppp": "perhaps"}})
+    drive = oracle.vehicle_path(120.0)
+    one = raw_drive.with_observations(oracle.drive(drive)[0], drive, carrier=0.0).crop(0.0, 30.0)
+    settings = settings_from({"raw_gnss": {"ppp": True}})
+    for recording, word in (
+        (one, "two signals"),
+        (replace(one, raw_gnss=replace(one.raw_gnss, precise=False)), "precise orbits"),
+    ):
+        with pytest.raises(GraphnavError, match=word):
+            run(recording, settings, ("ekf",))
+
+
+# m in e, where the phase centre of the station SLAC was on that day (scripts/reproduce_ppp.py says from where)
+SLAC = np.array([-2703116.3143, -4291766.7591, 3854248.0714])
+PHASE_CENTRE = 0.055  # m, up
+
+
+def test_a_station_comes_to_its_place_within_a_decimetre(shared_data):
+    """After an hour, float, GPS and Galileo, with CODE's orbits and clocks; the IMU at rest is simulated."""
+    data = shared_data / "raw_gnss_slac_20210428"
+    begin = DAY + 19.5 * 3600.0
+    sources = Sources(
+        (data / "slac1180.21o.gz",),
+        (data / "brdc1180.21n.gz",),
+        tuple(data.glob("*SP3.gz")),
+        tuple(data.glob("*CLK.gz")),
+    )
+    raw, fixes, _ = load_raw(sources, begin)
+    t = np.arange(1, 3600 * 5 + 1) / 5.0
+    llh = earth.ecef_to_llh(SLAC[None])[0]
+    rng = np.random.default_rng(0)
+    noise = ImuNoise(1.5e-4, 4e-3, 5e-6, 2e-4, 2e-3, 0.1)
+    rate = earth.RATE * np.array([0.0, np.cos(llh[0]), np.sin(llh[0])])
+    gyro = rate + noise.gyro_noise_density * np.sqrt(5.0) * rng.standard_normal((len(t), 3))
+    force = np.array([0.0, 0.0, float(earth.gravity(llh[0], llh[2]))])
+    accel = force + noise.accel_noise_density * np.sqrt(5.0) * rng.standard_normal((len(t), 3))
+    good = np.isfinite(fixes.p[:, 0]) & (fixes.t > 0.0) & (fixes.t < 3600.0)
+    sd = np.sqrt(np.diagonal(fixes.covariance[good], axis1=1, axis2=2))
+    gnss = Gnss(fixes.t[good], earth.ecef_to_llh(fixes.p[good]), sd, derived=True)
+    recording = Recording("SLAC", "vehicle", Imu(t, gyro, accel, noise), gnss, gps_zero=begin, raw_gnss=raw)
+    chosen = {"raw_gnss": {"ppp": True}, "alignment": {"heading": 0.0}, "keyframes": {"rate": 0.1}}
+    found = run(recording, settings_from(chosen), ("ekf",))["ekf"]
+    off = found.states.p[-1] - found.frame.from_llh(earth.ecef_to_llh(SLAC[None]))[0] - [0.0, 0.0, PHASE_CENTRE]
+    assert np.linalg.norm(off) < 0.1
+    assert off @ np.linalg.solve(found.covariance[-1][3:6, 3:6], off) < 16.3  # chi-square of 3, 99.9 %
