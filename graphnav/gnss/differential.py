@@ -2,7 +2,10 @@
 
 Orbits, clocks and the atmosphere do nearly the same to both; models are applied to both first, so that what differs
 between the two, height above all, is taken care of. The base's clock is taken off by a median over its satellites of
-each epoch; what is left of it is the same for all of them and goes into the rover's.
+each epoch; what is left of it is the same for all of them, codes and carriers, and goes into the rover's.
+
+Carriers of the base are drawn through in the same way, but only within an arc: what a rover's carrier is then off by
+is the difference of two ambiguities, and ends with the arc of either.
 """
 
 from __future__ import annotations
@@ -10,12 +13,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphnav.core.rotation import Array
+from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.series import RawGnss, median_of_epochs
+from graphnav.gnss.signals import C
 from graphnav.gnss.single_point import coefficients, look
 
 _OLDEST = 15.0  # s between a base's epochs that a line is drawn through
+_SAME_EPOCH = 2e-3  # s: two receivers that keep their clocks within a millisecond of the nominal epoch
 _LEAST = np.radians(5.0)  # elevation of a base's satellites
 
 
@@ -28,18 +35,29 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     position : (3,) m in e, of the base's antenna.
     """
     base = base.take(np.isfinite(base.code) & np.isfinite(base.clock) & np.isfinite(base.p[:, 0]))
-    geometry = look(base, np.tile(position, (len(base), 1)), coefficients(replace(base, klobuchar=rover.klobuchar)))
+    base = replace(base, klobuchar=rover.klobuchar, antenna=np.tile(position, (len(base), 1)))
+    geometry = look(base, base.antenna, coefficients(base))
+    arcs = find_arcs(base, still=True)
     high = geometry.elevation > _LEAST
-    error = geometry.distance + geometry.ionosphere + geometry.troposphere - base.code - base.clock
-    base, error = base.take(high), error[high]
-    error = error - median_of_epochs(base.t, error)
-    difference = np.full(len(rover), np.nan)
+    known = geometry.distance + geometry.troposphere - base.clock
+    error = known + geometry.ionosphere - base.code
+    of_carrier = known - geometry.ionosphere - C / base.frequency * base.carrier
+    base, error, of_carrier, arc = base.take(high), error[high], of_carrier[high], arcs.arc[high]
+    common = median_of_epochs(base.t, error)
+    error, of_carrier = error - common, of_carrier - common
+    difference, carrier_difference = np.full(len(rover), np.nan), np.full(len(rover), np.nan)
+    base_arc = np.full(len(rover), -1)
     alike = {(int(s), int(g)) for s, g in zip(base.satellite, base.signal, strict=True)}
     for satellite, signal in sorted({(int(s), int(g)) for s, g in zip(rover.satellite, rover.signal, strict=True)}):
         own = (rover.satellite == satellite) & (rover.signal == signal)
         there = base.satellite == satellite
         if (satellite, signal) in alike:
             there &= base.signal == signal
+            counted = there & (arc >= 0)
+            if counted.sum() > 1:
+                carrier_difference[own], base_arc[own] = _within_arcs(
+                    rover.t[own], base.t[counted], of_carrier[counted], arc[counted]
+                )
         else:  # another code on the same carrier: apart by a constant, which is of all satellites of the system
             some = base.signal[there & (base.signal // 100 == signal // 100)]
             there &= base.signal == (some[0] if len(some) else -1)
@@ -50,7 +68,25 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     said: tuple[str, ...] = ()
     if missing.any():
         said = (f"{int(missing.sum())} of {len(rover)} codes have no counterpart at the base and are not used",)
-    return replace(rover, difference=difference), said
+    away = float(np.linalg.norm(np.median(rover.antenna, axis=0) - position))
+    return replace(
+        rover, difference=difference, carrier_difference=carrier_difference, base_arc=base_arc, baseline=away
+    ), said
+
+
+def _within_arcs(t: Array, at: Array, value: Array, arc: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+    """Values (N,) on lines between times of one arc, and that arc; NaN and -1 between two arcs and far from any time.
+
+    At a base's own epoch, but for the milliseconds that clocks are apart by, its value holds without a line.
+    """
+    right = np.clip(np.searchsorted(at, t), 1, len(at) - 1)
+    nearest = np.where(np.abs(at[right - 1] - t) < np.abs(at[right] - t), right - 1, right)
+    here = np.abs(at[nearest] - t) < _SAME_EPOCH
+    between = (arc[right] == arc[right - 1]) & (at[right] - at[right - 1] <= _OLDEST)
+    between &= (t >= at[right - 1]) & (t <= at[right])
+    line = np.where(between, np.interp(t, at, value), value[nearest])
+    good = between | here
+    return np.where(good, line, np.nan), np.where(good, arc[np.where(between, right, nearest)], -1)
 
 
 def _interpolate(t: Array, at: Array, value: Array) -> Array:

@@ -80,7 +80,7 @@ def place(
         p=placed.p, v=placed.v, clock=clock, drift=C * placed.drift, difference=np.full(len(obs), np.nan),
         zero=obs.zero, place=(float(rover[0]), float(rover[1]), float(rover[2])),
         klobuchar=None if nav is None or nav.klobuchar is None else tuple(map(tuple, nav.klobuchar.tolist())),
-        troposphere=corrected.troposphere, files=obs.files,
+        troposphere=corrected.troposphere, lock=obs.lock, files=obs.files,
     )  # fmt: skip
     return raw, tuple(remarks)
 

@@ -142,6 +142,11 @@ class RawGnss:
     place: tuple[float, float, float]  # m in e, within kilometres of the rover
     klobuchar: tuple[tuple[float, ...], ...] | None = None  # coefficients that were broadcast
     troposphere: bool = False  # already taken off the codes
+    lock: Array = field(default_factory=lambda: np.empty(0))  # (N,) s that the carrier has been in lock
+    # (N,) m to add to the carrier by a base station, and which of its arcs that is of; NaN and -1 where there is none
+    carrier_difference: Array = field(default_factory=lambda: np.empty(0))
+    base_arc: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, dtype=int))
+    baseline: float = 0.0  # m, to the base station
     antenna: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m in e, single-point, of each epoch
     receiver_clock: Array = field(default_factory=lambda: np.empty((0, 2)))  # (N, 2) m and m/s, single-point
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU

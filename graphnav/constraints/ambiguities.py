@@ -1,0 +1,34 @@
+"""Ambiguities of carriers as parameters: one for each signal of a satellite, which begins anew with every arc."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.core.state import Parameter
+from graphnav.gnss.arcs import Arcs
+
+_SIGMA = 30.0  # m, 1-sigma about what the codes say: next to nothing known
+
+
+def ambiguities(arcs: Arcs, cycles: Array, wavelength: Array) -> dict[int, Parameter]:
+    """A parameter (cycles) for each slot that has arcs, by slot.
+
+    Parameters
+    ----------
+    cycles : (N,) what the codes say the ambiguities are; that of an arc's first row is taken.
+    wavelength : (N,) m.
+    """
+    out = {}
+    for slot, begins in enumerate(arcs.begins):
+        if len(begins):
+            own = np.flatnonzero((arcs.slot == slot) & (arcs.arc >= 0))
+            first = own[np.unique(arcs.arc[own], return_index=True)[1], None]
+            sigma = _SIGMA / wavelength[first]
+            out[slot] = Parameter(ambiguity_name(arcs.names[slot]), cycles[first], sigma, "cycles", begins=begins)
+    return out
+
+
+def ambiguity_name(slot: str) -> str:
+    """The name of the parameter of a slot, "G05.1C"."""
+    return f"ambiguity.{slot}"

@@ -1,0 +1,123 @@
+"""Arcs of carriers: the stretches over which a receiver counts the cycles of a signal without losing one.
+
+Within an arc a carrier is a range but for one unknown number of cycles, its ambiguity. A new arc begins where
+
+* the receiver flags a loss of lock, or says otherwise that half a cycle is open or is no more (RINEX 3.05, table A2),
+* the signal is absent for an epoch, unless its counter of lock time covers the gap,
+* the base station's arc of that signal ends,
+* the change since the epoch before is off by more than a quarter of a cycle from what those of all satellites agree
+  upon, a displacement and the clock: a slip is half a cycle at least, so beyond a quarter it is nearer than none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.rotation import Array
+from graphnav.gnss.series import RawGnss
+from graphnav.gnss.signals import C, Ids, satellite_name, signal_name
+from graphnav.gnss.single_point import coefficients, look
+
+_ROUNDS = 20  # of reweighting towards the least sum of absolute residuals
+_SPARE = 2  # rows beyond the unknowns that have to agree before others are held against them
+_NOISE = 0.01  # m, of a difference of carriers: below it residuals weigh the same
+
+
+@dataclass(frozen=True)
+class Arcs:
+    """Which arc each of N rows is of; a slot is a signal of a satellite."""
+
+    slot: NDArray[np.intp]  # (N,)
+    arc: NDArray[np.intp]  # (N,) counted from 0 within its slot; -1 where there is no carrier
+    names: tuple[str, ...]  # (S,) of the slots: "G05.1C"
+    satellite: Ids  # (S,)
+    signal: Ids  # (S,)
+    begins: tuple[Array, ...]  # (S,) of (n,) s: first times of the arcs
+    half: tuple[NDArray[np.bool_], ...]  # (S,) of (n,): half a cycle is open throughout
+    slips: int  # that no flag tells
+
+
+def find_arcs(raw: RawGnss, still: bool = False, base_arc: NDArray[np.intp] | None = None) -> Arcs:
+    """The arcs of a receiver's carriers.
+
+    Parameters
+    ----------
+    raw : all epochs and signals that the receiver has, with nominal antennas; rows that are left out later keep theirs.
+    still : the antenna stands at its nominal place, as that of a base station does.
+    base_arc : (N,) a number that changes for a slot where the base station's arc does.
+    """
+    key = raw.satellite.astype(np.int64) * 1000 + raw.signal
+    slots, slot = np.unique(key, return_inverse=True)
+    _, epoch = raw.epochs
+    there = np.isfinite(raw.carrier) & np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock)
+    if base_arc is not None:
+        there &= base_arc >= 0
+    order = np.flatnonzero(there)
+    order = order[np.lexsort((epoch[order], slot[order]))]
+    now, before = order[1:], order[:-1]
+    same = slot[now] == slot[before]
+    held = np.nan_to_num(raw.lock[now], nan=-1.0) > raw.t[now] - raw.t[before] if len(raw.lock) else np.zeros_like(same)
+    kept = same & ~raw.slip[now] & (raw.half[now] == raw.half[before]) & ((epoch[now] - epoch[before] == 1) | held)
+    if base_arc is not None:
+        kept &= base_arc[now] == base_arc[before]
+    slipped = _slipped(raw, now[kept], before[kept], epoch, still)
+    kept[np.flatnonzero(kept)[slipped]] = False
+    begins_here = np.concatenate([[True], ~kept])[: len(order)]
+    count = np.cumsum(begins_here) - 1
+    first_of_slot = np.searchsorted(slot[order], np.arange(len(slots)))
+    arc = np.full(len(raw), -1)
+    base = count[np.minimum(first_of_slot, max(len(count) - 1, 0))] if len(count) else np.zeros(len(slots), dtype=int)
+    arc[order] = count - base[slot[order]]
+    firsts = [order[begins_here & (slot[order] == k)] for k in range(len(slots))]
+    ids = slots // 1000, slots % 1000
+    names = tuple(f"{satellite_name(s)}.{signal_name(g)}" for s, g in zip(*ids, strict=True))
+    return Arcs(
+        slot, arc, names, ids[0].astype(np.int16), ids[1].astype(np.int16), tuple(raw.t[k] for k in firsts),
+        tuple(raw.half[k] for k in firsts), int(slipped.sum()),
+    )  # fmt: skip
+
+
+def _slipped(
+    raw: RawGnss, now: NDArray[np.intp], before: NDArray[np.intp], epoch: NDArray[np.intp], still: bool
+) -> NDArray[np.bool_]:
+    """Which of the changes from rows `before` to rows `now` hold a slip."""
+    if not len(now):
+        return np.zeros(0, dtype=bool)
+    geometry = look(raw, raw.antenna, coefficients(raw))
+    wavelength = C / raw.frequency
+    known = geometry.distance + geometry.troposphere - geometry.ionosphere - raw.clock
+    off = wavelength * raw.carrier - known
+    if len(raw.carrier_difference):
+        off = off + raw.carrier_difference
+    change = off[now] - off[before]
+    # rows of an epoch side by side; a receiver's clock and the displacement are what they have in common
+    order = np.lexsort((raw.satellite[now], epoch[now]))
+    epochs, of = np.unique(epoch[now[order]], return_inverse=True)
+    place = np.arange(len(order)) - np.searchsorted(of, of)
+    unknowns = 1 if still else 4
+    shape = len(epochs), int(place.max()) + 1
+    A, y, w = np.zeros((*shape, unknowns)), np.zeros(shape), np.zeros(shape)
+    row = np.ones((len(order), unknowns))
+    if not still:
+        row[:, 1:] = -geometry.e[now[order]]
+    usable = np.isfinite(change[order])
+    A[of, place], y[of, place], w[of, place] = row, np.where(usable, change[order], 0.0), usable
+    # the clock's change may be 1e5 m, which would leave the weights without digits
+    middle = np.array([np.median(one[some]) if some.any() else 0.0 for one, some in zip(y, w > 0.0, strict=True)])
+    y = y - middle[:, None]
+    r = y
+    for _ in range(_ROUNDS):
+        weight = w / np.maximum(np.abs(r), _NOISE)
+        N = np.einsum("esi,es,esj->eij", A, weight, A, optimize=True) + 1e-9 * np.eye(unknowns)
+        x = np.linalg.solve(N, np.einsum("esi,es->ei", A, weight * y)[..., None])[..., 0]
+        r = y - np.einsum("esi,ei->es", A, x)
+    limit = np.zeros(shape)
+    limit[of, place] = 0.25 * wavelength[now[order]]
+    far = (np.abs(r) > limit) & (w > 0.0)
+    agreed = np.sum((w > 0.0) & ~far, axis=1) >= unknowns + _SPARE
+    out = np.zeros(len(now), dtype=bool)
+    out[order] = (far & agreed[:, None])[of, place]
+    return out
