@@ -24,6 +24,7 @@ from graphnav.core import earth, rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.files import permit_outside
 from graphnav.estimation.pipeline import run
+from graphnav.estimation.solution import Solution
 from graphnav.gnss.load import Sources, load_raw
 from graphnav.gnss.series import RawGnss
 from graphnav.recording import Recording
@@ -51,6 +52,11 @@ DRIVES = {
         2114, 5784.0, "truth.csv.gz", (-2430697.636, -4704189.056, 3544329.070), (-0.011, 0.061, -0.142)
     ),
     "cssrlib_2021_265": Drive(2176, 282600.0, "reference_rtk.csv.gz", (-3959400.631, 3385704.533, 3667523.111)),
+}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "codes, Doppler": {"carrier": False},
+    "and carriers, float": {"integers": False},
+    "and carriers, integers": {},
 }
 TOML = """format = "graphnav-recording/1"
 name = "{name}"
@@ -145,6 +151,19 @@ def line(name: str, e: Array) -> str:
     )
 
 
+def shares(solution: Solution, t: Array, e: Array) -> str:
+    """Share of epochs that are fixed, and of the fixed ones that are wrong, %."""
+    if not len(solution.fixed):
+        return ""
+    k = np.argmin(np.abs(solution.fixed[None, :, 0] - t[:, None]), axis=1)
+    fixed = (solution.fixed[k, 1] > 0.0) & (np.abs(solution.fixed[k, 0] - t) < 2e-3)
+    h = np.hypot(e[:, 0], e[:, 1])
+    wrong = np.mean(h[fixed] > _WRONG) if fixed.any() else 0.0
+    first = t[fixed][0] - t[0] if fixed.any() else np.nan
+    some = f", their H95 {np.nanpercentile(h[fixed], 95):.3f}" if fixed.any() else ""
+    return f"   fixed {100.0 * fixed.mean():.1f} %, wrong {100.0 * wrong:.2f} %, first after {first:.0f} s{some}"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
@@ -152,6 +171,7 @@ def main() -> None:
     parser.add_argument("--begin", type=float, default=0.0)
     parser.add_argument("--end", type=float, default=None)
     parser.add_argument("--solver", action="append")
+    parser.add_argument("--only", action="append", help="variants whose name begins so; repeatable")
     given = parser.parse_args()
     folder = (given.output / given.data.name).resolve()
     folder.mkdir(parents=True, exist_ok=True)
@@ -164,13 +184,15 @@ def main() -> None:
     fixes = errors(recording.gnss.t, recording.gnss.llh, t, places)
     print(line("codes by epoch, no IMU", fixes))
     solvers = tuple(given.solver or ("ekf", "rts"))
-    variants: dict[str, dict[str, Any]] = {"codes, Doppler": {}}
-    for name, chosen in variants.items():
+    for name, chosen in VARIANTS.items():
+        if given.only and not any(name.startswith(one) for one in given.only):
+            continue
         began = time.process_time()
         solutions = run(recording, settings_from({"raw_gnss": chosen}), solvers)
         seconds = time.process_time() - began
         for solver, one in solutions.items():
-            print(line(f"{name}, {solver}", errors(one.t, one.trajectory().llh, t, places)))
+            e = errors(one.t, one.trajectory().llh, t, places)
+            print(line(f"{name}, {solver}", e) + shares(one, t, e))
         print(f"{'':34} {seconds:.0f} s of processor time")
 
 

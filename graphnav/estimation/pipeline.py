@@ -194,6 +194,7 @@ def _solve(
             excluded=wrong,
             noise=found.noise,
             passes=dict(passes),
+            fixed=found.fixed.get(name, found.fixed.get("", out[name].fixed)),
             timings={k: timings.get(k, 0.0) + out[name].timings.get(k, 0.0) for k in (*timings, *out[name].timings)},
         )
         for name in solvers

@@ -104,6 +104,7 @@ class Solution:
     excluded: tuple[ExcludedSpan, ...] = ()  # spans of measurements found to be wrong, which no solver used
     noise: NoiseModel = STATED  # that all solvers used
     passes: Mapping[str, int] = field(default_factory=dict)  # over all keyframes, before the solver's own
+    fixed: Array = field(default_factory=lambda: np.empty((0, 2)))  # s of epochs with carriers, and 1 for integers
     between: tuple[Between, ...] = ()  # gives states between keyframes, one for each piece of the recording
 
     @property
@@ -202,6 +203,7 @@ def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Soluti
         excluded=tuple(f for p in parts for f in p.excluded),
         noise=_noise_of_all([p.noise for p in parts]),
         passes=_add_counts([dict(p.passes) for p in parts]),
+        fixed=np.concatenate([p.fixed for p in parts]),
         between=tuple(b for p in parts for b in p.between),
     )
 

@@ -14,6 +14,9 @@ from graphnav.core.rotation import Array
 _CODE, _CODE_POWER = 0.3, 1.1e4  # m at the zenith; m^2 Hz of a consumer receiver: 0.6 m at 45 dB-Hz
 _RATE, _RATE_POWER = 0.03, 60.0  # m/s; (m/s)^2 Hz: 0.04 m/s at 45 dB-Hz
 _IONOSPHERE, _TROPOSPHERE = 0.5, 0.3
+# m at the zenith, of reflections in each of two receivers' carriers (RTKLIB 2.4.3, rtkpos.c, varerr); Hz, of the loop
+# that follows a carrier (Groves 2013, section 9.3.3)
+_CARRIER, _LOOP = 0.003, 15.0
 LEAST = 20.0  # dB-Hz that a signal without a C/N0, or below it, is taken to have
 _USUAL = 45.0  # dB-Hz where a file says nothing of it
 
@@ -29,6 +32,13 @@ def rate_sigma(cn0: Array, elevation: Array) -> Array:
     """(N,) m/s, 1-sigma of a range rate."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
     return np.asarray(np.sqrt(_RATE_POWER * 10.0 ** (-0.1 * _power(cn0)) + (_RATE * rising) ** 2))
+
+
+def carrier_sigma(cn0: Array, elevation: Array, wavelength: Array) -> Array:
+    """(N,) m, 1-sigma of the difference of two receivers' carriers."""
+    rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
+    thermal = (wavelength / (2.0 * np.pi)) ** 2 * _LOOP * 10.0 ** (-0.1 * _power(cn0))
+    return np.asarray(np.sqrt(2.0 * (thermal + _CARRIER**2 * (1.0 + rising**2))))
 
 
 def _power(cn0: Array) -> Array:

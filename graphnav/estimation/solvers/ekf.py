@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,8 @@ from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
 from graphnav.estimation.solvers.watch import Bank, Verdicts
 
+Held = tuple[Array, Array, Array]
+Decide = Callable[[int, Array, Array], Held | None]  # of a keyframe, its parameters' values (D-15,) and P (D, D)
 _NONE = 1e-12  # weight of a row that is not used beside others of its keyframe
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
 
@@ -63,6 +66,7 @@ def ekf(
     opening: float | None = None,
     watch: bool = False,
     known: Points | None = None,
+    decide: Decide | None = None,
 ) -> FilterPass:
     """Run the filter over all keyframes.
 
@@ -72,12 +76,13 @@ def ekf(
         after it depend on nothing later than themselves.
     watch : look for errors that last in the rows that are to be watched, and go back to before them.
     known : where the opening is linearised, from its first keyframe on, if that is known better than by a first pass.
+    decide : asked after the updates of each keyframe for rows that follow from the estimate there.
     """
     began = time.perf_counter()
     K, about = len(problem.t), None
     if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
         about = backward(problem, _forward(problem, n, watch=watch)) if known is None else known.first(n)
-    one = _forward(problem, K, about, progress, watch)
+    one = _forward(problem, K, about, progress, watch, decide)
     seconds = time.perf_counter() - began
     filtered, P = one.states, one.P[:, :DIM, :DIM]
     if about is not None:
@@ -119,6 +124,7 @@ def _forward(
     about: Points | None = None,
     progress: Progress | None = None,
     watch: bool = False,
+    decide: Decide | None = None,
 ) -> ForwardRecord:
     """Filter the first K keyframes, of which the first n are linearised at given points."""
     n = 0 if about is None else len(about.values)
@@ -180,6 +186,9 @@ def _forward(
                 break
         if back is None and k == len(problem.t) - 1 and (trial := verdicts.ended()) is not None:
             back = int(np.searchsorted(problem.t, trial))
+        if decide is not None and back is None:
+            at = x.values if where is own else about.values[k] + x[DIM:]  # type: ignore[union-attr]
+            x, P = _hold(decide(k, at, P), x, P, where, taken)
         if back is not None:  # once more from before the fault, without it
             bank = banks.get(back) or bank.forgetful() if bank else None
             banks = {key: old for key, old in banks.items() if key < back}
@@ -295,6 +304,21 @@ def _update(
     elif bank is not None:
         bank.taken(K, H)
     return where.plus(at, d), P, fault
+
+
+def _hold(rows: Held | None, x: Any, P: Array, where: Any, taken: list[Gain] | None) -> tuple[Any, Array]:
+    """An update with rows that were decided upon: derivative (m, D), residuals (m,) at the estimate and sigmas (m,)."""
+    if rows is None:
+        return x, P
+    H, r, sigma = rows
+    solved = np.linalg.solve(H @ P @ H.T + np.diag(sigma**2), np.column_stack([r, H @ P, H]))
+    K = solved[:, 1 : 1 + len(P)].T
+    if taken is not None:
+        taken.append((K, H, -solved[:, 0], solved[:, 1 + len(P) :]))
+    M = np.eye(len(P)) - K @ H
+    P = M @ P @ M.T + (K * sigma**2) @ K.T
+    d = -(K @ r)
+    return (x + d if isinstance(x, np.ndarray) else where.plus(x, d)), 0.5 * (P + P.T)
 
 
 def _weights(record: Innovations, lo: int, hi: int) -> tuple[float, float | Array]:
