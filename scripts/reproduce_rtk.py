@@ -33,6 +33,7 @@ from graphnav.simulation.inertial import MEMS
 
 Array = np.ndarray
 _RATE = 50.0  # Hz of the simulated IMU
+_GAP = 20.0  # s
 _WRONG = 0.1  # m, half a wavelength: farther off horizontally a fixed epoch is wrong
 
 
@@ -164,6 +165,12 @@ def shares(solution: Solution, t: Array, e: Array) -> str:
     return f"   fixed {100.0 * fixed.mean():.1f} %, wrong {100.0 * wrong:.2f} %, first after {first:.0f} s{some}"
 
 
+def again(solution: Solution, end: float) -> float:
+    """Seconds from the end of a gap to the first epoch that is fixed."""
+    after = solution.fixed[(solution.fixed[:, 0] > end) & (solution.fixed[:, 1] > 0.0), 0]
+    return float(after[0] - end) if len(after) else np.nan
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
@@ -171,12 +178,15 @@ def main() -> None:
     parser.add_argument("--begin", type=float, default=0.0)
     parser.add_argument("--end", type=float, default=None)
     parser.add_argument("--solver", action="append")
+    parser.add_argument("--gap", type=float, action="append", help="s, where 20 s without GNSS begin; repeatable")
     parser.add_argument("--only", action="append", help="variants whose name begins so; repeatable")
     given = parser.parse_args()
     folder = (given.output / given.data.name).resolve()
     folder.mkdir(parents=True, exist_ok=True)
     recording, t, places = recording_of(given.data.resolve(), folder)
     recording = recording.crop(given.begin, given.end or recording.duration)
+    for gap in given.gap or ():
+        recording = recording.without("gnss", (gap, gap + _GAP))
     inside = (t >= recording.start) & (t <= recording.end)
     t, places = t[inside], places[inside]
     print(f"{'':34} {'epochs':>6} {'H50':>7} {'H95':>7} {'max':>7} {'U95':>7}")
@@ -193,6 +203,10 @@ def main() -> None:
         for solver, one in solutions.items():
             e = errors(one.t, one.trajectory().llh, t, places)
             print(line(f"{name}, {solver}", e) + shares(one, t, e))
+            for gap in given.gap or ():
+                print(
+                    f"{'':34} fixed again {again(one, recording.start + gap + _GAP):.2f} s after {gap:.0f} + {_GAP:.0f} s"
+                )
         print(f"{'':34} {seconds:.0f} s of processor time")
 
 

@@ -90,6 +90,8 @@ class GnssPhase(_Satellites):
         frame, raw, arc = scene.frame, raw.take(used), arcs.arc[used]
         geometry = look(raw, raw.antenna, coefficients(raw))
         common = _common(scene, found)
+        if s.robust == "automatic":
+            common["robust"] = "cauchy"  # for slips that nothing has told of
         common |= {
             "keyframe": keyframe[used],
             "s_n": (geometry.s - frame.r_e) @ frame.R_ne.T,

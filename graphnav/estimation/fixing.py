@@ -23,7 +23,7 @@ from graphnav.constraints.raw_phase import EXACT, GnssPhase, WholeCycles
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.ekf import ekf, refilter
+from graphnav.estimation.solvers.ekf import Decision, ekf, refilter
 from graphnav.estimation.solvers.linearise import Points, linearise
 from graphnav.estimation.solvers.passes import FilterPass, Progress, SmootherPass, points_of, values_of
 from graphnav.estimation.solvers.rts import backward
@@ -138,7 +138,7 @@ class _Epochs:
     """Which arcs there are at each keyframe with carriers, and where their numbers stand."""
 
     def __init__(self, problem: Problem, phase: GnssPhase) -> None:
-        self.phase = phase
+        self.phase, self._all_columns = phase, problem.columns
         self.columns = [problem.columns[name].start for name in phase.slots]
         self.keyframes = np.unique(phase.keyframe).tolist()
         self.t = problem.t[self.keyframes]
@@ -148,6 +148,12 @@ class _Epochs:
         for k, lo, hi in zip(self.keyframes, edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             self.rows[k] = slice(lo, hi)
             self.active[k] = list(zip(phase.slot[lo:hi].tolist(), phase.arc[lo:hi].tolist(), strict=True))
+
+    def residuals(self, k: int, here: Points) -> Array:
+        """(n,) cycles, of the rows of an epoch at a point."""
+        own = self.rows[k]
+        rows = linearise(self.phase, here, self._all_columns, own, np.zeros(own.stop - own.start, dtype=int))
+        return rows.residual[:, 0] / self.phase.wavelength[own]
 
     def can(self, arc: Arc) -> bool:
         """Whether it has integers."""
@@ -224,6 +230,8 @@ class _Causal:
 
     def __init__(self, epochs: _Epochs) -> None:
         self._epochs, self._fixed = epochs, dict.fromkeys(epochs.keyframes, 0.0)
+        own = {p.name: float(np.max(p.sigma)) for p in epochs.phase.parameters}
+        self._unknown = [own[name] for name in epochs.phase.slots]
         self.known = Known()
 
     @property
@@ -231,24 +239,29 @@ class _Causal:
         """(E, 2) s, and 1 where fixed."""
         return np.stack([self._epochs.t, list(self._fixed.values())], -1)
 
-    def __call__(self, k: int, values: Array, P: Array) -> tuple[Array, Array, Array] | None:
-        """Rows that hold: H (n, D), residuals (n,) and sigmas (n,); None for none."""
+    def __call__(self, k: int, here: Points, P: Array) -> Decision | None:
+        """Integers to hold from a keyframe on, and ambiguities that are not known any more."""
         epochs, known = self._epochs, self.known
-        values = np.concatenate([np.zeros(DIM), values])
         if k not in epochs.active:
             return None
-        found = _decide(epochs.sets(k, known), epochs.columns, values, P, known, impose=False)
+        added = np.zeros(len(P))
+        for arc, off in zip(epochs.active[k], epochs.residuals(k, here), strict=True):
+            if arc in known.of and abs(off) > _NEXT:
+                known.forget(arc)
+                added[epochs.columns[arc[0]]] = self._unknown[arc[0]] ** 2
+        found = []
+        if not added.any():
+            values = np.concatenate([np.zeros(DIM), here.values[0]])
+            found = _decide(epochs.sets(k, known), epochs.columns, values, P, known, impose=False)
         for a, b, n in found:
             known.join(a, b, n)
         self._fixed[k] = float(epochs.differences(k, known) >= _FEWEST)
-        if not found:
-            return None
         H, r = np.zeros((len(found), len(P))), np.zeros(len(found))
         for i, (a, b, n) in enumerate(found):
             first, second = epochs.columns[a[0]], epochs.columns[b[0]]
             H[i, first], H[i, second] = 1.0, -1.0
             r[i] = values[first] - values[second] - n
-        return H, r, np.full(len(found), EXACT)
+        return Decision(H, r, np.full(len(found), EXACT), added) if found or added.any() else None
 
 
 def _sweep(epochs: _Epochs, problem: Problem, smoothed: SmootherPass, known: Known) -> None:

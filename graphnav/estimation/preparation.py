@@ -298,7 +298,7 @@ def _differ(a: Array, b: Array) -> bool:
 def _smooth(problem: Problem, start: States) -> Solution:
     from graphnav.estimation.solvers.batch import batch
 
-    return batch(problem, start, wanted=(0,), reintegrate=False)
+    return batch(split(problem)[0], start, wanted=(0,), reintegrate=False)
 
 
 def _after(recording: Recording, aligned: Alignment) -> Recording:

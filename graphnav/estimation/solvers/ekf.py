@@ -27,6 +27,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -54,10 +55,21 @@ from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
 from graphnav.estimation.solvers.watch import Bank, Verdicts
 
-Held = tuple[Array, Array, Array]
-Decide = Callable[[int, Array, Array], Held | None]  # of a keyframe, its parameters' values (D-15,) and P (D, D)
 _NONE = 1e-12  # weight of a row that is not used beside others of its keyframe
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What was decided at a keyframe by the estimate there: rows to hold from now on, and what is not to be trusted."""
+
+    H: Array  # (m, D)
+    residual: Array  # (m,)
+    sigma: Array  # (m,)
+    added: Array  # (D,) variance
+
+
+Decide = Callable[[int, Points, Array], Decision | None]  # of a keyframe, the point there and P (D, D)
 
 
 def ekf(
@@ -76,7 +88,7 @@ def ekf(
         after it depend on nothing later than themselves.
     watch : look for errors that last in the rows that are to be watched, and go back to before them.
     known : where the opening is linearised, from its first keyframe on, if that is known better than by a first pass.
-    decide : asked after the updates of each keyframe for rows that follow from the estimate there.
+    decide : asked after the updates of each keyframe; a smoother is not to rest on what comes of it.
     """
     began = time.perf_counter()
     K, about = len(problem.t), None
@@ -187,8 +199,7 @@ def _forward(
         if back is None and k == len(problem.t) - 1 and (trial := verdicts.ended()) is not None:
             back = int(np.searchsorted(problem.t, trial))
         if decide is not None and back is None:
-            at = x.values if where is own else about.values[k] + x[DIM:]  # type: ignore[union-attr]
-            x, P = _hold(decide(k, at, P), x, P, where, taken)
+            x, P = _hold(decide(k, _here(about, k, x), P), x, P, where)
         if back is not None:  # once more from before the fault, without it
             bank = banks.get(back) or bank.forgetful() if bank else None
             banks = {key: old for key, old in banks.items() if key < back}
@@ -306,18 +317,26 @@ def _update(
     return where.plus(at, d), P, fault
 
 
-def _hold(rows: Held | None, x: Any, P: Array, where: Any, taken: list[Gain] | None) -> tuple[Any, Array]:
-    """An update with rows that were decided upon: derivative (m, D), residuals (m,) at the estimate and sigmas (m,)."""
-    if rows is None:
+def _here(about: Points | None, k: int, x: Any) -> Points:
+    """An estimate at a keyframe, or an error state about given points, as a point."""
+    if isinstance(x, Estimate):
+        return Points(x.state, x.values[None])
+    assert about is not None
+    return move_points(Points(about.states[k : k + 1], about.values[k : k + 1]), x[None])
+
+
+def _hold(one: Decision | None, x: Any, P: Array, where: Any) -> tuple[Any, Array]:
+    """An update with what was decided."""
+    if one is None:
         return x, P
-    H, r, sigma = rows
-    solved = np.linalg.solve(H @ P @ H.T + np.diag(sigma**2), np.column_stack([r, H @ P, H]))
-    K = solved[:, 1 : 1 + len(P)].T
-    if taken is not None:
-        taken.append((K, H, -solved[:, 0], solved[:, 1 + len(P) :]))
-    M = np.eye(len(P)) - K @ H
-    P = M @ P @ M.T + (K * sigma**2) @ K.T
-    d = -(K @ r)
+    P = P + np.diag(one.added)
+    if not len(one.residual):
+        return x, P
+    PHt, R = P @ one.H.T, np.diag(one.sigma**2)
+    K = np.linalg.solve(one.H @ PHt + R, PHt.T).T
+    M = np.eye(len(P)) - K @ one.H
+    P = M @ P @ M.T + K @ R @ K.T
+    d = -(K @ one.residual)
     return (x + d if isinstance(x, np.ndarray) else where.plus(x, d)), 0.5 * (P + P.T)
 
 
