@@ -135,7 +135,8 @@ def recording_of(data: Path, folder: Path) -> tuple[Recording, Array, Array]:
 def errors(t: Array, llh: Array, at: Array, places: Array) -> Array:
     """(N, 3) east, north, up (m) of positions at the truth's epochs."""
     r = earth.llh_to_ecef(llh)
-    k = np.clip(np.searchsorted(t, at - 1e-3), 0, len(t) - 1)
+    k = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
+    k = np.where(np.abs(t[k - 1] - at) < np.abs(t[k] - at), k - 1, k)
     good = np.abs(t[k] - at) < 2e-3
     R = earth.enu_axes(earth.ecef_to_llh(places))
     out = np.einsum("nij,nj->ni", R, r[k] - places)
@@ -204,9 +205,8 @@ def main() -> None:
             e = errors(one.t, one.trajectory().llh, t, places)
             print(line(f"{name}, {solver}", e) + shares(one, t, e))
             for gap in given.gap or ():
-                print(
-                    f"{'':34} fixed again {again(one, recording.start + gap + _GAP):.2f} s after {gap:.0f} + {_GAP:.0f} s"
-                )
+                after = again(one, recording.start + gap + _GAP)
+                print(f"{'':34} fixed again {after:.2f} s after {gap:.0f} + {_GAP:.0f} s")
         print(f"{'':34} {seconds:.0f} s of processor time")
 
 
