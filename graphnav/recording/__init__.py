@@ -204,6 +204,6 @@ def rows_of(sensor: Any, mask: NDArray[np.bool_]) -> Any:
     parts = {
         key: value[mask]
         for key, value in sensor.__dict__.items()
-        if isinstance(value, np.ndarray) and key not in ("lever_arm", "R_bs")
+        if isinstance(value, np.ndarray) and len(value) and key not in ("lever_arm", "R_bs")
     }
     return replace(sensor, **parts)
