@@ -10,18 +10,23 @@ known already: one more than a position needs, so that they check each other. Th
 when it comes to an epoch, and holds it from then on. The smoother looks at every epoch with all of the drive behind it,
 holds what it finds over the whole of an arc, and looks again.
 
-An arc whose residuals are nearer to another integer than to its own is let go of, and stays a real number.
+Integers that are right leave the carriers of an epoch consistent with one place and one clock for each signal, to
+millimetres: by a chi-square test, without which nothing is held. Where two epochs in a row fail it later on, the filter
+lets go of all that it holds, and of what it knew of the place by it, and finds integers again; the smoother of the arcs
+that an epoch is consistent without (data snooping: Baarda 1968) for half of their time, which stay real numbers.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import gammaincinv  # scipy.stats would take half a second to import
 
 from graphnav.constraints.raw_phase import EXACT, GnssPhase, WholeCycles
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM
+from graphnav.core.state import BLOCKS, DIM
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import Decision, ekf, refilter
 from graphnav.estimation.solvers.linearise import Points, linearise
@@ -31,7 +36,8 @@ from graphnav.gnss.integers import decorrelate, find_nearest
 
 _SUCCESS, _RATIO, _FEWEST = 0.999, 3.0, 4
 _ROUNDS = 4  # of the smoother: what one finds tells the next, and the last finds next to nothing
-_NEXT = 0.25  # cycles, half of the way to the next half cycle
+_PLACE, _SPEED = 10.0, 1.0  # m, m/s, 1-sigma of what is known where integers were wrong: less than codes tell
+_ALARM = 0.001  # of epochs with right integers that fail the test of consistency
 Arc = tuple[int, int]  # slot, number within it
 
 
@@ -149,11 +155,37 @@ class _Epochs:
             self.rows[k] = slice(lo, hi)
             self.active[k] = list(zip(phase.slot[lo:hi].tolist(), phase.arc[lo:hi].tolist(), strict=True))
 
-    def residuals(self, k: int, here: Points) -> Array:
-        """(n,) cycles, of the rows of an epoch at a point."""
+    def odd(self, k: int, here: Points, known: Known) -> list[Arc]:
+        """Arcs with integers that an epoch is not consistent with, and is without them.
+
+        Parameters
+        ----------
+        here : a point near enough for the directions to the satellites.
+        """
         own = self.rows[k]
         rows = linearise(self.phase, here, self._all_columns, own, np.zeros(own.stop - own.start, dtype=int))
-        return rows.residual[:, 0] / self.phase.wavelength[own]
+        arcs = self.active[k]
+        used = np.array([i for i, arc in enumerate(arcs) if arc in known.of], dtype=int)
+        if not len(used):
+            return []
+        sets = [known.find(arcs[i])[0] for i in used]
+        clocks = (np.array([sets.index(one) for one in sets])[:, None] == np.arange(len(sets))).astype(float)
+        A = np.concatenate([rows.linear.jacobians["p"][used, 0], clocks[:, clocks.any(axis=0)]], axis=1)
+        # with the integers in place of the estimates; what they have in common is a clock's
+        at = np.array([self.columns[arcs[i][0]] for i in used]) - DIM
+        off = np.array([known.find(arcs[i])[1] for i in used]) - here.values[0, at]
+        r = rows.residual[used, 0] + self.phase.wavelength[own][used] * off
+        A, r = A / rows.stated[used], r / rows.stated[used, 0]
+        kept = np.ones(len(used), dtype=bool)
+        while True:
+            Q, _ = np.linalg.qr(A[kept][:, A[kept].any(axis=0)])
+            left = r[kept] - Q @ (Q.T @ r[kept])
+            spare = int(kept.sum()) - Q.shape[1]
+            if spare < 1 or left @ left <= 2.0 * gammaincinv(0.5 * spare, 1.0 - _ALARM):
+                break
+            share = np.maximum(1.0 - np.sum(Q * Q, axis=1), 1e-9)  # of its own error that is left in a residual
+            kept[np.flatnonzero(kept)[np.argmax(left**2 / share)]] = False
+        return [arcs[i] for i in used[~kept]]
 
     def can(self, arc: Arc) -> bool:
         """Whether it has integers."""
@@ -232,7 +264,7 @@ class _Causal:
         self._epochs, self._fixed = epochs, dict.fromkeys(epochs.keyframes, 0.0)
         own = {p.name: float(np.max(p.sigma)) for p in epochs.phase.parameters}
         self._unknown = [own[name] for name in epochs.phase.slots]
-        self.known = Known()
+        self.known, self._odd = Known(), False
 
     @property
     def epochs(self) -> Array:
@@ -244,17 +276,25 @@ class _Causal:
         epochs, known = self._epochs, self.known
         if k not in epochs.active:
             return None
-        added = np.zeros(len(P))
-        for arc, off in zip(epochs.active[k], epochs.residuals(k, here), strict=True):
-            if arc in known.of and abs(off) > _NEXT:
-                known.forget(arc)
-                added[epochs.columns[arc[0]]] = self._unknown[arc[0]] ** 2
-        found = []
-        if not added.any():
+        added, found = np.zeros(len(P)), []
+        odd = bool(epochs.odd(k, here, known))
+        if odd and self._odd:
+            self.known = known = Known()
+            for slot, sigma in enumerate(self._unknown):
+                added[epochs.columns[slot]] = sigma**2
+            added[BLOCKS["p"]], added[BLOCKS["v"]] = _PLACE**2, _SPEED**2
+        elif not odd:
             values = np.concatenate([np.zeros(DIM), here.values[0]])
             found = _decide(epochs.sets(k, known), epochs.columns, values, P, known, impose=False)
-        for a, b, n in found:
-            known.join(a, b, n)
+        self._odd = odd
+        if found:
+            held = replace(known, of=known.of.copy())
+            for a, b, n in found:
+                held.join(a, b, n)
+            if epochs.odd(k, here, held):
+                found = []
+            else:
+                self.known = known = held
         self._fixed[k] = float(epochs.differences(k, known) >= _FEWEST)
         H, r = np.zeros((len(found), len(P))), np.zeros(len(found))
         for i, (a, b, n) in enumerate(found):
@@ -274,8 +314,15 @@ def _sweep(epochs: _Epochs, problem: Problem, smoothed: SmootherPass, known: Kno
         if key in tried or all(len(some) == 1 for some in sets.values()):
             continue
         tried.add(key)
+        held = replace(known, of=known.of.copy())
         for a, b, n in _decide(sets, epochs.columns, values[k], smoothed.P[k], known, impose=True):
-            known.join(a, b, n)
+            held.join(a, b, n)
+        if len(held.of) > len(known.of) and not epochs.odd(k, _one(smoothed, k), held):
+            known.of = held.of
+
+
+def _one(points: Points, k: int) -> Points:
+    return Points(points.states[k : k + 1], points.values[k : k + 1])
 
 
 def _holding(problem: Problem, phase: GnssPhase, epochs: _Epochs, known: Known) -> Problem:
@@ -302,18 +349,14 @@ def _holding(problem: Problem, phase: GnssPhase, epochs: _Epochs, known: Known) 
 
 
 def _let_go(epochs: _Epochs, problem: Problem, smoothed: SmootherPass, known: Known) -> bool:
-    """Give up arcs whose residuals are nearer to another integer."""
-    phase = epochs.phase
-    r = np.abs(linearise(phase, smoothed, problem.columns).residual[:, 0]) / phase.wavelength
-    key = phase.slot * 100000 + phase.arc
-    order = np.argsort(key, kind="stable")
-    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
-    gone = False
-    for lo, hi in zip(starts, [*starts[1:], len(order)], strict=True):
-        own = order[lo:hi]
-        arc = int(phase.slot[own[0]]), int(phase.arc[own[0]])
-        if arc in known.of and np.median(r[own]) > _NEXT:
-            known.forget(arc)
-            known.let_go.add(arc)
-            gone = True
-    return gone
+    """Give up arcs that most of their epochs are not consistent with."""
+    seen: Counter[Arc] = Counter()
+    odd: Counter[Arc] = Counter()
+    for k in epochs.keyframes:
+        seen.update(epochs.active[k])
+        odd.update(epochs.odd(k, _one(smoothed, k), known))
+    gone = {arc for arc, count in odd.items() if 2 * count > seen[arc]}
+    for arc in gone:
+        known.forget(arc)
+    known.let_go |= gone
+    return bool(gone)
