@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from graphnav.simulation.inertial import MEMS
 Array = np.ndarray
 _RATE = 50.0  # Hz of the simulated IMU
 _GAP = 20.0  # s
+_NO_IMU = 5.0  # m/s^2/sqrt(Hz): 5 m/s of velocity in a second, more than a car's brakes
 _WRONG = 0.1  # m, half a wavelength: farther off horizontally a fixed epoch is wrong
 
 
@@ -58,6 +59,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "codes, Doppler": {"carrier": False},
     "and carriers, float": {"integers": False},
     "and carriers, integers": {},
+}
+# no stops, which the IMU shows, and nothing of how a vehicle moves
+WITHOUT_IMU: dict[str, Any] = {
+    "noise": {"mode": "stated"},
+    "vehicle": {"nhc": False},
+    "standstill": {"zero_velocity": False, "zero_rate": False, "held_position": False},
 }
 TOML = """format = "graphnav-recording/1"
 name = "{name}"
@@ -180,6 +187,7 @@ def main() -> None:
     parser.add_argument("--end", type=float, default=None)
     parser.add_argument("--solver", action="append")
     parser.add_argument("--gap", type=float, action="append", help="s, where 20 s without GNSS begin; repeatable")
+    parser.add_argument("--without-imu", action="store_true", help="let the IMU say nothing of where the vehicle goes")
     parser.add_argument("--only", action="append", help="variants whose name begins so; repeatable")
     given = parser.parse_args()
     folder = (given.output / given.data.name).resolve()
@@ -188,6 +196,9 @@ def main() -> None:
     recording = recording.crop(given.begin, given.end or recording.duration)
     for gap in given.gap or ():
         recording = recording.without("gnss", (gap, gap + _GAP))
+    if given.without_imu:
+        loose = replace(recording.imu.noise, accel_noise_density=_NO_IMU)
+        recording = replace(recording, imu=replace(recording.imu, noise=loose))
     inside = (t >= recording.start) & (t <= recording.end)
     t, places = t[inside], places[inside]
     print(f"{'':34} {'epochs':>6} {'H50':>7} {'H95':>7} {'max':>7} {'U95':>7}")
@@ -199,7 +210,8 @@ def main() -> None:
         if given.only and not any(name.startswith(one) for one in given.only):
             continue
         began = time.process_time()
-        solutions = run(recording, settings_from({"raw_gnss": chosen}), solvers)
+        settings = {"raw_gnss": chosen, **(WITHOUT_IMU if given.without_imu else {})}
+        solutions = run(recording, settings_from(settings), solvers)
         seconds = time.process_time() - began
         for solver, one in solutions.items():
             e = errors(one.t, one.trajectory().llh, t, places)

@@ -10,14 +10,16 @@ import numpy as np
 import oracle
 import pytest
 import raw_drive
-from helpers import truth_states
+from helpers import errors, truth_states
 from test_raw_rows import scene
 
 from graphnav.config import settings_from
 from graphnav.constraints.raw_gnss import CLOCK
 from graphnav.constraints.raw_phase import GnssPhase, WholeCycles
 from graphnav.core import earth
+from graphnav.estimation import fixing
 from graphnav.estimation.fixing import Known
+from graphnav.estimation.pipeline import run
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.atmosphere import NIGHT, directions, klobuchar
 from graphnav.gnss.differential import with_differences
@@ -243,3 +245,59 @@ def test_derivatives_are_those_of_differences(exact):
                           slice(None))  # fmt: skip
     np.testing.assert_allclose(held.residual[:, 0], [1.0, -4.0])
     np.testing.assert_allclose(held.jacobians["a"][:, 0, 0], [1.0, -1.0])
+
+
+@pytest.fixture(scope="module")
+def drive():
+    path = oracle.vehicle_path(120.0, 50.0)
+    made, truth = oracle.drive(path, seed=5, gnss_velocity_sd=(0.1, 0.1, 0.1))
+    recording = raw_drive.with_observations(made, path, noise=0.5, seed=2).crop(0.0, 26.0)
+    return with_carriers(recording, path, 0.003)[0], truth
+
+
+def off_by(solution, truth):
+    """m, horizontally, at the epochs with carriers, and which of these are fixed."""
+    off = errors(solution, truth)[0]
+    k = np.searchsorted(solution.t, solution.fixed[:, 0] - 1e-6)
+    return np.linalg.norm(off[k, :2], axis=1), solution.fixed[:, 1] > 0.0
+
+
+def test_every_solver_is_fixed_and_right(drive):
+    recording, truth = drive
+    solutions = run(recording, STATED, ("ekf", "rts", "batch"))
+    for name, one in solutions.items():
+        off, fixed = off_by(one, truth)
+        assert fixed.any(), name
+        assert fixed[np.argmax(fixed) :].all(), name  # what is found is held
+        assert off[fixed].max() < 0.05, name
+    assert off_by(solutions["batch"], truth)[1].all()  # a smoother knows all the time what it knows at the end
+    np.testing.assert_allclose(solutions["rts"].states.p, solutions["batch"].states.p, atol=2e-3)
+    real = run(recording, settings_from({"noise": {"mode": "stated"}, "raw_gnss": {"integers": False}}), ("rts",))
+    off, fixed = off_by(real["rts"], truth)
+    assert not fixed.any()
+    assert np.sqrt(np.mean(off**2)) > 2.0 * np.sqrt(np.mean(off_by(solutions["rts"], truth)[0] ** 2))
+
+
+def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
+    """One number of the first vector that the filter finds is wrong, and nothing is noticed for some epochs."""
+    recording, truth = drive
+    found, noticed = [], fixing._Epochs.odd
+
+    def wrong(a, decorrelated):
+        found.append(find_nearest(a, decorrelated))
+        spoiled = (np.arange(len(a)) == 2) & (len(found) == 1)
+        return replace(found[-1], best=found[-1].best + spoiled)
+
+    monkeypatch.setattr(fixing, "find_nearest", wrong)
+    begin = recording.raw_gnss.t[0]
+    until = begin + 13.0
+    monkeypatch.setattr(
+        fixing._Epochs, "odd", lambda self, k, *rest: [] if self.time[k] < until else noticed(self, k, *rest)
+    )
+    one = run(recording, STATED, ("ekf",))["ekf"]
+    off, fixed = off_by(one, truth)
+    t = one.fixed[:, 0]
+    assert off[(t < until) & fixed].max() > 0.1
+    late = t > until + 6.0
+    assert fixed[late].mean() > 0.8
+    assert off[late & fixed].max() < 0.05

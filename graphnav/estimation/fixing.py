@@ -147,7 +147,7 @@ class _Epochs:
         self.phase, self._all_columns = phase, problem.columns
         self.columns = [problem.columns[name].start for name in phase.slots]
         self.keyframes = np.unique(phase.keyframe).tolist()
-        self.t = problem.t[self.keyframes]
+        self.t, self.time = problem.t[self.keyframes], problem.t
         self.rows: dict[int, slice] = {}
         self.active: dict[int, list[Arc]] = {}
         edges = np.searchsorted(phase.keyframe, [*self.keyframes, len(problem.t)])
