@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.config import settings_from
+from graphnav.core.files import permit_outside
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
@@ -72,7 +73,8 @@ def recording_of(data: Path, folder: Path, raw: bool, base: bool) -> Recording:
         text = text.replace(f'"{name}"', f'"{data}/{name}"')
     path = folder / f"{'base' if base else 'single'}.toml"
     path.write_text(text, encoding="utf-8")
-    return read(path)
+    with permit_outside():
+        return read(path)
 
 
 def score(solution: Solution, recording: Recording) -> tuple[float, ...]:

@@ -267,6 +267,7 @@ def solver_summary(
             "seconds": float(np.diff(solution.stationary).sum()),
             "each": [stop.values() for stop in stops_of_solution(solution)],
         },
+        "ambiguities": _ambiguities(solution),
         "iterations": solution.iterations,
         "passes": {"filter": 0, "smoother": 0, **solution.passes, "eliminations": solution.iterations},
         "noise": noise_summary(outcome, solution),
@@ -294,6 +295,16 @@ def solver_summary(
         "settings": outcome.request.settings.model_dump(),
         "provenance": provenance,
     }
+
+
+def _ambiguities(solution: Solution) -> dict[str, Any] | None:
+    """Epochs with carriers against a base station: how many have integers and how many real numbers."""
+    epochs = len(solution.fixed)
+    if not epochs:
+        return None
+    fixed = solution.fixed[:, 1] > 0.0
+    first = float(solution.fixed[fixed, 0][0] - solution.t[0]) if fixed.any() else None
+    return {"epochs": epochs, "fixed": int(fixed.sum()), "float": int((~fixed).sum()), "first_fix_s": first}
 
 
 def noise_rows(outcome: Outcome, solution: Solution) -> tuple[FigureRow, ...]:

@@ -26,6 +26,10 @@ class RawGnssSettings(Outliers):
         description="precise point positioning: codes and carriers of two signals, by precise orbits and clocks, in "
         "place of single codes and changes of carriers",
     )
+    carrier: bool = Field(
+        True, description="use the carriers, with their ambiguities, where the recording has a base station"
+    )
+    integers: bool = Field(True, description="find the ambiguities as integers; without, they stay real numbers")
     elevation: float = Field(10.0, ge=0, lt=90, description="deg, below which satellites are not used")
     cn0: float = Field(30.0, ge=0, description="dB-Hz, below which signals are not used: most are reflections")
     period: float = Field(1.0, ge=0, description="s between the epochs that are used, at least; 0 = all")

@@ -61,19 +61,22 @@ class _Pairs:
 
 
 def _epochs(recording: Recording, settings: Settings) -> Array:
-    raw = _select(recording, settings) if settings.raw_gnss.differences else None
+    raw = _select(recording, settings) if _are_wanted(recording, settings) else None
     return np.empty(0) if raw is None else np.unique(raw.t[np.isfinite(raw.carrier)])
 
 
+def _are_wanted(recording: Recording, settings: Settings) -> bool:
+    """Not where the carriers are used with their ambiguities: both kinds of rows are of the same numbers."""
+    s, raw = settings.raw_gnss, recording.raw_gnss
+    if raw is None or not s.differences:
+        return False
+    return not (s.carrier and s.code and np.isfinite(raw.carrier_difference).any())
+
+
 def _pairs(scene: BuildContext) -> tuple[_Prepared, _Pairs] | None:
-    if "raw_carrier" not in scene.made:
-        scene.made["raw_carrier"] = _find_pairs(scene) if scene.settings.raw_gnss.differences else None
-    found: tuple[_Prepared, _Pairs] | None = scene.made["raw_carrier"]
-    return found
-
-
-def _find_pairs(scene: BuildContext) -> tuple[_Prepared, _Pairs] | None:
-    found, whole = _prepare(scene), scene.recording.raw_gnss
+    if not _are_wanted(scene.recording, scene.settings):
+        return None
+    found, whole = scene.share(_prepare), scene.recording.raw_gnss
     if found is None or whole is None or not np.isfinite(found.raw.carrier).any():
         return None
     raw = found.raw
@@ -116,7 +119,7 @@ class GnssAntennaClone(Constraint):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssAntennaClone | None:
-        both = _pairs(scene)
+        both = scene.share(_pairs)
         if both is None:
             return None
         found, pairs = both
@@ -166,7 +169,7 @@ class GnssCarrier(_Satellites):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssCarrier | None:
-        both = _pairs(scene)
+        both = scene.share(_pairs)
         if both is None:
             return None
         found, pairs = both

@@ -56,6 +56,7 @@ _AXES = ("horizontal", "horizontal", "up")
 _HOURS, _ONE = np.array([1.0, 1.0, 2.0]), 0.7
 _ERROR = np.array([1.0, 1.0, 2.0])  # m, unit of what lasts for seconds and minutes
 _DIFFERENCED = 0.1  # of what lasts for hours, against a base station
+_GRADIENT = 2e-6  # of the zenith's delay over the distance to a base station, on an ordinary day (Odijk 2002)
 _RATE_ERROR = np.array([0.05, 0.05, 0.1])  # m/s
 _LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have a variance factor of their own
 _CLASSES = ("strong", "fair", "weak", "faint")
@@ -162,6 +163,12 @@ def _common(scene: BuildContext, found: _Prepared) -> dict[str, Any]:
     }
 
 
+def _ionosphere(raw: RawGnss, spacing: float) -> Parameter:
+    """What the ionosphere's model is wrong by at the zenith; against a base station, between the two."""
+    sigma = max(_GRADIENT * raw.baseline, 1e-3) if raw.differenced else _ZENITH
+    return Parameter(IONOSPHERE, np.zeros(1), np.full(1, sigma), "m", sigma / _ZENITH * _ZENITH_WALK, spacing=spacing)
+
+
 @dataclass(frozen=True)
 class _Satellites(Constraint):
     """Rows of single satellites."""
@@ -225,9 +232,7 @@ class GnssCode(_Satellites):
         groups, group = signal_groups(raw)
         common, spacing = _common(scene, found), found.spacing
         less = _DIFFERENCED if raw.differenced else 1.0
-        more: tuple[Parameter, ...] = (
-            Parameter(IONOSPHERE, np.zeros(1), np.full(1, less * _ZENITH), "m", less * _ZENITH_WALK, spacing=spacing),
-        )
+        more: tuple[Parameter, ...] = (_ionosphere(raw, spacing),)
         if len(groups) > 1:
             size = len(groups) - 1
             more += (
@@ -241,8 +246,6 @@ class GnssCode(_Satellites):
                 ),
             )
         common["parameters"] += more
-        satellites, which = np.unique(raw.satellite, return_inverse=True)
-        sigma, many = code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)
         satellites, which = np.unique(raw.satellite, return_inverse=True)
         sigma, many = code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)
         minutes, hours = settings.gnss.slow_times

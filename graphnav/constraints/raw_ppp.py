@@ -56,14 +56,9 @@ class _Free:
 
 
 def _free(scene: BuildContext) -> _Free | None:
-    if "raw_ppp" not in scene.made:
-        scene.made["raw_ppp"] = _prepare_rows(scene) if scene.settings.raw_gnss.ppp else None
-    found: _Free | None = scene.made["raw_ppp"]
-    return found
-
-
-def _prepare_rows(scene: BuildContext) -> _Free | None:
-    found, whole = _prepare(scene), scene.recording.raw_gnss
+    if not scene.settings.raw_gnss.ppp:
+        return None
+    found, whole = scene.share(_prepare), scene.recording.raw_gnss
     if found is None or whole is None:
         return None
     if not whole.precise:
@@ -155,7 +150,7 @@ class GnssPppCode(_Ppp):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssPppCode | None:
-        free = _free(scene)
+        free = scene.share(_free)
         if free is None:
             return None
         rows, raw = free.rows, free.found.raw.take(free.rows.which)
@@ -193,7 +188,7 @@ class GnssPppCarrier(_Ppp):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssPppCarrier | None:
-        free = _free(scene)
+        free = scene.share(_free)
         if free is None:
             return None
         rows = free.rows

@@ -235,6 +235,7 @@ def _solve(
             graphs=(_graph_of(problem, out[name]),),
             passes=dict(passes),
             separation=apart,
+            fixed=found.fixed.get(name, found.fixed.get("", out[name].fixed)),
             timings={k: timings.get(k, 0.0) + out[name].timings.get(k, 0.0) for k in (*timings, *out[name].timings)},
         )
         for name in solvers

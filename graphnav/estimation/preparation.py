@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints.raw_phase import GnssPhase
 from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
@@ -24,6 +25,7 @@ from graphnav.detectors import Detections, detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment, align, with_known_heading
 from graphnav.estimation.alignment.first import some
+from graphnav.estimation.fixing import fix, split
 from graphnav.estimation.noise.apply import with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import estimate_without_faults, excluded_share, without_excluded
@@ -67,6 +69,7 @@ class Prepared:
     notes: tuple[str, ...]
     timings: dict[str, float]
     passes: Counter[str] = field(default_factory=Counter)
+    fixed: dict[str, Array] = field(default_factory=dict)  # `Solution.fixed` of the filter, and of the others ("")
 
     @property
     def diverged(self) -> bool:
@@ -96,6 +99,7 @@ def prepare(
     """
     timings: dict[str, float] = {}
     passes: Counter[str] = Counter()
+    carriers: list[GnssPhase | None] = [None]
 
     def booked(stage: str, since: float) -> float:
         now = time.perf_counter()
@@ -116,6 +120,7 @@ def prepare(
             used, settings, frame, start.state, start_sigma(start), found.stationary, parts_of_noise=parts
         )
         booked("preintegration", since)
+        problem, carriers[0] = split(problem)  # the noise model rests on the codes
         return problem
 
     def without_wrong(noise: NoiseModel) -> tuple[Alignment, Detections, bool]:
@@ -183,12 +188,17 @@ def prepare(
     if any(rows.gate is not None for rows in problem.constraints):
         smoothed = backward(problem, refilter(problem, smoothed, progress), progress)
     forward, smoothed = _find_way(problem, aligned, known, forward, smoothed, progress, passes)
-    booked("smoother", filtered)
+    since = booked("smoother", filtered)
     passes.update(filter=1, smoother=1)
     del timings["filter"]  # the filter's own solution has it
-    return Prepared(
-        problem, noise, start, aligned, detections, forward, smoothed, describe(noise, problem), timings, passes
-    )
+    notes, epochs = describe(noise, problem), {}
+    if carriers[0] is not None:
+        tell("ambiguities")
+        fixed = fix(problem, carriers[0], smoothed, aligned.until, progress)
+        problem, forward, smoothed = fixed.problem, fixed.forward, fixed.smoothed
+        notes, epochs = (*notes, *fixed.notes), {"ekf": fixed.filtered_epochs, "": fixed.smoothed_epochs}
+        booked("ambiguities", since)
+    return Prepared(problem, noise, start, aligned, detections, forward, smoothed, notes, timings, passes, epochs)
 
 
 def _estimate(
@@ -288,7 +298,7 @@ def _differ(a: Array, b: Array) -> bool:
 def _smooth(problem: Problem, start: States) -> Solution:
     from graphnav.estimation.solvers.batch import batch
 
-    return batch(problem, start, wanted=(0,), reintegrate=False)
+    return batch(split(problem)[0], start, wanted=(0,), reintegrate=False)
 
 
 def _after(recording: Recording, aligned: Alignment) -> Recording:

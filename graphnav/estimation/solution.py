@@ -116,6 +116,7 @@ class Solution:
     passes: Mapping[str, int] = field(default_factory=dict)  # over all keyframes, before the solver's own
     graphs: tuple[Callable[[], tuple[Any, Any]], ...] = ()  # makes what `to_gtsam` gives, for each piece
     separation: Separation | None = None  # of the filter and its smoother, the same for all solvers
+    fixed: Array = field(default_factory=lambda: np.empty((0, 2)))  # s of epochs with carriers, and 1 for integers
     between: tuple[Between, ...] = ()  # gives states between keyframes, one for each piece of the recording
 
     @property
@@ -272,6 +273,7 @@ def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Soluti
         passes=_add_counts([dict(p.passes) for p in parts]),
         graphs=tuple(g for p in parts for g in p.graphs),
         separation=_separation_of_all([p.separation for p in parts]),
+        fixed=np.concatenate([p.fixed for p in parts]),
         between=tuple(b for p in parts for b in p.between),
     )
 

@@ -3,7 +3,7 @@
 Within an arc a carrier is a range but for one unknown number of cycles, its ambiguity. A new arc begins where
 
 * the receiver flags a loss of lock, or says otherwise that half a cycle is open or is no more (RINEX 3.05, table A2),
-* the signal is absent for an epoch, unless its counter of lock time covers the gap,
+* the signal is absent for an epoch, or all are, unless its counter of lock time covers the gap,
 * the base station's arc of that signal ends,
 * the change since the epoch before is off by more than a quarter of a cycle from what those of all satellites agree
   upon, a displacement and the clock: a slip is half a cycle at least, so beyond a quarter it is nearer than none.
@@ -51,7 +51,8 @@ def find_arcs(raw: RawGnss, still: bool = False, base_arc: NDArray[np.intp] | No
     """
     key = raw.satellite.astype(np.int64) * 1000 + raw.signal
     slots, slot = np.unique(key, return_inverse=True)
-    _, epoch = raw.epochs
+    epochs, epoch = raw.epochs
+    usual = float(np.median(np.diff(epochs))) if len(epochs) > 1 else np.inf
     there = np.isfinite(raw.carrier) & np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock)
     if base_arc is not None:
         there &= base_arc >= 0
@@ -59,8 +60,10 @@ def find_arcs(raw: RawGnss, still: bool = False, base_arc: NDArray[np.intp] | No
     order = order[np.lexsort((epoch[order], slot[order]))]
     now, before = order[1:], order[:-1]
     same = slot[now] == slot[before]
-    held = np.nan_to_num(raw.lock[now], nan=-1.0) > raw.t[now] - raw.t[before] if len(raw.lock) else np.zeros_like(same)
-    kept = same & ~raw.slip[now] & (raw.half[now] == raw.half[before]) & ((epoch[now] - epoch[before] == 1) | held)
+    since = raw.t[now] - raw.t[before]
+    held = np.nan_to_num(raw.lock[now], nan=-1.0) > since if len(raw.lock) else np.zeros_like(same)
+    held |= (epoch[now] - epoch[before] == 1) & (since < 1.5 * usual)
+    kept = same & held & ~raw.slip[now] & (raw.half[now] == raw.half[before])
     if base_arc is not None:
         kept &= base_arc[now] == base_arc[before]
     slipped = _slipped(raw, now[kept], before[kept], epoch, still)

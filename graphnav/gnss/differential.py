@@ -51,13 +51,13 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     for satellite, signal in sorted({(int(s), int(g)) for s, g in zip(rover.satellite, rover.signal, strict=True)}):
         own = (rover.satellite == satellite) & (rover.signal == signal)
         there = base.satellite == satellite
+        counted = there & (arc >= 0) & (base.signal == _partner(base, arc, satellite // 100, signal))
+        if counted.sum() > 1:
+            carrier_difference[own], base_arc[own] = _within_arcs(
+                rover.t[own], base.t[counted], of_carrier[counted], arc[counted]
+            )
         if (satellite, signal) in alike:
             there &= base.signal == signal
-            counted = there & (arc >= 0)
-            if counted.sum() > 1:
-                carrier_difference[own], base_arc[own] = _within_arcs(
-                    rover.t[own], base.t[counted], of_carrier[counted], arc[counted]
-                )
         else:  # another code on the same carrier: apart by a constant, which is of all satellites of the system
             some = base.signal[there & (base.signal // 100 == signal // 100)]
             there &= base.signal == (some[0] if len(some) else -1)
@@ -72,6 +72,19 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     return replace(
         rover, difference=difference, carrier_difference=carrier_difference, base_arc=base_arc, baseline=away
     ), said
+
+
+def _partner(base: RawGnss, arc: NDArray[np.intp], system: int, signal: int) -> int:
+    """The base's signal whose carriers stand against those of a rover's signal, the same for all of a system.
+
+    The same one, else that of the same frequency that the base has most of: by how much of a cycle they are apart is
+    then the same for all satellites, and in none of the differences between these.
+    """
+    own = base.signal[(base.satellite // 100 == system) & (base.signal // 100 == signal // 100) & (arc >= 0)]
+    if not len(own) or np.any(own == signal):
+        return signal
+    found, many = np.unique(own, return_counts=True)
+    return int(found[np.argmax(many)])
 
 
 def _within_arcs(t: Array, at: Array, value: Array, arc: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:

@@ -16,6 +16,7 @@ _RATE, _RATE_POWER = 0.03, 60.0  # m/s; (m/s)^2 Hz: 0.04 m/s at 45 dB-Hz
 _BANDWIDTH = 15.0  # Hz, of a receiver's carrier loop (Kaplan and Hegarty 2006, section 5.6)
 _PHASE = 1e-3  # m at the zenith: reflections and the loop's own, the same source as the codes' rising with the secant
 _IONOSPHERE, _TROPOSPHERE = 0.5, 0.3
+_CARRIER = 0.003  # m at the zenith, of reflections in each of two receivers' carriers (RTKLIB 2.4.3, rtkpos.c, varerr)
 LEAST = 20.0  # dB-Hz that a signal without a C/N0, or below it, is taken to have
 _USUAL = 45.0  # dB-Hz where a file says nothing of it
 
@@ -36,8 +37,17 @@ def rate_sigma(cn0: Array, elevation: Array) -> Array:
 def carrier_sigma(cn0: Array, elevation: Array, wavelength: Array) -> Array:
     """(N,) m, 1-sigma of a carrier: the loop's thermal noise, wavelength / 2 pi sqrt(B / C/N0), and reflections."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
-    thermal = (wavelength / (2.0 * np.pi)) ** 2 * _BANDWIDTH * 10.0 ** (-0.1 * _power(cn0))
-    return np.asarray(np.sqrt(thermal + (_PHASE * rising) ** 2))
+    return np.asarray(np.sqrt(_thermal(cn0, wavelength) + (_PHASE * rising) ** 2))
+
+
+def carrier_difference_sigma(cn0: Array, elevation: Array, wavelength: Array) -> Array:
+    """(N,) m, 1-sigma of the difference of two receivers' carriers."""
+    rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
+    return np.asarray(np.sqrt(2.0 * (_thermal(cn0, wavelength) + _CARRIER**2 * (1.0 + rising**2))))
+
+
+def _thermal(cn0: Array, wavelength: Array) -> Array:
+    return np.asarray((wavelength / (2.0 * np.pi)) ** 2 * _BANDWIDTH * 10.0 ** (-0.1 * _power(cn0)))
 
 
 def _power(cn0: Array) -> Array:

@@ -113,6 +113,7 @@ def write_report(
             [
                 *_gallery(pictures.timeline_picture(solution, recording, spans)),
                 *tables.constraint_table(solution),
+                *tables.ambiguity_table(solution),
                 *tables.rejected_table(solution, start),
                 *_fold("Residuals of each", _gallery(pictures.record_pictures(solution, start, end, spans))),
             ],

@@ -102,6 +102,17 @@ def constraint_table(solution: Solution) -> list[Raw]:
     return out
 
 
+def ambiguity_table(solution: Solution) -> list[Raw]:
+    """How many epochs with carriers against a base station have integer ambiguities."""
+    epochs = getattr(solution, "fixed", np.empty((0, 2)))
+    if not len(epochs):
+        return []
+    fixed = int(np.sum(epochs[:, 1] > 0.0))
+    share = Raw(f"{100.0 * fixed / len(epochs):.1f} %")
+    head = ["epochs with carriers", "ambiguities fixed as integers", "float", "share fixed"]
+    return [page.table(head, [[len(epochs), fixed, len(epochs) - fixed, share]])]
+
+
 def _largest(x: Array) -> float:
     x = np.abs(x[np.isfinite(x)])
     return float(x.max()) if x.size else float("nan")

@@ -26,6 +26,8 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -57,12 +59,26 @@ _NONE = 1e-12  # weight of a row that is not used beside others of its keyframe
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
 
 
+@dataclass(frozen=True)
+class Decision:
+    """What was decided at a keyframe by the estimate there: rows to hold from now on, and what is not to be trusted."""
+
+    H: Array  # (m, D)
+    residual: Array  # (m,)
+    sigma: Array  # (m,)
+    added: Array  # (D,) variance
+
+
+Decide = Callable[[int, Points, Array], Decision | None]  # of a keyframe, the point there and P (D, D)
+
+
 def ekf(
     problem: Problem,
     progress: Progress | None = None,
     opening: float | None = None,
     watch: bool = False,
     known: Points | None = None,
+    decide: Decide | None = None,
 ) -> FilterPass:
     """Run the filter over all keyframes.
 
@@ -72,12 +88,13 @@ def ekf(
         after it depend on nothing later than themselves.
     watch : look for errors that last in the rows that are to be watched, and go back to before them.
     known : where the opening is linearised, from its first keyframe on, if that is known better than by a first pass.
+    decide : asked after the updates of each keyframe; a smoother is not to rest on what comes of it.
     """
     began = time.perf_counter()
     K, about = len(problem.t), None
     if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
         about = backward(problem, _forward(problem, n, watch=watch)) if known is None else known.first(n)
-    one = _forward(problem, K, about, progress, watch)
+    one = _forward(problem, K, about, progress, watch, decide)
     seconds = time.perf_counter() - began
     filtered, P = one.states, one.P[:, :DIM, :DIM]
     if about is not None:
@@ -119,6 +136,7 @@ def _forward(
     about: Points | None = None,
     progress: Progress | None = None,
     watch: bool = False,
+    decide: Decide | None = None,
 ) -> ForwardRecord:
     """Filter the first K keyframes, of which the first n are linearised at given points."""
     n = 0 if about is None else len(about.values)
@@ -180,6 +198,8 @@ def _forward(
                 break
         if back is None and k == len(problem.t) - 1 and (trial := verdicts.ended()) is not None:
             back = int(np.searchsorted(problem.t, trial))
+        if decide is not None and back is None:
+            x, P = _hold(decide(k, _here(about, k, x), P), x, P, where)
         if back is not None:  # once more from before the fault, without it
             bank = banks.get(back) or bank.forgetful() if bank else None
             banks = {key: old for key, old in banks.items() if key < back}
@@ -295,6 +315,29 @@ def _update(
     elif bank is not None:
         bank.taken(K, H)
     return where.plus(at, d), P, fault
+
+
+def _here(about: Points | None, k: int, x: Any) -> Points:
+    """An estimate at a keyframe, or an error state about given points, as a point."""
+    if isinstance(x, Estimate):
+        return Points(x.state, x.values[None])
+    assert about is not None
+    return move_points(Points(about.states[k : k + 1], about.values[k : k + 1]), x[None])
+
+
+def _hold(one: Decision | None, x: Any, P: Array, where: Any) -> tuple[Any, Array]:
+    """An update with what was decided."""
+    if one is None:
+        return x, P
+    P = P + np.diag(one.added)
+    if not len(one.residual):
+        return x, P
+    PHt, R = P @ one.H.T, np.diag(one.sigma**2)
+    K = np.linalg.solve(one.H @ PHt + R, PHt.T).T
+    M = np.eye(len(P)) - K @ one.H
+    P = M @ P @ M.T + K @ R @ K.T
+    d = -(K @ one.residual)
+    return (x + d if isinstance(x, np.ndarray) else where.plus(x, d)), 0.5 * (P + P.T)
 
 
 def _weights(record: Innovations, lo: int, hi: int) -> tuple[float, float | Array]:

@@ -16,6 +16,7 @@ from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import Points, linearise, linearise_links
 from graphnav.imu.dynamics import SCALE
 
+_FEW = 6  # blocks of rows, which all of them touch
 Values = dict[str, Array]  # parameter name -> (nodes, k)
 Rows = list[tuple[list[tuple[Array, Array]], Array]]  # blocks of (keys, A (N, m, k)), and b (N, m)
 Step = tuple[Array, Values]  # (K, 15) and per parameter
@@ -129,10 +130,24 @@ def whiten(problem: Problem, point: Iterate, layout: Layout) -> Rows:
         H = scale[..., None] * linear.H
         weighted = {p.name: H[:, :, problem.columns[p.name]] for p in rows.parameters}
         blocks = [(rows.keyframe, H[:, :, :DIM])]
-        out.append((blocks + layout.parameter_blocks(rows.keyframe, weighted), -scale * linear.residual))
+        out += _touching(blocks + layout.parameter_blocks(rows.keyframe, weighted), -scale * linear.residual)
     for chain in problem.chains:
         out += _chain_rows(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name])
     return out
+
+
+def _touching(blocks: list[tuple[Array, Array]], b: Array) -> Rows:
+    """Rows of which each touches few of many variables: those of the same ones together, without blocks of zeros."""
+    if len(blocks) <= _FEW:
+        return [(blocks, b)]
+    touched = np.stack([A.any(axis=(1, 2)) for _, A in blocks], -1)
+    touched[~touched.any(axis=1), 0] = True  # a row without weight
+    patterns, of = np.unique(touched, axis=0, return_inverse=True)
+    rows = [np.flatnonzero(of.ravel() == j) for j in range(len(patterns))]
+    return [
+        ([(keys[own], A[own]) for (keys, A), there in zip(blocks, pattern, strict=True) if there], b[own])
+        for own, pattern in zip(rows, patterns, strict=True)
+    ]
 
 
 def cost(problem: Problem, point: Iterate, layout: Layout) -> float:

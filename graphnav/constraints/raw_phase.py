@@ -1,0 +1,170 @@
+"""Carriers against a base station, with an ambiguity for each arc; and what is known of ambiguities as integers.
+
+With what `graphnav.constraints.raw_gnss` says of codes, and N the difference of rover's and base's ambiguity (cycles),
+
+    r_phase   = |s - p_a| + b - m z + T - dt - lambda (phi - N)
+
+b is the same clock as that of the codes. Rows stay one for each satellite and signal rather than differences between
+satellites: sigmas are then independent, a kernel meets one satellite, and none of them is the reference. What receivers
+delay a signal by is in all ambiguities of a system's signal alike; so integers are the differences of two of them,
+
+    r_integer = N_i - N_j - n_ij
+
+(Teunissen and Montenbruck 2017, chapters 21, 23, 26). Rows are against a base: without one there are none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.ambiguities import ambiguities, ambiguity_name
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
+from graphnav.constraints.gnss import LEVER_ARM
+from graphnav.constraints.raw_gnss import CLOCK, IONOSPHERE, _common, _ionosphere, _prepare, _Satellites
+from graphnav.core import rotation
+from graphnav.core.rotation import Array
+from graphnav.core.state import States
+from graphnav.gnss.arcs import find_arcs
+from graphnav.gnss.atmosphere import obliquity
+from graphnav.gnss.sigmas import carrier_difference_sigma
+from graphnav.gnss.signals import GLONASS, L1, C
+from graphnav.gnss.single_point import coefficients, look
+from graphnav.recording import Recording
+
+EXACT = 1e-3  # cycles, 1-sigma of a difference that is known as an integer: a tenth of a carrier's noise
+
+
+@dataclass(frozen=True)
+class GnssPhase(_Satellites):
+    """A satellite's carrier was received by the antenna, and by a base station's."""
+
+    name: ClassVar[str] = "gnss_phase"
+    unit: ClassVar[str] = "m"
+    noise_axes: ClassVar[tuple[str, ...]] = ()
+
+    offset: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, all that does not depend on the estimate
+    nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m
+    slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) of the ionosphere's delay over that at the zenith
+    wavelength: Array = field(default_factory=lambda: np.empty(0))  # (N,) m
+    slot: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index of `slots`
+    arc: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) within the slot
+    slots: tuple[str, ...] = ()  # names of the ambiguities
+    group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (slots,) system and signal; -1: no integers
+    whole: tuple[Array, ...] = ()  # (slots,) of (arcs,) bool: differences are integers, no half cycle is open
+
+    def noise_groups(self) -> tuple[tuple[str, ...], Array]:
+        return (), np.full((len(self), 1), -1)
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        return np.empty(0)  # those of the codes
+
+    @classmethod
+    def build(cls, scene: BuildContext) -> GnssPhase | None:
+        s, raw = scene.settings.raw_gnss, scene.recording.raw_gnss
+        found = scene.share(_prepare) if s.carrier and s.code else None
+        if found is None or raw is None or not np.isfinite(raw.carrier_difference).any():
+            return None
+        arcs = find_arcs(raw, base_arc=raw.base_arc)
+        keyframe = scene.keyframe_at(raw.t)
+        # the epochs of the codes, whose clocks these are; all signals of a satellite
+        used = (arcs.arc >= 0) & ~(raw.cn0 < s.cn0) & np.isin(keyframe, found.keyframe)
+        used &= (raw.t >= scene.t[0] - SAME_TIME) & (raw.t <= scene.t[-1] + SAME_TIME)
+        geometry = look(raw, raw.antenna, coefficients(raw))
+        used &= geometry.elevation >= np.radians(s.elevation)
+        if not used.any():
+            return None
+        wavelength = C / raw.frequency
+        guess = raw.carrier + (raw.carrier_difference - raw.code - raw.difference) / wavelength
+        guess = np.where(np.isfinite(guess), guess, 0.0)
+        own = ambiguities(arcs, guess, wavelength)
+        there = [k for k in sorted(own) if np.any(used & (arcs.slot == k))]
+        place = np.full(len(arcs.names), -1)
+        place[there] = np.arange(len(there))
+        group = arcs.satellite[there].astype(int) // 100 * 1000 + arcs.signal[there]
+        group[arcs.satellite[there] // 100 == GLONASS] = -1  # each satellite has a frequency of its own
+        frame, raw, arc = scene.frame, raw.take(used), arcs.arc[used]
+        geometry = look(raw, raw.antenna, coefficients(raw))
+        common = _common(scene, found)
+        if s.robust == "automatic":
+            common["robust"] = "cauchy"  # for slips that nothing has told of
+        common |= {
+            "keyframe": keyframe[used],
+            "s_n": (geometry.s - frame.r_e) @ frame.R_ne.T,
+            "R_ln": np.empty((int(used.sum()), 0, 0)),
+            "satellite": raw.satellite,
+            "elevation": geometry.elevation,
+            "level": np.zeros(int(used.sum()), dtype=int),
+        }
+        common["parameters"] += (_ionosphere(found.raw, found.spacing), *(own[k] for k in there))
+        known = geometry.distance + geometry.troposphere - geometry.ionosphere
+        return cls(
+            offset=known - wavelength[used] * raw.carrier - raw.carrier_difference - raw.clock,
+            nominal=(raw.antenna - frame.r_e) @ frame.R_ne.T,
+            slant=-obliquity(geometry.elevation) * (L1 / raw.frequency) ** 2,
+            wavelength=wavelength[used],
+            sigma=carrier_difference_sigma(raw.cn0, geometry.elevation, wavelength[used])[:, None],
+            slot=place[arcs.slot[used]],
+            arc=arc,
+            slots=tuple(ambiguity_name(arcs.names[k]) for k in there),
+            group=group,
+            whole=tuple(~arcs.half[k] for k in there),
+            **common,
+        )
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        antenna, lever = self._antenna(states, parameters)
+        away, nominal = self.s_n[rows] - antenna, self.s_n[rows] - self.nominal[rows]
+        moved = antenna - self.nominal[rows]
+        distance, before = np.linalg.norm(away, axis=1), np.linalg.norm(nominal, axis=1)
+        e = away / distance[:, None]
+        nearer = np.sum(moved * (moved - 2.0 * nominal), axis=1) / (distance + before)
+        slant, wavelength, slot = self.slant[rows], self.wavelength[rows], self.slot[rows]
+        residual = nearer + self.offset[rows] + parameters[CLOCK][:, 0] + slant * parameters[IONOSPHERE][:, 0]
+        J = {
+            "theta": (e[:, None] @ states.R_nb) @ rotation.skew(lever),
+            "p": -e[:, None],
+            CLOCK: np.broadcast_to(np.array([[1.0, 0.0]]), (len(e), 1, 2)),
+            IONOSPHERE: slant[:, None, None],
+        }
+        if LEVER_ARM in parameters:
+            J[LEVER_ARM] = -e[:, None] @ states.R_nb
+        for k in np.unique(slot).tolist():
+            name, own = self.slots[k], np.where(slot == k, wavelength, 0.0)
+            residual = residual + own * parameters[name][:, 0]
+            J[name] = own[:, None, None]
+        return Linearized(residual[:, None], J, self.sigma[rows])
+
+
+@dataclass(frozen=True)
+class WholeCycles(Constraint):
+    """Two ambiguities of a signal differ by an integer that has been found (`graphnav.integers`)."""
+
+    name: ClassVar[str] = "gnss_integers"
+    axes: ClassVar[tuple[str, ...]] = ("cycles",)
+    unit: ClassVar[str] = "cycles"
+
+    slots: tuple[str, ...] = ()
+    pair: Array = field(default_factory=lambda: np.empty((0, 2), dtype=int))  # (N, 2) index of `slots`
+    cycles: Array = field(default_factory=lambda: np.empty(0))  # (N,) first less second
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        return np.empty(0)
+
+    @classmethod
+    def build(cls, scene: BuildContext) -> WholeCycles | None:
+        return None  # found from an estimate, not from a recording
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        pair, residual = self.pair[rows], -self.cycles[rows]
+        J = {}
+        for k in np.unique(pair).tolist():
+            sign = (pair[:, 0] == k).astype(float) - (pair[:, 1] == k)
+            residual = residual + sign * parameters[self.slots[k]][:, 0]
+            J[self.slots[k]] = sign[:, None, None]
+        return Linearized(residual[:, None], J, np.full((len(pair), 1), EXACT))

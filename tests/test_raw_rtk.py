@@ -1,0 +1,304 @@
+"""Carriers against a base station: arcs, rows, integers; on a simulated drive, against GTSAM, and on a real drive."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import oracle
+import pytest
+import raw_drive
+from helpers import errors, truth_states
+from test_raw_rows import scene
+
+from graphnav.config import settings_from
+from graphnav.constraints.raw_gnss import CLOCK
+from graphnav.constraints.raw_phase import GnssPhase, WholeCycles
+from graphnav.core import earth
+from graphnav.estimation import fixing
+from graphnav.estimation.fixing import Known
+from graphnav.estimation.pipeline import run
+from graphnav.gnss.arcs import find_arcs
+from graphnav.gnss.atmosphere import NIGHT, directions, klobuchar
+from graphnav.gnss.differential import with_differences
+from graphnav.gnss.ephemeris import EARTH_RATE
+from graphnav.gnss.integers import decorrelate, find_nearest
+from graphnav.gnss.series import RawGnss
+from graphnav.gnss.signals import L1, C
+
+STATED = settings_from({"noise": {"mode": "stated"}})
+WAVELENGTH = C / L1
+AWAY = np.array([1500.0, -2000.0, 60.0])  # m, from the drive's start to the base
+
+
+def cycles_of(satellite):
+    """The integers of the rover's carriers."""
+    return 1000 * (satellite.astype(int) % 97) - 31000
+
+
+def with_carriers(recording, path, noise, seed=3):
+    """Carriers of the rover, and differences by a base station, each with a clock and ambiguities of its own."""
+    raw, rng = recording.raw_gnss, np.random.default_rng(seed)
+    lever = tuple(float(x) for x in recording.gnss.lever_arm)
+    t = recording.gnss.t
+    places = {}
+    for k, name in enumerate(raw_drive.SATELLITES):
+        places[name] = k
+    above = np.array(raw.place)
+    llh = path.point(t, lever)[0]
+    at = np.searchsorted(t, raw.t)
+    azimuth, elevation = directions(earth.llh_to_ecef(llh)[at], raw.p)
+    delay = klobuchar(NIGHT, np.mod(raw.t, 604800.0), llh[at], azimuth, elevation)
+    true = np.empty(len(raw))
+    base = []
+    R = earth.enu_axes(llh[0])
+    position = earth.llh_to_ecef(llh[0]) + AWAY @ R
+    fixed = earth.ecef_to_llh(position)
+    for k, name in enumerate(raw_drive.SATELLITES):
+        own = raw.satellite == raw_drive.satellite_id(name)
+        if not own.any():
+            continue
+        true[own] = raw_drive.observe(lambda at: path.point(at, lever)[0], raw.t[own], above, k)[0]
+        seen, p, v = raw_drive.observe(lambda at: np.tile(fixed, (len(at), 1)), t, above, k)
+        high = directions(np.tile(position, (len(t), 1)), p)
+        of_base = klobuchar(NIGHT, np.mod(t, 604800.0), np.tile(fixed, (len(t), 1)), *high)
+        clock = -70.0 + 0.3 * t
+        base.append((raw.satellite[own][0], seen + clock, of_base, p, v))
+    clock = 150.0 + 1.0 * raw.t - 40.0 * np.cos(0.05 * raw.t)
+    carrier = (true + clock - delay + noise * rng.standard_normal(len(raw))) / WAVELENGTH
+    carrier = carrier + cycles_of(raw.satellite) + np.where(raw.satellite >= 200, 0.3, 0.6)
+    rows = [
+        (when, satellite, seen[i] + of[i], (seen[i] - of[i]) / WAVELENGTH, p[i], v[i])
+        for satellite, seen, of, p, v in base
+        for i, when in enumerate(t)
+    ]
+    rows.sort(key=lambda row: (row[0], row[1]))
+    when, satellite, code, phase, p, v = (np.array(x) for x in zip(*rows, strict=True))
+    n = len(when)
+    of_base = RawGnss(
+        t=when, satellite=satellite.astype(np.int16), signal=np.full(n, raw.signal[0]), code=code,
+        carrier=phase + noise / WAVELENGTH * rng.standard_normal(n), range_rate=np.full(n, np.nan),
+        cn0=np.full(n, 45.0), slip=np.zeros(n, dtype=bool), half=np.zeros(n, dtype=bool), frequency=np.full(n, L1),
+        p=p, v=v, clock=np.zeros(n), drift=np.zeros(n), difference=np.full(n, np.nan), zero=raw.zero,
+        place=tuple(position), troposphere=True,
+    )  # fmt: skip
+    raw, _ = with_differences(replace(raw, carrier=carrier), of_base, position)
+    return replace(recording, raw_gnss=raw), position
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_integers_are_those_that_all_tried_in_turn_find(n):
+    rng = np.random.default_rng(n)
+    for _ in range(20):
+        A = rng.normal(size=(n, n))
+        Q, a = 0.3 * A @ A.T + 1e-4 * np.eye(n), 5.0 * rng.normal(size=n)
+        found = decorrelate(Q)
+        assert abs(round(np.linalg.det(found.Z))) == 1
+        np.testing.assert_allclose(found.Z.T @ Q @ found.Z, found.L.T @ np.diag(found.D) @ found.L, atol=1e-9)
+        nearest = find_nearest(a, found)
+        # no integer farther off in any number can be nearer than the second best
+        reach = np.ceil(np.sqrt(np.diagonal(Q) * nearest.distance_second)).astype(int) + 1
+        grid = np.array(list(itertools.product(*(range(-r, r + 1) for r in reach)))) + np.rint(a)
+        far = np.einsum("ki,ij,kj->k", grid - a, np.linalg.inv(Q), grid - a)
+        order = np.argsort(far)[:2]
+        np.testing.assert_array_equal(grid[order], [nearest.best, nearest.second])
+        np.testing.assert_allclose(far[order], [nearest.distance, nearest.distance_second])
+
+
+def test_what_is_known_of_arcs_holds_however_they_were_joined():
+    rng = np.random.default_rng(0)
+    true = rng.integers(-100, 100, 12)
+    known = Known()
+    for a, b in rng.integers(0, 12, (60, 2)):
+        known.join((int(a), 0), (int(b), 0), int(true[a] - true[b]))
+    known.forget((3, 0))
+    assert known.find((3, 0)) == ((3, 0), 0)
+    others = [k for k in range(12) if k != 3]
+    assert len({known.find((k, 0))[0] for k in others}) == 1
+    of = [known.find((k, 0))[1] for k in others]
+    np.testing.assert_array_equal(np.diff(of), np.diff(true[others]))
+
+
+@pytest.fixture(scope="module")
+def exact():
+    path = oracle.vehicle_path(120.0, lat=-45.0)
+    made, truth = oracle.drive(path, imu_noise=None, gnss_exact=True, gnss_velocity_sd=(0.1, 0.1, 0.1))
+    recording = raw_drive.with_observations(made, path).crop(0.0, 40.0)
+    return *with_carriers(recording, path, 0.0), truth
+
+
+def test_an_arc_ends_at_flags_gaps_half_cycles_and_slips(exact):
+    raw = exact[0].raw_gnss
+    satellites = np.unique(raw.satellite)[:5]
+    epochs, _ = raw.epochs
+    assert all(len(b) == 1 for b in find_arcs(raw, base_arc=raw.base_arc).begins)
+
+    def rows(satellite, at):
+        return (raw.satellite == satellite) & (raw.t >= epochs[at])
+
+    flagged, absent, half, slipped, of_base = satellites
+    carrier, slip, open_half = raw.carrier.copy(), raw.slip.copy(), raw.half.copy()
+    base_arc = raw.base_arc.copy()
+    slip |= rows(flagged, 5) & ~rows(flagged, 6)
+    carrier[rows(absent, 8) & ~rows(absent, 9)] = np.nan
+    open_half |= rows(half, 12)
+    carrier[rows(slipped, 15)] += 0.5  # nobody says so
+    base_arc[rows(of_base, 18)] += 1
+    arcs = find_arcs(replace(raw, carrier=carrier, slip=slip, half=open_half), base_arc=base_arc)
+    begins = dict(zip(arcs.satellite.tolist(), arcs.begins, strict=True))
+    for satellite, at in ((flagged, 5), (absent, 9), (half, 12), (slipped, 15), (of_base, 18)):
+        np.testing.assert_allclose(begins.pop(int(satellite)), epochs[[0, at]])
+    assert arcs.slips == 1
+    assert all(len(b) == 1 for b in begins.values())
+
+
+def true_values(rows, where, raw, given):
+    """Parameters of the truth, up to what all carriers of a signal have in common."""
+    out = {p.name: np.tile(p.initial, (len(given), 1)) for p in rows.parameters if p.begins is None}
+    out[CLOCK] = np.zeros((len(given), 2))
+    satellites = {name: raw_drive.satellite_id(name.split(".")[1]) for name in rows.slots}
+    return out | {name: np.full((len(given), 1), float(cycles_of(np.array([k]))[0])) for name, k in satellites.items()}
+
+
+def test_differences_of_carrier_rows_are_gtsams_double_differences(exact):
+    """With true states and integers both are zero; off them by metres and cycles they stay the same."""
+    recording, position, truth = exact
+    where = scene(recording, STATED)
+    rows, raw = GnssPhase.build(where), recording.raw_gnss
+    frame = where.frame
+    states = truth_states(truth, where.t[rows.keyframe], frame)
+    R_en = frame.R_ne.T
+    values = true_values(rows, where, raw, rows.keyframe)
+    exact_rows = rows.linearize(states, values, slice(None)).residual[:, 0]
+    off = np.array([0.4, -0.7, 0.2])
+    moved = replace(states, p=states.p + off)
+    values[rows.slots[1]] = values[rows.slots[1]] + 3.0
+    linear = rows.linearize(moved, values, slice(None))
+    model = gtsam.noiseModel.Isotropic.Sigma(1, 1.0)
+    seen = 0
+    for k in range(2, where.t.size, 9):
+        own = np.flatnonzero(rows.keyframe == k)
+        own = own[rows.satellite[own] < 200]
+        for i, j in itertools.pairwise(own):
+            assert abs(exact_rows[i] - exact_rows[j]) < 2e-4
+            pose = gtsam.Pose3(gtsam.Rot3(R_en @ moved.R_nb[i]), frame.r_e + R_en @ moved.p[i])
+            meters, sat = [], []
+            for row in (i, j):
+                here = np.flatnonzero((np.abs(raw.t - where.t[k]) < 1e-6) & (raw.satellite == rows.satellite[row]))[0]
+                p = raw.p[here]
+                # the base as our difference has it: what its carrier is off by, against its distance, which GTSAM turns
+                earth_turned = EARTH_RATE / C * (p[0] * position[1] - p[1] * position[0])
+                away = np.linalg.norm(p - position) + earth_turned
+                known = WAVELENGTH * raw.carrier[here] + raw.carrier_difference[here]
+                meters.append((known + delay_of(rows, raw, here, row), away))
+                sat.append(p)
+            factor = gtsam.DoubleDifferenceCarrierPhaseFactorArm(
+                0, 1, 2, meters[0][0], meters[0][1], meters[1][0], meters[1][1], sat[0], sat[1], sat[0], sat[1],
+                position, WAVELENGTH, rows.lever_arm, model,
+            )  # fmt: skip
+            found = gtsam.Values()
+            found.insert(0, pose)
+            for key, row in ((1, i), (2, j)):
+                found.insert(key, float(values[rows.slots[rows.slot[row]]][row, 0]))
+            error = factor.unwhitenedError(found)[0]
+            # GTSAM's is of the target less the reference
+            ours = linear.residual[j, 0] - linear.residual[i, 0]
+            assert abs(error) == pytest.approx(abs(ours), abs=1e-3)
+            seen += 1
+    assert seen > 10
+
+
+def delay_of(rows, raw, here, row):
+    """m, the ionosphere's advance of a carrier at the rover, which GTSAM's has no part of."""
+    one = np.array([here])
+    antenna = raw.antenna[one]
+    azimuth, elevation = directions(antenna, raw.p[one])
+    return float(klobuchar(NIGHT, raw.seconds_of_week[one], earth.ecef_to_llh(antenna), azimuth, elevation)[0])
+
+
+def test_derivatives_are_those_of_differences(exact):
+    recording, _, truth = exact
+    where = scene(recording, STATED)
+    rows = GnssPhase.build(where)
+    pick = np.arange(0, len(rows), 17)
+    states = truth_states(truth, where.t[rows.keyframe[pick]], where.frame)
+    values = true_values(rows, where, recording.raw_gnss, pick)
+    linear = rows.linearize(states, values, pick)
+    h = 1e-4
+    for column, name in enumerate(["theta"] * 3 + ["p"] * 3):
+        step = np.zeros((len(pick), 15))
+        step[:, column] = h
+        ahead, behind = (rows.linearize(states.plus(s * step), values, pick).residual for s in (1.0, -1.0))
+        numeric = (ahead - behind) / (2.0 * h)
+        np.testing.assert_allclose(linear.jacobians[name][:, :, column % 3], numeric, atol=1e-5)
+    for name, J in linear.jacobians.items():
+        if name in values:
+            for i in range(J.shape[2]):
+                off = {**values, name: values[name] + h * (np.arange(J.shape[2]) == i)}
+                numeric = (rows.linearize(states, off, pick).residual - linear.residual) / h
+                np.testing.assert_allclose(J[:, :, i], numeric, atol=1e-5)
+    both = WholeCycles(keyframe=np.zeros(2, dtype=int), slots=("a", "b", "c"), pair=np.array([[0, 1], [2, 0]]),
+                       cycles=np.array([4.0, -1.0]))  # fmt: skip
+    held = both.linearize(states[:2], {"a": np.full((2, 1), 6.0), "b": np.ones((2, 1)), "c": np.ones((2, 1))},
+                          slice(None))  # fmt: skip
+    np.testing.assert_allclose(held.residual[:, 0], [1.0, -4.0])
+    np.testing.assert_allclose(held.jacobians["a"][:, 0, 0], [1.0, -1.0])
+
+
+@pytest.fixture(scope="module")
+def drive():
+    path = oracle.vehicle_path(120.0, 50.0)
+    made, truth = oracle.drive(path, seed=5, gnss_velocity_sd=(0.1, 0.1, 0.1))
+    recording = raw_drive.with_observations(made, path, noise=0.5, seed=2).crop(0.0, 26.0)
+    return with_carriers(recording, path, 0.003)[0], truth
+
+
+def off_by(solution, truth):
+    """m, horizontally, at the epochs with carriers, and which of these are fixed."""
+    off = errors(solution, truth)[0]
+    k = np.searchsorted(solution.t, solution.fixed[:, 0] - 1e-6)
+    return np.linalg.norm(off[k, :2], axis=1), solution.fixed[:, 1] > 0.0
+
+
+def test_every_solver_is_fixed_and_right(drive):
+    recording, truth = drive
+    solutions = run(recording, STATED, ("ekf", "rts", "batch"))
+    for name, one in solutions.items():
+        off, fixed = off_by(one, truth)
+        assert fixed.any(), name
+        assert fixed[np.argmax(fixed) :].all(), name  # what is found is held
+        assert off[fixed].max() < 0.05, name
+    assert off_by(solutions["batch"], truth)[1].all()  # a smoother knows all the time what it knows at the end
+    np.testing.assert_allclose(solutions["rts"].states.p, solutions["batch"].states.p, atol=2e-3)
+    real = run(recording, settings_from({"noise": {"mode": "stated"}, "raw_gnss": {"integers": False}}), ("rts",))
+    off, fixed = off_by(real["rts"], truth)
+    assert not fixed.any()
+    assert np.sqrt(np.mean(off**2)) > 2.0 * np.sqrt(np.mean(off_by(solutions["rts"], truth)[0] ** 2))
+
+
+def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
+    """One number of the first vector that the filter finds is wrong, and nothing is noticed for some epochs."""
+    recording, truth = drive
+    found, noticed = [], fixing._Epochs.odd
+
+    def wrong(a, decorrelated):
+        found.append(find_nearest(a, decorrelated))
+        spoiled = (np.arange(len(a)) == 2) & (len(found) == 1)
+        return replace(found[-1], best=found[-1].best + spoiled)
+
+    monkeypatch.setattr(fixing, "find_nearest", wrong)
+    begin = recording.raw_gnss.t[0]
+    until = begin + 13.0
+    monkeypatch.setattr(
+        fixing._Epochs, "odd", lambda self, k, *rest: [] if self.time[k] < until else noticed(self, k, *rest)
+    )
+    one = run(recording, STATED, ("ekf",))["ekf"]
+    off, fixed = off_by(one, truth)
+    t = one.fixed[:, 0]
+    assert off[(t < until) & fixed].max() > 0.1
+    late = t > until + 6.0
+    assert not fixed[t > until].all()
+    assert fixed[-1]
+    assert off[late & fixed].max() < 0.05
