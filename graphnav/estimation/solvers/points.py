@@ -141,15 +141,17 @@ class AtPoints:
         self._Q[:, :3] = turned @ self._Q[:, :3]
         self._Q[:, :, :3] = self._Q[:, :, :3] @ np.swapaxes(turned, -1, -2)
         self._speed = np.linalg.norm(points.states.v, axis=1)
-        self._r, self._sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
-        self._H = np.zeros((n, stack.M, D))
+        self.r, self._sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
+        self.H = np.zeros((n, stack.M, D))
         for rows in problem.constraints:
             at_k = rows.keyframe[: int(np.searchsorted(rows.keyframe, n))]
             if len(at_k):
                 linear = linearise(rows, points, columns, slice(0, len(at_k)))
                 place = at_k[:, None], stack.places[rows.name][1][: len(at_k)]
-                self._r[place], self._sigma[place] = linear.residual, linear.stated
-                self._H[place] = linear.H
+                self.r[place], self._sigma[place] = linear.residual, linear.stated
+                self.H[place] = linear.H
+        with np.errstate(divide="ignore"):
+            self.variance = (self._sigma / stack.root_weight[:n]) ** 2
 
     def step(self, k: int, x: Array) -> tuple[Array, Array, Array, Array | None]:
         """As `AtEstimate.step`, of error states (D,)."""
@@ -159,7 +161,7 @@ class AtPoints:
     def rows(self, some: RowBlock, at: None) -> Rows:
         """As `AtEstimate.rows`, linearised at the points."""
         at_k = some.at
-        return self._r[at_k], self._H[at_k], self._sigma[at_k]
+        return self.r[at_k], self.H[at_k], self._sigma[at_k]
 
     @staticmethod
     def about(x: Array) -> tuple[None, Array]:
