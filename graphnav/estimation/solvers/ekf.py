@@ -46,6 +46,7 @@ from graphnav.estimation.solvers.passes import (
     join_passes,
     move_points,
     parameters_of,
+    sigmas_of,
 )
 from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate, move_covariance
 from graphnav.estimation.solvers.robust import PASSES, soften, weight_and_cost
@@ -90,7 +91,7 @@ def ekf(
         t=problem.t,
         states=filtered,
         covariance=P,
-        parameters=parameters_of(problem, one.values, one.P),
+        parameters=parameters_of(problem, one.values, sigmas_of(one.P)),
         records={name: r.record(problem) for name, r in one.records.items()},
         counts={"imu": K - 1, **{rows.name: len(rows) for rows in problem.constraints}},
         iterations=1,

@@ -13,12 +13,13 @@ import numpy as np
 
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.incremental import Replay, node_steps, replay
+from graphnav.estimation.solvers.incremental import Replay, begin_at, replay
+from graphnav.estimation.solvers.linearise import node_steps
 from graphnav.estimation.solvers.passes import Progress
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.tree import Tree
 from graphnav.estimation.solvers.tree_marginals import newest_covariance, smooth_keyframes
-from graphnav.estimation.solvers.window import SettledStates, first_message, turn_limit
+from graphnav.estimation.solvers.window import SettledStates, turn_limit
 
 _SKIP = 10  # keyframes between two looks at what has moved, as GTSAM's relinearizeSkip
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long, as in the window
@@ -41,12 +42,7 @@ def isam2(
     """
     began = time.perf_counter()
     K, steps = len(problem.t), node_steps(problem)
-    mean = problem.prior.mean
-    assert mean is not None
-    prior = first_message(mean, problem.prior.sigma[0])
-    if start is not None:
-        prior = prior.moved(start.minus(mean)[0])
-    tree = Tree(prior, turn_limit(problem.imu_noise))
+    tree = Tree(begin_at(problem, start), turn_limit(problem.imu_noise))
     settled: list[SettledStates] = []
     live, P, values = [], np.empty((K, DIM, DIM)), []
     seconds = np.empty(K)

@@ -20,8 +20,8 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.linearise import Points, linearise, shift, stepping
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.linearise import Points, Step, linearise, node_steps, shift, stepping
 from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.imu.dynamics import SCALE
 
@@ -45,14 +45,8 @@ class AtEstimate:
         self._I = np.eye(self._width)
 
     @cached_property
-    def _steps(self) -> dict[int, list[tuple[slice, ParameterChain, int]]]:
-        """At keyframes where a parameter moves on to its next node: its columns, its chain and that node."""
-        out: dict[int, list[tuple[slice, ParameterChain, int]]] = {}
-        for chain in self._problem.chains:
-            at = self._columns[chain.parameter.name]
-            for k in stepping(chain).tolist():
-                out.setdefault(k, []).append((at, chain, int(chain.node[k])))
-        return out
+    def _steps(self) -> dict[int, tuple[Step, ...]]:
+        return node_steps(self._problem)
 
     def step(self, k: int, x: Estimate) -> tuple[Estimate, Array, Array, Array | None]:
         """The estimate at keyframe k from that at the one before, F (D, D), Q (15, 15), and more variance (D,)."""
@@ -65,11 +59,11 @@ class AtEstimate:
         values, added = x.values, None
         if k in self._steps:
             values, added = values.copy(), np.zeros(self._width)
-            for column, chain, j in self._steps[k]:
-                F[column, column] *= chain.decay[j]
-                own = shift(column)
-                values[own] = chain.mean[j] + chain.decay[j] * (values[own] - chain.mean[j - 1])
-                added[column] = chain.sigma[j] ** 2
+            for one in self._steps[k]:
+                column = self._columns[one.name]
+                F[column, column] *= one.decay
+                values[shift(column)] = one.ahead(values[shift(column)])
+                added[column] = one.sigma**2
         return Estimate(ahead, values), F, motion.noise(at, x.state.R_nb)[0], added
 
     def rows(self, some: RowBlock, at: Estimate) -> Rows:

@@ -35,6 +35,7 @@ from graphnav.estimation.solvers.passes import (
     move_points,
     parameters_of,
     residual_record,
+    sigmas_of,
 )
 
 _BLOCK = 32  # keyframes whose covariances stay in a processor's cache
@@ -133,7 +134,7 @@ def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None
         t=problem.t,
         states=smoothed,
         covariance=all_P[:, :DIM, :DIM],
-        parameters=parameters_of(problem, all_values, all_P),
+        parameters=parameters_of(problem, all_values, sigmas_of(all_P)),
         records=records,
         counts=forward.solution.counts,
         iterations=1,

@@ -95,7 +95,7 @@ class Stack:
         self._root, self._solved = np.zeros((K, self.M, self.M)), np.zeros((K, self.M))
 
     def together(self, k: int, one_by_one: bool = False) -> Iterator[RowBlock]:
-        """All rows of a keyframe, in the order of the constraints; each kind by itself if they are wanted one by one."""
+        """All rows of a keyframe, in the order of the constraints; each kind by itself if wanted so."""
         here = zip(self._constraints, self._first, range(len(self._first)), strict=True)
         parts = [(c, first[k], first[k + 1], i) for c, first, i in here if first[k] < first[k + 1]]
         if not one_by_one and not self._apart[k]:
