@@ -18,6 +18,7 @@ ROOMS = [
     "simulation", "wheels", "checks_imu", "checks_stated", "checks_aiding", "checks_raw", "plausibility_gnss",
     "plausibility_odometer", "plausibility", "checks", "detectors", "samples", "noise_model",
     "preintegration", "own_noise", "unresolved", "clipping", "dynamics", "constraints", "problem", "solution", "stops",
+    "long_drives",
     "alignment", "dense", "solvers", "faults", "noise", "onboard_offset", "preparation", "pipeline", "lever_arm",
     "interpolation", "metrics", "sigmas", "gates", "fitted", "scoring", "strides", "evaluation", "against", "exporters",
     "online",

@@ -199,8 +199,8 @@ class Recording:
         return replace(self, **parts)
 
 
-def rows_of(sensor: Any, mask: NDArray[np.bool_]) -> Any:
-    """A sensor with only the rows of `mask`."""
+def rows_of(sensor: Any, mask: NDArray[np.bool_] | slice) -> Any:
+    """A sensor with only the rows of `mask`; views of them where that is a slice."""
     parts = {
         key: value[mask]
         for key, value in sensor.__dict__.items()
