@@ -27,7 +27,7 @@ from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import linearise
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, values_of
 
-_BLOCK = 64  # keyframes whose covariances stay in a processor's cache
+_BLOCK = 64  # keyframes whose covariances stay in a processor cache
 
 
 @dataclass(frozen=True)

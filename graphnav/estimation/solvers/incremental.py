@@ -8,6 +8,7 @@ came before, and keyframes older than the lag settle, each with at least the lag
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -87,27 +88,17 @@ def incremental(
     start : one state to begin at, where that is not the prior's mean.
     """
     began = time.perf_counter()
-    K = len(problem.t)
     solver = Incremental(Window(begin_at(problem, start), turn_limit(problem.imu_noise)), lag)
-    steps = node_steps(problem)
-    live, live_P, live_values = [], np.empty((K, DIM, DIM)), []
-    seconds = np.empty(K)
-    for k in range(K):
-        before = time.process_time()
-        solver.add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
+
+    def add(place: Place) -> tuple[Message, Array]:
+        solver.add(place)
         newest = solver.window.newest
-        live.append(newest.state)
-        live_P[k] = newest.covariance[:DIM, :DIM]
-        live_values.append(newest.values)
-        seconds[k] = time.process_time() - before
-        if progress is not None and k % 64 == 0:
-            progress("incremental", k / K)
+        return newest, newest.covariance[:DIM, :DIM]
+
+    live = replay(problem, "incremental", add, progress)
     solver.finish()
     spent = time.perf_counter() - began
-    live_states, values = States.stack(live), np.array(live_values)
-    found = replay(problem, "incremental", solver.settled, live_states, live_P, values, seconds, spent, lag)
-    notes = (*found.settled.notes, f"{solver.window.relinearized} were linearised again")
-    return replace(found, settled=replace(found.settled, notes=notes))
+    return replay(problem, "incremental", solver.settled, live, solver.window.relinearized, spent, lag)
 
 
 def begin_at(problem: Problem, start: States | None) -> Message:
@@ -117,25 +108,46 @@ def begin_at(problem: Problem, start: States | None) -> Message:
     return message if start is None else message.moved(start.minus(problem.prior.mean)[0])
 
 
+@dataclass(frozen=True)
+class Live:
+    """Each keyframe as it was known when it had come, and the process time that it took."""
+
+    states: States
+    P: Array  # (K, 15, 15)
+    values: Array  # (K, D-15)
+    seconds: Array  # (K,)
+
+
 def replay(
-    problem: Problem,
-    solver: str,
-    parts: list[SettledStates],
-    live: States,
-    live_P: Array,
-    live_values: Array,
-    seconds: Array,
-    spent: float,
-    lag: float,
+    problem: Problem, solver: str, add: Callable[[Place], tuple[Message, Array]], progress: Progress | None
+) -> Live:
+    """Have all keyframes of a problem added in turn.
+
+    `add` gives the newest keyframe as it is known then, and the covariance (15, 15) of its state.
+    """
+    K, steps = len(problem.t), node_steps(problem)
+    states, values, P, seconds = [], [], np.empty((K, DIM, DIM)), np.empty(K)
+    for k in range(K):
+        before = time.process_time()
+        newest, P[k] = add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
+        states.append(newest.state)
+        values.append(newest.values)
+        seconds[k] = time.process_time() - before
+        if progress is not None and k % 64 == 0:
+            progress(solver, k / K)
+    return Live(States.stack(states), P, np.array(values), seconds)
+
+
+def replay(
+    problem: Problem, solver: str, parts: list[SettledStates], live: Live, again: int, spent: float, lag: float
 ) -> Replay:
     """What an incremental solver has found, as solutions.
 
     Parameters
     ----------
     parts : what settled, in turn.
-    live, live_P, live_values : (K,), (K, 15, 15) and (K, D-15) as known when each keyframe had come.
-    seconds, spent : (K,) s of process time, and s in all.
-    lag : s
+    again : how many keyframes were linearised again.
+    spent, lag : s
     """
     columns, K = parts[-1].columns[-1], len(problem.t)
     states = States.stack([part.states for part in parts])
@@ -160,20 +172,24 @@ def replay(
         cost=cost_at(problem, points),
         stopped=f"every keyframe settled with {whole}",
         timings={solver: spent},
-        notes=(*problem.notes, describe(seconds) if np.isinf(lag) else f"lag {lag:g} s: {describe(seconds)}"),
+        notes=(
+            *problem.notes,
+            ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe(live.seconds),
+            f"{again} keyframes were linearised again",
+        ),
         between=(dense(problem, states, covariance, scale_at(problem.columns, values), smooth=True),),
     )
     now = replace(
         settled,
         solver="live",
-        states=live,
-        covariance=live_P,
+        states=live.states,
+        covariance=live.P,
         parameters={},
         records={},
         stopped="each keyframe as it was known when it came",
-        between=(dense(problem, live, live_P, scale_at(problem.columns, live_values[:, order]), smooth=False),),
+        between=(dense(problem, live.states, live.P, scale_at(problem.columns, live.values[:, order]), smooth=False),),
     )
-    return Replay(settled, now, seconds)
+    return Replay(settled, now, live.seconds)
 
 
 def _robust(window: Window) -> bool:
