@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from graphnav import load
 from graphnav.config import Settings
 from graphnav.estimation import long_drives
 from graphnav.estimation.pipeline import run
+from graphnav.recording import rows_of
 
 DEMO = Path(__file__).resolve().parents[1] / "data" / "tokyo"
 
@@ -27,6 +29,12 @@ def test_parts_say_what_the_whole_says(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(shares) == 3
     assert all(a.end == b.start for a, b in itertools.pairwise(shares))
     assert all(np.shares_memory(share.recording.imu.gyro, recording.imu.gyro) for share in shares)
+    assert len(long_drives.shares(replace(recording, gnss=None))) == 1
+    seam = shares[1].start
+    assert recording.gnss is not None
+    silent = rows_of(recording.gnss, (recording.gnss.t < seam - 25.0) | (recording.gnss.t > seam))
+    monkeypatch.setattr(long_drives, "_SILENCE", 20.0)
+    assert [share.start for share in long_drives.shares(replace(recording, gnss=silent))[1:]] == [shares[2].start]
     parts = run(recording, settings, ("ekf", "rts"))
     assert any("3 parts" in note for note in parts["rts"].notes)
     seams = np.array([share.start for share in shares[1:]])

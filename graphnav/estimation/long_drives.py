@@ -3,7 +3,8 @@
 A pass of the filter keeps some twenty matrices of the error state for every keyframe until the smoother has used them,
 nearly a gigabyte an hour. So a recording of more than a few hours is cut into equal parts. Each is solved with what
 comes before and after it for as long as that has a say, from an alignment and with noise figures of its own; what it
-says of its own span stands.
+says of its own span stands. Nothing is cut where the fixes before do not tell a filter that begins there its place and
+its heading: in outages, at long halts, and without a receiver.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphnav.core.earth import A
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.detectors.base import Detection
@@ -25,6 +27,9 @@ PART = 3_600.0  # s, at most, of a part: the estimation of noise has enough keyf
 OVERLAP = (
     600.0  # s: what inertial sensors knew ten minutes ago says little (`graphnav.estimation.solvers.watch.LONGEST`)
 )
+
+_SILENCE = 60.0  # s between fixes, after which inertial sensors of any grade have begun to drift
+_COURSE = 0.01  # rad, of a heading that is told: half its square is nothing beside what sensors know
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,7 @@ def shares(recording: Recording) -> list[Share]:
     if length <= STRAIGHT:
         return [Share(recording, -np.inf, np.inf)]
     edges = np.linspace(0.0, length, int(np.ceil(length / PART)) + 1)
+    edges = np.array([0.0, *(edge for edge in edges[1:-1] if _is_told(recording, begin + edge)), length])
     out = []
     for k, (lo, hi) in enumerate(itertools.pairwise(edges)):
         first, last = max(lo - OVERLAP, 0.0), min(hi + OVERLAP, length)
@@ -52,6 +58,19 @@ def shares(recording: Recording) -> list[Share]:
         start = -np.inf if k == 0 else begin + lo
         out.append(Share(part, start, np.inf if k == len(edges) - 2 else begin + hi))
     return out
+
+
+def _is_told(recording: Recording, t: float) -> bool:
+    """Whether fixes come all through the overlap before a time (s), and their course tells the heading."""
+    gnss = recording.gnss
+    if gnss is None:
+        return False
+    some = (gnss.t >= t - OVERLAP) & (gnss.t <= t) & np.isfinite(gnss.llh).all(axis=1)
+    if np.max(np.diff([t - OVERLAP, *gnss.t[some], t])) > _SILENCE:
+        return False
+    llh = gnss.llh[some]
+    way = A * np.ptp(llh[:, :2] * [1.0, np.cos(llh[0, 0])], axis=0)
+    return bool(np.hypot(*way) * _COURSE > np.median(np.hypot(*gnss.sd[some, :2].T)))
 
 
 @dataclass(frozen=True)
