@@ -2,10 +2,11 @@
 
 The drives are exact laps of python-ins (see tests/oracle_path.py; the package's `dev` extra has it) with the errors
 of a MEMS unit, fixes of 2 cm at 1 Hz with three 60-s outages an hour, and wheel speed. They are real recording
-folders, so reading them counts. Every run is a process of its own, and its time and memory are what the operating
-system says they were.
+folders, so reading them counts. Those of more than three hours are solved in parts
+(`graphnav.estimation.long_drives`). Every run
+is a process of its own, and its time and memory are what the operating system says they were.
 
-    python scripts/benchmark.py --hours 0.1667,1,4,12 --keep build/benchmark
+    python scripts/benchmark.py --hours 0.1667,1,4,12,24 --keep build/benchmark
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ LAP = 3600.0  # s; longer drives repeat a lap of this length
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--hours", default="0.1667,1,4,12", help="lengths of the drives, comma separated (%(default)s)")
+    parser.add_argument("--hours", default="0.1667,1,4,12,24", help="lengths of the drives (%(default)s)")
     parser.add_argument("--solvers", default="ekf,rts,batch", help="as in graphnav compare (%(default)s)")
     parser.add_argument("--repeat", type=int, default=1, metavar="N", help="runs of each length; the fastest counts")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep drives and results here and use them again")

@@ -24,9 +24,10 @@ from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.incremental import Incremental, incremental, node_steps
+from graphnav.estimation.solvers.incremental import Incremental, incremental
+from graphnav.estimation.solvers.linearise import Step, node_steps
 from graphnav.estimation.solvers.rts import backward
-from graphnav.estimation.solvers.stages import Message, Place, Step, rotate_columns
+from graphnav.estimation.solvers.stages import Message, Place, rotate_columns
 from graphnav.estimation.solvers.window import Window, first_message
 from graphnav.recording import Recording
 from graphnav.recording.formats import read

@@ -19,8 +19,9 @@ from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.incremental import incremental, node_steps
+from graphnav.estimation.solvers.incremental import incremental
 from graphnav.estimation.solvers.isam import isam2
+from graphnav.estimation.solvers.linearise import node_steps
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.tree import Tree

@@ -69,7 +69,7 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed:
         axis=1,
     )
     points = Points(smoothed.states.plus(off), smoothed.values)
-    K, D, n = len(posed.t), DIM + points.values.shape[1], len(posed.constraints)
+    K, D = len(posed.t), DIM + points.values.shape[1]
     stack = Stack(posed, K)
     given, own = AtPoints(posed, points, stack, np.empty((K - 1, D, D))), AtEstimate(posed)
 
@@ -84,7 +84,7 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed:
 
         np.testing.assert_allclose(linear[0], ahead(np.zeros(D)), atol=1e-9)
         np.testing.assert_allclose(linear[1], derivative(ahead, D), atol=2e-5, rtol=1e-4)
-        for some in stack.together(k, [True] * n):
+        for some in stack.together(k, one_by_one=True):
             r, H, sigma = given.rows(some, None)
             mine, H_own, sigma_own = own.rows(some, here(k, np.zeros(D)))
             np.testing.assert_allclose(r, mine, atol=1e-9)

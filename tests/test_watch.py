@@ -16,7 +16,7 @@ from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers import watch
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.incremental import node_steps
+from graphnav.estimation.solvers.linearise import node_steps
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.watch import Bank
 from graphnav.estimation.solvers.window import Window, first_message

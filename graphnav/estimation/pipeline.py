@@ -24,6 +24,7 @@ from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation import faults
+from graphnav.estimation.long_drives import OVERLAP, shares, within
 from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe_far
@@ -122,15 +123,19 @@ def _run(
     pieces, notes = _pieces(recording, settings)
     notes = [*said, *notes]
     found: list[dict[str, Solution]] = []
-    for piece in pieces:
+    parts = [share for piece in pieces for share in shares(piece)]
+    if len(parts) > len(pieces):
+        notes.append(f"too long to be solved at once: solved in {len(parts)} parts that overlap by {OVERLAP:.0f} s")
+    for part in parts:
         try:
             # matrices here have thirty rows: threads for them cost more than the work, twenty times on a busy machine
             with threadpool_limits(limits=1, user_api="blas"):
-                found.append(_solve_with_retry(piece, settings, frame, solvers, progress, noise))
+                solved = _solve_with_retry(part.recording, settings, frame, solvers, progress, noise)
+            found.append({name: within(one, part) for name, one in solved.items()})
         except EstimationError as error:
-            if len(pieces) == 1:
+            if len(parts) == 1:
                 raise
-            notes.append(Note("pieces.left_out", f"{_span(recording, piece)} left out: {error}"))
+            notes.append(Note("pieces.left_out", f"{_span(recording, part.recording)} left out: {error}"))
     if not found:
         raise EstimationError(f"'{recording.name}': no piece between its IMU gaps can be solved")
     return {name: join_solutions([one[name] for one in found], tuple(notes)) for name in solvers}

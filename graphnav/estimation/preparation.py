@@ -174,6 +174,9 @@ def prepare(
         if _explains_more(base, plain, best):
             noise, known = plain, None
         noise = replace(noise, spacing=spacing)
+        # of what the estimation has left only its points are wanted any more: the rest is half of all memory
+        known = known and Points(known.states, known.values)
+        del best
         booked("noise", since)
     else:
         aligned, detections, changed = without_wrong(noise)

@@ -21,7 +21,8 @@ from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.stages import Place, Step
+from graphnav.estimation.solvers.linearise import Step
+from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.tree_window import TreeWindow
 from graphnav.estimation.solvers.watch import Verdicts, Watch
 from graphnav.estimation.solvers.window import Message, SettledStates, Window

@@ -267,7 +267,7 @@ def sources() -> tuple[str, ...]:
     return ("gnss", "odometer", *registered())
 
 
-def rows_of(sensor: Any, mask: NDArray[np.bool_]) -> Any:
+def rows_of(sensor: Any, mask: NDArray[np.bool_] | slice) -> Any:
     """Some rows of a sensor.
 
     Parameters
@@ -275,7 +275,7 @@ def rows_of(sensor: Any, mask: NDArray[np.bool_]) -> Any:
     sensor
         An `Imu`, `Gnss`, `Odometer` or the like.
     mask
-        (N,) bool, which rows.
+        (N,) bool, which rows; or a slice, and its arrays are views.
 
     Returns
     -------

@@ -27,6 +27,8 @@ from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import linearise
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, values_of
 
+_BLOCK = 64  # keyframes whose covariances stay in a processor cache
+
 
 @dataclass(frozen=True)
 class RowMoments:
@@ -92,9 +94,13 @@ def lag_moments(
     own = slice(at.start - DIM, at.stop - DIM)
     k = np.flatnonzero(np.diff(chain.node[:end])) + 1
     # Cov(x_k-1, x_k) = P_k-1 F^T P-_k^-1 P^s_k = P_k-1 F^T (I - N P-_k), of the columns of the process
-    ahead = forward.P[k - 1][:, at] @ np.swapaxes(forward.F[k - 1], -1, -2)
-    rest = np.eye(ahead.shape[-1])[:, at] - smoothed.N[k] @ forward.P_predicted[k][:, :, at]
-    cross = np.einsum("kid,kdi->ki", ahead, rest)
+    cross = np.empty((len(k), at.stop - at.start))
+    one = np.eye(forward.P.shape[-1])[:, at]
+    for lo in range(0, len(k), _BLOCK):
+        some = k[lo : lo + _BLOCK]
+        ahead = forward.P[some - 1, at] @ np.swapaxes(forward.F[some - 1], -1, -2)
+        rest = one - smoothed.N[some] @ forward.P_predicted[some, :, at]
+        cross[lo : lo + _BLOCK] = np.einsum("kid,kdi->ki", ahead, rest)
     c0, c1 = smoothed.values[k - 1, own], smoothed.values[k, own]
     v0, v1 = (np.diagonal(smoothed.P[j][:, at, at], axis1=-2, axis2=-1) for j in (k - 1, k))
     dt = np.diff(chain.t)[chain.node[k] - 1]

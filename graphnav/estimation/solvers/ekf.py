@@ -48,6 +48,7 @@ from graphnav.estimation.solvers.passes import (
     join_passes,
     move_points,
     parameters_of,
+    sigmas_of,
 )
 from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate, move_covariance
 from graphnav.estimation.solvers.robust import PASSES, soften, weight_and_cost
@@ -107,7 +108,7 @@ def ekf(
         t=problem.t,
         states=filtered,
         covariance=P,
-        parameters=parameters_of(problem, one.values, one.P),
+        parameters=parameters_of(problem, one.values, sigmas_of(one.P)),
         records={name: r.record(problem) for name, r in one.records.items()},
         counts={"imu": K - 1, **{rows.name: len(rows) for rows in problem.constraints}},
         iterations=1,
@@ -142,7 +143,9 @@ def _forward(
     n = 0 if about is None else len(about.values)
     D = DIM + sum(c.parameter.size for c in problem.chains)
     all_P, all_Pp, all_F = np.empty((K, D, D)), np.empty((K, D, D)), np.empty((K - 1, D, D))
-    stack, own = Stack(problem, K), AtEstimate(problem)
+    fixes = [c for c in problem.constraints if watch and c.fix_of]
+    decided = {c.name for c in problem.constraints if c.gate is not None or c.robust != "none"}
+    stack, own = Stack(problem, K, decided.union(c.name for c in fixes)), AtEstimate(problem)
     given = None if about is None else AtPoints(problem, about, stack, all_F)
     state = problem.prior.mean
     assert state is not None
@@ -151,10 +154,7 @@ def _forward(
         x = own.minus(x, _one(about, 0))
     P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
     records = stack.records
-    fixes = [c for c in problem.constraints if watch and c.fix_of]
     watched = [c for c in fixes if c.watched]
-    alone = [c.gate is not None or c.robust != "none" or any(c is one for one in fixes) for c in problem.constraints]
-    one_by_one = [True] * len(alone)  # each linearised where those before it have led
     bank = Bank(watched, problem.t, D) if watched else None
     banks: dict[int, Bank] = {}  # as they were before the latest keyframes with fixes
     met = {int(k) for c in watched for k in c.keyframe}
@@ -176,7 +176,7 @@ def _forward(
             x, F, Q, added = where.step(k, x)
             if where is own:
                 all_F[k - 1] = F
-            P = F @ P @ F.T
+            P = np.matmul(F @ P, F.T, out=all_Pp[k])
             P[:DIM, :DIM] += Q
             if bank is not None:
                 bank.predicted(F)
@@ -190,7 +190,15 @@ def _forward(
         taken: list[Gain] | None = None
         if k < n:
             taken = gains[k] = []
-        for some in stack.together(k, one_by_one if where is own else alone):
+        # at its own estimate, each kind is linearised where those before it have led
+        for some in stack.together(k, one_by_one=where is own):
+            if not some.alone:
+                assert given is not None
+                x, P, gain = _update_all(some, x, P, given, stack)
+                gains[k].append(gain)
+                if bank is not None:
+                    bank.taken(gain[0], gain[1])
+                continue
             x, P, fault = _update(some, x, P, where, stack, bank, taken)
             if fault is not None:
                 again = verdicts.settle(some.parts[0][0].name, fault, float(problem.t[k]))
@@ -262,14 +270,26 @@ def _points(about: Points | None, errors: Array, own: list[Estimate]) -> Points:
     return join_passes(parts)
 
 
+def _update_all(some: RowBlock, e: Array, P: Array, given: AtPoints, stack: Stack) -> tuple[Array, Array, Gain]:
+    """One update with rows linearised at given points about which nothing is to be decided."""
+    D, at = len(P), some.at
+    H, variance = given.H[at], given.variance[at]
+    r, PHt = given.r[at] + H @ e, P @ H.T
+    root, solved = _solve(H @ PHt, variance, np.concatenate([r[None], PHt, H.T]).T, some)
+    stack.seen(some, root, solved[:, 0])
+    K = solved[:, 1 : D + 1].T
+    gain = K, H, -solved[:, 0], solved[:, D + 1 :]
+    return e - K @ r, _joseph(P, PHt, H, K, variance), gain
+
+
 def _update(
     some: RowBlock, x: Any, P: Array, where: Any, stack: Stack, bank: Bank | None, taken: list[Gain] | None
 ) -> tuple[Any, Array, float | None]:
-    """One measurement update, added to what the keyframe has taken in; when a fault began comes last."""
+    """One update with rows of one kind, added to what the keyframe has taken in; when a fault began comes last."""
     D, (rows, lo, hi) = len(P), some.parts[0]
     end = D + 1 if taken is None else 2 * D + 1
     record = stack.records[rows.name]
-    weight, root_weight = _weights(record, lo, hi) if some.alone else (1.0, stack.root_weight[some.at])
+    weight, root_weight = _weights(record, lo, hi)
     tests = bank if bank is not None and weight > 0.0 and rows.name in bank else None
     at, e = where.about(x)
     for left in range(where.passes(some) - 1, -1, -1):
@@ -278,37 +298,32 @@ def _update(
         PHt = P @ H.T
         HPHt = H @ PHt
         right = [r[None], PHt] if taken is None else [r[None], PHt, H.T]
-        if some.alone and not left and tests is not None:
+        if not left and tests is not None:
             G = tests.signature(rows.name, some.k, H)
             right.append(tests.own(rows.name, G).T)
         sides = np.concatenate(right).T
-        root, solved = _solve(HPHt, sigma, sides, some)
+        root, solved = _solve(HPHt, sigma * sigma, sides, some)
         if not left:
             stack.seen(some, root, solved[:, 0])
-            if some.alone:
-                nis, bent = float(r @ solved[:, 0]), 1.0
-                if rows.robust != "none" and rows.gate is None:  # a gate stands in place of a kernel
-                    sigma, solved, bent = _robust(HPHt, sigma, sides, solved, some)
+            nis, bent = float(r @ solved[:, 0]), 1.0
+            if rows.robust != "none" and rows.gate is None:  # a gate stands in place of a kernel
+                sigma, solved, bent = _robust(HPHt, sigma, sides, solved, some)
         K = solved[:, 1 : D + 1].T
         d = -(K @ r) if e is None else e - K @ r
         if left:  # again about where this leads (Jazwinski 1970, theorem 8.2)
             at = where.plus(at, d)
             e = where.minus(x, at)
-    if some.alone:
-        refused = rows.gate is not None and nis > rows.gate**2
-        weight = 0.0 if refused else weight * bent
-        record.weight[lo:hi] = weight if hi - lo == 1 else record.used[lo:hi] * (0.0 if refused else bent)
-        record.refused[lo:hi] = refused
-        if bank is not None:
-            bank.seen(rows.name, some.k, nis, weight > 0.0)
-        if weight == 0.0:
-            return x, P, None
+    refused = rows.gate is not None and nis > rows.gate**2
+    weight = 0.0 if refused else weight * bent
+    record.weight[lo:hi] = weight if hi - lo == 1 else record.used[lo:hi] * (0.0 if refused else bent)
+    record.refused[lo:hi] = refused
+    if bank is not None:
+        bank.seen(rows.name, some.k, nis, weight > 0.0)
+    if weight == 0.0:
+        return x, P, None
     if taken is not None:
         taken.append((K, H, -solved[:, 0], solved[:, D + 1 : end]))
-    # Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T
-    P = P - K @ PHt.T
-    P = P - (P @ H.T - K * (sigma * sigma)) @ K.T
-    P = 0.5 * (P + P.T)  # rounding's asymmetry would grow, past what a stop leaves between its place and the state
+    P = _joseph(P, PHt, H, K, sigma * sigma)
     fault = None
     if tests is not None:
         fault = tests.updated(rows.name, K, G, solved[:, end:], r, where.speed(some.k, x))
@@ -349,10 +364,20 @@ def _weights(record: Innovations, lo: int, hi: int) -> tuple[float, float | Arra
     return weight, np.repeat(np.sqrt(np.maximum(used, _NONE)), len(record.rows.axes))
 
 
-def _solve(HPHt: Array, sigma: Array, right: Array, some: RowBlock) -> tuple[Array, Array]:
+def _joseph(P: Array, PHt: Array, H: Array, K: Array, variance: Array) -> Array:
+    """The covariance after an update, by Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T."""
+    out = K @ PHt.T
+    np.subtract(P, out, out=out)
+    out -= (out @ H.T - K * variance) @ K.T
+    out = out + out.T  # rounding's asymmetry would grow, past what a stop leaves between its place and the state
+    out *= 0.5
+    return out
+
+
+def _solve(HPHt: Array, variance: Array, right: Array, some: RowBlock) -> tuple[Array, Array]:
     """The upper root of S = H P H^T + R, and S^-1 times the right sides."""
     S = HPHt.copy()
-    S.flat[:: len(S) + 1] += sigma * sigma
+    S.flat[:: len(S) + 1] += variance
     # LAPACK called directly: for matrices this small the checks around it would cost more than the work
     root, solved, info = dposv(S.T, right, overwrite_a=1)
     if info:
@@ -373,5 +398,5 @@ def _robust(HPHt: Array, sigma: Array, right: Array, solved: Array, some: RowBlo
         s = np.linalg.norm(left.reshape(hi - lo, -1), axis=1)
         weight = np.maximum(weight_and_cost(soften(rows.robust), s, rows.scale_of(slice(lo, hi)))[0], 1e-12)
         sigma = stated / np.repeat(np.sqrt(weight), len(stated) // (hi - lo))
-        _, solved = _solve(HPHt, sigma, right, some)
+        _, solved = _solve(HPHt, sigma * sigma, right, some)
     return sigma, solved, float(np.min(weight))

@@ -99,12 +99,12 @@ def predict(
         k = len(step.mean)
         own, diagonal, value = np.arange(row, row + k), 1.0 / step.sigma, values[shift(at)]
         head[own, E + np.arange(at.start, at.stop)] = diagonal
-        off = value - step.mean
+        expected = step.mean
         if step.name in before.columns and step.decay:
             old = before.columns[step.name]
             head[own, to[old.start : old.stop]] = -step.decay * diagonal
-            off = off - step.decay * (before.value(step.name) - step.mean_before)
-        head[own, -1] = -off * diagonal
+            expected = step.ahead(before.value(step.name))
+        head[own, -1] = (expected - value) * diagonal
         row += k
     if link is not None:
         head[row : row + DIM, :DIM], head[row : row + DIM, E:] = link[:, :DIM], link[:, DIM:]

@@ -8,6 +8,7 @@ came before, and keyframes older than the lag settle, each with at least the lag
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,13 +18,12 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solution import ParameterEstimate, Solution
-from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import Progress, residual_record
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.linearise import Points, node_steps, scale_at, shift
+from graphnav.estimation.solvers.passes import Progress, parameters_of, residual_record
 from graphnav.estimation.solvers.rows import cost_at
-from graphnav.estimation.solvers.stages import Place, Step
+from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, Window, first_message, turn_limit
-from graphnav.imu.dynamics import SCALE
 
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
 _FINE = 0.02  # of the usual limits, within which the last window is converged
@@ -89,61 +89,75 @@ def incremental(
     start : one state to begin at, where that is not the prior's mean.
     """
     began = time.perf_counter()
-    K, mean = len(problem.t), problem.prior.mean
-    assert mean is not None
-    message = first_message(mean, problem.prior.sigma[0])
-    if start is not None:
-        message = message.moved(start.minus(mean)[0])
-    solver = Incremental(Window(message, turn_limit(problem.imu_noise)), lag)
-    steps = node_steps(problem)
-    live, live_P, live_values = [], np.empty((K, DIM, DIM)), []
-    seconds = np.empty(K)
-    for k in range(K):
-        before = time.process_time()
-        solver.add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
+    solver = Incremental(Window(begin_at(problem, start), turn_limit(problem.imu_noise)), lag)
+
+    def add(place: Place) -> tuple[Message, Array]:
+        solver.add(place)
         newest = solver.window.newest
-        live.append(newest.state)
-        live_P[k] = newest.covariance[:DIM, :DIM]
-        live_values.append(newest.values)
-        seconds[k] = time.process_time() - before
-        if progress is not None and k % 64 == 0:
-            progress("incremental", k / K)
+        return newest, newest.covariance[:DIM, :DIM]
+
+    live = replay(problem, "incremental", add, progress)
     solver.finish()
     spent = time.perf_counter() - began
-    live_states, values = States.stack(live), np.array(live_values)
-    found = replay(problem, "incremental", solver.settled, live_states, live_P, values, seconds, spent, lag)
-    notes = (*found.settled.notes, Note("solver.relinearised", f"{solver.window.relinearized} were linearised again"))
-    return replace(found, settled=replace(found.settled, notes=notes))
+    return assemble_replay(problem, "incremental", solver.settled, live, solver.window.relinearized, spent, lag)
+
+
+def begin_at(problem: Problem, start: States | None) -> Message:
+    """The prior of a problem, about its mean or one state to begin at."""
+    assert problem.prior.mean is not None
+    message = first_message(problem.prior.mean, problem.prior.sigma[0])
+    return message if start is None else message.moved(start.minus(problem.prior.mean)[0])
+
+
+@dataclass(frozen=True)
+class Live:
+    """Each keyframe as it was known when it had come, and the process time that it took."""
+
+    states: States
+    P: Array  # (K, 15, 15)
+    values: Array  # (K, D-15)
+    seconds: Array  # (K,)
 
 
 def replay(
-    problem: Problem,
-    solver: str,
-    parts: list[SettledStates],
-    live: States,
-    live_P: Array,
-    live_values: Array,
-    seconds: Array,
-    spent: float,
-    lag: float,
+    problem: Problem, solver: str, add: Callable[[Place], tuple[Message, Array]], progress: Progress | None
+) -> Live:
+    """Have all keyframes of a problem added in turn.
+
+    `add` gives the newest keyframe as it is known then, and the covariance (15, 15) of its state.
+    """
+    K, steps = len(problem.t), node_steps(problem)
+    states, values, P, seconds = [], [], np.empty((K, DIM, DIM)), np.empty(K)
+    for k in range(K):
+        before = time.process_time()
+        newest, P[k] = add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
+        states.append(newest.state)
+        values.append(newest.values)
+        seconds[k] = time.process_time() - before
+        if progress is not None and k % 64 == 0:
+            progress(solver, k / K)
+    return Live(States.stack(states), P, np.array(values), seconds)
+
+
+def assemble_replay(
+    problem: Problem, solver: str, parts: list[SettledStates], live: Live, again: int, spent: float, lag: float
 ) -> Replay:
     """What an incremental solver has found, as solutions.
 
     Parameters
     ----------
     parts : what settled, in turn.
-    live, live_P, live_values : (K,), (K, 15, 15) and (K, D-15) as known when each keyframe had come.
-    seconds, spent : (K,) s of process time, and s in all.
-    lag : s
+    again : how many keyframes were linearised again.
+    spent, lag : s
     """
     columns, K = parts[-1].columns[-1], len(problem.t)
     states = States.stack([part.states for part in parts])
-    values = np.array([row for part in parts for row in part.values])
-    sigma = np.array([row for part in parts for row in part.sigma])
+    # in the order that the problem has its parameters in
+    order = np.concatenate([np.empty(0, dtype=int), *(np.r_[shift(columns[name])] for name in problem.columns)])
+    values = np.array([row for part in parts for row in part.values])[:, order]
+    sigma = np.array([row for part in parts for row in part.sigma])[:, order]
     covariance = np.concatenate([part.covariance for part in parts])
-    at = {name: slice(s.start - DIM, s.stop - DIM) for name, s in columns.items()}
-    order = [values[:, at[c.parameter.name]] for c in problem.chains]
-    points = Points(states, np.concatenate([np.empty((K, 0)), *order], axis=1))
+    points = Points(states, values)
     records = {rows.name: residual_record(problem, rows, points, robust=True) for rows in problem.constraints}
     whole = "all there was" if np.isinf(lag) else f"{lag:g} s of the future, or all there was"
     settled = Solution(
@@ -152,7 +166,7 @@ def replay(
         t=problem.t,
         states=states,
         covariance=covariance,
-        parameters=_parameters(problem, at, values, sigma),
+        parameters=parameters_of(problem, values, sigma),
         records=records,
         counts={"initial_prior": 1, "imu": K - 1, **{c.name: len(c) for c in problem.constraints}},
         iterations=1,
@@ -161,58 +175,27 @@ def replay(
         timings={solver: spent},
         notes=(
             *problem.notes,
-            Note("solver.step_times", describe(seconds) if np.isinf(lag) else f"lag {lag:g} s: {describe(seconds)}"),
+            Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe(live.seconds)),
+            Note("solver.relinearised", f"{again} keyframes were linearised again"),
         ),
-        between=(dense(problem, states, covariance, _scale(at, values), smooth=True),),
+        between=(dense(problem, states, covariance, scale_at(problem.columns, values), smooth=True),),
     )
     now = replace(
         settled,
         solver="live",
-        states=live,
-        covariance=live_P,
+        states=live.states,
+        covariance=live.P,
         parameters={},
         records={},
         stopped="each keyframe as it was known when it came",
-        between=(dense(problem, live, live_P, _scale(at, live_values), smooth=False),),
+        between=(dense(problem, live.states, live.P, scale_at(problem.columns, live.values[:, order]), smooth=False),),
     )
-    return Replay(settled, now, seconds)
-
-
-def node_steps(problem: Problem) -> dict[int, tuple[Step, ...]]:
-    """The parameters that begin or move on to their next node, by keyframe."""
-    out: dict[int, list[Step]] = {}
-    for chain in problem.chains:
-        name = chain.parameter.name
-        out.setdefault(0, []).append(Step(name, chain.mean[0], chain.sigma[0]))
-        for k in np.flatnonzero(np.diff(chain.node)) + 1:
-            j = int(chain.node[k])
-            out.setdefault(int(k), []).append(
-                Step(name, chain.mean[j], chain.sigma[j], float(chain.decay[j]), chain.mean[j - 1])
-            )
-    return {k: tuple(steps) for k, steps in out.items()}
+    return Replay(settled, now, live.seconds)
 
 
 def _robust(window: Window) -> bool:
     problem = window.stages[-1].place.problem
     return problem is not None and any(c.robust != "none" for c in problem.constraints)
-
-
-def _scale(at: dict[str, slice], values: Array) -> Array | None:
-    return values[:, at[SCALE]] if SCALE in at else None
-
-
-def _parameters(problem: Problem, at: dict[str, slice], values: Array, sigma: Array) -> dict[str, ParameterEstimate]:
-    """At each node: the value at the last keyframe that it governs; of a constant the last one settled."""
-    out = {}
-    for chain in problem.chains:
-        p = chain.parameter
-        if p.begins is not None:
-            continue
-        last = np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
-        out[p.name] = ParameterEstimate(
-            chain.t, values[last][:, at[p.name]], sigma[last][:, at[p.name]], p.sigma, p.unit
-        )
-    return out
 
 
 def describe(seconds: Array) -> str:

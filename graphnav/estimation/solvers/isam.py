@@ -11,15 +11,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.core.notes import Note
-from graphnav.core.state import DIM, States
+from graphnav.core.rotation import Array
+from graphnav.core.state import States
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.incremental import Replay, node_steps, replay
+from graphnav.estimation.solvers.incremental import Replay, assemble_replay, begin_at, replay
 from graphnav.estimation.solvers.passes import Progress
-from graphnav.estimation.solvers.stages import Place
+from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.tree import Tree
 from graphnav.estimation.solvers.tree_marginals import newest_covariance, smooth_keyframes
-from graphnav.estimation.solvers.window import SettledStates, first_message, turn_limit
+from graphnav.estimation.solvers.window import SettledStates, turn_limit
 
 _SKIP = 10  # keyframes between two looks at what has moved, as GTSAM's relinearizeSkip
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long, as in the window
@@ -41,41 +41,27 @@ def isam2(
     start : one state to begin at, where that is not the prior's mean.
     """
     began = time.perf_counter()
-    K, steps = len(problem.t), node_steps(problem)
-    mean = problem.prior.mean
-    assert mean is not None
-    prior = first_message(mean, problem.prior.sigma[0])
-    if start is not None:
-        prior = prior.moved(start.minus(mean)[0])
-    tree = Tree(prior, turn_limit(problem.imu_noise))
+    tree = Tree(begin_at(problem, start), turn_limit(problem.imu_noise))
     settled: list[SettledStates] = []
-    live, P, values = [], np.empty((K, DIM, DIM)), []
-    seconds = np.empty(K)
-    for k in range(K):
-        before = time.process_time()
-        t = float(problem.t[k])
-        turn = tree.add(Place(t, problem, k, steps.get(k, ()), linked=k > 0))
-        if turn > tree.turn or k % _SKIP == 0:
+    posed = problem
+
+    def add(place: Place) -> tuple[Message, Array]:
+        nonlocal problem
+        turn = tree.add(replace(place, problem=problem))
+        if turn > tree.turn or place.k % _SKIP == 0:
             tree.relinearise()
-        oldest = tree.keyframes[0].place.t
-        if t - oldest > lag * (1.0 + 1.0 / _PORTIONS):
-            count = int(np.searchsorted(problem.t[:k], t - lag)) - tree.keyframes[0].place.k
+        oldest = tree.keyframes[0].place
+        if place.t - oldest.t > lag * (1.0 + 1.0 / _PORTIONS):
+            count = int(np.searchsorted(problem.t[: place.k], place.t - lag)) - oldest.k
             problem, _ = tree.integrate_again(problem)
             settled.append(smooth_keyframes(tree, count))
             tree.marginalise(count)
-        newest = tree.newest
-        live.append(newest.state)
-        P[k] = newest_covariance(tree)
-        values.append(newest.values)
-        seconds[k] = time.process_time() - before
-        if progress is not None and k % 64 == 0:
-            progress("isam2", k / K)
+        return tree.newest, newest_covariance(tree)
+
+    live = replay(posed, "isam2", add, progress)
     for _ in range(_ROUNDS):
         problem, again = tree.integrate_again(problem)
         if not tree.relinearise(_FINE) and not again:
             break
     settled.append(smooth_keyframes(tree, len(tree)))
-    spent = time.perf_counter() - began
-    found = replay(problem, "isam2", settled, States.stack(live), P, np.array(values), seconds, spent, lag)
-    notes = (*found.settled.notes, Note("solver.relinearised", f"{tree.relinearised} keyframes were linearised again"))
-    return replace(found, settled=replace(found.settled, notes=notes))
+    return assemble_replay(problem, "isam2", settled, live, tree.relinearised, time.perf_counter() - began, lag)

@@ -75,6 +75,34 @@ class Rows:
         return weight_and_cost(c.robust, s, c.scale_of(self.which), c.graduation)
 
 
+@dataclass(frozen=True)
+class Step:
+    """A parameter that moves on to its next node, or begins: value - mean = decay (before - mean_before) + noise."""
+
+    name: str
+    mean: Array  # (k,)
+    sigma: Array  # (k,)
+    decay: float = 0.0
+    mean_before: Array | float = 0.0
+
+    def ahead(self, before: Array | float) -> Array:
+        """(k,) the value that it is expected to have, by that before."""
+        return self.mean + self.decay * (before - self.mean_before)
+
+
+def node_steps(problem: Problem) -> dict[int, tuple[Step, ...]]:
+    """The parameters that begin or move on to their next node, by keyframe."""
+    out: dict[int, list[Step]] = {}
+    for chain in problem.chains:
+        name = chain.parameter.name
+        out.setdefault(0, []).append(Step(name, chain.mean[0], chain.sigma[0]))
+        for k in stepping(chain).tolist():
+            j = int(chain.node[k])
+            step = Step(name, chain.mean[j], chain.sigma[j], float(chain.decay[j]), chain.mean[j - 1])
+            out.setdefault(k, []).append(step)
+    return {k: tuple(steps) for k, steps in out.items()}
+
+
 def linearise(
     constraint: Constraint,
     points: Points,
@@ -89,10 +117,11 @@ def linearise(
     columns : where each parameter stands in the error state.
     at : (n,) which point each row is at; its keyframe when None.
     """
+    values, states = points.values, points.states
     at = constraint.keyframe[which] if at is None else at
-    values = points.values
-    given = {p.name: values[at, shift(columns[p.name])] for p in constraint.parameters}
-    states = points.states if len(at) == len(values) == 1 else points.states[at]
+    if len(at) != 1 or len(values) != 1:
+        values, states = values[at], states[at]
+    given = {p.name: values[:, shift(columns[p.name])] for p in constraint.parameters}
     return Rows(constraint, which, constraint.linearize(states, given, which), columns, DIM + values.shape[1])
 
 

@@ -139,16 +139,17 @@ def values_of(problem: Problem, points: Points) -> dict[str, Array]:
     return {name: points.values[:, shift(at)] for name, at in problem.columns.items()}
 
 
-def parameters_of(problem: Problem, values: Array, P: Array) -> dict[str, ParameterEstimate]:
-    """At each node: the value after the last keyframe that it governs."""
+def parameters_of(problem: Problem, values: Array, sigma: Array) -> dict[str, ParameterEstimate]:
+    """At each node: the value after the last keyframe that it governs, by those at keyframes (K, D-15)."""
     out = {}
     for chain in problem.chains:
         if chain.parameter.begins is not None:
             continue  # a place of a stop is no calibration
-        at = problem.columns[chain.parameter.name]
-        last = last_of(chain)
-        sigma = np.sqrt(np.maximum(np.diagonal(P[last][:, at, at], axis1=-2, axis2=-1), 0.0))
-        out[chain.parameter.name] = ParameterEstimate(
-            chain.t, values[last][:, shift(at)], sigma, chain.parameter.sigma, chain.parameter.unit
-        )
+        p, at, last = chain.parameter, shift(problem.columns[chain.parameter.name]), last_of(chain)
+        out[p.name] = ParameterEstimate(chain.t, values[last, at], sigma[last, at], p.sigma, p.unit)
     return out
+
+
+def sigmas_of(P: Array) -> Array:
+    """(K, D-15) 1-sigma of parameters by covariances (K, D, D)."""
+    return np.sqrt(np.maximum(np.diagonal(P, axis1=-2, axis2=-1)[:, DIM:], 0.0))

@@ -20,8 +20,8 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.linearise import Points, linearise, shift, stepping
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.linearise import Points, Step, linearise, node_steps, shift, stepping
 from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.imu.dynamics import SCALE
 
@@ -45,14 +45,8 @@ class AtEstimate:
         self._I = np.eye(self._width)
 
     @cached_property
-    def _steps(self) -> dict[int, list[tuple[slice, ParameterChain, int]]]:
-        """At keyframes where a parameter moves on to its next node: its columns, its chain and that node."""
-        out: dict[int, list[tuple[slice, ParameterChain, int]]] = {}
-        for chain in self._problem.chains:
-            at = self._columns[chain.parameter.name]
-            for k in stepping(chain).tolist():
-                out.setdefault(k, []).append((at, chain, int(chain.node[k])))
-        return out
+    def _steps(self) -> dict[int, tuple[Step, ...]]:
+        return node_steps(self._problem)
 
     def step(self, k: int, x: Estimate) -> tuple[Estimate, Array, Array, Array | None]:
         """The estimate at keyframe k from that at the one before, F (D, D), Q (15, 15), and more variance (D,)."""
@@ -65,11 +59,11 @@ class AtEstimate:
         values, added = x.values, None
         if k in self._steps:
             values, added = values.copy(), np.zeros(self._width)
-            for column, chain, j in self._steps[k]:
-                F[column, column] *= chain.decay[j]
-                own = shift(column)
-                values[own] = chain.mean[j] + chain.decay[j] * (values[own] - chain.mean[j - 1])
-                added[column] = chain.sigma[j] ** 2
+            for one in self._steps[k]:
+                column = self._columns[one.name]
+                F[column, column] *= one.decay
+                values[shift(column)] = one.ahead(values[shift(column)])
+                added[column] = one.sigma**2
         return Estimate(ahead, values), F, motion.noise(at, x.state.R_nb)[0], added
 
     def rows(self, some: RowBlock, at: Estimate) -> Rows:
@@ -141,15 +135,17 @@ class AtPoints:
         self._Q[:, :3] = turned @ self._Q[:, :3]
         self._Q[:, :, :3] = self._Q[:, :, :3] @ np.swapaxes(turned, -1, -2)
         self._speed = np.linalg.norm(points.states.v, axis=1)
-        self._r, self._sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
-        self._H = np.zeros((n, stack.M, D))
+        self.r, self._sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
+        self.H = np.zeros((n, stack.M, D))
         for rows in problem.constraints:
             at_k = rows.keyframe[: int(np.searchsorted(rows.keyframe, n))]
             if len(at_k):
                 linear = linearise(rows, points, columns, slice(0, len(at_k)))
                 place = at_k[:, None], stack.places[rows.name][1][: len(at_k)]
-                self._r[place], self._sigma[place] = linear.residual, linear.stated
-                self._H[place] = linear.H
+                self.r[place], self._sigma[place] = linear.residual, linear.stated
+                self.H[place] = linear.H
+        with np.errstate(divide="ignore"):
+            self.variance = (self._sigma / stack.root_weight[:n]) ** 2
 
     def step(self, k: int, x: Array) -> tuple[Array, Array, Array, Array | None]:
         """As `AtEstimate.step`, of error states (D,)."""
@@ -159,7 +155,7 @@ class AtPoints:
     def rows(self, some: RowBlock, at: None) -> Rows:
         """As `AtEstimate.rows`, linearised at the points."""
         at_k = some.at
-        return self._r[at_k], self._H[at_k], self._sigma[at_k]
+        return self.r[at_k], self.H[at_k], self._sigma[at_k]
 
     @staticmethod
     def about(x: Array) -> tuple[None, Array]:

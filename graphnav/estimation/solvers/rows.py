@@ -13,7 +13,7 @@ import numpy as np
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.linearise import Points, linearise, linearise_links
+from graphnav.estimation.solvers.linearise import Points, last_of, linearise, linearise_links
 from graphnav.imu.dynamics import SCALE
 
 _FEW = 6  # blocks of rows, which all of them touch
@@ -79,7 +79,7 @@ class Layout:
             self.groups.append(group)
             self.group_of |= dict.fromkeys(columns, group)
             self.width += [at] * n
-            for j, last in enumerate(np.searchsorted(node, np.arange(n), side="right") - 1):
+            for j, last in enumerate(last_of(chains[0])):
                 after.setdefault(int(last), []).append(int(keys[j]))
         self.keys = range(len(self.width))
         self.order = [key for k in range(K) for key in (k, *after.get(k, ()))]

@@ -35,7 +35,10 @@ from graphnav.estimation.solvers.passes import (
     move_points,
     parameters_of,
     residual_record,
+    sigmas_of,
 )
+
+_BLOCK = 32  # keyframes whose covariances stay in a processor's cache
 
 
 def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None = None) -> SmootherPass:
@@ -58,10 +61,12 @@ def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None
                 raise _breakdown(problem, end)
             r[end], N[end] = inverse @ away, inverse @ (ahead - P[end]) @ inverse
         _find_disturbances(forward, end, r, N, progress)
-        ahead = forward.P_predicted[:end]
-        smoothed = ahead - ahead @ N[:end] @ ahead
-        P[:end] = 0.5 * (smoothed + np.swapaxes(smoothed, -1, -2))
-        errors = forward.errors_predicted[:end] + (ahead @ r[:end, :, None])[..., 0]
+        errors = forward.errors_predicted[:end] + (forward.P_predicted[:end] @ r[:end, :, None])[..., 0]
+        for k in range(0, end, _BLOCK):
+            some = slice(k, min(k + _BLOCK, end))
+            ahead = forward.P_predicted[some]
+            smoothed = ahead - ahead @ N[some] @ ahead
+            P[some] = 0.5 * (smoothed + np.swapaxes(smoothed, -1, -2))
         first = move_points(forward.about.first(end), errors)
         values[:end] = first.values
         states = [first.states, *states]
@@ -129,7 +134,7 @@ def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None
         t=problem.t,
         states=smoothed,
         covariance=all_P[:, :DIM, :DIM],
-        parameters=parameters_of(problem, all_values, all_P),
+        parameters=parameters_of(problem, all_values, sigmas_of(all_P)),
         records=records,
         counts=forward.solution.counts,
         iterations=1,

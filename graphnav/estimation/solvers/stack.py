@@ -11,7 +11,7 @@ S = L L^T all the same: with w = L^-1 r, and L_jj what the kind j has on the dia
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,23 +63,29 @@ class RowBlock:
 
 
 class Stack:
-    """The rows of the first K keyframes, at most M numbers each."""
+    """The rows of the first K keyframes, at most M numbers each.
 
-    def __init__(self, problem: Problem, K: int) -> None:
+    `alone` are the names of constraints whose rows are taken in without others; those of weight 0 are anyway.
+    """
+
+    def __init__(self, problem: Problem, K: int, alone: Collection[str] = ()) -> None:
         self.K, self._constraints = K, problem.constraints
+        self._alone = [c.name in alone for c in problem.constraints]
         self._weights = [None if c.weight is None else c.weight.tolist() for c in self._constraints]
         self.records = {c.name: Innovations(c) for c in self._constraints}
         self.places: dict[str, tuple[Array, Array]] = {}  # per constraint: keyframe (n, 1) and place there (n, m)
         self._first: list[list[int]] = []
-        filled = np.zeros(K, dtype=int)
-        for c in self._constraints:
+        filled, apart = np.zeros(K, dtype=int), np.zeros(K, dtype=bool)
+        for c, one in zip(self._constraints, self._alone, strict=True):
             first, m = np.searchsorted(c.keyframe, np.arange(K + 1)), len(c.axes)
             self._first.append(first.tolist())
             k = c.keyframe[: first[-1]]
             begin = filled[k] + m * (np.arange(len(k)) - first[k])
             self.places[c.name] = k[:, None], begin[:, None] + np.arange(m)
             filled += m * np.diff(first)
+            apart[k if one else k[c.weight[: len(k)] == 0.0] if c.weight is not None else k[:0]] = True
         self.M = int(np.max(filled, initial=0))
+        self._filled, self._apart = filled.tolist(), apart.tolist()
         self.root_weight = np.ones((K, self.M))
         for c in self._constraints:
             if c.weight is not None:
@@ -88,19 +94,20 @@ class Stack:
                 self.records[c.name].weight[:n] = c.weight[:n]
         self._root, self._solved = np.zeros((K, self.M, self.M)), np.zeros((K, self.M))
 
-    def together(self, k: int, alone: Sequence[bool]) -> Iterator[RowBlock]:
-        """All rows of a keyframe, in the order of the constraints.
-
-        `alone` says of each constraint whether its rows are taken in without others; those of weight 0 are anyway.
-        """
+    def together(self, k: int, one_by_one: bool = False) -> Iterator[RowBlock]:
+        """All rows of a keyframe, in the order of the constraints; each kind by itself if wanted so."""
+        here = zip(self._constraints, self._first, range(len(self._first)), strict=True)
+        parts = [(c, first[k], first[k + 1], i) for c, first, i in here if first[k] < first[k + 1]]
+        if not one_by_one and not self._apart[k]:
+            if parts:
+                yield RowBlock(k, 0, self._filled[k], [part[:3] for part in parts], False)
+            return
         some: RowBlock | None = None
         end = 0
-        for c, first, weights, apart in zip(self._constraints, self._first, self._weights, alone, strict=True):
-            lo, hi = first[k], first[k + 1]
-            if lo == hi:
-                continue
+        for c, lo, hi, i in parts:
             begin, end = end, end + (hi - lo) * len(c.axes)
-            apart = apart or (weights is not None and 0.0 in weights[lo:hi])
+            weights = self._weights[i]
+            apart = one_by_one or self._alone[i] or (weights is not None and 0.0 in weights[lo:hi])
             if some is not None and not apart:
                 some.parts.append((c, lo, hi))
                 some.end = end

@@ -30,23 +30,12 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.linearise import Columns, Points, linearise, linearise_links, scale_at, shift
+from graphnav.estimation.solvers.linearise import Columns, Points, Step, linearise, linearise_links, scale_at, shift
 from graphnav.estimation.solvers.robust import soften, weight_and_cost
 from graphnav.estimation.solvers.watch import Watch
 from graphnav.imu.dynamics import SCALE, ImuFactors
 
 _I = np.eye(DIM)
-
-
-@dataclass(frozen=True)
-class Step:
-    """A parameter that moves on to its next node, or begins: value - mean = decay (before - mean_before) + noise."""
-
-    name: str
-    mean: Array  # (k,)
-    sigma: Array  # (k,)
-    decay: float = 0.0
-    mean_before: Array | float = 0.0
 
 
 @dataclass(frozen=True)
@@ -192,8 +181,7 @@ def predict_stage(before: Message, place: Place) -> tuple[States, Array, Columns
     values[: len(before.values)] = before.values
     for step in place.steps:
         at = shift(columns[step.name])
-        old = before.value(step.name) if step.name in before.columns else step.mean_before
-        values[at] = step.mean + step.decay * (old - step.mean_before)
+        values[at] = step.ahead(before.value(step.name) if step.name in before.columns else step.mean_before)
     if not place.linked:
         return before.state, values, columns, None
     assert place.problem is not None

@@ -27,7 +27,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.linearise import shift
+from graphnav.estimation.solvers.linearise import Step, shift
 from graphnav.estimation.solvers.passes import integrate_again
 from graphnav.estimation.solvers.revision import Renewed
 from graphnav.estimation.solvers.robust import PASSES
@@ -36,7 +36,6 @@ from graphnav.estimation.solvers.stages import (
     Measured,
     Message,
     Place,
-    Step,
     append_columns,
     at_points,
     measure,
@@ -148,7 +147,7 @@ class Tree:
         file(keyframe, made, list(result.getNewFactorsIndices())[begin:])
         self._read([x, *(node for node, _ in nodes.values())])
         for _ in range(PASSES - 1 if any(one.kernel != "none" for one in rows) else 0):
-            self.again([len(self.keyframes) - 1])
+            self.linearise_again([len(self.keyframes) - 1])
             self._read([x, *(node for node, _ in nodes.values())])
         return float(np.linalg.norm(x.delta[:3]))
 
@@ -224,7 +223,7 @@ class Tree:
                 own_A[at, at] = np.diag(1.0 / step.sigma)
                 if old is not None and step.decay:
                     was = self._in_force[step.name][1]
-                    node.anchor[at] += step.decay * (old.anchor[was] - step.mean_before)
+                    node.anchor[at] = step.ahead(old.anchor[was])
                     old_A[at, was] = -step.decay * own_A[at, at]
                 in_force[step.name] = node, at
             new.insert(node.key, np.zeros(len(node.unit)))
@@ -297,10 +296,6 @@ class Tree:
             x.delta = x.unit * flat[begin:end]
             begin = end
 
-    def estimates(self, first: int = 0) -> list[tuple[States, Array]]:
-        """State and parameter values of each keyframe from one on, as last read."""
-        return [(k.estimate, k.values) for k in self.keyframes[first:]]
-
     def moved(self, share: float = 1.0) -> Array:
         """Which keyframes' estimates are further from where their rows were linearised than a share of the limits."""
         if not self.keyframes:
@@ -321,7 +316,7 @@ class Tree:
         if not len(self.moved(share)):
             return 0
         which = self.moved(_ALMOST * share)
-        self.again(which, renewed)
+        self.linearise_again(which, renewed)
         self.read()
         return len(which)
 
@@ -338,10 +333,10 @@ class Tree:
         if count:
             for k in own:
                 k.place = replace(k.place, problem=problem)
-            self.again(range(len(self)))
+            self.linearise_again(range(len(self)))
         return problem, count > 0
 
-    def again(self, which: Iterable[int], renewed: Renewed | None = None) -> None:
+    def linearise_again(self, which: Iterable[int], renewed: Renewed | None = None) -> None:
         """Linearise keyframes, and the intervals on either side, where they are now."""
         rows = {i for i in map(int, which) if i >= self._held}
         if not rows:

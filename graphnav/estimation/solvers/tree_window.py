@@ -8,12 +8,10 @@ anew. The keyframe that settled last stays in the tree, so that all behind it ca
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from graphnav.core.rotation import Array
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.revision import Renewed
 from graphnav.estimation.solvers.stages import Message, Place
@@ -56,20 +54,6 @@ class TreeWindow(Window):
         self._means = None
 
     # ------------------------------------------------------------------------------------------- what the tree knows
-    def means(self) -> list[Array]:
-        """Smoothed error states, one of the message before the window and one of each stage."""
-        if self._means is None:
-            out = [np.zeros(len(self.head.z))]
-            if self.stages:
-                assert self.tree is not None
-                self.tree.read()
-                known = self.tree.estimates(self._before)
-                for stage, (state, values) in zip(self.stages, known, strict=True):
-                    m = stage.message
-                    out.append(np.concatenate([state.minus(m.state)[0], values - m.values]))
-            self._means = out
-        return self._means
-
     def first_moved(self, share: float = 1.0) -> int | None:
         """The first stage that the tree would linearise anew; None if there is none."""
         if self.tree is None or not self.stages:
@@ -78,21 +62,13 @@ class TreeWindow(Window):
         moved = self.tree.moved(share)
         return int(moved[0]) - self._before if len(moved) else None
 
-    def relinearize(self, first: int, places: Sequence[Place] | None = None) -> None:
-        """Linearise the stages from `first` on anew."""
-        assert self.tree is not None
-        which = range(first + self._before, len(self.tree))
-        renewed: Renewed | None = None if places is None else (lambda lo, hi: places[lo - first : hi - first])
-        self.tree.again(which, renewed)
-        self._relinearised(len(self) - first)
-
     def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> int:
         """Relinearise until nothing has moved; returns how often."""
         if self.tree is None or not self.stages:
             return 0
         count = 0
         if always:
-            self.tree.again(range(self._before, len(self.tree)), renewed)
+            self.tree.linearise_again(range(self._before, len(self.tree)), renewed)
             self._relinearised(len(self))
             share, count = min(share, _FINE), 1
         while count < _ROUNDS and (done := self.tree.relinearise(share, renewed)):

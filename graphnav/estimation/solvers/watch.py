@@ -21,6 +21,7 @@ from __future__ import annotations
 from array import array
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping
+from typing import Self
 
 import numpy as np
 from scipy.linalg.lapack import dtrtrs
@@ -139,7 +140,32 @@ class _InnovationLevel:
                 self.factor = max(1.0, float(np.median(np.frombuffer(self.nis)[:known])) / self.median)
 
 
-class Bank:
+class _Tests:
+    """The tests of some constraints, and what unit errors since their onsets do to an estimate: X (D, C)."""
+
+    _slots: dict[str, _Slots]
+    X: Array
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._slots
+
+    def copy(self) -> Self:
+        """The same, on its own."""
+        other = object.__new__(type(self))
+        other.__dict__ |= self.__dict__
+        other._slots = {name: slots.copy() for name, slots in self._slots.items()}
+        return other
+
+    def forgetful(self) -> Self:
+        """The same without any onset."""
+        other = self.copy()
+        other.X = np.zeros_like(self.X)
+        for slots in other._slots.values():
+            slots.forget()
+        return other
+
+
+class Bank(_Tests):
     """All tests of a filter.
 
     Parameters
@@ -155,28 +181,13 @@ class Bank:
 
     def copy(self) -> Bank:
         """The same, on its own."""
-        other = object.__new__(Bank)
-        other._t, other.X, other._slots = (
-            self._t,
-            self.X.copy(),
-            {name: slots.copy() for name, slots in self._slots.items()},
-        )
-        return other
-
-    def forgetful(self) -> Bank:
-        """The same without any onset."""
-        other = self.copy()
-        other.X[:] = 0.0
-        for slots in other._slots.values():
-            slots.forget()
+        other = super().copy()
+        other.X = self.X.copy()
         return other
 
     def predicted(self, F: Array) -> None:
         """The filter has gone on to the next keyframe."""
         self.X = F @ self.X
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._slots
 
     def signature(self, name: str, k: int, H: Array) -> Array:
         """(n m, C) mean of an innovation at keyframe k for unit errors since each onset; a fix itself is one."""
@@ -214,7 +225,7 @@ class Bank:
         return self._slots[name].found(-(r @ weighted), self.own(name, G), weighted, speed)
 
 
-class Watch:
+class Watch(_Tests):
     """The same tests beside a square-root message R y = z, which is then R y = z - R X b for errors b since each onset.
 
     With columns B = 1 / sigma for them at a fix, the QR that takes in its rows leaves behind, below those of the
@@ -232,35 +243,21 @@ class Watch:
         self._X: Array | None = np.zeros((width, sum(s.L * s.m for s in self._slots.values())))
         self._stands: tuple[Array, Array] | None = None  # R and R X
 
-    def copy(self) -> Watch:
-        """The same, on its own."""
-        other = object.__new__(Watch)
-        other._X, other._stands = self._X, self._stands
-        other._slots = {name: slots.copy() for name, slots in self._slots.items()}
-        return other
-
     @property
-    def X(self) -> Array:
+    def X(self) -> Array:  # type: ignore[override]
         """(D, C) what a unit error since each onset does to the estimate."""
         if self._X is None:
             assert self._stands is not None
             self._X, self._stands = dtrtrs(*self._stands)[0], None
         return self._X
 
+    @X.setter
+    def X(self, X: Array) -> None:
+        self._X, self._stands = X, None
+
     def stands(self, R: Array, Z: Array) -> None:
         """The message has come to a triangular R (D, D), with Z = R X (D, C) beside it."""
         self._X, self._stands = None, (R, Z)
-
-    def forgetful(self) -> Watch:
-        """The same without any onset."""
-        other = self.copy()
-        other._X, other._stands = np.zeros_like(self.X), None
-        for slots in other._slots.values():
-            slots.forget()
-        return other
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._slots
 
     def begin(self, name: str, t: float, sigma: Array) -> tuple[slice, slice, Array]:
         """Begin an onset with fixes of these sigmas (n, m): its columns, those of the kind, and B (n m, L m) there."""

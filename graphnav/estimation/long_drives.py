@@ -1,0 +1,144 @@
+"""Recordings that are too long to be solved at once: in parts that overlap, of which each keeps its own share.
+
+A pass of the filter keeps some twenty matrices of the error state for every keyframe until the smoother has used them,
+nearly a gigabyte an hour. So a recording of more than a few hours is cut into equal parts. Each is solved with what
+comes before and after it for as long as that has a say, from an alignment and with noise figures of its own; what it
+says of its own span stands. Nothing is cut where the fixes before do not tell a filter that begins there its place and
+its heading: in outages, at long halts, and without a receiver.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphnav.core.earth import A
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
+from graphnav.detectors.base import Detection
+from graphnav.estimation.noise.model import NoiseModel, RowWeights
+from graphnav.estimation.solution import Between, ConstraintRecord, ParameterEstimate, Solution
+from graphnav.recording import Recording, rows_of
+
+STRAIGHT = 10_800.0  # s, at most solved at once: 3 GB at a keyframe a second and 44 error states
+PART = 3_600.0  # s, at most, of a part: the estimation of noise has enough keyframes by a factor of two
+OVERLAP = (
+    600.0  # s: what inertial sensors knew ten minutes ago says little (`graphnav.estimation.solvers.watch.LONGEST`)
+)
+
+_SILENCE = 60.0  # s between fixes, after which inertial sensors of any grade have begun to drift
+_COURSE = 0.01  # rad, of a heading that is told: half its square is nothing beside what sensors know
+
+
+@dataclass(frozen=True)
+class Share:
+    """A part of a recording with its overlaps, and the span (s, the end not in it) that it answers for."""
+
+    recording: Recording
+    start: float
+    end: float
+
+
+def shares(recording: Recording) -> list[Share]:
+    """The recording in one part, or in parts of equal length that overlap."""
+    begin, length = recording.start, recording.end - recording.start
+    if length <= STRAIGHT:
+        return [Share(recording, -np.inf, np.inf)]
+    edges = np.linspace(0.0, length, int(np.ceil(length / PART)) + 1)
+    edges = np.array([0.0, *(edge for edge in edges[1:-1] if _is_told(recording, begin + edge)), length])
+    out = []
+    for k, (lo, hi) in enumerate(itertools.pairwise(edges)):
+        first, last = max(lo - OVERLAP, 0.0), min(hi + OVERLAP, length)
+        part = recording.crop(first - 1e-9, last + 1e-9)
+        lo_row, hi_row = np.searchsorted(recording.imu.t, part.imu.t[[0, -1]])
+        own = slice(int(lo_row), int(hi_row) + 1)
+        part = replace(part, imu=rows_of(recording.imu, own))  # no copy of what is by far the largest
+        start = -np.inf if k == 0 else begin + lo
+        out.append(Share(part, start, np.inf if k == len(edges) - 2 else begin + hi))
+    return out
+
+
+def _is_told(recording: Recording, t: float) -> bool:
+    """Whether fixes come all through the overlap before a time (s), and their course tells the heading."""
+    gnss = recording.gnss
+    if gnss is None:
+        return False
+    some = (gnss.t >= t - OVERLAP) & (gnss.t <= t) & np.isfinite(gnss.llh).all(axis=1)
+    if np.max(np.diff([t - OVERLAP, *gnss.t[some], t])) > _SILENCE:
+        return False
+    llh = gnss.llh[some]
+    way = A * np.ptp(llh[:, :2] * [1.0, np.cos(llh[0, 0])], axis=0)
+    return bool(np.hypot(*way) * _COURSE > np.median(np.hypot(*gnss.sd[some, :2].T)))
+
+
+@dataclass(frozen=True)
+class _Span:
+    """`Solution.between` of a part, for its own span alone."""
+
+    whole: Between
+    start: float
+    end: float
+
+    def times(self, rate: float) -> Array:
+        """Times at a rate inside the span."""
+        t = self.whole.times(rate)
+        return t[(t >= self.start) & (t <= self.end)]
+
+    def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
+        """As of the part."""
+        return self.whole(t, size)
+
+
+def within(solution: Solution, share: Share) -> Solution:
+    """What a solution of a part says of the part's own span."""
+    start, end = share.start, share.end
+    if np.isneginf(start) and np.isposinf(end):
+        return solution
+
+    def inside(t: Array) -> Array:
+        return np.flatnonzero((t >= start) & (t < end))
+
+    def node(p: ParameterEstimate) -> ParameterEstimate:
+        in_force = np.searchsorted(p.t, start, side="right") - 1  # holds from before the span on
+        some = np.flatnonzero((p.t < end) & (np.arange(len(p.t)) >= in_force))
+        return replace(p, t=p.t[some], value=p.value[some], sigma=p.sigma[some])
+
+    def record(r: ConstraintRecord) -> ConstraintRecord:
+        some = inside(r.t)
+        return replace(
+            r, t=r.t[some], residual=r.residual[some], sigma=r.sigma[some], nis=r.nis[some], weight=r.weight[some]
+        )
+
+    def detection(d: Detection) -> Detection:
+        some, n = inside(d.t), len(d.t)
+        spans = np.clip(d.intervals, start, end)
+        threshold = d.threshold[some] if isinstance(d.threshold, np.ndarray) and len(d.threshold) == n else d.threshold
+        details = {name: x[some] if len(x) == n else x for name, x in d.details.items()}
+        return replace(
+            d, t=d.t[some], statistic=d.statistic[some], threshold=threshold, mask=d.mask[some],
+            intervals=spans[spans[:, 1] > spans[:, 0]], details=details,
+        )  # fmt: skip
+
+    def noise(model: NoiseModel) -> NoiseModel:
+        weights = {name: RowWeights(w.t[inside(w.t)], w.weight[inside(w.t)]) for name, w in model.weights.items()}
+        spans = {
+            name: tuple((max(a, start), min(b, end)) for a, b in some if a < end and b >= start)
+            for name, some in model.excluded.items()
+        }
+        return replace(model, weights=weights, excluded=spans)
+
+    some, last = inside(solution.t), np.nextafter(end, -np.inf)
+    return replace(
+        solution,
+        t=solution.t[some],
+        states=solution.states[some],
+        covariance=solution.covariance[some],
+        parameters={name: node(p) for name, p in solution.parameters.items()},
+        records={name: record(r) for name, r in solution.records.items()},
+        detections=tuple(detection(d) for d in solution.detections),
+        excluded=tuple(fault for fault in solution.excluded if start <= fault.t_start < end),
+        noise=noise(solution.noise),
+        between=tuple(_Span(b, max(b.start, start), min(b.end, float(last))) for b in solution.between),
+    )
