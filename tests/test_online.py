@@ -217,7 +217,7 @@ def test_keyframes_are_prepared() -> None:
     Between a reading and the next row of an IMU of 50 Hz there is none either.
     """
     path = oracle.vehicle_path(130.0, 100.0)
-    recording = oracle.drive(path, seed=3, outages=[(50.0, 55.0)], odometer_rate=10.0)[0].crop(0.0, 75.0)
+    recording = oracle.drive(path, seed=3, outages=[(70.0, 80.0)], odometer_rate=10.0)[0].crop(0.0, 100.0)
     online, ready = Online(without_rows(recording), QUICK), []
     for row in rows_of(recording)[1]:
         before = online.tracker
