@@ -58,9 +58,11 @@ def seen_by(name: str, recording: Recording) -> Recording:
     return replace(recording, platform="foot", gnss=None, odometer=None) if name in ON_FOOT else recording
 
 
-def scene_of(cls: type[Constraint], recording: Recording, settings: Settings, frame: LocalFrame) -> BuildContext:
+def scene_of(
+    cls: type[Constraint], recording: Recording, settings: Settings, frame: LocalFrame, stops: Array = STANDING
+) -> BuildContext:
     """A scene with the keyframes one constraint asks for."""
-    inside = STANDING[(STANDING[:, 0] >= recording.start) & (STANDING[:, 1] <= recording.end)]
+    inside = stops[(stops[:, 0] >= recording.start) & (stops[:, 1] <= recording.end)]
     t = keyframe_times(recording.start, recording.end, cls.epochs(recording, settings, inside), 1.0)
     imu = recording.imu
     intervals = preintegrate(bridge_gaps(imu), imu, t, np.full(3, 0.02), np.full(3, 1e-3))
@@ -223,21 +225,31 @@ def tiny_problem(recording: Recording, settings: Settings) -> Problem:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_epochs_lie_within_the_imu(name: str, recording: Recording) -> None:
-    """Measurements before the first and after the last IMU sample ask for no keyframes and make no rows."""
+    """Measurements before the first and after the last IMU sample ask for no keyframes and make no rows.
+
+    Fixes have a keyframe each, stops at both ends, stances often; the others have rows at keyframes of any kind.
+    """
     cls = next(c for c in list_constraints() if c.name == name)
     settings = with_parameters() if name in ON_FOOT else Settings()
     recording = seen_by(name, recording)
     imu = recording.imu
     inside = (imu.t > recording.start + 50.3) & (imu.t < recording.start + 81.7)
     short = replace(recording, imu=replace(imu, t=imu.t[inside], gyro=imu.gyro[inside], accel=imu.accel[inside]))
-    epochs = cls.epochs(short, settings, np.empty((0, 2)))
+    stops = short.start + np.array([[4.7, 9.9], [19.7, 24.8]])
+    epochs = cls.epochs(short, settings, stops)
+    assert (len(epochs) == 0) == (name in {"initial_prior", "nhc", "odometer", "foot_lateral", "closed_loop"})
     assert np.all((epochs >= short.start) & (epochs <= short.end))
-    scene = scene_of(cls, short, settings, LocalFrame(np.array([0.8, 0.2, 100.0])))
-    rows = cls.build(scene)
-    if len(epochs):
-        times = np.unique(scene.t[rows.keyframe])
-        assert 0 < len(times) == len(epochs) < len(cls.epochs(recording, settings, STANDING))
+    if name == InitialPrior.name:
+        return  # it is no measurement
+    scene = scene_of(cls, short, settings, LocalFrame(np.array([0.8, 0.2, 100.0])), stops)
+    times = np.unique(scene.t[cls.build(scene).keyframe])
+    assert len(times)
+    assert np.all((times >= short.start) & (times <= short.end))
+    if name.startswith("gnss"):
+        assert len(epochs) < len(cls.epochs(recording, settings, stops))
         np.testing.assert_allclose(times, epochs, atol=1e-6)
+    elif name in {"zero_velocity", "zero_rate", "held_position"}:
+        assert np.all(np.any((times[:, None] >= stops[:, 0]) & (times[:, None] <= stops[:, 1] + 1e-6), axis=1))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -24,7 +24,7 @@ from graphnav.recording import Gnss, Recording
 
 @pytest.fixture(scope="module")
 def path() -> oracle.ExactPath:
-    return oracle.vehicle_path(duration=420, seed=11)
+    return oracle.vehicle_path(duration=240, rate=50.0, seed=11)
 
 
 def kinds_of(gnss: Gnss, other: int) -> Array:
