@@ -77,19 +77,19 @@ def velocity_errors(solution: Solution, truth: Trajectory) -> tuple[Array, Array
 
 @pytest.fixture(scope="module")
 def positions(shared_data: Path) -> dict[str, Score]:
-    drives = [oracle.oracle_drive(shared_data, seed, odometer=False, rate=50.0) for seed in range(SEEDS)]
+    drives = [oracle.oracle_drive(shared_data, seed, odometer=False) for seed in range(SEEDS)]
     return scored(drives, STATED)
 
 
 @pytest.fixture(scope="module")
 def estimated(shared_data: Path) -> dict[str, Score]:
-    drives = [oracle.oracle_drive(shared_data, seed, odometer=False, rate=50.0) for seed in range(SEEDS)]
+    drives = [oracle.oracle_drive(shared_data, seed, odometer=False) for seed in range(SEEDS)]
     return scored(drives, INERTIAL)
 
 
 @pytest.fixture(scope="module")
 def velocities(shared_data: Path) -> dict[str, Score]:
-    path = oracle.oracle_truth_path(shared_data, 50.0)
+    path = oracle.oracle_truth_path(shared_data)
     drives = [
         oracle.drive(path, seed=50 + seed, gnss_velocity_sd=(0.05, 0.05, 0.08), outages=((415.0, 475.0),))
         for seed in range(SEEDS)
