@@ -3,8 +3,8 @@
 The drives are exact laps of python-ins (see tests/oracle_path.py; the package's `dev` extra has it) with the errors
 of a MEMS unit, fixes of 2 cm at 1 Hz with three 60-s outages an hour, and wheel speed. They are real recording
 folders, so reading them counts. Those of more than three hours are solved in parts
-(`graphnav.estimation.long_drives`). Every run
-is a process of its own, and its time and memory are what the operating system says they were.
+(`graphnav.estimation.long_drives`). Every run is a process of its own, and its time and memory are what the operating
+system says they were.
 
     python scripts/benchmark.py --hours 0.1667,1,4,12,24 --keep build/benchmark
 """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,20 @@ def random_imu(rng: np.random.Generator, seconds: float, rate: float = 100.0, no
     gyro = 0.7 * rng.standard_normal((count, 3))
     accel = 3.0 * rng.standard_normal((count, 3)) + [0.5, -0.3, 9.8]
     return Imu(np.arange(1, count + 1) / rate, gyro, accel, noise or ImuNoise())
+
+
+def at_rate(recording: Recording, rate: float) -> Recording:
+    """The same recording of an IMU that samples less often: rows are means, so means of them are its rows."""
+    imu = recording.imu
+    n = round(1.0 / (rate * float(np.median(np.diff(imu.t)))))
+    count = len(imu.t) // n
+
+    def mean(x: Array) -> Array:
+        return x[: count * n].reshape(count, n, 3).mean(axis=1)
+
+    return replace(
+        recording, imu=replace(imu, t=imu.t[n - 1 : count * n : n], gyro=mean(imu.gyro), accel=mean(imu.accel))
+    )
 
 
 def truth_states(truth: Trajectory, t: Array, frame: LocalFrame) -> States:

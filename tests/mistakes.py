@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -51,10 +52,13 @@ class Mistake:
 # ---- tools
 def table(folder: Path, name: str) -> Table:
     """The columns of a sensor's file."""
-    with gzip.open(folder / f"{name}.csv.gz", "rt") as file:
-        header = file.readline().strip().split(",")
-        values = np.genfromtxt(file, delimiter=",")
-    return dict(zip(header, values.T, strict=True))
+    return {key: column.copy() for key, column in _parsed((folder / f"{name}.csv.gz").read_bytes()).items()}
+
+
+@lru_cache(maxsize=4)
+def _parsed(packed: bytes) -> Table:
+    header, *rows = gzip.decompress(packed).decode().splitlines()
+    return dict(zip(header.split(","), np.genfromtxt(rows, delimiter=",").T, strict=True))
 
 
 def write(folder: Path, name: str, columns: Table, separator: str = ",") -> None:

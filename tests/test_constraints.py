@@ -69,9 +69,11 @@ def seen_by(name: str, recording: Recording) -> Recording:
     return replace(recording, platform="foot", gnss=None, odometer=None) if name in ON_FOOT else recording
 
 
-def scene_of(cls: type[Constraint], recording: Recording, settings: Settings, frame: LocalFrame) -> BuildContext:
+def scene_of(
+    cls: type[Constraint], recording: Recording, settings: Settings, frame: LocalFrame, stops: Array = STANDING
+) -> BuildContext:
     """A scene with the keyframes one constraint asks for."""
-    inside = STANDING[(STANDING[:, 0] >= recording.start) & (STANDING[:, 1] <= recording.end)]
+    inside = stops[(stops[:, 0] >= recording.start) & (stops[:, 1] <= recording.end)]
     t = keyframe_times(recording.start, recording.end, cls.epochs(recording, settings, inside), 1.0)
     imu = recording.imu
     intervals = preintegrate(bridge_gaps(imu), imu, t, np.full(3, 0.02), np.full(3, 1e-3))
@@ -201,8 +203,7 @@ def test_filter_update_is_one_linear_graph_step(case: Case) -> None:
 def test_the_filter_itself_does_that_update(recording: Recording, copies: int) -> None:
     """The filter's update at its first fix against the formula, lever arm included; several rows are stacked."""
     problem = tiny_problem(recording, with_parameters(""))
-    rows = problem.constraints[0]
-    assert isinstance(rows, GnssPosition)
+    rows = next(c for c in problem.constraints if isinstance(c, GnssPosition))
     k = int(rows.keyframe[1])
     pick = np.array([1, 2][:copies])
     rows = replace(
@@ -235,22 +236,33 @@ def tiny_problem(recording: Recording, settings: Settings) -> Problem:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_epochs_lie_within_the_imu(name: str, recording: Recording) -> None:
-    """Measurements before the first and after the last IMU sample ask for no keyframes and make no rows."""
+    """Measurements before the first and after the last IMU sample ask for no keyframes and make no rows.
+
+    Fixes have a keyframe each, stops at both ends, stances often; the others have rows at keyframes of any kind.
+    """
     cls = next(c for c in list_constraints() if c.name == name)
     settings = with_parameters(name) if name in ON_FOOT | PPP else Settings()
     recording = seen_by(name, recording)
     imu = recording.imu
     inside = (imu.t > recording.start + 50.3) & (imu.t < recording.start + 81.7)
     short = replace(recording, imu=replace(imu, t=imu.t[inside], gyro=imu.gyro[inside], accel=imu.accel[inside]))
-    epochs = cls.epochs(short, settings, np.empty((0, 2)))
+    stops = short.start + np.array([[4.7, 9.9], [19.7, 24.8]])
+    epochs = cls.epochs(short, settings, stops)
+    anywhere = {"initial_prior", "nhc", "odometer", "foot_lateral", "closed_loop", "barometer", "gnss_ppp_carrier"}
+    assert (len(epochs) == 0) == (name in anywhere)  # rows at keyframes of any kind, or at those of other rows
     assert np.all((epochs >= short.start) & (epochs <= short.end))
-    scene = scene_of(cls, short, settings, LocalFrame(np.array([0.8, 0.2, 100.0])))
-    rows = cls.build(scene)
-    if len(epochs):
-        times = np.unique(scene.t[rows.keyframe])
-        assert 0 < len(epochs) < len(cls.epochs(recording, settings, STANDING))
-        without = int(cls.name == "gnss_carrier")  # of the first epoch there is no change
+    if name in {InitialPrior.name, "gnss_ppp_carrier"}:
+        return  # it is no measurement; and there are none without the keyframes of the codes
+    scene = scene_of(cls, short, settings, LocalFrame(np.array([0.8, 0.2, 100.0])), stops)
+    times = np.unique(scene.t[cls.build(scene).keyframe])
+    assert len(times)
+    assert np.all((times >= short.start) & (times <= short.end))
+    if name.startswith("gnss") and len(epochs):
+        assert len(epochs) < len(cls.epochs(recording, settings, stops))
+        without = int(name == "gnss_carrier")  # of the first epoch there is no change
         np.testing.assert_allclose(times, epochs[without:], atol=1e-6)
+    elif name in {"zero_velocity", "zero_rate", "held_position"}:
+        assert np.all(np.any((times[:, None] >= stops[:, 0]) & (times[:, None] <= stops[:, 1] + 1e-6), axis=1))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -277,7 +289,7 @@ def test_gnss_rows_are_the_measurement_of_the_truth(recording: Recording) -> Non
     made, truth = oracle.drive(path, imu_noise=None, gnss_exact=True, gnss_velocity_sd=(0.1, 0.1, 0.1))
     frame = LocalFrame(made.gnss.llh[40])
     for cls in list_constraints():
-        if not cls.name.startswith("gnss") or cls.name in {*RAW, "gnss_phase", "gnss_integers"}:
+        if cls.name not in {"gnss_position", "gnss_velocity"}:
             continue
         scene = scene_of(cls, made, Settings(), frame)
         rows = cls.build(scene)

@@ -85,7 +85,10 @@ def moments(problem: Problem, forward: ForwardRecord, smoothed: SmootherPass) ->
 
 def lap() -> Recording:
     recording, _ = oracle.drive(
-        oracle.vehicle_path(duration=120, seed=4), seed=2, gnss_velocity_sd=(0.05, 0.05, 0.08), odometer_rate=20.0
+        oracle.vehicle_path(duration=120, rate=50.0, seed=4),
+        seed=2,
+        gnss_velocity_sd=(0.05, 0.05, 0.08),
+        odometer_rate=20.0,
     )
     gnss = recording.gnss
     assert gnss is not None
@@ -329,9 +332,8 @@ def log_posterior(drive: Drive, noise: NoiseModel) -> float:
     return float(forward.log_likelihood.sum()) + priors
 
 
-def test_no_other_figures_are_likelier(request: pytest.FixtureRequest, estimated: Estimated) -> None:
+def test_no_other_figures_are_likelier(estimated: Estimated) -> None:
     """The maximum is no less than what the true figures have, and no more than chance makes it by so many figures."""
-    expect(request, fixes_worse="0.6 below the true figures in one of five: passes end before the last unit")
     gains = []
     for drive, found in zip(estimated.drives, estimated.found, strict=True):
         true = NoiseModel({name: Figure(x) for name, x in drive.true.items()})
@@ -341,9 +343,8 @@ def test_no_other_figures_are_likelier(request: pytest.FixtureRequest, estimated
     assert 2.0 * np.sum(gains) < chdtri(freedom * len(gains), 1e-3), gains
 
 
-def test_once_more_from_its_end_an_estimate_is_the_same(estimated: Estimated, request: pytest.FixtureRequest) -> None:
+def test_once_more_from_its_end_an_estimate_is_the_same(estimated: Estimated) -> None:
     """Within what chance makes of a log-likelihood."""
-    expect(request, fixes_worse="ends after four passes, with rows that weigh less since the first of them")
     for drive, found in zip(estimated.drives[:2], estimated.found[:2], strict=True):
         near = found.points, with_noise(drive.base, found.noise)
         again = estimate_noise(drive.base, drive.opening, found.noise, near)
@@ -352,11 +353,7 @@ def test_once_more_from_its_end_an_estimate_is_the_same(estimated: Estimated, re
 
 def test_figures_are_true_within_their_sigmas(estimated: Estimated, request: pytest.FixtureRequest) -> None:
     """Squared errors over the variances stated: chi-square over drives."""
-    expect(
-        request,
-        fixes_worse="accelerometer noise up to 4.5 sigma too large, for rows weigh less",
-        fixes_better="what lasts for hours is told by its prior, in units of a sigma four times too large",
-    )
+    expect(request, fixes_better="what lasts for hours is told by its prior, with a sigma 4 times too large")
     for name in estimated.drives[0].true:
         z = [
             (found.noise.figures[name].log_factor - drive.true[name]) / found.noise.figures[name].sigma
@@ -385,8 +382,10 @@ def test_sigmas_of_the_drive_are_true_with_estimated_figures(
     assert all(low < np.mean(x) < high for x in ratio.values()), ratio
 
 
-@pytest.mark.xfail(strict=False, reason="stops at 0.13 and 0.24 m/s with, 0.03 and 0.004 m/s without the other wheels")
-@pytest.mark.parametrize("nhc", [True, False])
+@pytest.mark.parametrize(
+    "nhc",
+    [True, pytest.param(False, marks=pytest.mark.xfail(strict=False, reason="stops at 0.03 and 0.004 m/s"))],
+)
 def test_an_odometer_that_is_wrong_for_seconds(nhc: bool) -> None:
     """Its errors last for 3 s: they are seen to, and are as large as they are."""
     path = oracle.vehicle_path(duration=240, seed=11)
@@ -433,7 +432,7 @@ def shifted(recording: Recording, begin: float, end: float, by: tuple[float, flo
 
 
 def wheeled(seed: int) -> Recording:
-    return oracle.drive(oracle.vehicle_path(duration=240, seed=11), seed=seed, odometer_rate=20.0)[0]
+    return oracle.drive(oracle.vehicle_path(duration=240, rate=50.0, seed=11), seed=seed, odometer_rate=20.0)[0]
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -454,13 +453,7 @@ def test_fixes_that_are_wrong_alike_are_left_out(wheels: bool) -> None:
     assert not set(found.noise.excluded) & set(WHEELS)
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        pytest.param("twice", marks=pytest.mark.xfail(strict=False, reason="ten of 241 fixes weigh less")),
-        "offset",
-    ],
-)
+@pytest.mark.parametrize("kind", ["twice", "offset"])
 def test_wheels_that_are_wrong_are_not_taken_for_fixes(kind: str) -> None:
     recording = wheeled(1)
     odometer = recording.odometer
@@ -482,16 +475,7 @@ def test_wheels_that_are_wrong_are_not_taken_for_fixes(kind: str) -> None:
 # ---------------------------------------------------------------------------------------------------------- once more
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "tokyo",
-        pytest.param(
-            "wrong fixes",
-            marks=pytest.mark.xfail(strict=False, reason="a start from all fixes, where noise is given"),
-        ),
-    ],
-)
+@pytest.mark.parametrize("name", ["tokyo", "wrong fixes"])
 def test_a_run_with_the_noise_that_another_found_is_the_same(name: str) -> None:
     recording = load(SHIPPED).crop(0.0, 60.0) if name == "tokyo" else shifted(lap(), -1.0, 20.0, (30.0, 0.0, 0.0))[0]
     one = run(recording)

@@ -29,7 +29,13 @@ INERTIAL = {
 
 @pytest.fixture(scope="module")
 def path() -> oracle.ExactPath:
-    return oracle.vehicle_path(duration=420, seed=11)
+    return oracle.vehicle_path(duration=420, rate=50.0, seed=11)
+
+
+@pytest.fixture(scope="module")
+def short() -> oracle.ExactPath:
+    """Of 240 fixes a sigma is known to 1 / sqrt(4 * 240) = 3 % (up 5 %): enough for what is asked of a factor."""
+    return oracle.vehicle_path(duration=240, rate=50.0, seed=11)
 
 
 def found_in(recording: Recording, settings: Settings | None = None) -> NoiseModel:
@@ -87,9 +93,9 @@ def wandering(recording: Recording, share: float, seed: int, time: float = 100.0
     ],
 )
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_true_figures_are_left_alone(path: oracle.ExactPath, seed: int, wheels: bool) -> None:
+def test_true_figures_are_left_alone(short: oracle.ExactPath, seed: int, wheels: bool) -> None:
     """Used as they are, for nothing is likelier; or within a factor of 1.5, or three of their sigmas."""
-    recording, _ = oracle.drive(path, seed=seed)
+    recording, _ = oracle.drive(short, seed=seed)
     noise = found_in(recording, Settings() if wheels else settings_from(INERTIAL))
     assert not any(noise.excluded.values())
     if not noise.figures:
@@ -100,8 +106,8 @@ def test_true_figures_are_left_alone(path: oracle.ExactPath, seed: int, wheels: 
         assert 1 / 1.15 < times(noise, name) < 1.15, name
 
 
-def test_fixes_that_scatter_more_than_they_state(path: oracle.ExactPath) -> None:
-    recording, _ = oracle.drive(path, seed=3)
+def test_fixes_that_scatter_more_than_they_state(short: oracle.ExactPath) -> None:
+    recording, _ = oracle.drive(short, seed=3)
     noise = found_in(stating(recording, fixes=3.0))
     for axis in ("horizontal", "up"):
         assert 2.4 < times(noise, f"gnss_position.{axis}") < 3.6
@@ -109,8 +115,8 @@ def test_fixes_that_scatter_more_than_they_state(path: oracle.ExactPath) -> None
 
 
 @pytest.mark.parametrize(("size", "seed"), [(1.0, 0), (1.0, 1), (1.0, 2), (3.0, 0), (3.0, 1)])
-def test_velocities_have_a_factor_of_their_own(path: oracle.ExactPath, size: float, seed: int) -> None:
-    recording, _ = oracle.drive(path, seed=seed, gnss_velocity_sd=(0.1 * size,) * 3)
+def test_velocities_have_a_factor_of_their_own(short: oracle.ExactPath, size: float, seed: int) -> None:
+    recording, _ = oracle.drive(short, seed=seed, gnss_velocity_sd=(0.1 * size,) * 3)
     assert recording.gnss is not None
     assert recording.gnss.sd_v is not None
     noise = found_in(replace(recording, gnss=replace(recording.gnss, sd_v=recording.gnss.sd_v / size)))
@@ -119,7 +125,6 @@ def test_velocities_have_a_factor_of_their_own(path: oracle.ExactPath, size: flo
         assert 0.8 < times(noise, f"gnss_position.{axis}") < 1.2, axis
 
 
-@pytest.mark.xfail(strict=False, reason="gyro noise x 5.3 instead of 4, accelerometer noise lower: wheels hold exactly")
 def test_an_imu_noisier_than_stated(path: oracle.ExactPath) -> None:
     """Both noise densities four times what is stated: at least half of that is seen, part goes to the bias walks."""
     recording, _ = oracle.drive(path, seed=4, gnss_rate=4.0, gnss_velocity_sd=(0.02, 0.02, 0.03))
@@ -137,11 +142,11 @@ def nees(recording: Recording, truth: Trajectory, settings: Settings | None = No
     return np.nanmean(found.nees_p) / 3.0
 
 
-def test_sigma_holds_when_fixes_are_wrong_alike(path: oracle.ExactPath) -> None:
+def test_sigma_holds_when_fixes_are_wrong_alike(short: oracle.ExactPath) -> None:
     """Seven tenths of the variance wander: as stated, the sigma is several times too small; estimated, it holds."""
     found, white = [], []
     for seed in range(6):
-        recording, truth = oracle.drive(path, seed=20 + seed, gnss_sd=tuple(np.sqrt(0.3) * np.array(oracle.RTK_SD)))
+        recording, truth = oracle.drive(short, seed=20 + seed, gnss_sd=tuple(np.sqrt(0.3) * np.array(oracle.RTK_SD)))
         recording = replace(recording, gnss=replace(recording.gnss, sd=recording.gnss.sd / np.sqrt(0.3)))
         recording = wandering(recording, 0.7, seed)
         found.append(nees(recording, truth))
@@ -150,15 +155,15 @@ def test_sigma_holds_when_fixes_are_wrong_alike(path: oracle.ExactPath) -> None:
     assert 0.5 < np.mean(found) < 1.6
 
 
-@pytest.mark.xfail(strict=False, reason="1.45 times as large as they are: what lasts for hours adds its prior")
-def test_errors_that_last_for_seconds(path: oracle.ExactPath) -> None:
+@pytest.mark.xfail(strict=False, reason="1.47 times as large as they are: what lasts for hours adds its prior")
+def test_errors_that_last_for_seconds(short: oracle.ExactPath) -> None:
     """Fixes that state 2 m (up 4 m): what they are wrong by is found from residuals, and every solver's sigma holds.
 
     White noise beside it makes it seem to last for less.
     """
     size, time, ratio = 5.0, 10.0, []
     for seed in range(2):
-        recording, truth = oracle.drive(path, seed=seed, gnss_sd=(2.0, 2.0, 4.0))
+        recording, truth = oracle.drive(short, seed=seed, gnss_sd=(2.0, 2.0, 4.0))
         recording = wandering(recording, 1.0, 100 + seed, time, size / 2.0)
         solutions = run(recording, None, ("ekf", "rts", "batch"))
         noise = solutions["rts"].noise
@@ -209,7 +214,7 @@ def test_five_minutes_of_single_point_fixes_among_high_houses(shared_data: Path,
 
 def test_an_imu_far_worse_than_stated_is_not_taken_for_bad_fixes(shared_data: Path) -> None:
     """Noise twenty times what is stated, of all four figures: errors of the fixes do not explain it either."""
-    recording = load(shared_data / "oracle_drive")
+    recording = load(shared_data / "oracle_drive").crop(0.0, 300.0)
     figures = ("gyro_noise_density", "accel_noise_density", "gyro_bias_walk", "accel_bias_walk")
     noise = replace(recording.imu.noise, **{name: getattr(recording.imu.noise, name) / 20.0 for name in figures})
     recording = replace(recording, imu=replace(recording.imu, noise=noise))

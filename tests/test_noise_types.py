@@ -24,7 +24,7 @@ from graphnav.recording import Gnss, Recording
 
 @pytest.fixture(scope="module")
 def path() -> oracle.ExactPath:
-    return oracle.vehicle_path(duration=420, seed=11)
+    return oracle.vehicle_path(duration=240, rate=50.0, seed=11)
 
 
 def kinds_of(gnss: Gnss, other: int) -> Array:
@@ -58,11 +58,10 @@ def rms_and_nees(trajectory: Trajectory, truth: Trajectory) -> tuple[float, floa
 @pytest.mark.xfail(
     strict=False, reason="sigma of float fixes x 6, outliers by the figures of the first pass weigh less"
 )
-@pytest.mark.parametrize("seed", [0, 1])
-def test_float_fixes_that_scatter_ten_times_as_much(path: oracle.ExactPath, seed: int) -> None:
+def test_float_fixes_that_scatter_ten_times_as_much(path: oracle.ExactPath) -> None:
     """The factor is found, sigmas of every solver hold, and the result is that of true sigmas."""
-    recording, truth = oracle.drive(path, seed=seed)
-    made = scattering(recording, 10.0, 100 + seed)
+    recording, truth = oracle.drive(path, seed=0)
+    made = scattering(recording, 10.0, 100)
     solutions = run(made, None, ("ekf", "rts", "batch"))
     noise = solutions["rts"].noise
     for axis in ("horizontal", "up"):

@@ -57,7 +57,10 @@ def test_json_of_compare_is_what_the_files_hold(solved):
         (["init", TOKYO / "imu.csv.gz", TOKYO / "gnss.csv.gz", "-o", "r.toml"], {"decisions", "files"}),
         (["simulate", "gait", "--set", "duration=20", "-o", "out"], {"scenario", "stops", "files"}),
         (["settings", "--profile", "car"], {"profile", "gnss", "vehicle"}),
-        (["smooth", TOKYO, "--end", "60", "--solver", "ekf", "-o", "out"], {"solver", "errors", "settings", "files"}),
+        (
+            ["smooth", TOKYO, "--end", "60", "--solver", "ekf", "--noise", "stated", "-o", "out"],
+            {"solver", "errors", "settings", "files"},
+        ),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
@@ -176,7 +179,7 @@ def test_a_profile_of_another_platform_is_refused_and_a_missing_odometer_is_said
 
 
 def test_a_run_can_be_repeated_with_the_settings_in_its_summary(tmp_path):
-    options = ["--end", "60", "--solver", "ekf", "--quiet"]
+    options = ["--end", "60", "--solver", "ekf", "--noise", "stated", "--quiet"]
     assert cli.run(["smooth", str(TOKYO), "--profile", "car", *options, "-o", str(tmp_path / "a")]) == 0
     again = ["--config", str(tmp_path / "a" / "summary.json")]
     assert cli.run(["smooth", str(TOKYO), *again, *options, "-o", str(tmp_path / "b")]) == 0
@@ -250,14 +253,12 @@ def test_ctrl_c_waits_for_what_must_not_be_cut():
 def test_a_full_disk_leaves_the_older_results_as_they_were(tmp_path):
     """A limit on the size of files stands for the disk."""
 
-    def smooth(end, limit):
-        command = [PROGRAM, "smooth", TOKYO, "--end", str(end), "--solver", "ekf", "-o", tmp_path]
-        cap = (lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))) if limit else None
-        return subprocess.run(command, preexec_fn=cap, capture_output=True, text=True, timeout=300)
-
-    assert smooth(60, None).returncode == 0
+    smooth = ["smooth", str(TOKYO), "--solver", "ekf", "--noise", "stated", "-o", str(tmp_path)]
+    assert cli.run([*smooth, "--end", "50", "--quiet"]) == 0
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
-    run = smooth(90, 20_000)
+    cap = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # noqa: E731
+    command = [PROGRAM, *smooth, "--end", "60"]
+    run = subprocess.run(command, preexec_fn=cap, capture_output=True, text=True, timeout=300)
     assert run.returncode == 2
     assert re.fullmatch(r"graphnav: -o .*: cannot be written \(File too large\); .*\n", run.stderr)
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before

@@ -61,7 +61,8 @@ def refine_lag(
         kept = some[valid(lag)[some]]
         if len(kept) < fewest:
             return None
-        x, of = quick(t[kept], x_at(kept, lag)), quick(t[kept], y[kept, None])[:, 0]
+        both = quick(t[kept], np.column_stack([x_at(kept, lag), y[kept]]))
+        x, of = both[:, :-1], both[:, -1]
         b = np.linalg.lstsq(x, of, rcond=None)[0]
         return _At(kept, x, of, b, of - x @ b)
 

@@ -168,7 +168,8 @@ def inspect(recording: Recording) -> Inspection:
         findings += raw_findings(recording.raw_gnss)
     turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis"}
     if vehicle and overlap and track is not None and recording.gnss is not None:
-        clock, yaw = clock_of(recording.imu, recording.gnss), crosschecks.yaw_fit(recording.imu, track)
+        clock = whole.clock or clock_of(recording.imu, recording.gnss)
+        yaw = crosschecks.yaw_fit(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
         if turns_back and (said := list(mirrored(recording))):

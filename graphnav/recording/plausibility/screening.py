@@ -21,7 +21,7 @@ from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, rows_of
 from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.aiding import imu_axes, imu_clock, overlap_s
-from graphnav.recording.checks.clock import clock_of
+from graphnav.recording.checks.clock import Clock, clock_of
 from graphnav.recording.checks.crosschecks import Fit, Track
 from graphnav.recording.checks.series import screen_series
 from graphnav.recording.formats.schema import FORCE
@@ -52,6 +52,7 @@ class Screened:
 
     recording: Recording
     findings: tuple[Finding, ...] = ()
+    clock: Clock | None = None  # of the IMU against the fixes, where it was looked at
 
 
 def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:
@@ -126,19 +127,23 @@ def screen(recording: Recording) -> Screened:
     if recording.odometer is not None and len(recording.odometer.t):
         recording, said = plausibility_odometer.screen(recording, track)
         findings += said
-    dead = any(f.key == "imu.dead_axis" for f in findings)
+    dead, clock = any(f.key == "imu.dead_axis" for f in findings), None
     if recording.platform == "vehicle" and not dead and not wrong_unit:
         way = track
         if way is None and recording.odometer is not None:
             way = plausibility_odometer.track(recording.odometer)
-        forward = crosschecks.forward_fit(recording.imu, way) if way is not None else None
-        findings += forward_sign(recording.imu, way, forward)
         # stamps that are late by now this, now that have no clock
         if track is not None and not any(f.key == "gnss.stamped_on_arrival" for f in findings):
             assert recording.gnss is not None
+            clock = clock_of(recording.imu, recording.gnss)
+            forward = clock.by_velocity if track.instant else clock.by_places
+        else:
+            forward = crosschecks.forward_fit(recording.imu, way) if way is not None else None
+        findings += forward_sign(recording.imu, way, forward)
+        if clock is not None and track is not None:
             odometer = crosschecks.odometer_fit(recording.odometer, track) if recording.odometer is not None else None
-            findings += imu_clock(clock_of(recording.imu, recording.gnss), None if odometer is None else odometer[0])
-    return Screened(recording, tuple(findings))
+            findings += imu_clock(clock, None if odometer is None else odometer[0])
+    return Screened(recording, tuple(findings), clock)
 
 
 def imu_scale(recording: Recording) -> Iterator[Finding]:
