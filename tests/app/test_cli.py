@@ -60,7 +60,7 @@ def summary(folder):
 @pytest.fixture(scope="session")
 def benchmark():
     """scripts/benchmark.py, which writes drives of another simulator as recording folders."""
-    path = Path(__file__).resolve().parents[1] / "scripts" / "benchmark.py"
+    path = Path(__file__).resolve().parents[2] / "scripts" / "benchmark.py"
     spec = importlib.util.spec_from_file_location("benchmark", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules["benchmark"] = module  # its dataclasses look themselves up
@@ -300,7 +300,7 @@ def test_a_run_is_repeated_from_the_provenance_of_its_report_alone(drive, tmp_pa
 
 def test_a_run_is_repeated_with_the_noise_model_of_its_summary(tmp_path):
     """Byte for byte, on a minute of a real drive; and the noise model matters."""
-    tokyo = Path(__file__).resolve().parents[1] / "data" / "tokyo"
+    tokyo = Path(__file__).resolve().parents[2] / "data" / "tokyo"
     smooth = ["smooth", str(tokyo), "--end", "60", "--quiet"]
     given = str(tmp_path / "first" / "summary.json")
     assert cli.run([*smooth, "-o", str(tmp_path / "first")]) == 0

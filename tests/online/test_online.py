@@ -37,7 +37,7 @@ from graphnav.online.view import view
 from graphnav.recording import Recording
 from graphnav.recording.formats import read
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 QUICK = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 20.0}})
 
 

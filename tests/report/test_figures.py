@@ -14,7 +14,7 @@ from graphnav.recording.formats.figures import EXAMPLES, UNITS, parse_figure
 from graphnav.recording.formats.imu_models import MODELS, find_model
 from graphnav.recording.formats.schema import NOISE_FIGURES
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize(

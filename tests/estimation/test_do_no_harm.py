@@ -16,7 +16,7 @@ import graphnav
 from graphnav.core.earth import LocalFrame
 from graphnav.estimation.solution import ExcludedSpan
 
-SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from graphnav.estimation import long_drives
 from graphnav.estimation.pipeline import run
 from graphnav.recording import rows_of
 
-DEMO = Path(__file__).resolve().parents[1] / "data" / "tokyo"
+DEMO = Path(__file__).resolve().parents[2] / "data" / "tokyo"
 
 
 def test_parts_say_what_the_whole_says(monkeypatch: pytest.MonkeyPatch) -> None:

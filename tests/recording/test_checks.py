@@ -274,7 +274,7 @@ def test_heights_in_feet_are_seen_where_it_goes_up_and_down(drive: Callable[[str
 
 def test_axes_are_denied_only_by_better_ones() -> None:
     """Fifty seconds of fixes with one change of speed tell no direction, and the axes are right."""
-    whole = load(str(Path(__file__).parents[1] / "data" / "tokyo"))
+    whole = load(str(Path(__file__).parents[2] / "data" / "tokyo"))
     late = whole.without("gnss", (0.0, 80.0))
     assert not warned(late, "axes")
 

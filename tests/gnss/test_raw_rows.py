@@ -22,7 +22,7 @@ from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording.formats import read
 
-DATA = Path(__file__).resolve().parents[1] / "data"
+DATA = Path(__file__).resolve().parents[2] / "data"
 TIGHT = settings_from({"raw_gnss": {"coupling": "tight"}})
 
 

@@ -19,7 +19,7 @@ from graphnav.recording import Recording
 
 SEEDS = 10
 # Wheels and stops hold exactly on these drives, which no sigma is made for; simulated ones that slip and sway are in
-# `tests/test_vehicle.py`.
+# `tests/constraints/test_vehicle.py`.
 INERTIAL = {
     "vehicle": {"nhc": False, "odometer": False},
     "standstill": {"zero_velocity": False, "zero_rate": False, "held_position": False},

@@ -23,7 +23,7 @@ from graphnav.estimation.noise.table import figure_rows, whole_ratio
 from graphnav.estimation.problem import build_problem
 from graphnav.recording.formats import read as load
 
-TOKYO = Path(__file__).resolve().parents[1] / "data" / "tokyo"
+TOKYO = Path(__file__).resolve().parents[2] / "data" / "tokyo"
 
 
 def some_noise(seed: int = 0) -> NoiseModel:

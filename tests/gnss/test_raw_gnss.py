@@ -21,7 +21,7 @@ from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, QZSS, C, satell
 from graphnav.gnss.single_point import look, solve
 from graphnav.recording.formats import read
 
-TOKYO = Path(__file__).resolve().parents[1] / "data" / "tokyo_raw"
+TOKYO = Path(__file__).resolve().parents[2] / "data" / "tokyo_raw"
 UCR, SLAC, CSSR = "ucr_riverside_20200712", "raw_gnss_slac_20210428", "cssrlib_2021_265"
 
 

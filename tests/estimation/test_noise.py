@@ -44,7 +44,7 @@ INERTIAL = settings_from(
         "standstill": {"zero_velocity": False, "zero_rate": False, "held_position": False},
     }
 )
-SHIPPED = Path(__file__).resolve().parents[1] / "data" / "tokyo"
+SHIPPED = Path(__file__).resolve().parents[2] / "data" / "tokyo"
 SEEDS = range(5)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.append(str(Path(__file__).resolve().parent / "fuzz"))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "fuzz"))
 import raw_cases
 
 from graphnav.core.errors import RecordingError
