@@ -78,7 +78,7 @@ def fleet(
     convert.check_rate(rate)
     if withhold is not None and not withhold > 0.0:
         raise ConfigError(f"--withhold {withhold:g}: must be a number of seconds above 0")
-    asked = manifest.Asked(
+    asked = manifest.DriveOptions(
         solver,
         profile,
         None if config is None else str(config),

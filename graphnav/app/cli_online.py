@@ -77,7 +77,7 @@ def online(
     recording = None if live else read(source, topic or (), allow_outside)
     session = Session(settings, source, folder, resume, recording)
     shown = Shown(session, quiet)
-    with Asked() as asked:
+    with StopRequest() as asked:
         try:
             if live:
                 follow(session, standard_input() if source == "-" else connections(source), shown, asked)
@@ -118,7 +118,7 @@ def _send(source: str, topics: list[str], allow_outside: bool, speed: float) -> 
         say(line, flush=speed > 0 or line == END)
 
 
-def replay(session: Session, pace: Pace, shown: Shown, asked: Asked) -> None:
+def replay(session: Session, pace: Pace, shown: Shown, asked: StopRequest) -> None:
     """Take in the rows of a recording when they are due."""
     for row in session.rows[session.taken :]:
         pace.wait(row[1], shown.update, asked)
@@ -128,14 +128,14 @@ def replay(session: Session, pace: Pace, shown: Shown, asked: Asked) -> None:
         shown.now_and_then()
 
 
-class Asked:
+class StopRequest:
     """Whether Ctrl-C or a SIGTERM asked to end: between two rows, where the smoother is whole."""
 
     def __init__(self) -> None:
         self.so = False
         self._before: dict[int, Any] = {}
 
-    def __enter__(self) -> Asked:
+    def __enter__(self) -> StopRequest:
         self._before = {what: signal.signal(what, self._ask) for what in (signal.SIGINT, signal.SIGTERM)}
         return self
 
@@ -152,7 +152,7 @@ class Asked:
         self.so = True
 
 
-def follow(session: Session, chunks: Iterator[bytes], shown: Shown, asked: Asked) -> None:
+def follow(session: Session, chunks: Iterator[bytes], shown: Shown, asked: StopRequest) -> None:
     """Take in lines until the source ends or says so; b"" means that nothing came for a while."""
     rest, heard = b"", time.monotonic()
     for chunk in chunks:
@@ -211,7 +211,7 @@ class Pace:
     def __init__(self, speed: float) -> None:
         self.speed, self.began, self.first = speed, time.monotonic(), float("nan")
 
-    def wait(self, t: float, meanwhile: Callable[[], None] | None = None, asked: Asked | None = None) -> None:
+    def wait(self, t: float, meanwhile: Callable[[], None] | None = None, asked: StopRequest | None = None) -> None:
         if self.speed <= 0.0:
             return
         if self.first != self.first:

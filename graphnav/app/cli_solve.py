@@ -67,7 +67,7 @@ def smooth(
     json: Json = False,
 ) -> None:
     """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
-    asked = _Asked(
+    asked = _Options(
         only(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
         quiet, json, pages,
     )  # fmt: skip
@@ -123,7 +123,7 @@ def compare(
     json: Json = False,
 ) -> None:
     """Put the same recording through several solvers and compare them, against the truth where there is one."""
-    asked = _Asked(
+    asked = _Options(
         only(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
         quiet, json, pages,
     )  # fmt: skip
@@ -156,7 +156,7 @@ def report(
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _Options:
     """The options that smooth and compare share."""
 
     recording: str
@@ -186,7 +186,7 @@ class _Beside:
 
 
 def _solve(
-    asked: _Asked,
+    asked: _Options,
     solvers: str,
     option: str,
     export: str | None = None,

@@ -18,7 +18,7 @@ from graphnav.core.notes import key_of
 from graphnav.core.progress import Progress
 from graphnav.core.staging import defer_interrupts
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.metrics import Span
+from graphnav.evaluation.metrics import SpanErrors
 
 _IMU = {
     "imu.gyro_noise_density": "gyro", "imu.accel_noise_density": "accelerometer",
@@ -159,7 +159,7 @@ def _spans(outcome: Outcome) -> list[str]:
     return lines
 
 
-def _share(span: Span) -> str:
+def _share(span: SpanErrors) -> str:
     """Drift as a share of the way; of a vehicle that stands it means nothing."""
     return short(span.drift_percent) if span.distance >= 1.0 else "-"
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from graphnav.config import Settings
 from graphnav.constraints.base import BuildContext, Constraint, Linearized
 from graphnav.constraints.gnss import LEVER_ARM
-from graphnav.constraints.raw_gnss import _AXES, _common, _prepare, _Prepared, _Satellites, _select
+from graphnav.constraints.raw_gnss import _AXES, _common, _prepare, _SatelliteRows, _Satellites, _select
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
@@ -73,7 +73,7 @@ def _are_wanted(recording: Recording, settings: Settings) -> bool:
     return not (s.carrier and s.code and np.isfinite(raw.carrier_difference).any())
 
 
-def _pairs(scene: BuildContext) -> tuple[_Prepared, _Pairs] | None:
+def _pairs(scene: BuildContext) -> tuple[_SatelliteRows, _Pairs] | None:
     if not _are_wanted(scene.recording, scene.settings):
         return None
     found, whole = scene.share(_prepare), scene.recording.raw_gnss
@@ -92,7 +92,7 @@ def _pairs(scene: BuildContext) -> tuple[_Prepared, _Pairs] | None:
     return found, _Pairs(before, after, of[after], epochs, first, change, clock)
 
 
-def _clones(found: _Prepared, pairs: _Pairs) -> tuple[Parameter, ...]:
+def _clones(found: _SatelliteRows, pairs: _Pairs) -> tuple[Parameter, ...]:
     return tuple(
         Parameter(
             name, found.nominal[pairs.first[k::2]], np.full((len(pairs.epochs[k::2]), 3), _ANYWHERE), "m",

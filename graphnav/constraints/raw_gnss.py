@@ -88,7 +88,7 @@ def _apart(t: Array, least: float) -> Array:
 
 
 @dataclass(frozen=True)
-class _Prepared:
+class _SatelliteRows:
     """What both kinds of rows need, of the rows that are used; made once for a scene."""
 
     raw: RawGnss
@@ -105,7 +105,7 @@ class _Prepared:
     spacing: float  # s from node to node of whatever changes slowly
 
 
-def _prepare(scene: BuildContext) -> _Prepared | None:
+def _prepare(scene: BuildContext) -> _SatelliteRows | None:
     raw = _select(scene.recording, scene.settings)
     if raw is None:
         return None
@@ -118,7 +118,7 @@ def _prepare(scene: BuildContext) -> _Prepared | None:
     geometry = look(raw, raw.antenna, coefficients(raw))
     frame = scene.frame
     epochs, first = np.unique(raw.t, return_index=True)
-    return _Prepared(
+    return _SatelliteRows(
         raw=raw,
         keyframe=keyframe,
         s_n=(geometry.s - frame.r_e) @ frame.R_ne.T,
@@ -136,7 +136,7 @@ def _prepare(scene: BuildContext) -> _Prepared | None:
     )
 
 
-def _common(scene: BuildContext, found: _Prepared) -> dict[str, Any]:
+def _common(scene: BuildContext, found: _SatelliteRows) -> dict[str, Any]:
     settings, raw = scene.settings, found.raw
     parameters: tuple[Parameter, ...] = (found.clock,)
     if settings.gnss.lever_arm_sigma is not None:

@@ -22,7 +22,16 @@ from graphnav.config import Settings
 from graphnav.constraints.ambiguities import ambiguity_name
 from graphnav.constraints.base import BuildContext, Linearized
 from graphnav.constraints.gnss import LEVER_ARM
-from graphnav.constraints.raw_gnss import BIASES, CLOCK, SATELLITES, _common, _prepare, _Prepared, _Satellites, _select
+from graphnav.constraints.raw_gnss import (
+    BIASES,
+    CLOCK,
+    SATELLITES,
+    _common,
+    _prepare,
+    _SatelliteRows,
+    _Satellites,
+    _select,
+)
 from graphnav.core import rotation
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
@@ -46,7 +55,7 @@ _AMBIGUITY = 30.0  # m, about what the first code says: next to nothing known
 class _Free:
     """What both kinds of rows need; made once for a scene."""
 
-    found: _Prepared
+    found: _SatelliteRows
     rows: IonosphereFree
     s_n: Array  # (N, 3) m
     satellites: NDArray[np.int16]  # those that have rows

@@ -40,7 +40,7 @@ from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.imu.dynamics import SCALE, as_biases, by_scale, scale_parameter
 from graphnav.imu.preintegration import Intervals
 from graphnav.recording import Imu, Odometer, Recording
-from graphnav.recording.odometer import Figures, MeanSpeed, faults
+from graphnav.recording.odometer import MeanSpeed, ReadingStatistics, faults
 
 MOUNTING = "mounting"
 AXLE = "axle"
@@ -293,7 +293,7 @@ class NonHolonomic(Wheels):
 
 
 def _speed_of(odometer: Odometer, imu: Imu) -> MeanSpeed:
-    figures = Figures.of(odometer)
+    figures = ReadingStatistics.of(odometer)
     return MeanSpeed.of(odometer, faults(odometer, imu, figures).spans, figures)
 
 

@@ -98,7 +98,7 @@ def _pieces(breaks: np.ndarray) -> list[tuple[int, int]]:
     return list(zip([0, *ends], [*ends, len(breaks) + 1], strict=True))
 
 
-def quantum(values: Array) -> float:
+def smallest_step(values: Array) -> float:
     """Smallest step between the values of a quantised sensor; tiny where it is none."""
     steps = np.diff(np.unique(np.abs(values)))
     steps = steps[steps > 1e-6]
@@ -107,7 +107,7 @@ def quantum(values: Array) -> float:
 
 def _odometer(o: Odometer, settings: FusionSettings) -> Speeds:
     # one pulse in a period may be the jitter of a wheel that stands on a tooth
-    limit = max(settings.max_speed, 1.5 * quantum(o.speed))
+    limit = max(settings.max_speed, 1.5 * smallest_step(o.speed))
     return Speeds(o.t, o.speed[:, None], np.full(len(o.t), limit), settings.odometer_delay)
 
 

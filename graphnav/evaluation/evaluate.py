@@ -23,7 +23,7 @@ from graphnav.evaluation.metrics import (
     Errors,
     Metrics,
     Nees,
-    Span,
+    SpanErrors,
     Statistic,
     average_nees,
     chi_square_band,
@@ -39,7 +39,7 @@ from graphnav.recording import Recording
 from graphnav.recording.formats.trajectories import WEEK, read_trajectory
 
 __all__ = [
-    "COMPONENTS", "Closure", "Errors", "Metrics", "Nees", "Span", "Statistic", "average_nees", "chi_square_band",
+    "COMPONENTS", "Closure", "Errors", "Metrics", "Nees", "SpanErrors", "Statistic", "average_nees", "chi_square_band",
     "closure", "comparison_rows", "ensemble_nees", "errors", "evaluate", "evaluate_recording", "measure", "summary",
     "text", "truth_of", "withheld_truth", "write_comparison_csv",
 ]  # fmt: skip

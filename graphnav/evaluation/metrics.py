@@ -81,7 +81,7 @@ class Nees:
 
 
 @dataclass(frozen=True)
-class Span:
+class SpanErrors:
     """What happened in a span of time, such as an outage; drift is of the largest horizontal error."""
 
     start: float  # s, as it was asked for
@@ -118,7 +118,7 @@ class Metrics:
     distance: float = 0.0  # m
     components: dict[str, Statistic] = field(default_factory=dict)
     nees: dict[str, Nees] = field(default_factory=dict)
-    spans: tuple[Span, ...] = ()
+    spans: tuple[SpanErrors, ...] = ()
     closure: Closure | None = None
     notes: tuple[str, ...] = ()
     errors: Errors | None = field(default=None, repr=False, compare=False)
@@ -225,16 +225,16 @@ def ensemble_nees(runs: Sequence[Errors], block: str = "p") -> tuple[Array, Arra
     )
 
 
-def _span(errors: Errors, start: float, end: float, origin: float) -> Span:
+def _span(errors: Errors, start: float, end: float, origin: float) -> SpanErrors:
     t = errors.t - origin
     inside = np.flatnonzero((t >= start) & (t <= end) & np.isfinite(errors.horizontal))
     if not len(inside):
-        return Span(start, end, 0, *[math.nan] * 8)
+        return SpanErrors(start, end, 0, *[math.nan] * 8)
     h, p, last = errors.horizontal[inside], errors.p[inside], inside[-1]
     distance = float(errors.distance[last] - errors.distance[inside[0]])
     nees = errors.nees_p[inside]
     nees = nees[np.isfinite(nees)]
-    return Span(
+    return SpanErrors(
         start=start,
         end=end,
         n=len(inside),

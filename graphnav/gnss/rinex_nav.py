@@ -28,7 +28,7 @@ _EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 
 
 @dataclass
-class _Found:
+class _Navigation:
     kepler: list[Kepler] = field(default_factory=list)
     glonass: list[Glonass] = field(default_factory=list)
     klobuchar: dict[str, list[float]] = field(default_factory=dict)
@@ -44,7 +44,7 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
     RecordingError
         If one is no RINEX navigation file, or none of them holds an ephemeris.
     """
-    found = _Found()
+    found = _Navigation()
     remarks: list[str] = []
     for path in paths:
         found.broken, found.skipped = [], {}
@@ -65,7 +65,7 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
     return Ephemerides.of(found.kepler, found.glonass, coefficients, tuple(remarks))
 
 
-def _read(path: Path, found: _Found) -> None:
+def _read(path: Path, found: _Navigation) -> None:
     lines = read_bytes(path).decode("latin-1").splitlines()
     try:
         version = float(lines[0][:9])
@@ -141,7 +141,7 @@ def _date(text: str, short: bool) -> np.datetime64:
     return days[0].astype("datetime64[us]") + np.timedelta64(round(seconds * 1e6), "us")
 
 
-def _add(found: _Found, system: int, number: int, date: np.datetime64, v: list[float], message: str) -> None:
+def _add(found: _Navigation, system: int, number: int, date: np.datetime64, v: list[float], message: str) -> None:
     satellite = 100 * system + number
     clock = float((date - _EPOCH) / np.timedelta64(1, "us")) * 1e-6
     if system in (GLONASS, SBAS):
@@ -190,7 +190,7 @@ def _add(found: _Found, system: int, number: int, date: np.datetime64, v: list[f
     )  # fmt: skip
 
 
-def _header(lines: list[str], path: Path, found: _Found) -> int:
+def _header(lines: list[str], path: Path, found: _Navigation) -> int:
     for k, line in enumerate(lines):
         label, body = line[60:].strip(), line[:60].replace("D", "E")
         try:
@@ -215,7 +215,7 @@ def _coefficients(body: str) -> list[float]:
     return found
 
 
-def _ionosphere(lines: list[str], found: _Found) -> None:
+def _ionosphere(lines: list[str], found: _Navigation) -> None:
     """Klobuchar's coefficients of version 4, if they are whole."""
     if len(lines) < 3:
         return

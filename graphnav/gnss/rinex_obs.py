@@ -44,7 +44,7 @@ class Header:
 
 
 @dataclass
-class _Rows:
+class _SatelliteLines:
     """Lines of satellites: their epoch and satellite, and where their fields are."""
 
     line: NDArray[np.intp]
@@ -53,7 +53,7 @@ class _Rows:
 
 
 Cells = Callable[[NDArray[np.intp], int], NDArray[np.uint8]]  # the fields of some rows, so many of each
-_Body = tuple[Array, float, NDArray[np.intp], _Rows, Cells]  # stamps, their zero, flags of the epochs
+_Body = tuple[Array, float, NDArray[np.intp], _SatelliteLines, Cells]  # stamps, their zero, flags of the epochs
 
 
 def read_observations(path: Path) -> Observations:
@@ -254,7 +254,7 @@ def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
         k = own[wrong][0]
         raise RecordingError(f"{path}, line {k + 1}: '{lines.text(k)[:3]}' names no satellite")
     satellite = (100 * system[own] + number).astype(np.int16)
-    rows = _Rows(own, of, satellite)
+    rows = _SatelliteLines(own, of, satellite)
 
     def cells(which: NDArray[np.intp], types: int) -> NDArray[np.uint8]:
         return lines.block(rows.line[which], 3, 3 + _WIDTH * types)
@@ -338,7 +338,9 @@ def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
     fields[:, 0] += np.where(fields[:, 0] < 80, 2000, 1900)
     if (bad := ~calendar_days(fields)[1]).any():
         raise _bad_epoch(lines, epoch[bad], path, 0)
-    rows = _Rows(np.array(first_line, dtype=np.intp), np.array(of, dtype=np.intp), np.array(satellite, dtype=np.int16))
+    rows = _SatelliteLines(
+        np.array(first_line, dtype=np.intp), np.array(of, dtype=np.intp), np.array(satellite, dtype=np.int16)
+    )
 
     def cells(which: NDArray[np.intp], types: int) -> NDArray[np.uint8]:
         parts = [lines.block(rows.line[which] + j, 0, 5 * _WIDTH) for j in range(each)]
@@ -381,7 +383,7 @@ def _bad_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int = 2
 
 
 def _bad_field(
-    rows: _Rows, own: NDArray[np.intp], types: list[str], block: NDArray[np.uint8], path: Path
+    rows: _SatelliteLines, own: NDArray[np.intp], types: list[str], block: NDArray[np.uint8], path: Path
 ) -> RecordingError:
     """For the first field that is no number, of those (n, m, 14) of some rows."""
     for k, cells, elsewhere in zip(own, block, find_moved_points(block), strict=True):

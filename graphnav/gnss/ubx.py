@@ -39,7 +39,7 @@ _CODE, _CARRIER, _HALF = 1, 2, 4  # bits of the status: code valid, carrier vali
 
 
 @dataclass
-class _Content:
+class _RawMessages:
     times: list[tuple[float, int]] = field(default_factory=list)  # of the epochs: s of the week, week
     rows: list[np.ndarray] = field(default_factory=list)
     frames: list[tuple[int, bytes]] = field(default_factory=list)  # SFRBX, and after which epoch
@@ -114,9 +114,9 @@ def _slips(t: np.ndarray, satellite: np.ndarray, signal: np.ndarray, lock: np.nd
     return out
 
 
-def _frames(data: bytes) -> _Content:
+def _frames(data: bytes) -> _RawMessages:
     """All messages that are used, their check sums tested."""
-    out = _Content()
+    out = _RawMessages()
     at = data.find(SYNC)
     while at >= 0:
         if at + 8 > len(data):

@@ -14,7 +14,7 @@ from graphnav.core.rotation import Array
 from graphnav.detectors import stops
 from graphnav.detectors.base import merge_spans
 from graphnav.online.sensors import Sensors
-from graphnav.recording.odometer import Figures, faults
+from graphnav.recording.odometer import ReadingStatistics, faults
 
 CONTEXT = 30.0  # s of rows before a keyframe that its constraints may look at
 SURE = 1.0  # s before now that the detectors answer for: the end of a stop shows only when it is over
@@ -97,7 +97,7 @@ class Readings:
 
     def __init__(self) -> None:
         self.wrong: Array = np.empty((0, 2))  # s
-        self.figures: Figures | None = None
+        self.figures: ReadingStatistics | None = None
         self.revised = False  # whether the figures have become clearly others
         self._looked = -np.inf  # s
         self._moving, self._told, self._counted = 0, 0, -np.inf  # readings in motion, by when told, and up to when
@@ -125,7 +125,7 @@ class Readings:
         if self.figures is None or self._moving >= 2 * max(self._told, 1):
             every = sensors.recording().odometer
             assert every is not None
-            before, self.figures, self._told, lag = self.figures, Figures.of(every), self._moving, None
+            before, self.figures, self._told, lag = self.figures, ReadingStatistics.of(every), self._moving, None
             self.revised |= before is not None and _other(before.sigmas(o), self.figures.sigmas(o))
         seen, known = faults(recording.odometer, recording.imu, self.figures, lag), self.wrong
         found, self._lag = seen.spans, seen.lag

@@ -108,7 +108,7 @@ def _near(dt: float, dp: Array) -> bool:
 
 
 @dataclass
-class Clock:
+class ClockGuard:
     """Notices that the clock of the IMU was set back.
 
     Rows at times that have passed are late, or sent again, or of a clock that was set back. Late ones fill a hole,

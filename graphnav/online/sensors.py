@@ -12,7 +12,7 @@ from graphnav.constraints.gnss import period
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.spacing import best_fixes, grid_start
 from graphnav.online.buffers import SAME, Buffer
-from graphnav.online.sanity import Clock, Reach, Row, fix_odds, imu_reads, odometer_reads, with_sane_velocity
+from graphnav.online.sanity import ClockGuard, Reach, Row, fix_odds, imu_reads, odometer_reads, with_sane_velocity
 from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.recording.formats.repair import LATEST
 
@@ -50,7 +50,7 @@ class Sensors:
     released: list[Row] = field(default_factory=list)  # rows that were held and are to be taken in now
     left: list[float] = field(default_factory=list)  # s, fixes that were used until better ones of their span came
     _grid: tuple[float, float] | None = None  # begin and length of the spans, s, of which the best fix is used
-    _clock: Clock = field(default_factory=Clock)
+    _clock: ClockGuard = field(default_factory=ClockGuard)
     _reach: Reach = field(default_factory=Reach)
     _before: set[tuple[str | float, ...]] = field(default_factory=set)  # fixes and readings of the clock before
 

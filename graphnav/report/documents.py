@@ -221,13 +221,13 @@ def detector_pictures(recording: Recording, solution: Solution) -> list[page.Raw
     return pictures.detection_pictures(recording, solution.detections)
 
 
-def _clocks(recording: Recording) -> list[page.Clock]:
+def _clocks(recording: Recording) -> list[page.TimeAxis]:
     """The recording's own clock, and where it is known which one that is GPS time and UTC."""
-    out = [page.Clock("time on the recording's clock [s]", recording.start)]
+    out = [page.TimeAxis("time on the recording's clock [s]", recording.start)]
     if recording.gps_zero is not None:
         gps = recording.gps_zero + recording.start
         utc = (gps_to_utc(np.array([gps]))[0] - np.datetime64(0, "us")) / np.timedelta64(1, "s")
-        out += [page.Clock("UTC", float(utc), date=True), page.Clock("GPS time", gps + GPS_TO_UNIX, date=True)]
+        out += [page.TimeAxis("UTC", float(utc), date=True), page.TimeAxis("GPS time", gps + GPS_TO_UNIX, date=True)]
     return out
 
 

@@ -192,7 +192,7 @@ def fold(title: str, content: str) -> Raw:
 
 
 @dataclass(frozen=True)
-class Clock:
+class TimeAxis:
     """A clock that figures over time can be read on: what it is called, and what it reads at the start, s.
 
     `date`: the seconds are of a day of the calendar, since 1970.
@@ -204,7 +204,7 @@ class Clock:
 
 
 def page(
-    title: str, lead: Sequence[str], sections: Sequence[tuple[str, Sequence[str]]], clocks: Sequence[Clock] = ()
+    title: str, lead: Sequence[str], sections: Sequence[tuple[str, Sequence[str]]], clocks: Sequence[TimeAxis] = ()
 ) -> str:
     """The whole page.
 

@@ -81,7 +81,7 @@ def accelerometer(
 
 
 @dataclass(frozen=True)
-class ImuModel:
+class SimulatedImu:
     """An IMU: two triads and a rate, Hz."""
 
     name: str
@@ -110,32 +110,32 @@ class ImuModel:
         a, b_a = self.accel.read(accel, self.rate, stream(seed, "accel"))
         return g, a, b_g, b_a
 
-    def at(self, rate: float) -> ImuModel:
+    def at(self, rate: float) -> SimulatedImu:
         """The same sensors read at another rate."""
         return replace(self, rate=float(rate))
 
 
 # Consumer-grade, the PwrPak7-E2's EG370N of Li 2024 (table 1), the MIMU of Zhu 2020 (table 1), navigation-grade.
-MEMS = ImuModel(
+MEMS = SimulatedImu(
     "MEMS", 100.0,
     gyroscope(0.3, 700.0, instability_deg_h=8.0, scale_ppm=2000.0, misalignment_mrad=1.0, range_deg_s=250.0,
               step_deg_s=250.0 / 32768),
     accelerometer(150.0, 15.0, instability_mg=0.05, scale_ppm=2000.0, misalignment_mrad=1.0, range_g=4.0,
                   step_mg=4000.0 / 32768),
 )  # fmt: skip
-EG370N = ImuModel(
+EG370N = SimulatedImu(
     "MEMS of Li 2024, table 1", 200.0,
     gyroscope(0.06, 360.0, instability_deg_h=0.8),
     accelerometer(60.0, 2.0, instability_mg=0.012),
 )  # fmt: skip
 # "White noise 0.1 degree/h" and "0.05 mg" are taken for 0.1 deg/sqrt(h) and 50 ug/sqrt(Hz), as data sheets of such
 # sensors have them.
-MIMU = ImuModel(
+MIMU = SimulatedImu(
     "MIMU of Zhu 2020, table 1", 400.0,
     gyroscope(0.1, 3.0, instability_deg_h=1.0, scale_ppm=200.0),
     accelerometer(50.0, 0.1, instability_mg=0.03, scale_ppm=150.0),
 )  # fmt: skip
-NAVIGATION = ImuModel(
+NAVIGATION = SimulatedImu(
     "navigation grade", 200.0,
     gyroscope(0.002, 0.01, instability_deg_h=0.003, scale_ppm=5.0, correlation_time=3600.0),
     accelerometer(10.0, 0.03, instability_mg=0.01, scale_ppm=30.0, correlation_time=3600.0),

@@ -71,7 +71,7 @@ class TrueMotion:
 
 
 @dataclass(frozen=True)
-class _Felt:
+class _AxleMotion:
     """All of the motion at some times but the place, in local ENU at the axle (l) and vehicle axes (v)."""
 
     v_axle: Array  # (n, 3) l
@@ -83,7 +83,7 @@ class _Felt:
     euler: Array  # (n, 3) rate of the body against l, in body axes
 
 
-def _felt(path: Path, shake: Shake, mount: Mount, t: Array) -> _Felt:
+def _axle_motion(path: Path, shake: Shake, mount: Mount, t: Array) -> _AxleMotion:
     x = path.spline(np.clip(t, path.start, path.end))
     dx = path.spline.derivative()(np.clip(t, path.start, path.end))
     base, d_base = x[:, [BANK, SLOPE, HEADING]], dx[:, [BANK, SLOPE, HEADING]]
@@ -96,7 +96,7 @@ def _felt(path: Path, shake: Shake, mount: Mount, t: Array) -> _Felt:
     speed, slip = x[:, SPEED], x[:, SLIP]
     # in a bend to the right the tyres give way to the left
     v_road = np.column_stack([-speed * np.sin(slip), speed * np.cos(slip), np.zeros(len(t))])
-    return _Felt(
+    return _AxleMotion(
         rotation.mv(R_base, v_road), R_base, _euler_rate(base, d_base), np.array(mount.above_axle) + shaken[:, :3],
         d_shaken[:, :3], rotation.from_rph(body), _euler_rate(body, d_body),
     )  # fmt: skip
@@ -118,7 +118,7 @@ def _radii(lat: Array, h: Array) -> tuple[Array, Array]:
     return A * (1.0 - E2) / w**1.5 + h, A / np.sqrt(w) + h
 
 
-def _level(felt: _Felt, lat: Array, h: Array) -> tuple[Array, Array, Array, Array, Array]:
+def _level(felt: _AxleMotion, lat: Array, h: Array) -> tuple[Array, Array, Array, Array, Array]:
     """(V in l, V in v, turn over the Earth in v, Earth's rate in v, gravity in v), each (n, 3)."""
     north, east = _radii(lat, h)
     ve, vn = felt.v_axle[:, 0], felt.v_axle[:, 1]
@@ -153,7 +153,7 @@ def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Sh
         b = min(a + _CHUNK, count)
         n = b - a
         nodes = np.append((t[a:b, None] + _NODES / rate).ravel(), t[b])
-        felt = _felt(path, shake, mount, nodes)
+        felt = _axle_motion(path, shake, mount, nodes)
         axle[a + 1 : b + 1] = _travel(axle[a], _means(felt.v_axle), 1.0 / rate)
         # between two samples the place hardly changes: what is left of a straight line is 1e-5 m
         place = axle[a:b, None] + _NODES[:, None] * (axle[a + 1 : b + 1] - axle[a:b])[:, None]
@@ -175,11 +175,11 @@ def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Sh
     def point(times: Array, lever_arm_b: Array) -> tuple[Array, Array]:
         """(llh, velocity in local ENU) of a point fixed to the IMU, at times within the drive, (M, 3) each."""
         times = np.clip(np.asarray(times, dtype=float), t[0], t[-1])
-        felt = _felt(path, shake, mount, times)
+        felt = _axle_motion(path, shake, mount, times)
         k = np.clip(((times - t[0]) * rate).astype(int), 0, count - 1)
         u = ((times - t[k]) * rate)[:, None]
         # cubic Hermite through the axle's places and their rates
-        d0, d1 = (_place_rate(axle[j], _felt(path, shake, mount, t[j]).v_axle) / rate for j in (k, k + 1))
+        d0, d1 = (_place_rate(axle[j], _axle_motion(path, shake, mount, t[j]).v_axle) / rate for j in (k, k + 1))
         change = axle[k + 1] - axle[k]
         place = axle[k] + u * (d0 + u * (3 * change - 2 * d0 - d1 + u * (d0 + d1 - 2 * change)))
         V_l, _, omega, _, _ = _level(felt, place[:, 0], place[:, 2])

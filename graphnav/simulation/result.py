@@ -13,7 +13,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Imu, Recording, Truth
 from graphnav.recording.formats.writing import round_recording, write_facts, write_folder
 from graphnav.simulation.aiding import GnssModel, OdometerModel
-from graphnav.simulation.inertial import ImuModel
+from graphnav.simulation.inertial import SimulatedImu
 from graphnav.simulation.kinematics import Mount, TrueMotion, move
 from graphnav.simulation.motion import Path
 from graphnav.simulation.vibration import Shake
@@ -51,7 +51,7 @@ def record(
     path: Path,
     *,
     origin: tuple[float, float, float],
-    imu: ImuModel,
+    imu: SimulatedImu,
     mount: Mount,
     shake: Shake,
     gnss: GnssModel | None = None,

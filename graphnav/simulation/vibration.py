@@ -124,7 +124,7 @@ class Engine:
         phases[:, PITCH] = phases[:, FORWARD] + 0.5 * np.pi
         phase = spline(path.start, _SLOW, 2.0 * np.pi * f, _SLOW_DEGREE)
         size = spline(path.start, _SLOW, amplitude, _SLOW_DEGREE)
-        return _Lines(phase.antiderivative(), phase, size, size.derivative(), np.array(self.orders), phases)
+        return _EngineOrders(phase.antiderivative(), phase, size, size.derivative(), np.array(self.orders), phases)
 
 
 def _amplitudes(idle: Idle, count: int) -> tuple[Array, Array]:
@@ -134,7 +134,7 @@ def _amplitudes(idle: Idle, count: int) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class _Lines:
+class _EngineOrders:
     """Sum over orders k of A_k(t) sin(k phi(t) + phase_k)."""
 
     phase: BSpline

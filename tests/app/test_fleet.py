@@ -21,7 +21,7 @@ from graphnav import load
 from graphnav.app import cli
 from graphnav.app.fleet import page, tables
 from graphnav.app.fleet.drive import CRASHED, DONE, HUNG, REFUSED, key_of, read_row, spans
-from graphnav.app.fleet.manifest import Asked, Task, read_drives, task_of
+from graphnav.app.fleet.manifest import DriveOptions, Task, read_drives, task_of
 from graphnav.app.fleet.workers import Limits, Worker, solve_on_cluster
 from graphnav.config import Settings
 from graphnav.core.errors import ConfigError
@@ -199,7 +199,7 @@ def test_a_manifest_gives_each_drive_its_own_settings(tmp_path: Path) -> None:
     )
     found = []
     for name in ("m.csv", "m.toml"):
-        drives = read_drives(tmp_path / name, Asked(solver="rts"))
+        drives = read_drives(tmp_path / name, DriveOptions(solver="rts"))
         tasks = [task_of(drive, tmp_path, {}) for drive in drives]
         assert [task.name for task in tasks] == ["kitti", "kitti-2"]
         found.append(tasks)
@@ -230,7 +230,7 @@ def test_a_manifest_that_cannot_be_is_refused_where_it_says_so(tmp_path: Path, t
     path = tmp_path / "m.csv"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
-        [task_of(drive, tmp_path, {}) for drive in read_drives(path, Asked())]
+        [task_of(drive, tmp_path, {}) for drive in read_drives(path, DriveOptions())]
     assert "m.csv" in str(caught.value)
     for word in words:
         assert word in str(caught.value)

@@ -18,7 +18,7 @@ from graphnav.core.rotation import exp, right_jacobian_inverse
 from graphnav.core.state import DIM, States
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.apply import with_noise
-from graphnav.estimation.noise.model import STATED, Figure, NoiseModel
+from graphnav.estimation.noise.model import STATED, NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
@@ -35,13 +35,13 @@ from graphnav.recording.formats import read
 EVERYTHING = 1e9  # s, a lag longer than any drive
 # errors of the fixes that last, for two fifths of the stated variance, and of wheels
 LASTING = NoiseModel(
-    {f"gnss_position.{axis}": Figure(float(np.log(0.6))) for axis in ("horizontal", "up")}
+    {f"gnss_position.{axis}": VarianceComponent(float(np.log(0.6))) for axis in ("horizontal", "up")}
     | {
-        f"gnss_position.{t}.{axis}": Figure(float(np.log(0.2)))
+        f"gnss_position.{t}.{axis}": VarianceComponent(float(np.log(0.2)))
         for t in ("minutes", "hours")
         for axis in ("horizontal", "up")
     }
-    | {f"nhc.seconds.{axis}": Figure(0.0) for axis in ("right", "up")}
+    | {f"nhc.seconds.{axis}": VarianceComponent(0.0) for axis in ("right", "up")}
 )
 
 

@@ -14,7 +14,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import exp
 from graphnav.core.state import States
 from graphnav.estimation.noise.apply import with_noise
-from graphnav.estimation.noise.model import Figure, NoiseModel
+from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.batch import batch
@@ -31,9 +31,9 @@ from graphnav.recording import Recording
 
 Drive = tuple[Recording, States, Array]
 LASTING = NoiseModel(
-    {f"gnss_position.{axis}": Figure(float(np.log(0.6))) for axis in ("horizontal", "up")}
-    | {f"gnss_position.minutes.{axis}": Figure(float(np.log(0.2))) for axis in ("horizontal", "up")}
-    | {f"nhc.seconds.{axis}": Figure(0.0) for axis in ("right", "up")}
+    {f"gnss_position.{axis}": VarianceComponent(float(np.log(0.6))) for axis in ("horizontal", "up")}
+    | {f"gnss_position.minutes.{axis}": VarianceComponent(float(np.log(0.2))) for axis in ("horizontal", "up")}
+    | {f"nhc.seconds.{axis}": VarianceComponent(0.0) for axis in ("right", "up")}
 )
 
 

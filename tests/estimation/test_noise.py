@@ -22,7 +22,7 @@ from graphnav.estimation.alignment import align
 from graphnav.estimation.noise.apply import row_weights, with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import FIXES, WHEELS
-from graphnav.estimation.noise.model import STATED, Figure, NoiseModel, RowWeights
+from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import imu_moments, lag_moments, process_moments, row_moments
 from graphnav.estimation.noise.priors import prior
 from graphnav.estimation.noise.spacing import space_fixes
@@ -108,7 +108,7 @@ def test_moments_are_the_derivative_of_the_likelihood(name: str) -> None:
     for group, (A, B) in found.items():
         both = []
         for step in (-h, h):
-            other = {**noise.figures, group: Figure(noise.figures[group].log_factor + step)}
+            other = {**noise.figures, group: VarianceComponent(noise.figures[group].log_factor + step)}
             both.append(refilter(with_noise(base, replace(noise, figures=other)), about).log_likelihood.sum())
         slope = (both[1] - both[0]) / (2.0 * h)
         assert pytest.approx(slope, abs=2e-4 * (1.0 + A + B)) == 0.5 * (A - B), group
@@ -117,7 +117,7 @@ def test_moments_are_the_derivative_of_the_likelihood(name: str) -> None:
 def mixed(base: Problem, opening: float | None) -> tuple[Problem, NoiseModel, SmootherPass]:
     """With figures that differ, so that no component is all of its noise; and points that smoothing leaves alone."""
     size = np.random.default_rng(1).normal(0.0, 0.5, len(groups(base)))
-    noise = NoiseModel({name: Figure(float(x)) for name, x in zip(groups(base), size, strict=True)})
+    noise = NoiseModel({name: VarianceComponent(float(x)) for name, x in zip(groups(base), size, strict=True)})
     used = with_noise(base, noise)
     about = backward(used, ekf(used, opening=opening))
     for _ in range(3):
@@ -176,7 +176,7 @@ def test_factors_of_the_imu_are_those_of_its_figures() -> None:
             (a if a.ndim == 3 else a.sum(1)) / scale, (b if b.ndim == 3 else b.sum(1)) / scale, atol=1e-9
         )
     noise = NoiseModel(
-        {f"imu.{name}": Figure(float(np.log(f))) for name, f in zip(NOISE_FIGURES, factors, strict=True)}
+        {f"imu.{name}": VarianceComponent(float(np.log(f))) for name, f in zip(NOISE_FIGURES, factors, strict=True)}
     )
     used = with_noise(base, noise)
     np.testing.assert_allclose(used.motion.intervals.covariance / scale, mine.covariance / scale, atol=1e-12)
@@ -202,9 +202,9 @@ def test_factors_of_rows_and_processes_are_of_their_own_components() -> None:
     base, _ = posed(lap().crop(0.0, 60.0))
     noise = NoiseModel(
         {
-            "gnss_position.float.up": Figure(np.log(4.0)),
-            "gnss_position.float.minutes.up": Figure(np.log(9.0)),
-            "odometer.forward": Figure(np.log(0.25)),
+            "gnss_position.float.up": VarianceComponent(np.log(4.0)),
+            "gnss_position.float.minutes.up": VarianceComponent(np.log(9.0)),
+            "odometer.forward": VarianceComponent(np.log(0.25)),
         },
         times={"gnss_error_of_minutes_float": 40.0},
     )
@@ -336,7 +336,7 @@ def test_no_other_figures_are_likelier(estimated: Estimated) -> None:
     """The maximum is no less than what the true figures have, and no more than chance makes it by so many figures."""
     gains = []
     for drive, found in zip(estimated.drives, estimated.found, strict=True):
-        true = NoiseModel({name: Figure(x) for name, x in drive.true.items()})
+        true = NoiseModel({name: VarianceComponent(x) for name, x in drive.true.items()})
         gains.append(log_posterior(drive, replace(found.noise, weights={})) - log_posterior(drive, true))
     freedom = len(estimated.drives[0].true)
     assert min(gains) > -0.5, gains

@@ -18,7 +18,7 @@ from graphnav.core.errors import ConfigError
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.estimation.noise.files import known_groups, noise_values, read_noise, read_noise_and_mode, write_noise
-from graphnav.estimation.noise.model import STATED, Figure, NoiseModel, RowWeights
+from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.table import figure_rows, whole_ratio
 from graphnav.estimation.problem import build_problem
 from graphnav.recording.formats import read as load
@@ -29,7 +29,7 @@ TOKYO = Path(__file__).resolve().parents[2] / "data" / "tokyo"
 def some_noise(seed: int = 0) -> NoiseModel:
     """Every group there is, with figures of all digits."""
     rng = np.random.default_rng(seed)
-    figures = {name: Figure(*rng.normal(size=1), *rng.uniform(0.1, 3.0, 4)) for name in known_groups()}
+    figures = {name: VarianceComponent(*rng.normal(size=1), *rng.uniform(0.1, 3.0, 4)) for name in known_groups()}
     t = np.sort(rng.uniform(1.6e9, 1.7e9, 50))  # of a clock that counts from 1970
     return NoiseModel(
         figures,
@@ -146,10 +146,10 @@ def test_rows_stand_beside_what_is_stated() -> None:
     assert recording.gnss is not None
     noise = NoiseModel(
         {
-            "imu.accel_bias_walk": Figure(np.log(9.0)),
-            "gnss_position.up": Figure(np.log(4.0)),
-            "gnss_position.minutes.up": Figure(np.log(0.25)),
-            "nhc.seconds.right": Figure(0.0),
+            "imu.accel_bias_walk": VarianceComponent(np.log(9.0)),
+            "gnss_position.up": VarianceComponent(np.log(4.0)),
+            "gnss_position.minutes.up": VarianceComponent(np.log(0.25)),
+            "nhc.seconds.right": VarianceComponent(0.0),
         },
         {"nhc_error": 7.0},
     )
@@ -172,7 +172,11 @@ def test_what_a_noise_model_says_of_nothing_is_told() -> None:
     solution: Any = SimpleNamespace(records={"gnss_position": SimpleNamespace(t=t)})
     weights = RowWeights(np.array([3.0, 4.5]), np.array([0.5, 0.5]))
     noise = NoiseModel(
-        {"odometer.forward": Figure(0.0), "gnss_position.up": Figure(0.0), "imu.gyro_bias_walk": Figure(0.0)},
+        {
+            "odometer.forward": VarianceComponent(0.0),
+            "gnss_position.up": VarianceComponent(0.0),
+            "imu.gyro_bias_walk": VarianceComponent(0.0),
+        },
         weights={"gnss_position": weights},
         excluded={"gnss_position": ((2.0, 3.0), (20.0, 30.0))},
     )
@@ -181,4 +185,4 @@ def test_what_a_noise_model_says_of_nothing_is_told() -> None:
     assert "odometer" in said[0]
     assert "1 of the 2 rows" in said[1]
     assert "1 of the 2 spans" in said[2]
-    assert unused_noise(NoiseModel({"gnss_position.up": Figure(0.0)}), solution) == []
+    assert unused_noise(NoiseModel({"gnss_position.up": VarianceComponent(0.0)}), solution) == []

@@ -16,7 +16,7 @@ from graphnav.constraints.gnss import ERRORS, GnssPosition
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
-from graphnav.estimation.noise.model import Figure, NoiseModel
+from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import run
 from graphnav.evaluation.scoring import errors
 from graphnav.recording import Gnss, Recording
@@ -154,7 +154,7 @@ def test_errors_of_two_types_have_nodes_at_the_same_times(path: oracle.ExactPath
     shares = {"fixed": 0.98, "float": 0.1}
     noise = NoiseModel(
         {
-            f"gnss_position.{kind}.{time}.{axis}": Figure(float(np.log(0.5 * share)))
+            f"gnss_position.{kind}.{time}.{axis}": VarianceComponent(float(np.log(0.5 * share)))
             for kind, share in shares.items()
             for time in ("minutes", "hours")
             for axis in ("horizontal", "up")

@@ -18,7 +18,7 @@ from graphnav.core.state import DIM
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
 from graphnav.estimation.noise.apply import with_noise
-from graphnav.estimation.noise.model import Figure, NoiseModel
+from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.batch import batch
@@ -41,7 +41,7 @@ def posed() -> Problem:
     found = align(recording, settings, frame, lambda p, s: batch(p, s, wanted=(0,), reintegrate=False))
     base = build_problem(recording, settings, frame, found.state, found.sigma, detect(recording, settings).stationary)
     lasting = (f"gnss_position.{time}.{axis}" for time in ("minutes", "hours") for axis in ("horizontal", "up"))
-    return with_noise(base, NoiseModel({name: Figure(float(np.log(0.25))) for name in lasting}))
+    return with_noise(base, NoiseModel({name: VarianceComponent(float(np.log(0.25))) for name in lasting}))
 
 
 def scattered_points(problem: Problem, seed: int) -> Points:

@@ -19,7 +19,7 @@ from graphnav.core.rotation import exp
 from graphnav.core.state import DIM
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.apply import with_noise
-from graphnav.estimation.noise.model import STATED, Figure, NoiseModel
+from graphnav.estimation.noise.model import STATED, NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
@@ -42,7 +42,7 @@ WHITE = {
 # errors of minutes and of hours beside the white ones, given, because a bad start would find others
 LASTING = NoiseModel(
     {
-        f"gnss_position.{time}.{axis}": Figure(float(np.log(0.5)))
+        f"gnss_position.{time}.{axis}": VarianceComponent(float(np.log(0.5)))
         for time in ("minutes", "hours")
         for axis in ("horizontal", "up")
     }

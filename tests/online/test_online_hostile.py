@@ -16,7 +16,7 @@ import pytest
 from test_online import off, played, same
 
 import graphnav
-from graphnav.app.cli_online import Asked, follow
+from graphnav.app.cli_online import StopRequest, follow
 from graphnav.config import settings_from
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.core.trajectory import Trajectory
@@ -427,7 +427,7 @@ def test_a_line_that_never_ends_is_one_bad_line(drive: tuple[Recording, Trajecto
 
     head, *lines = [line.encode() + b"\n" for _, line in lines_of(drive[0])][:200]
     tracemalloc.start()
-    follow(session, iter([head, *[b"1" * (1 << 20)] * 16, b"\n", b"".join(lines)]), Quiet(), Asked())
+    follow(session, iter([head, *[b"1" * (1 << 20)] * 16, b"\n", b"".join(lines)]), Quiet(), StopRequest())
     tracemalloc.stop()
     assert session.bad == 1
     assert session.taken == len(lines)

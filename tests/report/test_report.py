@@ -21,7 +21,7 @@ from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.state import States
 from graphnav.detectors.base import Detection
-from graphnav.estimation.noise.model import Figure, NoiseModel, RowWeights
+from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.table import figure_rows
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Separation, Solution, join_solutions
 from graphnav.evaluation.metrics import Errors
@@ -436,8 +436,8 @@ def test_what_cannot_be_trusted_says_so_first(tmp_path, recording):
 def test_the_noise_model_is_a_table(tmp_path, recording):
     noise = NoiseModel(
         {
-            "imu.gyro_bias_walk": Figure(np.log(16.0), 0.5, 0.0, 2.0, 37.0),
-            "gnss_position.seconds.up": Figure(np.log(0.09)),
+            "imu.gyro_bias_walk": VarianceComponent(np.log(16.0), 0.5, 0.0, 2.0, 37.0),
+            "gnss_position.seconds.up": VarianceComponent(np.log(0.09)),
         },
         {"gnss_error_of_seconds": 4.25},
         {"gnss_position": RowWeights(record().t[:7], np.full(7, 0.125))},
@@ -471,7 +471,7 @@ def test_pieces_keep_all_weights_and_spans_and_the_report_says_whose_figures_it_
         replace(
             solution(),
             noise=NoiseModel(
-                {"imu.gyro_bias_walk": Figure(float(k))},
+                {"imu.gyro_bias_walk": VarianceComponent(float(k))},
                 weights={names[k]: RowWeights(t[[k]], np.array([0.5]))},
                 excluded={"gnss_position": ((t[k], t[k + 1]),)},
             ),

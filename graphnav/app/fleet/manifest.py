@@ -27,7 +27,7 @@ _FORM = "graphnav-recording"  # that every recording.toml names
 
 
 @dataclass(frozen=True)
-class Asked:
+class DriveOptions:
     """What is asked of a drive; the same for all, except where a manifest says otherwise."""
 
     solver: str = "batch"
@@ -60,10 +60,10 @@ class Task:
     outside: bool = False  # whether recordings may name files outside their folders
 
 
-_COLUMNS = ("recording", "name", *(f.name for f in fields(Asked)))
+_COLUMNS = ("recording", "name", *(f.name for f in fields(DriveOptions)))
 
 
-def read_drives(source: Path, asked: Asked) -> list[tuple[str, str, Asked, str]]:
+def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, DriveOptions, str]]:
     """Name, recording, what is asked, and where that was said, of every drive.
 
     Parameters
@@ -94,7 +94,9 @@ def read_drives(source: Path, asked: Asked) -> list[tuple[str, str, Asked, str]]
     return _distinct(drives)
 
 
-def task_of(drive: tuple[str, str, Asked, str], out: Path, known: dict[Any, dict[str, Any]], **common: Any) -> Task:
+def task_of(
+    drive: tuple[str, str, DriveOptions, str], out: Path, known: dict[Any, dict[str, Any]], **common: Any
+) -> Task:
     """A drive with its settings read and checked; `known` keeps those that many share.
 
     Raises
@@ -159,7 +161,7 @@ def _plain(text: str) -> str:
     return re.sub(r"[^\w.+-]+", "_", text).strip("._")[:120] or "drive"
 
 
-def _distinct(drives: list[tuple[str, str, Asked, str]]) -> list[tuple[str, str, Asked, str]]:
+def _distinct(drives: list[tuple[str, str, DriveOptions, str]]) -> list[tuple[str, str, DriveOptions, str]]:
     """The same with different names: a number behind those that come again."""
     taken: set[str] = set()
     out = []
@@ -207,10 +209,10 @@ def _check_columns(names: Iterable[str], where: str) -> None:
         raise ConfigError(f"{where}: 'recording' is missing")
 
 
-def _drive(source: Path, where: str, row: Mapping[str, Any], asked: Asked) -> tuple[str, str, Asked, str]:
+def _drive(source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions) -> tuple[str, str, DriveOptions, str]:
     """A row of a manifest; what is blank is as for all."""
     said: dict[str, Any] = {}
-    for key in (f.name for f in fields(Asked)):
+    for key in (f.name for f in fields(DriveOptions)):
         value = row.get(key)
         if value is None or value == "":
             continue

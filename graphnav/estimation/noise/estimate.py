@@ -28,7 +28,7 @@ from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import TIMES
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.apply import with_noise
-from graphnav.estimation.noise.model import Figure, NoiseModel, RowWeights
+from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import imu_moments, lag_moments, process_moments, row_moments
 from graphnav.estimation.noise.priors import TIME_WITHIN, prior
 from graphnav.estimation.problem import ParameterChain, Problem
@@ -61,7 +61,7 @@ class NoiseEstimate:
 
 
 @dataclass
-class _Figures:
+class _Components:
     """The figures as they are so far."""
 
     log: dict[str, float]
@@ -78,7 +78,7 @@ class _Figures:
         for name, x in self.log.items():
             m, s = self.prior(name)
             B = self.freedom.get(name, 0.0)
-            figures[name] = Figure(x, float((0.5 * B + s**-2.0) ** -0.5), m, s, B)
+            figures[name] = VarianceComponent(x, float((0.5 * B + s**-2.0) ** -0.5), m, s, B)
         return NoiseModel(figures, dict(self.times), dict(self.weights), self.excluded)
 
     def prior(self, name: str) -> tuple[float, float]:
@@ -161,7 +161,7 @@ def estimate_noise(
     return NoiseEstimate(figures.model(), smoothed, forward, now, prior_then, passes)
 
 
-def _begin(problem: Problem, start: NoiseModel | None) -> _Figures:
+def _begin(problem: Problem, start: NoiseModel | None) -> _Components:
     names = [f"imu.{name}" for name in NOISE_FIGURES]
     for rows in problem.constraints:
         names += [*rows.noise_groups()[0], *(g for p in (*rows.parameters, *rows.processes) for g in p.noise_groups)]
@@ -170,12 +170,12 @@ def _begin(problem: Problem, start: NoiseModel | None) -> _Figures:
     processes = [p for rows in problem.constraints for p in (*rows.parameters, *rows.processes)]
     times = {p.name: p.correlation_time for p in processes if p.correlation_time is not None}
     if start is None:
-        return _Figures(log, times)
+        return _Components(log, times)
     log |= {name: start.figures[name].log_factor for name in log if name in start.figures}
-    return _Figures(log, times, times=dict(start.times), weights=dict(start.weights), excluded=start.excluded)
+    return _Components(log, times, times=dict(start.times), weights=dict(start.weights), excluded=start.excluded)
 
 
-def _first_points(problem: Problem, figures: _Figures, opening: float | None) -> Points:
+def _first_points(problem: Problem, figures: _Components, opening: float | None) -> Points:
     used = with_noise(problem, figures.model())
     return backward(used, ekf(used, opening=opening))
 
@@ -208,7 +208,7 @@ def _cap(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, float]
     return float(np.sum(np.minimum(A, most / freedom * B))) * freedom / mean, float(np.sum(B))
 
 
-def _improve(figures: _Figures, problem: Problem, forward: ForwardRecord, smoothed: SmootherPass, end: int) -> None:
+def _improve(figures: _Components, problem: Problem, forward: ForwardRecord, smoothed: SmootherPass, end: int) -> None:
     """One step for all figures and weights."""
     A, B = imu_moments(problem, forward, smoothed)
     for i, name in enumerate(NOISE_FIGURES):
@@ -233,7 +233,7 @@ def _improve(figures: _Figures, problem: Problem, forward: ForwardRecord, smooth
         _weigh(figures, problem, rows, np.maximum(found.left_out.sum(axis=1), found.whole.sum(axis=1)), n)
 
 
-def _improve_process(figures: _Figures, chain: ParameterChain, moments: tuple[Array, Array, Array]) -> None:
+def _improve_process(figures: _Components, chain: ParameterChain, moments: tuple[Array, Array, Array]) -> None:
     _, A, B = moments
     groups = np.array(chain.parameter.noise_groups)
     for group in dict.fromkeys(chain.parameter.noise_groups):
@@ -241,7 +241,7 @@ def _improve_process(figures: _Figures, chain: ParameterChain, moments: tuple[Ar
         figures.update(group, *_cap(A[:, own], B[:, own], 1, _USUAL))
 
 
-def _improve_time(figures: _Figures, chain: ParameterChain, lags: tuple[Array, ...]) -> None:
+def _improve_time(figures: _Components, chain: ParameterChain, lags: tuple[Array, ...]) -> None:
     """The correlation time by expectation and maximisation, on a grid, with a log-normal prior about what it was."""
     dt, later, cross, before = lags
     p = chain.parameter
@@ -264,7 +264,7 @@ def _improve_time(figures: _Figures, chain: ParameterChain, lags: tuple[Array, .
     figures.times[p.name] = float(np.clip(found, usual / _TIMES, usual * _TIMES))
 
 
-def _weigh(figures: _Figures, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:
+def _weigh(figures: _Components, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:
     """Weights of the first n rows by their squared errors (n,): of their own, and of the whole with what lasts."""
     m = len(rows.axes)
     t, most = problem.t[rows.keyframe], float(chdtri(m, _CHANCE))

@@ -33,7 +33,7 @@ from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.core.complaints import nearest
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import parse_json, read_text
-from graphnav.estimation.noise.model import Figure, NoiseModel, RowWeights
+from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
 from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.recording import FIX_TYPES
 
@@ -200,7 +200,7 @@ class _Reader:
             raise self.error(key, value, f"must be between {low:g} and {high:g}: {what}")
         return float(value)
 
-    def figure(self, key: str, value: Any) -> Figure:
+    def figure(self, key: str, value: Any) -> VarianceComponent:
         if not isinstance(value, Mapping):
             raise self.error(key, value, "must be a table with log_factor or variance_factor")
         self.names(value, (*_FIGURE, *_BESIDE), key)
@@ -221,7 +221,7 @@ class _Reader:
                     f"{self.path}: '{key}': log_factor and variance_factor disagree; leave one of them out"
                 )
         assert log is not None
-        return Figure(
+        return VarianceComponent(
             log,
             self.number(f"{key}.sigma", value.get("sigma", 0.0), 0.0, _HUGE, f"1-sigma of {what}"),
             self.number(f"{key}.prior", value.get("prior", 0.0), _TINY, _HUGE, f"the prior's median, {what}"),

@@ -23,7 +23,7 @@ from graphnav.core.rotation import Array
 
 
 @dataclass(frozen=True)
-class Figure:
+class VarianceComponent:
     """A variance component: natural logarithm of its variance factor, with its uncertainty and its prior."""
 
     log_factor: float
@@ -50,7 +50,7 @@ class RowWeights:
 class NoiseModel:
     """How good the sensors are taken to be. Beside what it names, everything is as stated."""
 
-    figures: Mapping[str, Figure] = field(default_factory=dict)
+    figures: Mapping[str, VarianceComponent] = field(default_factory=dict)
     times: Mapping[str, float] = field(default_factory=dict)  # s, correlation time of a process by its parameter
     weights: Mapping[str, RowWeights] = field(default_factory=dict)  # by constraint
     excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)  # spans (s) by constraint

@@ -9,7 +9,7 @@ import numpy as np
 from graphnav.constraints.gnss import OFFSETS, STAMPS, TIMES, VELOCITY_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.core.state import SECONDS
-from graphnav.estimation.noise.model import Figure, NoiseModel
+from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.recording import FIX_TYPES, ImuNoise, Recording
 
 _IMU = {
@@ -33,7 +33,7 @@ class FigureRow:
 
     group: str
     words: str  # what it is, for people
-    figure: Figure
+    figure: VarianceComponent
     stated: float | None  # where it is one number: of an IMU, or the median sigma that fixes state
     used: float | None
     unit: str

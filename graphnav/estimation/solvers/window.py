@@ -60,7 +60,7 @@ class SettledStates:
 
 
 @dataclass(frozen=True)
-class _Span:
+class _Stretch:
     """Some stages as one, smoothing back: y_first = F y_last + noise of covariance C. Indices count from the first."""
 
     first: int
@@ -86,7 +86,7 @@ class Window:
         self.relinearized = 0  # stages made anew
         self._limit = limits(prior.columns, {})
         self._gone = 0  # stages that have left
-        self._spans: list[_Span] = []
+        self._spans: list[_Stretch] = []
         self._means: list[Array] | None = None
         self._revision: Revision | None = None
         self._rounds = 0  # of it
@@ -230,7 +230,7 @@ class Window:
             at -= 1
         return out[::-1]
 
-    def _bridged(self, count: int) -> list[_Span]:
+    def _bridged(self, count: int) -> list[_Stretch]:
         """What leads from the newest stages back to the last of the first `count`, most of it as it was last time."""
         first, newest = self._gone + count - 1, self._gone + len(self.stages) - 1
         spans = [
@@ -244,7 +244,7 @@ class Window:
             F, C = run[-1].G, run[-1].noise
             for stage in run[-2::-1]:
                 F, C = stage.G @ F, stage.before(C)
-            spans.append(_Span(k, k + _SPAN, run[-1], F, C))
+            spans.append(_Stretch(k, k + _SPAN, run[-1], F, C))
         self._spans = spans
         return spans
 

@@ -15,7 +15,7 @@ from graphnav.core.timescales import NEAR, between_clocks
 from graphnav.recording import Imu, Odometer, Recording
 from graphnav.recording import odometer as wheels
 from graphnav.recording.checks import crosschecks
-from graphnav.recording.checks.clock import Clock
+from graphnav.recording.checks.clock import ClockOffsets
 from graphnav.recording.checks.crosschecks import Fit, Track
 from graphnav.recording.checks.stated import exchange_lat_lon, exchanged_finding
 from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
@@ -123,7 +123,7 @@ def gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Finding]:
         )
 
 
-def imu_clock(clock: Clock, odometer: Fit | None = None) -> Iterator[Finding]:
+def imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterator[Finding]:
     """By GNSS speed, and by the positions alone, which in some receivers are of another time.
 
     `odometer` is its fit against GNSS, which tells whose clock it is. What is further off than the stamps of the fixes

@@ -14,7 +14,7 @@ _SIGNIFICANT = 3.0  # sigma
 
 
 @dataclass(frozen=True)
-class Clock:
+class ClockOffsets:
     """How late the IMU's stamps are by the velocities of the fixes, and by their places alone; None where unknown."""
 
     by_velocity: Fit | None
@@ -46,12 +46,12 @@ def surely(fit: Fit) -> bool:
     return abs(fit.lag) >= _MATTERS + _SIGNIFICANT * fit.spread
 
 
-def clock_of(imu: Imu, gnss: Gnss) -> Clock:
+def clock_of(imu: Imu, gnss: Gnss) -> ClockOffsets:
     """By the force along the way against changes of speed; what a drive without such says is None."""
     places = crosschecks.track(replace(gnss, v=None))
     by_places = None if places is None else crosschecks.forward_fit(imu, places)
     track = crosschecks.track(gnss) if gnss.v is not None else None
     if track is None or not track.instant:
-        return Clock(None, by_places, None)
+        return ClockOffsets(None, by_places, None)
     between = None if places is None else crosschecks.velocity_fit(track, places)
-    return Clock(crosschecks.forward_fit(imu, track), by_places, between)
+    return ClockOffsets(crosschecks.forward_fit(imu, track), by_places, between)

@@ -8,7 +8,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu
-from graphnav.recording.checks.clock import Clock, clock_of
+from graphnav.recording.checks.clock import ClockOffsets, clock_of
 from graphnav.recording.draft import motion
 
 CLEAR, FAIR = 0.8, 0.5  # correlations: sure, likely
@@ -29,7 +29,7 @@ class Agreement:
     velocity: motion.Lag | None = None
     forward: Array | None = None  # (3,) in file axes
     far: float = 0.0  # s
-    clock: Clock | None = None
+    clock: ClockOffsets | None = None
     known: float = 0.0  # s, to be added to the stamps of the fixes beforehand; the rest is found on top
 
     @property
@@ -59,7 +59,7 @@ class Agreement:
         """The same, of the fixes with what is known added to their stamps."""
         if self.clock is None:
             return None
-        clock = self.clock if self.late_velocity is None else Clock(None, self.clock.by_places, None)
+        clock = self.clock if self.late_velocity is None else ClockOffsets(None, self.clock.by_places, None)
         if clock.late is not None:
             return clock.late.lag - self.far, clock.late.spread
         if not self.far:
@@ -119,7 +119,7 @@ def _compare(t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array,
     return replace(out, forward=np.cos(angle) * axes[0] + np.sin(angle) * axes[1])
 
 
-def _clock(t: Array, gyro: Array, accel: Array, fixes: tuple[Array, Array, Array | None], shift: float) -> Clock:
+def _clock(t: Array, gyro: Array, accel: Array, fixes: tuple[Array, Array, Array | None], shift: float) -> ClockOffsets:
     """As the recording will hold them, with the fixes `shift` seconds earlier."""
     rows = np.concatenate([[True], np.diff(fixes[0]) > 0.0]) & np.isfinite(fixes[1]).all(axis=1)
     v = None if fixes[2] is None else fixes[2][rows]

@@ -99,14 +99,14 @@ class Source:
 
 
 @dataclass
-class Found:
+class LogsFound:
     """What logs hold, by sensor, and in words which of them are left out."""
 
     sensors: dict[str, Source]
     left_out: list[str]
 
 
-def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> Found:
+def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     """What the logs hold, by sensor; of a folder all that is in it. What is no sensor's log is left out.
 
     Raises
@@ -150,7 +150,7 @@ def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> Found:
     parts = [s.path.name for name in ("gyro", "accel", "gravity") for s in every.get(name, ())]
     if "imu" in every and parts:
         left.append(f"{', '.join(parts)}: {sensors['imu'].path.name} holds both")
-    return Found({name: sensors[name] for name in ("imu", "gnss", "odometer") if name in sensors}, left)
+    return LogsFound({name: sensors[name] for name in ("imu", "gnss", "odometer") if name in sensors}, left)
 
 
 def _files(path: Path) -> list[Path]:

@@ -3,6 +3,24 @@
 from __future__ import annotations
 
 from graphnav.recording.odometer.faults import Faults, faults
-from graphnav.recording.odometer.mean import Figures, MeanSpeed, counts, gaps, longest_step, quantum, reading_sigma
+from graphnav.recording.odometer.mean import (
+    MeanSpeed,
+    ReadingStatistics,
+    counts,
+    gaps,
+    longest_step,
+    quantum,
+    reading_sigma,
+)
 
-__all__ = ["Faults", "Figures", "MeanSpeed", "counts", "faults", "gaps", "longest_step", "quantum", "reading_sigma"]
+__all__ = [
+    "Faults",
+    "MeanSpeed",
+    "ReadingStatistics",
+    "counts",
+    "faults",
+    "gaps",
+    "longest_step",
+    "quantum",
+    "reading_sigma",
+]

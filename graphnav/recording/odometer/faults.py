@@ -23,7 +23,7 @@ from scipy.ndimage import median_filter
 from graphnav.core.findings import period_of, runs_of
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Odometer
-from graphnav.recording.odometer.mean import Figures, gaps
+from graphnav.recording.odometer.mean import ReadingStatistics, gaps
 
 GAP, STUCK, FROZEN, WILD = "no readings", "stuck at zero", "frozen", "against the motion"
 
@@ -56,13 +56,13 @@ class Faults:
 
 
 def faults(
-    odometer: Odometer, imu: Imu | None = None, figures: Figures | None = None, lag: float | None = None
+    odometer: Odometer, imu: Imu | None = None, figures: ReadingStatistics | None = None, lag: float | None = None
 ) -> Faults:
     """Where readings are missing or wrong; see the module's head. Times are those of the odometer's own stamps.
 
     `figures` and `lag` (s) are what is known of the odometer already.
     """
-    figures = figures or Figures.of(odometer)
+    figures = figures or ReadingStatistics.of(odometer)
     found = [(a, b, GAP) for a, b in gaps(odometer.t, figures.longest)]
     if len(odometer.t) >= 10:
         motion = _motion(odometer, imu, lag) if imu is not None and len(imu.t) > 10 else None
@@ -131,7 +131,7 @@ def _motion(odometer: Odometer, imu: Imu, known: float | None) -> _InertialMotio
     return _InertialMotion(np.interp(at, imu.t, gained) + np.interp(at, ends, drift) + 1e6 * hole, inside, lag)
 
 
-def _breaks(odometer: Odometer, motion: _InertialMotion | None, figures: Figures) -> list[tuple[int, int]]:
+def _breaks(odometer: Odometer, motion: _InertialMotion | None, figures: ReadingStatistics) -> list[tuple[int, int]]:
     """Pairs of readings between which x changes by more than it can, the closest pairs that show it, in order."""
     t, v = odometer.t, odometer.speed
     error = figures.step + 6.0 * figures.sigma
@@ -180,7 +180,7 @@ def _closest(i: NDArray[np.intp], j: NDArray[np.intp], found: list[tuple[int, in
 
 
 def _wrong(
-    odometer: Odometer, imu: Imu | None, motion: _InertialMotion | None, figures: Figures
+    odometer: Odometer, imu: Imu | None, motion: _InertialMotion | None, figures: ReadingStatistics
 ) -> list[tuple[float, float, str]]:
     t, v = odometer.t, odometer.speed
     breaks = _breaks(odometer, motion, figures)
@@ -250,7 +250,7 @@ def _stuck(
 
 
 def _noiseless(
-    v: Array, figures: Figures, equal: list[tuple[int, int]], stays: list[tuple[int, int]]
+    v: Array, figures: ReadingStatistics, equal: list[tuple[int, int]], stays: list[tuple[int, int]]
 ) -> list[tuple[int, int, str]]:
     """Readings that stay the same while moving, of a sensor whose noise is above its step: it never is so still."""
     if figures.sigma < 2.0 * figures.step:

@@ -109,7 +109,7 @@ def gaps(t: Array, longest: float | None = None) -> Spans:
 
 
 @dataclass(frozen=True)
-class Figures:
+class ReadingStatistics:
     """What many readings tell of each of them."""
 
     step: float  # m/s, `quantum`
@@ -118,7 +118,7 @@ class Figures:
     longest: float  # s, `longest_step`
 
     @classmethod
-    def of(cls, odometer: Odometer) -> Figures:
+    def of(cls, odometer: Odometer) -> ReadingStatistics:
         """As these readings tell."""
         step = quantum(odometer.speed)
         return cls(step, reading_sigma(odometer, step), counts(odometer, step), longest_step(odometer.t))
@@ -158,9 +158,9 @@ class MeanSpeed:
     ends: float  # m, the error of a way that is counted
 
     @classmethod
-    def of(cls, odometer: Odometer, spans: Spans | None = None, figures: Figures | None = None) -> MeanSpeed:
+    def of(cls, odometer: Odometer, spans: Spans | None = None, figures: ReadingStatistics | None = None) -> MeanSpeed:
         """Without the readings in `spans` (see `faults`) and not across gaps; `figures` if they are known already."""
-        figures = figures or Figures.of(odometer)
+        figures = figures or ReadingStatistics.of(odometer)
         t, speed = odometer.t, odometer.speed
         step = t[1:] - t[:-1]
         good = np.ones(len(t), dtype=bool)

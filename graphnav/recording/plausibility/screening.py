@@ -21,7 +21,7 @@ from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, rows_of
 from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.aiding import imu_axes, imu_clock, overlap_s
-from graphnav.recording.checks.clock import Clock, clock_of
+from graphnav.recording.checks.clock import ClockOffsets, clock_of
 from graphnav.recording.checks.crosschecks import Fit, Track
 from graphnav.recording.checks.series import screen_series
 from graphnav.recording.formats.schema import FORCE
@@ -52,7 +52,7 @@ class Screened:
 
     recording: Recording
     findings: tuple[Finding, ...] = ()
-    clock: Clock | None = None  # of the IMU against the fixes, where it was looked at
+    clock: ClockOffsets | None = None  # of the IMU against the fixes, where it was looked at
 
 
 def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:

@@ -8,7 +8,7 @@ from graphnav.core.errors import ConfigError
 from graphnav.simulation.footsteps import Cadence, footsteps, rectangle, way
 from graphnav.simulation.gait import Sole, Style
 from graphnav.simulation.gait import walk as walk_over
-from graphnav.simulation.inertial import DEG_H, DEG_SQRT_H, ImuModel, Triad, accelerometer, gyroscope
+from graphnav.simulation.inertial import DEG_H, DEG_SQRT_H, SimulatedImu, Triad, accelerometer, gyroscope
 from graphnav.simulation.pedestrian import record_walk
 from graphnav.simulation.result import Simulated
 from graphnav.simulation.scenarios.registry import Scenario
@@ -23,13 +23,13 @@ WALKS = (
 )  # fmt: skip
 # Table 1 as printed; what it does not give is of the size usual for the sensor: 2 mg and 0.02 deg/s at turn-on,
 # scale errors of 500 ppm.
-ELLIPSE2 = ImuModel(
+ELLIPSE2 = SimulatedImu(
     "SBG Ellipse2 of Ren 2021, table 1", 100.0,
     Triad(0.15 * DEG_SQRT_H, 72.0 * DEG_H, 7.0 * DEG_H, scale=5e-4, misalignment=5e-4, limit=450.0 * DEG),
     Triad(5.7e-5, 0.02, 1.4e-5, scale=5e-4, misalignment=5e-4, limit=160.0),
 )  # fmt: skip
 # Of the noise that the recordings of OpenShoe (3DM-GX2) and x-io (NGIMU) have at rest.
-SHOE = ImuModel(
+SHOE = SimulatedImu(
     "MEMS in a shoe", 200.0,
     gyroscope(1.0, 1800.0, instability_deg_h=20.0, scale_ppm=3000.0, misalignment_mrad=3.0, range_deg_s=1200.0),
     accelerometer(100.0, 6.0, instability_mg=0.05, scale_ppm=3000.0, misalignment_mrad=3.0, range_g=18.0),
@@ -100,7 +100,7 @@ def _rest(seed: int) -> np.ndarray:
 
 
 def _walked(
-    name: str, seed: int, duration: float, parts: list[tuple[float, float]], imu: ImuModel, exact: bool,
+    name: str, seed: int, duration: float, parts: list[tuple[float, float]], imu: SimulatedImu, exact: bool,
     compensated: bool, closed: bool, facts: dict[str, object],
 ) -> Simulated:  # fmt: skip
     rest = _rest(seed)

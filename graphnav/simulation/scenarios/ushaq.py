@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from graphnav.core.errors import ConfigError
 from graphnav.simulation.aiding import GnssModel, OdometerModel, SimulatedFault, Span
-from graphnav.simulation.inertial import ImuModel, accelerometer, gyroscope
+from graphnav.simulation.inertial import SimulatedImu, accelerometer, gyroscope
 from graphnav.simulation.kinematics import Mount
 from graphnav.simulation.motion import Manoeuvre, drive
 from graphnav.simulation.result import Simulated, record
@@ -13,7 +13,7 @@ from graphnav.simulation.splines import stream
 from graphnav.simulation.vibration import Engine, Idle, Shake, idle_floor, road_noise
 
 # The paper gives the biases only; noise and instability are those usual of such sensors.
-IMU = ImuModel(
+IMU = SimulatedImu(
     "IMU of Ushaq", 100.0,
     gyroscope(0.1, 5.0, instability_deg_h=1.0), accelerometer(50.0, 0.2, instability_mg=0.02),
 )  # fmt: skip
