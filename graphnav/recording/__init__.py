@@ -263,7 +263,13 @@ class Recording:
 
 
 def sources() -> tuple[str, ...]:
-    """Names of what can be withheld."""
+    """Names of what can be withheld.
+
+    Returns
+    -------
+    tuple of str
+        "gnss", "odometer" and those of `graphnav.sensors`.
+    """
     return ("gnss", "odometer", *registered())
 
 

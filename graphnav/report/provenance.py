@@ -57,8 +57,8 @@ def toml_text(values: Mapping[str, Any], table: str = "") -> str:
     """Nested plain values as TOML; what is None is left out, as TOML has no word for it."""
     plain = [f"{key} = {_toml(value)}" for key, value in values.items()
              if value is not None and not isinstance(value, Mapping)]  # fmt: skip
-    head = [f"[{table}]"] if table and plain else []
-    parts = ["\n".join([*head, *plain])] if plain else []
+    head = [f"[{table}]"] if table and (plain or not values) else []
+    parts = ["\n".join([*head, *plain])] if head or plain else []
     for key, value in values.items():
         if isinstance(value, Mapping):
             parts.append(toml_text(value, f"{table}.{key}" if table else key).rstrip("\n"))

@@ -11,7 +11,7 @@ from typing import Any
 
 import mutators
 import numpy as np
-import test_raw_ubx
+from ubx_frames import rawx
 
 from graphnav.core.timescales import gps_to_utc
 from graphnav.gnss.load import Sources, load_raw
@@ -42,7 +42,7 @@ def write_seeds(folder: Path) -> Path:
     at = nav.place(one, t, obs.zero)
     known = np.isfinite(at.p[:, 0])
     write_orbits(t[known], one[known], at.p[known], at.clock[known], obs.zero, folder)
-    (folder / "a.ubx").write_bytes(b"".join(test_raw_ubx.rawx(300.0 + k) for k in range(4)))
+    (folder / "a.ubx").write_bytes(b"".join(rawx(300.0 + k) for k in range(4)))
     return folder
 
 

@@ -446,7 +446,7 @@ def test_what_was_solved_is_kept_if_one_file_fails(
         raise OSError(28, "No space left on device")
 
     if what == "export":
-        monkeypatch.setattr(convert, "written", failing)
+        monkeypatch.setattr(convert, "write_parts", failing)
     else:
         monkeypatch.setattr(report, "write_report", failing)
     out = tmp_path / "out"
