@@ -20,7 +20,9 @@ class RawGnssSettings(Outliers):
     )
     code: bool = Field(True, description="use the codes")
     doppler: bool = Field(True, description="use the Doppler shifts")
-    differences: bool = Field(True, description="use what the carriers change by from epoch to epoch")
+    differences: bool = Field(
+        False, description="use what the carriers change by from epoch to epoch, where they have no ambiguities"
+    )
     ppp: bool = Field(
         False,
         description="precise point positioning: codes and carriers of two signals, by precise orbits and clocks, in "

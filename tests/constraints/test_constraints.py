@@ -32,6 +32,7 @@ STANDING = np.array([[3.0, 14.0], [88.0, 104.0]])  # parts of two stops of the p
 ON_FOOT = {"stance", "foot_lateral", "closed_loop"}  # constraints that only a foot has
 RAW = {"gnss_code", "gnss_doppler", "gnss_carrier", "gnss_antenna_clone"}  # of single satellites
 PPP = {"gnss_ppp_code", "gnss_ppp_carrier"}
+CARRIERS = settings_from({"raw_gnss": {"differences": True}})
 SIGMA = np.repeat([0.05, 1.0, 0.5, 0.05, 1e-3], 3)
 
 
@@ -59,7 +60,7 @@ def readings(sensor: Sensor, recording: Recording) -> Series:
 def with_parameters(name: str) -> Settings:
     """Everything that can be estimated is estimated."""
     chosen = {"gnss": {"lever_arm_sigma": 0.5}, "foot": {"lateral": True, "closed_loop": 0.01}}
-    return settings_from({**chosen, "raw_gnss": {"ppp": name in PPP}})
+    return settings_from({**chosen, "raw_gnss": {"ppp": True} if name in PPP else {"differences": True}})
 
 
 def seen_by(name: str, recording: Recording) -> Recording:
@@ -112,7 +113,7 @@ CASES = [(n, p) for n in NAMES for p in (False, True) if p or n not in {"foot_la
 @pytest.fixture(scope="module", params=CASES, ids=lambda x: f"{x[0]}-{x[1]}")
 def case(request: pytest.FixtureRequest, recording: Recording) -> Case:
     name, estimated = request.param
-    return build(name, recording, with_parameters(name) if estimated else Settings())
+    return build(name, recording, with_parameters(name) if estimated else CARRIERS)
 
 
 def test_the_prior_and_both_gnss_constraints_are_registered() -> None:
@@ -241,7 +242,7 @@ def test_epochs_lie_within_the_imu(name: str, recording: Recording) -> None:
     Fixes have a keyframe each, stops at both ends, stances often; the others have rows at keyframes of any kind.
     """
     cls = next(c for c in list_constraints() if c.name == name)
-    settings = with_parameters(name) if name in ON_FOOT | PPP else Settings()
+    settings = with_parameters(name) if name in ON_FOOT | PPP else CARRIERS
     recording = seen_by(name, recording)
     imu = recording.imu
     inside = (imu.t > recording.start + 50.3) & (imu.t < recording.start + 81.7)

@@ -50,7 +50,7 @@ def at_the_truth(rows, where, truth):
 def test_rows_are_zero_at_the_truth(exact, cls, limit):
     """With exact carriers, made in space, and the true places of the antenna, attitudes and clocks."""
     recording, truth = exact
-    where = scene(recording, cls=GnssCarrier)
+    where = scene(recording, settings(True), GnssCarrier)
     rows = cls.build(where)
     assert len(rows) > 50
     linear = rows.linearize(*at_the_truth(rows, where, truth), slice(None))
@@ -60,7 +60,7 @@ def test_rows_are_zero_at_the_truth(exact, cls, limit):
 def test_a_change_is_the_difference_of_gtsams_carrier_factors(exact):
     """Two CarrierPhaseFactorArm with one ambiguity: their errors' difference, ionosphere taken off."""
     recording, truth = exact
-    where = scene(recording, cls=GnssCarrier)
+    where = scene(recording, settings(True), GnssCarrier)
     rows = GnssCarrier.build(where)
     states, given = at_the_truth(rows, where, truth)
     moved = {name: value + (0.7 if name in CLONES else 0.0) for name, value in given.items()}
