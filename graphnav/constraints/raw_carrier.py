@@ -27,7 +27,15 @@ from numpy.typing import NDArray
 from graphnav.config import Settings
 from graphnav.constraints.base import BuildContext, Constraint, Linearized
 from graphnav.constraints.gnss import LEVER_ARM
-from graphnav.constraints.raw_gnss import _AXES, _common, _prepare, _SatelliteRows, _Satellites, _select
+from graphnav.constraints.raw_gnss import (
+    AXES,
+    PreparedRows,
+    SatelliteConstraint,
+    common_fields,
+    prepare_rows,
+    range_change,
+    select_observations,
+)
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
@@ -61,11 +69,11 @@ class _Pairs:
 
 
 def _epochs(recording: Recording, settings: Settings) -> Array:
-    raw = _select(recording, settings) if _are_wanted(recording, settings) else None
+    raw = select_observations(recording, settings) if _use_differences(recording, settings) else None
     return np.empty(0) if raw is None else np.unique(raw.t[np.isfinite(raw.carrier)])
 
 
-def _are_wanted(recording: Recording, settings: Settings) -> bool:
+def _use_differences(recording: Recording, settings: Settings) -> bool:
     """Not where the carriers are used with their ambiguities: both kinds of rows are of the same numbers."""
     s, raw = settings.raw_gnss, recording.raw_gnss
     if raw is None or not s.differences:
@@ -73,10 +81,10 @@ def _are_wanted(recording: Recording, settings: Settings) -> bool:
     return not (s.carrier and s.code and np.isfinite(raw.carrier_difference).any())
 
 
-def _pairs(scene: BuildContext) -> tuple[_SatelliteRows, _Pairs] | None:
-    if not _are_wanted(scene.recording, scene.settings):
+def _pairs(scene: BuildContext) -> tuple[PreparedRows, _Pairs] | None:
+    if not _use_differences(scene.recording, scene.settings):
         return None
-    found, whole = scene.share(_prepare), scene.recording.raw_gnss
+    found, whole = scene.share(prepare_rows), scene.recording.raw_gnss
     if found is None or whole is None or not np.isfinite(found.raw.carrier).any():
         return None
     raw = found.raw
@@ -92,7 +100,7 @@ def _pairs(scene: BuildContext) -> tuple[_SatelliteRows, _Pairs] | None:
     return found, _Pairs(before, after, of[after], epochs, first, change, clock)
 
 
-def _clones(found: _SatelliteRows, pairs: _Pairs) -> tuple[Parameter, ...]:
+def _clones(found: PreparedRows, pairs: _Pairs) -> tuple[Parameter, ...]:
     return tuple(
         Parameter(
             name, found.nominal[pairs.first[k::2]], np.full((len(pairs.epochs[k::2]), 3), _ANYWHERE), "m",
@@ -124,7 +132,7 @@ class GnssAntennaClone(Constraint):
             return None
         found, pairs = both
         own = np.arange(len(pairs.epochs))
-        parameters = [p for p in _common(scene, found)["parameters"] if p.name == LEVER_ARM]
+        parameters = [p for p in common_fields(scene, found)["parameters"] if p.name == LEVER_ARM]
         return cls(
             keyframe=found.keyframe[pairs.first[own]],
             lever_arm=found.raw.lever_arm,
@@ -150,7 +158,7 @@ class GnssAntennaClone(Constraint):
 
 
 @dataclass(frozen=True)
-class GnssCarrier(_Satellites):
+class GnssCarrier(SatelliteConstraint):
     """A satellite's carrier has counted on since the epoch before."""
 
     name: ClassVar[str] = "gnss_carrier"
@@ -174,7 +182,7 @@ class GnssCarrier(_Satellites):
             return None
         found, pairs = both
         raw, j, k = found.raw, pairs.before, pairs.after
-        common: dict[str, Any] = _common(scene, found)
+        common: dict[str, Any] = common_fields(scene, found)
         common |= {name: common[name][k] for name in ("keyframe", "s_n", "R_ln", "satellite", "elevation", "level")}
         if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
             common["robust"] = "cauchy"
@@ -186,7 +194,7 @@ class GnssCarrier(_Satellites):
         minutes = scene.settings.gnss.slow_times[0]
         drift = Parameter(
             DRIFT, np.zeros(3), _DRIFT, "m/s", correlation_time=minutes, spacing=found.spacing,
-            noise_groups=tuple(f"{cls.name}.minutes.{axis}" for axis in _AXES),
+            noise_groups=tuple(f"{cls.name}.minutes.{axis}" for axis in AXES),
         )  # fmt: skip
         sigma = np.hypot(
             carrier_sigma(raw.cn0[j], found.elevation[j], C / raw.frequency[j]),
@@ -208,8 +216,8 @@ class GnssCarrier(_Satellites):
         antenna, lever = self._antenna(states, parameters)
         odd = self.odd[rows]
         before = np.where(odd[:, None] == 0, parameters[CLONES[0]], parameters[CLONES[1]])
-        nearer, e = _nearer(self.s_n[rows], antenna, self.nominal[rows])
-        nearer_before, e_before = _nearer(self.s_before[rows], before, self.nominal_before[rows])
+        nearer, e = range_change(self.s_n[rows], antenna, self.nominal[rows])
+        nearer_before, e_before = range_change(self.s_before[rows], before, self.nominal_before[rows])
         residual = nearer - nearer_before + self.change[rows] + parameters[CHANGE][:, 0]
         J = {
             "theta": (e[:, None] @ states.R_nb) @ rotation.skew(lever),
@@ -225,12 +233,3 @@ class GnssCarrier(_Satellites):
             time = self.time[rows]
             residual, J = residual + shift * time, J | {DRIFT: more[DRIFT] * time[:, None, None]}
         return Linearized(residual[:, None], J, self.sigma[rows])
-
-
-def _nearer(s: Array, antenna: Array, nominal: Array) -> tuple[Array, Array]:
-    """|s - antenna| - |s - nominal| (n,) without the digits that a difference of distances loses, and directions."""
-    away, from_nominal = s - antenna, s - nominal
-    moved = antenna - nominal
-    distance = np.linalg.norm(away, axis=1)
-    nearer = np.sum(moved * (moved - 2.0 * from_nominal), axis=1) / (distance + np.linalg.norm(from_nominal, axis=1))
-    return nearer, away / distance[:, None]

@@ -50,7 +50,7 @@ _ZENITH = 1.5  # m, 1-sigma of what the model of the ionosphere is wrong by: hal
 # unit/sqrt(s), of what changes over hours. Even a lever arm walks, by a centimetre in three hours: all that rows depend
 # on beside states and clocks has its nodes in common then, one variable of the graph
 _ZENITH_WALK, _BIAS_WALK, _LEVER_WALK = 0.01, 0.003, 1e-4
-_AXES = ("horizontal", "horizontal", "up")
+AXES = ("horizontal", "horizontal", "up")
 # m, 1-sigma of what lasts for hours, which a drive does not tell from its place: of all satellites, as a shift of the
 # place, where the ionosphere's gradient and the datum of an orbit make a metre or two; and of one satellite
 _HOURS, _ONE = np.array([1.0, 1.0, 2.0]), 0.7
@@ -62,7 +62,7 @@ _LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have 
 _CLASSES = ("strong", "fair", "weak", "faint")
 
 
-def _select(recording: Recording, settings: Settings) -> RawGnss | None:
+def select_observations(recording: Recording, settings: Settings) -> RawGnss | None:
     """The rows to be used: of one signal for each satellite, strong enough, where the IMU is."""
     s, raw = settings.raw_gnss, recording.raw_gnss
     if raw is None or not recording.tight(s.coupling) or not len(raw):
@@ -88,7 +88,7 @@ def _apart(t: Array, least: float) -> Array:
 
 
 @dataclass(frozen=True)
-class _SatelliteRows:
+class PreparedRows:
     """What both kinds of rows need, of the rows that are used; made once for a scene."""
 
     raw: RawGnss
@@ -105,8 +105,8 @@ class _SatelliteRows:
     spacing: float  # s from node to node of whatever changes slowly
 
 
-def _prepare(scene: BuildContext) -> _SatelliteRows | None:
-    raw = _select(scene.recording, scene.settings)
+def prepare_rows(scene: BuildContext) -> PreparedRows | None:
+    raw = select_observations(scene.recording, scene.settings)
     if raw is None:
         return None
     keyframe = scene.keyframe_at(raw.t)
@@ -118,7 +118,7 @@ def _prepare(scene: BuildContext) -> _SatelliteRows | None:
     geometry = look(raw, raw.antenna, coefficients(raw))
     frame = scene.frame
     epochs, first = np.unique(raw.t, return_index=True)
-    return _SatelliteRows(
+    return PreparedRows(
         raw=raw,
         keyframe=keyframe,
         s_n=(geometry.s - frame.r_e) @ frame.R_ne.T,
@@ -136,7 +136,7 @@ def _prepare(scene: BuildContext) -> _SatelliteRows | None:
     )
 
 
-def _common(scene: BuildContext, found: _SatelliteRows) -> dict[str, Any]:
+def common_fields(scene: BuildContext, found: PreparedRows) -> dict[str, Any]:
     settings, raw = scene.settings, found.raw
     parameters: tuple[Parameter, ...] = (found.clock,)
     if settings.gnss.lever_arm_sigma is not None:
@@ -163,14 +163,14 @@ def _common(scene: BuildContext, found: _SatelliteRows) -> dict[str, Any]:
     }
 
 
-def _ionosphere(raw: RawGnss, spacing: float) -> Parameter:
+def ionosphere_parameter(raw: RawGnss, spacing: float) -> Parameter:
     """What the ionosphere's model is wrong by at the zenith; against a base station, between the two."""
     sigma = max(_GRADIENT * raw.baseline, 1e-3) if raw.differenced else _ZENITH
     return Parameter(IONOSPHERE, np.zeros(1), np.full(1, sigma), "m", sigma / _ZENITH * _ZENITH_WALK, spacing=spacing)
 
 
 @dataclass(frozen=True)
-class _Satellites(Constraint):
+class SatelliteConstraint(Constraint):
     """Rows of single satellites."""
 
     axes: ClassVar[tuple[str, ...]] = ("range",)
@@ -205,34 +205,72 @@ class _Satellites(Constraint):
         return shift, dict.fromkeys(there, towards[:, None])
 
 
+def range_change(s: Array, antenna: Array, nominal: Array) -> tuple[Array, Array]:
+    """|s - antenna| - |s - nominal| (n,) without the digits that a difference of distances loses, and directions."""
+    away, from_nominal = s - antenna, s - nominal
+    moved = antenna - nominal
+    distance = np.linalg.norm(away, axis=1)
+    change = np.sum(moved * (moved - 2.0 * from_nominal), axis=1) / (distance + np.linalg.norm(from_nominal, axis=1))
+    return change, away / distance[:, None]
+
+
+def select_columns(values: Array, which: Array) -> tuple[Array, Array]:
+    """Of values (n, k) the one of each row's column (n,), 0 for the column -1; and the derivatives (n, 1, k)."""
+    own = which[:, None] == np.arange(values.shape[1])
+    return np.sum(own * values, axis=1), own[:, None].astype(float)
+
+
 @dataclass(frozen=True)
-class GnssCode(_Satellites):
+class RangeConstraint(SatelliteConstraint):
+    """Rows of distances to satellites."""
+
+    offset: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, all that does not depend on the estimate
+    nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m
+
+    def _linearize_ranges(
+        self, states: States, parameters: dict[str, Array], rows: slice | Array, delay: str, factor: Array
+    ) -> tuple[Array, dict[str, Array], Array]:
+        """Residuals (n,), Jacobians, and directions (n, 3); a parameter delays each row by its factor (n,)."""
+        antenna, lever = self._antenna(states, parameters)
+        change, e = range_change(self.s_n[rows], antenna, self.nominal[rows])
+        residual = change + self.offset[rows] + parameters[CLOCK][:, 0] + factor * parameters[delay][:, 0]
+        J = {
+            "theta": (e[:, None] @ states.R_nb) @ rotation.skew(lever),
+            "p": -e[:, None],
+            CLOCK: np.broadcast_to(np.array([[1.0, 0.0]]), (len(e), 1, 2)),
+            delay: factor[:, None, None],
+        }
+        if LEVER_ARM in parameters:
+            J[LEVER_ARM] = -e[:, None] @ states.R_nb
+        return residual, J, e
+
+
+@dataclass(frozen=True)
+class GnssCode(RangeConstraint):
     """A satellite's code was received by the antenna."""
 
     name: ClassVar[str] = "gnss_code"
     unit: ClassVar[str] = "m"
 
-    offset: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, all that does not depend on the estimate
-    nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m
     group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of the signals, 0 the reference
     which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite, in the order of their errors
     slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) of the ionosphere's delay over that at the zenith
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        raw = _select(recording, settings) if settings.raw_gnss.code else None
+        raw = select_observations(recording, settings) if settings.raw_gnss.code else None
         return np.empty(0) if raw is None else np.unique(raw.t)
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssCode | None:
-        found = scene.share(_prepare) if scene.settings.raw_gnss.code else None
+        found = scene.share(prepare_rows) if scene.settings.raw_gnss.code else None
         if found is None:
             return None
         raw, settings = found.raw, scene.settings
         groups, group = signal_groups(raw)
-        common, spacing = _common(scene, found), found.spacing
+        common, spacing = common_fields(scene, found), found.spacing
         less = _DIFFERENCED if raw.differenced else 1.0
-        more: tuple[Parameter, ...] = (_ionosphere(raw, spacing),)
+        more: tuple[Parameter, ...] = (ionosphere_parameter(raw, spacing),)
         if len(groups) > 1:
             size = len(groups) - 1
             more += (
@@ -258,7 +296,7 @@ class GnssCode(_Satellites):
         processes = tuple(
             Parameter(
                 error, np.zeros(3), _ERROR, "m", correlation_time=lasts, spacing=spacing,
-                noise_groups=tuple(f"{cls.name}.{time}.{axis}" for axis in _AXES),
+                noise_groups=tuple(f"{cls.name}.{time}.{axis}" for axis in AXES),
             )
             for error, time, lasts in zip(CODE_ERRORS, TIMES, (SECONDS, minutes), strict=False)
         )  # fmt: skip
@@ -278,36 +316,18 @@ class GnssCode(_Satellites):
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        antenna, lever = self._antenna(states, parameters)
-        away, nominal = self.s_n[rows] - antenna, self.s_n[rows] - self.nominal[rows]
-        moved = antenna - self.nominal[rows]
-        distance, before = np.linalg.norm(away, axis=1), np.linalg.norm(nominal, axis=1)
-        e = away / distance[:, None]
-        # |a| - |b| without the digits that a difference of distances would lose
-        nearer = np.sum(moved * (moved - 2.0 * nominal), axis=1) / (distance + before)
-        slant = self.slant[rows]
-        residual = nearer + self.offset[rows] + parameters[CLOCK][:, 0] + slant * parameters[IONOSPHERE][:, 0]
-        J = {
-            "theta": (e[:, None] @ states.R_nb) @ rotation.skew(lever),
-            "p": -e[:, None],
-            CLOCK: np.broadcast_to(np.array([[1.0, 0.0]]), (len(e), 1, 2)),
-            IONOSPHERE: slant[:, None, None],
-        }
-        if LEVER_ARM in parameters:
-            J[LEVER_ARM] = -e[:, None] @ states.R_nb
-        if BIASES in parameters:
-            own = self.group[rows][:, None] == np.arange(1, parameters[BIASES].shape[1] + 1)
-            residual = residual + np.sum(own * parameters[BIASES], axis=1)
-            J[BIASES] = own[:, None].astype(float)
-        own = self.which[rows][:, None] == np.arange(parameters[SATELLITES].shape[1])
-        residual = residual + np.sum(own * parameters[SATELLITES], axis=1)
-        J[SATELLITES] = own[:, None].astype(float)
+        residual, J, e = self._linearize_ranges(states, parameters, rows, IONOSPHERE, self.slant[rows])
+        chosen = {BIASES: self.group[rows] - 1, SATELLITES: self.which[rows]}
+        for name, which in chosen.items():
+            if name in parameters:
+                own, J[name] = select_columns(parameters[name], which)
+                residual = residual + own
         shift, more = self._lasting(parameters, CODE_ERRORS, rows, e)
         return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])
 
 
 @dataclass(frozen=True)
-class GnssDoppler(_Satellites):
+class GnssDoppler(SatelliteConstraint):
     """A satellite's signal was received with a Doppler shift."""
 
     name: ClassVar[str] = "gnss_doppler"
@@ -321,15 +341,15 @@ class GnssDoppler(_Satellites):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        raw = _select(recording, settings) if settings.raw_gnss.doppler else None
+        raw = select_observations(recording, settings) if settings.raw_gnss.doppler else None
         return np.empty(0) if raw is None else np.unique(raw.t[np.isfinite(raw.range_rate)])
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssDoppler | None:
-        found = scene.share(_prepare) if scene.settings.raw_gnss.doppler else None
+        found = scene.share(prepare_rows) if scene.settings.raw_gnss.doppler else None
         if found is None:
             return None
-        raw, common = found.raw, _common(scene, found)
+        raw, common = found.raw, common_fields(scene, found)
         some = np.isfinite(raw.range_rate) & np.isfinite(raw.drift)
         if not some.any():
             return None
@@ -338,7 +358,7 @@ class GnssDoppler(_Satellites):
         lasting = Parameter(
             RATE_ERROR, np.zeros(3), _RATE_ERROR, "m/s", correlation_time=SECONDS,
             spacing=found.spacing,
-            noise_groups=tuple(f"{cls.name}.seconds.{axis}" for axis in _AXES),
+            noise_groups=tuple(f"{cls.name}.seconds.{axis}" for axis in AXES),
         )  # fmt: skip
         imu = scene.recording.imu
         return cls(

@@ -23,9 +23,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.ambiguities import ambiguities, ambiguity_name
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
-from graphnav.constraints.gnss import LEVER_ARM
-from graphnav.constraints.raw_gnss import CLOCK, IONOSPHERE, _common, _ionosphere, _prepare, _Satellites
-from graphnav.core import rotation
+from graphnav.constraints.raw_gnss import IONOSPHERE, RangeConstraint, common_fields, ionosphere_parameter, prepare_rows
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.gnss.arcs import find_arcs
@@ -39,15 +37,13 @@ EXACT = 1e-3  # cycles, 1-sigma of a difference that is known as an integer: a t
 
 
 @dataclass(frozen=True)
-class GnssPhase(_Satellites):
+class GnssPhase(RangeConstraint):
     """A satellite's carrier was received by the antenna, and by a base station's."""
 
     name: ClassVar[str] = "gnss_phase"
     unit: ClassVar[str] = "m"
     noise_axes: ClassVar[tuple[str, ...]] = ()
 
-    offset: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, all that does not depend on the estimate
-    nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m
     slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) of the ionosphere's delay over that at the zenith
     wavelength: Array = field(default_factory=lambda: np.empty(0))  # (N,) m
     slot: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index of `slots`
@@ -66,7 +62,7 @@ class GnssPhase(_Satellites):
     @classmethod
     def build(cls, scene: BuildContext) -> GnssPhase | None:
         s, raw = scene.settings.raw_gnss, scene.recording.raw_gnss
-        found = scene.share(_prepare) if s.carrier and s.code else None
+        found = scene.share(prepare_rows) if s.carrier and s.code else None
         if found is None or raw is None or not np.isfinite(raw.carrier_difference).any():
             return None
         arcs = find_arcs(raw, base_arc=raw.base_arc)
@@ -89,7 +85,7 @@ class GnssPhase(_Satellites):
         group[arcs.satellite[there] // 100 == GLONASS] = -1  # each satellite has a frequency of its own
         frame, raw, arc = scene.frame, raw.take(used), arcs.arc[used]
         geometry = look(raw, raw.antenna, coefficients(raw))
-        common = _common(scene, found)
+        common = common_fields(scene, found)
         if s.robust == "automatic":
             common["robust"] = "cauchy"  # for slips that nothing has told of
         common |= {
@@ -100,7 +96,7 @@ class GnssPhase(_Satellites):
             "elevation": geometry.elevation,
             "level": np.zeros(int(used.sum()), dtype=int),
         }
-        common["parameters"] += (_ionosphere(found.raw, found.spacing), *(own[k] for k in there))
+        common["parameters"] += (ionosphere_parameter(found.raw, found.spacing), *(own[k] for k in there))
         known = geometry.distance + geometry.troposphere - geometry.ionosphere
         return cls(
             offset=known - wavelength[used] * raw.carrier - raw.carrier_difference - raw.clock,
@@ -117,22 +113,8 @@ class GnssPhase(_Satellites):
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        antenna, lever = self._antenna(states, parameters)
-        away, nominal = self.s_n[rows] - antenna, self.s_n[rows] - self.nominal[rows]
-        moved = antenna - self.nominal[rows]
-        distance, before = np.linalg.norm(away, axis=1), np.linalg.norm(nominal, axis=1)
-        e = away / distance[:, None]
-        nearer = np.sum(moved * (moved - 2.0 * nominal), axis=1) / (distance + before)
-        slant, wavelength, slot = self.slant[rows], self.wavelength[rows], self.slot[rows]
-        residual = nearer + self.offset[rows] + parameters[CLOCK][:, 0] + slant * parameters[IONOSPHERE][:, 0]
-        J = {
-            "theta": (e[:, None] @ states.R_nb) @ rotation.skew(lever),
-            "p": -e[:, None],
-            CLOCK: np.broadcast_to(np.array([[1.0, 0.0]]), (len(e), 1, 2)),
-            IONOSPHERE: slant[:, None, None],
-        }
-        if LEVER_ARM in parameters:
-            J[LEVER_ARM] = -e[:, None] @ states.R_nb
+        residual, J, _ = self._linearize_ranges(states, parameters, rows, IONOSPHERE, self.slant[rows])
+        wavelength, slot = self.wavelength[rows], self.slot[rows]
         for k in np.unique(slot).tolist():
             name, own = self.slots[k], np.where(slot == k, wavelength, 0.0)
             residual = residual + own * parameters[name][:, 0]

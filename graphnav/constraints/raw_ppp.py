@@ -21,18 +21,16 @@ from numpy.typing import NDArray
 from graphnav.config import Settings
 from graphnav.constraints.ambiguities import ambiguity_name
 from graphnav.constraints.base import BuildContext, Linearized
-from graphnav.constraints.gnss import LEVER_ARM
 from graphnav.constraints.raw_gnss import (
     BIASES,
-    CLOCK,
     SATELLITES,
-    _common,
-    _prepare,
-    _SatelliteRows,
-    _Satellites,
-    _select,
+    PreparedRows,
+    RangeConstraint,
+    common_fields,
+    prepare_rows,
+    select_columns,
+    select_observations,
 )
-from graphnav.core import rotation
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
@@ -55,7 +53,7 @@ _AMBIGUITY = 30.0  # m, about what the first code says: next to nothing known
 class _Free:
     """What both kinds of rows need; made once for a scene."""
 
-    found: _SatelliteRows
+    found: PreparedRows
     rows: IonosphereFree
     s_n: Array  # (N, 3) m
     satellites: NDArray[np.int16]  # those that have rows
@@ -67,7 +65,7 @@ class _Free:
 def _free(scene: BuildContext) -> _Free | None:
     if not scene.settings.raw_gnss.ppp:
         return None
-    found, whole = scene.share(_prepare), scene.recording.raw_gnss
+    found, whole = scene.share(prepare_rows), scene.recording.raw_gnss
     if found is None or whole is None:
         return None
     if not whole.precise:
@@ -89,23 +87,21 @@ def _free(scene: BuildContext) -> _Free | None:
 
 
 @dataclass(frozen=True)
-class _Ppp(_Satellites):
+class _Ppp(RangeConstraint):
     """Rows of single satellites without the ionosphere."""
 
-    offset: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, all that does not depend on the estimate
-    nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m
     wet: Array = field(default_factory=lambda: np.empty(0))  # (N,)
     group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) system, 0 the reference
     which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        raw = _select(recording, settings) if settings.raw_gnss.ppp else None
+        raw = select_observations(recording, settings) if settings.raw_gnss.ppp else None
         return np.empty(0) if raw is None else np.unique(raw.t)
 
     @staticmethod
     def _shared(scene: BuildContext, free: _Free, used: NDArray[np.intp]) -> dict[str, Any]:
-        rows, common = free.rows, _common(scene, free.found)
+        rows, common = free.rows, common_fields(scene, free.found)
         at = rows.which[used]
         common |= {name: common[name][at] for name in ("keyframe", "R_ln", "satellite", "elevation", "level")}
         common["parameters"] += (
@@ -128,25 +124,10 @@ class _Ppp(_Satellites):
         self, states: States, parameters: dict[str, Array], rows: slice | Array
     ) -> tuple[Array, dict[str, Array]]:
         """Residuals (n,) without ambiguities and code biases, and Jacobians."""
-        antenna, lever = self._antenna(states, parameters)
-        away, before = self.s_n[rows] - antenna, self.s_n[rows] - self.nominal[rows]
-        moved = antenna - self.nominal[rows]
-        distance = np.linalg.norm(away, axis=1)
-        nearer = np.sum(moved * (moved - 2.0 * before), axis=1) / (distance + np.linalg.norm(before, axis=1))
-        e, wet = away / distance[:, None], self.wet[rows]
-        residual = nearer + self.offset[rows] + parameters[CLOCK][:, 0] + wet * parameters[WET][:, 0]
-        J = {
-            "theta": (e[:, None] @ states.R_nb) @ rotation.skew(lever),
-            "p": -e[:, None],
-            CLOCK: np.broadcast_to(np.array([[1.0, 0.0]]), (len(e), 1, 2)),
-            WET: wet[:, None, None],
-        }
-        if LEVER_ARM in parameters:
-            J[LEVER_ARM] = -e[:, None] @ states.R_nb
+        residual, J, _ = self._linearize_ranges(states, parameters, rows, WET, self.wet[rows])
         if BIASES in parameters:
-            own = self.group[rows][:, None] == np.arange(1, parameters[BIASES].shape[1] + 1)
-            residual = residual + np.sum(own * parameters[BIASES], axis=1)
-            J[BIASES] = own[:, None].astype(float)
+            own, J[BIASES] = select_columns(parameters[BIASES], self.group[rows] - 1)
+            residual = residual + own
         return residual, J
 
 
@@ -176,10 +157,8 @@ class GnssPppCode(_Ppp):
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         residual, J = self._ranges(states, parameters, rows)
-        own = self.which[rows][:, None] == np.arange(parameters[SATELLITES].shape[1])
-        residual = residual + np.sum(own * parameters[SATELLITES], axis=1)
-        J[SATELLITES] = own[:, None].astype(float)
-        return Linearized(residual[:, None], J, self.sigma[rows])
+        own, J[SATELLITES] = select_columns(parameters[SATELLITES], self.which[rows])
+        return Linearized((residual + own)[:, None], J, self.sigma[rows])
 
 
 @dataclass(frozen=True)

@@ -119,13 +119,13 @@ def _run(
     if unknown:
         raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}")
     frame = LocalFrame(origin(recording))
-    said = fitting(recording, settings)
     pieces, notes = _pieces(recording, settings)
-    notes = [*said, *notes]
+    notes = [*fitting(recording, settings), *notes]
     found: list[dict[str, Solution]] = []
     parts = [share for piece in pieces for share in shares(piece)]
     if len(parts) > len(pieces):
-        notes.append(f"too long to be solved at once: solved in {len(parts)} parts that overlap by {OVERLAP:.0f} s")
+        said = f"too long to be solved at once: solved in {len(parts)} parts that overlap by {OVERLAP:.0f} s"
+        notes.append(Note("pieces.parts", said))
     for part in parts:
         try:
             # matrices here have thirty rows: threads for them cost more than the work, twenty times on a busy machine
