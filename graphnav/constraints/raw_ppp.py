@@ -100,7 +100,7 @@ class _Ppp(RangeConstraint):
         return np.empty(0) if raw is None else np.unique(raw.t)
 
     @staticmethod
-    def _shared(scene: BuildContext, free: _Free, used: NDArray[np.intp]) -> dict[str, Any]:
+    def _shared_fields(scene: BuildContext, free: _Free, used: NDArray[np.intp]) -> dict[str, Any]:
         rows, common = free.rows, common_fields(scene, free.found)
         at = rows.which[used]
         common |= {name: common[name][at] for name in ("keyframe", "R_ln", "satellite", "elevation", "level")}
@@ -144,7 +144,7 @@ class GnssPppCode(_Ppp):
         if free is None:
             return None
         rows, raw = free.rows, free.found.raw.take(free.rows.which)
-        common = cls._shared(scene, free, np.arange(len(rows.which)))
+        common = cls._shared_fields(scene, free, np.arange(len(rows.which)))
         size, hours = len(free.satellites), scene.settings.gnss.slow_times[1]
         common["parameters"] += (
             Parameter(
@@ -184,7 +184,7 @@ class GnssPppCarrier(_Ppp):
         if not len(used):
             return None
         raw = free.found.raw.take(rows.which[used])
-        common = cls._shared(scene, free, used)
+        common = cls._shared_fields(scene, free, used)
         names = tuple(ambiguity_name(f"{satellite_name(s)}.free") for s in free.satellites)
         begins_at: list[NDArray[np.intp]] = []
         for k in range(len(names)):

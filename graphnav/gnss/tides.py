@@ -55,11 +55,11 @@ def sun_and_moon(gps: Array) -> tuple[Array, Array]:
     )  # fmt: skip
     sidereal = np.radians(np.mod(280.46061837 + 360.98564736629 * utc / _DAY, 360.0))
     # longitudes are of the equinox of date, as the sidereal time is
-    sun = _fixed(sun_lon, np.zeros_like(sun_lon), sun_range, tilt, sidereal)
-    return sun, _fixed(moon_lon, moon_lat, moon_range, tilt, sidereal)
+    sun = _to_earth_fixed(sun_lon, np.zeros_like(sun_lon), sun_range, tilt, sidereal)
+    return sun, _to_earth_fixed(moon_lon, moon_lat, moon_range, tilt, sidereal)
 
 
-def _fixed(lon: Array, lat: Array, distance: Array, tilt: Array, sidereal: Array) -> Array:
+def _to_earth_fixed(lon: Array, lat: Array, distance: Array, tilt: Array, sidereal: Array) -> Array:
     """From the ecliptic of date to the Earth-fixed frame."""
     x, y, z = np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)
     y, z = np.cos(tilt) * y - np.sin(tilt) * z, np.sin(tilt) * y + np.cos(tilt) * z

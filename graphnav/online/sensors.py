@@ -148,7 +148,7 @@ class Sensors:
             why = "not a number"
         elif not sensor.usable(row := sensor.within_bounds(row))[0]:
             why = "beyond any sensor"
-        elif not self._in_time(name, t, values, _known(name, t, values), released):
+        elif not self._in_time(name, t, values, _identify(name, t, values), released):
             return False
         elif not self.others[name].add(t, tuple(row[0].tolist())):
             why = "repeated"
@@ -254,7 +254,7 @@ class Sensors:
                     rows = getattr(self, name).rows[:, : width + 1].tolist()
                     self._before = {one for one in self._before if one[0] != name} | {(name, *row) for row in rows}
                 for name, buffer in self.others.items():
-                    again = {_known(name, t, tuple(values)) for t, *values in buffer.rows.tolist()}
+                    again = {_identify(name, t, tuple(values)) for t, *values in buffer.rows.tolist()}
                     self._before = {one for one in self._before if one[0] != name} | again
             self._sort_out()
             return False
@@ -322,7 +322,7 @@ class Sensors:
         return replace(self.setup.odometer, t=rows[:, 0], speed=rows[:, 1], way=way, wheels=wheels)
 
 
-def _known(name: str, t: float, values: tuple[float, ...]) -> tuple[str | float, ...]:
+def _identify(name: str, t: float, values: tuple[float, ...]) -> tuple[str | float, ...]:
     """By what a row of another sensor is known again."""
     return (name, t, *(x for x in values if math.isfinite(x)))
 

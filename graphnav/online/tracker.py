@@ -242,7 +242,7 @@ class Tracker(Chain):
 
     def _revise(self, sensors: Sensors, always: bool = False) -> bool:
         """Linearise again as much as there is time for at a row; False once there is nothing left to do."""
-        more = self.window.revise(self.at_a_row, lambda *which: self._renewed(sensors, *which), always)
+        more = self.window.revise(self.at_a_row, lambda *which: self._pose_again(sensors, *which), always)
         self._forget()
         return more
 
@@ -253,7 +253,7 @@ class Tracker(Chain):
     def settle(self, sensors: Sensors) -> None:
         """Settle all keyframes: no more will come."""
         if len(self.window):
-            self.window.converge(always=True, renewed=lambda *which: self._renewed(sensors, *which))
+            self.window.converge(always=True, renewed=lambda *which: self._pose_again(sensors, *which))
             self._settle(np.inf)
 
     def _settle(self, until: float) -> None:
@@ -370,7 +370,7 @@ class Tracker(Chain):
         whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < GAP * period_of(t)
         return near if whole else sensors.recording(begin - CONTEXT, end)
 
-    def _renewed(self, sensors: Sensors, first: int, end: int) -> list[Place]:
+    def _pose_again(self, sensors: Sensors, first: int, end: int) -> list[Place]:
         """The places of the stages from `first` to `end`, posed again with those around them, and stops as a whole."""
         times, skip = self.times, len(self.times) - len(self.window)  # 1 once there is one before the first stage
         begin, until = max(0, first + skip - _BEFORE), min(end + skip + _BEFORE, len(times))

@@ -148,12 +148,12 @@ class Walker(Tracker):
     def _shown(self) -> tuple[Message, float]:
         return (self.window.newest, self.newest) if self._work is None else self._work.shown
 
-    def _renewed(self, sensors: Sensors, first: int, end: int) -> list[Place]:
+    def _pose_again(self, sensors: Sensors, first: int, end: int) -> list[Place]:
         """As of `Tracker`; what is posed for some stages is kept for those that follow."""
         stages, known = self.window.stages[first:end], self._renewal
         if known.stops is not self.stops or not {stage.place.t for stage in stages} <= known.places.keys():
             until = max(end, min(first + _RENEWED, len(self.window)))
-            places = super()._renewed(sensors, first, until)
+            places = super()._pose_again(sensors, first, until)
             known = self._renewal = _Renewal(self.stops, {place.t: place for place in places})
         fresh = [known.places[stage.place.t] for stage in stages]
         return [replace(stage.place, problem=one.problem, k=one.k) for stage, one in zip(stages, fresh, strict=True)]

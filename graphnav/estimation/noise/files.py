@@ -150,7 +150,7 @@ def known_groups() -> tuple[str, ...]:
     return tuple(out)
 
 
-def _known_processes() -> tuple[str, ...]:
+def _list_processes() -> tuple[str, ...]:
     typed = [f"{error}_{kind}" for error in ERRORS for kind in FIX_TYPES.values()]
     return (*ERRORS, *typed, VELOCITY_ERROR, *CODE_ERRORS, RATE_ERROR, STAMP_ERROR, NHC_ERROR, ODOMETER_ERROR)
 
@@ -169,7 +169,7 @@ class _Reader:
         constraints = [cls.name for cls in list_constraints()]
         return NoiseModel(
             self.each(values, "figures", known_groups(), self.figure),
-            self.each(values, "correlation_times", _known_processes(), self.time),
+            self.each(values, "correlation_times", _list_processes(), self.time),
             self.each(values, "weights", constraints, self.weights),
             self.each(values, "excluded", constraints, self.spans),
             self.number("noise.spacing", values.get("spacing", 0.0), 0.0, 60.0, "s between fixes"),

@@ -64,7 +64,7 @@ def batch(
         # such a kernel gives up on whatever is far from the start; Cauchy's never quite does, and leads there
         rows = (replace(c, robust="cauchy") if c.robust in REDESCENDING else c for c in problem.constraints)
         point = _minimise(replace(problem, constraints=tuple(rows)), point, progress, reintegrate).point
-    for gentle in _graduated(problem, point):
+    for gentle in _graduate(problem, point):
         point = _minimise(gentle, point, progress, reintegrate, 1).point
     found = _minimise(problem, point, progress, reintegrate)
     problem, point, layout = found.problem, found.point, found.layout
@@ -117,7 +117,7 @@ class _Minimum:
     notes: tuple[str, ...]
 
 
-def _graduated(problem: Problem, point: Iterate) -> Iterator[Problem]:
+def _graduate(problem: Problem, point: Iterate) -> Iterator[Problem]:
     """The problem with its "gnc" kernels convex at first and then ever less so, for a step each."""
     mu: dict[str, float] = {}
     points = point.points(problem)

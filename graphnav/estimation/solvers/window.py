@@ -216,7 +216,7 @@ class Window:
         """(D, D) of the first `count` stages."""
         out: list[Array] = []
         P, at = self.newest.covariance, len(self.stages) - 1
-        for span in reversed(self._bridged(count)):
+        for span in reversed(self._bridge(count)):
             while at > span.last - self._gone:
                 P = self.stages[at].before(P)
                 at -= 1
@@ -230,7 +230,7 @@ class Window:
             at -= 1
         return out[::-1]
 
-    def _bridged(self, count: int) -> list[_Stretch]:
+    def _bridge(self, count: int) -> list[_Stretch]:
         """What leads from the newest stages back to the last of the first `count`, most of it as it was last time."""
         first, newest = self._gone + count - 1, self._gone + len(self.stages) - 1
         spans = [

@@ -20,12 +20,12 @@ def screen_series(recording: Recording) -> tuple[Recording, list[Finding]]:
     """The recording without values beyond the bounds of their sensors, and what was found."""
     kept, findings = {}, []
     for name, series in recording.sensors.items():
-        kept[name], found = _screened(series)
+        kept[name], found = _screen(series)
         findings += found
     return (replace(recording, sensors=kept) if kept else recording), findings
 
 
-def _screened(series: Series) -> tuple[Series, list[Finding]]:
+def _screen(series: Series) -> tuple[Series, list[Finding]]:
     sensor, before = series.sensor, np.isfinite(series.values)
     values = sensor.within_bounds(series.values)
     findings = []

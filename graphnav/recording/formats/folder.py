@@ -75,7 +75,7 @@ def read_folder(source: str | Path) -> Recording:
             if not all(column in rows for column in required):
                 read_table(file, required, (), section.columns)  # says what is missing
         if name in known:
-            required = (*required, *_needed(known[name], rows))
+            required = (*required, *_list_needed(known[name], rows))
         return usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
 
     def sensor(name: str, of_table: Callable[[Any, Table, Remarks], Any], of_log: Callable[[Any, Any], Any]) -> Any:
@@ -275,7 +275,7 @@ def _odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odomete
     )
 
 
-def _needed(sensor: Sensor, rows: Table) -> tuple[str, ...]:
+def _list_needed(sensor: Sensor, rows: Table) -> tuple[str, ...]:
     """The columns that every row must have: the first of the sets that the file has.
 
     Raises
