@@ -20,7 +20,7 @@ import numpy as np
 from withheld_spans import runs_of
 
 from graphnav import load
-from graphnav.app.workflow import Withheld, _score
+from graphnav.app.scores import Withheld, score
 from graphnav.config import Settings, settings_from
 from graphnav.detectors import detect, list_detectors
 from graphnav.detectors.base import inside, longer_than, spans_of
@@ -110,7 +110,7 @@ def rms(drive: Drive, fire: str, noise: NoiseModel) -> dict[str, float]:
         for source, span in withheld:
             used = used.without(source, span)
         solutions = run(used, settings_of(fire), SOLVERS, noise=noise)
-        for name, metrics in _score(drive.recording, used, solutions, withheld)[0].items():
+        for name, metrics in score(drive.recording, used, solutions, withheld)[0].items():
             assert metrics.errors is not None
             t = metrics.errors.t - drive.recording.start
             for s in starts:

@@ -30,7 +30,7 @@ from harm_verdict import BOUNDS, FLOOR, Row, broken, compared, failures, key_of,
 from scipy.stats import chi2
 
 import graphnav
-from graphnav.app.workflow import Span, Withheld, _score
+from graphnav.app.scores import Span, Withheld, score
 from graphnav.config import settings_from
 from graphnav.core.earth import LocalFrame
 from graphnav.core.interpolation import interpolate
@@ -178,7 +178,7 @@ def solve(job: Job) -> list[Row]:
         began = time.process_time()
         solutions = graphnav.run(used, settings_of(job.variant, job.sensors, drive.doppler), SOLVERS)
         seconds = time.process_time() - began
-        metrics = _score(part, used, solutions, withheld)[0]
+        metrics = score(part, used, solutions, withheld)[0]
         for row in rows:
             said = summary(metrics[row["solver"]])
             row |= {"h": said.get("h_rms_m"), "up": said.get("up_rms_m"), "nees": said.get("nees_p")}

@@ -194,6 +194,7 @@ def _solve(
     beside: _Beside | None = None,
 ) -> None:
     from graphnav.app import convert, outputs, terminal, workflow
+    from graphnav.app.summary import comparison
     from graphnav.config import read_settings
     from graphnav.core.complaints import split_names
     from graphnav.core.staging import final_path, stage_results
@@ -244,7 +245,7 @@ def _solve(
             with stage_results(folder) as part:
                 more = convert.export_run(outcome, part, exported, point, alone)
             files += final_path(more, part, folder)
-    verdicts = gates.judge(requirements, outputs.comparison(outcome, ours=True)) if requirements else []
+    verdicts = gates.judge(requirements, comparison(outcome, ours=True)) if requirements else []
 
     def values() -> dict[str, Any]:
         places = {name: folder if alone else folder / name for name in chosen}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav.app.outputs import median_sigmas
+from graphnav.app.summary import median_sigmas
 from graphnav.app.workflow import Outcome
 from graphnav.constraints.gnss import TIMES
 from graphnav.core.notes import key_of
@@ -129,7 +129,7 @@ def _whole(outcome: Outcome) -> list[str]:
 
 
 def _sigmas(solution: Solution) -> list[float]:
-    """Those that `outputs.median_sigmas` gives, NaN where there are none."""
+    """Those that `summary.median_sigmas` gives, NaN where there are none."""
     found = median_sigmas(solution)
     return [found.get(key, float("nan")) for key in ("sd_h_median_m", "sd_u_median_m", "sd_heading_median_deg")]
 

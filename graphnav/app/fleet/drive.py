@@ -19,6 +19,7 @@ import graphnav
 from graphnav.app import outputs
 from graphnav.app.fleet.manifest import Task
 from graphnav.app.stored import sha256
+from graphnav.app.summary import median_sigmas, solver_summary
 from graphnav.app.workflow import Outcome, Request, parse_noise, parse_withheld, read_part, run_request
 from graphnav.config.files import settings_from
 from graphnav.core.errors import GraphnavError
@@ -164,7 +165,7 @@ def spans(recording: Recording, length: float, zero: float = 0.0) -> list[tuple[
 def _figures(outcome: Outcome) -> Row:
     """What a row says of a drive that was solved."""
     ((name, solution),) = outcome.solutions.items()
-    summary = outputs.solver_summary(outcome, name, {}, {})
+    summary = solver_summary(outcome, name, {}, {})
     measured: Mapping[str, Any] = {**(summary["errors"] or {}), **(summary["nees"] or {})}
     ends = [span["end_h_m"] for span in summary["spans"] if span.get("end_h_m") is not None]
     speed = np.linalg.norm(solution.states.v[:, :2], axis=1)
@@ -178,7 +179,7 @@ def _figures(outcome: Outcome) -> Row:
         "keyframes": len(solution.t),
         "against": outcome.against,
         **{key: measured.get(key) for key in MEASURED},
-        **{key: _short(value) for key, value in outputs.median_sigmas(solution).items()},
+        **{key: _short(value) for key, value in median_sigmas(solution).items()},
         "spans": len(ends),
         "span_end_h_median_m": _short(float(np.median(ends))) if ends else None,
         "span_end_h_max_m": max(ends, default=None),

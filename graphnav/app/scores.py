@@ -1,0 +1,126 @@
+"""Errors of a run against the best truth there is, over all of it and over each span in which something is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.rotation import Array
+from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.solution import Solution, to_trajectory
+from graphnav.evaluation.against import Foreign, own_solutions, without_attitude
+from graphnav.recording import Recording
+
+if TYPE_CHECKING:
+    from graphnav.evaluation.metrics import Metrics
+
+Span = tuple[float, float]
+Withheld = tuple[str, Span | None]
+
+_DENSEST, _MOST = 0.1, 5_000  # s between, and number of, the epochs of a truth that are met exactly
+_MOST_TURNING = 20_000  # the same where a point at the end of a lever arm swings between them
+_ENOUGH = 1000  # keyframes that make other epochs needless
+_SAME, _BETWEEN_ROWS = 1e-4, 0.02  # s; between epochs that are one, and between rows where nothing else can happen
+OUTAGE = 10.0  # s; fixes further apart than this are an outage worth a line of its own
+
+
+def outages(recording: Recording) -> list[Span]:
+    """Spans of more than `OUTAGE` s without a fix, s from the start; both ends of the recording count too.
+
+    Each lasts from the last fix to one period before the next: at its end there is still none.
+    """
+    if recording.gnss is None or not len(recording.gnss.t):
+        return []
+    t = recording.gnss.t[np.isfinite(recording.gnss.llh).all(axis=1)] - recording.start
+    t = t[(t >= 0.0) & (t <= recording.duration)]
+    period = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    begin, end = np.concatenate([[0.0], t]), np.concatenate([t - period, [recording.duration]])
+    return [(float(a), float(b)) for a, b in zip(begin, end, strict=True) if b - a > OUTAGE]
+
+
+def score(
+    recording: Recording, used: Recording, solutions: Mapping[str, Solution], withheld: tuple[Withheld, ...]
+) -> tuple[dict[str, Metrics], str | None, tuple[str, ...]]:
+    """Metrics per solver against the best truth there is, what that is, and what is missing in each of their spans."""
+    from graphnav.evaluation.evaluate import evaluate_recording, truth_of, withheld_truth
+
+    spans = [(f"without {source}", span) for source, span in withheld if span is not None]
+    truth = recording.truth
+    gnss_withheld = any(source == "gnss" for source, _ in withheld)
+    if truth is not None and truth.closed_loop_sigma is not None:
+        if any("closed_loop" in solution.records for solution in own_solutions(solutions).values()):
+            return {}, None, ()  # what was put in is no measure of what came out
+        against, spans = "the start, where the loop ends", []
+    elif truth is not None:
+        against = "the recording's truth"
+        taken = [span for _, span in spans]
+        spans += [("no GNSS", s) for s in outages(recording) if not any(a < s[1] and b > s[0] for a, b in taken)]
+    elif gnss_withheld and recording.gnss is not None:
+        against = "the withheld GNSS fixes"
+        spans = [(name, span) for name, span in spans if name == "without gnss"]
+    else:
+        return {}, None, ()
+    # the evaluation scores each span of GNSS by itself, whatever it is that is missing there
+    asked: list[Withheld] = [("gnss", span) for _, span in spans]
+    if truth is None and any(source == "gnss" and span is None for source, span in withheld):
+        asked.append(("gnss", None))
+    reference, swings = np.empty(0), False
+    compared = truth_of(recording)
+    if compared is None and truth is None:
+        compared = withheld_truth(recording, "gnss", [span for _, span in asked])
+    if compared is not None:
+        reference, arm = compared[0].t, compared[1]
+        swings = compared[0].v is not None and arm is not None and bool(np.any(arm))
+    found = {}
+    for name, solution in solutions.items():
+        at = _epochs(solution, reference)
+        wanted = np.union1d(np.union1d(solution.t, at), _thin(reference, solution, _MOST_TURNING)) if swings else at
+        track = _score_at(solution, wanted, placed=used.gnss is not None)
+        metrics = evaluate_recording(track, recording, withheld=asked, at=at if len(at) else None)
+        if metrics is None:
+            return {}, None, ()
+        borrowed = isinstance(solution, Foreign) and solution.borrowed
+        found[name] = without_attitude(metrics) if borrowed else metrics
+    return found, against, tuple(name for name, _ in spans)
+
+
+def _epochs(solution: Solution, truth: Array) -> Array:
+    """Epochs to compare at: the keyframes where the truth has them and they are many, else (some of) the truth's.
+
+    Never others: interpolated between keyframes, a filter would seem to know in an outage what the fix after it
+    will tell.
+    """
+    truth = truth[np.isfinite(truth)]
+    if len(truth) > 1:
+        t = solution.t[(solution.t >= truth[0] - _SAME) & (solution.t <= truth[-1] + _SAME)]
+        k = np.clip(np.searchsorted(truth, t), 1, len(truth) - 1)
+        before, after = t - truth[k - 1], truth[k] - t
+        there = (np.minimum(np.abs(before), np.abs(after)) <= _SAME) | (before + after <= _BETWEEN_ROWS)
+        if there.sum() >= max(_ENOUGH, 0.8 * len(t)):
+            return np.asarray(t[there])
+    return _thin(truth, solution, _MOST)
+
+
+def _thin(t: Array, solution: Solution, most: int) -> Array:
+    """At most so many of some times over the length of a solution, and none closer than `_DENSEST`."""
+    spacing = max(_DENSEST, (solution.t[-1] - solution.t[0]) / most)
+    _, apart = np.unique(np.floor(t / spacing), return_index=True)
+    return np.asarray(t[apart])
+
+
+def _score_at(solution: Solution, t: Array, placed: bool) -> Trajectory:
+    """The solution at the times, or at all keyframes where these will do; in metres of its frame if not `placed`."""
+    if isinstance(solution, Foreign):
+        track = solution.track_at(t)
+        return track if placed else replace(track, llh=solution.frame.from_llh(track.llh), frame="local")
+    times, states, covariance = solution.t, solution.states, solution.covariance
+    if not np.isin(t, times).all():
+        times, states, covariance = solution.at(np.union1d(times[[0, -1]], t))
+    track = to_trajectory(solution.solver, solution.frame, times, states, covariance)
+    if placed:
+        return track
+    return replace(track, llh=states.p, v=states.v, rph=rotation.to_rph(states.R_nb), frame="local")

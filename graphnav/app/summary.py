@@ -1,0 +1,179 @@
+"""The numbers of a run for programs and tables: summary.json, the comparison of solvers, noise figures, provenance."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import graphnav
+from graphnav.app.stored import sha256
+from graphnav.app.workflow import Outcome
+from graphnav.core.findings import Finding
+from graphnav.core.jsonable import peak_memory_mb
+from graphnav.core.notes import key_of
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.stops import stops_of_solution
+from graphnav.evaluation.against import antenna_lever_arm, own_solutions
+
+if TYPE_CHECKING:
+    from graphnav.estimation.noise.table import FigureRow
+
+
+def solver_summary(
+    outcome: Outcome, name: str, spent: Mapping[str, float], provenance: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What summary.json holds; `spent` are the seconds of writing, which only the writer knows."""
+    from graphnav.evaluation.metrics import summary
+    from graphnav.report.sentences import doubts
+
+    solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
+    errors = None if metrics is None else summary(metrics)
+    spans = [] if errors is None else errors.pop("spans", [])
+    notes = list(solution.notes) if errors is None else [*solution.notes, *errors.pop("notes", [])]
+    nees = None
+    if errors is not None:
+        nees = {key: value for key, value in errors.items() if key.startswith("nees_")}
+        errors = {key: value for key, value in errors.items() if key not in nees}
+    doubted = doubts({name: solution}, {} if metrics is None or metrics.errors is None else {name: metrics.errors})
+    timings = {**solution.timings, "evaluation": outcome.timings["evaluation"], **spent}
+    said = [Finding("untrusted", doubt, key_of(doubt)) for doubt in doubted]
+    messages = dict.fromkeys([*said, *outcome.checks, *(Finding("note", note, key_of(note)) for note in notes)])
+    rejected = {key: int(np.sum(r.weight <= 1e-9)) for key, r in solution.records.items()}
+    return {
+        "solver": name,
+        "recording": outcome.recording.name,
+        "duration_s": round(outcome.recording.duration, 6),
+        "keyframes": len(solution.t),
+        "counts": solution.counts,
+        "rejected": rejected,
+        "stationary": {
+            "stops": len(solution.stationary),
+            "seconds": float(np.diff(solution.stationary).sum()),
+            "each": [stop.values() for stop in stops_of_solution(solution)],
+        },
+        "ambiguities": _ambiguities(solution),
+        "iterations": solution.iterations,
+        "passes": {"filter": 0, "smoother": 0, **solution.passes, "eliminations": solution.iterations},
+        "noise": noise_summary(outcome, solution),
+        "doubts": list(doubted),
+        "stopped": solution.stopped,
+        "final_cost": solution.cost,
+        "timings": {stage: round(seconds, 4) for stage, seconds in timings.items()},
+        "peak_memory_mb": peak_memory_mb(),
+        "against": outcome.against,
+        "errors": errors,
+        "spans": [
+            {"missing": missing, **span, **{key: round(span[key] + outcome.zero, 6) for key in ("start_s", "end_s")}}
+            for missing, span in zip(outcome.span_names, spans, strict=True)
+        ],
+        "nees": nees or None,
+        "parameters": {
+            key: {"value": p.value[-1], "sigma": p.sigma[-1], "unit": p.unit} for key, p in solution.parameters.items()
+        },
+        "antenna_lever_arm": antenna_lever_arm(outcome.recording, solution),
+        "gps_zero": outcome.recording.gps_zero,
+        "notes": list(dict.fromkeys(notes)),
+        "remarks": list(outcome.findings),
+        "checks": [f.values() for f in outcome.checks],
+        "messages": [f.values() for f in messages],
+        "settings": outcome.request.settings.model_dump(),
+        "provenance": provenance,
+    }
+
+
+def _ambiguities(solution: Solution) -> dict[str, Any] | None:
+    """Epochs with carriers against a base station: how many have integers and how many real numbers."""
+    epochs = len(solution.fixed)
+    if not epochs:
+        return None
+    fixed = solution.fixed[:, 1] > 0.0
+    first = float(solution.fixed[fixed, 0][0] - solution.t[0]) if fixed.any() else None
+    return {"epochs": epochs, "fixed": int(fixed.sum()), "float": int((~fixed).sum()), "first_fix_s": first}
+
+
+def noise_rows(outcome: Outcome, solution: Solution) -> tuple[FigureRow, ...]:
+    """The figures of a solution's noise model beside those stated."""
+    from graphnav.estimation.noise.table import figure_rows
+
+    recording, settings = outcome.recording, outcome.request.settings
+    for source, span in outcome.used_withheld:
+        if source in recording.aiding:
+            recording = recording.without(source, span)
+    imu = None
+    if recording.platform == "foot" and any(group.startswith("imu.") for group in solution.noise.figures):
+        # factors of a walk are relative to the densities of its rests
+        from graphnav.estimation.noise.imu_floor import with_measured_floor
+        from graphnav.imu.onboard_offset import without_onboard_offset
+
+        imu = with_measured_floor(without_onboard_offset(recording, settings)[0], settings)[0].imu.noise
+    return figure_rows(solution.noise, recording, settings.gnss.slow_times, imu)
+
+
+def noise_summary(outcome: Outcome, solution: Solution) -> dict[str, Any]:
+    """What `graphnav.estimation.noise.files.read_noise` reads, with what is stated and used beside each figure."""
+    from graphnav.estimation.noise.files import noise_values
+
+    values = noise_values(solution.noise, outcome.request.settings.noise.mode)
+    if len(solution.between) > 1:
+        values["pieces"] = len(solution.between)
+    for row in noise_rows(outcome, solution):
+        beside = {"stated": row.stated, "used": row.used, "unit": row.unit, "correlation_time": row.correlation_time}
+        values["figures"][row.group] |= beside
+    return values
+
+
+def comparison(outcome: Outcome, ours: bool = False) -> list[dict[str, Any]]:
+    """One flat row per solver: errors where there are any, stated sigmas, seconds and iterations."""
+    from graphnav.evaluation.metrics import comparison_rows
+
+    measured = {row["solver"]: row for row in comparison_rows(outcome.metrics)}
+    rows = []
+    for name, solution in (own_solutions(outcome.solutions) if ours else outcome.solutions).items():
+        row = measured.get(name, {"solver": name})
+        row |= {key: _round(value) for key, value in median_sigmas(solution).items()}
+        row |= {"keyframes": len(solution.t), "iterations": solution.iterations, "final_cost": _round(solution.cost)}
+        row["run_time_s"] = _round(sum(solution.timings.values()))
+        for key in [k for k in row if k.startswith("span") and k.endswith(("_start_s", "_end_s"))]:
+            row[key] = round(row[key] + outcome.zero, 6)
+        rows.append(row)
+    return rows
+
+
+def median_sigmas(solution: Solution) -> dict[str, float]:
+    """Medians of the sigmas a solution states of itself: horizontal and up (m), heading (deg)."""
+    track = solution.trajectory()
+    out = {}
+    if track.sd_p is not None:
+        out["sd_h_median_m"] = float(np.median(np.hypot(track.sd_p[:, 0], track.sd_p[:, 1])))
+        out["sd_u_median_m"] = float(np.median(track.sd_p[:, 2]))
+    if track.sd_rph is not None:
+        out["sd_heading_median_deg"] = float(np.degrees(np.median(track.sd_rph[:, 2])))
+    return out
+
+
+def gather_provenance(outcome: Outcome) -> dict[str, Any]:
+    """Versions, what was read (with its sha256), where the noise model is from, and how the program was called."""
+    given = outcome.request.noise
+    files = [*outcome.recording.files, *([given.file] if given is not None and given.file is not None else [])]
+    used: str = outcome.request.settings.noise.mode
+    if given is not None:
+        used = "given" if given.file is None else str(given.file)
+    return {
+        "graphnav": graphnav.__version__,
+        "gtsam": version("gtsam"),
+        "numpy": np.__version__,
+        "scipy": version("scipy"),
+        "python": platform.python_version(),
+        "noise": used,
+        "inputs": {str(path): sha256(path) for path in files},
+        "options": dict(outcome.request.options),
+    }
+
+
+def _round(x: float) -> float | None:
+    return float(f"{x:.5g}") if math.isfinite(x) else None
