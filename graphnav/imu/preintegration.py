@@ -36,12 +36,12 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
+from graphnav.imu.interval_noise import last_of, running_sum, walk_covariances, white_covariance, white_variances
 from graphnav.imu.samples import MANY, Samples, chunks, pieces_of
 from graphnav.recording import Imu
 
 NOISE_FIGURES = ("gyro_noise_density", "accel_noise_density", "gyro_bias_walk", "accel_bias_walk")
 _CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
-_WALK_POINTS = 6  # quadrature points for the effect of bias walk inside an interval
 _FEW = 16  # intervals at once, below which calls cost more than numbers
 _CELL = 4  # Jacobians and noise of intervals of `MANY` pieces are summed over cells of so many; means never
 
@@ -216,8 +216,8 @@ def _means(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Array]:
     R = np.ascontiguousarray(_products(turn).transpose(0, 2, 3, 1))
     one = _cross(phi, f)
     two = _cross(phi, one)
-    V = _running_sum(_rotate(R[:-1], (f + b * one + c * two) * h))
-    P = _running_sum(V[:-1] * h + _rotate(R[:-1], (0.5 * f + c * one + d * two) * (h * h)))
+    V = running_sum(_rotate(R[:-1], (f + b * one + c * two) * h))
+    P = running_sum(V[:-1] * h + _rotate(R[:-1], (0.5 * f + c * one + d * two) * (h * h)))
     return R, V, P
 
 
@@ -256,12 +256,12 @@ def _integrate(
     w, f = _less(samples.gyro, index, bg), _less(samples.accel, index, ba)
     R, V, P = _means(w, f, dt)
     T = dt.sum(0)
-    A = _running_sum((-0.5 * dt)[:, None, None] * (R[:-1] + R[1:]))
+    A = running_sum((-0.5 * dt)[:, None, None] * (R[:-1] + R[1:]))
     # the rest in cells of a few pieces, within which A is a straight line
     cut = np.append(np.arange(0, L, _CELL if L >= MANY else 1), L)
     A, R, V, P = A[cut], R[cut], V[cut], P[cut]
-    edge = _running_sum(dt)[cut]
-    qg, qa = _white_noise(samples, imu, dt, index, edge, cut)
+    edge = running_sum(dt)[cut]
+    qg, qa = white_variances(samples, imu, dt, index, edge, cut)
     h = (edge[1:] - edge[:-1])[:, None]
     # dV / d bg = -int [dV]x A, exactly for A linear in a cell: int (t - t_start) dV = h dV - int (V - V_start) dt
     dv = V[1:] - V[:-1]
@@ -269,18 +269,18 @@ def _integrate(
     late = h * dv - gain
     h = h[:, None]
     slope = (A[1:] - A[:-1]) / np.maximum(h, 1e-12)
-    B = _running_sum(-_cross(dv, A[:-1]) - _cross(late, slope))
-    PA = _running_sum(0.5 * h * (A[:-1] + A[1:]))  # dP / d ba
+    B = running_sum(-_cross(dv, A[:-1]) - _cross(late, slope))
+    PA = running_sum(0.5 * h * (A[:-1] + A[1:]))  # dP / d ba
     # dP / d bg = int B, in a cell B_start h - int [(t_end - t) dV]x A
-    PB = _running_sum(h * B[:-1] - _cross(gain, A[:-1] + (h / 3.0) * slope))
+    PB = running_sum(h * B[:-1] - _cross(gain, A[:-1] + (h / 3.0) * slope))
     left = T - edge  # time left at each edge
     a_edge = V[-1] - V
     b_edge = P[-1] - P - V * left[:, None]
-    walks = _walks(edge, left, A, B, PA, PB, a_edge, b_edge)
+    walks = walk_covariances(edge, left, A, B, PA, PB, a_edge, b_edge)
     of_gyro, of_accel = imu.noise.gyro_bias_walk**2 * walks[0], imu.noise.accel_bias_walk**2 * walks[1]
-    Q = _white(qg, qa, left, a_edge, b_edge) + of_gyro + of_accel
+    Q = white_covariance(qg, qa, left, a_edge, b_edge) + of_gyro + of_accel
 
-    dR, v_ba, v_bg, p_ba, p_bg = (_last(x) for x in (R, A, B, PA, PB))
+    dR, v_ba, v_bg, p_ba, p_bg = (last_of(x) for x in (R, A, B, PA, PB))
     turn = np.zeros((n, 15, 15))  # theta from the start frame to a right perturbation of dR
     turn[:, 3:, 3:] = np.eye(12)
     turn[:, :3, :3] = np.swapaxes(dR, -1, -2)
@@ -288,13 +288,13 @@ def _integrate(
     parts = np.empty((n, 0, 15, 15))
     if parts_of_noise:
         none, each = np.zeros_like(qg), edge[1:] - edge[:-1]
-        rate = _white(imu.noise.gyro_noise_density**2 * each, none, left, a_edge, b_edge)
-        force = _white(none, imu.noise.accel_noise_density**2 * each, left, a_edge, b_edge)
+        rate = white_covariance(imu.noise.gyro_noise_density**2 * each, none, left, a_edge, b_edge)
+        force = white_covariance(none, imu.noise.accel_noise_density**2 * each, left, a_edge, b_edge)
         parts = turn[:, None] @ np.stack([rate, force, of_gyro, of_accel], 1) @ np.swapaxes(turn, -1, -2)[:, None]
     theta_bg = np.swapaxes(dR, -1, -2) @ v_ba
     mean_rate, mean_force = (np.sum(x * dt[:, None], axis=0).T / T[:, None] for x in (w, f))
     return Intervals(
-        t[rows], t[rows + 1], dR, _last(V), _last(P), theta_bg, v_ba, v_bg, p_ba, p_bg,
+        t[rows], t[rows + 1], dR, last_of(V), last_of(P), theta_bg, v_ba, v_bg, p_ba, p_bg,
         np.array(ba), np.array(bg), mean_rate, mean_force, Q, parts, *_mean_velocity_parts(edge, R, V, A),
     )  # fmt: skip
 
@@ -314,93 +314,4 @@ def _mean_velocity_parts(edge: Array, R: Array, V: Array, A: Array) -> tuple[Arr
         np.moveaxis(np.einsum("ln,lijn->ijn", w, x), -1, 0)
         for w, x in ((weight, back), (weight * (T - edge), back), (weight, left))
     )
-    return turned @ _last(R), late @ _last(R), left[..., 0], left[..., 1:]
-
-
-def _last(x: Array) -> Array:
-    """(n, ...) what (L, ..., n) holds at the end."""
-    x = x[-1]
-    return np.ascontiguousarray(x.transpose(x.ndim - 1, *range(x.ndim - 1)))
-
-
-def _running_sum(terms: Array) -> Array:
-    """Running sums along the first axis, from zero: one more than there are terms."""
-    out = np.zeros((len(terms) + 1, *terms.shape[1:]))
-    if out[0].size < 100:
-        np.cumsum(terms, axis=0, out=out[1:])
-    else:  # several times quicker than NumPy's sums, which go down one column after the other
-        for k, term in enumerate(terms):
-            np.add(out[k], term, out=out[k + 1])
-    return out
-
-
-def _white_noise(samples: Samples, imu: Imu, dt: Array, index: Array, edge: Array, cut: Array) -> tuple[Array, Array]:
-    """Variances of the integrals of white rate and force noise over each cell between the edges."""
-    h = edge[1:] - edge[:-1]
-    qg, qa = imu.noise.gyro_noise_density**2 * h, imu.noise.accel_noise_density**2 * h
-    if samples.extra_gyro.any() or samples.extra_accel.any():
-        qg += np.diff(_running_sum(samples.extra_gyro[index] * dt)[cut], axis=0)
-        qa += np.diff(_running_sum(samples.extra_accel[index] * dt)[cut], axis=0)
-    return qg, qa
-
-
-def _white(qg: Array, qa: Array, left: Array, a_edge: Array, b_edge: Array) -> Array:
-    """Covariance (n, 15, 15), start frame, of white noise with variances qg, qa (L, n) in each cell."""
-    ab = np.concatenate([a_edge, b_edge], axis=1)
-    ab = 0.5 * (ab[:-1] + ab[1:])
-    s, dt = 0.5 * (left[:-1] + left[1:]), left[:-1] - left[1:]
-    weighted = qg[:, None] * ab
-    moment = weighted.sum(0).T
-    products = np.einsum("lin,ljn->nij", weighted, ab)  # sum q [a; b] [a; b]^T
-    eye = np.eye(3)
-    Q = np.zeros((qg.shape[1], 15, 15))
-    theta, p, v = slice(0, 3), slice(3, 6), slice(6, 9)
-    a, b = slice(0, 3), slice(3, 6)
-
-    def outer(x: slice, y: slice, own: Array) -> Array:
-        """sum qg ([x]x [y]x^T) = sum qg (x.y I - y x^T), and a variance on the diagonal"""
-        yx = products[:, y, x]
-        return (np.trace(yx, axis1=-2, axis2=-1) + own)[:, None, None] * eye - yx
-
-    Q[:, theta, theta] = qg.sum(0)[:, None, None] * eye
-    Q[:, theta, v], Q[:, theta, p] = rotation.skew(moment[:, a]), rotation.skew(moment[:, b])
-    Q[:, v, v] = outer(a, a, qa.sum(0))
-    Q[:, v, p] = outer(a, b, (qa * s).sum(0))
-    # force noise inside a cell also moves the position: dt^2/12 keeps one-cell intervals regular
-    Q[:, p, p] = outer(b, b, (qa * (s * s + dt * dt / 12.0)).sum(0))
-    for x, y in ((theta, v), (theta, p), (v, p)):
-        Q[:, y, x] = np.swapaxes(Q[:, x, y], -1, -2)
-    return Q
-
-
-def _walks(
-    edge: Array, left: Array, A: Array, B: Array, PA: Array, PB: Array, a: Array, b: Array
-) -> tuple[Array, Array]:
-    """Covariances (n, 15, 15), start frame, of walks of unit density inside the interval, by midpoint quadrature.
-
-    Of the gyro's bias and of the accelerometer's.
-    """
-    n = edge.shape[1]
-    T = edge[-1]
-    target = T * ((np.arange(_WALK_POINTS) + 0.5) / _WALK_POINTS)[:, None]
-    at = np.abs(edge[:, None] - target).argmin(axis=0).T  # the edge nearest to each quadrature point
-    row = np.arange(n)[:, None]
-    s = left[at, row][..., None, None]
-    # of a change of the gyro's bias, of one of the accelerometer's
-    M = np.zeros((n, _WALK_POINTS, 15, 6))
-    eye = np.eye(3)
-    A_t, B_t, PA_t, PB_t = (x[at, :, :, row] for x in (A, B, PA, PB))
-    A_T, B_T, PA_T, PB_T = (_last(x)[:, None] for x in (A, B, PA, PB))
-    turned = A_T - A_t
-    M[..., 0:3, :3] = turned
-    M[..., 3:6, :3] = PB_T - PB_t - B_t * s + rotation.skew(b[at, :, row]) @ A_t
-    M[..., 6:9, :3] = B_T - B_t + rotation.skew(a[at, :, row]) @ A_t
-    M[..., 12:15, :3] = eye
-    M[..., 3:6, 3:] = PA_T - PA_t - A_t * s
-    M[..., 6:9, 3:] = turned
-    M[..., 9:12, 3:] = eye
-    out = []
-    for triad in (slice(0, 3), slice(3, 6)):
-        flat = np.swapaxes(M[..., triad], 1, 2).reshape(n, 15, -1)
-        out.append(np.asarray((T / _WALK_POINTS)[:, None, None] * (flat @ np.swapaxes(flat, -1, -2))))
-    return out[0], out[1]
+    return turned @ last_of(R), late @ last_of(R), left[..., 0], left[..., 1:]

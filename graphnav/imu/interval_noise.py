@@ -1,0 +1,107 @@
+"""Covariances of preintegrated intervals: white noise of the samples, and bias walks inside an interval.
+
+`graphnav.imu.preintegration` has the sums written out. Arrays of pieces run along the first axis, intervals along
+the last: (L, ..., n).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.rotation import Array
+from graphnav.imu.samples import Samples
+from graphnav.recording import Imu
+
+_WALK_POINTS = 6  # quadrature points for the effect of bias walk inside an interval
+
+
+def last_of(x: Array) -> Array:
+    """(n, ...) what (L, ..., n) holds at the end."""
+    x = x[-1]
+    return np.ascontiguousarray(x.transpose(x.ndim - 1, *range(x.ndim - 1)))
+
+
+def running_sum(terms: Array) -> Array:
+    """Running sums along the first axis, from zero: one more than there are terms."""
+    out = np.zeros((len(terms) + 1, *terms.shape[1:]))
+    if out[0].size < 100:
+        np.cumsum(terms, axis=0, out=out[1:])
+    else:  # several times quicker than NumPy's sums, which go down one column after the other
+        for k, term in enumerate(terms):
+            np.add(out[k], term, out=out[k + 1])
+    return out
+
+
+def white_variances(
+    samples: Samples, imu: Imu, dt: Array, index: Array, edge: Array, cut: Array
+) -> tuple[Array, Array]:
+    """Variances of the integrals of white rate and force noise over each cell between the edges."""
+    h = edge[1:] - edge[:-1]
+    qg, qa = imu.noise.gyro_noise_density**2 * h, imu.noise.accel_noise_density**2 * h
+    if samples.extra_gyro.any() or samples.extra_accel.any():
+        qg += np.diff(running_sum(samples.extra_gyro[index] * dt)[cut], axis=0)
+        qa += np.diff(running_sum(samples.extra_accel[index] * dt)[cut], axis=0)
+    return qg, qa
+
+
+def white_covariance(qg: Array, qa: Array, left: Array, a_edge: Array, b_edge: Array) -> Array:
+    """Covariance (n, 15, 15), start frame, of white noise with variances qg, qa (L, n) in each cell."""
+    ab = np.concatenate([a_edge, b_edge], axis=1)
+    ab = 0.5 * (ab[:-1] + ab[1:])
+    s, dt = 0.5 * (left[:-1] + left[1:]), left[:-1] - left[1:]
+    weighted = qg[:, None] * ab
+    moment = weighted.sum(0).T
+    products = np.einsum("lin,ljn->nij", weighted, ab)  # sum q [a; b] [a; b]^T
+    eye = np.eye(3)
+    Q = np.zeros((qg.shape[1], 15, 15))
+    theta, p, v = slice(0, 3), slice(3, 6), slice(6, 9)
+    a, b = slice(0, 3), slice(3, 6)
+
+    def outer(x: slice, y: slice, own: Array) -> Array:
+        """sum qg ([x]x [y]x^T) = sum qg (x.y I - y x^T), and a variance on the diagonal"""
+        yx = products[:, y, x]
+        return (np.trace(yx, axis1=-2, axis2=-1) + own)[:, None, None] * eye - yx
+
+    Q[:, theta, theta] = qg.sum(0)[:, None, None] * eye
+    Q[:, theta, v], Q[:, theta, p] = rotation.skew(moment[:, a]), rotation.skew(moment[:, b])
+    Q[:, v, v] = outer(a, a, qa.sum(0))
+    Q[:, v, p] = outer(a, b, (qa * s).sum(0))
+    # force noise inside a cell also moves the position: dt^2/12 keeps one-cell intervals regular
+    Q[:, p, p] = outer(b, b, (qa * (s * s + dt * dt / 12.0)).sum(0))
+    for x, y in ((theta, v), (theta, p), (v, p)):
+        Q[:, y, x] = np.swapaxes(Q[:, x, y], -1, -2)
+    return Q
+
+
+def walk_covariances(
+    edge: Array, left: Array, A: Array, B: Array, PA: Array, PB: Array, a: Array, b: Array
+) -> tuple[Array, Array]:
+    """Covariances (n, 15, 15), start frame, of walks of unit density inside the interval, by midpoint quadrature.
+
+    Of the gyro's bias and of the accelerometer's.
+    """
+    n = edge.shape[1]
+    T = edge[-1]
+    target = T * ((np.arange(_WALK_POINTS) + 0.5) / _WALK_POINTS)[:, None]
+    at = np.abs(edge[:, None] - target).argmin(axis=0).T  # the edge nearest to each quadrature point
+    row = np.arange(n)[:, None]
+    s = left[at, row][..., None, None]
+    # of a change of the gyro's bias, of one of the accelerometer's
+    M = np.zeros((n, _WALK_POINTS, 15, 6))
+    eye = np.eye(3)
+    A_t, B_t, PA_t, PB_t = (x[at, :, :, row] for x in (A, B, PA, PB))
+    A_T, B_T, PA_T, PB_T = (last_of(x)[:, None] for x in (A, B, PA, PB))
+    turned = A_T - A_t
+    M[..., 0:3, :3] = turned
+    M[..., 3:6, :3] = PB_T - PB_t - B_t * s + rotation.skew(b[at, :, row]) @ A_t
+    M[..., 6:9, :3] = B_T - B_t + rotation.skew(a[at, :, row]) @ A_t
+    M[..., 12:15, :3] = eye
+    M[..., 3:6, 3:] = PA_T - PA_t - A_t * s
+    M[..., 6:9, 3:] = turned
+    M[..., 9:12, 3:] = eye
+    out = []
+    for triad in (slice(0, 3), slice(3, 6)):
+        flat = np.swapaxes(M[..., triad], 1, 2).reshape(n, 15, -1)
+        out.append(np.asarray((T / _WALK_POINTS)[:, None, None] * (flat @ np.swapaxes(flat, -1, -2))))
+    return out[0], out[1]
