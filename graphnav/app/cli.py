@@ -131,7 +131,7 @@ def detect(
     from graphnav.config import read_settings
     from graphnav.core.staging import final_path, stage_results
     from graphnav.detectors import detect as detected
-    from graphnav.recording.plausibility.screening import screened
+    from graphnav.recording.plausibility.screening import screen_recording
     from graphnav.report import detections as detection_report
 
     withheld = withheld_of(without, start, end)
@@ -139,7 +139,9 @@ def detect(
     folder = outputs.output_folder(out)
     with bar(quiet, "detect"), permit_outside(allow_outside):
         tell("reading")
-        used, said = screened(workflow.read_part(only(context, recording), start, end, withheld, tuple(topic or ())))
+        used, said = screen_recording(
+            workflow.read_part(only(context, recording), start, end, withheld, tuple(topic or ()))
+        )
         tell("detection")
         found = detected(used, settings)
         found = replace(found, notes=(*said, *found.notes))

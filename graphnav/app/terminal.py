@@ -220,7 +220,7 @@ class Pace:
             before = self._stages[: self._stages.index(name)]
             self.done = max(self.done, (sum(_STAGES[s] for s in before) + share * _STAGES[name]) / self._total)
 
-    def left(self, elapsed: float) -> float | None:
+    def estimate_left(self, elapsed: float) -> float | None:
         """s, as the time up to here tells; None where that is too little."""
         return elapsed * (1.0 / self.done - 1.0) if self.done > 0.03 and elapsed > 1.0 else None
 
@@ -245,7 +245,7 @@ def progress_bar(quiet: bool, work: Sequence[str]) -> Iterator[Progress | None]:
     def update(stage: str, share: float) -> None:
         elapsed = time.monotonic() - began
         pace.reach(stage, share)
-        left = pace.left(elapsed)
+        left = pace.estimate_left(elapsed)
         said = "" if left is None else f"{left:.0f} s left" if left < 90 else f"{left / 60:.0f} min left"
         bar.update(task, description=stage, completed=pace.done, left=said)
         if elapsed > 0.5 and not bar.live.is_started:

@@ -102,7 +102,7 @@ class DetectorSettings(Section):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _renamed(cls, values: Any, handler: ModelWrapValidatorHandler[DetectorSettings]) -> DetectorSettings:
+    def _rename_old(cls, values: Any, handler: ModelWrapValidatorHandler[DetectorSettings]) -> DetectorSettings:
         """Tables under the names that they had before."""
         old = [name for name in _OLD if isinstance(values, Mapping) and name in values]
         for name in old:

@@ -133,12 +133,12 @@ class Constraint(ABC):
         jacobians = {}
         for block in self.depends_on:
 
-            def moved(step: Array, at: slice = BLOCKS[block]) -> Array:
+            def residual_at(step: Array, at: slice = BLOCKS[block]) -> Array:
                 delta = np.zeros((len(states), DIM))
                 delta[:, at] = step
                 return self.residual(states.plus(delta), parameters, rows)
 
-            jacobians[block] = _differences(moved, np.full(3, _STEPS[block]))
+            jacobians[block] = _differences(residual_at, np.full(3, _STEPS[block]))
         for p in self.parameters:
 
             def along(step: Array, name: str = p.name) -> Array:

@@ -51,7 +51,7 @@ def standing_intervals(scene: BuildContext) -> tuple[Array, Array]:
     return rows, stop[rows]
 
 
-def _unmoved(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array, Array]:
+def _find_standing(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array, Array]:
     """Those of the intervals in which a foot does not roll over its stance but stands, and in which standing.
 
     They last together for longer than any stance of a walk is that quiet, at less than the rate of the slowest rolling.
@@ -160,7 +160,7 @@ class ZeroRate(_Standing):
     def build(cls, scene: BuildContext) -> ZeroRate | None:
         rows, stop = standing_intervals(scene)
         if scene.recording.platform == "foot":
-            rows, stop = _unmoved(scene, rows, stop)
+            rows, stop = _find_standing(scene, rows, stop)
         if not len(rows) or not scene.settings.standstill.zero_rate:
             return None
         _, rate = unrest(scene, rows, stop)

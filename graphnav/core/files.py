@@ -68,7 +68,7 @@ def inside(path: Path, folder: Path, error: Kind = RecordingError) -> bool:
     try:
         return _outside.get() or path.resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError):  # too long, a null character, a loop of links
-        raise error(f"{_shown(path)}: is no path of a file") from None
+        raise error(f"{_shorten(path)}: is no path of a file") from None
 
 
 def check_inside(files: Iterable[Path], source: Path, error: Kind = RecordingError) -> None:
@@ -96,7 +96,7 @@ def exists(path: Path, error: Kind = RecordingError) -> bool:
     try:
         return path.exists()
     except (OSError, ValueError) as cause:
-        raise error(f"{_shown(path)}: {getattr(cause, 'strerror', None) or 'is no path of a file'}") from None
+        raise error(f"{_shorten(path)}: {getattr(cause, 'strerror', None) or 'is no path of a file'}") from None
 
 
 def check_regular(path: Path, error: Kind = RecordingError) -> None:
@@ -110,9 +110,9 @@ def check_regular(path: Path, error: Kind = RecordingError) -> None:
     try:
         mode = os.stat(path).st_mode
     except OSError as cause:
-        raise error(f"{_shown(path)}: cannot be read ({cause.strerror})") from None
+        raise error(f"{_shorten(path)}: cannot be read ({cause.strerror})") from None
     except ValueError:
-        raise error(f"{_shown(path)}: is no path of a file") from None
+        raise error(f"{_shorten(path)}: is no path of a file") from None
     if stat.S_ISDIR(mode):
         raise error(f"{path}: cannot be read (it is a folder)")
     if not stat.S_ISREG(mode):
@@ -218,7 +218,7 @@ def _too_large(path: Path, most: int, packed: bool) -> str:
     return f"{path}: holds more than {most / 1e6:g} MB{' unpacked' if packed else ''}; if that is right, set {MAX_FILE}"
 
 
-def _shown(path: Path) -> str:
+def _shorten(path: Path) -> str:
     text = str(path)
     return text if len(text) <= 200 else f"{text[:100]}...{text[-40:]}"
 

@@ -92,7 +92,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     quotient = _quotients(height, settings)
     asked: Mask = np.asarray(np.isfinite(quotient).any(axis=0))
     if line is not None:
-        notes.append(Note("detectors.fft.line", _found(line)))
+        notes.append(Note("detectors.fft.line", _describe(line)))
         idling = inner & _shows(height, where, line)
         met = np.asarray((quotient[idling] < 1.0).mean(axis=0) >= _MET) if idling.any() else asked
         if labels is None:
@@ -212,7 +212,7 @@ def _speed_quotient(t: Array, settings: FftSettings, speeds: Sequence[Speeds]) -
     return out
 
 
-def _found(line: IdleLine) -> str:
+def _describe(line: IdleLine) -> str:
     drift = "" if line.highest - line.lowest < 0.5 else f" (from {line.lowest:.1f} to {line.highest:.1f})"
     if np.isnan(line.harmonic):
         second = "its second harmonic lies above half the IMU's rate"

@@ -56,13 +56,13 @@ class Windows:
                 self._all if which is None else self._all[which],
             )
             return
-        yield from self._made(np.arange(self.count) if which is None else which)
+        yield from self._make(np.arange(self.count) if which is None else which)
 
     @cached_property
     def _all(self) -> Array:
-        return next(self._made(np.arange(self.count)))[1]
+        return next(self._make(np.arange(self.count)))[1]
 
-    def _made(self, number: Array) -> Iterator[tuple[slice, Array]]:
+    def _make(self, number: Array) -> Iterator[tuple[slice, Array]]:
         n = self.length
         ramp = np.linspace(-1.0, 1.0, n)
         hann = np.hanning(n + 1)[:-1]

@@ -64,7 +64,7 @@ class Dense:
         touched = np.unique(k)
         ends = self.t[touched + 1] if self.smooth else self.t[:0]
         targets = np.unique(np.concatenate([t[t > self.t[0]], ends]))
-        ahead = self._predicted(targets)
+        ahead = self._predict(targets)
         states = self.states[k]
         moved = t > self.t[0]
         at = np.searchsorted(targets, t[moved])
@@ -81,7 +81,7 @@ class Dense:
         before, after = self.covariance[k, :size, :size], self.covariance[k + 1, :size, :size]
         return states, (1.0 - w) * before + w * after
 
-    def _predicted(self, t: Array) -> States:
+    def _predict(self, t: Array) -> States:
         """Prediction from the keyframe before each time."""
         k = np.searchsorted(self.t, t, side="left") - 1
         if not len(t):

@@ -36,7 +36,7 @@ from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.imu.onboard_offset import without_onboard_offset
 from graphnav.recording import Own, Recording
-from graphnav.recording.plausibility.screening import screened
+from graphnav.recording.plausibility.screening import screen_recording
 
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
@@ -86,7 +86,7 @@ def run(
     """
     settings = settings or Settings()
     recording = with_own(recording, constraints, detectors)
-    recording, found = screened(recording)
+    recording, found = screen_recording(recording)
     with listening(progress):
         solutions = _run(recording, settings, solvers, progress, noise)
     return {name: replace(one, notes=(*found, *one.notes)) for name, one in solutions.items()}
@@ -250,13 +250,13 @@ def _solve(
 def _graph_of(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, Any]]:
     """What makes the problem GTSAM's, with a solution's values of parameters."""
 
-    def made() -> tuple[Any, Any]:
+    def export() -> tuple[Any, Any]:
         from graphnav.estimation.solvers.nonlinear import Exported  # which needs GTSAM
 
         values = {name: estimate.value for name, estimate in solution.parameters.items()}
         return Exported(problem, solution.states, values)()
 
-    return made
+    return export
 
 
 def fitting(recording: Recording, settings: Settings) -> list[str]:

@@ -101,16 +101,16 @@ def prepare(
     passes: Counter[str] = Counter()
     carriers: list[GnssPhase | None] = [None]
 
-    def booked(stage: str, since: float) -> float:
+    def book(stage: str, since: float) -> float:
         now = time.perf_counter()
         timings[stage] = timings.get(stage, 0.0) + now - since
         return now
 
-    def aligned_by(fixes: Recording, stationary: Array) -> Alignment:
+    def align_with(fixes: Recording, stationary: Array) -> Alignment:
         tell("alignment")
         since = time.perf_counter()
         found = align(fixes, settings, frame, _smooth, stationary)
-        booked("alignment", since)
+        book("alignment", since)
         return found
 
     def build(at: Alignment, found: Detections, parts: bool) -> Problem:
@@ -119,7 +119,7 @@ def prepare(
         problem = build_problem(
             used, settings, frame, start.state, start_sigma(start), found.stationary, parts_of_noise=parts
         )
-        booked("preintegration", since)
+        book("preintegration", since)
         problem, carriers[0] = split(problem)  # the noise model rests on the codes
         return problem
 
@@ -135,14 +135,14 @@ def prepare(
         if not any(begin <= seen for spans in noise.excluded.values() for begin, _ in spans):
             return aligned, stops, changed  # the start has seen none of them
         try:
-            found = aligned_by(fixes, stops.stationary)
+            found = align_with(fixes, stops.stationary)
         except EstimationError:
             return aligned, stops, changed
         other = found.motion is not None and found.contradicts(aligned)
         return (found if other else aligned), stops, changed or other
 
     known: Points | None = None
-    aligned = aligned_by(recording, detections.stationary)
+    aligned = align_with(recording, detections.stationary)
     told = aligned.motion is not None and settings.gnss.position
     if noise is None and (settings.noise.mode == "stated" or not told):
         noise = STATED
@@ -156,7 +156,7 @@ def prepare(
         if excluded_share(base, best.noise) > _MOST:
             # most fixes contradict what came of the start: it is looked for in what follows
             try:
-                later = aligned_by(_after(recording, aligned), detections.stationary)
+                later = align_with(_after(recording, aligned), detections.stationary)
                 other = build(later, detections, parts=True)
                 again = _estimate(other, later, settings, progress, passes)
                 if excluded_share(other, again.noise) < excluded_share(base, best.noise):
@@ -177,7 +177,7 @@ def prepare(
         # of what the estimation has left only its points are wanted any more: the rest is half of all memory
         known = known and Points(known.states, known.values)
         del best
-        booked("noise", since)
+        book("noise", since)
     else:
         aligned, detections, changed = without_wrong(noise)
         base = build(aligned, detections, parts=noise != STATED) if changed else base
@@ -185,13 +185,13 @@ def prepare(
     start = with_known_heading(aligned, settings)
     since = time.perf_counter()
     forward = ekf(problem, progress, aligned.until)
-    filtered = booked("filter", since)
+    filtered = book("filter", since)
     smoothed = backward(problem, forward, progress)
     problem = _without_refused(problem, forward)
     if any(rows.gate is not None for rows in problem.constraints):
         smoothed = backward(problem, refilter(problem, smoothed, progress), progress)
     forward, smoothed = _find_way(problem, aligned, known, forward, smoothed, progress, passes)
-    since = booked("smoother", filtered)
+    since = book("smoother", filtered)
     passes.update(filter=1, smoother=1)
     del timings["filter"]  # the filter's own solution has it
     notes, epochs = describe(noise, problem), {}
@@ -200,7 +200,7 @@ def prepare(
         fixed = fix(problem, carriers[0], smoothed, aligned.until, progress)
         problem, forward, smoothed = fixed.problem, fixed.forward, fixed.smoothed
         notes, epochs = (*notes, *fixed.notes), {"ekf": fixed.filtered_epochs, "": fixed.smoothed_epochs}
-        booked("ambiguities", since)
+        book("ambiguities", since)
     return Prepared(problem, noise, start, aligned, detections, forward, smoothed, notes, timings, passes, epochs)
 
 

@@ -166,10 +166,10 @@ def _build_constraints(scene: BuildContext, ahead: bool | None) -> tuple[Constra
     """The constraints of a scene: those that look ahead, those that do not, or all (None)."""
     classes = (cls for cls in kinds_for(scene.recording) if ahead is None or cls.looks_ahead == ahead)
     rows = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
-    return tuple(_said(one) if type(one).linearize is Constraint.linearize else one for one in rows)
+    return tuple(_note_differences(one) if type(one).linearize is Constraint.linearize else one for one in rows)
 
 
-def _said(rows: Constraint) -> Constraint:
+def _note_differences(rows: Constraint) -> Constraint:
     note = f"{rows.name}: gives no Jacobians, so they are made of differences, which takes longer"
     return replace(rows, notes=(*rows.notes, note))
 

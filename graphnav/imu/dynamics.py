@@ -137,7 +137,7 @@ class ImuFactors:
         turn, moved = bent[:, :3], self.step[rows] + bent[:, 3:]  # dP, dV
         dR = iv.dR[rows] @ rotation.exp(turn)
 
-        turned = self._turned(rows, R)
+        turned = self._turn(rows, R)
         G = self.frame.gravity_n(start.p) + start.p @ self.W2.T
         pv = mv(self.coast[rows], np.concatenate([start.p, start.v], -1)) + mv(turned, moved) + mv(self.pushed[rows], G)
         end = States(self.back[rows] @ R @ dR, pv[:, :3], pv[:, 3:], start.ba, start.bg)
@@ -154,7 +154,7 @@ class ImuFactors:
         F[:, 9:15, 9:15] = _I6
         return end, F
 
-    def _turned(self, rows: slice, R_nb: Array) -> Array:
+    def _turn(self, rows: slice, R_nb: Array) -> Array:
         """(n, 6, 6) from (dP, dV) in the start's body axes to (p, v) at the end."""
         return (self.post[rows].reshape(-1, 6, 2, 3) @ R_nb[:, None]).reshape(-1, 6, 6)
 
@@ -171,13 +171,13 @@ class ImuFactors:
         n = len(R_nb)
         L = np.zeros((n, DIM, DIM))
         L[:, 0:3, 0:3] = _I3
-        L[:, 3:9, 3:9] = self._turned(rows, R_nb)
+        L[:, 3:9, 3:9] = self._turn(rows, R_nb)
         L[:, 9:15, 9:15] = _I6
         return L
 
     def noise(self, rows: slice, R_nb: Array) -> Array:
         """Q (n, 15, 15), covariance of the end's error state, for starts with attitudes R_nb."""
-        Q, turned = self.intervals.covariance[rows].copy(), self._turned(rows, R_nb)
+        Q, turned = self.intervals.covariance[rows].copy(), self._turn(rows, R_nb)
         Q[:, 3:9] = turned @ Q[:, 3:9]
         Q[:, :, 3:9] = Q[:, :, 3:9] @ np.swapaxes(turned, -1, -2)
         return np.asarray(Q)

@@ -117,7 +117,7 @@ def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array, par
     pieces = pieces_of(samples, t)
     parts: list[tuple[Array, Intervals]] = []
     for rows in chunks(pieces.count):
-        dt, index = pieces.padded(rows)
+        dt, index = pieces.pad(rows)
         parts.append((rows, _integrate(samples, imu, t, rows, dt, index, ba[rows], bg[rows], parts_of_noise)))
     if n == 1:
         return parts[0][1]
@@ -165,7 +165,7 @@ def within(samples: Samples, keyframes: Array, t: Array, ba: Array, bg: Array) -
     interval = np.searchsorted(keyframes, t, side="left") - 1
     dR, dV, dP = np.empty((len(t), 3, 3)), np.empty((len(t), 3)), np.empty((len(t), 3))
     for rows in chunks(pieces.count):
-        dt, index = pieces.padded(rows)
+        dt, index = pieces.pad(rows)
         R, V, P = _means(_less(samples.gyro, index, bg[rows]), _less(samples.accel, index, ba[rows]), dt)
         place = np.full(len(pieces.count), -1)
         place[rows] = np.arange(len(rows))

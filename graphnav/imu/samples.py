@@ -89,7 +89,7 @@ class Pieces:
     first: Array
     count: Array
 
-    def padded(self, rows: Array) -> tuple[Array, Array]:
+    def pad(self, rows: Array) -> tuple[Array, Array]:
         """(L, n) lengths and sample indices of some intervals, padded with pieces of no length."""
         piece = np.arange(int(self.count[rows].max()))[:, None]
         inside = piece < self.count[rows]

@@ -19,7 +19,7 @@ _own: dict[str, Sensor] = {}
 
 
 @cache
-def _found() -> dict[str, Sensor]:
+def _find() -> dict[str, Sensor]:
     modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
     sensors = [m.SENSOR for m in modules if isinstance(getattr(m, "SENSOR", None), Sensor)]
     return {s.name: s for s in sorted(sensors, key=lambda s: s.name)}
@@ -27,7 +27,7 @@ def _found() -> dict[str, Sensor]:
 
 def registered() -> dict[str, Sensor]:
     """All sensors that are known, by their names."""
-    return _found() | _own
+    return _find() | _own
 
 
 def register(sensor: Sensor) -> Sensor:
@@ -38,7 +38,7 @@ def register(sensor: Sensor) -> Sensor:
     RecordingError
         If something else has that name.
     """
-    if sensor.name in _TAKEN or sensor.name in _found():
+    if sensor.name in _TAKEN or sensor.name in _find():
         raise RecordingError(f"sensor '{sensor.name}': graphnav has one of that name; choose another")
     _own[sensor.name] = sensor
     return sensor

@@ -57,15 +57,15 @@ class Path:
     start: float  # s
     end: float
 
-    def sampled(self, channel: int, t: Array) -> Array:
+    def sample(self, channel: int, t: Array) -> Array:
         """One channel at times within the path (the nearest end beyond it)."""
         return self.spline(np.clip(t, self.start, self.end))[..., channel]
 
     def speed(self, t: Array) -> Array:
         """Signed speed of the rear axle, m/s."""
-        return self.sampled(SPEED, t)
+        return self.sample(SPEED, t)
 
-    def travelled(self, t: Array) -> Array:
+    def distance(self, t: Array) -> Array:
         """Metres along the way from the start, backward ones counted negative."""
         whole = self.spline.antiderivative()
         return whole(np.clip(t, self.start, self.end))[..., SPEED] - whole(self.start)[SPEED]

@@ -43,7 +43,7 @@ from graphnav.recording.formats import load, read
 from graphnav.recording.formats.schema import read_description
 from graphnav.recording.formats.trajectories import read_trajectory
 from graphnav.recording.formats.writer import write_recording
-from graphnav.recording.plausibility.screening import screened
+from graphnav.recording.plausibility.screening import screen_recording
 
 KINDS = ("right", "refused", "traceback", "hang", "silent wrong")
 SECONDS = 10.0  # of a processor
@@ -158,7 +158,7 @@ def of_recording(folder: Path, chance: random.Random) -> None:
     spoilt(path, mutators.TABLE, chance)
     recording = read(folder / "own")
     same_rows(recording, path, name)
-    used, said = screened(recording)
+    used, said = screen_recording(recording)
     sensor, left = getattr(recording, name), getattr(used, name)
     if sensor is not None and (left is None or len(left.t) < len(sensor.t)):
         insist(bool(said), f"{name}: rows were screened and nothing was said")

@@ -21,7 +21,7 @@ from graphnav.recording.formats import read
 from graphnav.recording.formats.repair import Remarks, sigmas
 from graphnav.recording.formats.table import Table
 from graphnav.recording.plausibility.fixes import out_of_reach
-from graphnav.recording.plausibility.screening import screen, screened
+from graphnav.recording.plausibility.screening import screen, screen_recording
 
 Change = Callable[[Recording], Recording]
 METRE = 1.0 / 6.37e6  # rad of latitude
@@ -220,7 +220,7 @@ def test_a_force_at_rest_that_is_not_gravity_is_refused(tokyo: Recording, factor
     scaled = change(tokyo, "imu", accel=lambda x: factor * x)
     assert found(scaled)["imu.force_scale"] == "refused"
     with pytest.raises(RecordingError, match=named):
-        screened(scaled)
+        screen_recording(scaled)
 
 
 @pytest.mark.parametrize("factor", [0.9, 0.96, 1.04, 1.1])
@@ -248,7 +248,7 @@ def test_a_reversed_forward_axis_is_refused(tokyo: Recording, without: str | Non
     )  # fmt: skip
     assert found(both) == {"imu.axes_turned": "refused"}
     with pytest.raises(RecordingError, match='"LBU"'):
-        screened(both)
+        screen_recording(both)
 
 
 # ---- GNSS

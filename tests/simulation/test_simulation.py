@@ -450,7 +450,7 @@ def test_wheel_pulses_are_whole_and_none_is_lost() -> None:
     odometer, _ = model.read(path, Mount(), 0)
     counts = odometer.speed / 25.0 / 0.04
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
-    total = path.travelled(np.array([path.end + 1.0]))[0]
+    total = path.distance(np.array([path.end + 1.0]))[0]
     assert abs(np.sum(odometer.speed) / 25.0 - total) <= 0.04
 
 

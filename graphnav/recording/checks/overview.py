@@ -192,7 +192,7 @@ def inspect(recording: Recording) -> Inspection:
         if recording.truth.closed_loop_sigma:
             facts["truth"] = {"closed_loop_sigma_m": recording.truth.closed_loop_sigma}
         findings += truth_findings(recording)
-    if any(f.severity != "note" for f in findings) and not described(recording):
+    if any(f.severity != "note" for f in findings) and not has_keys(recording):
         findings.append(
             Finding(
                 "note",
@@ -205,7 +205,7 @@ def inspect(recording: Recording) -> Inspection:
     return Inspection(recording.name, recording.platform, facts, whole.recording, tuple(findings))
 
 
-def described(recording: Recording) -> bool:
+def has_keys(recording: Recording) -> bool:
     """Whether keys of a recording.toml can be set: there is one, or nothing was read from files."""
     source = recording.source
     return source is None or source.suffix == ".toml" or not recording.files

@@ -65,8 +65,8 @@ def imu_of(path: Path) -> tuple[Array, Array, Array]:
     """
     source = sources([path]).sensors["imu"]
     gyro, accel = source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
-    force = guesses.accel_unit(path, accel, source.stated("ax", "accel"))
-    rate = guesses.gyro_unit(gyro, source.stated("gx", "gyro"), None, vehicle=False)
+    force = guesses.accel_unit(path, accel, source.find_unit("ax", "accel"))
+    rate = guesses.gyro_unit(gyro, source.find_unit("gx", "gyro"), None, vehicle=False)
     return source.t, gyro * RATE[str(rate.value)], accel * FORCE[str(force.value)]
 
 
@@ -112,7 +112,7 @@ class _Writer:
             t, gyro, accel = imu.t, imu.gyro @ imu.R_bs, imu.accel @ imu.R_bs  # in the log's own axes
         else:
             t, gyro, accel = source.t, source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
-            force = guesses.accel_unit(source.path, accel, source.stated("ax", "accel"))
+            force = guesses.accel_unit(source.path, accel, source.find_unit("ax", "accel"))
             accel = accel * FORCE[str(force.value)]
         up, up_why = guesses.up_of(accel)
         agreement = Agreement()
@@ -120,7 +120,7 @@ class _Writer:
             self.epochs = _epochs(source, gnss)
             agreement = compare(t, gyro, accel, up, fixes(gnss), self.epochs.offset if self.epochs else 0.0)
         if source.log is None:
-            rate = guesses.gyro_unit(gyro, source.stated("gx", "gyro"), agreement.turn, vehicle)
+            rate = guesses.gyro_unit(gyro, source.find_unit("gx", "gyro"), agreement.turn, vehicle)
             gyro = gyro * RATE[str(rate.value)]
             self._units({"t": source.t_unit, "gyro": rate, "accel": force})
             front = self._axes(up, up_why, agreement)
@@ -188,7 +188,7 @@ class _Writer:
                 units["angle"] = Guess("rad", "lat and lon are all small enough")
             if {"speed", "course"} <= values.keys() and "ve" not in values and late is None:
                 units["speed"] = fix_speed_unit(source)
-            elif stated := source.stated("ve", "speed"):
+            elif stated := source.find_unit("ve", "speed"):
                 units["speed"] = Guess(stated, "as the column's name says")
             self._units(units)
             if not {"sd_e", "sd_n", "sd_u"} <= values.keys():
@@ -219,7 +219,7 @@ class _Writer:
         self.lines += ["", "[odometer]"]
         self._file(source, "odometer")
         if source.log is None:
-            speed = guesses.speed_unit(source.t, source.values["speed"], course, source.stated("speed", "speed"))
+            speed = guesses.speed_unit(source.t, source.values["speed"], course, source.find_unit("speed", "speed"))
             self._units({"t": source.t_unit, "speed": speed})
             lag = _odometer_lag(source.t, source.values["speed"] * SPEED[str(speed.value)], felt)
             if lag is not None and lag.correlation > FAIR and abs(lag.seconds) > _SMALL:

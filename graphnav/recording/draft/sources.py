@@ -79,14 +79,14 @@ class Source:
         """Columns side by side, (N, len(names))."""
         return np.stack([self.values[n] for n in names], -1)
 
-    def stated(self, ours: str, kind: str) -> str | None:
+    def find_unit(self, ours: str, kind: str) -> str | None:
         """The unit that a column's name states."""
         return matching.unit_of(self.columns, ours, kind)
 
     @property
     def radians(self) -> bool:
         """Whether lat and lon are in radians."""
-        if stated := self.stated("lat", "angle"):
+        if stated := self.find_unit("lat", "angle"):
             return stated == "rad"
         return bool(np.abs(self.values["lat"]).max() < 1.58 and np.abs(self.values["lon"]).max() < 3.15)
 
@@ -141,7 +141,7 @@ def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
                 left.append(f"{pull[0].path.name}: {sensors['accel'].path.name} has gravity in it")
         elif "accel" in every:
             worst = every["accel"][0]
-            guesses.accel_unit(worst.path, worst.stack("ax", "ay", "az"), worst.stated("ax", "accel"))
+            guesses.accel_unit(worst.path, worst.stack("ax", "ay", "az"), worst.find_unit("ax", "accel"))
     if "imu" not in sensors:
         there = ", ".join(sensors) or "nothing"
         raise RecordingError(
@@ -195,7 +195,7 @@ def _choose(sensor: str, some: list[Source], left: list[str]) -> Source | None:
 
 def _has_gravity(source: Source) -> bool:
     try:
-        guesses.accel_unit(source.path, source.stack("ax", "ay", "az"), source.stated("ax", "accel"))
+        guesses.accel_unit(source.path, source.stack("ax", "ay", "az"), source.find_unit("ax", "accel"))
     except RecordingError:
         return False
     return True
@@ -236,10 +236,10 @@ def fixes(source: Source) -> tuple[Array, Array, Array | None]:
         return gnss.t, gnss.llh, None if gnss.v is None else gnss.v[:, :2]
     values = source.values
     if {"ve", "vn"} <= values.keys():
-        return source.t, source.llh, source.stack("ve", "vn") * SPEED[source.stated("ve", "speed") or "m/s"]
+        return source.t, source.llh, source.stack("ve", "vn") * SPEED[source.find_unit("ve", "speed") or "m/s"]
     if {"speed", "course"} <= values.keys():
         speed = values["speed"] * SPEED[str(fix_speed_unit(source).value)]
-        course = values["course"] * ANGLE["rad" if source.stated("course", "angle") == "rad" else "deg"]
+        course = values["course"] * ANGLE["rad" if source.find_unit("course", "angle") == "rad" else "deg"]
         return source.t, source.llh, np.stack([speed * np.sin(course), speed * np.cos(course)], -1)
     return source.t, source.llh, None
 
@@ -247,7 +247,7 @@ def fixes(source: Source) -> tuple[Array, Array, Array | None]:
 def fix_speed_unit(source: Source) -> Guess:
     """The unit of a receiver's speed, by its positions."""
     course = motion.course_of(source.t, source.llh, None)
-    return guesses.speed_unit(source.t, source.values["speed"], course, source.stated("speed", "speed"))
+    return guesses.speed_unit(source.t, source.values["speed"], course, source.find_unit("speed", "speed"))
 
 
 class _NoSensor(RecordingError):
@@ -349,5 +349,5 @@ def _read(path: Path, columns: matching.Columns, role: str) -> Source:
         columns = matching.Columns(columns.names, {**columns.units, "speed": columns.units.get(rear[0], "")})
     source = Source(path, matching.Columns(names, columns.units), values)
     inertial = role not in ("gnss", "odometer")
-    source.t_unit = guesses.time_unit(source.values["t"], source.stated("t", "t"), inertial)
+    source.t_unit = guesses.time_unit(source.values["t"], source.find_unit("t", "t"), inertial)
     return source

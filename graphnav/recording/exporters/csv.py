@@ -45,7 +45,7 @@ def columns(trajectory: Trajectory) -> list[tuple[Array | None, str]]:
     """The columns of the file in its units, (K, n) each or None for three blanks, and the format of their numbers."""
     deg = np.rad2deg(1.0)
 
-    def scaled(values: Array | None, scale: float = 1.0) -> Array | None:
+    def apply_scale(values: Array | None, scale: float = 1.0) -> Array | None:
         return None if values is None else values * scale
 
     return [
@@ -53,10 +53,10 @@ def columns(trajectory: Trajectory) -> list[tuple[Array | None, str]]:
         (trajectory.llh[:, :2] * deg, "%.11f"),
         (trajectory.llh[:, 2:], "%.5f"),
         (trajectory.v, "%.5f"),
-        (scaled(trajectory.rph, deg), "%.7f"),
+        (apply_scale(trajectory.rph, deg), "%.7f"),
         (trajectory.sd_p, "%.6g"),
         (trajectory.sd_v, "%.6g"),
-        (scaled(trajectory.sd_rph, deg), "%.6g"),
+        (apply_scale(trajectory.sd_rph, deg), "%.6g"),
         (trajectory.gyro_bias, "%.6g"),
         (trajectory.accel_bias, "%.6g"),
     ]

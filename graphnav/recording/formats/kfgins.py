@@ -67,8 +67,8 @@ def load(path: Path) -> Log:
     config_file = path if path.suffix.lower() in (".yaml", ".yml") else _config_in(path) if path.is_dir() else None
     if config_file is not None:
         config = _read_yaml(config_file)
-        imu_file = _named(config_file, config, _IMU_KEYS)
-        gnss_file = _named(config_file, config, _GNSS_KEYS)
+        imu_file = _find_file(config_file, config, _IMU_KEYS)
+        gnss_file = _find_file(config_file, config, _GNSS_KEYS)
     else:
         imu_file, gnss_file = _pair(path)
         remarks.add(
@@ -302,7 +302,7 @@ def _check_tokens(path: Path, yaml: Any, text: str) -> None:
             raise RecordingError(f"{path}, line {token.start_mark.line + 1}: not valid YAML (nested too deep)")
 
 
-def _named(config_file: Path, config: dict[str, Any], keys: tuple[str, ...]) -> Path | None:
+def _find_file(config_file: Path, config: dict[str, Any], keys: tuple[str, ...]) -> Path | None:
     """The file a key names: as it stands, below any folder above the configuration, or beside it."""
     key = next((k for k in keys if k in config), None)
     if key is None:

@@ -78,13 +78,13 @@ def log_format(
 ) -> Format:
     """The `Format` of another program's log."""
 
-    def known(source: str | Path) -> bool:
+    def can_read(source: str | Path) -> bool:
         try:
             return recognises(Path(source))
         except (OSError, RecordingError):
             return False
 
-    def loaded(source: str | Path, topics: Sequence[str] = ()) -> Log:
+    def load_log(source: str | Path, topics: Sequence[str] = ()) -> Log:
         path = Path(source)
         if not exists(path):
             raise RecordingError(f"{path}: no such file or folder")
@@ -96,8 +96,8 @@ def log_format(
         return replace(_without_nowhere(sound(log, path)), files=log.files or _files(path))
 
     return Format(
-        name, about, known, lambda source: loaded(source).recording(source), load=loaded,
-        choose=None if choose is None else loaded,
+        name, about, can_read, lambda source: load_log(source).recording(source), load=load_log,
+        choose=None if choose is None else load_log,
     )  # fmt: skip
 
 

@@ -26,7 +26,7 @@ def sound(log: Log, path: Path) -> Log:
     remarks = list(log.remarks)
     imu, gnss, odometer, truth = log.imu, log.gnss, log.odometer, log.truth
 
-    def kept(what: str, good: NDArray[np.bool_], why: str) -> bool:
+    def check_rows(what: str, good: NDArray[np.bool_], why: str) -> bool:
         if good.all():
             return True
         if good.sum() < (2 if what == "IMU" else 1):
@@ -37,30 +37,30 @@ def sound(log: Log, path: Path) -> Log:
     if imu is not None:
         finite = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
         good = finite & (np.abs(imu.t) <= LATEST)
-        if not kept("IMU", good, "are no numbers or at no time"):
+        if not check_rows("IMU", good, "are no numbers or at no time"):
             imu = rows_of(imu, good)
     if gnss is not None:
-        gnss = _sound_gnss(gnss, kept)
+        gnss = _sound_gnss(gnss, check_rows)
     if odometer is not None:
         good = np.isfinite(odometer.speed) & (np.abs(odometer.t) <= LATEST)
-        if not kept("odometer", good, "are no numbers or at no time"):
+        if not check_rows("odometer", good, "are no numbers or at no time"):
             odometer = rows_of(odometer, good)
     if truth is not None and truth.llh is not None:
         good = on_earth(*truth.llh.T) & (np.abs(truth.t) <= LATEST)
-        if not kept("truth", good, "are nowhere on Earth or at no time"):
+        if not check_rows("truth", good, "are nowhere on Earth or at no time"):
             truth = rows_of(truth, good)
     return replace(log, imu=imu, gnss=gnss, odometer=odometer, truth=truth, remarks=tuple(remarks))
 
 
-def _sound_gnss(gnss: Gnss, kept: Callable[[str, NDArray[np.bool_], str], bool]) -> Gnss:
+def _sound_gnss(gnss: Gnss, check_rows: Callable[[str, NDArray[np.bool_], str], bool]) -> Gnss:
     """The fixes that are somewhere, and as sure of it as any receiver is that has a fix."""
     there: NDArray[np.bool_] = np.asarray(on_earth(*gnss.llh.T) & (np.abs(gnss.t) <= LATEST))
     first = gnss.llh[~there][:1]
     at = "".join(f" (the first at {np.degrees(p[0]):.7g}, {np.degrees(p[1]):.7g} deg, {p[2]:.7g} m)" for p in first)
-    if not kept("GNSS", there, f"are nowhere on Earth or at no time{at}"):
+    if not check_rows("GNSS", there, f"are nowhere on Earth or at no time{at}"):
         gnss = rows_of(gnss, there)
     sure: NDArray[np.bool_] = np.asarray(((gnss.sd > 0.0) & (gnss.sd <= VAGUEST)).all(axis=1))
-    if not kept("GNSS", sure, f"have a sigma that is not above 0 or beyond {VAGUEST:g} m"):
+    if not check_rows("GNSS", sure, f"have a sigma that is not above 0 or beyond {VAGUEST:g} m"):
         gnss = rows_of(gnss, sure)
     if gnss.v is None or gnss.sd_v is None:
         return gnss

@@ -244,7 +244,7 @@ def _stuck(
         if first < a:
             begin = first + 1
         elif v[a] == 0.0 and mine[0][1] <= b:  # where it stood before it was stuck, its zeros were true
-            begin = 1 + (first if motion is None else _pulled_away(t, motion.force, a, first))
+            begin = 1 + (first if motion is None else _find_departure(t, motion.force, a, first))
         out.append((begin, max(last, b + 1), STUCK if v[a] == 0.0 else FROZEN))
     return out
 
@@ -261,7 +261,7 @@ def _noiseless(
     return [(a + 1, b + 1, FROZEN) for a, b in stays if v[a] != 0.0 and b - a > _LONGER * (usual + 1.0)]
 
 
-def _pulled_away(t: Array, force: Array, earliest: int, k: int) -> int:
+def _find_departure(t: Array, force: Array, earliest: int, k: int) -> int:
     """The reading at which what moves at k began to move: back while the force of the second before says so."""
     while k > earliest:
         before = max(int(np.searchsorted(t, t[k] - 1.0)), earliest)

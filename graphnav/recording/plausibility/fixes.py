@@ -38,7 +38,7 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
     gnss = recording.gnss
     assert gnss is not None
     findings: list[Finding] = []
-    if cached := cached_fixes(gnss.t, recording.start):
+    if cached := count_cached_fixes(gnss.t, recording.start):
         many = "1 fix" if cached == 1 else f"{cached} fixes"
         early = recording.start - gnss.t[0]
         findings.append(
@@ -77,7 +77,7 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
     return replace(recording, gnss=gnss), findings
 
 
-def cached_fixes(t: Array, start: float) -> int:
+def count_cached_fixes(t: Array, start: float) -> int:
     """How many of the first fixes at t (M,) s are long before the IMU starts, with none for as long after them."""
     before = np.flatnonzero((t[:-1] < start) & (np.diff(t) > _CACHED))
     return int(before[-1]) + 1 if len(before) and t[-1] > start else 0

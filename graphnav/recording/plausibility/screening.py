@@ -2,7 +2,7 @@
 
 `screen` goes over a recording once. Single rows that no sensor can have read are taken out, as if they had never been
 logged, and said; a sensor that is wrong throughout, so that every state would be, is a *refused* finding, which
-`screened` raises. Nothing is mended by a guess.
+`screen_recording` raises. Nothing is mended by a guess.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:
             raise RecordingError(f"'{recording.name}': {finding.sentence}")
 
 
-def screened(recording: Recording) -> tuple[Recording, list[str]]:
+def screen_recording(recording: Recording) -> tuple[Recording, list[str]]:
     """The recording without what cannot be right.
 
     Parameters

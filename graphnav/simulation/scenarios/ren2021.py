@@ -46,7 +46,7 @@ def ren2021(
     if not (isinstance(walk, int) and 1 <= walk <= len(WALKS)):
         raise ConfigError(f"walk = {walk}: must be from 1 to {len(WALKS)}")
     perimeter, laps, duration = WALKS[walk - 1]
-    return _walked(
+    return _walk(
         "ren2021", seed, duration, rectangle(perimeter, laps), ELLIPSE2.at(_usable(rate)), exact, compensated, True,
         {"walk": walk, "laps": laps},
     )  # fmt: skip
@@ -82,7 +82,7 @@ def free(
         parts.append((left, 0.0))
     else:
         raise ConfigError(f"course = '{course}': must be laps, bends or straight")
-    return _walked(
+    return _walk(
         "gait", seed, duration, parts, PRESETS[imu].at(_usable(rate)), exact, compensated, course == "laps",
         {"pace": pace, "course": course},
     )  # fmt: skip
@@ -99,7 +99,7 @@ def _rest(seed: int) -> np.ndarray:
     return stream(seed, "rest").uniform([2.0, 1.5], [6.0, 4.0])
 
 
-def _walked(
+def _walk(
     name: str, seed: int, duration: float, parts: list[tuple[float, float]], imu: SimulatedImu, exact: bool,
     compensated: bool, closed: bool, facts: dict[str, object],
 ) -> Simulated:  # fmt: skip
