@@ -20,7 +20,7 @@ ROOMS = {
     "recording": ["core", "sensors", "config", "gnss"],
     "imu": ["core", "config", "recording"],
     "detectors": ["core", "config", "recording"],
-    "simulation": ["core", "recording"],
+    "simulation": ["core", "sensors", "recording"],
     "constraints": ["core", "sensors", "config", "gnss", "recording", "imu"],
     "estimation": ["core", "config", "gnss", "recording", "imu", "detectors", "constraints"],
     "online": ["core", "sensors", "config", "recording", "imu", "detectors", "constraints", "estimation"],

@@ -47,3 +47,8 @@ def standard_height(series: Series) -> Array:
     """(N,) m in the standard atmosphere, of readings of pressure, or of height where a row has that alone."""
     of_pressure = _SCALE * (1.0 - (series["pressure"] / _PRESSURE) ** _POWER)
     return np.where(np.isfinite(of_pressure), of_pressure, series["height"])
+
+
+def standard_pressure(height: Array) -> Array:
+    """(N,) Pa at heights (N,) m of the standard atmosphere: the inverse of `standard_height`."""
+    return np.asarray(_PRESSURE * (1.0 - height / _SCALE) ** (1.0 / _POWER))

@@ -16,6 +16,7 @@ from graphnav.simulation.aiding import GnssModel, OdometerModel
 from graphnav.simulation.inertial import SimulatedImu
 from graphnav.simulation.kinematics import Mount, TrueMotion, move
 from graphnav.simulation.motion import Path
+from graphnav.simulation.series import BarometerModel, DualAntennaModel
 from graphnav.simulation.vibration import Shake
 
 
@@ -56,6 +57,8 @@ def record(
     shake: Shake,
     gnss: GnssModel | None = None,
     odometer: OdometerModel | None = None,
+    barometer: BarometerModel | None = None,
+    antennas: DualAntennaModel | None = None,
     exact: bool = False,
     truth_rate: float = 10.0,
     facts: dict[str, Any] | None = None,
@@ -74,6 +77,12 @@ def record(
     if odometer is not None:
         wheels, scale = odometer.read(path, mount, seed)
         known["odometer_scale_error"] = scale
+    sensors = {}
+    for model in (barometer, antennas):
+        if model is not None:
+            series, put_in = model.read(motion, seed)
+            sensors[series.sensor.name] = series
+            known[series.sensor.name] = put_in
     recording = Recording(
         name=f"{name} (simulated, seed {seed})",
         platform="vehicle",
@@ -81,6 +90,7 @@ def record(
         gnss=None if gnss is None else gnss.read(motion, seed),
         odometer=wheels,
         truth=Truth(motion.t[every], motion.llh[every], None, motion.v[every], rph[every]),
+        sensors=sensors,
     )
     truth = Trajectory(
         motion.t, motion.llh, motion.v, rph, name="truth",

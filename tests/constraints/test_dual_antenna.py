@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from series_drive import SETTINGS, along_truth, errors, rms, shared_drive, smoothed_online, with_series
 
 from graphnav.core import rotation
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import key_of
+from graphnav.detectors import detect
+from graphnav.estimation.alignment.antennas import baseline_heading
 from graphnav.estimation.pipeline import run
+from graphnav.online import Online, rows_of, without_rows
 from graphnav.recording import Recording
 from graphnav.sensors.dual_antenna import SENSOR, Figures
+from graphnav.simulation import simulate
 
 SIGMA, TURNED = np.radians(0.2), np.radians(0.6)
 BASELINE = (1.0, 0.0, 0.05)  # across the roof
@@ -48,6 +55,49 @@ def test_heading_holds_without_fixes(drive):
 def test_heading_holds_as_the_drive_happens(drive):
     # what is not known of the mounting comes on top of the receiver's noise
     assert rms(np.concatenate([errors(track, drive)[1] for track in smoothed_online(drive)])) < np.radians(1.0)
+
+
+@pytest.fixture(scope="module")
+def standing() -> Recording:
+    """The first twelve seconds of a simulated town, in which the car does not move."""
+    made = simulate("urban", 1, duration=240.0, tunnels=0, antennas=True, rate=50.0)
+    assert made.stops[0, 1] > 15.0
+    recording = made.recording.crop(0.0, 12.0)
+    series = recording.sensors[SENSOR.name]
+    values = series.values.copy()
+    values[1, 0] += np.pi  # one that is wrong must not decide
+    return replace(recording, sensors={SENSOR.name: replace(series, values=values)})
+
+
+def test_a_vehicle_that_stands_knows_its_heading(standing):
+    found = baseline_heading(standing, SETTINGS, detect(standing).stationary)
+    true = standing.truth.rph[0, 2]
+    assert abs(rotation.wrap(found.heading - true)) < 4.0 * found.sigma
+    assert found.sigma < np.radians(1.5)
+    solution = run(standing, SETTINGS, ("batch",))["batch"]
+    track = solution.trajectory()
+    assert "alignment.antennas" in map(key_of, solution.notes)
+    assert np.all(np.abs(rotation.wrap(track.rph[:, 2] - true)) < 4.0 * track.sd_rph[:, 2])
+    assert np.all(track.sd_rph[:, 2] < np.radians(1.5))
+    blind = run(standing.without(SENSOR.name), SETTINGS, ("batch",))["batch"]
+    assert "alignment.no_motion" in map(key_of, blind.notes)
+
+
+def test_its_heading_is_known_live_before_it_moves(standing):
+    online = Online(without_rows(standing), SETTINGS)
+    for row in rows_of(standing)[1]:
+        online.add(row)
+    now = online.live()
+    assert now is not None
+    heading = rotation.to_rph(now.state.R_nb[0])[2]
+    assert abs(rotation.wrap(heading - standing.truth.rph[0, 2])) < 4.0 * np.radians(1.1)
+
+
+def test_on_the_move_readings_tell_no_start(drive):
+    assert baseline_heading(drive, SETTINGS, np.empty((0, 2))) is None
+    assert baseline_heading(drive, SETTINGS, None) is None
+    far = drive.crop(10.0, 30.0)
+    assert baseline_heading(far, SETTINGS, np.array([[drive.start + 15.0, drive.start + 20.0]])) is None
 
 
 def test_a_baseline_that_stands_upright_is_refused():

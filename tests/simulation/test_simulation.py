@@ -47,8 +47,8 @@ WAY = [
 ASKEW = Mount(above_axle=(0.3, 1.2, 0.8), angles=(1.0, -2.0, 3.0))
 SHORT = {
     "li2024": {"short": True, "odometer": True}, "zhu2020": {}, "urban": {"duration": 300.0},
-    "electric": {"duration": 260.0}, "motorway": {"duration": 300.0}, "crawl": {"jam": 120.0},
-    "ushaq": {"stops_every": 20.0, "rate": 20.0},
+    "electric": {"duration": 260.0, "barometer": True, "antennas": True},
+    "motorway": {"duration": 300.0}, "crawl": {"jam": 120.0}, "ushaq": {"stops_every": 20.0, "rate": 20.0},
 }  # fmt: skip
 
 
@@ -473,6 +473,11 @@ def test_the_folder_holds_the_recording(name: str, tmp_path: Path) -> None:
     facts = json.loads((tmp_path / name / "simulated.json").read_text())
     assert facts["simulated"] is True
     np.testing.assert_allclose(facts["stops"], made_here.stops)
+    assert again.sensors.keys() == recording.sensors.keys()
+    for sensor, series in recording.sensors.items():
+        np.testing.assert_array_equal(again.sensors[sensor].t, series.t)
+        np.testing.assert_allclose(again.sensors[sensor].values, series.values, rtol=1e-12, atol=1e-12)
+        assert again.sensors[sensor].figures == series.figures
 
 
 def test_counts_and_wheels_are_written_too(tmp_path: Path) -> None:

@@ -5,7 +5,8 @@ which the vehicle moves. Levelling (the mean specific force points up) and the m
 mostly goes straight or stands) start it, and the heading that turns the felt accelerations into those of the
 fixes, or one of three more 90 degrees apart: the one that explains the fixes best wins. So neither speed nor a standing
 start is assumed. What is too slow to feel its accelerations knows its heading by its course, which is forwards unless
-they say otherwise. From there the gyro carries the attitude back to the first sample.
+they say otherwise. From there the gyro carries the attitude back to the first sample. Before anything moves, two
+antennas tell the heading of a vehicle that stands.
 
 What the short problem learned, the long one will learn again from the same data. So the result enters as the
 point to start from, with a prior `prior_inflation` times wider than its own sigma: information counts once. Only
@@ -24,6 +25,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE
+from graphnav.estimation.alignment.antennas import baseline_heading
 from graphnav.estimation.alignment.course import COURSE_SIGMA
 from graphnav.estimation.alignment.first import Alignment
 from graphnav.estimation.alignment.motion import Smoother, in_motion, motion, plausible
@@ -55,10 +57,17 @@ def align(
     return replace(in_motion(recording, settings, frame, smooth, span), motion=span[0], until=span[1])
 
 
-def ready(recording: Recording, settings: Settings, stationary: Array = NONE) -> bool:
-    """Whether the fixes so far show all the motion that an alignment wants to see."""
-    span = motion(plausible(recording), settings, stationary)
-    return span is not None and recording.gnss is not None and span[1] < recording.gnss.t[-1]
+def ready(recording: Recording, settings: Settings, stationary: Array | None = None) -> bool:
+    """Whether the fixes so far show all the motion that an alignment wants to see, or two antennas tell the heading.
+
+    Parameters
+    ----------
+    stationary : as for `align`; None where nobody has looked for stops yet, which only a quiet IMU stands for then.
+    """
+    span = motion(plausible(recording), settings, NONE if stationary is None else stationary)
+    if span is None:
+        return baseline_heading(recording, settings, stationary) is not None
+    return recording.gnss is not None and span[1] < recording.gnss.t[-1]
 
 
 def with_known_heading(found: Alignment, settings: Settings) -> Alignment:

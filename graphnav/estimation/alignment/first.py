@@ -23,7 +23,7 @@ class Alignment:
     sigma: Array  # (15,) of the prior
     own_sigma: Array  # (3,) rad, of roll, pitch, heading as the alignment itself believes them
     notes: tuple[str, ...]
-    motion: float | None = None  # s, about when the vehicle first moves; None when it never does
+    motion: float | None = None  # s, from when on the heading is told: the first motion, or two antennas; None: never
     until: float | None = None  # s, the end of what a filter goes through twice: the stretch of motion, or first steps
 
     @property

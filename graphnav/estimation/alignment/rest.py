@@ -1,4 +1,4 @@
-"""The first state where nothing shows motion over ground: levelled, the heading unknown or zero by definition."""
+"""The first state where nothing shows motion over ground: levelled, the heading by two antennas, unknown, or zero."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.detectors.base import NONE
+from graphnav.estimation.alignment.antennas import baseline_heading
 from graphnav.estimation.alignment.first import Alignment, level
 from graphnav.imu.preintegration import prefix
 from graphnav.imu.samples import bridge_gaps
@@ -22,7 +23,7 @@ _WALKING = 3.0  # m/s, 1-sigma of the start velocity of a foot in the air
 
 
 def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, stationary: Array) -> Alignment:
-    """Level only; the heading stays unknown. Of a foot, `stationary` (N, 2) s are its stances."""
+    """Level; the heading is that of two antennas or unknown. Of a foot, `stationary` (N, 2) s are its stances."""
     noise, gnss = recording.imu.noise, recording.gnss
     stances = stationary if recording.platform == "foot" else NONE
     begin, seconds = _standing(recording, stances)
@@ -36,15 +37,24 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
         R = R @ dR[0].T
         R = rotation.from_rph(rotation.to_rph(R) * [1.0, 1.0, 0.0])
         tilt, sd_v = np.hypot(tilt, sd_bias * (begin - recording.start)), _WALKING
-    own = np.array([tilt, tilt, np.pi])
+    own, known = np.array([tilt, tilt, np.pi]), None
     if gnss is None or not len(gnss.t):
         # without fixes the first pose defines the frame: position and heading are exact by definition
         p, sd_p, sd_heading = np.zeros(3), np.full(3, 1e-3), 1e-4
         note = Note("alignment.no_gnss", "no GNSS: levelled at the start, position and heading count from zero there")
     else:
-        p = frame.from_llh(gnss.llh[0]) - R @ gnss.lever_arm
         sd_p, sd_heading = 10.0 * gnss.sd[0] + 1.0, np.pi
-        note = Note("alignment.no_motion", "no motion in the GNSS fixes: levelled at the start, heading unknown")
+        known = baseline_heading(recording, settings, stationary)
+        if known is None:
+            note = Note("alignment.no_motion", "no motion in the GNSS fixes: levelled at the start, heading unknown")
+        else:
+            own[2], sd_heading = known.sigma, settings.alignment.prior_inflation * known.sigma
+            R = rotation.from_rph(np.array([*rotation.to_rph(R)[:2], known.heading]))
+            note = Note(
+                "alignment.antennas",
+                f"stands at the start: levelled there, heading by two antennas to {np.degrees(known.sigma):.2g} deg",
+            )
+        p = frame.from_llh(gnss.llh[0]) - R @ gnss.lever_arm
     state = States(
         R[None],
         p[None],
@@ -62,6 +72,8 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
             [sd_bias] * 3,
         ]
     )
+    if known is not None:
+        return Alignment(state, sigma, own, (note,), known.until, known.until)
     return Alignment(state, sigma, own, (note,), until=float(stances[:_OPENING][-1, 1]) if len(stances) else None)
 
 

@@ -16,6 +16,7 @@ from graphnav.simulation.passengers import Boarding, Fidget, movement
 from graphnav.simulation.result import Simulated, record
 from graphnav.simulation.scenarios.registry import Scenario
 from graphnav.simulation.scenarios.town import streets
+from graphnav.simulation.series import BarometerModel, DualAntennaModel
 from graphnav.simulation.splines import stream
 from graphnav.simulation.vibration import Engine, Idle, Shake, Springs, idle_floor, road_noise
 
@@ -31,27 +32,29 @@ PULSE = 2.0 * np.pi * 0.31 / 48.0 / 4.0  # m of way: 48 teeth on each of four wh
 
 def urban(
     seed: int, *, duration: float = 1200.0, tunnels: int = 2, gnss: str = "rtk", odometer: bool = True,
-    engine: bool = True, idle_hz: float = 13.3, exact: bool = False, rate: float = 100.0,
+    engine: bool = True, idle_hz: float = 13.3, barometer: bool = False, antennas: bool = False, exact: bool = False,
+    rate: float = 100.0,
 ) -> Simulated:  # fmt: skip
     """A consumer IMU through a town of `duration` s with `tunnels` gaps in GNSS, and backwards into a parking place.
 
     `gnss` is "rtk" or "single"; the odometer counts wheel pulses; `idle_hz` is the crankshaft's, whose strong line is
-    at twice this.
+    at twice this. `antennas` adds a second antenna.
     """
-    return _town("urban", seed, duration, tunnels, gnss, odometer, idle_hz if engine else 0.0, exact, rate)
+    idle = idle_hz if engine else 0.0
+    return _town("urban", seed, duration, tunnels, gnss, odometer, idle, barometer, antennas, exact, rate)
 
 
 def electric(
     seed: int, *, duration: float = 900.0, tunnels: int = 1, gnss: str = "rtk", odometer: bool = True,
-    exact: bool = False, rate: float = 100.0,
+    barometer: bool = False, antennas: bool = False, exact: bool = False, rate: float = 100.0,
 ) -> Simulated:  # fmt: skip
     """The same sort of town in a car whose stops are silent."""
-    return _town("electric", seed, duration, tunnels, gnss, odometer, 0.0, exact, rate)
+    return _town("electric", seed, duration, tunnels, gnss, odometer, 0.0, barometer, antennas, exact, rate)
 
 
 def _town(
-    name: str, seed: int, duration: float, tunnels: int, gnss: str, odometer: bool, idle_hz: float, exact: bool,
-    rate: float,
+    name: str, seed: int, duration: float, tunnels: int, gnss: str, odometer: bool, idle_hz: float,
+    barometer: bool, antennas: bool, exact: bool, rate: float,
 ) -> Simulated:  # fmt: skip
     if duration < 240.0:
         raise ConfigError(f"duration = {duration:g}: a town takes at least 240 s")
@@ -81,6 +84,8 @@ def _town(
         name, seed, path,
         origin=(45.46, 9.19, 20.0), imu=MEMS.at(rate), mount=mount, shake=Shake(tuple(parts)), exact=exact,
         gnss=receiver, odometer=OdometerModel(rate=10.0, scale=0.01, white=0.0, pulse=PULSE) if odometer else None,
+        barometer=BarometerModel() if barometer else None,
+        antennas=DualAntennaModel(outages=gaps) if antennas else None,
         facts={"tunnels_s": [list(gap) for gap in gaps], "engine_hz": idle_hz},
     )  # fmt: skip
 

@@ -1,0 +1,64 @@
+"""The heading of a vehicle that stands, by two antennas: the direction of their baseline less that in the vehicle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME
+from graphnav.constraints.dual_antenna import SENSOR
+from graphnav.core import rotation
+from graphnav.core.rotation import Array
+from graphnav.estimation.alignment.back import stands_until
+from graphnav.estimation.alignment.first import level
+from graphnav.recording import Recording
+
+_FEWEST = 3  # readings: their median is none of one that is wrong
+
+
+@dataclass(frozen=True)
+class BaselineHeading:
+    """What two antennas say of the heading at the start."""
+
+    heading: float  # rad
+    sigma: float  # rad
+    until: float  # s, the last reading used
+
+
+def baseline_heading(recording: Recording, settings: Settings, stationary: Array | None) -> BaselineHeading | None:
+    """The heading of a vehicle that stands at the start, by the readings of two antennas there.
+
+    Errors of readings within seconds are alike (multipath), and that of the mounting is in all of them: many are worth
+    no more than one.
+
+    Parameters
+    ----------
+    stationary : (N, 2) s, intervals in which it stands; None: unknown, and a quiet IMU is taken for standing.
+
+    Returns
+    -------
+    BaselineHeading or None
+        None where it does not stand, or where fewer than three readings can be used.
+    """
+    series = recording.sensors.get(SENSOR.name)
+    if recording.platform != "vehicle" or series is None or not settings.sensor(SENSOR.name).use:
+        return None
+    begin, first = recording.start, float(recording.imu.t[0]) + SAME_TIME
+    if stationary is None:
+        end = stands_until(recording.imu, begin, recording.end)
+    else:
+        end = float(max((b for a, b in stationary if a <= first), default=begin))
+    rows = (series.t >= begin - SAME_TIME) & (series.t <= end + SAME_TIME) & np.isfinite(series["heading"])
+    if end <= begin or np.count_nonzero(rows) < _FEWEST:
+        return None
+    of_level = rotation.from_rph(np.array([*level(recording, begin), 0.0])) @ np.array(series.figures.baseline)
+    heading = rotation.wrap(series["heading"][rows] - np.arctan2(of_level[0], of_level[1]))
+    middle = np.angle(np.mean(np.exp(1j * heading)))
+    one = np.median(series.sigma("heading", np.radians(series.figures.sigma))[rows])
+    return BaselineHeading(
+        float(middle + np.median(rotation.wrap(heading - middle))),
+        float(np.hypot(one, np.radians(series.figures.baseline_sigma))),
+        float(series.t[rows][-1]),
+    )
