@@ -170,8 +170,8 @@ def _build_constraints(scene: BuildContext, ahead: bool | None) -> tuple[Constra
 
 
 def _note_differences(rows: Constraint) -> Constraint:
-    note = f"{rows.name}: gives no Jacobians, so they are made of differences, which takes longer"
-    return replace(rows, notes=(*rows.notes, note))
+    said = f"{rows.name}: gives no Jacobians, so they are made of differences, which takes longer"
+    return replace(rows, notes=(*rows.notes, Note("constraint.differences", said)))
 
 
 def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Array:

@@ -139,7 +139,7 @@ def estimated(recording: Recording, **settings: dict[str, object]) -> Solution:
     return run(recording, settings_from(settings), ("batch",))["batch"]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0])
 def test_calibration_is_recovered(seed: int) -> None:
     """Simulated after Zhu 2020: mounting within 0.1 deg, scale within 0.1 %, and as sure as the sigmas say."""
     made = simulate("zhu2020", seed, unplugged=False, after_s=90.0)
@@ -155,7 +155,7 @@ def test_calibration_is_recovered(seed: int) -> None:
 
 
 def test_a_late_odometer_is_found_out(shared_data: Path) -> None:
-    recording, _ = oracle.oracle_drive(shared_data, 3)
+    recording = oracle.oracle_drive(shared_data, 3)[0].crop(0.0, 300.0)
     late = replace(recording.odometer, t=recording.odometer.t + 0.35, delay_sigma=0.3)
     delay = estimated(replace(recording, odometer=late)).parameters[ODOMETER_DELAY]
     assert delay.value[0, 0] == pytest.approx(0.35, abs=0.02)
@@ -189,7 +189,7 @@ def heading(truth: Trajectory) -> Array:
 
 
 def test_an_odometer_stuck_at_zero_is_not_believed(shared_data: Path) -> None:
-    recording, _ = oracle.oracle_drive(shared_data, 4)
+    recording = oracle.oracle_drive(shared_data, 4)[0].crop(300.0, 560.0)  # with the outage
     odometer = recording.odometer
     stuck = (odometer.t > 440.0) & (odometer.t < 460.0)  # in the outage, at speed
     broken = replace(recording, odometer=replace(odometer, speed=np.where(stuck, 0.0, odometer.speed)))
@@ -201,10 +201,16 @@ def test_an_odometer_stuck_at_zero_is_not_believed(shared_data: Path) -> None:
 
 
 # -------------------------------------------------------------------------------------------------- real recordings
-def largest(recording: Recording, span: tuple[float, float], solver: str, **settings: dict[str, object]) -> float:
-    """Largest horizontal distance from the withheld fixes that are known to be good, m."""
+def largest(
+    recording: Recording, span: tuple[float, float], *solvers: str, **settings: dict[str, object]
+) -> list[float]:
+    """Largest horizontal distance from the withheld fixes that are known to be good, m, of each solver."""
+    found = run(recording.without("gnss", span), settings_from(settings), solvers)
+    return [distance(found[name], recording, span) for name in solvers]
+
+
+def distance(solution: Solution, recording: Recording, span: tuple[float, float]) -> float:
     truth = recording.truth
-    solution = run(recording.without("gnss", span), settings_from(settings), (solver,))[solver]
     t = truth.t - recording.start
     rows = np.flatnonzero((t > span[0]) & (t < span[1]))
     states, _ = solution.between[0](truth.t[rows])
@@ -230,15 +236,16 @@ def test_a_minute_in_tokyo_without_gnss(shared_data: Path) -> None:
     """Real streets, 2020: measured 0.2 m (batch) and 0.7 m (filter); inertial alone 0.9 m and 40 m."""
     recording = read(shared_data / "tokyo_20201105").crop(1050.0, 1450.0)
     span = (1169.0 - 1050.0, 1229.0 - 1050.0)
-    assert largest(recording, span, "batch") < 0.6
-    assert largest(recording, span, "ekf") < 3.0
+    smoothed, filtered = largest(recording, span, "batch", "ekf")
+    assert smoothed < 0.6
+    assert filtered < 3.0
 
 
 def test_the_last_half_minute_of_a_motorway(shared_data: Path) -> None:
     """Phone-grade IMU, straight road, no GNSS after 30 s: with wheels within a metre or so, without 19 m."""
     recording = read(shared_data / "comma_highway_20180802")
-    assert largest(recording, (30.0, 60.0), "batch") < 1.6
-    assert largest(recording, (30.0, 60.0), "batch", vehicle={"nhc": False, "odometer": False}) > 5.0
+    assert largest(recording, (30.0, 60.0), "batch")[0] < 1.6
+    assert largest(recording, (30.0, 60.0), "batch", vehicle={"nhc": False, "odometer": False})[0] > 5.0
 
 
 def test_sigma_survives_long_stops_in_the_dark(shared_data: Path) -> None:

@@ -14,6 +14,7 @@ from road import made, with_gnss
 from graphnav.config import Settings, settings_from
 from graphnav.config.detectors import FUSED, DetectorName
 from graphnav.core.earth import LocalFrame
+from graphnav.core.notes import key_of
 from graphnav.detectors import base, detect, list_detectors, stops
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import build_problem
@@ -133,7 +134,7 @@ def test_several_stand_where_one_of_them_says_so() -> None:
 def test_the_old_name_of_a_table_is_read_and_said() -> None:
     old = settings_from({"detectors": {"sway": {"threshold": 4.5}}})
     assert old.detectors.low_band_glrt.threshold == 4.5
-    assert any("low_band_glrt" in note for note in detect(drive(), old).notes)
+    assert "settings.renamed" in map(key_of, detect(drive(), old).notes)
     assert Settings.model_validate(old.model_dump()).detectors.low_band_glrt.threshold == 4.5
 
 

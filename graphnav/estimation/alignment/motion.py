@@ -32,7 +32,9 @@ _FEWEST = 3  # without which there is no acceleration
 _MOVES = 5.0  # sigmas of way that are motion: noise gets there once in 270 000 fixes, exp(-5^2/2)
 _BEFORE = 10.0  # s of the stretch before the motion
 _JUMP = 6.0  # times what fixes usually are off their running median, or their sigma
-_TURNS = (0.0, np.pi, 0.5 * np.pi, 1.5 * np.pi)  # rad, of the start headings that are tried from the first guess
+_TURNS = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)  # rad, of the start headings that are tried from the first guess
+_FIRST = 10  # iterations by which a start either has converged or creeps
+_UNLIKELY = 14.0  # by which a log-likelihood is less where one in a million is left: -ln 1e-6
 
 Smoother = Callable[[Problem, States], Solution]
 
@@ -102,8 +104,7 @@ def in_motion(
     bias = _usual_rate(imu)
     rp = level(recording, begin)
     heading = _heading_of_accelerations(part, frame, rp, bias)
-    tried = [_try(part, settings, frame, smooth, np.array([*rp, heading + turn]), bias) for turn in _TURNS]
-    tried = [one for one in tried if np.isfinite(one.cost)]
+    tried = _try_headings(part, settings, frame, smooth, rp, heading, bias)
     if not tried:
         raise EstimationError(
             f"'{recording.name}': no start attitude explains the GNSS fixes between {begin - recording.start:.0f} "
@@ -166,6 +167,27 @@ def _thin(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
             keep.append(i)
             last = gnss.t[i]
     return some(gnss, np.array(keep))
+
+
+def _try_headings(
+    part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, rp: Array, heading: float, bias: Array
+) -> list[Solution]:
+    """Solutions of the short problem from each of the start headings.
+
+    The last points backwards and may creep along a saddle, on to the minimum that the others have or to none. It is
+    given up where nothing would be left of its weight beside the best; `worth` fixes in a row are worth one at worst,
+    over a stretch with one turn (`graphnav.estimation.alignment.course`).
+    """
+    ends = [np.array([*rp, heading + turn]) for turn in _TURNS]
+    tried = [_try(part, settings, frame, smooth, end, bias) for end in ends[:-1]]
+    assert part.gnss is not None
+    worth = max(1.0, len(part.gnss.t) / (2.0 * np.pi))
+    few = settings.solver.model_copy(update={"max_iterations": min(_FIRST, settings.solver.max_iterations)})
+    last = _try(part, settings.model_copy(update={"solver": few}), frame, smooth, ends[-1], bias)
+    best = min((one.cost for one in tried if np.isfinite(one.cost)), default=np.inf)
+    if last.iterations >= few.max_iterations and last.cost < best + _UNLIKELY * worth:
+        last = _try(part, settings, frame, smooth, ends[-1], bias)
+    return [one for one in (*tried, last) if np.isfinite(one.cost)]
 
 
 def _try(part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, rph: Array, bias: Array) -> Solution:
