@@ -306,6 +306,7 @@ def straight_path(
     return _exact(t, _travelled(t, start, v), v, rph, f"{length_m / 1e3:g} km straight")
 
 
+@lru_cache(maxsize=12)
 def winding_path(
     duration: float, speed: float, seed: int = 0, turn: float | None = None, rate: float = 50.0
 ) -> ExactPath:

@@ -28,11 +28,6 @@ INERTIAL = {
 
 
 @pytest.fixture(scope="module")
-def path() -> oracle.ExactPath:
-    return oracle.vehicle_path(duration=420, rate=50.0, seed=11)
-
-
-@pytest.fixture(scope="module")
 def short() -> oracle.ExactPath:
     """Of 240 fixes a sigma is known to 1 / sqrt(4 * 240) = 3 % (up 5 %): enough for what is asked of a factor."""
     return oracle.vehicle_path(duration=240, rate=50.0, seed=11)
@@ -92,7 +87,7 @@ def wandering(recording: Recording, share: float, seed: int, time: float = 100.0
         ),
     ],
 )
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_true_figures_are_left_alone(short: oracle.ExactPath, seed: int, wheels: bool) -> None:
     """Used as they are, for nothing is likelier; or within a factor of 1.5, or three of their sigmas."""
     recording, _ = oracle.drive(short, seed=seed)
@@ -114,7 +109,7 @@ def test_fixes_that_scatter_more_than_they_state(short: oracle.ExactPath) -> Non
         assert whole(noise, "gnss_position", axis) < 4.0
 
 
-@pytest.mark.parametrize(("size", "seed"), [(1.0, 0), (1.0, 1), (1.0, 2), (3.0, 0), (3.0, 1)])
+@pytest.mark.parametrize(("size", "seed"), [(1.0, 0), (3.0, 1)])
 def test_velocities_have_a_factor_of_their_own(short: oracle.ExactPath, size: float, seed: int) -> None:
     recording, _ = oracle.drive(short, seed=seed, gnss_velocity_sd=(0.1 * size,) * 3)
     assert recording.gnss is not None
@@ -125,8 +120,9 @@ def test_velocities_have_a_factor_of_their_own(short: oracle.ExactPath, size: fl
         assert 0.8 < times(noise, f"gnss_position.{axis}") < 1.2, axis
 
 
-def test_an_imu_noisier_than_stated(path: oracle.ExactPath) -> None:
+def test_an_imu_noisier_than_stated() -> None:
     """Both noise densities four times what is stated: at least half of that is seen, part goes to the bias walks."""
+    path = oracle.vehicle_path(duration=420, rate=50.0, seed=11)
     recording, _ = oracle.drive(path, seed=4, gnss_rate=4.0, gnss_velocity_sd=(0.02, 0.02, 0.03))
     noise = found_in(stating(recording, imu=4.0))
     for name in ("gyro_noise_density", "accel_noise_density"):
@@ -145,7 +141,7 @@ def nees(recording: Recording, truth: Trajectory, settings: Settings | None = No
 def test_sigma_holds_when_fixes_are_wrong_alike(short: oracle.ExactPath) -> None:
     """Seven tenths of the variance wander: as stated, the sigma is several times too small; estimated, it holds."""
     found, white = [], []
-    for seed in range(6):
+    for seed in range(4):
         recording, truth = oracle.drive(short, seed=20 + seed, gnss_sd=tuple(np.sqrt(0.3) * np.array(oracle.RTK_SD)))
         recording = replace(recording, gnss=replace(recording.gnss, sd=recording.gnss.sd / np.sqrt(0.3)))
         recording = wandering(recording, 0.7, seed)

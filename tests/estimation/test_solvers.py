@@ -331,11 +331,11 @@ def test_huber_is_pulled_by_a_burst_and_redescending_kernels_are_not(lap: tuple[
     recording, truth = lap[0].crop(0.0, 100.0), lap[1]
     rows = np.arange(45, 65)
     bad = moved_fixes(recording, rows, np.array([10.0, 0.0, 0.0]))
-    found = {kernel: solve(bad, kernel) for kernel in ("none", "huber", "cauchy", "geman-mcclure", "tukey", "welsch")}
+    found = {kernel: solve(bad, kernel) for kernel in ("none", "huber", "cauchy", "tukey")}
     far = {kernel: worst(s, truth) for kernel, s in found.items()}
     assert min(far["none"], far["huber"]) > 3.0
     reference = worst(solve(without(recording, rows), "none"), truth)
-    for kernel in ("cauchy", "geman-mcclure", "tukey", "welsch"):
+    for kernel in ("cauchy", "tukey"):
         assert far[kernel] < reference + 0.04, kernel
 
 

@@ -272,7 +272,7 @@ def test_a_stamp_far_ahead_is_dropped(drive: tuple[Recording, Trajectory], rows:
     np.testing.assert_array_equal(track.llh, same.llh)
 
 
-@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     seed=st.integers(0, 10**6),
     jitter=st.floats(0.0, 4.0),
@@ -587,7 +587,7 @@ def test_a_source_without_its_first_line_is_refused() -> None:
 
 
 def test_real_recording_settles_on_the_batch_solution(shared_data: Path) -> None:
-    recording = at_rate(read(shared_data / "oracle_drive").crop(80.0, 280.0), 25.0)
+    recording = at_rate(read(shared_data / "oracle_drive").crop(80.0, 200.0), 25.0)
     online, track = played(recording, rows_of(recording)[1], Settings())
     best = run(recording, solvers=("batch",))["batch"]
     t, states, P = best.at(track.t[(track.t >= best.t[0]) & (track.t <= best.t[-1])])
@@ -646,7 +646,7 @@ def test_a_walk_with_lost_packets_settles_on_the_batch_solution(shared_data: Pat
 # ----------------------------------------------------------------------------------------------- judged as it goes
 def test_wheels_are_judged_with_all_else(drive: tuple[Recording, Trajectory]) -> None:
     """An odometer that reads off by a tenth of a metre a second for seconds at a time weighs as much as that."""
-    path = oracle.vehicle_path(300.0, 50.0, seed=6)
+    path = oracle.vehicle_path(180.0, 25.0, seed=6)
     recording, truth = oracle.drive(path, seed=4, odometer_rate=10.0)
     o = recording.odometer
     rng, lasting = np.random.default_rng(8), np.zeros(len(o.t))
@@ -664,14 +664,14 @@ def test_wheels_are_judged_with_all_else(drive: tuple[Recording, Trajectory]) ->
 @pytest.mark.xfail(strict=False, reason="accelerometer variance x 1.7, wanted 2: rows of ideal wheels share its noise")
 def test_an_imu_is_judged_by_ever_more_rows(drive: tuple[Recording, Trajectory]) -> None:
     """A third of the noise is stated; the last word is that of all rows so far, as a recording of them has it."""
-    path = oracle.vehicle_path(420.0, 50.0, seed=11)
+    path = oracle.vehicle_path(240.0, 25.0, seed=11)
     recording, _ = oracle.drive(path, seed=2, odometer_rate=None)
     noise = recording.imu.noise
     figures = ("gyro_noise_density", "accel_noise_density")
     quiet = replace(noise, **{name: getattr(noise, name) / 3.0 for name in figures})
     recording = replace(recording, imu=replace(recording.imu, noise=quiet))
     rows, how = rows_of(recording)[1], settings_from({"solver": {"lag": 60.0}})
-    online, track = played(recording, rows, how)
+    online, _ = played(recording, rows, how)
     used, whole = online.tracker.noise, run(recording.crop(0.0, online._judged), how, ("ekf",))["ekf"].noise
     for name in figures:
         assert used.factor(f"imu.{name}", 1.0) > 2.0
@@ -682,15 +682,22 @@ def test_an_imu_is_judged_by_ever_more_rows(drive: tuple[Recording, Trajectory])
         assert abs(used.figures[name].log_factor - one.log_factor) < 3.0 * one.sigma, name
     assert sum(note.startswith("noise model, IMU") for note in online.notes) == 1
     assert online.tracker.window.turn > turn_limit(quiet)
-    # ended and resumed while it is being judged, and while what has not settled is gone through again
-    other, parts, resumed = Online(without_rows(recording), how), [], 0
+
+
+def test_resumed_while_it_is_judged_it_ends_with_the_same(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    """While the sensors are being judged, and while what has not settled is gone through again."""
+    how, rows = settings_from({"solver": {"lag": 20.0}}), [row for row in rows if row[1] < 60.0]
+    other, parts, resumed = Online(without_rows(drive[0]), how), [], {"judged": 0, "again": 0}
     for k, row in enumerate(rows):
         other.add(row)
-        if other._again is not None or (other._judgement is not None and k % 100 == 0):
-            other, resumed = pickle.loads(pickle.dumps(other)), resumed + 1
+        doing = "again" if other._again is not None else "judged" if other._judgement is not None else ""
+        if doing and k % (4 if doing == "again" else 20) == 0:
+            resumed[doing] += 1
+            other = pickle.loads(pickle.dumps(other))
         parts += other.settled()
     other.finish()
-    assert resumed > 20
+    assert min(resumed.values()) > 2, resumed
+    track = played(drive[0], rows, how)[1]
     np.testing.assert_array_equal(joined([*parts, *other.settled()]).llh, track.llh)
 
 
