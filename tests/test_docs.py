@@ -18,6 +18,7 @@ import oracle
 import pytest
 from helpers import STEPS, difference, random_states
 
+from graphnav.app import cli
 from graphnav.config import Settings, read_settings
 from graphnav.constraints import list_constraints
 from graphnav.constraints.base import BuildContext, assemble
@@ -44,8 +45,6 @@ def blocks(kind):
     ]
 
 
-PROGRAM = Path(sys.executable).with_name("graphnav")
-
 # the commands of a block belong together: one may need what another wrote
 COMMANDS = sorted(
     {
@@ -59,9 +58,10 @@ PYTHON = [(page, text) for page, text in blocks("python") if JERK not in text]
 
 
 @pytest.fixture
-def clone(tmp_path):
+def clone(tmp_path, monkeypatch):
     """A folder that looks like the clone from inside, to run in: the recordings are there."""
     shutil.copytree(ROOT / "data", tmp_path / "data")
+    monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
@@ -71,13 +71,11 @@ def test_the_pages_show_commands_and_python():
 
 
 @pytest.mark.parametrize("lines", COMMANDS)
-def test_commands_run(lines, clone):
+def test_commands_run(lines, clone, capsys):
     for line in lines.splitlines():
         program, *arguments = shlex.split(line)
         assert program == "graphnav", "a console block holds commands of graphnav and make; use another kind for others"
-        command = [PROGRAM, *arguments]
-        run = subprocess.run(command, cwd=clone, capture_output=True, text=True, timeout=300)
-        assert run.returncode == 0, run.stderr
+        assert cli.run(arguments) == 0, capsys.readouterr().err
 
 
 SHOWN = [text for _, text in blocks("text") if text.startswith("$ graphnav ")]
@@ -85,13 +83,13 @@ NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]\d+)?")
 
 
 @pytest.mark.parametrize("text", SHOWN, ids=lambda text: text.splitlines()[0])
-def test_what_a_page_shows_of_a_command_is_what_it_prints(text, clone):
+def test_what_a_page_shows_of_a_command_is_what_it_prints(text, clone, capsys):
     """Word for word; numbers nearly, but for run times; a line of dots stands for some."""
     command, *shown = text.splitlines()
     _, *arguments = shlex.split(command.removeprefix("$ "))
-    run = subprocess.run([PROGRAM, *arguments], cwd=clone, capture_output=True, text=True, timeout=300)
-    assert run.returncode == 0, run.stderr
-    printed = run.stdout.splitlines()
+    capsys.readouterr()
+    assert cli.run(arguments) == 0
+    printed = capsys.readouterr().out.splitlines()
     if "  ..." in shown:
         k = shown.index("  ...")
         rest = len(shown) - k - 1
