@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from graphnav.core.rotation import Array
+from graphnav.estimation.noise.model import INTERVALS
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.estimation.stops import stops_of_solution
 from graphnav.evaluation.against import own_solutions

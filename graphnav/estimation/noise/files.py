@@ -5,8 +5,8 @@ Under the key "noise", in a file of its own or in the summary.json of a run::
     mode                what `noise.mode` was: a walk whose figures are estimated has its own noise densities first
     figures             by variance component: log_factor (natural, of the variance), its sigma, the prior, freedom
     correlation_times   s, by the parameter of a process
-    weights             by constraint: t (s) and weight of rows with less information; by imu.gyro and imu.accel: end (s)
-                        of intervals between keyframes with more white noise, and 1 over the factor on its variance
+    weights             by constraint: t (s) and weight of rows with less information; by imu.gyro and imu.accel: end
+                        (s) of intervals between keyframes with more white noise, and 1 over its variance's factor
     excluded            by constraint: [begin, end] (s) of spans left out
     spacing             s between the fixes that are used, 0 for all
 

@@ -58,7 +58,8 @@ def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
     more = [f"{len(some.t)} with {_IMU_WHITE[name]}" for name, some in of_imu if len(some.t)]
     if more:
         most = np.sqrt(1.0 / min(float(np.min(some.weight)) for _, some in of_imu if len(some.t)))
-        said = f"of {len(problem.t) - 1} intervals between keyframes {' and '.join(more)} than usual, {most:.2g} times at most"
+        said = f"of {len(problem.t) - 1} intervals between keyframes {' and '.join(more)} than usual"
+        said = f"{said}, {most:.2g} times at most"
         out.append(Note("noise.imu.outliers", f"noise model, IMU: {said}"))
     for rows in problem.constraints:
         names = [g for g in rows.noise_groups()[0] if g in noise.figures]
