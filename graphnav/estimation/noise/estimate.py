@@ -41,7 +41,8 @@ from graphnav.imu.preintegration import NOISE_FIGURES
 CHANCE = 1e-3  # below which a squared residual is taken for an outlier
 _USUAL = 0.05  # of the squares of an aiding sensor, that count for no more: nearly two in five may be wrong
 _FIRST = 1500  # keyframes: figures told by a thousand numbers are good to a twentieth
-_ROUNDS, _AGAIN = 8, 3  # passes at most, from priors and from figures that were estimated before
+_ROUNDS, _AGAIN = 8, 3  # passes, from priors and from figures that were estimated before
+_MOST = 3 * _ROUNDS  # passes at most, as long as each gains what chance does not
 _AHEAD = 2.0  # times its own length that a step is taken at most (Aitken's extrapolation)
 _TIMES = 30.0  # by which a correlation time may be shorter or longer than usual
 _GRID = np.linspace(-1.0, 1.0, 21)
@@ -144,18 +145,18 @@ def estimate_noise(
     for end in ends:
         before = -np.inf
         figures.ahead = 1.0
-        for k in range(rounds):
+        for k in range(_MOST):
             used = with_noise(problem, figures.model())
             forward, smoothed = _pass(used, about, end)
             passes += 1
             prior_then = figures.log_prior()
             now = float(np.sum(forward.log_likelihood)) + prior_then
             if progress is not None:
-                progress("noise", (k + 1) / rounds)
+                progress("noise", min((k + 1) / rounds, 1.0))
             _improve(figures, used, forward, smoothed, end)
             about = _splice(about, smoothed)
-            # a tenth of what chance makes as many figures gain
-            if k > 1 and abs(now - before) < 0.05 * len(figures.log):
+            # chance makes each figure gain a half; with one sensor far off it takes many passes to see which
+            if k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log):
                 break
             before, figures.ahead = now, _AHEAD if k > 1 and now > before else 1.0
     return NoiseEstimate(figures.model(), smoothed, forward, now, prior_then, passes)
