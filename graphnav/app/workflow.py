@@ -23,7 +23,7 @@ from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.findings import Finding
 from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, listening, tell
-from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import Against, read_against
 from graphnav.recording import Recording, sources
@@ -220,7 +220,7 @@ def _beside(request: Request, recording: Recording, solutions: Mapping[str, Solu
 
 def unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
     """Sentences on what a noise model says of measurements that a solution has not."""
-    have = {name: record.t for name, record in solution.records.items()}
+    have = dict.fromkeys(INTERVALS, solution.t) | {name: record.t for name, record in solution.records.items()}
     named = {group.split(".")[0] for group in noise.figures} - {"imu"} | set(noise.weights) | set(noise.excluded)
     notes: list[str] = [
         Note("noise.file.unused", f"noise model: it has figures of {name}, of which nothing is used here")

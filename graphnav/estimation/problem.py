@@ -55,6 +55,7 @@ class Problem:
     constraints: tuple[Constraint, ...]
     notes: tuple[str, ...] = ()
     imu_noise: ImuNoise = field(default_factory=ImuNoise)  # that the intervals were integrated with
+    interval_factors: Array | None = None  # (K-1, 4) on the variances of `NOISE_FIGURES` beside; ones when None
 
     @cached_property
     def parameters(self) -> dict[str, Parameter]:
@@ -91,7 +92,9 @@ class Problem:
     def reintegrate(self, ba: Array, bg: Array) -> Problem:
         """The same problem with its intervals integrated anew about better biases, (K-1, 3) each."""
         imu = replace(self.recording.imu, noise=self.imu_noise)
-        intervals = preintegrate(self.samples, imu, self.t, ba, bg)
+        intervals = preintegrate(self.samples, imu, self.t, ba, bg, self.interval_factors is not None)
+        if self.interval_factors is not None:
+            intervals = intervals.with_noise(self.interval_factors).without_parts()
         return replace(self, intervals=intervals, motion=ImuFactors(intervals, self.frame))
 
 

@@ -89,9 +89,14 @@ class Intervals:
         return self.t1 - self.t0
 
     def with_noise(self, factors: Array) -> Intervals:
-        """The same with the variances of `NOISE_FIGURES` multiplied by factors (4,); needs `parts`."""
-        more = np.einsum("f,nfij->nij", factors - 1.0, self.parts)
-        return replace(self, covariance=self.covariance + more, parts=factors[:, None, None] * self.parts)
+        """The same with the variances of `NOISE_FIGURES` multiplied by factors (4,) or (n, 4); needs `parts`."""
+        parts = factors[..., None, None] * self.parts
+        return replace(self, covariance=self.covariance + np.sum(parts - self.parts, axis=1), parts=parts)
+
+    def without_parts(self) -> Intervals:
+        """The same without what each noise figure contributes, which takes room."""
+        n, _, *size = self.parts.shape
+        return replace(self, parts=np.empty((n, 0, *size)))
 
     def out_of_range(self, bg: Array, angle: float = 1e-3) -> Array:
         """(n,) whether the gyro bias moved so far that the first-order correction is not enough.

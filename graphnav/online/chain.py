@@ -17,7 +17,7 @@ from graphnav.constraints.standstill import PLACE
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter
 from graphnav.estimation.noise.apply import row_weights
-from graphnav.estimation.noise.model import STATED, NoiseModel
+from graphnav.estimation.noise.model import INTERVALS, STATED, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.elimination import Predicted
@@ -102,7 +102,8 @@ class Chain:
     def _noise_of_rows(self) -> NoiseModel:
         """The noise model for a problem whose intervals have it already."""
         rows = {name: one for name, one in self.noise.figures.items() if not name.startswith("imu.")}
-        return replace(self.noise, figures=rows)
+        weights = {name: some for name, some in self.noise.weights.items() if name not in INTERVALS}
+        return replace(self.noise, figures=rows, weights=weights)
 
     @property
     def _oldest(self) -> float:

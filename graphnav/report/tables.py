@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from graphnav.core.rotation import Array
+from graphnav.estimation.noise.model import INTERVALS
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.estimation.stops import stops_of_solution
 from graphnav.evaluation.against import own_solutions
@@ -193,6 +194,7 @@ def _notes(errors: Mapping[str, Errors]) -> list[Raw]:
     return [page.bullets(notes)] if notes else []
 
 
+_OF_IMU = dict(zip(INTERVALS, ("gyro", "accelerometer"), strict=True))
 NOISE_HEAD = ("figure", "stated", "used", "unit", "times stated sigma", "1-sigma", "correlation time [s]",
               "degrees of freedom", "expected beforehand")  # fmt: skip
 
@@ -232,6 +234,13 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Raw]:
         f"{page.number(float(some.weight.min()), 2)} of a row."
         for name, some in noise.weights.items()
         if len(some.t) and name in solution.records
+    ]
+    less += [
+        f"{len(some.t)} of {len(solution.t) - 1} intervals between keyframes have more noise of the "
+        f"{_OF_IMU[name]} than chance allows once in a thousand times, "
+        f"{page.number(float(np.sqrt(1.0 / some.weight.min())), 2)} times the usual one at most."
+        for name, some in noise.weights.items()
+        if len(some.t) and name in _OF_IMU
     ]
     return [*out, page.bullets(less)] if less else out
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri
 
 from graphnav import load
 from graphnav.config import Settings, settings_from
@@ -67,8 +67,8 @@ def groups(problem: Problem) -> list[str]:
 def moments(problem: Problem, forward: ForwardRecord, smoothed: SmootherPass) -> dict[str, tuple[float, float]]:
     """A and B of every component."""
     out: dict[str, tuple[float, float]] = {}
-    A, B = imu_moments(problem, forward, smoothed)
-    out |= {f"imu.{name}": (A[:, i].sum(), B[:, i].sum()) for i, name in enumerate(NOISE_FIGURES)}
+    imu = imu_moments(problem, forward, smoothed)
+    out |= {f"imu.{name}": (imu.A[:, i].sum(), imu.B[:, i].sum()) for i, name in enumerate(NOISE_FIGURES)}
     for chain in problem.chains:
         _, A, B = process_moments(problem, chain, smoothed, len(problem.t))
         own = np.array(chain.parameter.noise_groups)
@@ -416,6 +416,56 @@ def test_sensors_in_any_order_give_the_same() -> None:
     assert one.log_posterior == pytest.approx(other.log_posterior, abs=1e-3)
     for name, figure in one.noise.figures.items():
         assert figure.log_factor == pytest.approx(other.noise.figures[name].log_factor, abs=1e-3), name
+
+
+# ---------------------------------------------------------------------------------------------------------- intervals
+
+
+def test_disturbances_of_intervals_are_as_large_as_chance_has_them() -> None:
+    """A of each interval beside the chi-square variable that it is said to be near to, of a drive with true figures."""
+    recording, _ = oracle.drive(
+        oracle.vehicle_path(duration=300, rate=50.0, seed=4), seed=2, gnss_velocity_sd=(0.05, 0.05, 0.08)
+    )
+    base, opening = posed(recording, INERTIAL)
+    forward = refilter(base, backward(base, ekf(base, opening=opening)))
+    found = imu_moments(base, forward, backward(base, forward))
+    for i in range(2):
+        likelihood = chdtrc(found.freedom[:, i], found.A[:, i] / found.B[:, i] * found.freedom[:, i])
+        told = found.B[:, i] > 0.01
+        assert told.sum() > 200
+        for chance in (0.5, 0.1, 0.01):  # an approximation: within a factor of two in the tail
+            assert 0.5 * chance - 0.02 < np.mean(likelihood[told] < chance) < 1.5 * chance + 0.02, (i, chance)
+
+
+def test_intervals_have_factors_that_stay_when_they_are_integrated_anew() -> None:
+    base, _ = posed(lap().crop(0.0, 60.0))
+    noise = NoiseModel(weights={"imu.gyro": RowWeights(base.t[[7]], np.array([0.01]))})
+    used = with_noise(base, noise)
+    more = used.intervals.covariance - base.intervals.covariance
+    assert np.flatnonzero(np.abs(more).max(axis=(1, 2))).tolist() == [6]
+    assert more[6] == pytest.approx(99.0 * base.intervals.parts[6, 0], rel=1e-9)
+    again = used.reintegrate(base.intervals.ba, base.intervals.bg)
+    assert again.intervals.covariance == pytest.approx(used.intervals.covariance, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("wheels", [True, False])
+def test_a_gyro_that_misses_a_turn_is_not_taken_for_fixes(seed: int, wheels: bool) -> None:
+    """Ten degrees of heading lost within half a second, as where samples are dropped."""
+    recording, truth = oracle.drive(
+        oracle.vehicle_path(duration=240, rate=50.0, seed=11), seed=seed, odometer_rate=20.0 if wheels else None
+    )
+    t = recording.imu.t - recording.start
+    gyro = recording.imu.gyro + np.outer((t > 60.0) & (t <= 60.5), [0.0, 0.0, 0.35])
+    wrong = replace(recording, imu=replace(recording.imu, gyro=gyro))
+    plain, found = (run(one, None, ("rts", "batch")) for one in (recording, wrong))
+    for solver in ("rts", "batch"):
+        model = found[solver].noise
+        assert not any(model.excluded.values()), model.excluded
+        some = model.weights["imu.gyro"]
+        assert 60.0 < some.t[np.argmin(some.weight)] - recording.start < 62.0
+        rms = [float(np.sqrt(np.mean(errors(x[solver].trajectory(), truth).p ** 2))) for x in (plain, found)]
+        assert rms[1] < 1.5 * rms[0], solver
 
 
 # ---------------------------------------------------------------------------------------------------------- exclusion

@@ -10,7 +10,7 @@ import numpy as np
 from graphnav.constraints.base import SAME_TIME, Constraint
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter
-from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import NOISE_FIGURES
@@ -24,8 +24,9 @@ def with_noise(problem: Problem, noise: NoiseModel) -> Problem:
     problem : as posed; its intervals keep the parts of their covariances if a figure of the IMU differs.
     """
     factors = np.array([noise.factor(f"imu.{name}", 1.0) for name in NOISE_FIGURES])
-    if np.any(factors != 1.0):
-        intervals = problem.intervals.with_noise(factors)
+    each = _interval_factors(problem, noise)
+    if each is not None or np.any(factors != 1.0):
+        intervals = problem.intervals.with_noise(factors if each is None else factors * each)
         figures = {
             name: float(np.sqrt(f)) * getattr(problem.imu_noise, name)
             for name, f in zip(NOISE_FIGURES, factors, strict=True)
@@ -35,10 +36,21 @@ def with_noise(problem: Problem, noise: NoiseModel) -> Problem:
             intervals=intervals,
             motion=ImuFactors(intervals, problem.frame),
             imu_noise=replace(problem.imu_noise, **figures),
+            interval_factors=each,
         )
     return replace(
         problem, constraints=_with_common_nodes([_rows(problem, rows, noise) for rows in problem.constraints])
     )
+
+
+def _interval_factors(problem: Problem, noise: NoiseModel) -> Array | None:
+    """(K-1, 4) on the variances of `NOISE_FIGURES`, where single intervals have more noise than usual."""
+    if not any(name in noise.weights for name in INTERVALS):
+        return None
+    factors = np.ones((len(problem.t) - 1, len(NOISE_FIGURES)))
+    for i, name in enumerate(INTERVALS):
+        factors[:, i] = 1.0 / row_weights(problem.t[1:], noise, name)
+    return factors if np.any(factors != 1.0) else None
 
 
 def _with_common_nodes(constraints: list[Constraint]) -> tuple[Constraint, ...]:
@@ -103,6 +115,5 @@ def row_weights(t: Array, noise: NoiseModel, name: str) -> Array:
 
 def without_parts(problem: Problem) -> Problem:
     """The same without what each noise figure contributes, which takes room and nobody asks for any more."""
-    n, _, *size = problem.intervals.parts.shape
-    intervals = replace(problem.intervals, parts=np.empty((n, 0, *size)))
+    intervals = problem.intervals.without_parts()
     return replace(problem, intervals=intervals, motion=ImuFactors(intervals, problem.frame))

@@ -10,7 +10,7 @@ the points that the pass before left, every factor f with redundancy B and the s
 the likelihood of A / f as a chi-square variable of B degrees of freedom, and the prior. Without a prior that is the
 fixed point f <- f A / B of Foerstner (1979), Koch (1999, section 3.6) and MacKay (1992); no sensor is judged before
 another, so none is believed for having come first. What few rows say is bounded: squares that chance would leave once
-in a thousand times have no more say than that (`_CHANCE`), and a row, or what is wrong with wheels for seconds, has a
+in a thousand times have no more say than that (`CHANCE`), and a row, or what is wrong with wheels for seconds, has a
 weight by which it would be that large.
 
 The first passes see the first `_FIRST` keyframes only; the last ones see all.
@@ -27,9 +27,9 @@ from scipy.special import chdtrc, chdtri
 from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import TIMES
 from graphnav.core.rotation import Array
-from graphnav.estimation.noise.apply import with_noise
-from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
-from graphnav.estimation.noise.moments import imu_moments, lag_moments, process_moments, row_moments
+from graphnav.estimation.noise.apply import row_weights, with_noise
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, VarianceComponent
+from graphnav.estimation.noise.moments import ImuMoments, imu_moments, lag_moments, process_moments, row_moments
 from graphnav.estimation.noise.priors import TIME_WITHIN, prior
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import ekf, refilter
@@ -38,10 +38,11 @@ from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, poin
 from graphnav.estimation.solvers.rts import backward
 from graphnav.imu.preintegration import NOISE_FIGURES
 
-_CHANCE = 1e-3  # below which a squared residual is taken for an outlier
+CHANCE = 1e-3  # below which a squared residual is taken for an outlier
 _USUAL = 0.05  # of the squares of an aiding sensor, that count for no more: nearly two in five may be wrong
 _FIRST = 1500  # keyframes: figures told by a thousand numbers are good to a twentieth
-_ROUNDS, _AGAIN = 8, 3  # passes at most, from priors and from figures that were estimated before
+_ROUNDS, _AGAIN = 8, 3  # passes, from priors and from figures that were estimated before
+_MOST = 3 * _ROUNDS  # passes at most, as long as each gains what chance does not
 _AHEAD = 2.0  # times its own length that a step is taken at most (Aitken's extrapolation)
 _TIMES = 30.0  # by which a correlation time may be shorter or longer than usual
 _GRID = np.linspace(-1.0, 1.0, 21)
@@ -144,18 +145,18 @@ def estimate_noise(
     for end in ends:
         before = -np.inf
         figures.ahead = 1.0
-        for k in range(rounds):
+        for k in range(_MOST):
             used = with_noise(problem, figures.model())
             forward, smoothed = _pass(used, about, end)
             passes += 1
             prior_then = figures.log_prior()
             now = float(np.sum(forward.log_likelihood)) + prior_then
             if progress is not None:
-                progress("noise", (k + 1) / rounds)
+                progress("noise", min((k + 1) / rounds, 1.0))
             _improve(figures, used, forward, smoothed, end)
             about = _splice(about, smoothed)
-            # a tenth of what chance makes as many figures gain
-            if k > 1 and abs(now - before) < 0.05 * len(figures.log):
+            # chance makes each figure gain a half; with one sensor far off it takes many passes to see which
+            if k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log):
                 break
             before, figures.ahead = now, _AHEAD if k > 1 and now > before else 1.0
     return NoiseEstimate(figures.model(), smoothed, forward, now, prior_then, passes)
@@ -210,9 +211,10 @@ def _cap(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, float]
 
 def _improve(figures: _Components, problem: Problem, forward: ForwardRecord, smoothed: SmootherPass, end: int) -> None:
     """One step for all figures and weights."""
-    A, B = imu_moments(problem, forward, smoothed)
+    imu = imu_moments(problem, forward, smoothed)
     for i, name in enumerate(NOISE_FIGURES):
-        figures.update(f"imu.{name}", *_cap(A[:, i], B[:, i], 3, _CHANCE))
+        figures.update(f"imu.{name}", *_cap(imu.A[:, i], imu.B[:, i], 3, CHANCE))
+    _weigh_intervals(figures, problem, imu)
     driven: dict[str, tuple[Array, Array, Array]] = {}
     for chain in problem.chains:
         if chain.parameter.noise_groups:
@@ -231,6 +233,20 @@ def _improve(figures: _Components, problem: Problem, forward: ForwardRecord, smo
             if own.any():
                 figures.update(name, *_cap(found.A[own], found.B[own], 1, _USUAL))
         _weigh(figures, problem, rows, np.maximum(found.left_out.sum(axis=1), found.whole.sum(axis=1)), n)
+
+
+def _weigh_intervals(figures: _Components, problem: Problem, imu: ImuMoments) -> None:
+    """More noise for the intervals whose disturbance is larger than chance allows: until it is as likely as that."""
+    t, n = problem.t[1:], len(imu.A)
+    for i, name in enumerate(INTERVALS):
+        freedom = imu.freedom[:, i]
+        ratio = imu.A[:, i] / np.maximum(imu.B[:, i], 1e-30) * freedom
+        # what half of the intervals do is no outlier: the figures have not come to what they are yet
+        usual = max(float(np.median(ratio / chdtri(freedom, 0.5))), 1.0)
+        more = 1.0 / row_weights(t, figures.model(), name)
+        more[:n] = np.maximum(more[:n] * ratio / chdtri(freedom, CHANCE) / usual, 1.0)
+        some = more > 1.0
+        figures.weights[name] = RowWeights(t[some], 1.0 / more[some])
 
 
 def _improve_process(figures: _Components, chain: ParameterChain, moments: tuple[Array, Array, Array]) -> None:
@@ -267,7 +283,7 @@ def _improve_time(figures: _Components, chain: ParameterChain, lags: tuple[Array
 def _weigh(figures: _Components, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:
     """Weights of the first n rows by their squared errors (n,): of their own, and of the whole with what lasts."""
     m = len(rows.axes)
-    t, most = problem.t[rows.keyframe], float(chdtri(m, _CHANCE))
+    t, most = problem.t[rows.keyframe], float(chdtri(m, CHANCE))
     before = np.ones(len(rows)) if rows.weight is None else rows.weight
     some = squared[before[:n] > 0.0]
     # what half of the rows do is no error of rows: the figures have not come to what they are yet

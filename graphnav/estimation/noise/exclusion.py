@@ -8,6 +8,7 @@ next one:
     neither     all is as the noise model has it
     fixes       positions, velocities or both have one unknown error in common in the span, which grows steadily
     wheels      what is assumed of wheels, and the odometer, have one such error in common there
+    IMU         the intervals there that the smoother needs more noise of have it
 
 An unknown error has a Gaussian prior about zero, as wide as such errors get (`_WIDE`), and so has its growth; what that
 width costs in likelihood is the cost of the explanation (MacKay 1992, "Bayesian interpolation": the Occam factor). A
@@ -33,8 +34,8 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.estimation import faults
 from graphnav.estimation.noise.apply import row_weights, with_noise
-from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.model import NoiseModel, RowWeights
+from graphnav.estimation.noise.estimate import CHANCE, NoiseEstimate, estimate_noise
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.ekf import refilter
@@ -44,10 +45,11 @@ from graphnav.estimation.solvers.watch import FALSE_ALARM
 from graphnav.recording import Recording
 
 FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
-_WRONG: tuple[tuple[str, ...], ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS)
+_WRONG: tuple[tuple[str, ...], ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS)
 _WIDE = {"m": 100.0, "m/s": 10.0}  # reflections in a city are off by up to a hundred metres; wheels by their speed
 _ODDS = -float(np.log(FALSE_ALARM))  # by which a fault is less likely beforehand than none
 _NONE = 1e-9  # sigma of an error that is not there
+_OUTLIER = -float(np.log(CHANCE))  # the same of one interval of the IMU
 _MINUTE = 60.0  # s
 
 
@@ -170,8 +172,9 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
 
 def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[tuple[float, float]]:
     """Spans (s) in which fixes disagree with everything else, by figures that need not be those found."""
-    # a fault that rows have lost their weight for is to be seen by the tests
-    open_ = with_noise(base, replace(noise, weights={k: w for k, w in noise.weights.items() if k not in FIXES}))
+    # a fault that rows have lost their weight for, or the IMU its own, is to be seen by the tests
+    hidden = {name: some for name, some in noise.weights.items() if name not in (*FIXES, *INTERVALS)}
+    open_ = with_noise(base, replace(noise, weights=hidden))
     known = values_of(with_noise(base, found.noise), found.points)
     watched = refilter(open_, points_of(open_, found.points.states, known), watch=True)
     return join_spans(faults.fault_spans(faults.weigh_rows(open_, watched.weights)))
@@ -182,19 +185,37 @@ def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]
     if not spans:
         return Explained(found.noise, found.log_posterior, 0, 0)
     noise = replace(found.noise, excluded={})
-    inside = {name: _outside(some, spans) for name, some in noise.weights.items()}
-    used = with_noise(base, replace(noise, weights=inside))
+    reach = _with_next_fix(base, spans)
+    outside = {name: _outside(some, reach if name in INTERVALS else spans) for name, some in noise.weights.items()}
+    used = with_noise(base, replace(noise, weights=outside))
+    of_imu = {name: some for name, some in noise.weights.items() if name in INTERVALS}
+    loose = with_noise(base, replace(noise, weights=outside | of_imu))
     known = values_of(with_noise(base, found.noise), found.points)
-    before, likelihood = evidence(used, points_of(used, found.points.states, known), spans)
+    before, likelihood = evidence(used, points_of(used, found.points.states, known), spans, loose)
     excluded: dict[str, tuple[tuple[float, float], ...]] = {}
-    total = before + found.log_prior
-    for span, one in zip(spans, likelihood - _ODDS * (np.arange(len(_WRONG)) > 0), strict=True):
+    total, of_fixes = before + found.log_prior, []
+    for k, span in enumerate(spans):
+        outliers = sum(len(some.t) - len(_outside(some, reach[k : k + 1]).t) for some in of_imu.values())
+        cost = np.array([0.0 if not kinds else _ODDS for kinds in _WRONG])
+        cost[_WRONG.index(INTERVALS)] = _OUTLIER * outliers if outliers else np.inf
+        one = likelihood[k] - cost
         best = int(np.argmax(one))
         total += float(one[best])
+        if _WRONG[best] == INTERVALS:
+            continue
+        of_fixes.append(reach[k])
         excluded |= {name: (*excluded.get(name, ()), span) for name in _WRONG[best]}
     present = {rows.name for rows in base.constraints}
     excluded = {name: some for name, some in excluded.items() if name in present}
-    return Explained(replace(noise, weights=inside, excluded=excluded), total, 0, len(_WRONG))
+    weights = outside | {name: _outside(some, of_fixes) for name, some in of_imu.items()}
+    return Explained(replace(noise, weights=weights, excluded=excluded), total, 0, len(_WRONG))
+
+
+def _with_next_fix(problem: Problem, spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Spans (s) that reach to the first keyframe with a fix behind each: what leads back from an error is there."""
+    rows = [c.keyframe for c in problem.constraints if c.name in FIXES]
+    t = np.append(np.unique(problem.t[np.concatenate(rows)]), problem.t[-1])
+    return [(a, max(b, float(t[min(int(np.searchsorted(t, b + SAME_TIME)), len(t) - 1)]))) for a, b in spans]
 
 
 def _outside(some: RowWeights, spans: list[tuple[float, float]]) -> RowWeights:
@@ -211,24 +232,27 @@ def excluded_share(problem: Problem, noise: NoiseModel) -> float:
     return 0.0 if rows is None else 1.0 - float(np.mean(row_weights(problem.t[rows.keyframe], noise, rows.name)))
 
 
-def evidence(problem: Problem, about: Points, spans: list[tuple[float, float]]) -> tuple[float, Array]:
-    """Log-likelihood of the innovations before all spans, and (M, 5) from each span's beginning on, by `_WRONG`.
+def evidence(problem: Problem, about: Points, spans: list[tuple[float, float]], loose: Problem) -> tuple[float, Array]:
+    """Log-likelihood of the innovations before all spans, and (M, 6) from each span's beginning on, by `_WRONG`.
 
     Parameters
     ----------
     problem : with its noise model and no fix left out.
     about : points of all keyframes.
     spans : s, first and last wrong fix, in order and apart.
+    loose : the problem with more noise of the IMU where the smoother needs it.
     """
     edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
     known = values_of(problem, about)
     found, before = [], 0.0
     present = {rows.name for rows in problem.constraints}
     for kinds in _WRONG:
-        if kinds and not (present.issuperset(kinds) if kinds != WHEELS else present & set(WHEELS)):
+        possible = present & set(kinds) if kinds == WHEELS else kinds == INTERVALS or present.issuperset(kinds)
+        if not possible:
             found.append([-np.inf] * len(spans))
             continue
-        one = with_common_errors(problem, spans, kinds) if kinds else problem
+        shifted = kinds and kinds != INTERVALS
+        one = with_common_errors(problem, spans, kinds) if shifted else loose if kinds else problem
         likelihood = refilter(one, points_of(one, about.states, known)).log_likelihood
         before = float(np.sum(likelihood[: edges[0]])) if not kinds else before
         found.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)])

@@ -5,7 +5,8 @@ Under the key "noise", in a file of its own or in the summary.json of a run::
     mode                what `noise.mode` was: a walk whose figures are estimated has its own noise densities first
     figures             by variance component: log_factor (natural, of the variance), its sigma, the prior, freedom
     correlation_times   s, by the parameter of a process
-    weights             by constraint: t (s) and weight of rows with less information
+    weights             by constraint: t (s) and weight of rows with less information; by imu.gyro and imu.accel: end
+                        (s) of intervals between keyframes with more white noise, and 1 over its variance's factor
     excluded            by constraint: [begin, end] (s) of spans left out
     spacing             s between the fixes that are used, 0 for all
 
@@ -33,11 +34,12 @@ from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.core.complaints import nearest
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import parse_json, read_text
-from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, VarianceComponent
 from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.recording import FIX_TYPES
 
 MODES: tuple[str, ...] = get_args(NoiseSettings.model_fields["mode"].annotation)
+_LEAST = 1e-15  # weight of an interval: one without any would have no end of noise
 _KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded", "spacing")
 _FIGURE = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
            "degrees_of_freedom": "freedom"}  # fmt: skip
@@ -170,7 +172,7 @@ class _Reader:
         return NoiseModel(
             self.each(values, "figures", known_groups(), self.figure),
             self.each(values, "correlation_times", _list_processes(), self.time),
-            self.each(values, "weights", constraints, self.weights),
+            self.each(values, "weights", [*constraints, *INTERVALS], self.weights),
             self.each(values, "excluded", constraints, self.spans),
             self.number("noise.spacing", values.get("spacing", 0.0), 0.0, 60.0, "s between fixes"),
         ), mode
@@ -236,7 +238,8 @@ class _Reader:
         if not isinstance(value, Mapping) or set(value) != {"t", "weight"}:
             raise self.error(key, value, "must be a table with the lists t and weight")
         lists = {}
-        for name, what, low, high in (("t", "s", -math.inf, math.inf), ("weight", "of information", 0.0, 1.0)):
+        least = _LEAST if key.endswith(INTERVALS) else 0.0
+        for name, what, low, high in (("t", "s", -math.inf, math.inf), ("weight", "of information", least, 1.0)):
             some = value[name]
             if not isinstance(some, list):
                 raise self.error(f"{key}.{name}", some, "must be a list of numbers")

@@ -21,6 +21,8 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 
+INTERVALS = ("imu.gyro", "imu.accel")  # white noise of the IMU, of which single intervals can have more than usual
+
 
 @dataclass(frozen=True)
 class VarianceComponent:
@@ -40,9 +42,9 @@ class VarianceComponent:
 
 @dataclass(frozen=True)
 class RowWeights:
-    """Rows of a constraint that have less information than their sigmas say."""
+    """Rows of a constraint, or intervals of an IMU, that have less information than their sigmas say."""
 
-    t: Array  # (n,) s, ascending; where a time has several rows, all of them
+    t: Array  # (n,) s, ascending; where a time has several rows, all of them; of an interval its end
     weight: Array  # (n,) in (0, 1]
 
 
@@ -52,7 +54,7 @@ class NoiseModel:
 
     figures: Mapping[str, VarianceComponent] = field(default_factory=dict)
     times: Mapping[str, float] = field(default_factory=dict)  # s, correlation time of a process by its parameter
-    weights: Mapping[str, RowWeights] = field(default_factory=dict)  # by constraint
+    weights: Mapping[str, RowWeights] = field(default_factory=dict)  # by constraint, and by `INTERVALS`
     excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)  # spans (s) by constraint
     spacing: float = 0.0  # s, at least, between the fixes that are used (`graphnav.estimation.noise.spacing`)
 

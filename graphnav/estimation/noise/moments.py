@@ -40,8 +40,21 @@ class RowMoments:
     whole: Array  # (N, m) squared whole error, what lasts included, against its steady variance
 
 
-def imu_moments(problem: Problem, forward: ForwardRecord, smoothed: SmootherPass) -> tuple[Array, Array]:
-    """A and B (K-1, 4) of `NOISE_FIGURES`, by interval."""
+@dataclass(frozen=True)
+class ImuMoments:
+    """White noise and bias walks of intervals at a smoothed solution."""
+
+    A: Array  # (n, 4) of `NOISE_FIGURES`
+    B: Array  # (n, 4)
+    freedom: Array  # (n, 4), of the chi-square variable that A freedom / B is near to where f is right
+
+
+def imu_moments(problem: Problem, forward: ForwardRecord, smoothed: SmootherPass) -> ImuMoments:
+    """Moments of the intervals.
+
+    A = |s|^2 with s of covariance M, trace(M) = B, is near to a chi-square variable of B^2 / trace(M^2) degrees of
+    freedom times B over these (Satterthwaite 1946, "An approximate distribution of estimates of variance components").
+    """
     start = forward.predicted_from.R_nb
     L = problem.motion.frames(slice(0, len(start)), start)
     Lt = np.swapaxes(L, -1, -2)
@@ -49,7 +62,11 @@ def imu_moments(problem: Problem, forward: ForwardRecord, smoothed: SmootherPass
     N = Lt @ smoothed.N[1:, :DIM, :DIM] @ L
     Q = problem.intervals.parts[: len(r)]
     A = np.einsum("ni,nfij,nj->nf", r, Q, r, optimize=True)
-    return A, np.maximum(np.einsum("nfij,nji->nf", Q, N, optimize=True), 0.0)
+    QN = Q @ N[:, None]
+    B = np.maximum(np.einsum("nfii->nf", QN), 0.0)
+    squared = np.einsum("nfij,nfji->nf", QN, QN)
+    freedom = np.where(B > 0.0, B**2 / np.maximum(squared, 1e-300), 1.0)
+    return ImuMoments(A, B, np.maximum(freedom, 1.0))
 
 
 def process_moments(

@@ -6,7 +6,7 @@ import numpy as np
 
 from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
 from graphnav.core.notes import Note
-from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, shift
 
@@ -18,6 +18,7 @@ _IMU = {
 }
 
 
+_IMU_WHITE = dict(zip(INTERVALS, ("more noise of the gyro", "more noise of the accelerometer"), strict=True))
 _FAR = 5.0  # prior sigmas, which chance does not reach
 
 
@@ -53,6 +54,13 @@ def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
     ]
     if imu:
         out.append(Note("noise.imu", f"noise model, IMU: stated figures multiplied by: {', '.join(imu)}"))
+    of_imu = [(name, noise.weights[name]) for name in INTERVALS if name in noise.weights]
+    more = [f"{len(some.t)} with {_IMU_WHITE[name]}" for name, some in of_imu if len(some.t)]
+    if more:
+        most = np.sqrt(1.0 / min(float(np.min(some.weight)) for _, some in of_imu if len(some.t)))
+        said = f"of {len(problem.t) - 1} intervals between keyframes {' and '.join(more)} than usual"
+        said = f"{said}, {most:.2g} times at most"
+        out.append(Note("noise.imu.outliers", f"noise model, IMU: {said}"))
     for rows in problem.constraints:
         names = [g for g in rows.noise_groups()[0] if g in noise.figures]
         errors = [
