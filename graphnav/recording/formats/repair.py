@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -107,7 +109,27 @@ def usable_rows(
         rows = rows.take(~repeated)
     if sensor == "imu":
         _check_imu_time(rows, unit)
+    if sensor == "gnss" and not (new := new_fixes(rows.columns)).all():
+        rows = rows.take(new)
+        remarks.add(
+            "gnss.held", f"{(~new).sum()} GNSS rows that repeat the fix of the row before left out: {len(rows)} are new"
+        )
     return rows
+
+
+def new_fixes(columns: Mapping[str, Array]) -> NDArray[np.bool_]:
+    """(N,) which rows of fixes are new, of a log that holds the last fix in its rows until there is another.
+
+    That is one in which most fixes, between two that differ, fill two rows or more, the same in all but their time.
+    A receiver that stands and rounds repeats itself too, but not between two fixes under way.
+    """
+    others = [x for name, x in columns.items() if name != "t"]
+    same = np.ones(max(len(columns["t"]) - 1, 0), dtype=bool)
+    for x in others:
+        same &= (x[1:] == x[:-1]) | (np.isnan(x[1:]) & np.isnan(x[:-1]))
+    changes = np.flatnonzero(~same) + 1
+    held = len(changes) > 2 and float(np.median(np.diff(changes))) >= 2.0
+    return np.r_[True, ~same] if held else np.ones(len(columns["t"]), dtype=bool)
 
 
 def _check_passes(rows: Table, label: str) -> None:
