@@ -48,9 +48,10 @@ def verdicts(solution: Solution, errors: Errors | None) -> Raw:
 def _by_truth(errors: Errors) -> dict[str, tuple[str, str]]:
     from graphnav.evaluation.sigmas import judge_sigmas
 
+    # a truth may have no heights
+    up = f", {page.number(rms(errors.p[:, 2]), 3)} m up" if np.isfinite(errors.p[:, 2]).any() else ""
     sizes = {
-        "position": f"{page.number(rms(errors.horizontal), 3)} m rms horizontal, "
-        f"{page.number(rms(errors.p[:, 2]), 3)} m up",
+        "position": f"{page.number(rms(errors.horizontal), 3)} m rms horizontal{up}",
         "velocity": f"{page.number(rms(np.linalg.norm(errors.v, axis=1)), 3)} m/s rms",
         "attitude": f"{page.number(rms(np.degrees(errors.rph[:, :2])), 3)} deg rms roll and pitch, "
         f"{page.number(rms(np.degrees(errors.rph[:, 2])), 3)} deg heading",
