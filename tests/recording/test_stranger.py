@@ -132,6 +132,15 @@ def test_dates_are_unix_time(tmp_path, text, unix):
     assert found.columns["x"].tolist() == [1.5, 2.5]
 
 
+def test_words_with_dates_do_not_stop_a_draft_and_what_is_no_table_is_named(tokyo, tmp_path, capsys):
+    folder = stranger.write_spreadsheet(tmp_path / "ride", tokyo[1])
+    (folder / "notes.csv").write_text("time,text\n2025-07-08T16:00:00Z,a turn\n2025-07-08T16:00:09Z,left, then right\n")
+    run("init", folder, "-o", folder, "--quiet")
+    (folder / "imu.csv").write_bytes((folder / "imu.csv").read_text("utf-8").encode("utf-16"))
+    assert cli.run(["init", str(folder), "-o", str(folder), "--force", "--quiet"]) == 2
+    assert "imu.csv: is UTF-16" in capsys.readouterr().err
+
+
 def test_a_table_of_numbers_is_left_as_it_is(tmp_path):
     for text in ("t,x\n1,2\n2,3\n", "t,x\n1,\n2,3\n", "t\n1\n2\n", "a,b\nword,1\nother,2\n", ""):
         (tmp_path / "a.csv").write_text(text)

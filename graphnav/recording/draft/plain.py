@@ -12,6 +12,7 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import open_file, parse_number
 from graphnav.core.rotation import Array
+from graphnav.recording.draft.columns import match
 from graphnav.recording.formats.text import text_lines
 
 _START = 1 << 16  # bytes, in which the header is
@@ -38,7 +39,8 @@ def read_plain(path: Path) -> Plain | None:
     Returns
     -------
     Plain or None
-        Columns that hold no numbers are left out; blanks are NaN. Dates without a zone are taken as UTC.
+        Columns that hold no numbers are left out, as is a table of no sensor whose rows differ in length; blanks are
+        NaN. Dates without a zone are taken as UTC.
 
     Raises
     ------
@@ -59,6 +61,8 @@ def read_plain(path: Path) -> Plain | None:
     lines = _lines(text_lines(path))
     rows = [[cell.strip().strip('"') for cell in line.split(mark)] for _, line in lines[1:]]
     wrong = next((k for k, row in enumerate(rows) if len(row) != len(header)), None)
+    if wrong is not None and match(header, path.stem).sensor is None:
+        return None  # notes, not numbers
     if wrong is not None:
         raise RecordingError(
             f"{path}, line {lines[wrong + 1][0]}: has {len(rows[wrong])} fields where the header has {len(header)}"

@@ -122,6 +122,7 @@ def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     every: dict[str, list[Source]] = {}
     left: list[str] = []
     nothing: list[str] = []
+    refused: list[str] = []  # why some are no tables
     for path in files:
         try:
             found = _look(path, topics)
@@ -129,6 +130,7 @@ def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             if len(files) == 1:
                 raise
             nothing.append(path.name if path.exists() else str(error))
+            refused += [str(error)] if isinstance(error.__cause__, RecordingError) else []
             continue
         for sensor, source in found.items():
             every.setdefault(sensor, []).append(source)
@@ -147,8 +149,9 @@ def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             guesses.accel_unit(worst.path, worst.stack("ax", "ay", "az"), worst.stated("ax", "accel"))
     if "imu" not in sensors:
         there = ", ".join(sensors) or "nothing"
+        unread = f" ({refused[0]})" if refused else ""
         raise RecordingError(
-            f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one"
+            f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one{unread}"
         )
     parts = [s.path.name for name in ("gyro", "accel", "gravity") for s in every.get(name, ())]
     if "imu" in every and parts:
@@ -275,7 +278,7 @@ def _look(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     try:
         header = read_header(path) if plain is None else list(plain.columns)
     except RecordingError as error:
-        raise _NoSensor(str(error)) from None
+        raise _NoSensor(str(error)) from error
     columns = matching.match(header, path.name.split(".")[0])
     sensor = columns.sensor
     if sensor is None:
