@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import gzip
 import io
+import json
+import re
 import resource
 import subprocess
 import sys
@@ -16,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.app import cli
+from graphnav.core.notes import Note, key_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
-SEVERITIES = ("refused: ", "untrusted: ", "warning: ", "note: ")
 Array = np.ndarray
 Table = dict[str, Array]  # the columns of a CSV file by name
 
@@ -27,15 +29,16 @@ Table = dict[str, Array]  # the columns of a CSV file by name
 HEAD = """\
 # What can go wrong
 
-Common mistakes and what graphnav prints for each, long lines shortened (...). The tests make them on `data/tokyo`.
+Common mistakes and what graphnav says of each, made by the tests on `data/tokyo`. Run `graphnav info` first and read
+from the top: the first finding may be the cause of the others.
 
-A line that begins with *note*, *warning*, *untrusted* or *refused* is a finding of `graphnav info`, the gravest first;
-`smooth`, `compare` and the reports list them too. Results suffer from a *warning*; with an *untrusted* one they may be
-wrong whatever their sigmas say; with a *refused* one nothing is solved. All other lines are errors, exit code 2. Run
-`graphnav info` first and read from the top: the first finding may be the cause of the others. Scripts read the `key` of
-a finding (`--json`, `messages` in summary.json), which stays the same whatever its words.
+A finding has a severity, a [key](keys.md) that stays the same whatever its words, and a sentence, of which the end is
+shown here. A *note* changes nothing; results suffer from a *warning*; with *untrusted* they may be wrong whatever
+their sigmas say; with *refused* nothing is solved. All other lines are errors, exit code 2: one sentence behind the
+file, line and column, which are left out here.
 """
-_SHOWN = 9  # words at either end of a line that is shortened
+_WHOLE, _HEAD, _TAIL = 11, 5, 6  # words of a line that is shown whole; of either end of one that is not
+_PLACE = re.compile(r"^(?:(?:drive|settings)\S*|'tokyo')(?:, line \d+)?(?:, column '\w+')?: ")
 
 
 @dataclass(frozen=True)
@@ -141,11 +144,14 @@ def made(mistake: Mistake, room: Path) -> tuple[int, list[str]]:
     for file in (ROOT / "data" / "tokyo").iterdir():
         (folder / file.name).write_bytes(file.read_bytes())
     mistake.make(folder)
-    code, out, err = run(mistake.command, room, full="no space" in mistake.what)
+    command = mistake.command
+    if command[0] == "info":  # for the keys
+        command = (*command, "--json")
+    code, out, err = run(command, room, full="no space" in mistake.what)
     if code:
         return code, err.splitlines()
-    said = [line.strip() for line in out.splitlines()]
-    return code, [line for line in said if line.startswith(SEVERITIES)]
+    found = json.loads(out)["findings"] if command[0] == "info" else []
+    return code, [Note(one["key"], f"{one['severity']}: {one['sentence']}") for one in found]
 
 
 def run(command: tuple[str, ...], room: Path, full: bool = False) -> tuple[int, str, str]:
@@ -169,11 +175,17 @@ def said(mistake: Mistake, lines: list[str]) -> list[str]:
 def row(mistake: Mistake, lines: list[str]) -> str:
     """The mistake's line of the page."""
     (line, *_) = said(mistake, lines) or lines or [""]
-    line = line.removeprefix("graphnav: ").replace("|", "\\|").replace("<", "&lt;")
-    words = line.split()
-    if len(words) > 2 * _SHOWN + 2:
-        line = " ".join([*words[:_SHOWN], "...", *words[-_SHOWN:]])
-    return f"| {mistake.what} | {line} |"
+    severity, key = line.split(": ")[0], key_of(line)
+    text = line.removeprefix(f"{severity}: ") if key else _PLACE.sub("", line.removeprefix("graphnav: "))
+    words = text.split()
+    if len(words) > _WHOLE:
+        words = re.sub(r" \([^()]*\)", "", text).split()
+    if len(words) > _WHOLE:
+        end = re.split("[;:] ", " ".join(words))[-1].split()
+        end = end if 3 <= len(end) <= _WHOLE + 2 else words[-_TAIL:]
+        words = end if key else [*words[:_HEAD], "...", *end]
+    text = " ".join(words).replace("|", "\\|").replace("<", "&lt;")
+    return f"| {mistake.what} | {severity} `{key}`: {text} |" if key else f"| {mistake.what} | {text} |"
 
 
 def page(rows: dict[str, list[str]]) -> str:

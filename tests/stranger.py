@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import re
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import logs
@@ -137,6 +139,40 @@ def write_receiver(folder: Path, drive: Cut) -> Path:
     fixes = zip(gnss.t, gnss.llh, gnss.v, strict=True)
     frames = [logs.nav_pvt(gps + t, llh, v, (0.07, 0.1, 0.2)) for t, llh, v in fixes]
     (folder / "rover.ubx").write_bytes(b"".join(frames))
+    return folder
+
+
+def write_spreadsheet(folder: Path, drive: Cut) -> Path:
+    """As a spreadsheet saves it east of the Rhine: semicolons, decimal commas, units in the header, dates in words."""
+    folder.mkdir(parents=True, exist_ok=True)
+    imu, gnss = drive.recording.imu, drive.recording.gnss
+
+    def write(name: str, header: str, t: Array, columns: list, decimals: int) -> None:
+        days = [f"{datetime.fromtimestamp(UNIX + x, UTC):%d.%m.%Y %H:%M:%S.%f}"[:-3] for x in t]
+        rows = [";".join([day, *(f"{x:.{decimals}f}" for x in row)]) for day, *row in zip(days, *columns, strict=True)]
+        (folder / name).write_text("\n".join([header, *rows]).replace(".", ",") + "\n", encoding="utf-8")
+        text = (folder / name).read_text(encoding="utf-8")
+        (folder / name).write_text(re.sub(r"(?m)^(\d\d),(\d\d),(\d{4}) ", r"\1.\2.\3 ", text), encoding="utf-8")
+
+    header = "Zeit;Acc X [g];Acc Y [g];Acc Z [g];Gyro X [°/s];Gyro Y [°/s];Gyro Z [°/s]"
+    write("imu.csv", header, imu.t, [*(imu.accel / G).T, *np.degrees(imu.gyro).T], 6)
+    speed, course = np.hypot(*gnss.v[:, :2].T), np.degrees(np.arctan2(gnss.v[:, 0], gnss.v[:, 1])) % 360
+    place = [*np.degrees(gnss.llh[:, :2]).T, gnss.llh[:, 2]]
+    header = "Zeit;Breite;Länge;Höhe [m];Geschwindigkeit [km/h];Kurs [°]"
+    write("gps.csv", header, gnss.t, [*place, 3.6 * speed, course], 8)
+    return folder
+
+
+def write_one_file(folder: Path, drive: Cut) -> Path:
+    """A logger's one file: a row for each sample of the IMU, in which the last fix stands until there is another."""
+    folder.mkdir(parents=True, exist_ok=True)
+    imu, gnss = drive.recording.imu, drive.recording.gnss
+    k = np.searchsorted(gnss.t, imu.t + 1e-6) - 1
+    there = k >= 0
+    last = np.column_stack([np.degrees(gnss.llh[:, :2]), gnss.llh[:, 2]])[k[there]]
+    columns = [[f"{1e3 * x:.0f}" for x in drive.unix[there]], *(imu.accel[there] / G).T, *np.degrees(imu.gyro[there]).T]
+    header = "timestamp(ms),ax(g),ay(g),az(g),gx(dps),gy(dps),gz(dps),latitude,longitude,altitude(m)"
+    _write(folder / "log.csv", header, [*columns, *last.T], 8)
     return folder
 
 

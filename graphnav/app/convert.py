@@ -14,6 +14,7 @@ from graphnav.core.complaints import nearest, split_names
 from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.files import parse_json, read_text
 from graphnav.core.interpolation import interpolate
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.staging import final_path, stage_results
 from graphnav.core.timescales import gps_to_utc, parse_clock
@@ -92,7 +93,10 @@ def _with_measured_noise(log: Log) -> Log:
     if not found:
         return log
     said = ", ".join(f"{key} = {value:g}" for key, value in found.items())
-    remark = f"noise: {said} measured, between its quietest and usual state; the other figures are of a consumer IMU"
+    remark = Note(
+        "imu.noise_measured",
+        f"noise: {said} measured, between its quietest and usual state; the other figures are of a consumer IMU",
+    )
     noise = replace(imu.noise, **found)
     return replace(log, imu=replace(imu, noise=noise, noise_assumed=False), remarks=(*log.remarks, remark))
 

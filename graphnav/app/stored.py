@@ -30,8 +30,8 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import times_between
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
-from graphnav.recording.checks.overview import inspect
 from graphnav.recording.checks.stated import truth_apart
+from graphnav.recording.plausibility.screening import screen
 
 NAME = "run.npz"
 _FORM = "graphnav-run/1"
@@ -127,7 +127,7 @@ def attach_recording(outcome: Outcome, inputs: Mapping[str, str]) -> Outcome:
         if sha256(Path(name)) != digest:
             raise RecordingError(f"{name}: has changed since; solve again")
     part = read_part(request.source, request.start, request.end, topics=request.topics)
-    recording = inspect(part).recording
+    recording = screen(part).recording
     return replace(outcome, recording=replace(recording, truth=None) if truth_apart(recording) else recording)
 
 

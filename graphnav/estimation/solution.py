@@ -51,7 +51,8 @@ class ConstraintRecord:
     t: Array  # (N,) s
     residual: Array  # (N, m) predicted minus measured
     sigma: Array  # (N, m) of the innovation (state and measurement) or of the measurement
-    nis: Array  # (N,) normalised squared innovation or residual, chi-square with m degrees of freedom for a filter
+    nis: Array  # (N,) normalised squared innovation, as weighted, or residual, at the full weight; chi-square with m
+    # degrees of freedom for a filter
     weight: Array  # (N,) robust weight, 1 = as a Gaussian, 0 = rejected
     axes: tuple[str, ...]  # names of the m components
     unit: str

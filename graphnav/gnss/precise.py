@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import utc_to_gps
 from graphnav.gnss.ephemeris import Placed, rotate_earth
@@ -75,7 +76,16 @@ def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
         t, satellite, clock = (np.concatenate(x) for x in zip(*(_read_clk(path) for path in clk), strict=True))
         clocks |= {int(one): _once(t[satellite == one], clock[satellite == one]) for one in np.unique(satellite)}
     few = sorted(one for one, (t, _) in orbit.items() if len(t) < _NODES)
-    remarks = (f"{len(few)} satellites have fewer than {_NODES} nodes in {sp3[0].name} and no orbit",) if few else ()
+    remarks = (
+        (
+            Note(
+                "raw_gnss.orbit_short",
+                f"{len(few)} satellites have fewer than {_NODES} nodes in {sp3[0].name} and no orbit",
+            ),
+        )
+        if few
+        else ()
+    )
     return Orbits({k: x for k, x in orbit.items() if k not in few}, clocks, remarks)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
+from graphnav.core.notes import Note
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.ephemeris import Ephemerides, Glonass, Kepler
 from graphnav.gnss.files import calendar_days, read_bytes
@@ -51,12 +52,15 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
         _read(path, found)
         if found.broken:
             remarks.append(
-                f"{path.name}: {len(found.broken)} records cannot be read and are left out (the first at line "
-                f"{found.broken[0]})"
+                Note(
+                    "raw_gnss.broken_records",
+                    f"{path.name}: {len(found.broken)} records cannot be read and are left out (the first at line "
+                    f"{found.broken[0]})",
+                )
             )
         if found.skipped:
             names = ", ".join(f"{n} {name}" for name, n in sorted(found.skipped.items()))
-            remarks.append(f"{path.name}: messages that are not used: {names}")
+            remarks.append(Note("raw_gnss.unknown_messages", f"{path.name}: messages that are not used: {names}"))
     if not found.kepler and not found.glonass:
         raise RecordingError(f"{', '.join(str(p) for p in paths)}: no ephemeris in it")
     coefficients = None

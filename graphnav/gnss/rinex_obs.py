@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.files import Lines, calendar_days, find_moved_points, numbers, read_bytes
@@ -115,7 +116,12 @@ def parse_observations(data: bytes, path: Path) -> Observations:
     if not parts:
         raise RecordingError(f"{path}: no code or carrier of a known signal")
     if unknown:
-        remarks.append(f"{path.name}: signals that are not known are left out: {', '.join(sorted(unknown))}")
+        remarks.append(
+            Note(
+                "raw_gnss.unknown_signals",
+                f"{path.name}: signals that are not known are left out: {', '.join(sorted(unknown))}",
+            )
+        )
     t, satellite, signal_of, code, carrier, doppler, cn0, slip, half = (
         np.concatenate(x) for x in zip(*parts, strict=True)
     )
@@ -327,7 +333,12 @@ def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
         flags.append(flag)
         k = begin + count * each
     if cut:
-        remarks.append(f"{path.name}: is cut off in the middle of a record; what is whole before it is used")
+        remarks.append(
+            Note(
+                "raw_gnss.cut_off",
+                f"{path.name}: is cut off in the middle of a record; what is whole before it is used",
+            )
+        )
     epoch = np.array(epochs, dtype=np.intp)
     if not len(epoch):
         raise RecordingError(f"{path}: holds a header and no observations")
@@ -357,11 +368,19 @@ def _say_cut(
     """Remarks about epochs with fewer lines of satellites than they announce."""
     short = np.flatnonzero((np.bincount(of, minlength=len(epoch)) < count) & (flag <= 1))
     if len(short) == 1 and short[0] == len(epoch) - 1:
-        remarks.append(f"{path.name}: is cut off in the middle of a record; what is whole before it is used")
+        remarks.append(
+            Note(
+                "raw_gnss.cut_off",
+                f"{path.name}: is cut off in the middle of a record; what is whole before it is used",
+            )
+        )
     elif len(short):
         remarks.append(
-            f"{path.name}: {len(short)} epochs hold fewer satellites than they announce (the first at line "
-            f"{epoch[short[0]] + 1})"
+            Note(
+                "raw_gnss.short_epochs",
+                f"{path.name}: {len(short)} epochs hold fewer satellites than they announce (the first at line "
+                f"{epoch[short[0]] + 1})",
+            )
         )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.gnss.antex import Antennas
 from graphnav.gnss.signals import C, Ids, frequencies
@@ -106,7 +107,13 @@ def once(obs: Observations) -> Observations:
     out = obs.take(first)
     if not twice:
         return out
-    return replace(out, remarks=(*out.remarks, f"{twice} observations are there twice; the first of each is used"))
+    return replace(
+        out,
+        remarks=(
+            *out.remarks,
+            Note("raw_gnss.repeated", f"{twice} observations are there twice; the first of each is used"),
+        ),
+    )
 
 
 def _plausible(obs: Observations) -> Observations:
@@ -116,7 +123,7 @@ def _plausible(obs: Observations) -> Observations:
     if not bad.any():
         return obs
     code, carrier, doppler = (np.where(bad, np.nan, x) for x in (obs.code, obs.carrier, obs.doppler))
-    said = f"{bad.sum()} observations are beyond what a receiver can measure and are left out"
+    said = Note("raw_gnss.beyond", f"{bad.sum()} observations are beyond what a receiver can measure and are left out")
     return replace(obs, code=code, carrier=carrier, doppler=doppler, remarks=(*obs.remarks, said))
 
 

@@ -60,15 +60,20 @@ class Consistency:
 
 
 def consistency(record: ConstraintRecord) -> Consistency:
-    """Summarise a record."""
+    """Summarise a record.
+
+    A residual of weight w counts with the sigma that it was used with, larger by 1 / sqrt(w); of an innovation
+    the normalised square is of that already.
+    """
     used = record.weight > 1e-9
-    white = np.abs(record.residual[used] / record.sigma[used])
+    weight = record.weight[used] if record.kind == "residual" else np.ones(int(used.sum()))
+    white = np.abs(record.residual[used] / record.sigma[used]) * np.sqrt(weight)[:, None]
     white = white[np.isfinite(white)]
     return Consistency(
         count=len(record.t),
         rejected=int(np.sum(~used)),
         reduced=int(np.sum(used & (record.weight < 0.5))),
-        mean_nis=_mean(record.nis[used]),
+        mean_nis=_mean(weight * record.nis[used]),
         dof=record.residual.shape[1],
         outside=_mean((white > 3.0).astype(float)),
         kind=record.kind,

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import copy
+import importlib.util
 import json
 import pickle
 import re
+from pathlib import Path
 
 import logs
+import pytest
 
 from graphnav.app import cli
 from graphnav.app.stored import NAME, read_outcome
 from graphnav.core.notes import Note, key_of
+from graphnav.recording.formats import load, read
 
+ROOT = Path(__file__).resolve().parents[2]
 KEY = re.compile(r"[a-z_]+(\.[a-z_]+)+")
 
 
@@ -22,6 +27,53 @@ def test_a_note_keeps_its_key():
         assert (one, one.key) == ("7 rows are outliers", "noise.outliers")
     assert json.dumps({"note": note}) == '{"note": "7 rows are outliers"}'
     assert key_of("a sentence") == ""
+
+
+def test_the_page_lists_every_key_of_the_code():
+    spec = importlib.util.spec_from_file_location("note_keys", ROOT / "scripts" / "note_keys.py")
+    note_keys = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(note_keys)
+    assert (ROOT / "docs" / "keys.md").read_text(encoding="utf-8") == note_keys.page()
+
+
+LOGS = {
+    "kf-gins": lambda folder, recording, truth: logs.write_kf_gins(folder, recording, truth, odometer=True),
+    "rtklib": lambda folder, recording, truth: logs.write_rtklib(folder / "a.pos", recording, "UTC"),
+    "nmea": lambda folder, recording, truth: logs.write_nmea(folder / "a.nmea", recording, gst=False),
+    "kitti-raw": logs.write_kitti,
+}
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_what_a_loader_says_has_a_key_for_each_thing(name, tmp_path):
+    """Two different sentences of a log never share one."""
+    tmp_path.joinpath("log").mkdir()
+    written = LOGS[name](tmp_path / "log", *logs.simulated(20.0))
+    remarks = load(written).remarks
+    keys = [key_of(remark) for remark in remarks]
+    assert remarks
+    assert [key for key in keys if not KEY.fullmatch(key)] == []
+    assert len(set(keys)) == len(keys)
+
+
+def test_what_is_repaired_of_a_recording_has_a_key_for_each_sensor(tmp_path):
+    (tmp_path / "recording.toml").write_text(
+        'format = "graphnav-recording/1"\nplatform = "vehicle"\n[imu]\nfile = "imu.csv"\n[gnss]\nfile = "gnss.csv"\n'
+    )
+    imu = [f"{k / 10:.1f},0,0,0,0,0,9.8" for k in range(1, 101)]
+    imu[20:22] = imu[21], imu[20]
+    imu[40] = "4.1,,0,0,0,0,9.8"
+    imu.insert(60, imu[60])
+    (tmp_path / "imu.csv").write_text("\n".join(["t,gx,gy,gz,ax,ay,az", *imu]) + "\n")
+    gnss = [f"{k},48.0,11.0,500.0" for k in range(1, 10)]
+    gnss[3:5] = ["4,0,0,0", "5,,11.0,500.0"]
+    (tmp_path / "gnss.csv").write_text("\n".join(["t,lat,lon,h", *gnss]) + "\n")
+    keys = [key_of(remark) for remark in read(tmp_path).remarks]
+    assert len(set(keys)) == len(keys)
+    assert set(keys) >= {
+        *("imu.rows_blank", "imu.rows_unordered", "imu.rows_repeated", "imu.noise_assumed"),
+        *("gnss.rows_blank", "gnss.nowhere", "gnss_position.sigma_assumed"),
+    }
 
 
 def test_all_that_a_run_says_has_a_key(tmp_path):

@@ -16,6 +16,7 @@ from graphnav.app import cli
 from graphnav.core.timescales import between_clocks
 from graphnav.recording.draft import draft
 from graphnav.recording.draft.guesses import noise_density
+from graphnav.recording.draft.plain import read_plain
 from graphnav.recording.formats import read
 from graphnav.recording.formats.trajectories import read_trajectory
 
@@ -86,6 +87,64 @@ def test_a_receiver_beside_an_imu_in_other_units(tokyo, tmp_path, capsys):
     assert recording.gnss.t == pytest.approx(stranger.UNIX + drive.recording.gnss.t, abs=0.06)
     run("smooth", folder, "-o", tmp_path / "out", "--solver", "rts", "--quiet")
     assert rms(errors(drive, tmp_path / "out")) < 0.1
+
+
+def test_the_tables_of_a_spreadsheet(tokyo, tmp_path):
+    """No edit: semicolons, decimal commas, German names, degrees, g, km/h, and dates, of which init makes CSV files."""
+    drive = tokyo[1]
+    folder = stranger.write_spreadsheet(tmp_path / "ride", drive)
+    for _ in range(2):  # the second time what the first has made is there
+        run("init", folder, "-o", folder, "--force", "--quiet")
+        recording = read(folder)
+        assert recording.imu.t == pytest.approx(drive.unix, abs=1e-3)
+        assert recording.imu.gyro == pytest.approx(drive.recording.imu.gyro, abs=1e-6)
+        assert recording.imu.accel == pytest.approx(drive.recording.imu.accel, abs=1e-4)
+        assert np.degrees(recording.gnss.llh) == pytest.approx(np.degrees(drive.recording.gnss.llh), abs=1e-5)
+        assert recording.gnss.v[:, :2] == pytest.approx(drive.recording.gnss.v[:, :2], abs=1e-3)
+
+
+def test_a_fix_that_stands_in_every_row_of_the_imu_counts_once(tokyo, tmp_path):
+    drive = tokyo[1]
+    folder = stranger.write_one_file(tmp_path / "log", drive)
+    run("init", folder, "-o", folder, "--quiet")
+    recording, gnss = read(folder), drive.recording.gnss
+    late = recording.gnss.t[:, None] - stranger.UNIX - gnss.t
+    assert np.abs(late).min(axis=1).max() < 0.03  # a sample of the IMU; no shift of half a second
+    place = np.column_stack([np.degrees(gnss.llh[:, :2]), gnss.llh[:, 2]])
+    differ = 1 + np.sum((np.diff(np.round(place, 8), axis=0) != 0.0).any(axis=1))
+    assert len(recording.gnss.t) == differ  # some repeat the one before at a stop
+
+
+@pytest.mark.parametrize(
+    ("text", "unix"),
+    [
+        ("2025-07-09T01:00:00.040+09:00", 1751990400.04),
+        ("2025-07-08T16:00:00Z", 1751990400.0),
+        ("2025-07-08 16:00:00.5", 1751990400.5),
+        ("08.07.2025 16:00:00,25", 1751990400.25),
+        ("2025/7/8 16:00:00", 1751990400.0),
+    ],
+)
+def test_dates_are_unix_time(tmp_path, text, unix):
+    (tmp_path / "a.csv").write_text(f"time;x\n{text};1,5\n{text};2,5\n")
+    found = read_plain(tmp_path / "a.csv")
+    assert found.columns["time"][0] == pytest.approx(unix, abs=1e-6)
+    assert found.columns["x"].tolist() == [1.5, 2.5]
+
+
+def test_words_with_dates_do_not_stop_a_draft_and_what_is_no_table_is_named(tokyo, tmp_path, capsys):
+    folder = stranger.write_spreadsheet(tmp_path / "ride", tokyo[1])
+    (folder / "notes.csv").write_text("time,text\n2025-07-08T16:00:00Z,a turn\n2025-07-08T16:00:09Z,left, then right\n")
+    run("init", folder, "-o", folder, "--quiet")
+    (folder / "imu.csv").write_bytes((folder / "imu.csv").read_text("utf-8").encode("utf-16"))
+    assert cli.run(["init", str(folder), "-o", str(folder), "--force", "--quiet"]) == 2
+    assert "imu.csv: is UTF-16" in capsys.readouterr().err
+
+
+def test_a_table_of_numbers_is_left_as_it_is(tmp_path):
+    for text in ("t,x\n1,2\n2,3\n", "t,x\n1,\n2,3\n", "t\n1\n2\n", "a,b\nword,1\nother,2\n", ""):
+        (tmp_path / "a.csv").write_text(text)
+        assert read_plain(tmp_path / "a.csv") is None
 
 
 def test_a_bag_with_two_imus(tokyo, tmp_path, capsys):

@@ -19,6 +19,7 @@ from graphnav.constraints.gnss import LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFS
 from graphnav.constraints.vehicle import AXLE, BODY, MOUNTING, ODOMETER_DELAY, ODOMETER_SCALE
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
+from graphnav.core.notes import key_of
 from graphnav.core.state import States
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
@@ -345,11 +346,11 @@ def test_each_block_is_judged_by_itself():
     assert re.findall(r'class="verdict (\w*)"><b>(\w+)', verdicts(solution(), e)) == [
         ("bad", "Position"), ("", "Velocity"), ("", "Attitude"),
     ]  # fmt: skip
-    off = record()
+    off = record(kind="residual")
     off.nis[60:63], off.weight[60:63] = 1e6, 1e-6  # rows that weigh next to nothing do not speak against the others
     velocities = replace(solution(), records={"gnss_position": off, "gnss_velocity": record(3.0)})
     assert re.findall(r'class="verdict (\w*)"><b>(\w+)', verdicts(velocities, None)) == [
-        ("good", "Position"), ("bad", "Velocity"), ("", "Attitude"),
+        ("", "Position"), ("bad", "Velocity"), ("", "Attitude"),
     ]  # fmt: skip
 
 
@@ -589,6 +590,20 @@ def test_consistency_counts_and_judges():
     assert "wider" in consistency(record(0.5)).verdict
     assert "within" in consistency(record(0.5, "residual")).verdict
     assert "too small" in consistency(record(2.0, "residual")).verdict
+
+
+def test_an_outlier_that_has_little_weight_says_nothing_against_sigma():
+    """Of residuals: one row in ten 12 sigma off, with the weights by which the smoother used them; not without."""
+    kept = record(0.9, "residual")
+    off, weight = np.arange(COUNT) % 10 == 0, kept.weight.copy()
+    white = np.where(off[:, None], 12.0, kept.residual / kept.sigma)
+    weight[off] = 16.3 / (white[off] ** 2).sum(1)  # as unlikely as one in a thousand, chi-square of three
+    rows = replace(kept, residual=white * kept.sigma, nis=(white**2).sum(1), weight=weight)
+    found = {}
+    for name, some in (("weighted", rows), ("as good as the others", replace(rows, weight=np.ones(COUNT)))):
+        one = replace(solution("rts"), records={"gnss_position": some})
+        found[name] = [key_of(doubt) for doubt in doubts({"rts": one}, {})]
+    assert found == {"weighted": [], "as good as the others": ["doubt.sigma"]}
 
 
 def test_separation_satellites_and_stated_accuracy_are_shown(tmp_path, recording):

@@ -39,10 +39,12 @@ class Innovations:
         return np.where(self.refused, 0.0, self.used)
 
     def record(self, problem: Problem) -> ConstraintRecord:
-        """All of them."""
+        """All of them; a kernel's weight is in the normalised squares, as the noise model's is."""
         t = problem.t[self.rows.keyframe]
+        kept = (self.weight > 0.0) & (self.used > 0.0)
+        nis = self.nis * np.divide(self.weight, self.used, out=np.ones_like(self.nis), where=kept)
         return ConstraintRecord(
-            "innovation", t, self.residual, self.sigma, self.nis, self.weight, self.rows.axes, self.rows.unit
+            "innovation", t, self.residual, self.sigma, nis, self.weight, self.rows.axes, self.rows.unit
         )
 
 

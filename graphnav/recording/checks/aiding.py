@@ -209,14 +209,11 @@ def _letters(R_bs: Array, forward: Array, up: Array) -> str | None:
 def reversed_sign(imu: Imu) -> Iterator[Finding]:
     """The gyro about the mean force turns against the course: no choice of axes mends that."""
     if crosschecks.up_of(imu)[2] < 0:
-        key, sentence = (
-            "imu.force_sign",
-            "the accelerometer's sign is reversed (gyro and course deny its up), it must read +9.8 upward at rest",
-        )
+        what = "the accelerometer's sign is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
+        yield Finding("warning", f"{what}; negate it in the file", "imu.force_sign")
     else:
-        key = "imu.gyro_sign"
-        sentence = "the gyro's sign is reversed: it turns against the GNSS course while gravity points as stated"
-    yield Finding("warning", f"{sentence}; negate it in the file", key)
+        what = "the gyro's sign is reversed: it turns against the GNSS course while gravity points as stated"
+        yield Finding("warning", f"{what}; negate it in the file", "imu.gyro_sign")
 
 
 def yaw_scale(yaw: Fit | None) -> Iterator[Finding]:

@@ -172,13 +172,18 @@ def _horizontal(way: Array, said: Array) -> Iterator[Finding]:
         (np.diag([1.0, -1.0]), "the north velocity is reversed: negate it in the file"),
         (-np.eye(2), "the velocities are reversed: negate them in the file"),
     ]
+    turned = len(changes)  # the others are of units
     for factor, unit in _SPEEDS.items():
         hint = f'say units = {{ speed = "{unit}" }}' if factor < 1.0 else "leave out units.speed"
         changes.append((factor * np.eye(2), f"the velocities are in {unit}: {hint} in [gnss]"))
     misses = [miss(change) for change, _ in changes]
     best = int(np.argmin(misses))
     if misses[best] < 0.3 * miss(np.eye(2)) and misses[best] < 0.2 * float(np.median(np.linalg.norm(way, axis=1))):
-        yield Finding("warning", f"by the positions {changes[best][1]}", "gnss.velocity_axes")
+        sentence = f"by the positions {changes[best][1]}"
+        if best < turned:
+            yield Finding("warning", sentence, "gnss.velocity_axes")
+        else:
+            yield Finding("warning", sentence, "gnss.velocity_unit")
 
 
 def truth_findings(recording: Recording) -> Iterator[Finding]:

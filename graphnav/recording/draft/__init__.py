@@ -17,7 +17,7 @@ from graphnav.recording import Gnss, Odometer
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.agreement import CLEAR, FAIR, Agreement, compare
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.sources import JOINED, Source, fix_speed_unit, fixes, sources
+from graphnav.recording.draft.sources import JOINED, Source, fix_speed_unit, fixes, plain_name, sources
 from graphnav.recording.formats.schema import FORCE, RATE, SPEED
 from graphnav.recording.formats.writer import quote
 
@@ -248,13 +248,19 @@ class _Writer:
             self.made[relative] = source.values
             rates, forces = (path.name for path in source.joined_from)
             self.decisions.append(f"{relative}: made of {rates} and {forces}, the forces at the times of the rates")
+        elif source.plain is not None:
+            relative = plain_name(source.path, sensor)
+            self.made[relative] = {source.columns.names[ours]: x for ours, x in source.values.items()}
+            words = f"made of {source.path.name}: {source.plain.words}"
+            self.lines.append(f"# {words}")
+            self.decisions.append(f"{relative}: {words}")
         self.lines.append(f"file = {quote(relative)}")
         if source.log is not None and (topics := source.log.topics.get(sensor, ())):
             others = f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}"
             if topics[0] in self.asked:
                 others = "as was asked"
             self._key("topic", quote(topics[0]), others if len(topics) > 1 else "the only one")
-        if source.joined_from is None and not inside(source.path, self.folder):
+        if source.joined_from is None and source.plain is None and not inside(source.path, self.folder):
             self.decisions.append(f"{relative}: lies outside the folder of this file; say --allow-outside to read it")
         names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
         if names:

@@ -17,16 +17,16 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
         r"t", r"seconds_elapsed", r"time_elapsed|elapsed_time|elapsed|time_since_start|rel_?time",
         r"(?:.*_)?header_stamp", r"time(?:stamp)?", r"gps_?time|gps_?sow|sow|i_?tow|gnss_time",
         r"(?:unix|epoch|utc|sensor|logging|local)_?time\w*",
-        r"sec(?:onds?)?|stamp|(?:.*_)time(?:stamp)?",
+        r"sec(?:onds?)?|stamp|(?:.*_)time(?:stamp)?", r"date_?time|unix|epoch|utc|zeit(?:stempel)?",
     ),
     **{f"g{x}": (rf"{_GYRO}{x}",) for x in "xyz"},
     **{f"a{x}": (rf"{_ACCEL}{x}",) for x in "xyz"},
-    "lat": (r"(?:.*_)?lat(?:itude)?",),
-    "lon": (r"(?:.*_)?(?:lon|lng|long|longitude)",),
+    "lat": (r"(?:.*_)?lat(?:itude)?", r"breite(?:ngrad)?"),
+    "lon": (r"(?:.*_)?(?:lon|lng|long|longitude)", r"l_nge(?:ngrad)?|laenge(?:ngrad)?"),
     "h": (
         r"h|h_?ell|height_?(?:ell\w*)?|ell\w*_height|alt_?ell\w*",
         r"(?:.*_)?(?:alt(?:itude)?|height|h_?msl|elevation|ele)",
-        r"(?:.*_)?(?:alt(?:itude)?|height|h)_?(?:msl|wgs84)?",
+        r"(?:.*_)?(?:alt(?:itude)?|height|h)_?(?:msl|wgs84)?", r"h_he|hoehe",
     ),
     "ve": (r"ve|v_?east|vel_?e(?:ast)?|east_vel\w*|velocity_e(?:ast)?|e_vel",),
     "vn": (r"vn|v_?north|vel_?n(?:orth)?|north_vel\w*|velocity_n(?:orth)?|n_vel",),
@@ -38,7 +38,7 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
     "speed": (
         r"speed", r"(?:wheel|vehicle|odo(?:meter)?|ground|gps|gnss|can|car)_?(?:speed|velocity)",
         r"speed_over_ground|sog|g_?speed",
-        r"(?:.*_)?(?:speed|velocity|v_?x|twist_linear_x|linear_x|v)",
+        r"(?:.*_)?(?:speed|velocity|v_?x|twist_linear_x|linear_x|v)", r"geschwindigkeit",
     ),
     "speed_fl": (rf"{_WHEEL}(?:fl|front_left|left_front){_SPEED}",),
     "speed_fr": (rf"{_WHEEL}(?:fr|front_right|right_front){_SPEED}",),
@@ -46,7 +46,7 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
     "speed_rr": (rf"{_WHEEL}(?:rr|rear_right|right_rear){_SPEED}",),
     "course": (
         r"course(?:_over_ground)?|cog", r"(?:.*_)?(?:bearing|track|course|head_mot|motion_heading|heading_of_motion)",
-        r"heading",
+        r"heading|kurs",
     ),
     "type": (
         r"type", r"q", r"(?:.*_)?(?:fix|gps|gnss|gga|nmea|sol|solution|rtk)_?(?:q|qual\w*|type|status|flag)",

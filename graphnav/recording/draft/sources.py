@@ -14,11 +14,13 @@ from graphnav.recording import Gnss, Imu, Odometer
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.guesses import Guess
+from graphnav.recording.draft.plain import Plain, read_plain
 from graphnav.recording.formats import formats
 from graphnav.recording.formats.folder import other_log
 from graphnav.recording.formats.registry import Log
+from graphnav.recording.formats.repair import new_fixes
 from graphnav.recording.formats.schema import SPEED, WHEELS
-from graphnav.recording.formats.table import first_rows, read_header, read_table
+from graphnav.recording.formats.table import Table, first_rows, read_header, read_table
 from graphnav.sensors.tables import ANGLE, TIME
 
 JOINED = "imu.csv.gz"  # the file that is made of a gyro's and an accelerometer's
@@ -61,6 +63,7 @@ class Source:
     log: Log | None = None
     t_unit: Guess = field(default_factory=lambda: Guess("s", ""))
     joined_from: tuple[Path, Path] | None = None  # a gyro's and an accelerometer's file, whose rows are put together
+    plain: Plain | None = None  # a table that is no CSV file of numbers, of which one is made
 
     def __len__(self) -> int:
         return len(self.values["t"]) if self.log is None else len(next(s.t for s in self._sensors))
@@ -119,6 +122,7 @@ def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     every: dict[str, list[Source]] = {}
     left: list[str] = []
     nothing: list[str] = []
+    refused: list[str] = []  # why some are no tables
     for path in files:
         try:
             found = _look(path, topics)
@@ -126,6 +130,7 @@ def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             if len(files) == 1:
                 raise
             nothing.append(path.name if path.exists() else str(error))
+            refused += [str(error)] if isinstance(error.__cause__, RecordingError) else []
             continue
         for sensor, source in found.items():
             every.setdefault(sensor, []).append(source)
@@ -144,8 +149,9 @@ def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             guesses.accel_unit(worst.path, worst.stack("ax", "ay", "az"), worst.find_unit("ax", "accel"))
     if "imu" not in sensors:
         there = ", ".join(sensors) or "nothing"
+        unread = f" ({refused[0]})" if refused else ""
         raise RecordingError(
-            f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one"
+            f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one{unread}"
         )
     parts = [s.path.name for name in ("gyro", "accel", "gravity") for s in every.get(name, ())]
     if "imu" in every and parts:
@@ -157,12 +163,19 @@ def _files(path: Path) -> list[Path]:
     """A log by itself, or those in a folder that is none."""
     if not path.is_dir() or any(known.load is not None and known.recognises(path) for known in formats().values()):
         return [path]
+    every = [p for p in path.iterdir() if not p.name.startswith(".")]
     made = {JOINED, "recording.toml"}  # by an earlier draft
-    inside = sorted(p for p in path.iterdir() if not p.name.startswith(".") and p.name not in made)
+    made |= {plain_name(p, sensor) for p in every for sensor in _WANTED}
+    inside = sorted(p for p in every if p.name not in made)
     logs = [p for p in inside if p.name.endswith((".csv", ".csv.gz")) or _is_known(p)]
     if not logs:
         raise RecordingError(f"{path}: no log in this folder: no CSV file, and none of a kind that is known")
     return logs
+
+
+def plain_name(path: Path, sensor: str) -> str:
+    """The CSV file that is made of a sensor's part of a table that is none."""
+    return f"{path.stem}-{sensor}.csv.gz"
 
 
 def _is_known(path: Path) -> bool:
@@ -261,10 +274,11 @@ def _look(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     log = other_log(path, topics)
     if log is not None:
         return {s: Source(path, log=log) for s in ("imu", "gnss", "odometer") if getattr(log, s) is not None}
+    plain = read_plain(path) if path.is_file() and path.name.endswith((".csv", ".txt", ".tsv")) else None
     try:
-        header = read_header(path)
+        header = read_header(path) if plain is None else list(plain.columns)
     except RecordingError as error:
-        raise _NoSensor(str(error)) from None
+        raise _NoSensor(str(error)) from error
     columns = matching.match(header, path.name.split(".")[0])
     sensor = columns.sensor
     if sensor is None:
@@ -272,13 +286,17 @@ def _look(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
             f"{path}, line 1: no sensor is recognised in the columns {', '.join(header[:12])}; "
             "rename them (t; gx gy gz ax ay az; lat lon h; speed)"
         )
-    columns = _with_clock(path, header, columns)
+    if plain is None:
+        columns = _with_clock(path, header, columns)
+    elif plain.dated is not None:
+        units = {ours: unit for ours, unit in columns.units.items() if ours != "t"}
+        columns = matching.Columns({**columns.names, "t": plain.dated}, units)
     roles = [sensor]
     if sensor == "imu" and {"lat", "lon"} <= columns.names.keys():
         roles.append("gnss")
     elif sensor == "imu" and "speed" in columns.names:
         roles.append("odometer")
-    return {role: _read(path, columns, role) for role in roles}
+    return {role: _read(path, columns, role, plain) for role in roles}
 
 
 def _stamps(cells: list[str]) -> Array | None:
@@ -310,22 +328,28 @@ def _with_clock(path: Path, header: list[str], columns: matching.Columns) -> mat
     return matching.Columns({**columns.names, "t": best}, units)
 
 
-def _numbers(path: Path, name: str) -> bool:
+def _numbers(path: Path, name: str, plain: Plain | None) -> bool:
     """Whether a column holds numbers and blanks alone."""
+    if plain is not None:
+        return name in plain.columns
     try:
         return len(read_table(path, (name,))) > 0
     except RecordingError:
         return False
 
 
-def _read(path: Path, columns: matching.Columns, role: str) -> Source:
+def _read(path: Path, columns: matching.Columns, role: str, plain: Plain | None) -> Source:
     """The columns of one sensor, rows that hold all it needs, in order of time."""
     wanted = _WANTED[role]
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in wanted}
     for extra in ("type", "satellites"):
-        if extra in names and not _numbers(path, names[extra]):
+        if extra in names and not _numbers(path, names[extra], plain):
             del names[extra]
-    table = read_table(path, tuple(names), (), names)
+    if plain is None:
+        table = read_table(path, tuple(names), (), names)
+    else:
+        own = {ours: plain.columns[theirs] for ours, theirs in names.items()}
+        table = Table(path, own, names, np.arange(len(own["t"])))
     needed = [n for n in wanted[: _NEEDED.get(role, len(wanted))] if n in names]
     whole = np.isfinite(table.stack(*needed)).all(-1)
     if role == "gnss":
@@ -336,6 +360,9 @@ def _read(path: Path, columns: matching.Columns, role: str) -> Source:
     order = np.argsort(values["t"], kind="stable")
     order = order[np.concatenate([[True], np.diff(values["t"][order]) > 0])]
     values = {ours: v[order] for ours, v in values.items()}
+    if role == "gnss":
+        new = new_fixes(values)  # as it will be read
+        values = {ours: v[new] for ours, v in values.items()}
     step = np.diff(values["t"])
     if step.sum() > _PAUSES * len(step) * np.median(step):
         k = int(np.argmax(step))
@@ -347,7 +374,7 @@ def _read(path: Path, columns: matching.Columns, role: str) -> Source:
         rear = [w for w in WHEELS[2:] if w in values] or [w for w in WHEELS if w in values]
         values["speed"] = np.mean([values[w] for w in rear], axis=0)
         columns = matching.Columns(columns.names, {**columns.units, "speed": columns.units.get(rear[0], "")})
-    source = Source(path, matching.Columns(names, columns.units), values)
+    source = Source(path, matching.Columns(names, columns.units), values, plain=plain)
     inertial = role not in ("gnss", "odometer")
     source.t_unit = guesses.time_unit(source.values["t"], source.find_unit("t", "t"), inertial)
     return source

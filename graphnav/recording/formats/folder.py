@@ -116,7 +116,9 @@ def read_folder(source: str | Path) -> Recording:
         raw, fixes = _raw_gnss(d.raw_gnss, path, gps_zero, remarks, files)
         if gnss is None:
             gnss = fixes
-            remarks.add(f"no [gnss]: {len(fixes.t)} single-point fixes of the raw observations stand in for it")
+            remarks.add(
+                "gnss.of_raw", f"no [gnss]: {len(fixes.t)} single-point fixes of the raw observations stand in for it"
+            )
     truth = None
     if d.truth and d.truth.closed_loop_sigma:
         truth = Truth(imu.t[[0, -1]], of=d.truth.of, closed_loop_sigma=d.truth.closed_loop_sigma)
@@ -150,12 +152,15 @@ def _imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
     noise = replace(ImuNoise(), **stated)
     missing = [key for key in schema.NOISE_FIGURES if key not in stated]
     if 0 < len(missing) < len(schema.NOISE_FIGURES):
-        remarks.add(f"[imu.noise] says nothing of {', '.join(missing)}: defaults of a consumer IMU are used")
+        remarks.add(
+            "imu.noise_partly", f"[imu.noise] says nothing of {', '.join(missing)}: defaults of a consumer IMU are used"
+        )
     elif missing:
         remarks.add(
+            "imu.noise_assumed",
             "no [imu.noise]: figures of a consumer IMU are assumed "
             f"(gyro {noise.gyro_noise_density:g} rad/s/sqrt(Hz), "
-            f"accelerometer {noise.accel_noise_density:g} m/s2/sqrt(Hz))"
+            f"accelerometer {noise.accel_noise_density:g} m/s2/sqrt(Hz))",
         )
     return Imu(rows["t"], gyro, accel, noise, R_bs, noise_assumed=len(missing) == len(schema.NOISE_FIGURES))
 
@@ -168,7 +173,9 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     if vague.any():
         if vague.all():
             raise RecordingError(f"{rows.path}: every fix has a sigma of more than {VAGUEST:g} m and says nothing")
-        remarks.add(f"{vague.sum()} of {len(rows)} fixes have a sigma of more than {VAGUEST:g} m: left out")
+        remarks.add(
+            "gnss.sigma_vague", f"{vague.sum()} of {len(rows)} fixes have a sigma of more than {VAGUEST:g} m: left out"
+        )
         llh, sd, rows = llh[~vague], sd[~vague], rows.take(~vague)
     v = sd_v = None
     if "vd" in rows and "vu" not in rows:
@@ -186,15 +193,18 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
         v[absent] = sd_v[absent] = np.nan
         if absent.all():
             v = sd_v = None
-            remarks.add("the GNSS velocity columns are blank throughout: no velocities")
+            remarks.add("gnss.velocity_blank", "the GNSS velocity columns are blank throughout: no velocities")
     elif "speed" in rows and "course" in rows:
         course = rows["course"] * ANGLE[d.units.angle or "deg"]
         v, sd_v, sentence = horizontal_velocity(
             rows["speed"] * schema.SPEED[d.units.speed], course, d.sd_v or DEFAULT_SD_V
         )
-        remarks.add(sentence)
+        remarks.add("gnss.velocity_of_course", sentence)
     elif there:
-        remarks.add(f"GNSS velocities need ve, vn and vu; only {', '.join(there)} is there, so none are used")
+        remarks.add(
+            "gnss.velocity_partly",
+            f"GNSS velocities need ve, vn and vu; only {', '.join(there)} is there, so none are used",
+        )
     kinds = fixes_by_type(rows, d.units.type) if "type" in rows else None
     gnss = Gnss(
         rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds, kinds is not None and d.units.type == "rtklib"
@@ -298,7 +308,7 @@ def _series(sensor: Sensor, d: Any, rows: Table, remarks: Remarks) -> Series:
     figures = sensor.figures(**{name: getattr(d, name) for name in sensor.figures.model_fields})
     whole = sensor.usable(values)
     if not whole.all():
-        remarks.add(f"{(~whole).sum()} {sensor.name} rows without a measurement dropped")
+        remarks.add(f"{sensor.name}.rows_blank", f"{(~whole).sum()} {sensor.name} rows without a measurement dropped")
     return Series(sensor, rows["t"][whole], values[whole], figures)
 
 

@@ -72,7 +72,8 @@ def load(path: Path) -> Log:
     else:
         imu_file, gnss_file = _pair(path)
         remarks.add(
-            "no configuration (.yaml) of KF-GINS or OB_GINS beside it: the antenna's lever arm is taken as zero"
+            "log.no_configuration",
+            "no configuration (.yaml) of KF-GINS or OB_GINS beside it: the antenna's lever arm is taken as zero",
         )
     files = [f for f in (config_file, imu_file, gnss_file) if f is not None]
     if path.is_dir():
@@ -85,7 +86,9 @@ def load(path: Path) -> Log:
             imu = replace(imu, noise=_noise(where, config, remarks), noise_assumed=False)
         if speed is not None:
             odometer = Odometer(imu.t, speed, _frd(where, config, "odolever"))
-            remarks.add("the eighth column of the IMU file is taken as the odometer's forward speed in m/s")
+            remarks.add(
+                "odometer.read_as", "the eighth column of the IMU file is taken as the odometer's forward speed in m/s"
+            )
     if gnss_file is not None:
         gnss = _read_gnss(gnss_file, _frd(where, config, "antlever"), remarks)
     folder = where.parent if config else where
@@ -98,10 +101,11 @@ def load(path: Path) -> Log:
         zero = WEEK * week if 0 < week < 10_000 else None  # KF-GINS itself writes week 0
         files.append(nav)
         remarks.add(
-            f"truth: {nav.name}, of the IMU, with north-east-down velocities and roll, pitch, yaw of an FRD body"
+            "truth.read_as",
+            f"truth: {nav.name}, of the IMU, with north-east-down velocities and roll, pitch, yaw of an FRD body",
         )
     _mention(config, remarks)
-    remarks.add("clock: seconds of the GPS week, as in the files")
+    remarks.add("log.clock", "clock: seconds of the GPS week, as in the files")
     return Log(
         path.stem if path.is_file() else path.resolve().name, imu, gnss, odometer, truth, gps_zero=zero,
         files=tuple(files), remarks=tuple(remarks),
@@ -183,7 +187,9 @@ def _truth_file(folder: Path, remarks: Remarks) -> Path | None:
     found = [p for p in sorted(folder.iterdir()) if p.suffix.lower() == ".nav" and "navresult" not in p.name.lower()]
     named = [p for p in found if "truth" in p.name.lower()]
     if len(named or found) > 1:
-        remarks.add(f"no truth is read: it could be any of {', '.join(p.name for p in named or found)}")
+        remarks.add(
+            "truth.several", f"no truth is read: it could be any of {', '.join(p.name for p in named or found)}"
+        )
         return None
     return next(iter(named or found), None)
 
@@ -221,11 +227,15 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
     gap = step > _GAP * period
     dt = np.concatenate([[period], np.where(gap, period, step)])[:, None]
     if gap.any():
-        remarks.add(f"{gap.sum()} gaps in the IMU: the increments after each are taken as those of one period")
+        remarks.add(
+            "imu.increments_after_gap",
+            f"{gap.sum()} gaps in the IMU: the increments after each are taken as those of one period",
+        )
     R_bs = rotation_from_letters("FRD")
     remarks.add(
+        "imu.read_as",
         f"IMU: angle (rad) and velocity (m/s) increments in forward-right-down, divided by their sample period "
-        f"({period:g} s)"
+        f"({period:g} s)",
     )
     imu = Imu(t.copy(), table[:, 1:4] / dt @ R_bs.T, table[:, 4:7] / dt @ R_bs.T, R_bs=R_bs, noise_assumed=True)
     return imu, table[:, 7].copy() if table.shape[1] == 8 else None
@@ -254,14 +264,17 @@ def _read_gnss(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
     order = np.argsort(table["t"], kind="stable")
     keep = order[np.concatenate([[True], np.diff(table["t"][order]) > 0])]
     if len(keep) < len(order) or (np.diff(order) < 0).any():
-        remarks.add("GNSS rows were sorted by time, repeated ones dropped")
+        remarks.add("gnss.rows_sorted", "GNSS rows were sorted by time, repeated ones dropped")
     llh = np.stack([np.radians(table["lat"]), np.radians(table["lon"]), table["h"]], -1)
-    remarks.add("GNSS: the sigma columns are taken as north, east, down; heights above the ellipsoid")
+    remarks.add("gnss.read_as", "GNSS: the sigma columns are taken as north, east, down; heights above the ellipsoid")
     v = sd_v = None
     if width == 13:
         v = np.stack([table["ve"], table["vn"], -table["vd"]], -1)[keep]
         sd_v = np.stack([table["sd_ve"], table["sd_vn"], table["sd_vd"]], -1)[keep]
-        remarks.add("GNSS: columns 5 to 7 are taken as the velocity north, east, down in m/s, 11 to 13 as its sigmas")
+        remarks.add(
+            "gnss.velocity_read_as",
+            "GNSS: columns 5 to 7 are taken as the velocity north, east, down in m/s, 11 to 13 as its sigmas",
+        )
     return Gnss(table["t"][keep], llh[keep], sd[keep], v, sd_v, lever_arm)
 
 
@@ -354,7 +367,7 @@ def _noise(where: Path, config: dict[str, Any], remarks: Remarks) -> ImuNoise:
                 f"(from {_LEAST:g} to {_MOST:g})"
             )
         if len(set(numbers)) > 1:
-            remarks.add(f"{key} differs between the axes; the root mean square is used for all")
+            remarks.add("imu.noise_axes", f"{key} differs between the axes; the root mean square is used for all")
         return float(np.sqrt(np.mean(np.square(numbers))))
 
     root = np.sqrt(2.0 / (figure("corrtime") * 3600.0))
@@ -362,8 +375,9 @@ def _noise(where: Path, config: dict[str, Any], remarks: Remarks) -> ImuNoise:
     scales = {ours: figure(theirs) * 1e-6 for ours, theirs in
               (("gyro_scale_sigma", "gsstd"), ("accel_scale_sigma", "asstd")) if theirs in section}  # fmt: skip
     remarks.add(
+        "imu.noise_read_as",
         "noise figures: from the configuration; a Gauss-Markov bias of sigma s and correlation time T becomes a random "
-        "walk of s sqrt(2/T) that starts from s"
+        "walk of s sqrt(2/T) that starts from s",
     )
     return ImuNoise(
         gyro_noise_density=figure("arw") * DEG_PER_SQRT_H,
@@ -380,15 +394,20 @@ def _mention(config: dict[str, Any], remarks: Remarks) -> None:
     """Keys of the configuration that have no place in a recording."""
     if any(key in config for key in ("starttime", "endtime")):
         span = f"{str(config.get('starttime', ''))[:30]} to {str(config.get('endtime', ''))[:30]}"
-        remarks.add(f"starttime and endtime ({span}) are not applied: use --start and --end")
+        remarks.add("log.span_not_used", f"starttime and endtime ({span}) are not applied: use --start and --end")
     if any(key in config for key in ("initpos", "initvel", "initatt")):
-        remarks.add("the initial state of the configuration is not used: graphnav finds its own")
+        remarks.add("log.start_not_used", "the initial state of the configuration is not used: graphnav finds its own")
     body = config.get("bodyangle")
     if isinstance(body, list) and any(body):
-        remarks.add(f"bodyangle {repr(body)[:60]} deg is not applied: the body axes are the IMU's")
+        remarks.add(
+            "log.body_angle_not_used", f"bodyangle {repr(body)[:60]} deg is not applied: the body axes are the IMU's"
+        )
     odometer = config.get("odometer")
     if isinstance(odometer, dict) and odometer.get("isuseodo") is False:
-        remarks.add("the configuration does not use the odometer; withhold it with --without odometer")
+        remarks.add(
+            "odometer.not_used_there",
+            "the configuration does not use the odometer; withhold it with --without odometer",
+        )
 
 
 FORMAT = log_format(

@@ -14,6 +14,7 @@ import numpy as np
 
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import Note
 from graphnav.recording import Gnss, Imu, ImuNoise, Recording
 from graphnav.recording.formats.registry import Format
 from graphnav.recording.formats.schema import rotation_from_letters
@@ -81,9 +82,19 @@ def read_kitti(source: str | Path = "kitti") -> Recording:
         gnss=Gnss(gps[:, 0].copy(), frame.to_llh(gps[:, 1:4]), np.tile(SD, (len(gps), 1))),
         files=files,
         remarks=(
-            f"the first IMU row, 1.92 s before the second, and {early.sum()} position before the second were dropped",
-            f"positions are local metres: {lat:g} N, {lon:g} E, {h:g} m (Karlsruhe) is only a nominal origin",
-            "position sigmas (0.1 m) and IMU noise are graphnav's own, larger than the file's, which hold at rest",
+            Note(
+                "log.rows_left_out",
+                f"the first IMU row, 1.92 s before the second, and {early.sum()} position before the second were "
+                "dropped",
+            ),
+            Note(
+                "log.origin",
+                f"positions are local metres: {lat:g} N, {lon:g} E, {h:g} m (Karlsruhe) is only a nominal origin",
+            ),
+            Note(
+                "log.noise",
+                "position sigmas (0.1 m) and IMU noise are graphnav's own, larger than the file's, which hold at rest",
+            ),
         ),
     )
 

@@ -57,10 +57,10 @@ def load(path: Path) -> Log:
         raise RecordingError(f"{samples[k]}, line 1: lat, lon, alt of {rows[k, :3]} are nowhere on Earth")
     order = np.argsort(t, kind="stable")
     if (np.diff(order) < 0).any():
-        remarks.add(f"{(np.diff(t) < 0).sum()} samples out of order were sorted by time")
+        remarks.add("log.rows_unordered", f"{(np.diff(t) < 0).sum()} samples out of order were sorted by time")
     order = order[np.concatenate([[True], np.diff(t[order]) > 0])]
     if len(order) < len(t):
-        remarks.add(f"{len(t) - len(order)} samples with the time of another were dropped")
+        remarks.add("log.rows_repeated", f"{len(t) - len(order)} samples with the time of another were dropped")
     t, rows = t[order], rows[order]
     R_bs = rotation_from_letters("FLU")
     llh = np.column_stack([np.radians(rows[:, :2]), rows[:, 2]])
@@ -72,15 +72,20 @@ def load(path: Path) -> Log:
     if not ((sd > 0).all() and (sd_v > 0).all()):
         raise RecordingError(f"{samples[order[0]]}: accuracies (numbers 24 and 25) must be above zero")
     remarks.add(
-        "IMU: ax ay az and wx wy wz, forward-left-up, m/s2 with gravity and rad/s; noise figures are not stated"
+        "imu.read_as",
+        "IMU: ax ay az and wx wy wz, forward-left-up, m/s2 with gravity and rad/s; noise figures are not stated",
     )
     remarks.add(
+        "gnss.read_as",
         "GNSS: the position and velocity of the OXTS' own INS once a second, with its stated accuracies; they are of "
-        "the IMU, so without a lever arm"
+        "the IMU, so without a lever arm",
     )
-    remarks.add("truth: the same INS at every sample, so errors against it at the fixes say little; withhold some")
-    remarks.add("odometer: the INS' forward speed vf is not a wheel's and is left out")
-    remarks.add(f"clock: seconds since midnight of {zero} as in timestamps.txt")
+    remarks.add(
+        "truth.smoothed",
+        "truth: the same INS at every sample, so errors against it at the fixes say little; withhold some",
+    )
+    remarks.add("odometer.not_a_wheel", "odometer: the INS' forward speed vf is not a wheel's and is left out")
+    remarks.add("log.clock", f"clock: seconds since midnight of {zero} as in timestamps.txt")
     name = folder.parent.name if folder.name == "oxts" else folder.name
     return Log(
         name,

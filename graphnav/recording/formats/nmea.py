@@ -63,8 +63,9 @@ def load(path: Path) -> Log:
     epochs, broken, lines = _epochs(path)
     if broken:
         remarks.add(
+            "log.broken_lines",
             f"{path.name}, line {broken[0]}: not a sound sentence (checksum or form); {len(broken)} of {lines} lines "
-            "were skipped"
+            "were skipped",
         )
     fixes = [e for e in epochs if e.gga is not None and e.gga.quality not in (0, 6, 7, 8) and e.gga.lat != ""]
     if not fixes:
@@ -72,14 +73,22 @@ def load(path: Path) -> Log:
         raise RecordingError(f"{path}{at} no GGA sentence with a position is in it")
     simulated = sum(e.gga is not None and e.gga.quality in (6, 7, 8) for e in epochs)
     if simulated:
-        remarks.add(f"{simulated} GGA positions that the receiver only estimated, or was told, were left out")
+        remarks.add(
+            "gnss.not_measured",
+            f"{simulated} GGA positions that the receiver only estimated, or was told, were left out",
+        )
     t, zero = _times(epochs, fixes, remarks)
     separation = np.array([_number(e.gga.sep) for e in fixes])
     height = np.array([_number(e.gga.alt) for e in fixes])
     if np.isnan(separation).any():
-        remarks.add("GGA without the geoid's height: heights are above mean sea level there, not above the ellipsoid")
+        remarks.add(
+            "gnss.height_above_sea",
+            "GGA without the geoid's height: heights are above mean sea level there, not above the ellipsoid",
+        )
     else:
-        remarks.add("heights: above the ellipsoid, as GGA's altitude and geoid separation add up")
+        remarks.add(
+            "gnss.height_read_as", "heights: above the ellipsoid, as GGA's altitude and geoid separation add up"
+        )
     llh = np.stack(
         [
             np.radians([_number(e.gga.lat) for e in fixes]),
@@ -93,12 +102,17 @@ def load(path: Path) -> Log:
     order = np.argsort(t, kind="stable")
     order = order[np.concatenate([[True], np.diff(t[order]) > 0]) & np.isfinite(llh[order]).all(-1)]
     if len(order) < len(t):
-        remarks.add(f"{len(t) - len(order)} fixes without a height or with the time of another were left out")
+        remarks.add(
+            "gnss.rows_left_out",
+            f"{len(t) - len(order)} fixes without a height or with the time of another were left out",
+        )
     kinds = fix_types(np.array([e.gga.quality for e in fixes])[order], NMEA_TYPES)
     v, sd_v = (None if x is None else x[order] for x in (v, sd_v))
     satellites = np.array([_number(e.gga.numSV) for e in fixes])[order]
     gnss = Gnss(t[order], llh[order], sd[order], v, sd_v, type=kinds, satellites=satellites)
-    remarks.add("GNSS: position of the antenna; its lever arm is not in the log and taken as zero")
+    remarks.add(
+        "gnss.lever_arm_unknown", "GNSS: position of the antenna; its lever arm is not in the log and taken as zero"
+    )
     return Log(path.stem, gnss=gnss, gps_zero=zero, remarks=tuple(remarks))
 
 
@@ -179,13 +193,19 @@ def _times(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Remarks) -> tuple
     dated = next((e for e in epochs if e.date is not None), None)
     of_day = np.array([e.time + _DAY * days[id(e)] for e in fixes])
     if dated is None or dated.date is None:
-        remarks.add("clock: seconds of the UTC day; no RMC or ZDA sentence gives a date, so it is not GPS time")
+        remarks.add(
+            "log.clock_unknown",
+            "clock: seconds of the UTC day; no RMC or ZDA sentence gives a date, so it is not GPS time",
+        )
         return of_day, None
     midnight = np.datetime64(dated.date, "us") - np.timedelta64(days[id(dated)], "D")
     gps = utc_to_gps(midnight + (of_day * 1e6).round().astype("timedelta64[us]"))
     t, zero = of_week(gps)
     ahead = round(float(gps[0] - (midnight - np.datetime64("1980-01-06", "us")) / np.timedelta64(1, "s") - of_day[0]))
-    remarks.add(f"clock: UTC turned into GPS time ({ahead} leap seconds in {dated.date.year}), seconds of the GPS week")
+    remarks.add(
+        "log.clock",
+        f"clock: UTC turned into GPS time ({ahead} leap seconds in {dated.date.year}), seconds of the GPS week",
+    )
     return t, zero
 
 
@@ -196,7 +216,7 @@ def _sigmas(fixes: list[_Epoch], remarks: Remarks) -> Array:
             sd[k] = [_number(e.gst.stdLong), _number(e.gst.stdLat), _number(e.gst.stdAlt)]
     without = ~(sd > 0).all(-1)
     if not without.any():
-        remarks.add("position sigmas: from GST")
+        remarks.add("gnss.sigma_read_as", "position sigmas: from GST")
         return sd
     for k in np.flatnonzero(without).tolist():
         e = fixes[k].gga
@@ -204,8 +224,9 @@ def _sigmas(fixes: list[_Epoch], remarks: Remarks) -> Array:
         axis = _BY_QUALITY.get(e.quality, DEFAULT_SD[0]) * (hdop if hdop > 0 else 1.0)
         sd[k] = axis, axis, 2.0 * axis
     remarks.add(
+        "gnss.sigma_of_hdop",
         f"{without.sum()} of {len(fixes)} fixes have no GST: their sigmas are GGA's HDOP times 2.5 m (autonomous), 1 m "
-        "(differential), 0.4 m (float) or 0.02 m (fixed), twice that in height"
+        "(differential), 0.4 m (float) or 0.02 m (fixed), twice that in height",
     )
     return sd
 
@@ -216,7 +237,7 @@ def _velocities(fixes: list[_Epoch], remarks: Remarks) -> tuple[Array | None, Ar
     if np.isnan(speed).all():
         return None, None
     v, sd_v, sentence = horizontal_velocity(speed, course, DEFAULT_SD_V)
-    remarks.add(sentence)
+    remarks.add("gnss.velocity_of_course", sentence)
     return v, sd_v
 
 

@@ -25,8 +25,9 @@ def count_pulses(
         changes = step[step != 0.0]
         kind = "cumulative" if len(changes) and (changes > 0.0).mean() > 0.9 else "per_row"
         remarks.add(
+            "odometer.pulses_read_as",
             f"the odometer's pulses are taken as {'a running count' if kind == 'cumulative' else 'counts per row'}; "
-            f'if they are not, say pulses = "{"per_row" if kind == "cumulative" else "cumulative"}"'
+            f'if they are not, say pulses = "{"per_row" if kind == "cumulative" else "cumulative"}"',
         )
     if kind == "per_row":  # those of row k came between the rows k-1 and k
         return np.cumsum(pulses) - pulses[0]
@@ -53,5 +54,5 @@ def _unwrap(pulses: Array, step: Array, signed: bool | None, remarks: Remarks) -
     for mask, what in ((ran_over & ~anew, f"ran over ({modulus:.0f})"), (anew, "began anew")):
         if mask.any():
             times = "once" if mask.sum() == 1 else f"{mask.sum()} times"
-            remarks.add(f"the odometer's counter {what} {times}: mended")
+            remarks.add("odometer.counter_mended", f"the odometer's counter {what} {times}: mended")
     return whole

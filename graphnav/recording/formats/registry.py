@@ -12,6 +12,7 @@ from pathlib import Path
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import check_regular, exists
+from graphnav.core.notes import Note
 from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth, rows_of
 from graphnav.sensors import Series
 
@@ -107,7 +108,11 @@ def _without_nowhere(log: Log) -> Log:
     if gnss is None or not (nowhere := (gnss.llh[:, :2] == 0.0).all(axis=1)).any() or nowhere.all():
         return log
     many = "1 fix" if nowhere.sum() == 1 else f"{nowhere.sum()} fixes"
-    return replace(log, gnss=rows_of(gnss, ~nowhere), remarks=(*log.remarks, f"{many} at 0, 0 (no fix) left out"))
+    return replace(
+        log,
+        gnss=rows_of(gnss, ~nowhere),
+        remarks=(*log.remarks, Note("gnss.nowhere", f"{many} at 0, 0 (no fix) left out")),
+    )
 
 
 def _files(path: Path) -> tuple[Path, ...]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.recording import FIX_TYPES, fix_types
 from graphnav.recording.formats.table import Mask, Table
@@ -36,9 +39,9 @@ NMEA_TYPES = {0: 0, 1: 5, 2: 4, 3: 0, 4: 1, 5: 2, 9: 3}
 class Remarks(list[str]):
     """Sentences about what loading changed or assumed."""
 
-    def add(self, sentence: str) -> None:
-        """One more sentence."""
-        self.append(sentence)
+    def add(self, key: str, sentence: str) -> None:
+        """One more sentence, under the key that says what it is about."""
+        self.append(Note(key, sentence))
 
 
 def usable_rows(
@@ -77,7 +80,7 @@ def usable_rows(
         first = np.flatnonzero(blank)[0]
         at = f" (first at t = {rows['t'][first]:.3f} s)" if np.isfinite(rows["t"][first]) else ""
         what = "blank, NaN or infinite" if sensor == "odometer" else "blank or NaN"
-        remarks.add(f"{_rows(blank, label)} with {what} values dropped{at}")
+        remarks.add(f"{sensor}.rows_blank", f"{_rows(blank, label)} with {what} values dropped{at}")
         rows = rows.take(~blank)
 
     t = rows["t"]
@@ -86,8 +89,9 @@ def usable_rows(
         first = np.flatnonzero(step < 0)[0]
         _check_passes(rows, label)
         remarks.add(
+            f"{sensor}.rows_unordered",
             f"{label} rows out of order sorted by time ({(step < 0).sum()} steps back, "
-            f"the first after t = {t[first]:.3f} s)"
+            f"the first after t = {t[first]:.3f} s)",
         )
         rows = rows.take(np.argsort(t, kind="stable"))
         t = rows["t"]
@@ -99,12 +103,33 @@ def usable_rows(
         )
     if repeated.any():
         remarks.add(
-            f"{_rows(repeated, label)} with the time of the row before dropped (first at t = {t[repeated][0]:.3f} s)"
+            f"{sensor}.rows_repeated",
+            f"{_rows(repeated, label)} with the time of the row before dropped (first at t = {t[repeated][0]:.3f} s)",
         )
         rows = rows.take(~repeated)
     if sensor == "imu":
         _check_imu_time(rows, unit)
+    if sensor == "gnss" and not (new := new_fixes(rows.columns)).all():
+        rows = rows.take(new)
+        remarks.add(
+            "gnss.held", f"{(~new).sum()} GNSS rows that repeat the fix of the row before left out: {len(rows)} are new"
+        )
     return rows
+
+
+def new_fixes(columns: Mapping[str, Array]) -> NDArray[np.bool_]:
+    """(N,) which rows of fixes are new, of a log that holds the last fix in its rows until there is another.
+
+    That is one in which most fixes, between two that differ, fill two rows or more, the same in all but their time.
+    A receiver that stands and rounds repeats itself too, but not between two fixes under way.
+    """
+    others = [x for name, x in columns.items() if name != "t"]
+    same = np.ones(max(len(columns["t"]) - 1, 0), dtype=bool)
+    for x in others:
+        same &= (x[1:] == x[:-1]) | (np.isnan(x[1:]) & np.isnan(x[:-1]))
+    changes = np.flatnonzero(~same) + 1
+    held = len(changes) > 2 and float(np.median(np.diff(changes))) >= 2.0
+    return np.r_[True, ~same] if held else np.ones(len(columns["t"]), dtype=bool)
 
 
 def _check_passes(rows: Table, label: str) -> None:
@@ -165,7 +190,9 @@ def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tup
     nowhere = (rows["lat"] == 0) & (rows["lon"] == 0)
     if nowhere.any() and not nowhere.all():
         first = rows["t"][nowhere][0]
-        remarks.add(f"{_rows(nowhere, label)} at 0, 0 (no fix) dropped (first at t = {first:.3f} s)")
+        remarks.add(
+            f"{label.lower()}.nowhere", f"{_rows(nowhere, label)} at 0, 0 (no fix) dropped (first at t = {first:.3f} s)"
+        )
         rows = rows.take(~nowhere)
     lat, lon, h = rows["lat"], rows["lon"], rows["h"]
     scale = 1.0 if unit == "rad" else np.pi / 180.0
@@ -219,14 +246,18 @@ def sigmas(
     RecordingError
         If the file holds a sigma below zero, or only zeros and blanks.
     """
+    of = what.lower().replace(" ", "_")  # gnss_position
     there = [name for name in names if name in rows]
     fallback = np.array(stated or default)
     assumed = f"{what} sigmas of {default[0]:g}, {default[1]:g}, {default[2]:g} (east, north, up) are assumed"
     if len(there) < 3:
         if there:
-            remarks.add(f"{what} sigmas need {', '.join(names)}; only {', '.join(there)} is there, so it is not used")
+            remarks.add(
+                f"{of}.sigma_partly",
+                f"{what} sigmas need {', '.join(names)}; only {', '.join(there)} is there, so it is not used",
+            )
         if stated is None:
-            remarks.add(f"{assumed}: neither the file nor the description states any")
+            remarks.add(f"{of}.sigma_assumed", f"{assumed}: neither the file nor the description states any")
         return np.tile(fallback, (len(rows), 1))
     sd = rows.stack(*names)
     for k, name in enumerate(names):
@@ -238,12 +269,13 @@ def sigmas(
         if zero.any():
             sd[zero, k] = floor
             remarks.add(
+                f"{of}.sigma_zero",
                 f"{what} sigma {name} is 0 in {zero.sum()} of {len(rows)} rows: rounded away, {floor:g} is taken there "
-                "(half of the column's last digit, or its smallest above zero)"
+                "(half of the column's last digit, or its smallest above zero)",
             )
     blank = np.isnan(sd)
     if stated is None and (n := (blank.any(-1) & used).sum()):
-        remarks.add(f"{assumed} where the file's own are blank ({n} of {len(rows)} rows)")
+        remarks.add(f"{of}.sigma_blank", f"{assumed} where the file's own are blank ({n} of {len(rows)} rows)")
     return np.where(blank, fallback, sd)
 
 

@@ -74,7 +74,7 @@ def load(path: Path, wanted: Sequence[str] = ()) -> Log:
         if len(found) > 1:
             left = ", ".join(t.name for t in found[1:])
             why = "as was asked" if found[0].name in wanted else "having the most messages"
-            remarks.add(f"{found[0].name} is used, {why}; not {left}")
+            remarks.add("log.topic", f"{found[0].name} is used, {why}; not {left}")
     imu = _imu(chosen["imu"], remarks) if "imu" in chosen else None
     gnss = _gnss(chosen["fix"], remarks) if "fix" in chosen else None
     odometer = None
@@ -82,7 +82,9 @@ def load(path: Path, wanted: Sequence[str] = ()) -> Log:
         gnss, odometer = _twist(chosen["twist"], gnss, remarks)
     first = float(next(s.t[0] for s in (imu, gnss, odometer) if s is not None))
     zero = float(unix_to_gps(np.array([first]))[0] - first) if first > _UNIX else None
-    remarks.add("clock: the stamps in the headers" + (", Unix time" if zero is not None else ", of no known epoch"))
+    remarks.add(
+        "log.clock", "clock: the stamps in the headers" + (", Unix time" if zero is not None else ", of no known epoch")
+    )
     name = path.stem if path.is_file() else path.resolve().name
     return Log(
         name, imu, gnss, odometer, gps_zero=zero,
@@ -142,11 +144,11 @@ def _imu(topic: _Topic, remarks: Remarks) -> Imu | None:
     t, rows = _table(topic)
     good = np.isfinite(rows[:, :6]).all(-1)
     if good.sum() < 2:
-        remarks.add(f"{topic.name}: fewer than two usable messages, so it is not used")
+        remarks.add("imu.topic_not_used", f"{topic.name}: fewer than two usable messages, so it is not used")
         return None
     t, rows = t[good], rows[good]
     R_bs = rotation_from_letters("FLU")
-    remarks.add(f"IMU: {topic.name}, rad/s and m/s2 with gravity, taken as forward-left-up (REP 103)")
+    remarks.add("imu.read_as", f"IMU: {topic.name}, rad/s and m/s2 with gravity, taken as forward-left-up (REP 103)")
     white = np.median(rows[:, 6:], axis=0)
     noise, assumed = ImuNoise(), True
     if (white > 0).all():
@@ -154,7 +156,10 @@ def _imu(topic: _Topic, remarks: Remarks) -> Imu | None:
         density = np.sqrt(white * period)
         noise = ImuNoise(gyro_noise_density=float(density[0]), accel_noise_density=float(density[1]))
         assumed = False
-        remarks.add("noise densities: from the messages' covariances and the period; biases as of a consumer IMU")
+        remarks.add(
+            "imu.noise_read_as",
+            "noise densities: from the messages' covariances and the period; biases as of a consumer IMU",
+        )
     return Imu(t, rows[:, :3] @ R_bs.T, rows[:, 3:6] @ R_bs.T, noise, R_bs, assumed)
 
 
@@ -162,16 +167,21 @@ def _gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
     t, rows = _table(topic)
     good = np.isfinite(rows[:, :3]).all(-1) & (rows[:, 6] >= 0) & (rows[:, :2] != 0).any(-1)
     if not good.any():
-        remarks.add(f"{topic.name}: no message has a fix, so it is not used")
+        remarks.add("gnss.topic_not_used", f"{topic.name}: no message has a fix, so it is not used")
         return None
     if not good.all():
-        remarks.add(f"{topic.name}: {np.sum(~good)} messages without a fix left out")
+        remarks.add("gnss.rows_left_out", f"{topic.name}: {np.sum(~good)} messages without a fix left out")
     t, rows = t[good], rows[good]
     known = (rows[:, 3:6] > 0).all(-1)
     sd = np.where(known[:, None], np.sqrt(np.abs(np.nan_to_num(rows[:, 3:6]))), DEFAULT_SD)
     if not known.all():
-        remarks.add(f"{topic.name}: {np.sum(~known)} fixes without a covariance get sigmas of 3.3, 3.3, 6.6 m")
-    remarks.add(f"GNSS: {topic.name}; heights above the ellipsoid; the antenna's lever arm is taken as zero")
+        remarks.add(
+            "gnss.sigma_assumed",
+            f"{topic.name}: {np.sum(~known)} fixes without a covariance get sigmas of 3.3, 3.3, 6.6 m",
+        )
+    remarks.add(
+        "gnss.read_as", f"GNSS: {topic.name}; heights above the ellipsoid; the antenna's lever arm is taken as zero"
+    )
     # many drivers write 0 whatever the fix is: where no other status is to be seen, it says nothing
     kinds = fix_types(rows[:, 6], _STATUS) if rows[:, 6].any() else None
     return Gnss(t, np.column_stack([np.radians(rows[:, :2]), rows[:, 2]]), sd, type=kinds)
@@ -185,10 +195,16 @@ def _twist(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> tuple[Gnss | N
     moving = np.hypot(rows[:, 0], rows[:, 1]) > 1.0
     across = np.median(np.abs(rows[moving, 1]) / np.hypot(rows[moving, 0], rows[moving, 1])) if moving.any() else 0.0
     if topic.kind == _TWISTS[2] or across <= _SIDEWAYS:
-        remarks.add(f"odometer: {topic.name}, linear.x as forward speed in m/s; its lever arm is taken as zero")
+        remarks.add(
+            "odometer.read_as",
+            f"odometer: {topic.name}, linear.x as forward speed in m/s; its lever arm is taken as zero",
+        )
         return gnss, Odometer(t, rows[:, 0])
     if gnss is None:
-        remarks.add(f"{topic.name} looks like a velocity over ground, but there are no fixes: not used")
+        remarks.add(
+            "gnss.velocity_not_used",
+            f"{topic.name} looks like a velocity over ground, but there are no fixes: not used",
+        )
         return None, None
     k = np.clip(np.searchsorted(t, gnss.t), 1, len(t) - 1)
     near = np.where(np.abs(t[k] - gnss.t) < np.abs(t[k - 1] - gnss.t), k, k - 1)
@@ -196,8 +212,9 @@ def _twist(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> tuple[Gnss | N
     v = np.where(same[:, None], rows[near], np.nan)
     sd_v = np.where(same[:, None], DEFAULT_SD_V, np.nan)
     remarks.add(
+        "gnss.velocity_read_as",
         f"velocity: {topic.name}, taken as east-north-up because it points sideways as well; at {np.sum(same)} of "
-        f"{len(gnss.t)} fixes, sigmas of 0.2, 0.2, 0.4 m/s"
+        f"{len(gnss.t)} fixes, sigmas of 0.2, 0.2, 0.4 m/s",
     )
     return replace(gnss, v=v, sd_v=sd_v), None
 

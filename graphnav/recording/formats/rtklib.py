@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import key_of
 from graphnav.core.timescales import WEEK, of_week, unix_to_gps
 from graphnav.recording import Gnss, fix_types
 from graphnav.recording.formats.registry import Log, first_bytes, log_format
@@ -45,24 +46,30 @@ def load(path: Path) -> Log:
     titles = next(line for line in lines if line.startswith("%") and "latitude" in line and "=" not in line)
     scale = titles.strip("% ").split()[0].split(",")[0]
     if scale in ("UTC", "JST"):
-        remarks[:] = [r for r in remarks if "not GPS time" not in r]
+        remarks[:] = [r for r in remarks if key_of(r) != "trajectory.time_scale"]
         utc = t + zero + 315964800.0 - (_JST if scale == "JST" else 0.0)
         t, zero = of_week(unix_to_gps(utc))
-        remarks.add(f"{path.name}: times were in {scale}; the leap seconds of their date make them GPS time")
+        remarks.add(
+            "log.clock_leap", f"{path.name}: times were in {scale}; the leap seconds of their date make them GPS time"
+        )
     sd = track.sd_p
     if sd is None:
         raise RecordingError(f"{path}: no sigma columns (sdn, sde, sdu); write it again with out-outsolstd or as llh")
     good = np.flatnonzero((sd > 0).all(-1))
     if len(good) < len(t):
-        remarks.add(f"{len(t) - len(good)} fixes without a sigma above zero left out")
+        remarks.add("gnss.rows_left_out", f"{len(t) - len(good)} fixes without a sigma above zero left out")
         track, t, sd = track.take(good), t[good], sd[good]
     v, sd_v = track.v, track.sd_v
     if v is not None and sd_v is None:
         sd_v = np.tile(_SD_V, (len(t), 1))
-        remarks.add("velocity sigmas of 0.2, 0.2, 0.4 m/s are assumed: the file states none")
+        remarks.add(
+            "gnss.velocity_sigma_assumed", "velocity sigmas of 0.2, 0.2, 0.4 m/s are assumed: the file states none"
+        )
     kinds = None if track.fix_type is None else fix_types(track.fix_type)
-    remarks.add("GNSS: position of the antenna; its lever arm is not in the file and taken as zero")
-    remarks.add("clock: seconds of the GPS week of the first row")
+    remarks.add(
+        "gnss.lever_arm_unknown", "GNSS: position of the antenna; its lever arm is not in the file and taken as zero"
+    )
+    remarks.add("log.clock", "clock: seconds of the GPS week of the first row")
     gnss = Gnss(t, track.llh, sd, v, sd_v, type=kinds, satellites=track.satellites)
     return Log(path.stem, gnss=gnss, gps_zero=zero, remarks=tuple(remarks))
 

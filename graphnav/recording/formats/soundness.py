@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import Note
 from graphnav.recording import Gnss, rows_of
 from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.repair import LATEST, VAGUEST, VAGUEST_V, on_earth
@@ -31,7 +32,9 @@ def sound(log: Log, path: Path) -> Log:
             return True
         if good.sum() < (2 if what == "IMU" else 1):
             raise RecordingError(f"{path}: {what}: all {len(good)} rows {why}")
-        remarks.append(f"{what}: {np.sum(~good)} of {len(good)} rows {why}: left out")
+        remarks.append(
+            Note(f"{what.lower()}.rows_left_out", f"{what}: {np.sum(~good)} of {len(good)} rows {why}: left out")
+        )
         return False
 
     if imu is not None:

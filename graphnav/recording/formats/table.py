@@ -192,7 +192,7 @@ def _header(path: Path) -> tuple[int, list[str]]:
             mark = "a semicolon" if ";" in line else "a tab"
             raise RecordingError(
                 f"{path}, line {number}: fields are separated by {mark}; they must be by commas, numbers written with "
-                "points"
+                "points (graphnav init makes such a file of it)"
             )
         if all(_is_number(name) for name in names):
             raise RecordingError(f"{path}, line {number}: the first line must name the columns, and it holds numbers")

@@ -58,7 +58,7 @@ def load(path: Path) -> Log:
     content = _messages(path)
     remarks = Remarks()
     if content.broken:
-        remarks.add(f"{content.broken} broken frames were skipped")
+        remarks.add("log.broken_frames", f"{content.broken} broken frames were skipped")
     fixes = [m for m in content.pvt if m.gnssFixOk and m.fixType in (3, 4)]
     if not fixes and not content.samples:
         what = f"{len(content.pvt)} NAV-PVT messages without a fix" if content.pvt else "no NAV-PVT and no ESF messages"
@@ -66,11 +66,11 @@ def load(path: Path) -> Log:
     dated = [start for start in map(_week_start, fixes) if start is not None]
     zero = dated[0] if dated else None
     if fixes and zero is None:
-        remarks.add("clock: no NAV-PVT has a date, so the GPS week is not known")
+        remarks.add("log.clock_unknown", "clock: no NAV-PVT has a date, so the GPS week is not known")
     gnss = _gnss(fixes, content, remarks) if fixes else None
     imu, odometer = _sensors(path, content, remarks)
     if zero is not None:
-        remarks.add("clock: seconds of the GPS week (iTOW)")
+        remarks.add("log.clock", "clock: seconds of the GPS week (iTOW)")
     return Log(
         path.stem, imu, gnss, odometer, gps_zero=zero, remarks=tuple(remarks),
         mount_known=False,
@@ -166,12 +166,23 @@ def _gnss(fixes: list[Any], content: _Content, remarks: Remarks) -> Gnss:
     v = np.array([[m.velE, m.velN, -m.velD] for m in fixes]) * 1e-3
     order = np.argsort(t, kind="stable")
     order = order[np.concatenate([[True], np.diff(t[order]) > 0])]
-    remarks.add("GNSS: NAV-PVT, heights above the ellipsoid; sigmas hAcc/sqrt(2) east and north, vAcc up, sAcc/sqrt(3)")
+    remarks.add(
+        "gnss.read_as",
+        "GNSS: NAV-PVT, heights above the ellipsoid; sigmas hAcc/sqrt(2) east and north, vAcc up, sAcc/sqrt(3)",
+    )
     if any(p is not m for p, m in zip(best, fixes, strict=True)):
-        remarks.add("GNSS: positions are NAV-HPPOSLLH's, in tenths of a millimetre, where the log has them")
+        remarks.add(
+            "gnss.position_read_as",
+            "GNSS: positions are NAV-HPPOSLLH's, in tenths of a millimetre, where the log has them",
+        )
     if any(m.fixType == 4 for m in fixes):
-        remarks.add("some fixes are of GNSS and dead reckoning combined: they already have the receiver's IMU in them")
-    remarks.add("GNSS: position of the antenna; its lever arm is not in the log and taken as zero")
+        remarks.add(
+            "gnss.dead_reckoning",
+            "some fixes are of GNSS and dead reckoning combined: they already have the receiver's IMU in them",
+        )
+    remarks.add(
+        "gnss.lever_arm_unknown", "GNSS: position of the antenna; its lever arm is not in the log and taken as zero"
+    )
     kinds = np.array([_type(m) for m in fixes])[order]
     used = np.array([float(m.numSV) for m in fixes])[order]
     return Gnss(t[order], llh[order], sd[order], v[order], sd_v[order], type=fix_types(kinds), satellites=used)
@@ -204,14 +215,20 @@ def _sensors(path: Path, content: _Content, remarks: Remarks) -> tuple[Imu | Non
         columns = [np.interp(base, *_once(series[k])) for k in (*_GYRO, *_ACCEL)]
         table = np.column_stack(columns)
         imu = Imu(times(base), table[:, :3], table[:, 3:], noise_assumed=True)
-        remarks.add("IMU: ESF rates and forces in the receiver's own axes, taken as RFU; no noise figures in the log")
+        remarks.add(
+            "imu.read_as",
+            "IMU: ESF rates and forces in the receiver's own axes, taken as RFU; no noise figures in the log",
+        )
     elif there:
-        remarks.add(f"IMU: only {len(there)} of its six axes are in the log ({path.name}), so it is not used")
+        remarks.add(
+            "imu.axes_missing",
+            f"IMU: only {len(there)} of its six axes are in the log ({path.name}), so it is not used",
+        )
     odometer = None
     if _SPEED in series:
         tags, speed = _once(series[_SPEED])
         odometer = Odometer(times(tags), speed)
-        remarks.add("odometer: ESF speed; its lever arm is not in the log and taken as zero")
+        remarks.add("odometer.read_as", "odometer: ESF speed; its lever arm is not in the log and taken as zero")
     return imu, odometer
 
 
@@ -224,7 +241,7 @@ def _once(series: Array) -> tuple[Array, Array]:
 def _clock(content: _Content, remarks: Remarks) -> tuple[float, float]:
     """Seconds per time tag, and GPS seconds of the week at tag 0, by which tags came last before which fix."""
     if len(content.last_tag) < 2:
-        remarks.add("clock of the sensors: their own time tags, taken as ms")
+        remarks.add("log.sensor_clock_unknown", "clock of the sensors: their own time tags, taken as ms")
         return _TICKS[0], 0.0
     number, tags = np.array(content.last_tag, dtype=float).T
     tags = tags + _WRAP * np.cumsum(np.concatenate([[0.0], np.diff(tags) < -0.5 * _WRAP]))
@@ -234,8 +251,9 @@ def _clock(content: _Content, remarks: Remarks) -> tuple[float, float]:
     if abs(slope / tick - 1.0) > 0.01:
         tick = float(slope)
     remarks.add(
+        "log.sensor_clock",
         f"clock of the sensors: time tags of {tick * 1e3:g} ms, set so that the newest tag before each NAV-PVT has its "
-        "time; the receiver's delay, some 50 to 150 ms, is in the stamps: graphnav init finds it (time_offset)"
+        "time; the receiver's delay, some 50 to 150 ms, is in the stamps: graphnav init finds it (time_offset)",
     )
     return tick, float(np.median(t - tick * tags))
 

@@ -142,12 +142,15 @@ def _ends(panel: Panel, en: Array, scale: float) -> None:
 
 
 def _scale_bar(figure: Figure, panel: Panel) -> None:
-    """A bar of a round number of metres, about a fifth of the width, at the lower edge of a map."""
-    west, east = panel.xlim
-    reach = east - west
+    """A bar of a round number of metres at the lower edge of a map: about a fifth of its width, a tenth of its height.
+
+    Both axes have the same scale, so a track that is high and narrow stands in a map much wider than itself.
+    """
+    (west, east), (south, north) = panel.xlim, panel.ylim
+    reach = max(east - west, 0.5 * (north - south))
     metres = 10.0 ** math.floor(math.log10(reach / 5))
     metres *= max(m for m in (1, 2, 5) if m * metres <= reach / 4)
-    x = east - 0.01 * reach
+    x = east - 0.01 * (east - west)
     figure.shapes.append({
         "type": "line", "xref": "x", "yref": "paper", "x0": x - metres, "x1": x, "y0": 0.02, "y1": 0.02,
         "line": {"color": colour("truth"), "width": 3.5},

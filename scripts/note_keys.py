@@ -1,0 +1,67 @@
+"""The page docs/keys.md: the keys of all notes and findings, read off the code.
+
+python scripts/note_keys.py > docs/keys.md
+"""
+
+from __future__ import annotations
+
+import ast
+from collections import defaultdict
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAD = """\
+# Keys of notes and findings
+
+What a run says of a recording and of itself is in `messages` of `summary.json` and `findings` of `graphnav info
+--json`: a `key` that stays the same, a `severity` and a `sentence`. `*` stands for the name of a sensor or of what a
+row is about. `python scripts/note_keys.py` makes this list from the code.
+
+| what | keys |
+| --- | --- |
+"""
+
+
+def _text(node: ast.expr) -> str | None:
+    """A string of the code, with * for what is filled in; None of anything else."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    if isinstance(node, ast.JoinedStr):
+        return "".join(str(v.value) if isinstance(v, ast.Constant) else "*" for v in node.values)
+    return None
+
+
+def _key(call: ast.Call) -> str | None:
+    """The key that a call gives to a note or a finding."""
+    name = call.func.id if isinstance(call.func, ast.Name) else getattr(call.func, "attr", "")
+    if name == "Note" or (name == "add" and ast.unparse(call.func).endswith("remarks.add")):
+        return _text(call.args[0])
+    if name == "Finding" and len(call.args) > 2:
+        return _text(call.args[2])
+    if name == "Finding" and (named := [k.value for k in call.keywords if k.arg == "key"]):
+        return _text(named[0])
+    return None
+
+
+def list_keys() -> list[str]:
+    """All keys, sorted."""
+    calls = (
+        node
+        for path in sorted((ROOT / "graphnav").rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+    )
+    return sorted({key for call in calls if (key := _key(call))})
+
+
+def page() -> str:
+    """docs/keys.md."""
+    groups = defaultdict(list)
+    for key in list_keys():
+        first, _, rest = key.partition(".")
+        groups[first].append(f"`{rest}`")
+    return HEAD + "".join(f"| `{name}.` | {', '.join(some)} |\n" for name, some in groups.items())
+
+
+if __name__ == "__main__":
+    print(page(), end="")
