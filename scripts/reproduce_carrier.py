@@ -5,7 +5,8 @@
 
 `increments` solves the displacement of each epoch from the carriers' changes alone and compares it with the truth's.
 `canyon` takes satellites away by a mask: in ten spans of 60 s the 4, 3, 2, 1, 0 highest are left, and the table has the
-horizontal errors in the spans, of filter, smoother and batch, with changes of carriers and without.
+horizontal errors in the spans, of filter, smoother and batch, with changes of carriers and without. Each span is solved
+with what is a minute before and half a minute behind it.
 
 The recording has no IMU. Its samples are SIMULATED: a spline through the reference positions is the motion, level but
 for the slope, heading along the way; errors are those of a low-cost MEMS (the figures of data/tokyo_raw). Carriers,
@@ -42,6 +43,7 @@ ZERO = 2114 * 604800.0 + 5784.0  # s since the GPS epoch of the reference's firs
 RATE = 100.0  # Hz of the simulated IMU
 MEMS = ImuNoise(1.5e-4, 4e-3, 5e-6, 2e-4, 2e-3, 0.1)
 SPAN, SPANS, FIRST, APART = 60.0, 10, 150.0, 210.0  # s: of a canyon, how many, where the first begins, and the others
+BEFORE, AFTER = 60.0, 30.0  # s, of the drive around a canyon that is solved with it
 SOLVERS = ("ekf", "rts", "batch")
 MOVING = 1.0  # m/s, from which on a heading is that of the way
 
@@ -135,12 +137,6 @@ def recording_of(data: Path) -> Recording:
     )
 
 
-def canyons(recording: Recording, end: float) -> list[tuple[float, float]]:
-    """Spans of 60 s, in seconds from the start."""
-    begins = [FIRST + APART * k for k in range(SPANS)]
-    return [(b, b + SPAN) for b in begins if b + SPAN < min(end, recording.duration)]
-
-
 def masked(recording: Recording, spans: list[tuple[float, float]], left: int) -> Recording:
     """With the highest `left` satellites of each span's middle, and no fixes in it."""
     raw, gnss = recording.raw_gnss, recording.gnss
@@ -176,44 +172,47 @@ def errors(solution: Solution, recording: Recording, spans: list[tuple[float, fl
     return np.concatenate(whole), np.concatenate(drift)
 
 
-def canyon(data: Path, end: float, counts: list[int], solvers: tuple[str, ...]) -> None:
-    whole = recording_of(data).crop(0.0, end)
-    spans = canyons(whole, end)
-    print(
-        f"{len(spans)} spans of {SPAN:.0f} s, IMU simulated; horizontal errors in the spans, m; drift: since they began"
-    )
+def canyon(data: Path, spans: list[int], counts: list[int], solvers: tuple[str, ...]) -> None:
+    whole = recording_of(data)
+    print(f"spans of {SPAN:.0f} s, IMU simulated; horizontal errors in the spans, m; drift: since they began")
     print(
         f"{'satellites':>10} {'carriers':>8} {'solver':6} {'H50':>6} {'H95':>6} {'max':>6} {'rms':>6} {'drift50':>7} "
-        f"{'drift95':>7} {'rms':>6}"
+        f"{'drift95':>7} {'rms':>6} {'spans':>5}"
     )
-    for left in counts:
-        recording = masked(whole, spans, left)
+    found: dict[tuple[int, bool, str], list[tuple[Array, Array]]] = {}
+    for k in spans:
+        begin = FIRST + APART * k
+        window = whole.crop(begin - BEFORE, begin + SPAN + AFTER)
+        span = [(BEFORE, BEFORE + SPAN)]
         for differences in (True, False):
             settings = settings_from({"raw_gnss": {"coupling": "tight", "differences": differences}})
-            began = time.process_time()
-            solutions = run(recording, settings, solvers)
-            seconds = time.process_time() - began
-            for solver, one in solutions.items():
-                h, d = errors(one, whole, spans)
-                cells = " ".join(f"{x:6.2f}" for x in (*np.percentile(h, [50, 95, 100]), np.sqrt(np.mean(h**2))))
-                cells += " " + " ".join(f"{x:7.2f}" for x in np.percentile(d, [50, 95]))
-                cells += f" {np.sqrt(np.mean(d**2)):6.2f}"
-                print(f"{left:10} {'yes' if differences else 'no':>8} {solver:6} {cells}", flush=True)
-            print(f"{'':26} {seconds:.0f} s of processor time", flush=True)
+            # a drive is long beside its canyons: how good the sensors are is known from without
+            noise = run(window, settings, ("ekf",))["ekf"].noise
+            for left in counts:
+                solutions = run(masked(window, span, left), settings, solvers, noise=noise)
+                for solver, one in solutions.items():
+                    found.setdefault((left, differences, solver), []).append(errors(one, window, span))
+        print(f"{k + 1} of {len(spans)} spans, {time.process_time():.0f} s of processor time", flush=True)
+    for (left, differences, solver), parts in sorted(found.items(), key=lambda one: (-one[0][0], not one[0][1])):
+        h, d = (np.concatenate(some) for some in zip(*parts, strict=True))
+        cells = " ".join(f"{x:6.2f}" for x in (*np.percentile(h, [50, 95, 100]), np.sqrt(np.mean(h**2))))
+        cells += " " + " ".join(f"{x:7.2f}" for x in np.percentile(d, [50, 95]))
+        cells += f" {np.sqrt(np.mean(d**2)):6.2f} {len(parts):5}"
+        print(f"{left:10} {'yes' if differences else 'no':>8} {solver:6} {cells}", flush=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("increments", "canyon"))
     parser.add_argument("data", type=Path)
-    parser.add_argument("--end", type=float, default=np.inf)
+    parser.add_argument("--span", type=int, action="append", help="of ten, counted from 0; repeatable, all without")
     parser.add_argument("--satellites", type=int, nargs="+", default=[4, 3, 2, 1, 0])
     parser.add_argument("--solver", action="append", default=[], help="repeatable; all three without")
     given = parser.parse_args()
     if given.what == "increments":
         increments(given.data)
     else:
-        canyon(given.data, given.end, given.satellites, tuple(given.solver) or SOLVERS)
+        canyon(given.data, given.span or list(range(SPANS)), given.satellites, tuple(given.solver) or SOLVERS)
 
 
 if __name__ == "__main__":

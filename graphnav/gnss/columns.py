@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.gnss.series import Observations, once
 from graphnav.gnss.signals import GPS, L1, QZSS, C, signal_id
@@ -43,6 +44,11 @@ def observations(columns: Mapping[str, Array], zero: float, name: str) -> Observ
     if not whole.all():
         obs = replace(
             obs.take(whole),
-            remarks=(f"{name}: {int((~whole).sum())} rows without time, prn (1 to 99) or code left out",),
+            remarks=(
+                Note(
+                    "raw.rows_left_out",
+                    f"{name}: {int((~whole).sum())} rows without time, prn (1 to 99) or code left out",
+                ),
+            ),
         )
     return once(obs)

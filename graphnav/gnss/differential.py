@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.series import RawGnss, median_of_epochs
@@ -67,7 +68,8 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     missing = np.isnan(difference) & np.isfinite(rover.code) & np.isfinite(rover.p[:, 0])
     said: tuple[str, ...] = ()
     if missing.any():
-        said = (f"{int(missing.sum())} of {len(rover)} codes have no counterpart at the base and are not used",)
+        sentence = f"{int(missing.sum())} of {len(rover)} codes have no counterpart at the base and are not used"
+        said = (Note("raw.without_base", sentence),)
     away = float(np.linalg.norm(np.median(rover.antenna, axis=0) - position))
     return replace(
         rover, difference=difference, carrier_difference=carrier_difference, base_arc=base_arc, baseline=away

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.gnss.ephemeris import Ephemerides, Placed, rotate_earth
 from graphnav.gnss.precise import Orbits
@@ -69,18 +70,19 @@ def place(
     mute = sorted({int(x) for x in np.unique(obs.satellite[np.isnan(frequency)])} - lost)
     if mute:
         names = ", ".join(satellite_name(x) for x in mute)
-        remarks.append(
-            f"no frequency channel for {names}: their observations are not used; a GLONASS nav file tells it"
-        )
+        sentence = f"no frequency channel for {names}: their observations are not used; a GLONASS nav file tells it"
+        remarks.append(Note("raw.no_channel", sentence))
     if without:
         names = ", ".join(satellite_name(s) for s in without)
-        remarks.append(f"no ephemeris for {names}: their observations are not used")
+        remarks.append(Note("raw.no_ephemeris", f"no ephemeris for {names}: their observations are not used"))
     if ill:
-        remarks.append(f"unhealthy by their own word and not used: {', '.join(satellite_name(s) for s in ill)}")
+        names = ", ".join(satellite_name(s) for s in ill)
+        remarks.append(Note("raw.unhealthy", f"unhealthy by their own word and not used: {names}"))
     partly = sorted(lost - set(lost_all))
     if partly:
         names = ", ".join(satellite_name(s) for s in partly)
-        remarks.append(f"no ephemeris near enough in time for a part of the observations of {names}")
+        sentence = f"no ephemeris near enough in time for a part of the observations of {names}"
+        remarks.append(Note("raw.no_ephemeris_then", sentence))
     raw = RawGnss(
         t=obs.t, satellite=obs.satellite, signal=obs.signal, code=obs.code, carrier=obs.carrier,
         range_rate=-obs.doppler * C / frequency, cn0=obs.cn0, slip=obs.slip, half=obs.half, frequency=frequency,

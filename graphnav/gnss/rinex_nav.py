@@ -13,6 +13,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
+from graphnav.core.notes import Note
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.ephemeris import Ephemerides, Glonass, Kepler
 from graphnav.gnss.files import calendar_days, read_bytes
@@ -50,13 +51,13 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
         found.broken, found.skipped = [], {}
         _read(path, found)
         if found.broken:
-            remarks.append(
-                f"{path.name}: {len(found.broken)} records cannot be read and are left out (the first at line "
-                f"{found.broken[0]})"
+            sentence = (
+                f"{len(found.broken)} records cannot be read and are left out (the first at line {found.broken[0]})"
             )
+            remarks.append(Note("raw.broken_records", f"{path.name}: {sentence}"))
         if found.skipped:
             names = ", ".join(f"{n} {name}" for name, n in sorted(found.skipped.items()))
-            remarks.append(f"{path.name}: messages that are not used: {names}")
+            remarks.append(Note("raw.unused_messages", f"{path.name}: messages that are not used: {names}"))
     if not found.kepler and not found.glonass:
         raise RecordingError(f"{', '.join(str(p) for p in paths)}: no ephemeris in it")
     coefficients = None
