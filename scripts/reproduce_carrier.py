@@ -1,10 +1,12 @@
 """What carriers of single satellites tell from epoch to epoch, on ucr_riverside_20200712 with a simulated IMU.
 
     python scripts/reproduce_carrier.py increments ../shared/data/ucr_riverside_20200712
-    python scripts/reproduce_carrier.py canyon ../shared/data/ucr_riverside_20200712 -o build/carrier
+    python scripts/reproduce_carrier.py windows ../shared/data/ucr_riverside_20200712 --window 0 300
+    python scripts/reproduce_carrier.py canyon ../shared/data/ucr_riverside_20200712
 
 `increments` solves the displacement of each epoch from the carriers' changes alone and compares it with the truth's.
-`canyon` takes satellites away by a mask: in ten spans of 60 s the 4, 3, 2, 1, 0 highest are left, and the table has the
+`windows` has the errors of parts of a drive without a base, with changes of carriers and without; of
+cssrlib_2021_265 as well, with the simulated IMU of scripts/reproduce_rtk.py. `canyon` takes satellites away by a mask: in ten spans of 60 s the 4, 3, 2, 1, 0 highest are left, and the table has the
 horizontal errors in the spans, of filter, smoother and batch, with changes of carriers and without. Each span is solved
 with what is a minute before and half a minute behind it.
 
@@ -17,11 +19,13 @@ from __future__ import annotations
 
 import argparse
 import gzip
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import reproduce_rtk
 from pyins import sim
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
@@ -201,16 +205,56 @@ def canyon(data: Path, spans: list[int], counts: list[int], solvers: tuple[str, 
         print(f"{left:10} {'yes' if differences else 'no':>8} {solver:6} {cells}", flush=True)
 
 
+def windows(data: Path, spans: list[list[float]], solvers: tuple[str, ...]) -> None:
+    if data.name.startswith("ucr"):
+        whole = recording_of(data)
+    else:
+        folder = Path(tempfile.mkdtemp())
+        whole, t, places = reproduce_rtk.recording_of(data.resolve(), folder, with_base=False)
+        whole = replace(whole, truth=Truth(t, earth.ecef_to_llh(places)))
+    print(
+        f"{'window, s':>11} {'carriers':>8} {'solver':6} {'H rms':>6} {'shape':>6} {'U rms':>6} {'NEES H':>6} {'s':>4}"
+    )
+    for begin, end in spans:
+        recording = whole.crop(begin, min(end, whole.duration))
+        truth = recording.truth
+        assert truth is not None
+        assert truth.llh is not None
+        for differences in (False, True):
+            settings = settings_from({"raw_gnss": {"coupling": "tight", "differences": differences}})
+            began = time.process_time()
+            solutions = run(recording, settings, solvers)
+            seconds = time.process_time() - began
+            for solver, one in solutions.items():
+                inside = (truth.t >= one.t[0]) & (truth.t <= one.t[-1])
+                at = truth.t[inside]
+                p = np.stack([np.interp(at, one.t, one.states.p[:, i]) for i in range(3)], -1)
+                e = p - one.frame.from_llh(truth.llh[inside])
+                k = np.argmin(np.abs(one.t[None] - at[:, None]), axis=1)
+                P = one.covariance[k][:, 3:5, 3:5]
+                nees = np.mean(np.einsum("ni,nij,nj->n", e[:, :2], np.linalg.inv(P), e[:, :2])) / 2.0
+                shape = np.hypot(*(e - e.mean(axis=0))[:, :2].T)
+                sizes = (np.sqrt(np.mean(x**2)) for x in (np.hypot(e[:, 0], e[:, 1]), shape, e[:, 2]))
+                cells = " ".join(f"{x:6.2f}" for x in (*sizes, nees))
+                print(
+                    f"{begin:5.0f}-{end:5.0f} {'yes' if differences else 'no':>8} {solver:6} {cells} {seconds:4.0f}",
+                    flush=True,
+                )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("increments", "canyon"))
+    parser.add_argument("what", choices=("increments", "windows", "canyon"))
     parser.add_argument("data", type=Path)
     parser.add_argument("--span", type=int, action="append", help="of ten, counted from 0; repeatable, all without")
     parser.add_argument("--satellites", type=int, nargs="+", default=[4, 3, 2, 1, 0])
     parser.add_argument("--solver", action="append", default=[], help="repeatable; all three without")
+    parser.add_argument("--window", type=float, nargs=2, action="append", help="s from the start; repeatable")
     given = parser.parse_args()
     if given.what == "increments":
         increments(given.data)
+    elif given.what == "windows":
+        windows(given.data, given.window or [[0.0, np.inf]], tuple(given.solver) or SOLVERS)
     else:
         canyon(given.data, given.span or list(range(SPANS)), given.satellites, tuple(given.solver) or SOLVERS)
 
