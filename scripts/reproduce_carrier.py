@@ -6,9 +6,10 @@
 
 `increments` solves the displacement of each epoch from the carriers' changes alone and compares it with the truth's.
 `windows` has the errors of parts of a drive without a base, with changes of carriers and without; of
-cssrlib_2021_265 as well, with the simulated IMU of scripts/reproduce_rtk.py. `canyon` takes satellites away by a mask: in ten spans of 60 s the 4, 3, 2, 1, 0 highest are left, and the table has the
-horizontal errors in the spans, of filter, smoother and batch, with changes of carriers and without. Each span is solved
-with what is a minute before and half a minute behind it.
+cssrlib_2021_265 as well, with the simulated IMU of scripts/reproduce_rtk.py. `canyon` takes satellites away by a mask:
+in ten spans of 60 s the 4, 3, 2, 1, 0 highest are left, and the table has the horizontal errors in the spans, of
+filter, smoother and batch, with changes of carriers and without. Each span is solved with what is a minute before and
+half a minute behind it.
 
 The recording has no IMU. Its samples are SIMULATED: a spline through the reference positions is the motion, level but
 for the slope, heading along the way; errors are those of a low-cost MEMS (the figures of data/tokyo_raw). Carriers,
