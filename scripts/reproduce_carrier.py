@@ -196,8 +196,12 @@ def canyon(data: Path, spans: list[int], counts: list[int], solvers: tuple[str, 
             for left in counts:
                 solutions = run(masked(window, span, left), settings, solvers, noise=noise)
                 for solver, one in solutions.items():
-                    found.setdefault((left, differences, solver), []).append(errors(one, window, span))
-        print(f"{k + 1} of {len(spans)} spans, {time.process_time():.0f} s of processor time", flush=True)
+                    h, d = errors(one, window, span)
+                    found.setdefault((left, differences, solver), []).append((h, d))
+                    size = " ".join(f"{np.sqrt(np.mean(x**2)):6.2f}" for x in (h, d))
+                    seconds = time.process_time()
+                    name = "yes" if differences else "no"
+                    print(f"span {k}: {left:3} {name:>8} {solver:6} rms, drift {size} {seconds:6.0f} s", flush=True)
     for (left, differences, solver), parts in sorted(found.items(), key=lambda one: (-one[0][0], not one[0][1])):
         h, d = (np.concatenate(some) for some in zip(*parts, strict=True))
         cells = " ".join(f"{x:6.2f}" for x in (*np.percentile(h, [50, 95, 100]), np.sqrt(np.mean(h**2))))
