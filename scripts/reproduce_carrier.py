@@ -1,11 +1,15 @@
 """What carriers of single satellites tell from epoch to epoch, on ucr_riverside_20200712 with a simulated IMU.
 
     python scripts/reproduce_carrier.py increments ../shared/data/ucr_riverside_20200712
-    python scripts/reproduce_carrier.py canyon ../shared/data/ucr_riverside_20200712 -o build/carrier
+    python scripts/reproduce_carrier.py windows ../shared/data/ucr_riverside_20200712 --window 0 300
+    python scripts/reproduce_carrier.py canyon ../shared/data/ucr_riverside_20200712
 
 `increments` solves the displacement of each epoch from the carriers' changes alone and compares it with the truth's.
-`canyon` takes satellites away by a mask: in ten spans of 60 s the 4, 3, 2, 1, 0 highest are left, and the table has the
-horizontal errors in the spans, of filter, smoother and batch, with changes of carriers and without.
+`windows` has the errors of parts of a drive without a base, with changes of carriers and without; of
+cssrlib_2021_265 as well, with the simulated IMU of scripts/reproduce_rtk.py. `canyon` takes satellites away by a mask:
+in ten spans of 60 s the 4, 3, 2, 1, 0 highest are left, and the table has the horizontal errors in the spans, of
+filter, smoother and batch, with changes of carriers and without. Each span is solved with what is a minute before and
+half a minute behind it.
 
 The recording has no IMU. Its samples are SIMULATED: a spline through the reference positions is the motion, level but
 for the slope, heading along the way; errors are those of a low-cost MEMS (the figures of data/tokyo_raw). Carriers,
@@ -16,11 +20,13 @@ from __future__ import annotations
 
 import argparse
 import gzip
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import reproduce_rtk
 from pyins import sim
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
@@ -42,6 +48,7 @@ ZERO = 2114 * 604800.0 + 5784.0  # s since the GPS epoch of the reference's firs
 RATE = 100.0  # Hz of the simulated IMU
 MEMS = ImuNoise(1.5e-4, 4e-3, 5e-6, 2e-4, 2e-3, 0.1)
 SPAN, SPANS, FIRST, APART = 60.0, 10, 150.0, 210.0  # s: of a canyon, how many, where the first begins, and the others
+BEFORE, AFTER = 60.0, 30.0  # s, of the drive around a canyon that is solved with it
 SOLVERS = ("ekf", "rts", "batch")
 MOVING = 1.0  # m/s, from which on a heading is that of the way
 
@@ -135,12 +142,6 @@ def recording_of(data: Path) -> Recording:
     )
 
 
-def canyons(recording: Recording, end: float) -> list[tuple[float, float]]:
-    """Spans of 60 s, in seconds from the start."""
-    begins = [FIRST + APART * k for k in range(SPANS)]
-    return [(b, b + SPAN) for b in begins if b + SPAN < min(end, recording.duration)]
-
-
 def masked(recording: Recording, spans: list[tuple[float, float]], left: int) -> Recording:
     """With the highest `left` satellites of each span's middle, and no fixes in it."""
     raw, gnss = recording.raw_gnss, recording.gnss
@@ -176,44 +177,91 @@ def errors(solution: Solution, recording: Recording, spans: list[tuple[float, fl
     return np.concatenate(whole), np.concatenate(drift)
 
 
-def canyon(data: Path, end: float, counts: list[int], solvers: tuple[str, ...]) -> None:
-    whole = recording_of(data).crop(0.0, end)
-    spans = canyons(whole, end)
-    print(
-        f"{len(spans)} spans of {SPAN:.0f} s, IMU simulated; horizontal errors in the spans, m; drift: since they began"
-    )
+def canyon(data: Path, spans: list[int], counts: list[int], solvers: tuple[str, ...]) -> None:
+    whole = recording_of(data)
+    print(f"spans of {SPAN:.0f} s, IMU simulated; horizontal errors in the spans, m; drift: since they began")
     print(
         f"{'satellites':>10} {'carriers':>8} {'solver':6} {'H50':>6} {'H95':>6} {'max':>6} {'rms':>6} {'drift50':>7} "
-        f"{'drift95':>7} {'rms':>6}"
+        f"{'drift95':>7} {'rms':>6} {'spans':>5}"
     )
-    for left in counts:
-        recording = masked(whole, spans, left)
+    found: dict[tuple[int, bool, str], list[tuple[Array, Array]]] = {}
+    for k in spans:
+        begin = FIRST + APART * k
+        window = whole.crop(begin - BEFORE, begin + SPAN + AFTER)
+        span = [(BEFORE, BEFORE + SPAN)]
         for differences in (True, False):
+            settings = settings_from({"raw_gnss": {"coupling": "tight", "differences": differences}})
+            # a drive is long beside its canyons: how good the sensors are is known from without
+            noise = run(window, settings, ("ekf",))["ekf"].noise
+            for left in counts:
+                solutions = run(masked(window, span, left), settings, solvers, noise=noise)
+                for solver, one in solutions.items():
+                    h, d = errors(one, window, span)
+                    found.setdefault((left, differences, solver), []).append((h, d))
+                    size = " ".join(f"{np.sqrt(np.mean(x**2)):6.2f}" for x in (h, d))
+                    seconds = time.process_time()
+                    name = "yes" if differences else "no"
+                    print(f"span {k}: {left:3} {name:>8} {solver:6} rms, drift {size} {seconds:6.0f} s", flush=True)
+    for (left, differences, solver), parts in sorted(found.items(), key=lambda one: (-one[0][0], not one[0][1])):
+        h, d = (np.concatenate(some) for some in zip(*parts, strict=True))
+        cells = " ".join(f"{x:6.2f}" for x in (*np.percentile(h, [50, 95, 100]), np.sqrt(np.mean(h**2))))
+        cells += " " + " ".join(f"{x:7.2f}" for x in np.percentile(d, [50, 95]))
+        cells += f" {np.sqrt(np.mean(d**2)):6.2f} {len(parts):5}"
+        print(f"{left:10} {'yes' if differences else 'no':>8} {solver:6} {cells}", flush=True)
+
+
+def windows(data: Path, spans: list[list[float]], solvers: tuple[str, ...]) -> None:
+    if data.name.startswith("ucr"):
+        whole = recording_of(data)
+    else:
+        folder = Path(tempfile.mkdtemp())
+        whole, t, places = reproduce_rtk.recording_of(data.resolve(), folder, with_base=False)
+        whole = replace(whole, truth=Truth(t, earth.ecef_to_llh(places)))
+    print(
+        f"{'window, s':>11} {'carriers':>8} {'solver':6} {'H rms':>6} {'shape':>6} {'U rms':>6} {'NEES H':>6} {'s':>4}"
+    )
+    for begin, end in spans:
+        recording = whole.crop(begin, min(end, whole.duration))
+        truth = recording.truth
+        assert truth is not None
+        assert truth.llh is not None
+        for differences in (False, True):
             settings = settings_from({"raw_gnss": {"coupling": "tight", "differences": differences}})
             began = time.process_time()
             solutions = run(recording, settings, solvers)
             seconds = time.process_time() - began
             for solver, one in solutions.items():
-                h, d = errors(one, whole, spans)
-                cells = " ".join(f"{x:6.2f}" for x in (*np.percentile(h, [50, 95, 100]), np.sqrt(np.mean(h**2))))
-                cells += " " + " ".join(f"{x:7.2f}" for x in np.percentile(d, [50, 95]))
-                cells += f" {np.sqrt(np.mean(d**2)):6.2f}"
-                print(f"{left:10} {'yes' if differences else 'no':>8} {solver:6} {cells}", flush=True)
-            print(f"{'':26} {seconds:.0f} s of processor time", flush=True)
+                inside = (truth.t >= one.t[0]) & (truth.t <= one.t[-1])
+                at = truth.t[inside]
+                p = np.stack([np.interp(at, one.t, one.states.p[:, i]) for i in range(3)], -1)
+                e = p - one.frame.from_llh(truth.llh[inside])
+                k = np.argmin(np.abs(one.t[None] - at[:, None]), axis=1)
+                P = one.covariance[k][:, 3:5, 3:5]
+                nees = np.mean(np.einsum("ni,nij,nj->n", e[:, :2], np.linalg.inv(P), e[:, :2])) / 2.0
+                shape = np.hypot(*(e - e.mean(axis=0))[:, :2].T)
+                sizes = (np.sqrt(np.mean(x**2)) for x in (np.hypot(e[:, 0], e[:, 1]), shape, e[:, 2]))
+                cells = " ".join(f"{x:6.2f}" for x in (*sizes, nees))
+                print(
+                    f"{begin:5.0f}-{end:5.0f} {'yes' if differences else 'no':>8} {solver:6} {cells} {seconds:4.0f}",
+                    flush=True,
+                )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("increments", "canyon"))
+    parser.add_argument("what", choices=("increments", "windows", "canyon"))
     parser.add_argument("data", type=Path)
-    parser.add_argument("--end", type=float, default=np.inf)
+    parser.add_argument("--span", type=int, action="append", help="of ten, counted from 0; repeatable, all without")
     parser.add_argument("--satellites", type=int, nargs="+", default=[4, 3, 2, 1, 0])
     parser.add_argument("--solver", action="append", default=[], help="repeatable; all three without")
+    parser.add_argument("--window", type=float, nargs=2, action="append", help="s from the start; repeatable")
     given = parser.parse_args()
     if given.what == "increments":
         increments(given.data)
+    elif given.what == "windows":
+        windows(given.data, given.window or [[0.0, np.inf]], tuple(given.solver) or SOLVERS)
     else:
-        canyon(given.data, given.end, given.satellites, tuple(given.solver) or SOLVERS)
+        canyon(given.data, given.span or list(range(SPANS)), given.satellites, tuple(given.solver) or SOLVERS)
 
 
 if __name__ == "__main__":

@@ -81,7 +81,8 @@ axes = "RFU"
 [raw_gnss]
 rover = "{data}/rover.obs.gz"
 nav = "{data}/nav.gz"
-base = "{data}/base.obs.gz"
+"""
+BASE = """base = "{data}/base.obs.gz"
 base_position = [{base[0]}, {base[1]}, {base[2]}]
 """
 
@@ -121,7 +122,7 @@ def simulate_imu(t: Array, places: Array, seed: int = 1) -> tuple[Array, Array, 
     return at[1:], gyro, accel, frame
 
 
-def recording_of(data: Path, folder: Path) -> tuple[Recording, Array, Array]:
+def recording_of(data: Path, folder: Path, with_base: bool = True) -> tuple[Recording, Array, Array]:
     """The drive with a simulated IMU, written into a folder, and its truth."""
     drive = DRIVES[data.name]
     sources = Sources(
@@ -133,7 +134,9 @@ def recording_of(data: Path, folder: Path) -> tuple[Recording, Array, Array]:
     table = np.column_stack([at, gyro, accel])
     np.savetxt(folder / "imu.csv", table, "%.9g", ",", header="t,gx,gy,gz,ax,ay,az", comments="")
     noise = "\n".join(f"{name} = {value:.6g}" for name, value in vars(MEMS.noise).items() if isinstance(value, float))
-    text = TOML.format(name=data.name, folder=folder, data=data, noise=noise, base=drive.base, week=drive.week)
+    text = (TOML + BASE if with_base else TOML).format(
+        name=data.name, folder=folder, data=data, noise=noise, base=drive.base, week=drive.week
+    )
     (folder / f"{data.name}.toml").write_text(text, encoding="utf-8")
     with permit_outside():
         return read(folder / f"{data.name}.toml"), t, places

@@ -21,7 +21,7 @@ class RawGnssSettings(Outliers):
     code: bool = Field(True, description="use the codes")
     doppler: bool = Field(True, description="use the Doppler shifts")
     differences: bool = Field(
-        False, description="use what the carriers change by from epoch to epoch, where they have no ambiguities"
+        True, description="use what the carriers change by from epoch to epoch, where they have no ambiguities"
     )
     ppp: bool = Field(
         False,

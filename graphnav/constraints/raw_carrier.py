@@ -4,13 +4,21 @@ A carrier counts cycles from an unknown number on; between two epochs without a 
 a range change (van Graas and Soloviev 2004, "Precise velocity estimation using a stand-alone GPS receiver"). With a the
 place of the antenna at the epoch before and p_a = p + R_nb l that of now::
 
-    r = |s - p_a| - |s' - a| + w + [T - I - dt] - e_l.g (t - t') - lambda [phi]
+    r = |s - p_a| - |s' - a| + w + [T - I - dt] - [m] z + (h - e_l.g) (t - t') - lambda [phi]
 
-[x] is the change of x, w that of the receiver's clock, which is anew at every epoch, g what the atmosphere, satellites'
-clocks and orbits do to all of them together over minutes, as a velocity in east, north, up. The place a is a parameter
-that begins anew at every other epoch, two of them in turn, and is tied to the state of its own epoch by rows of its own
-(stochastic cloning: Roumeliotis and Burdick 2002), so that a row knows both places, both attitudes through the lever
-arm and how far each is certain, in every solver.
+[x] is the change of x, w that of the receiver's clock, which is anew at every epoch, z what the model of the ionosphere
+is wrong by at the zenith, the same as in the codes. g is what the atmosphere, satellites' clocks and orbits do to all
+of them together over minutes, as a velocity in east, north, up, and h what they do to one satellite for hours. Without
+h and z the sum of changes over minutes would be known to centimetres, and so would the place: directions to satellites
+turn by a hundredth in a minute, so a place a metre off changes ranges by a centimetre, and so do these errors.
+
+Errors of single changes are white here. What a carrier is off by at one epoch cancels in the sum of two changes, but
+reflections and the ionosphere add up like a random walk of 2 mm in the root of a second over 20 to 300 s (measured on
+ucr_riverside_20200712), which is what white changes make.
+
+The place a is a parameter that begins anew at every other epoch, two of them in turn, and is tied to the state of its
+own epoch by rows of its own (stochastic cloning: Roumeliotis and Burdick 2002), so that a row knows both places, both
+attitudes through the lever arm and how far each is certain, in every solver.
 
 Slips end an arc (`graphnav.gnss.arcs`), by the receiver's flags and by the other satellites of the epoch; one that
 neither tells meets the kernel, which judges it by what all other rows and the IMU say.
@@ -29,25 +37,31 @@ from graphnav.constraints.base import BuildContext, Constraint, Linearized
 from graphnav.constraints.gnss import LEVER_ARM
 from graphnav.constraints.raw_gnss import (
     AXES,
+    IONOSPHERE,
+    ONE,
     PreparedRows,
     SatelliteConstraint,
     common_fields,
+    ionosphere_parameter,
     prepare_rows,
     range_change,
+    select_columns,
     select_observations,
 )
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
+from graphnav.gnss.atmosphere import obliquity
 from graphnav.gnss.carrier import consecutive
 from graphnav.gnss.series import median_of_epochs
 from graphnav.gnss.sigmas import carrier_sigma
-from graphnav.gnss.signals import C
+from graphnav.gnss.signals import L1, C
 from graphnav.recording import Recording
 
 CHANGE = "receiver_clock_change"
 CLONES = ("gnss_antenna_of_even_epochs", "gnss_antenna_of_odd_epochs")
 DRIFT = "gnss_carrier_drift"
+RATES = "gnss_satellite_rates"
 _CHANGE_SIGMA = 100.0  # m, about the median over the satellites at places that may be that far off
 _ANYWHERE = 1e3  # m, 1-sigma of an antenna's place before its tie: nothing known
 _TIE = 5e-4  # m, a tenth of what a carrier's change is good to
@@ -170,6 +184,8 @@ class GnssCarrier(SatelliteConstraint):
     nominal_before: Array = field(default_factory=lambda: np.empty((0, 3)))
     time: Array = field(default_factory=lambda: np.empty(0))  # (N,) s since the epoch before
     odd: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) which of `CLONES` is of that epoch
+    which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite, in the order of their rates
+    slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) change of the ionosphere's delay over the zenith's
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -187,11 +203,20 @@ class GnssCarrier(SatelliteConstraint):
         if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
             common["robust"] = "cauchy"
         E = len(pairs.epochs)
+        satellites, which = np.unique(raw.satellite[k], return_inverse=True)
+        many = len(satellites)
+        minutes, hours = scene.settings.gnss.slow_times
         common["parameters"] = (
             Parameter(CHANGE, pairs.clock[:, None], np.full((E, 1), _CHANGE_SIGMA), "m", begins=pairs.epochs),
+            # what has a size and a correlation time changes by the one in the other
+            Parameter(
+                RATES, np.zeros(many), np.full(many, ONE / hours), "m/s", correlation_time=hours, spacing=found.spacing
+            ),
+            ionosphere_parameter(raw, found.spacing),
             *_clones(found, pairs),
         )
-        minutes = scene.settings.gnss.slow_times[0]
+        # of a phase the delay is negative; against a base the parameter is what lies between the two receivers
+        delay = -obliquity(found.elevation) * (0.0 if raw.differenced else (L1 / raw.frequency) ** 2)
         drift = Parameter(
             DRIFT, np.zeros(3), _DRIFT, "m/s", correlation_time=minutes, spacing=found.spacing,
             noise_groups=tuple(f"{cls.name}.minutes.{axis}" for axis in AXES),
@@ -207,6 +232,8 @@ class GnssCarrier(SatelliteConstraint):
             nominal_before=found.nominal[j],
             time=raw.t[k] - raw.t[j],
             odd=(pairs.epoch - 1) % 2,
+            which=which,
+            slant=delay[k] - delay[j],
             sigma=sigma[:, None],
             processes=(drift,),
             **common,
@@ -228,8 +255,10 @@ class GnssCarrier(SatelliteConstraint):
         }
         if LEVER_ARM in parameters:
             J[LEVER_ARM] = -e[:, None] @ states.R_nb
-        if DRIFT in parameters:
-            shift, more = self._lasting(parameters, (DRIFT,), rows, e)
-            time = self.time[rows]
-            residual, J = residual + shift * time, J | {DRIFT: more[DRIFT] * time[:, None, None]}
+        time = self.time[rows]
+        own, chosen = select_columns(parameters[RATES], self.which[rows])
+        shift, more = self._lasting(parameters, (DRIFT,), rows, e)
+        residual = residual + self.slant[rows] * parameters[IONOSPHERE][:, 0] + (own + shift) * time
+        J |= {IONOSPHERE: self.slant[rows, None, None], RATES: chosen * time[:, None, None]}
+        J |= {name: by * time[:, None, None] for name, by in more.items()}
         return Linearized(residual[:, None], J, self.sigma[rows])

@@ -53,7 +53,7 @@ _ZENITH_WALK, _BIAS_WALK, _LEVER_WALK = 0.01, 0.003, 1e-4
 AXES = ("horizontal", "horizontal", "up")
 # m, 1-sigma of what lasts for hours, which a drive does not tell from its place: of all satellites, as a shift of the
 # place, where the ionosphere's gradient and the datum of an orbit make a metre or two; and of one satellite
-_HOURS, _ONE = np.array([1.0, 1.0, 2.0]), 0.7
+_HOURS, ONE = np.array([1.0, 1.0, 2.0]), 0.7
 _ERROR = np.array([1.0, 1.0, 2.0])  # m, unit of what lasts for seconds and minutes
 _DIFFERENCED = 0.1  # of what lasts for hours, against a base station
 _GRADIENT = 2e-6  # of the zenith's delay over the distance to a base station, on an ordinary day (Odijk 2002)
@@ -290,7 +290,7 @@ class GnssCode(RangeConstraint):
         common["parameters"] += (
             Parameter(CODE_ERRORS[2], np.zeros(3), less * _HOURS, "m", correlation_time=hours, spacing=spacing),
             Parameter(
-                SATELLITES, np.zeros(many), np.full(many, less * _ONE), "m", correlation_time=hours, spacing=spacing
+                SATELLITES, np.zeros(many), np.full(many, less * ONE), "m", correlation_time=hours, spacing=spacing
             ),
         )
         processes = tuple(

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphnav.config import Settings
 from graphnav.core.earth import A
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
@@ -22,7 +23,7 @@ from graphnav.estimation.noise.model import NoiseModel, RowWeights
 from graphnav.estimation.solution import Between, ConstraintRecord, ParameterEstimate, Solution
 from graphnav.recording import Recording, rows_of
 
-STRAIGHT = 10_800.0  # s, at most solved at once: 3 GB at a keyframe a second and 44 error states
+STRAIGHT, _STATES = 10_800.0, 44  # s, at most solved at once: 3 GB at a keyframe a second and 44 error states
 PART = 3_600.0  # s, at most, of a part: the estimation of noise has enough keyframes by a factor of two
 OVERLAP = (
     600.0  # s: what inertial sensors knew ten minutes ago says little (`graphnav.estimation.solvers.watch.LONGEST`)
@@ -41,10 +42,10 @@ class Share:
     end: float
 
 
-def shares(recording: Recording) -> list[Share]:
+def shares(recording: Recording, settings: Settings) -> list[Share]:
     """The recording in one part, or in parts of equal length that overlap."""
     begin, length = recording.start, recording.end - recording.start
-    if length <= STRAIGHT:
+    if length <= _longest(recording, settings):
         return [Share(recording, -np.inf, np.inf)]
     edges = np.linspace(0.0, length, int(np.ceil(length / PART)) + 1)
     edges = np.array([0.0, *(edge for edge in edges[1:-1] if _is_told(recording, begin + edge)), length])
@@ -58,6 +59,22 @@ def shares(recording: Recording) -> list[Share]:
         start = -np.inf if k == 0 else begin + lo
         out.append(Share(part, start, np.inf if k == len(edges) - 2 else begin + hi))
     return out
+
+
+def _longest(recording: Recording, settings: Settings) -> float:
+    """s, at most solved at once: memory goes by the square of the error states, of which satellites have their own."""
+    raw, chosen = recording.raw_gnss, settings.raw_gnss
+    if raw is None or not recording.tight(chosen.coupling):
+        return STRAIGHT
+    against_base = (
+        np.isfinite(raw.carrier_difference) if len(raw.carrier_difference) else np.zeros(len(raw), dtype=bool)
+    )
+    more = len(np.unique(raw.satellite))
+    if chosen.carrier and against_base.any():
+        more += len(np.unique(1000 * raw.satellite[against_base].astype(int) + raw.signal[against_base]))
+    elif chosen.differences and np.isfinite(raw.carrier).any():
+        more *= 2
+    return max(PART, STRAIGHT * (_STATES / (_STATES + more)) ** 2)
 
 
 def _is_told(recording: Recording, t: float) -> bool:
@@ -140,5 +157,6 @@ def within(solution: Solution, share: Share) -> Solution:
         detections=tuple(detection(d) for d in solution.detections),
         excluded=tuple(fault for fault in solution.excluded if start <= fault.t_start < end),
         noise=noise(solution.noise),
+        fixed=solution.fixed[inside(solution.fixed[:, 0])] if len(solution.fixed) else solution.fixed,
         between=tuple(_Span(b, max(b.start, start), min(b.end, float(last))) for b in solution.between),
     )

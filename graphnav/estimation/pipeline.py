@@ -122,7 +122,7 @@ def _run(
     pieces, notes = _pieces(recording, settings)
     notes = [*fitting(recording, settings), *notes]
     found: list[dict[str, Solution]] = []
-    parts = [share for piece in pieces for share in shares(piece)]
+    parts = [share for piece in pieces for share in shares(piece, settings)]
     if len(parts) > len(pieces):
         said = f"too long to be solved at once: solved in {len(parts)} parts that overlap by {OVERLAP:.0f} s"
         notes.append(Note("pieces.parts", said))

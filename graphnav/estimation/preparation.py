@@ -101,6 +101,10 @@ def prepare(
     passes: Counter[str] = Counter()
     carriers: list[GnssPhase | None] = [None]
 
+    # of carriers an alignment needs nothing, and solves dozens of problems
+    codes_alone = settings.raw_gnss.model_copy(update={"differences": False})
+    without_changes = settings.model_copy(update={"raw_gnss": codes_alone})
+
     def book(stage: str, since: float) -> float:
         now = time.perf_counter()
         timings[stage] = timings.get(stage, 0.0) + now - since
@@ -109,7 +113,7 @@ def prepare(
     def align_with(fixes: Recording, stationary: Array) -> Alignment:
         tell("alignment")
         since = time.perf_counter()
-        found = align(fixes, settings, frame, _smooth, stationary)
+        found = align(fixes, without_changes, frame, _smooth, stationary)
         book("alignment", since)
         return found
 

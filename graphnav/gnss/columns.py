@@ -46,7 +46,7 @@ def observations(columns: Mapping[str, Array], zero: float, name: str) -> Observ
             obs.take(whole),
             remarks=(
                 Note(
-                    "raw_gnss.rows_left_out",
+                    "raw.rows_left_out",
                     f"{name}: {int((~whole).sum())} rows without time, prn (1 to 99) or code left out",
                 ),
             ),

@@ -68,12 +68,8 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     missing = np.isnan(difference) & np.isfinite(rover.code) & np.isfinite(rover.p[:, 0])
     said: tuple[str, ...] = ()
     if missing.any():
-        said = (
-            Note(
-                "raw_gnss.not_at_base",
-                f"{int(missing.sum())} of {len(rover)} codes have no counterpart at the base and are not used",
-            ),
-        )
+        sentence = f"{int(missing.sum())} of {len(rover)} codes have no counterpart at the base and are not used"
+        said = (Note("raw.without_base", sentence),)
     away = float(np.linalg.norm(np.median(rover.antenna, axis=0) - position))
     return replace(
         rover, difference=difference, carrier_difference=carrier_difference, base_arc=base_arc, baseline=away

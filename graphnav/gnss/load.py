@@ -112,9 +112,9 @@ def load_raw(
     if raw.klobuchar is None:
         said.append(
             Note(
-                "raw_gnss.no_ionosphere",
-                "no ionosphere coefficients in the navigation files: the delay of the night is assumed "
-                "(5 ns at the zenith)",
+                "raw.no_ionosphere",
+                "no ionosphere coefficients in the navigation files: the delay of the night is assumed (5 ns at the "
+                "zenith)",
             )
         )
     raw, fixes = _at_true_times(raw, fixes)
@@ -153,15 +153,11 @@ def _difference(
             f"{sources.base[0]}: its observations put the base {off:.0f} m from its stated position; see base_position"
         )
     if given is None:
-        said.append(
-            Note(
-                "raw_gnss.base_position",
-                f"the base's position is that of its header, {off:.1f} m from its own single-point positions",
-            )
-        )
+        sentence = f"the base's position is that of its header, {off:.1f} m from its own single-point positions"
+        said.append(Note("raw.base_position", sentence))
     base, _ = _at_true_times(base, base_fixes)
     raw, more = with_differences(raw, base, position)
-    said += [Note("raw_gnss.base", f"codes are differences against a base {away / 1e3:.1f} km away"), *more]
+    said += [Note("raw.base", f"codes are differences against a base {away / 1e3:.1f} km away"), *more]
     return raw, said
 
 

@@ -1,7 +1,8 @@
 """Navigation messages as satellites send them, word by word: ephemerides out of bits.
 
-GPS and QZSS LNAV (IS-GPS-200N, 20.3.3), Galileo I/NAV (OS SIS ICD 2.1, 4.3), BeiDou D1 (BDS-SIS-ICD-B1I 3.0, 5.2) and
-GLONASS (ICD GLONASS L1/L2 5.1, 4.4). A message is complete once its parts are of one issue.
+GPS and QZSS LNAV (IS-GPS-200N, 20.3.3), Galileo I/NAV and F/NAV (OS SIS ICD 2.1, 4.3 and 4.2), BeiDou D1
+(BDS-SIS-ICD-B1I 3.0, 5.2) and GLONASS (ICD GLONASS L1/L2 5.1, 4.4). A message is complete once its parts are of one
+issue.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, QZSS
 
 _PI = 3.1415926535898  # of the interface descriptions
 _LNAV_DAY = 86400.0
+_E5A, _FNAV = 3, 10_000  # sigId of the signal with F/NAV, and what keeps its parts from those of I/NAV
 _UBLOX = {0: GPS, 2: GALILEO, 3: BEIDOU, 5: QZSS, 6: GLONASS}
 _BDT = 14.0
 _MOSCOW = 3 * 3600.0
@@ -80,7 +82,8 @@ class Decoder:
         if system in (GPS, QZSS) and len(words) >= 10 and words[0] >> 24 != 0x8B:
             self._lnav(satellite, Bits.of(words[:10], 30, 6), gps)
         elif system == GALILEO and len(words) >= 8:
-            self._inav(satellite, Bits.of(words[:8], 32), gps)
+            own = self._fnav if payload[2] == _E5A else self._inav
+            own(satellite, Bits.of(words[:8], 32), gps)
         elif system == BEIDOU and len(words) >= 10 and 5 < number < 59:
             self._d1(satellite, Bits.of(words[:10], 30), gps)
         elif system == GLONASS and len(words) >= 4:
@@ -105,6 +108,7 @@ class Decoder:
             return
         toc, toes = one.u((176, 16)) * 16.0, two.u((216, 16)) * 16.0
         health = one.u((64, 6))
+        parts.clear()
         self._add(
             satellite, _near(toes, gps), _near(toc, gps), toes,
             clock=(one.s((216, 22)) * 2.0**-31, one.s((200, 16)) * 2.0**-43, one.s((192, 8)) * 2.0**-55),
@@ -136,6 +140,7 @@ class Decoder:
         if any(x.u((6, 10)) != issue for x in (two, three, four)):
             return
         toes, toc = one.u((16, 14)) * 60.0, four.u((54, 14)) * 60.0
+        parts.clear()
         self._add(
             satellite, _near(toes, gps), _near(toc, gps), toes,
             clock=(four.s((68, 31)) * 2.0**-34, four.s((99, 21)) * 2.0**-46, four.s((120, 6)) * 2.0**-59),
@@ -147,6 +152,33 @@ class Decoder:
             omega=two.s((80, 32)) * 2.0**-31 * _PI, omega_dot=three.s((16, 24)) * 2.0**-43 * _PI,
             idot=two.s((112, 14)) * 2.0**-43 * _PI, healthy=five.u((67, 6)) == 0,
             delay=(five.s((47, 10)) * 2.0**-32, five.s((57, 10)) * 2.0**-32),
+        )  # fmt: skip
+
+    def _fnav(self, satellite: int, page: Bits, gps: float) -> None:
+        number = page.u((0, 6))
+        if not 1 <= number <= 4:
+            return
+        parts = self._parts.setdefault(satellite + _FNAV, {})
+        parts[number] = page
+        if len(parts) < 4:
+            return
+        one, two, three, four = (parts[k] for k in range(1, 5))
+        issue = one.u((12, 10))
+        if two.u((6, 10)) != issue or three.u((6, 10)) != issue or four.u((6, 10)) != issue:
+            return
+        toes, toc = three.u((160, 14)) * 60.0, one.u((22, 14)) * 60.0
+        parts.clear()
+        self._add(
+            satellite, _near(toes, gps), _near(toc, gps), toes,
+            clock=(one.s((36, 31)) * 2.0**-34, one.s((67, 21)) * 2.0**-46, one.s((88, 6)) * 2.0**-59),
+            iode=issue, crs=three.s((144, 16)) * 2.0**-5, delta_n=three.s((80, 16)) * 2.0**-43 * _PI,
+            m0=two.s((16, 32)) * 2.0**-31 * _PI, cuc=three.s((96, 16)) * 2.0**-29, e=two.u((72, 32)) * 2.0**-33,
+            cus=three.s((112, 16)) * 2.0**-29, root_a=two.u((104, 32)) * 2.0**-19, cic=four.s((16, 16)) * 2.0**-29,
+            omega0=two.s((136, 32)) * 2.0**-31 * _PI, cis=four.s((32, 16)) * 2.0**-29,
+            i0=three.s((16, 32)) * 2.0**-31 * _PI, crc=three.s((128, 16)) * 2.0**-5,
+            omega=three.s((48, 32)) * 2.0**-31 * _PI, omega_dot=two.s((48, 24)) * 2.0**-43 * _PI,
+            idot=two.s((168, 14)) * 2.0**-43 * _PI, healthy=one.u((153, 2)) == 0,
+            delay=(one.s((143, 10)) * 2.0**-32, np.nan), fnav=True,
         )  # fmt: skip
 
     def _d1(self, satellite: int, bits: Bits, gps: float) -> None:
@@ -163,6 +195,7 @@ class Decoder:
             return
         toes = (two.u((290, 2)) << 15 | three.u((42, 10), (60, 5))) * 8.0
         toc = one.u((73, 9), (90, 8)) * 8.0
+        parts.clear()
         self._add(
             satellite, _near(toes + _BDT, gps), _near(toc + _BDT, gps), toes,
             clock=(
@@ -212,7 +245,6 @@ class Decoder:
         parts.clear()
 
     def _add(self, satellite: int, toe: float, toc: float, toes: float, **fields: object) -> None:
-        self._parts[satellite] = {}
         one = Kepler(satellite=satellite, toe=toe, toc=toc, toes=toes, accuracy=np.nan, **fields)  # type: ignore[arg-type]
         if one.root_a > 0.0:
             self._kepler.append(one)

@@ -70,31 +70,19 @@ def place(
     mute = sorted({int(x) for x in np.unique(obs.satellite[np.isnan(frequency)])} - lost)
     if mute:
         names = ", ".join(satellite_name(x) for x in mute)
-        remarks.append(
-            Note(
-                "raw_gnss.no_channel",
-                f"no frequency channel for {names}: their observations are not used; a GLONASS nav file tells it",
-            )
-        )
+        sentence = f"no frequency channel for {names}: their observations are not used; a GLONASS nav file tells it"
+        remarks.append(Note("raw.no_channel", sentence))
     if without:
         names = ", ".join(satellite_name(s) for s in without)
-        remarks.append(Note("raw_gnss.no_ephemeris", f"no ephemeris for {names}: their observations are not used"))
+        remarks.append(Note("raw.no_ephemeris", f"no ephemeris for {names}: their observations are not used"))
     if ill:
-        remarks.append(
-            Note(
-                "raw_gnss.unhealthy",
-                f"unhealthy by their own word and not used: {', '.join(satellite_name(s) for s in ill)}",
-            )
-        )
+        names = ", ".join(satellite_name(s) for s in ill)
+        remarks.append(Note("raw.unhealthy", f"unhealthy by their own word and not used: {names}"))
     partly = sorted(lost - set(lost_all))
     if partly:
         names = ", ".join(satellite_name(s) for s in partly)
-        remarks.append(
-            Note(
-                "raw_gnss.ephemeris_partly",
-                f"no ephemeris near enough in time for a part of the observations of {names}",
-            )
-        )
+        sentence = f"no ephemeris near enough in time for a part of the observations of {names}"
+        remarks.append(Note("raw.no_ephemeris_then", sentence))
     raw = RawGnss(
         t=obs.t, satellite=obs.satellite, signal=obs.signal, code=obs.code, carrier=obs.carrier,
         range_rate=-obs.doppler * C / frequency, cn0=obs.cn0, slip=obs.slip, half=obs.half, frequency=frequency,

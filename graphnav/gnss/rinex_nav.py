@@ -51,16 +51,13 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
         found.broken, found.skipped = [], {}
         _read(path, found)
         if found.broken:
-            remarks.append(
-                Note(
-                    "raw_gnss.broken_records",
-                    f"{path.name}: {len(found.broken)} records cannot be read and are left out (the first at line "
-                    f"{found.broken[0]})",
-                )
+            sentence = (
+                f"{len(found.broken)} records cannot be read and are left out (the first at line {found.broken[0]})"
             )
+            remarks.append(Note("raw.broken_records", f"{path.name}: {sentence}"))
         if found.skipped:
             names = ", ".join(f"{n} {name}" for name, n in sorted(found.skipped.items()))
-            remarks.append(Note("raw_gnss.unknown_messages", f"{path.name}: messages that are not used: {names}"))
+            remarks.append(Note("raw.unused_messages", f"{path.name}: messages that are not used: {names}"))
     if not found.kepler and not found.glonass:
         raise RecordingError(f"{', '.join(str(p) for p in paths)}: no ephemeris in it")
     coefficients = None

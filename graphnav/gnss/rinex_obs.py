@@ -20,7 +20,7 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.files import Lines, calendar_days, find_moved_points, numbers, read_bytes
-from graphnav.gnss.series import Observations, once
+from graphnav.gnss.series import Observations, note_cut, once
 from graphnav.gnss.signals import BEIDOU, GLONASS, GPS, QZSS, SYSTEMS, Ids, known_signal, satellite_id, signal_id
 
 _SYSTEM_OF = np.full(256, -1)
@@ -93,11 +93,10 @@ def parse_observations(data: bytes, path: Path) -> Observations:
         lli = block[:, :, 14].astype(np.intp) - 48
         lli[(lli < 0) | (lli > 9)] = 0
         named = [_translate_name(name, system, header.version) for name in types]
-        filled = np.asarray(np.isfinite(value).any(axis=0))
         unknown |= {
             f"{SYSTEMS[system]} {name}"
-            for name, there in zip(named, filled, strict=True)
-            if there and name[0] in _KINDS and not known_signal(system, name[1:])
+            for name, there in zip(named, np.isfinite(value).T, strict=True)
+            if there.any() and name[0] in _KINDS and not known_signal(system, name[1:])
         }
         for signal in dict.fromkeys(name[1:] for name in named if known_signal(system, name[1:])):
             at = {kind: [k for k, name in enumerate(named) if name == kind + signal] for kind in _KINDS}
@@ -116,12 +115,8 @@ def parse_observations(data: bytes, path: Path) -> Observations:
     if not parts:
         raise RecordingError(f"{path}: no code or carrier of a known signal")
     if unknown:
-        remarks.append(
-            Note(
-                "raw_gnss.unknown_signals",
-                f"{path.name}: signals that are not known are left out: {', '.join(sorted(unknown))}",
-            )
-        )
+        names = ", ".join(sorted(unknown))
+        remarks.append(Note("raw.unknown_signals", f"{path.name}: signals not known are left out: {names}"))
     t, satellite, signal_of, code, carrier, doppler, cn0, slip, half = (
         np.concatenate(x) for x in zip(*parts, strict=True)
     )
@@ -152,8 +147,7 @@ def _header(lines: Lines, path: Path) -> Header:
                 out.types.setdefault(system, []).extend(body[6:].split())
             elif label == "# / TYPES OF OBSERV":
                 many = int(body[:6]) if body[:6].strip() else many
-                both = out.types.setdefault(-2, [])
-                both += body[6:].split()
+                out.types.setdefault(-2, []).extend(body[6:].split())
             elif label == "APPROX POSITION XYZ":
                 place = np.array(body.split(), dtype=float)
                 out.marker = place if len(place) == 3 and 6e6 < np.linalg.norm(place) < 7e6 else None
@@ -333,12 +327,7 @@ def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
         flags.append(flag)
         k = begin + count * each
     if cut:
-        remarks.append(
-            Note(
-                "raw_gnss.cut_off",
-                f"{path.name}: is cut off in the middle of a record; what is whole before it is used",
-            )
-        )
+        remarks.append(note_cut(path.name, "record"))
     epoch = np.array(epochs, dtype=np.intp)
     if not len(epoch):
         raise RecordingError(f"{path}: holds a header and no observations")
@@ -368,20 +357,12 @@ def _say_cut(
     """Remarks about epochs with fewer lines of satellites than they announce."""
     short = np.flatnonzero((np.bincount(of, minlength=len(epoch)) < count) & (flag <= 1))
     if len(short) == 1 and short[0] == len(epoch) - 1:
-        remarks.append(
-            Note(
-                "raw_gnss.cut_off",
-                f"{path.name}: is cut off in the middle of a record; what is whole before it is used",
-            )
-        )
+        remarks.append(note_cut(path.name, "record"))
     elif len(short):
-        remarks.append(
-            Note(
-                "raw_gnss.short_epochs",
-                f"{path.name}: {len(short)} epochs hold fewer satellites than they announce (the first at line "
-                f"{epoch[short[0]] + 1})",
-            )
+        sentence = (
+            f"{len(short)} epochs hold fewer satellites than they announce (the first at line {epoch[short[0]] + 1})"
         )
+        remarks.append(Note("raw.short_epochs", f"{path.name}: {sentence}"))
 
 
 def _bad_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int = 2) -> RecordingError:

@@ -86,6 +86,11 @@ def join_files(parts: list[Observations]) -> Observations:
     return once(whole)
 
 
+def note_cut(name: str, what: str) -> Note:
+    """Of a file that ends in the middle of a record."""
+    return Note("raw.cut", f"{name}: is cut off in the middle of a {what}; what is whole before it is used")
+
+
 def once(obs: Observations) -> Observations:
     """In order of time, satellite and signal, and each of these once: the row that was first.
 
@@ -109,10 +114,7 @@ def once(obs: Observations) -> Observations:
         return out
     return replace(
         out,
-        remarks=(
-            *out.remarks,
-            Note("raw_gnss.repeated", f"{twice} observations are there twice; the first of each is used"),
-        ),
+        remarks=(*out.remarks, Note("raw.twice", f"{twice} observations are there twice; the first of each is used")),
     )
 
 
@@ -123,7 +125,8 @@ def _plausible(obs: Observations) -> Observations:
     if not bad.any():
         return obs
     code, carrier, doppler = (np.where(bad, np.nan, x) for x in (obs.code, obs.carrier, obs.doppler))
-    said = Note("raw_gnss.beyond", f"{bad.sum()} observations are beyond what a receiver can measure and are left out")
+    sentence = f"{bad.sum()} observations are beyond what a receiver can measure and are left out"
+    said = Note("raw.impossible", sentence)
     return replace(obs, code=code, carrier=carrier, doppler=doppler, remarks=(*obs.remarks, said))
 
 
@@ -196,7 +199,7 @@ def primary(raw: RawGnss) -> NDArray[np.bool_]:
     order = np.where(np.isfinite(raw.code), order, 100.0)
     sorted_rows = np.lexsort((order, raw.satellite, raw.t))
     t, satellite = raw.t[sorted_rows], raw.satellite[sorted_rows]
-    first = np.concatenate([[True], (np.diff(t) > 0) | (np.diff(satellite) != 0)])
+    first = np.concatenate([[True], (np.diff(t) > 0) | (np.diff(satellite) != 0)])[: len(t)]
     out = np.zeros(len(raw), dtype=bool)
     out[sorted_rows[first]] = True
     return out & np.isfinite(raw.code)

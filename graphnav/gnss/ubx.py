@@ -16,7 +16,7 @@ from graphnav.core.notes import Note
 from graphnav.core.timescales import WEEK
 from graphnav.gnss.ephemeris import Ephemerides
 from graphnav.gnss.messages import Decoder
-from graphnav.gnss.series import Observations, once
+from graphnav.gnss.series import Observations, note_cut, once
 from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, NAVIC, QZSS, SBAS, signal_id
 
 SYNC = b"\xb5\x62"
@@ -67,14 +67,9 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
         raise RecordingError(f"{path}: no RXM-RAWX messages; switch them on in the receiver")
     remarks = []
     if found.broken:
-        remarks.append(Note("raw_gnss.broken_frames", f"{path.name}: {found.broken} broken frames were skipped"))
+        remarks.append(Note("raw.broken_records", f"{path.name}: {found.broken} broken frames were skipped"))
     if found.cut:
-        remarks.append(
-            Note(
-                "raw_gnss.cut_off",
-                f"{path.name}: is cut off in the middle of a message; what is whole before it is used",
-            )
-        )
+        remarks.append(note_cut(path.name, "message"))
     week0 = found.times[0][1]
     t_of = np.array([tow + WEEK * (week - week0) for tow, week in found.times])
     rows = np.concatenate(found.rows)
@@ -86,12 +81,8 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
         signal[(rows["gnss"] == gnss) & (rows["sig"] == sig)] = one
     known = (signal >= 0) & (system >= 0) & (rows["sv"] > 0) & (rows["sv"] < 255)
     if not known.all():
-        remarks.append(
-            Note(
-                "raw_gnss.unknown_signals",
-                f"{path.name}: {int((~known).sum())} measurements of signals that are not known are left out",
-            )
-        )
+        sentence = f"{int((~known).sum())} measurements of signals that are not known are left out"
+        remarks.append(Note("raw.unknown_signals", f"{path.name}: {sentence}"))
     number = np.where(rows["gnss"] == 1, rows["sv"].astype(int) - 100, rows["sv"])
     satellite = (100 * system + number).astype(np.int16)
     status, lock = rows["status"], rows["lock"] * 1e-3

@@ -13,10 +13,15 @@ from helpers import errors, truth_states
 from test_raw_rows import scene
 
 from graphnav.config import settings_from
-from graphnav.constraints.raw_carrier import CHANGE, CLONES, GnssAntennaClone, GnssCarrier
+from graphnav.constraints.raw_carrier import CHANGE, CLONES, RATES, GnssAntennaClone, GnssCarrier
+from graphnav.constraints.raw_gnss import IONOSPHERE
+from graphnav.core import earth
+from graphnav.core.state import States
 from graphnav.estimation.pipeline import run
 from graphnav.gnss.carrier import consecutive, rows_in
+from graphnav.gnss.load import Sources, load_raw
 from graphnav.gnss.signals import L1, C
+from graphnav.recording import Gnss, Imu, Recording
 
 NOISE = 0.003  # m, of a carrier
 
@@ -153,3 +158,55 @@ def test_nothing_is_counted_across_slips_half_cycles_other_ephemerides_and_gaps(
     own = (thin.satellite[after] == raw.satellite[0]) & (np.abs(thin.t[after] - t[11]) < 0.1)
     assert not own.any()
     np.testing.assert_array_equal(raw.t[rows_in(thin, raw)], thin.t)
+
+
+UCR, UCR_ZERO = "ucr_riverside_20200712", 2114 * 604800.0 + 5784.0
+
+
+@pytest.fixture(scope="module")
+def riverside(shared_data):
+    """Codes and carriers of a real drive, and its true places (2400, 3), m in e, one a second."""
+    folder = shared_data / UCR
+    raw, fixes, _ = load_raw(Sources((folder / "rover.obs.gz",), (folder / "nav.gz",)), UCR_ZERO)
+    table = np.genfromtxt(folder / "truth.csv.gz", delimiter=",", names=True)
+    return raw, fixes, np.stack([table["x"], table["y"], table["z"]], -1)
+
+
+def displacement(riverside, begin):
+    """What five minutes of real carriers say of one displacement of all places, m, and its covariance."""
+    raw, fixes, truth = riverside
+    raw = raw.take((raw.t > begin) & (raw.t < begin + 300.0))
+    inside = (fixes.t > begin) & (fixes.t < begin + 300.0)
+    t = np.linspace(begin, begin + 300.0, 601)
+    still = Imu(t[1:], np.zeros((600, 3)), np.tile([0.0, 0.0, 9.8], (600, 1)))
+    gnss = Gnss(fixes.t[inside], earth.ecef_to_llh(fixes.p[inside]), np.ones((int(inside.sum()), 3)), derived=True)
+    recording = Recording("riverside", "vehicle", still, gnss, gps_zero=UCR_ZERO, raw_gnss=raw)
+    where = scene(recording, settings(True), GnssCarrier)
+    rows, frame = GnssCarrier.build(where), where.frame
+    place = (truth[np.clip(np.round(where.t).astype(int), 0, len(truth) - 1)] - frame.r_e) @ frame.R_ne.T
+    k, n = rows.keyframe, len(rows)
+    before = np.searchsorted(where.t, where.t[k] - rows.time - 1e-3)
+    turns, zero = np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3))
+    given = {p.name: np.zeros((n, p.size)) for p in rows.parameters} | dict.fromkeys(CLONES, place[before])
+    linear = rows.linearize(States(turns, place[k], zero, zero, zero), given, slice(None))
+    epoch = np.unique(k, return_inverse=True)[1][:, None] == np.arange(len(np.unique(k)))
+    J = linear.jacobians
+    prior = {p.name: p.sigma for p in rows.parameters}
+    shift = J["p"] + J[CLONES[0]] + J[CLONES[1]]  # of all places together
+    A = np.concatenate([shift[:, 0], J[RATES][:, 0], J[IONOSPHERE][:, 0], epoch], axis=1) / linear.sigma
+    off = linear.residual[:, 0]
+    kept = np.abs(off - np.array([np.median(off[k == one]) for one in k])) < 0.05  # m: no slip
+    r = off / linear.sigma[:, 0]
+    few = np.concatenate([np.zeros(3), prior[RATES] ** -2.0, prior[IONOSPHERE] ** -2.0, np.zeros(epoch.shape[1])])
+    C = np.linalg.inv(A[kept].T @ A[kept] + np.diag(few))
+    found = -(C @ A[kept].T @ r[kept])[:3]
+    return found, C[:3, :3]
+
+
+def test_sums_of_changes_do_not_claim_more_of_the_place_than_they_know(riverside):
+    """Directions to satellites turn by 0.04 rad in five minutes: what lasts of their errors looks like a metre."""
+    total = 0.0
+    for begin in range(0, 2400, 300):
+        found, C = displacement(riverside, begin)
+        total += found @ np.linalg.solve(C, found)
+    assert total < 51.2  # chi-square of 24, 99.9 %; 62 without rates of satellites and the ionosphere

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -27,6 +28,7 @@ from graphnav.gnss.ephemeris import EARTH_RATE
 from graphnav.gnss.integers import decorrelate, find_nearest
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import L1, C
+from graphnav.recording.formats import read
 
 STATED = settings_from({"noise": {"mode": "stated"}})
 WAVELENGTH = C / L1
@@ -105,6 +107,41 @@ def test_integers_are_those_that_all_tried_in_turn_find(n):
         order = np.argsort(far)[:2]
         np.testing.assert_array_equal(grid[order], [nearest.best, nearest.second])
         np.testing.assert_allclose(far[order], [nearest.distance, nearest.distance_second])
+
+
+KAMAKURA = Path(__file__).resolve().parents[2] / "data" / "kamakura_rtk"
+
+
+def test_real_epochs_are_soon_fixed_and_their_integers_are_rtklibs(monkeypatch):
+    """Twelve seconds of three frequencies: each search of filter and smoother, by RTKLIB's LAMBDA as well."""
+    rt = pytest.importorskip("pyrtklib")
+    searches, seen = [], []
+    monkeypatch.setattr(fixing, "decorrelate", lambda Q: seen.append(Q) or decorrelate(Q))
+    monkeypatch.setattr(
+        fixing,
+        "find_nearest",
+        lambda a, found: searches.append((a, seen[-1], find_nearest(a, found))) or searches[-1][2],
+    )
+    recording = read(KAMAKURA).crop(0.0, 12.0)
+    solutions = run(recording, STATED, ("ekf", "rts"))
+    assert len(searches) > 3
+    for a, Q, nearest in searches:
+        n = len(a)
+        values, covariance = rt.Arr1Ddouble(n), rt.Arr1Ddouble(n * n)
+        for i in range(n):
+            values[i] = float(a[i])
+            for j in range(n):
+                covariance[i + n * j] = float(Q[i, j])
+        vectors, distances = rt.Arr1Ddouble(2 * n), rt.Arr1Ddouble(2)
+        assert getattr(rt, "lambda")(n, 2, values, covariance, vectors, distances) == 0
+        assert [round(vectors[i]) for i in range(2 * n)] == [*nearest.best, *nearest.second]
+        np.testing.assert_allclose([distances[0], distances[1]], [nearest.distance, nearest.distance_second], rtol=1e-4)
+    for one in solutions.values():
+        assert one.fixed[one.fixed[:, 0] > recording.start + 2.0, 1].all()
+        t = recording.truth.t
+        p = np.stack([np.interp(t, one.t, one.states.p[:, i]) for i in range(3)], -1)
+        off = (one.frame.from_llh(recording.truth.llh) - p)[(t > recording.start + 2.0) & (t < recording.end)]
+        assert np.hypot(off[:, 0], off[:, 1]).max() < 0.05  # m, what the reference is good to
 
 
 def test_what_is_known_of_arcs_holds_however_they_were_joined():

@@ -87,6 +87,23 @@ def inav(words: list[np.ndarray], sv: int) -> bytes:
     return out
 
 
+def fnav_pages(rng: np.random.Generator, sv: int) -> list[np.ndarray]:
+    """Pages 1 to 4, 244 bits each, of one issue."""
+    pages = []
+    for part in (1, 2, 3, 4):
+        data = rng.integers(0, 2, 244)
+        put(data, 0, 6, part)
+        put(data, 12 if part == 1 else 6, 10, 99)
+        if part == 1:
+            put(data, 6, 6, sv)
+            put(data, 22, 14, int(TOW // 600 * 600 / 60))
+            put(data, 153, 2, 0)
+        if part == 3:
+            put(data, 160, 14, int(TOW // 600 * 600 / 60))
+        pages.append(data)
+    return pages
+
+
 def d1(rng: np.random.Generator, sv: int) -> bytes:
     """Subframes 1 to 3, six seconds apart."""
     out = b""
@@ -153,15 +170,11 @@ def test_ephemerides_are_those_that_rtklib_decodes(log: bytes) -> None:
     rt.decode_gal_inav(buffer, galileo, *more)
     ours = {satellite_name(s): k for k, s in enumerate(nav.kepler["satellite"])}
     assert set(ours) == set(systems)
-    same = {
-        "iode": "iode", "crs": "crs", "delta_n": "deln", "m0": "M0", "cuc": "cuc", "e": "e", "cus": "cus", "cic": "cic",
-        "omega0": "OMG0", "cis": "cis", "i0": "i0", "crc": "crc", "omega": "omg", "omega_dot": "OMGd", "idot": "idot",
-    }  # fmt: skip
     for name, system in systems.items():
         sat = rt.satno(system, int(name[1:]) + (192 if name[0] == "J" else 0))
         theirs = galileo if name[0] == "E" else raw.nav.eph[sat - 1]
         one = {key: value[ours[name]] for key, value in nav.kepler.items()}
-        for key, their in same.items():
+        for key, their in SAME.items():
             assert one[key] == pytest.approx(getattr(theirs, their), rel=1e-12), (name, key)
         assert one["root_a"] ** 2 == pytest.approx(theirs.A, rel=1e-12)
         np.testing.assert_allclose(one["clock"], [theirs.f0, theirs.f1, theirs.f2], rtol=1e-12)
@@ -170,6 +183,46 @@ def test_ephemerides_are_those_that_rtklib_decodes(log: bytes) -> None:
         assert one["toc"] - WEEK * WEEK_NUMBER == pytest.approx(rt.timediff(theirs.toc, epoch), abs=1e-6), name
         for k, delay in enumerate(one["delay"]):
             assert np.isnan(delay) or delay == pytest.approx(theirs.tgd[k], rel=1e-12)
+
+
+SAME = {
+    "iode": "iode", "crs": "crs", "delta_n": "deln", "m0": "M0", "cuc": "cuc", "e": "e", "cus": "cus", "cic": "cic",
+    "omega0": "OMG0", "cis": "cis", "i0": "i0", "crc": "crc", "omega": "omg", "omega_dot": "OMGd", "idot": "idot",
+}  # fmt: skip
+
+
+def test_fnav_is_what_rtklib_decodes_beside_an_inav_that_is_not_whole() -> None:
+    rt = pytest.importorskip("pyrtklib")
+    rng = np.random.default_rng(6)
+    pages, words, decoder = fnav_pages(rng, 11), inav_words(rng, 11), Decoder()
+    gps = WEEK * WEEK_NUMBER + TOW
+    first = inav(words[:3], 11)
+    size = len(first) // 3
+    for k in range(3):
+        decoder.add(first[k * size : (k + 1) * size][6:-2], gps)
+    for data in pages:
+        bits = np.concatenate([data, np.zeros(12, dtype=int)])
+        page = bytearray(sfrbx(2, 11, [number(bits[32 * i : 32 * i + 32]) for i in range(8)])[6:-2])
+        page[2] = 3  # E5a
+        decoder.add(bytes(page), gps)
+    ours = decoder.ephemerides.kepler
+    assert ours["fnav"].tolist() == [1]
+    buffer, theirs = getattr(rt, "Arr1Dunsigned char")(4 * 31), rt.eph_t()
+    padded = np.concatenate([np.concatenate([data, np.zeros(4, dtype=int)]) for data in pages])
+    for i, byte in enumerate(np.packbits(padded.astype(np.uint8))):
+        buffer[i] = int(byte)
+    assert rt.decode_gal_fnav(buffer, theirs, rt.Arr1Ddouble(8), rt.Arr1Ddouble(8)) == 1
+    for key, their in SAME.items():
+        assert ours[key][0] == pytest.approx(getattr(theirs, their), rel=1e-12), key
+    assert ours["root_a"][0] ** 2 == pytest.approx(theirs.A, rel=1e-12)
+    np.testing.assert_allclose(ours["clock"][0], [theirs.f0, theirs.f1, theirs.f2], rtol=1e-12)
+    assert ours["delay"][0, 0] == pytest.approx(theirs.tgd[0], rel=1e-12)
+    assert ours["toes"][0] == theirs.toes
+    assert ours["toc"][0] - WEEK * WEEK_NUMBER == TOW // 600 * 600
+    rest = inav(words[3:], 11)
+    for k in range(3):
+        decoder.add(rest[k * size : (k + 1) * size][6:-2], gps)
+    assert decoder.ephemerides.kepler["fnav"].tolist() == [1, 0]
 
 
 def test_what_is_broken_or_cut_costs_only_itself(log: bytes, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from graphnav.config.gnss import GnssSettings
 from graphnav.core.findings import Finding, period_of
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import NEAR, between_clocks
+from graphnav.core.timescales import NEAR, WEEK, between_clocks
 from graphnav.recording import Imu, Odometer, Recording
 from graphnav.recording import odometer as wheels
 from graphnav.recording.checks import crosschecks
@@ -41,6 +41,10 @@ def gnss_apart(recording: Recording) -> str | None:
         f"GNSS ({gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) do not "
         "overlap in time"
     )
+    if gnss.derived:  # of raw observations, whose receiver knows the date
+        weeks = round(offset / WEEK)
+        near = f", {abs(weeks)} week(s) too {'late' if weeks > 0 else 'early'}" if weeks else ""
+        return f"{apart}: the observations' times are GPS time, so what clock says of the IMU's t = 0 is wrong{near}"
     known = between_clocks(recording.start, recording.gps_zero, float(gnss.t[0]), None)
     if (unit := _unit_of_stamps(gnss.t, recording)) is not None:
         return f'{apart}: the stamps of the fixes are in {unit}; say units = {{ t = "{unit}" }} in [gnss]'
