@@ -328,7 +328,7 @@ class Tracker(Chain):
             stops = stops if self.foot else stops[stops[:, 1] > begin]
             here = stops[(stops[:, 0] < begin) & (stops[:, 1] > begin)]
             begin = min([begin, *here[:, 0].tolist()])
-        recording = self._around(sensors, begin, float(times[-1]) + 0.1)
+        recording = self._around(sensors, begin, max(float(times[-1]) + 0.1, sensors.imu_until(float(times[-1]))))
         start, speed = self.window.newest.state, None
         if recording.odometer is not None:
             speed = MeanSpeed.of(recording.odometer, self._readings.wrong, self._readings.figures)
