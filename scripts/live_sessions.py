@@ -44,7 +44,7 @@ def main() -> int:
     parser.add_argument("who", choices=RATE)
     parser.add_argument("--hours", type=float, default=2.0)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--lag", type=float, default=120.0)
+    parser.add_argument("--lag", type=float, default=120.0, help="s (%(default)s)")
     options = parser.parse_args()
     rng = random.Random(options.seed)
     recording = made(options.who, 3600.0 * options.hours)
@@ -70,11 +70,15 @@ def made(who: str, seconds: float) -> Recording:
 
 
 def interrupted(rows: list[Row], recording: Recording) -> list[Row]:
-    """Fixes away for half a minute of every ten, the odometer too, and a clock set back at a third, ahead at two."""
+    """Fixes away for half a minute of every ten, the odometer too, and a clock set back at a third, ahead at two.
+
+    Of an IMU that is alone a tenth of a second is away every ten minutes.
+    """
     start, whole, out = recording.start, recording.duration, []
+    alone = recording.gnss is None and recording.odometer is None
     for sensor, t, values in rows:
         since = t - start
-        if sensor != "imu" and 300.0 < since % 600.0 < 330.0:
+        if 300.0 < since % 600.0 < (300.1 if alone else 330.0) and (alone or sensor != "imu"):
             continue
         step = 0.0 if since < whole / 3 else -1000.0 if since < 2 * whole / 3 else 2600.0
         out.append((sensor, t + step, values))

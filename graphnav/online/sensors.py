@@ -290,6 +290,11 @@ class Sensors:
         for buffer in (self.imu, *self.aiding.values()):
             buffer.drop_before(t)
 
+    def imu_until(self, t: float) -> float:
+        """When the IMU spoke first at or after a time, s; only that row tells that it was silent there."""
+        rows = self.imu.t
+        return float(rows[min(int(np.searchsorted(rows, t - SAME)), len(rows) - 1)]) if len(rows) else t
+
     def recording(self, begin: float = -np.inf, end: float = np.inf, every: bool = False) -> Recording:
         """The rows between two times as a recording; with `every` the fixes that are not used, too."""
         rows = self.imu.between(begin, end)

@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import os
 import pickle
 from collections import deque
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from graphnav.core.errors import ConfigError, GraphnavError
 from graphnav.core.trajectory import Trajectory
@@ -28,8 +27,8 @@ from graphnav.online.steady import Online
 from graphnav.recording.exporters import csv
 
 TRAJECTORY, CHECKPOINT, SUMMARY = "trajectory.csv", "checkpoint", "summary.json"
-_MAGIC = b"graphnav checkpoint 3\n"
-
+_MAGIC = b"graphnav checkpoint 4\n"
+_DIGEST = hashlib.sha256
 
 _PLAIN = {
     "array": ("_array_reconstructor", "array"),
@@ -157,14 +156,18 @@ class Store:
     def checkpoint(self, online: Online, counts: dict[str, int], done: bool = False) -> None:
         """Remember the smoother as it is now; what the journal held before is done with."""
         number = self._number + 1
-        body = pickle.dumps(Checkpoint(online, self.source, counts, self._length, number, done, self.piece), protocol=5)
+        now = Checkpoint(online, self.source, counts, self._length, number, done, self.piece)
         path, fresh = self.folder / CHECKPOINT, self.folder / (CHECKPOINT + ".new")
 
         def write() -> None:
             if self.pending:
                 self._path(number).write_bytes(b"".join(line + b"\n" for line in self.pending))
             with fresh.open("wb") as file:
-                file.write(_MAGIC + hashlib.sha256(body).digest() + body)
+                file.write(_MAGIC + bytes(_DIGEST().digest_size))
+                body = _Digested(file)
+                pickle.dump(now, body, protocol=5)
+                file.seek(len(_MAGIC))
+                file.write(body.digest.digest())
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(fresh, path)
@@ -205,16 +208,28 @@ class Store:
             raise GraphnavError(f"{self.folder}: cannot be written ({error.strerror}); {how}") from None
 
 
+class _Digested:
+    """A file that is written through a digest, so that a checkpoint is in memory nowhere as a whole."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self.digest = file, _DIGEST()
+
+    def write(self, data: bytes) -> int:
+        self.digest.update(data)
+        return self._file.write(data)
+
+
 def _read(path: Path) -> Checkpoint:
-    data = path.read_bytes()
-    start = len(_MAGIC) + 32
-    body = data[start:]
-    if not data.startswith(_MAGIC) or hashlib.sha256(body).digest() != data[len(_MAGIC) : start]:
-        raise ConfigError(f"--resume: {path} is no checkpoint of this version, or damaged")
-    try:
-        found = _Unpickler(io.BytesIO(body)).load()
-    except Exception:  # whatever a pickle made by somebody else stumbles over
-        found = None
+    found = None
+    with path.open("rb") as file:
+        magic, told = file.read(len(_MAGIC)), file.read(_DIGEST().digest_size)
+        start = file.tell()
+        if magic == _MAGIC and hashlib.file_digest(file, _DIGEST).digest() == told:
+            file.seek(start)
+            try:
+                found = _Unpickler(file).load()
+            except Exception:  # whatever a pickle made by somebody else stumbles over
+                found = None
     if not isinstance(found, Checkpoint):
         raise ConfigError(f"--resume: {path} is no checkpoint of this version, or damaged")
     return found

@@ -46,6 +46,7 @@ from graphnav.recording.odometer import MeanSpeed
 _ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints look at where the IMU has no gap; else `CONTEXT`
 _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
+_SMOOTHED = 8  # covariances that are smoothed back over in the time in which one keyframe is linearised again
 _LATEST = 0.5  # of the lag by which they may be late for it, where states still move
 
 
@@ -174,6 +175,8 @@ class Tracker(Chain):
             self._turned = False
             if not self._revise(sensors) and self._settling:
                 self._settle(self.newest - lag)
+        elif settling and self.window.leaving:
+            self._settle(self.newest - lag)
         elif settling and self._tried < self.newest and self.newest - self._oldest > lag * (1.0 + 1.0 / _PORTIONS):
             self._tried, self._settling = self.newest, True
             if not self._revise(sensors, always=self._robust):
@@ -242,7 +245,7 @@ class Tracker(Chain):
 
     def _revise(self, sensors: Sensors, always: bool = False) -> bool:
         """Linearise again as much as there is time for at a row; False once there is nothing left to do."""
-        more = self.window.revise(self.at_a_row, lambda *which: self._pose_again(sensors, *which), always)
+        more = self.window.revise(self.at_a_row, lambda *which: self._renew(sensors, *which), always)
         self._forget()
         return more
 
@@ -259,13 +262,17 @@ class Tracker(Chain):
     def _settle(self, until: float) -> None:
         """Settle the keyframes before a time, which have been linearised again where they moved."""
         self._settling = False
-        count = int(np.searchsorted(self.window.t, until))
+        count = self.window.leaving or int(np.searchsorted(self.window.t, until))
         if not count:
             return
-        last = count == len(self.window)
+        last = until == np.inf
         overdue = self.newest - float(self.window.stages[0].place.t) - self.settings.solver.lag
         if not last and overdue < _LATEST * self.settings.solver.lag and self.window.first_moved() is not None:
             return  # still being linearised again: the next keyframe will do
+        if last:
+            count = len(self.window)
+        elif not self.window.smooth_back(count, _SMOOTHED * self.at_a_row) and overdue < self.settings.solver.lag:
+            return  # some rows more
         self.settled.append(self._leave(count))
         self._ahead = None  # what has settled may say that sigmas are others
         self._motions = {t: one for t, one in self._motions.items() if t > self.head - CONTEXT}
@@ -328,7 +335,7 @@ class Tracker(Chain):
             stops = stops if self.foot else stops[stops[:, 1] > begin]
             here = stops[(stops[:, 0] < begin) & (stops[:, 1] > begin)]
             begin = min([begin, *here[:, 0].tolist()])
-        recording = self._around(sensors, begin, float(times[-1]) + 0.1)
+        recording = self._around(sensors, begin, max(float(times[-1]) + 0.1, sensors.imu_until(float(times[-1]))))
         start, speed = self.window.newest.state, None
         if recording.odometer is not None:
             speed = MeanSpeed.of(recording.odometer, self._readings.wrong, self._readings.figures)
@@ -369,6 +376,10 @@ class Tracker(Chain):
         t = near.imu.t
         whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < GAP * period_of(t)
         return near if whole else sensors.recording(begin - CONTEXT, end)
+
+    def _renew(self, sensors: Sensors, first: int, end: int) -> list[Place] | None:
+        """As `_pose_again`; None where that was enough for a row, and is to be asked for again at the next."""
+        return self._pose_again(sensors, first, end)
 
     def _pose_again(self, sensors: Sensors, first: int, end: int) -> list[Place]:
         """The places of the stages from `first` to `end`, posed again with those around them, and stops as a whole."""

@@ -148,6 +148,11 @@ class Walker(Tracker):
     def _shown(self) -> tuple[Message, float]:
         return (self.window.newest, self.newest) if self._work is None else self._work.shown
 
+    def _renew(self, sensors: Sensors, first: int, end: int) -> list[Place] | None:
+        before = self._renewal
+        places = self._pose_again(sensors, first, end)
+        return places if self._renewal is before else None
+
     def _pose_again(self, sensors: Sensors, first: int, end: int) -> list[Place]:
         """As of `Tracker`; what is posed for some stages is kept for those that follow."""
         stages, known = self.window.stages[first:end], self._renewal

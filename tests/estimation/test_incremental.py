@@ -136,7 +136,7 @@ def test_a_lag_over_the_outage_gives_the_batch_solution_to_a_centimetre(drive: t
 
 # -------------------------------------------------------------------------------------------------------- messages
 def some_message(rng: np.random.Generator) -> Message:
-    return Message(random_states(rng, 1), rng.standard_normal(4), {"a": slice(15, 19)}, np.triu(
+    return Message.of(random_states(rng, 1), rng.standard_normal(4), {"a": slice(15, 19)}, np.triu(
         rng.standard_normal((19, 19)) + 5 * np.eye(19)), rng.standard_normal(19))  # fmt: skip
 
 
@@ -243,29 +243,39 @@ def test_real_program_run(shared_data: Path, name: str) -> None:
     assert "solver.step_times" in map(key_of, a.notes)
 
 
-def test_spans_that_are_kept_smooth_back_as_stage_by_stage(posed: Problem) -> None:
-    """Covariances of what settles, with spans from before, after a change within them, and without any."""
+def test_what_smooths_back_is_the_whole_matrix(posed: Problem) -> None:
+    """Of which a stage keeps the rows that are not those of the identity."""
+    window, steps = Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3), node_steps(posed)
+    fill(window, posed, 0, 90, steps)
+    P = window.newest.covariance
+    for stage in reversed(window.stages[1:]):
+        G, noise = stage.back(np.eye(len(P))), np.zeros((len(stage.g), len(stage.g)))
+        noise[stage.lost[:, None], stage.lost] = stage.C
+        expected = G @ P @ G.T + noise
+        P = stage.before(P)
+        scale = np.sqrt(np.diag(expected))
+        np.testing.assert_allclose(P / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-12)
+
+
+def test_covariances_come_in_portions_as_at_once(posed: Problem) -> None:
+    """Of what was known when the first was asked for; and of what is known now once keyframes were taken back."""
     steps = node_steps(posed)
-    window = Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3)
-
-    def plain(count: int) -> list[Array]:
-        P, out = window.newest.covariance, []
-        for k in range(len(window) - 1, -1, -1):
-            if k < count:
-                out.append(P)
-            P = window.stages[k].before(P)
-        return out[::-1]
-
-    fill(window, posed, 0, 70, steps)
-    for first, last, count in ((70, 90, 10), (90, 95, 7), (95, 130, 30)):
-        expected = plain(count)
-        for P, own in zip(expected, window._covariances(count), strict=True):
-            np.testing.assert_allclose(own, P, rtol=1e-6, atol=1e-9 * np.abs(P).max())
-        window.settle(count)
-        if first == 90:
-            window.relinearize(40)
-        fill(window, posed, first, last, steps)
-    assert window._spans
+    one, two = (Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3) for _ in range(2))
+    for window in (one, two):
+        fill(window, posed, 0, 90, steps)
+    fill(two, posed, 90, 100, steps)
+    two.truncate(90)
+    assert not two.smooth_back(20, 7)
+    two.truncate(80)
+    fill(two, posed, 80, 90, steps)
+    assert not two.leaving
+    while not two.smooth_back(20, 7):
+        if len(two) < 95:
+            fill(two, posed, len(two), len(two) + 1, steps)
+    assert two.leaving == 20
+    found, expected = two.settle(20).covariance, one.settle(20).covariance
+    sd = np.sqrt(np.einsum("kii->ki", expected))  # about states that differ by what came meanwhile
+    np.testing.assert_allclose((found - expected) / sd[:, None] / sd[..., None], 0.0, atol=1e-3)
 
 
 def test_linearised_again_in_portions_it_is_the_same(posed: Problem) -> None:

@@ -67,7 +67,7 @@ def predict(
     EstimationError
         If the rows do not determine what is eliminated: sigmas or units are wrong.
     """
-    D0, D = len(before.z), width(columns)
+    D0, D, R0 = len(before.z), width(columns), before.R
     gone = [before.columns[s.name] for s in place.steps if s.name in before.columns]
     lost = np.arange(DIM if place.linked else 0)
     if gone:
@@ -81,18 +81,18 @@ def predict(
     linked = 0 if link is None else DIM
     A = np.zeros((D0 + steps + linked + sum(one.b.size for one in rows), E + D + 1 + C), order="F")
     head = A[:, : E + D + 1]
-    head[:D0, to], head[:D0, -1] = before.R, before.z
+    head[:D0, to], head[:D0, -1] = R0, before.z
     if tests is not None:
-        A[:D0, E + D + 1 :] = before.R @ tests.X
+        A[:D0, E + D + 1 :] = R0 @ tests.X
     apart = np.zeros(DIM) if place.linked else state.minus(before.state)[0]
     if np.any(apart):  # one and the same state, but about its new point
-        head[:D0, -1] -= before.R[:, :DIM] @ apart
+        head[:D0, -1] -= R0[:, :DIM] @ apart
         head[:D0, E : E + 3] = head[:D0, E : E + 3] @ rotation.right_jacobian_inverse(apart[None, :3])[0]
     moved = values[: D0 - DIM] - before.values
     for at in gone:
         moved[shift(at)] = 0.0
     if np.any(moved):  # parameters that stay are about the new point's values
-        head[:D0, -1] -= before.R[:, DIM:] @ moved
+        head[:D0, -1] -= R0[:, DIM:] @ moved
     row = D0
     for step in place.steps:
         at = columns[step.name]
@@ -120,15 +120,14 @@ def predict(
     if info:
         raise EstimationError(f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units")
     root = root * _upper(E)
-    G, g = np.zeros((D0, D)), np.zeros(D0)
-    kept = np.arange(D0)
-    G[kept, kept] = 1.0
+    g = np.zeros(D0)
     g[DIM:] = values[: D0 - DIM] - before.values
-    G[lost], g[lost] = -root @ R[:E, E : E + D], root @ R[:E, E + D]
-    if np.any(apart):
-        G[:DIM] = rotate_columns(G[:DIM], rotation.right_jacobian_inverse(apart[None, :3])[0])
+    G, g[lost], noise = -root @ R[:E, E : E + D], root @ R[:E, E + D], root @ root.T
+    if not place.linked:  # nothing is eliminated of the state, but its attitude is about another point
+        J = rotate_columns(np.eye(3, D), rotation.right_jacobian_inverse(apart[None, :3])[0])
+        G, lost, noise = np.concatenate([J, G]), np.concatenate([np.arange(3), lost]), np.pad(noise, (3, 0))
         g[:DIM] += apart
-    return Predicted(before, place, state, values, columns, link, top, G, g, lost, root @ root.T, tuple(rows))
+    return Predicted(before, place, state, values, columns, link, top, G, g, lost, noise, tuple(rows))
 
 
 def update(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -> tuple[Stage, Array]:
@@ -159,10 +158,10 @@ def update(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -
             top, _ = _under(top, tail)
         if tests is not None:
             top, beside, fault = _tested(top, tests.copy(), rows, y, passes, place.t, ahead.state)
-        message = Message(ahead.state, ahead.values, ahead.columns, top[:, :D], top[:, D], beside)
-        y, info = dtrtrs(message.R, message.z)
+        y, info = dtrtrs(top[:, :D], top[:, D])
         if info:
             raise EstimationError(f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units")
+    message = Message.of(ahead.state, ahead.values, ahead.columns, top[:, :D], top[:, D], beside)
     measured = (*ahead.measured, *rows)
     return Stage(place, message, ahead.G, ahead.g, ahead.lost, ahead.C, measured, fault=fault), y
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from graphnav.estimation.solvers.window import Window
 
 Renewed = Callable[[int, int], Sequence[Place]]
+Renewing = Callable[[int, int], Sequence[Place] | None]  # None where it wants to be asked again at the next step
 
 
 class Revision:
@@ -33,7 +34,7 @@ class Revision:
         self._before: Stage | Message = before.moved(window.means()[first])
         self._made: list[tuple[Stage, Stage]] = []  # what was there, and what is instead
 
-    def step(self, count: int, renewed: Renewed | None) -> bool:
+    def step(self, count: int, renewed: Renewing | None) -> bool:
         """Make at most so many stages; True once they are in their place, or are not wanted any more.
 
         Parameters
@@ -50,6 +51,8 @@ class Revision:
         if begin < end:
             old = window.stages[begin:end]
             places = [stage.place for stage in old] if renewed is None else renewed(begin, end)
+            if places is None:
+                return False
             made += zip(old, self._again(old, window.means()[begin + 1 : end + 1], places), strict=True)
         if end < len(window):
             return False

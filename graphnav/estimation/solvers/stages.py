@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.linalg.lapack import dgesv
@@ -54,14 +55,33 @@ class Place:
 
 @dataclass(frozen=True)
 class Message:
-    """R y = z about a point; `columns` says where the parameters stand behind the fifteen states."""
+    """R y = z about a point; `columns` says where the parameters stand behind the fifteen states.
+
+    R is a triangle whose first three columns may be turned. A window of hundreds of keyframes is made of such
+    matrices, so of each is kept what may be other than zero (`Message.of`).
+    """
 
     state: States  # one
     values: Array  # (D-15,)
     columns: Columns
-    R: Array  # (D, D)
+    packed: Array  # (D (D + 1) / 2 + 3,) of R, row by row
     z: Array  # (D,)
     tests: Watch | None = None
+
+    @classmethod
+    def of(
+        cls, state: States, values: Array, columns: Columns, R: Array, z: Array, tests: Watch | None = None
+    ) -> Message:
+        """One with R (D, D), of which nothing is looked at below the triangle and its first three rows."""
+        return cls(state, values, columns, R[_triangle(len(z))], np.array(z), tests)
+
+    @property
+    def R(self) -> Array:
+        """(D, D)"""
+        D = len(self.z)
+        out = np.zeros((D, D))
+        out[_triangle(D)] = self.packed
+        return out
 
     @property
     def estimate(self) -> Array:
@@ -80,8 +100,8 @@ class Message:
     def moved(self, e: Array, J: Array | None = None) -> Message:
         """The same about the point moved by the error state e (D,); J is Jr^-1 of its turn, if known."""
         J = rotation.right_jacobian_inverse(e[None, :3])[0] if J is None else J
-        state, values = self.state.plus(e[None, :DIM]), self.values + e[DIM:]
-        return Message(state, values, self.columns, rotate_columns(self.R, J), self.z - self.R @ e, self.tests)
+        state, values, R = self.state.plus(e[None, :DIM]), self.values + e[DIM:], self.R
+        return Message.of(state, values, self.columns, rotate_columns(R, J), self.z - R @ e, self.tests)
 
     def value(self, name: str) -> Array:
         """A parameter at the point."""
@@ -112,13 +132,16 @@ class Measured:
 
 @dataclass(frozen=True)
 class Stage:
-    """A keyframe in the window. Smoothing back, y_before = g + G y + noise of covariance C in the rows `lost`."""
+    """A keyframe in the window. Smoothing back, y_before = g + y, but g + G y + noise of covariance C in rows `lost`.
+
+    What was not eliminated is the same at both.
+    """
 
     place: Place
     message: Message
-    G: Array  # (D before, D)
+    G: Array  # (lost, D)
     g: Array  # (D before,)
-    lost: Array  # rows that were eliminated
+    lost: Array  # rows that were eliminated, or are about another point
     C: Array  # (lost, lost)
     measured: tuple[Measured, ...] = ()
     fault: tuple[str, float] | None = None  # whose fixes are wrong, and since when (s)
@@ -126,21 +149,31 @@ class Stage:
     def moved(self, e: Array) -> Stage:
         """The same about the point moved by the error state e."""
         J = rotation.right_jacobian_inverse(e[None, :3])[0]
-        message, G, g = self.message.moved(e, J), rotate_columns(self.G, J), self.g + self.G @ e
+        message, G, g = self.message.moved(e, J), rotate_columns(self.G, J), self.g + self.back(e)
         return Stage(self.place, message, G, g, self.lost, self.C, self.measured, self.fault)
 
-    @property
-    def noise(self) -> Array:
-        """(D before, D before), C in its place."""
-        out = np.zeros((len(self.G), len(self.G)))
-        out[self.lost[:, None], self.lost] = self.C
+    def back(self, A: Array) -> Array:
+        """What smooths back, without g, times A (D, ...)."""
+        out = A[: len(self.g)].copy()
+        out[self.lost] = self.G @ A
         return out
 
     def before(self, P: Array) -> Array:
         """The covariance before from that of y."""
-        out = self.G @ P @ self.G.T
-        out[self.lost[:, None], self.lost] += self.C
-        return np.asarray(out)
+        n, lost = len(self.g), self.lost
+        cross = self.G @ P
+        out = P[:n, :n].copy()
+        out[lost] = cross[:, :n]
+        out[:, lost] = cross[:, :n].T
+        out[lost[:, None], lost] = cross @ self.G.T + self.C
+        return out
+
+
+@cache
+def _triangle(D: int) -> tuple[Array, Array]:
+    """Rows and columns of what may be other than zero in R: an upper triangle, and its first three columns turned."""
+    rows, columns = np.nonzero(np.triu(np.ones((D, D))) + np.pad(np.ones((3, 3)), (0, max(D - 3, 0)))[:D, :D])
+    return rows, columns
 
 
 def rotate_columns(A: Array, J: Array) -> Array:

@@ -95,8 +95,8 @@ class Tree:
         """State and parameter values of the newest keyframe as they are known now, without what is known of them."""
         if not self.keyframes:
             return self._prior
-        last, none = self.keyframes[-1], np.empty((0, 0))
-        return Message(last.estimate, last.values, last.columns, none, none[0:0])
+        last, none = self.keyframes[-1], np.empty(0)
+        return Message(last.estimate, last.values, last.columns, none, none)
 
     def add(self, place: Place, ahead: Predicted | None = None, rows: Sequence[Measured] = ()) -> float:
         """Take in one more keyframe; returns by how much its rows turned it, rad.

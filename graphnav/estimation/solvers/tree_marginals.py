@@ -22,7 +22,7 @@ def newest_covariance(tree: Tree) -> Array:
 
 
 def newest_root(tree: Tree, columns: Columns) -> Array:
-    """(D, D) R, not triangular: R e are the whitened errors of the newest keyframe and its parameters."""
+    """(D, D) R, a triangle: R e are the whitened errors of the newest keyframe and its parameters."""
     last = tree.keyframes[-1]
     D = DIM + len(last.values)
     variables = list({x.key: x for x in (last.state, *(n for n, _ in last.nodes.values()))}.values())
@@ -41,7 +41,7 @@ def newest_root(tree: Tree, columns: Columns) -> Array:
     # of the correlations, so that a gyro's bias and a place have the same digits
     sd = np.sqrt(np.diag(P))
     w, V = np.linalg.eigh(P / sd[:, None] / sd)
-    return np.asarray((V / np.sqrt(np.maximum(w, np.finfo(float).eps))).T / sd)
+    return np.asarray(np.linalg.qr((V / np.sqrt(np.maximum(w, np.finfo(float).eps))).T, "r") / sd)
 
 
 def smooth_keyframes(tree: Tree, count: int, first: int = 0) -> SettledStates:

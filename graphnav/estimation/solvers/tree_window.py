@@ -8,18 +8,20 @@ anew. The keyframe that settled last stays in the tree, so that all behind it ca
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.revision import Renewed
-from graphnav.estimation.solvers.stages import Message, Place
+from graphnav.estimation.solvers.revision import Renewed, Renewing
+from graphnav.estimation.solvers.stages import Message, Place, Stage
 from graphnav.estimation.solvers.tree import Tree
 from graphnav.estimation.solvers.tree_marginals import newest_root, smooth_keyframes
 from graphnav.estimation.solvers.window import SettledStates, Window
 
 _ROUNDS = 5
+_ASKED = 16  # parts in which covariances are asked for: rows of an IMU between two keyframes are more
 _FINE = 0.02  # of the usual limits, within which the last window is converged
 
 
@@ -30,6 +32,8 @@ class TreeWindow(Window):
         super().__init__(prior, turn)
         self.tree: Tree | None = None
         self._before = 0  # keyframes in the tree before the first stage
+        # stages that are to leave; the newest when that began, and up to which keyframe covariances were asked for
+        self._leaving: tuple[int, Stage, int] | None = None
 
     def push(self, place: Place, ahead: Predicted | None = None) -> float:
         """As of `Window`; the newest message is about the tree's estimate."""
@@ -48,9 +52,9 @@ class TreeWindow(Window):
         e = np.concatenate([now.state.minus(stage.message.state)[0], now.values - stage.message.values])
         moved = stage.moved(e)
         message = moved.message
-        R = newest_root(self.tree, message.columns) if full else message.R
-        tests = message.tests
-        self.stages[-1] = replace(moved, message=replace(message, R=R, z=np.zeros(len(R)), tests=tests))
+        R, tests = newest_root(self.tree, message.columns) if full else message.R, message.tests
+        message = Message.of(message.state, message.values, message.columns, R, np.zeros(len(R)), tests)
+        self.stages[-1] = replace(moved, message=message)
         self._means = None
 
     # ------------------------------------------------------------------------------------------- what the tree knows
@@ -76,10 +80,37 @@ class TreeWindow(Window):
             count += 1
         return count
 
-    def revise(self, count: int, renewed: Renewed, always: bool = False) -> bool:
+    def revise(self, count: int, renewed: Renewing, always: bool = False) -> bool:
         """As `converge`, all at once; False, as nothing is left to do."""
-        self.converge(always=always, renewed=renewed)
+
+        def at_once(first: int, end: int) -> Sequence[Place]:
+            while (places := renewed(first, end)) is None:
+                pass
+            return places
+
+        self.converge(always=always, renewed=at_once)
         return False
+
+    def smooth_back(self, count: int, most: int) -> bool:
+        """A part of what the tree has to do for covariances of the first stages; True once they cost little.
+
+        What it makes for one keyframe it has for those before, until a keyframe comes: so the newest are asked for
+        first, and a part is a sixteenth of the window.
+        """
+        assert self.tree is not None
+        newest = self.stages[-1]
+        if self._leaving is None or self._leaving[1] is not newest:
+            self._leaving = count, newest, len(self.tree) - 1
+        first, _, at = self._leaving
+        at = max(0, at - max(1, len(self.tree) // _ASKED))
+        smooth_keyframes(self.tree, at + 1, at)
+        self._leaving = first, newest, at
+        return at == 0
+
+    @property
+    def leaving(self) -> int:
+        """How many stages `smooth_back` is about, 0 if it has not begun."""
+        return 0 if self._leaving is None else self._leaving[0]
 
     def _relinearised(self, count: int) -> None:
         self.relinearized += count
@@ -91,7 +122,7 @@ class TreeWindow(Window):
             return
         assert self.tree is not None
         del self.stages[keep:]
-        self._means = None
+        self._means = self._leaving = None
         if keep + self._before == 0:
             self.tree = None  # it has only just begun
             return
@@ -105,11 +136,11 @@ class TreeWindow(Window):
         gone = self.stages[:count]
         if self.tree is None or not gone:
             return super().settle(0)
+        self._leaving = None
         self.tree.read()
         out = smooth_keyframes(self.tree, self._before + count, self._before)
         self.head = gone[-1].message
         del self.stages[:count]
-        self._gone += count
         self._means = None
         if len(self.tree) > self._before + count:
             self.tree.marginalise(self._before + count - 1)

@@ -19,7 +19,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.elimination import Predicted, predict, update
 from graphnav.estimation.solvers.points import move_covariance
-from graphnav.estimation.solvers.revision import Renewed, Revision
+from graphnav.estimation.solvers.revision import Renewed, Renewing, Revision
 from graphnav.estimation.solvers.stages import (
     Columns,
     Message,
@@ -33,14 +33,12 @@ from graphnav.estimation.solvers.stages import (
 from graphnav.estimation.solvers.watch import Watch
 from graphnav.recording import ImuNoise
 
-_SHARE = (
-    0.01  # of the noise of a second's force that a turn may be neglected for: the same way every second, it adds up
-)
+# of the noise of a second's force that a turn may be neglected for: the same way every second, it adds up
+_SHARE = 0.01
 _G = 9.8  # m/s^2
 _DELAY = 0.02  # s, of a delay: 1 mm where speed is known to 5 cm/s
 _ROUNDS = 5
-_SPAN = 16  # stages that are smoothed back over at once
-_ALMOST = 0.3
+_ALMOST = 0.3  # of the limits: what has moved that far goes with what is beyond them, as it would be next
 _LIMITS = {"rad": 1e-2, "s": _DELAY}
 
 
@@ -59,15 +57,25 @@ class SettledStates:
         return len(self.t)
 
 
-@dataclass(frozen=True)
-class _Stretch:
-    """Some stages as one, smoothing back: y_first = F y_last + noise of covariance C. Indices count from the first."""
+class _Covariances:
+    """Covariances of the first `count` of some stages, smoothed back from the last a portion at a time."""
 
-    first: int
-    last: int
-    stage: Stage  # the last: when it has been replaced, so may have been those before it
-    F: Array
-    C: Array
+    def __init__(self, stages: Sequence[Stage], count: int) -> None:
+        self.count, self._stages = count, list(stages)
+        self._P = stages[-1].message.covariance if stages else np.empty((0, 0))
+        self.found: list[Array] = []  # (D, D), the last first
+
+    def step(self, most: int) -> bool:
+        """Go back over at most so many stages; True once all are known."""
+        for _ in range(most):
+            if len(self.found) == self.count:
+                break
+            stage = self._stages.pop()
+            if len(self._stages) < self.count:
+                self.found.append(self._P)
+            if self._stages:
+                self._P = stage.before(self._P)
+        return len(self.found) == self.count
 
 
 class Window:
@@ -85,9 +93,9 @@ class Window:
         self.stages: list[Stage] = []
         self.relinearized = 0  # stages made anew
         self._limit = limits(prior.columns, {})
-        self._gone = 0  # stages that have left
-        self._spans: list[_Stretch] = []
+        self._covariances: _Covariances | None = None  # of stages that are to leave
         self._means: list[Array] | None = None
+        self._moved: Array | None = None  # `_moves`, of these
         self._revision: Revision | None = None
         self._rounds = 0  # of it
 
@@ -151,7 +159,7 @@ class Window:
         if keep >= len(self.stages):
             return
         del self.stages[keep:]
-        self._means = None
+        self._means = self._covariances = None
         if self.stages:
             self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
         else:
@@ -167,7 +175,7 @@ class Window:
         self.stages[first:] = stages
         if stages:
             self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
-        self._means = None
+        self._means = self._covariances = None
         self.relinearized += len(stages)
 
     def means(self) -> list[Array]:
@@ -176,19 +184,36 @@ class Window:
             e = self.newest.estimate
             out = [e]
             for stage in reversed(self.stages):
-                e = stage.G @ e
+                e = stage.back(e)
                 e += stage.g
                 out.append(e)
-            self._means = out[::-1]
+            self._means, self._moved = out[::-1], None
         return self._means
+
+    def smooth_back(self, count: int, most: int) -> bool:
+        """A part of what `settle` does for the first stages, over at most so many; True once it is done.
+
+        Keyframes that come meanwhile do not count; when some are taken back, it begins anew.
+        """
+        if self._covariances is None:
+            self._covariances = _Covariances(self.stages, count)
+        return self._covariances.step(most)
+
+    @property
+    def leaving(self) -> int:
+        """How many stages `smooth_back` is about, 0 if it has not begun."""
+        return 0 if self._covariances is None else self._covariances.count
 
     def settle(self, count: int) -> SettledStates:
         """Smooth the window and let its first `count` stages go."""
-        gone, means = self.stages[:count], self.means()[1 : count + 1]
-        self._revision, self._rounds = None, 0
+        gone, means, back = self.stages[:count], self.means()[1 : count + 1], self._covariances
+        if back is None or back.count != count:
+            back = _Covariances(self.stages, count)
+        back.step(len(self.stages))
+        self._revision, self._covariances, self._rounds = None, None, 0
         columns = tuple(stage.message.columns for stage in gone)
         rows, covariance, sigma = [], np.empty((len(gone), DIM, DIM)), []
-        for k, (stage, P) in enumerate(zip(gone, self._covariances(count), strict=True)):
+        for k, (stage, P) in enumerate(zip(gone, reversed(back.found), strict=True)):
             rows.append(stage.message.state)
             covariance[k] = P[:DIM, :DIM]
             sigma.append(np.sqrt(np.maximum(np.diagonal(P)[DIM:], 0.0)))
@@ -199,7 +224,6 @@ class Window:
             states, covariance = States.stack(rows).plus(moved), move_covariance(covariance, moved)
             self.head = gone[-1].message
             del self.stages[:count]
-            self._gone += count
             self._means = None
             if not self.stages:
                 self.head = self.head.moved(self.head.estimate)
@@ -212,55 +236,22 @@ class Window:
             sigma=tuple(sigma),
         )
 
-    def _covariances(self, count: int) -> list[Array]:
-        """(D, D) of the first `count` stages."""
-        out: list[Array] = []
-        P, at = self.newest.covariance, len(self.stages) - 1
-        for span in reversed(self._bridge(count)):
-            while at > span.last - self._gone:
-                P = self.stages[at].before(P)
-                at -= 1
-            P = span.F @ P @ span.F.T + span.C
-            at = span.first - self._gone
-        while at >= 0:
-            if at < count:
-                out.append(P)
-            if at:
-                P = self.stages[at].before(P)
-            at -= 1
-        return out[::-1]
-
-    def _bridge(self, count: int) -> list[_Stretch]:
-        """What leads from the newest stages back to the last of the first `count`, most of it as it was last time."""
-        first, newest = self._gone + count - 1, self._gone + len(self.stages) - 1
-        spans = [
-            span
-            for span in self._spans
-            if first <= span.first and span.last <= newest and self.stages[span.last - self._gone] is span.stage
-        ]
-        begin = spans[-1].last if spans else first
-        for k in range(begin, newest - _SPAN + 1, _SPAN):
-            run = self.stages[k - self._gone + 1 : k - self._gone + _SPAN + 1]
-            F, C = run[-1].G, run[-1].noise
-            for stage in run[-2::-1]:
-                F, C = stage.G @ F, stage.before(C)
-            spans.append(_Stretch(k, k + _SPAN, run[-1], F, C))
-        self._spans = spans
-        return spans
-
     # ------------------------------------------------------------------------------------------ linearising again
     def first_moved(self, share: float = 1.0) -> int | None:
         """The first stage whose point is further than its limit from the smoothed state; None if there is none."""
-        means = self.means()[1:]
-        if not means:
-            return None
-        limit = self._limit[1]
-        e = np.zeros((len(means), max(len(x) for x in means)))
-        for row, x in zip(e, means, strict=True):
-            row[: len(x)] = x
-        far = np.einsum("ki,ki->k", e[:, :3], e[:, :3]) > (share * self.turn) ** 2
-        far |= np.any(np.abs(e[:, DIM:]) > share * limit[: e.shape[1] - DIM], axis=1)
+        far = self._moves() > share
         return int(np.argmax(far)) if far.any() else None
+
+    def _moves(self) -> Array:
+        """(n,) how far the smoothed states are from their points, 1 at the limit."""
+        means, limit = self.means()[1:], self._limit[1]
+        if self._moved is None and means:
+            e = np.zeros((len(means), max(len(x) for x in means)))
+            for row, x in zip(e, means, strict=True):
+                row[: len(x)] = x
+            turn = np.linalg.norm(e[:, :3], axis=1) / self.turn
+            self._moved = np.maximum(turn, np.abs(e[:, DIM:] / limit[: e.shape[1] - DIM]).max(axis=1, initial=0.0))
+        return np.empty(0) if self._moved is None else self._moved
 
     def relinearize(self, first: int, places: Sequence[Place] | None = None) -> None:
         """Make the stages from `first` on anew about the smoothed states.
@@ -292,7 +283,7 @@ class Window:
         """Whether `revise` is not through."""
         return self._revision is not None or self._rounds > 0
 
-    def revise(self, count: int, renewed: Renewed, always: bool = False) -> bool:
+    def revise(self, count: int, renewed: Renewing, always: bool = False) -> bool:
         """A part of what `converge` does, at most so many stages of it; False once there is nothing left to do.
 
         Keyframes may come and go before the next part, and what has been made of them goes with them.
@@ -321,7 +312,7 @@ def turn_limit(noise: ImuNoise) -> float:
 
 def first_message(state: States, sigma: Array) -> Message:
     """A prior: one state and its fifteen sigmas."""
-    return Message(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM))
+    return Message.of(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM))
 
 
 def limits(columns: Columns, units: dict[str, str]) -> tuple[Columns, Array]:
