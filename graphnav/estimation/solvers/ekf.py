@@ -24,14 +24,12 @@ throughout.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg.lapack import dposv
 
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
@@ -39,6 +37,14 @@ from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.ahead import Spans, about_estimates, linear_for, predict_points
+from graphnav.estimation.solvers.gain import (
+    predict_covariance,
+    solve_innovation,
+    solve_robust,
+    update_covariance,
+    weights_of,
+)
 from graphnav.estimation.solvers.linearise import Points, scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
@@ -51,12 +57,10 @@ from graphnav.estimation.solvers.passes import (
     sigmas_of,
 )
 from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate, move_covariance
-from graphnav.estimation.solvers.robust import PASSES, soften, weight_and_cost
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
 from graphnav.estimation.solvers.watch import Bank, Verdicts
 
-_NONE = 1e-12  # weight of a row that is not used beside others of its keyframe
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
 
 
@@ -165,8 +169,22 @@ def _forward(
     begun, P = (x, P), _placed(P, records)
     found: list[Any] = [None] * K  # estimates, or errors where points are given
     ahead = found.copy()
+    # whoever decides by an estimate, or goes back to one, is asked once for each
+    spans = Spans() if bank is None and decide is None else None
     k = 0
     while k < K:
+        if spans is not None and k >= max(n, 1) and spans.due(k):
+            tried = min(spans.length, K - k)
+            done = _filter_span(problem, stack, k, tried, x, P, (all_P, all_Pp, all_F))
+            spans.went(k, tried, len(done))
+            for x, before in done:
+                found[k], ahead[k] = x, before
+                if progress is not None and k % 256 == 0:
+                    progress("filter", k / K)
+                k += 1
+            P = all_P[k - 1]
+            if done:
+                continue
         where: AtEstimate | AtPoints = given if given is not None and k < n else own
         if bank is not None and k in met:
             banks[k] = bank.copy()
@@ -176,12 +194,9 @@ def _forward(
             x, F, Q, added = where.step(k, x)
             if where is own:
                 all_F[k - 1] = F
-            P = np.matmul(F @ P, F.T, out=all_Pp[k])
-            P[:DIM, :DIM] += Q
+            P = predict_covariance(P, F, Q, added, all_Pp[k])
             if bank is not None:
                 bank.predicted(F)
-            if added is not None:
-                P.flat[:: D + 1] += added
         for kind in watched if verdicts.anew else ():
             if (kind.name, problem.t[k]) in verdicts.anew:
                 P = _anywhere(P, kind.fix_of)
@@ -245,6 +260,44 @@ def _forward(
     )
 
 
+def _filter_span(
+    problem: Problem, stack: Stack, k: int, n: int, x: Estimate, P: Array, space: tuple[Array, Array, Array]
+) -> list[tuple[Estimate, Estimate]]:
+    """Filter keyframes k..k+n from the estimate x before them, linearised where that leads to.
+
+    Returns
+    -------
+    list
+        Of those for which that is linear enough: the estimate, and that before the updates. Their covariances and
+        transitions are in `space`: P, P ahead and F, of all keyframes.
+    """
+    points = predict_points(problem, k - 1, n, x)
+    P_of, Pp_of, F_of = space[0][k - 1 : k + n], space[1][k - 1 : k + n], space[2][k - 1 : k + n - 1]
+    given = AtPoints(problem, points, stack, F_of, k - 1)
+    errors, ahead = np.zeros((n + 1, len(P))), np.zeros((n + 1, len(P)))
+    e = errors[0]
+    try:
+        for j in range(1, n + 1):
+            e, F, Q, added = given.step(k - 1 + j, e)
+            ahead[j], P = e, predict_covariance(P, F, Q, added, Pp_of[j])
+            for some in stack.together(k - 1 + j):
+                if some.alone:
+                    e, P, _ = _update(some, e, P, given, stack, None, None)
+                else:
+                    e, P, _ = _update_all(some, e, P, given, stack)
+            errors[j], P_of[j] = e, P
+    except EstimationError:
+        return []  # one by one they say where
+    n = linear_for(problem, given, stack, errors, ahead, Pp_of)
+    there, own = points.first(n + 1), slice(1, n + 1)
+    about_estimates(P_of[own], Pp_of[own], F_of[:n], errors[own], ahead[own])
+    found, before = (move_points(there, one[: n + 1]) for one in (errors, ahead))
+    return [
+        (Estimate(found.states[j : j + 1], found.values[j]), Estimate(before.states[j : j + 1], before.values[j]))
+        for j in range(1, n + 1)
+    ]
+
+
 def _placed(P: Array, records: dict[str, Innovations]) -> Array:
     """What is known at the start, but for the place where the first fix, which tells it, is not used."""
     first = [one.used[0] for one in records.values() if one.rows.fix_of == "p" and len(one.used)]
@@ -272,14 +325,13 @@ def _points(about: Points | None, errors: Array, own: list[Estimate]) -> Points:
 
 def _update_all(some: RowBlock, e: Array, P: Array, given: AtPoints, stack: Stack) -> tuple[Array, Array, Gain]:
     """One update with rows linearised at given points about which nothing is to be decided."""
-    D, at = len(P), some.at
-    H, variance = given.H[at], given.variance[at]
-    r, PHt = given.r[at] + H @ e, P @ H.T
-    root, solved = _solve(H @ PHt, variance, np.concatenate([r[None], PHt, H.T]).T, some)
+    D, (r, H, variance) = len(P), given.weighted(some)
+    r, PHt = r + H @ e, P @ H.T
+    root, solved = solve_innovation(H @ PHt, variance, np.concatenate([r[None], PHt, H.T]).T, some)
     stack.seen(some, root, solved[:, 0])
     K = solved[:, 1 : D + 1].T
     gain = K, H, -solved[:, 0], solved[:, D + 1 :]
-    return e - K @ r, _joseph(P, PHt, H, K, variance), gain
+    return e - K @ r, update_covariance(P, PHt, H, K, variance), gain
 
 
 def _update(
@@ -289,7 +341,7 @@ def _update(
     D, (rows, lo, hi) = len(P), some.parts[0]
     end = D + 1 if taken is None else 2 * D + 1
     record = stack.records[rows.name]
-    weight, root_weight = _weights(record, lo, hi)
+    weight, root_weight = weights_of(record, lo, hi)
     tests = bank if bank is not None and weight > 0.0 and rows.name in bank else None
     at, e = where.about(x)
     for left in range(where.passes(some) - 1, -1, -1):
@@ -302,12 +354,12 @@ def _update(
             G = tests.signature(rows.name, some.k, H)
             right.append(tests.own(rows.name, G).T)
         sides = np.concatenate(right).T
-        root, solved = _solve(HPHt, sigma * sigma, sides, some)
+        root, solved = solve_innovation(HPHt, sigma * sigma, sides, some)
         if not left:
             stack.seen(some, root, solved[:, 0])
             nis, bent = float(r @ solved[:, 0]), 1.0
             if rows.robust != "none" and rows.gate is None:  # a gate stands in place of a kernel
-                sigma, solved, bent = _robust(HPHt, sigma, sides, solved, some)
+                sigma, solved, bent = solve_robust(HPHt, sigma, sides, solved, some)
         K = solved[:, 1 : D + 1].T
         d = -(K @ r) if e is None else e - K @ r
         if left:  # again about where this leads (Jazwinski 1970, theorem 8.2)
@@ -323,7 +375,7 @@ def _update(
         return x, P, None
     if taken is not None:
         taken.append((K, H, -solved[:, 0], solved[:, D + 1 : end]))
-    P = _joseph(P, PHt, H, K, sigma * sigma)
+    P = update_covariance(P, PHt, H, K, sigma * sigma)
     fault = None
     if tests is not None:
         fault = tests.updated(rows.name, K, G, solved[:, end:], r, where.speed(some.k, x))
@@ -353,50 +405,3 @@ def _hold(one: Decision | None, x: Any, P: Array, where: Any) -> tuple[Any, Arra
     P = M @ P @ M.T + K @ R @ K.T
     d = -(K @ one.residual)
     return (x + d if isinstance(x, np.ndarray) else where.plus(x, d)), 0.5 * (P + P.T)
-
-
-def _weights(record: Innovations, lo: int, hi: int) -> tuple[float, float | Array]:
-    """The largest weight of some rows, and the root of each number's; ones where none is used."""
-    used = record.used[lo:hi]
-    weight = float(max(used))
-    if hi - lo == 1 or weight == 0.0:
-        return weight, math.sqrt(weight) or 1.0
-    return weight, np.repeat(np.sqrt(np.maximum(used, _NONE)), len(record.rows.axes))
-
-
-def _joseph(P: Array, PHt: Array, H: Array, K: Array, variance: Array) -> Array:
-    """The covariance after an update, by Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T."""
-    out = K @ PHt.T
-    np.subtract(P, out, out=out)
-    out -= (out @ H.T - K * variance) @ K.T
-    out = out + out.T  # rounding's asymmetry would grow, past what a stop leaves between its place and the state
-    out *= 0.5
-    return out
-
-
-def _solve(HPHt: Array, variance: Array, right: Array, some: RowBlock) -> tuple[Array, Array]:
-    """The upper root of S = H P H^T + R, and S^-1 times the right sides."""
-    S = HPHt.copy()
-    S.flat[:: len(S) + 1] += variance
-    # LAPACK called directly: for matrices this small the checks around it would cost more than the work
-    root, solved, info = dposv(S.T, right, overwrite_a=1)
-    if info:
-        at = ", ".join(f"'{rows.name}' row {lo}" for rows, lo, _ in some.parts)
-        raise EstimationError(f"the filter's covariance broke down at {at}: check sigmas and units")
-    return root, solved
-
-
-def _robust(HPHt: Array, sigma: Array, right: Array, solved: Array, some: RowBlock) -> tuple[Array, Array, float]:
-    """Sigmas with a kernel's weights in them, S^-1 times the right sides with these, and the least weight.
-
-    As the incremental smoother does with a new keyframe: none at first, then by what the update leaves, a few times.
-    """
-    rows, lo, hi = some.parts[0]
-    stated, weight = sigma, np.ones(hi - lo)
-    for _ in range(PASSES - 1):
-        left = (right[:, 0] - HPHt @ solved[:, 0]) / stated
-        s = np.linalg.norm(left.reshape(hi - lo, -1), axis=1)
-        weight = np.maximum(weight_and_cost(soften(rows.robust), s, rows.scale_of(slice(lo, hi)))[0], 1e-12)
-        sigma = stated / np.repeat(np.sqrt(weight), len(stated) // (hi - lo))
-        _, solved = _solve(HPHt, sigma * sigma, right, some)
-    return sigma, solved, float(np.min(weight))

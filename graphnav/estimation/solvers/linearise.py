@@ -150,6 +150,6 @@ def last_of(chain: ParameterChain) -> Array:
     return np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
 
 
-def stepping(chain: ParameterChain, n: int | None = None) -> Array:
-    """Which of the first n keyframes a parameter moves on to its next node at."""
-    return np.flatnonzero(np.diff(chain.node[:n])) + 1
+def stepping(chain: ParameterChain, first: int = 0, n: int | None = None) -> Array:
+    """Which of n keyframes from `first` on, counted from there, a parameter moves on to its next node at."""
+    return np.flatnonzero(np.diff(chain.node[first : None if n is None else first + n])) + 1

@@ -12,16 +12,18 @@ A pass at given points takes a ninth of the time, and is the better one wherever
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from graphnav.core import rotation
-from graphnav.core.rotation import Array
+from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
-from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.linearise import Points, Step, linearise, node_steps, shift, stepping
+from graphnav.estimation.problem import ParameterChain, Problem
+from graphnav.estimation.solvers.linearise import Points, linearise, shift, stepping
+from graphnav.estimation.solvers.linearise import Rows as LinearRows
 from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.imu.dynamics import SCALE
 
@@ -43,10 +45,10 @@ class AtEstimate:
         self._problem, self._columns, self._scale = problem, problem.columns, problem.columns.get(SCALE)
         self._width = DIM + sum(s.stop - s.start for s in self._columns.values())
         self._I = np.eye(self._width)
-
-    @cached_property
-    def _steps(self) -> dict[int, tuple[Step, ...]]:
-        return node_steps(self._problem)
+        self._steps: dict[int, list[ParameterChain]] = {}  # that move on to their next node, by keyframe
+        for chain in problem.chains:
+            for k in stepping(chain).tolist():
+                self._steps.setdefault(k, []).append(chain)
 
     def step(self, k: int, x: Estimate) -> tuple[Estimate, Array, Array, Array | None]:
         """The estimate at keyframe k from that at the one before, F (D, D), Q (15, 15), and more variance (D,)."""
@@ -57,13 +59,14 @@ class AtEstimate:
         if scale is not None:
             F[:DIM, scale] = motion.scale_columns(at, F15, scale.stop - scale.start)[0]
         values, added = x.values, None
-        if k in self._steps:
-            values, added = values.copy(), np.zeros(self._width)
-            for one in self._steps[k]:
-                column = self._columns[one.name]
-                F[column, column] *= one.decay
-                values[shift(column)] = one.ahead(values[shift(column)])
-                added[column] = one.sigma**2
+        for one in self._steps.get(k, ()):
+            if added is None:
+                values, added = values.copy(), np.zeros(self._width)
+            j, column = int(one.node[k]), self._columns[one.parameter.name]
+            own, decay = shift(column), float(one.decay[j])
+            F[column, column] *= decay
+            values[own] = one.mean[j] + decay * (values[own] - one.mean[j - 1])
+            added[column] = one.sigma[j] ** 2
         return Estimate(ahead, values), F, motion.noise(at, x.state.R_nb)[0], added
 
     def rows(self, some: RowBlock, at: Estimate) -> Rows:
@@ -100,17 +103,19 @@ class AtEstimate:
 
 
 class AtPoints:
-    """Steps and rows of the first n keyframes, all linearised at n points.
+    """Steps and rows of n keyframes, all linearised at n points.
 
     Parameters
     ----------
     F : (n-1, D, D) or more, for the transition matrices.
+    first : the first of the keyframes; of its own rows it has none, unless it is the very first.
     """
 
-    def __init__(self, problem: Problem, points: Points, stack: Stack, F: Array) -> None:
+    def __init__(self, problem: Problem, points: Points, stack: Stack, F: Array, first: int = 0) -> None:
         n, columns, motion = len(points.values), problem.columns, problem.motion
+        self.first, self.points, last = first, points, first + n - 1
         D = DIM + points.values.shape[1]
-        begin, end, at = points.states[: n - 1], points.states[1:n], slice(0, n - 1)
+        begin, end, at = points.states[: n - 1], points.states[1:n], slice(first, last)
         scale = columns.get(SCALE)
         ahead, F15 = motion.propagate(at, begin, None if scale is None else points.values[: n - 1, shift(scale)])
         self.F = F[: n - 1]
@@ -122,8 +127,8 @@ class AtPoints:
         values = points.values[: n - 1].copy()
         self._added = np.zeros((n, D))
         for chain in problem.chains:
-            column, k = columns[chain.parameter.name], stepping(chain, n)
-            j, own, each = chain.node[k], shift(column), np.arange(column.start, column.stop)
+            column, k = columns[chain.parameter.name], stepping(chain, first, n)
+            j, own, each = chain.node[first + k], shift(column), np.arange(column.start, column.stop)
             self.F[k[:, None] - 1, each, each] *= chain.decay[j, None]
             values[k - 1, own] = chain.mean[j] + chain.decay[j, None] * (values[k - 1, own] - chain.mean[j - 1])
             self._added[k, column] = chain.sigma[j] ** 2
@@ -135,27 +140,33 @@ class AtPoints:
         self._Q[:, :3] = turned @ self._Q[:, :3]
         self._Q[:, :, :3] = self._Q[:, :, :3] @ np.swapaxes(turned, -1, -2)
         self._speed = np.linalg.norm(points.states.v, axis=1)
-        self.r, self._sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
-        self.H = np.zeros((n, stack.M, D))
-        for rows in problem.constraints:
-            at_k = rows.keyframe[: int(np.searchsorted(rows.keyframe, n))]
-            if len(at_k):
-                linear = linearise(rows, points, columns, slice(0, len(at_k)))
-                place = at_k[:, None], stack.places[rows.name][1][: len(at_k)]
-                self.r[place], self._sigma[place] = linear.residual, linear.stated
-                self.H[place] = linear.H
+        self._r, self._sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
+        self._H = np.zeros((n, stack.M, D))
+        for place, linear in rows_within(problem, points, stack, first):
+            self._r[place], self._sigma[place] = linear.residual, linear.stated
+            self._H[place] = linear.H
         with np.errstate(divide="ignore"):
-            self.variance = (self._sigma / stack.root_weight[:n]) ** 2
+            self._variance = (self._sigma / stack.root_weight[first : first + n]) ** 2
 
     def step(self, k: int, x: Array) -> tuple[Array, Array, Array, Array | None]:
         """As `AtEstimate.step`, of error states (D,)."""
-        F = self.F[k - 1]
-        return self._gap[k - 1] + F @ x, F, self._Q[k - 1], self._added[k] if self._steps[k] else None
+        j = k - self.first
+        F = self.F[j - 1]
+        return self._gap[j - 1] + F @ x, F, self._Q[j - 1], self._added[j] if self._steps[j] else None
 
     def rows(self, some: RowBlock, at: None) -> Rows:
         """As `AtEstimate.rows`, linearised at the points."""
-        at_k = some.at
-        return self.r[at_k], self.H[at_k], self._sigma[at_k]
+        here = some.k - self.first, slice(some.begin, some.end)
+        return self._r[here], self._H[here], self._sigma[here]
+
+    def weighted(self, some: RowBlock) -> Rows:
+        """The same with variances (m,) in place of sigmas, and the rows' weights in them."""
+        here = some.k - self.first, slice(some.begin, some.end)
+        return self._r[here], self._H[here], self._variance[here]
+
+    def predicted(self, k: Array, own: Array, e: Array) -> Array:
+        """(N, m) residuals of rows at their places, counted from the first keyframe, for errors e (n, D)."""
+        return self._r[k, own] + mv(self._H[k, own], e[k[:, 0]])
 
     @staticmethod
     def about(x: Array) -> tuple[None, Array]:
@@ -174,7 +185,20 @@ class AtPoints:
 
     def speed(self, k: int, x: Array) -> float:
         """m/s."""
-        return float(self._speed[k])
+        return float(self._speed[k - self.first])
+
+
+def rows_within(problem: Problem, points: Points, stack: Stack, first: int) -> Iterator[tuple[Any, LinearRows]]:
+    """Rows of keyframes that begin with `first`, linearised at points, each with their places in a `Stack` from there.
+
+    Those of the first itself are left out, unless it is the very first.
+    """
+    end = first + len(points.values)
+    for rows in problem.constraints:
+        lo, hi = np.searchsorted(rows.keyframe, (first + bool(first), end)).tolist()
+        if lo < hi:
+            k, own = (x[lo:hi] for x in stack.places[rows.name])
+            yield (k - first, own), linearise(rows, points, problem.columns, slice(lo, hi), k[:, 0] - first)
 
 
 def move_covariance(P: Array, e: Array) -> Array:

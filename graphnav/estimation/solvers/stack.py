@@ -124,6 +124,7 @@ class Stack:
     def seen(self, rows: RowBlock, root: Array, solved: Array) -> None:
         """Rows have had an innovation r: the upper root of its covariance S, below it anything, and S^-1 r."""
         k, at = rows.at
+        self._root[k, at] = 0.0  # they may have been taken in with others before
         self._root[k, at, at], self._solved[k, at] = root, solved
 
     def finish(self) -> None:
