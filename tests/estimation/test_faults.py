@@ -106,7 +106,7 @@ def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypa
         p[63:, axis] += delta
         shifted = replace(rows, p_n=p)
         other = replace(posed, constraints=tuple(shifted if c is rows else c for c in posed.constraints))
-        change = (ekf(other).solution.records[rows.name].residual - plain) / delta
+        change = (ekf(other, watch=True).solution.records[rows.name].residual - plain) / delta
         # innovations are the negative of residuals, in axes of the fix
         C = rows.R_ln[63:160]
         expected = -np.einsum("nij,nj->ni", np.stack([seen[k] for k in range(63, 160)]) @ C, np.eye(3)[[axis] * 97])
@@ -116,7 +116,9 @@ def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypa
 def test_filter_and_its_tests_are_the_filter_where_nothing_is_wrong(posed: Problem) -> None:
     watched, plain = ekf(posed, watch=True), ekf(posed)
     assert all(np.all(w == 1.0) for w in watched.weights.values())
-    assert np.array_equal(watched.solution.states.p, plain.solution.states.p)
+    # one linearises keyframe by keyframe, the other many at once
+    sigma = np.sqrt(np.diagonal(plain.solution.covariance, axis1=1, axis2=2))
+    assert np.max(np.abs(watched.solution.states.minus(plain.solution.states)) / sigma) < 0.05
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -35,23 +35,33 @@ _WORTH = 4  # keyframes: to linearise a span takes as long as that many one by o
 
 @dataclass
 class Spans:
-    """How many keyframes are tried at a time, by how it went before."""
+    """How many keyframes are tried at a time, by how it went before.
+
+    Only a filter whose latest innovations were all as it expects them is near enough to where it should be: one that is
+    thrown about by wrong fixes comes to somewhere else by a thousandth of a sigma.
+    """
 
     length: int = 2 * _WORTH
+    pause: int = _WORTH  # keyframes to go on one by one where it did not
     wait: int = 0  # until which keyframe none is tried
+    quiet: int = 0  # keyframes since an innovation was larger than chance makes it
 
     def due(self, k: int) -> bool:
         """Whether to try from keyframe k on."""
-        return k >= self.wait
+        return k >= self.wait and self.quiet >= _LONGEST
+
+    def seen(self, surprising: bool) -> None:
+        """A keyframe was taken in by itself."""
+        self.quiet = 0 if surprising else self.quiet + 1
 
     def went(self, k: int, tried: int, kept: int) -> None:
         """Of some keyframes from k on, how many were tried and how many were linear enough."""
-        if kept == tried:
-            self.length = min(2 * self.length, _LONGEST)
+        self.length = min(2 * tried, _LONGEST) if kept == tried else max(kept, 2 * _WORTH)
+        if kept >= _WORTH:
+            self.pause, self.wait = _WORTH, k + kept + (kept < tried)
             return
-        self.length = max(kept, 2 * _WORTH)
-        if kept < _WORTH:
-            self.wait = k + kept + _WORTH
+        self.wait = k + kept + self.pause
+        self.pause = min(2 * self.pause, _LONGEST)
 
 
 def predict_points(problem: Problem, k: int, n: int, x: Estimate) -> Points:
@@ -64,11 +74,10 @@ def predict_points(problem: Problem, k: int, n: int, x: Estimate) -> Points:
     values = np.tile(x.values, (n + 1, 1))
     for chain in problem.chains:
         own, node = shift(columns[chain.parameter.name]), chain.node[k : k + n + 1]
-        j = np.arange(node[0], node[-1] + 1)
-        left = np.cumprod(np.concatenate([[1.0], chain.decay[j[1:]]]))[node - node[0], None]
+        left = np.cumprod(np.concatenate([[1.0], chain.decay[node[0] + 1 : node[-1] + 1]]))[node - node[0], None]
         values[:, own] = chain.mean[node] + left * (x.values[own] - chain.mean[node[0]])
     scale = scale_at(columns, values[:-1])
-    same = np.zeros(n, dtype=int)
+    same: Array = np.zeros(n, dtype=int)
     still = x.state[same]
     level = replace(still, R_nb=np.broadcast_to(np.eye(3), (n, 3, 3)))
     turned, _ = motion.propagate(rows, level, scale, linear=False)
@@ -83,7 +92,7 @@ def predict_points(problem: Problem, k: int, n: int, x: Estimate) -> Points:
     v = x.state.v + np.concatenate([np.zeros((1, 3)), np.cumsum(change, axis=0)])
     moved = pushed.p - still.p + (v[:-1] - still.v) * motion.intervals.T[rows, None]
     p = x.state.p + np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
-    every = np.zeros(n + 1, dtype=int)
+    every: Array = np.zeros(n + 1, dtype=int)
     return Points(States(R, p, v, x.state.ba[every], x.state.bg[every]), values)
 
 
@@ -108,7 +117,7 @@ def linear_for(problem: Problem, given: AtPoints, stack: Stack, e: Array, ahead:
     led, _ = problem.motion.propagate(slice(first, first + n - 1), at.states[:-1], scale, linear=False)
     there = given.points.states[1:].plus(ahead[1:, :DIM])
     sigma = np.sqrt(np.diagonal(P[1:, :DIM, :DIM], axis1=1, axis2=2))
-    step = np.max(np.abs(there.minus(led)) / sigma, axis=1)
+    step = np.max(np.abs(there.minus(led)) / np.maximum(sigma, 1e-300), axis=1)
     wrong = np.flatnonzero(~((off[1:] <= LINEAR) & (step <= LINEAR)))
     return int(wrong[0]) if len(wrong) else n - 1
 

@@ -25,8 +25,6 @@ throughout.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,6 +36,7 @@ from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ahead import Spans, about_estimates, linear_for, predict_points
+from graphnav.estimation.solvers.decision import Decide, hold
 from graphnav.estimation.solvers.gain import (
     predict_covariance,
     solve_innovation,
@@ -62,19 +61,6 @@ from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
 from graphnav.estimation.solvers.watch import Bank, Verdicts
 
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
-
-
-@dataclass(frozen=True)
-class Decision:
-    """What was decided at a keyframe by the estimate there: rows to hold from now on, and what is not to be trusted."""
-
-    H: Array  # (m, D)
-    residual: Array  # (m,)
-    sigma: Array  # (m,)
-    added: Array  # (D,) variance
-
-
-Decide = Callable[[int, Points, Array], Decision | None]  # of a keyframe, the point there and P (D, D)
 
 
 def ekf(
@@ -203,6 +189,7 @@ def _forward(
         ahead[k], all_Pp[k] = x, P
         back: int | None = None
         taken: list[Gain] | None = None
+        surprising = False
         if k < n:
             taken = gains[k] = []
         # at its own estimate, each kind is linearised where those before it have led
@@ -215,6 +202,7 @@ def _forward(
                     bank.taken(gain[0], gain[1])
                 continue
             x, P, fault = _update(some, x, P, where, stack, bank, taken)
+            surprising |= stack.surprising(some)
             if fault is not None:
                 again = verdicts.settle(some.parts[0][0].name, fault, float(problem.t[k]))
                 back = int(np.searchsorted(problem.t, again))
@@ -222,7 +210,7 @@ def _forward(
         if back is None and k == len(problem.t) - 1 and (trial := verdicts.ended()) is not None:
             back = int(np.searchsorted(problem.t, trial))
         if decide is not None and back is None:
-            x, P = _hold(decide(k, _here(about, k, x), P), x, P, where)
+            x, P = hold(decide(k, _here(about, k, x), P), x, P, where)
         if back is not None:  # once more from before the fault, without it
             bank = banks.get(back) or bank.forgetful() if bank else None
             banks = {key: old for key, old in banks.items() if key < back}
@@ -232,6 +220,8 @@ def _forward(
                 x = own.plus(_one(about, k - 1), x)
             continue
         found[k], all_P[k] = x, P
+        if spans is not None and where is own:
+            spans.seen(surprising)
         if progress is not None and k % 256 == 0:
             progress("filter", k / K)
         k += 1
@@ -285,10 +275,15 @@ def _filter_span(
                     e, P, _ = _update(some, e, P, given, stack, None, None)
                 else:
                     e, P, _ = _update_all(some, e, P, given, stack)
+                if stack.surprising(some):
+                    n = j - 1
+                    break
+            if j > n:
+                break
             errors[j], P_of[j] = e, P
     except EstimationError:
         return []  # one by one they say where
-    n = linear_for(problem, given, stack, errors, ahead, Pp_of)
+    n = min(n, linear_for(problem, given, stack, errors, ahead, Pp_of))
     there, own = points.first(n + 1), slice(1, n + 1)
     about_estimates(P_of[own], Pp_of[own], F_of[:n], errors[own], ahead[own])
     found, before = (move_points(there, one[: n + 1]) for one in (errors, ahead))
@@ -390,18 +385,3 @@ def _here(about: Points | None, k: int, x: Any) -> Points:
         return Points(x.state, x.values[None])
     assert about is not None
     return move_points(Points(about.states[k : k + 1], about.values[k : k + 1]), x[None])
-
-
-def _hold(one: Decision | None, x: Any, P: Array, where: Any) -> tuple[Any, Array]:
-    """An update with what was decided."""
-    if one is None:
-        return x, P
-    P = P + np.diag(one.added)
-    if not len(one.residual):
-        return x, P
-    PHt, R = P @ one.H.T, np.diag(one.sigma**2)
-    K = np.linalg.solve(one.H @ PHt + R, PHt.T).T
-    M = np.eye(len(P)) - K @ one.H
-    P = M @ P @ M.T + K @ R @ K.T
-    d = -(K @ one.residual)
-    return (x + d if isinstance(x, np.ndarray) else where.plus(x, d)), 0.5 * (P + P.T)

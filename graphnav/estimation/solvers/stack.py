@@ -13,13 +13,20 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+from scipy.special import chdtri
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array, mv
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord
+
+
+@cache
+def _largest(m: int) -> float:
+    return float(chdtri(m, 1e-3))
 
 
 class Innovations:
@@ -126,6 +133,14 @@ class Stack:
         k, at = rows.at
         self._root[k, at] = 0.0  # they may have been taken in with others before
         self._root[k, at, at], self._solved[k, at] = root, solved
+
+    def surprising(self, rows: RowBlock) -> bool:
+        """Whether rows that were seen had an innovation larger than chance makes it once in a thousand times."""
+        k, at = rows.at
+        if not self.root_weight[k, at].any():
+            return False
+        white = np.triu(self._root[k, at, at]) @ self._solved[k, at]
+        return float(white @ white) > _largest(len(white))
 
     def finish(self) -> None:
         """Work out the innovations of each kind."""
