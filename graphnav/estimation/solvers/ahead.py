@@ -116,8 +116,8 @@ def linear_for(problem: Problem, given: AtPoints, stack: Stack, e: Array, ahead:
     scale = scale_at(problem.columns, at.values[:-1])
     led, _ = problem.motion.propagate(slice(first, first + n - 1), at.states[:-1], scale, linear=False)
     there = given.points.states[1:].plus(ahead[1:, :DIM])
-    sigma = np.sqrt(np.diagonal(P[1:, :DIM, :DIM], axis1=1, axis2=2))
-    step = np.max(np.abs(there.minus(led)) / np.maximum(sigma, 1e-300), axis=1)
+    sigma = np.sqrt(np.maximum(np.diagonal(P[1:, :DIM, :DIM], axis1=1, axis2=2), 1e-300))
+    step = np.max(np.abs(there.minus(led)) / sigma, axis=1)
     wrong = np.flatnonzero(~((off[1:] <= LINEAR) & (step <= LINEAR)))
     return int(wrong[0]) if len(wrong) else n - 1
 

@@ -16,7 +16,8 @@ heading, the filter's wanders by degrees until the first motion puts it right, a
 contradict those taken afterwards: heading, tilt and accelerometer bias get correlations that were never measured.
 So the opening is filtered and smoothed, and filtered again from the same prior, linearised at the points that the first
 pass left (`graphnav.estimation.solvers.points`). So are the first steps of a walk, which tell tilt and accelerometer
-bias apart. Later keyframes are linearised where the filter is.
+bias apart. Later keyframes are linearised where the filter is, or, many at once, where it expects to be
+(`graphnav.estimation.solvers.ahead`).
 
 Where only figures or weights have changed since the drive was filtered, `refilter` is linearised at given points
 throughout.
