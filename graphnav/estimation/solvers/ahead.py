@@ -29,7 +29,7 @@ from graphnav.estimation.solvers.points import AtPoints, Estimate, rows_within
 from graphnav.estimation.solvers.stack import Stack
 
 LINEAR = 0.01  # sigmas: a hundred rows that are all off by so much one way move what they tell by a tenth of its sigma
-_LONGEST = 64  # keyframes: as many again would save a tenth of the time
+_LONGEST = 64  # keyframes: what is asked once a span is then a tenth of what they take one by one
 _WORTH = 4  # keyframes: to linearise a span takes as long as that many one by one
 
 
