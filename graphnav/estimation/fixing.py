@@ -28,7 +28,8 @@ from graphnav.constraints.raw_phase import EXACT, GnssPhase, WholeCycles
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, DIM
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.ekf import Decision, ekf, refilter
+from graphnav.estimation.solvers.decision import Decision
+from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points, linearise
 from graphnav.estimation.solvers.passes import FilterPass, Progress, SmootherPass, points_of, values_of
 from graphnav.estimation.solvers.rts import backward

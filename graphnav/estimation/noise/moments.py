@@ -76,7 +76,7 @@ def process_moments(
     at = problem.columns[chain.parameter.name]
     k = np.concatenate([[0], np.flatnonzero(np.diff(chain.node[:end])) + 1])
     q = chain.sigma[chain.node[k]] ** 2
-    N = np.diagonal(smoothed.N[k][:, at, at], axis1=-2, axis2=-1)
+    N = np.diagonal(smoothed.N[:, at, at], axis1=-2, axis2=-1)[k]
     return k, q * smoothed.r[k, at] ** 2, q * np.maximum(N, 0.0)
 
 
@@ -119,6 +119,7 @@ def lag_moments(
         rest = one - smoothed.N[some] @ forward.P_predicted[some, :, at]
         cross[lo : lo + _BLOCK] = np.einsum("kid,kdi->ki", ahead, rest)
     c0, c1 = smoothed.values[k - 1, own], smoothed.values[k, own]
-    v0, v1 = (np.diagonal(smoothed.P[j][:, at, at], axis1=-2, axis2=-1) for j in (k - 1, k))
+    variance = np.diagonal(smoothed.P[:, at, at], axis1=-2, axis2=-1)
+    v0, v1 = variance[k - 1], variance[k]
     dt = np.diff(chain.t)[chain.node[k] - 1]
     return dt, c1 * c1 + v1, c1 * c0 + cross, c0 * c0 + v0

@@ -24,21 +24,24 @@ throughout.
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg.lapack import dposv
 
-from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.decision import Decide, hold
+from graphnav.estimation.solvers.gain import (
+    predict_covariance,
+    solve_innovation,
+    solve_robust,
+    update_covariance,
+    weights_of,
+)
 from graphnav.estimation.solvers.linearise import Points, scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
@@ -51,26 +54,11 @@ from graphnav.estimation.solvers.passes import (
     sigmas_of,
 )
 from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate, move_covariance
-from graphnav.estimation.solvers.robust import PASSES, soften, weight_and_cost
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
 from graphnav.estimation.solvers.watch import Bank, Verdicts
 
-_NONE = 1e-12  # weight of a row that is not used beside others of its keyframe
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
-
-
-@dataclass(frozen=True)
-class Decision:
-    """What was decided at a keyframe by the estimate there: rows to hold from now on, and what is not to be trusted."""
-
-    H: Array  # (m, D)
-    residual: Array  # (m,)
-    sigma: Array  # (m,)
-    added: Array  # (D,) variance
-
-
-Decide = Callable[[int, Points, Array], Decision | None]  # of a keyframe, the point there and P (D, D)
 
 
 def ekf(
@@ -176,12 +164,9 @@ def _forward(
             x, F, Q, added = where.step(k, x)
             if where is own:
                 all_F[k - 1] = F
-            P = np.matmul(F @ P, F.T, out=all_Pp[k])
-            P[:DIM, :DIM] += Q
+            P = predict_covariance(P, F, Q, added, all_Pp[k])
             if bank is not None:
                 bank.predicted(F)
-            if added is not None:
-                P.flat[:: D + 1] += added
         for kind in watched if verdicts.anew else ():
             if (kind.name, problem.t[k]) in verdicts.anew:
                 P = _anywhere(P, kind.fix_of)
@@ -207,7 +192,7 @@ def _forward(
         if back is None and k == len(problem.t) - 1 and (trial := verdicts.ended()) is not None:
             back = int(np.searchsorted(problem.t, trial))
         if decide is not None and back is None:
-            x, P = _hold(decide(k, _here(about, k, x), P), x, P, where)
+            x, P = hold(decide(k, _here(about, k, x), P), x, P, where)
         if back is not None:  # once more from before the fault, without it
             bank = banks.get(back) or bank.forgetful() if bank else None
             banks = {key: old for key, old in banks.items() if key < back}
@@ -275,11 +260,11 @@ def _update_all(some: RowBlock, e: Array, P: Array, given: AtPoints, stack: Stac
     D, at = len(P), some.at
     H, variance = given.H[at], given.variance[at]
     r, PHt = given.r[at] + H @ e, P @ H.T
-    root, solved = _solve(H @ PHt, variance, np.concatenate([r[None], PHt, H.T]).T, some)
+    root, solved = solve_innovation(H @ PHt, variance, np.concatenate([r[None], PHt, H.T]).T, some)
     stack.seen(some, root, solved[:, 0])
     K = solved[:, 1 : D + 1].T
     gain = K, H, -solved[:, 0], solved[:, D + 1 :]
-    return e - K @ r, _joseph(P, PHt, H, K, variance), gain
+    return e - K @ r, update_covariance(P, PHt, H, K, variance), gain
 
 
 def _update(
@@ -289,7 +274,7 @@ def _update(
     D, (rows, lo, hi) = len(P), some.parts[0]
     end = D + 1 if taken is None else 2 * D + 1
     record = stack.records[rows.name]
-    weight, root_weight = _weights(record, lo, hi)
+    weight, root_weight = weights_of(record, lo, hi)
     tests = bank if bank is not None and weight > 0.0 and rows.name in bank else None
     at, e = where.about(x)
     for left in range(where.passes(some) - 1, -1, -1):
@@ -302,12 +287,12 @@ def _update(
             G = tests.signature(rows.name, some.k, H)
             right.append(tests.own(rows.name, G).T)
         sides = np.concatenate(right).T
-        root, solved = _solve(HPHt, sigma * sigma, sides, some)
+        root, solved = solve_innovation(HPHt, sigma * sigma, sides, some)
         if not left:
             stack.seen(some, root, solved[:, 0])
             nis, bent = float(r @ solved[:, 0]), 1.0
             if rows.robust != "none" and rows.gate is None:  # a gate stands in place of a kernel
-                sigma, solved, bent = _robust(HPHt, sigma, sides, solved, some)
+                sigma, solved, bent = solve_robust(HPHt, sigma, sides, solved, some)
         K = solved[:, 1 : D + 1].T
         d = -(K @ r) if e is None else e - K @ r
         if left:  # again about where this leads (Jazwinski 1970, theorem 8.2)
@@ -323,7 +308,7 @@ def _update(
         return x, P, None
     if taken is not None:
         taken.append((K, H, -solved[:, 0], solved[:, D + 1 : end]))
-    P = _joseph(P, PHt, H, K, sigma * sigma)
+    P = update_covariance(P, PHt, H, K, sigma * sigma)
     fault = None
     if tests is not None:
         fault = tests.updated(rows.name, K, G, solved[:, end:], r, where.speed(some.k, x))
@@ -338,65 +323,3 @@ def _here(about: Points | None, k: int, x: Any) -> Points:
         return Points(x.state, x.values[None])
     assert about is not None
     return move_points(Points(about.states[k : k + 1], about.values[k : k + 1]), x[None])
-
-
-def _hold(one: Decision | None, x: Any, P: Array, where: Any) -> tuple[Any, Array]:
-    """An update with what was decided."""
-    if one is None:
-        return x, P
-    P = P + np.diag(one.added)
-    if not len(one.residual):
-        return x, P
-    PHt, R = P @ one.H.T, np.diag(one.sigma**2)
-    K = np.linalg.solve(one.H @ PHt + R, PHt.T).T
-    M = np.eye(len(P)) - K @ one.H
-    P = M @ P @ M.T + K @ R @ K.T
-    d = -(K @ one.residual)
-    return (x + d if isinstance(x, np.ndarray) else where.plus(x, d)), 0.5 * (P + P.T)
-
-
-def _weights(record: Innovations, lo: int, hi: int) -> tuple[float, float | Array]:
-    """The largest weight of some rows, and the root of each number's; ones where none is used."""
-    used = record.used[lo:hi]
-    weight = float(max(used))
-    if hi - lo == 1 or weight == 0.0:
-        return weight, math.sqrt(weight) or 1.0
-    return weight, np.repeat(np.sqrt(np.maximum(used, _NONE)), len(record.rows.axes))
-
-
-def _joseph(P: Array, PHt: Array, H: Array, K: Array, variance: Array) -> Array:
-    """The covariance after an update, by Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T."""
-    out = K @ PHt.T
-    np.subtract(P, out, out=out)
-    out -= (out @ H.T - K * variance) @ K.T
-    out = out + out.T  # rounding's asymmetry would grow, past what a stop leaves between its place and the state
-    out *= 0.5
-    return out
-
-
-def _solve(HPHt: Array, variance: Array, right: Array, some: RowBlock) -> tuple[Array, Array]:
-    """The upper root of S = H P H^T + R, and S^-1 times the right sides."""
-    S = HPHt.copy()
-    S.flat[:: len(S) + 1] += variance
-    # LAPACK called directly: for matrices this small the checks around it would cost more than the work
-    root, solved, info = dposv(S.T, right, overwrite_a=1)
-    if info:
-        at = ", ".join(f"'{rows.name}' row {lo}" for rows, lo, _ in some.parts)
-        raise EstimationError(f"the filter's covariance broke down at {at}: check sigmas and units")
-    return root, solved
-
-
-def _robust(HPHt: Array, sigma: Array, right: Array, solved: Array, some: RowBlock) -> tuple[Array, Array, float]:
-    """Sigmas with a kernel's weights in them, S^-1 times the right sides with these, and the least weight.
-
-    As the incremental smoother does with a new keyframe: none at first, then by what the update leaves, a few times.
-    """
-    rows, lo, hi = some.parts[0]
-    stated, weight = sigma, np.ones(hi - lo)
-    for _ in range(PASSES - 1):
-        left = (right[:, 0] - HPHt @ solved[:, 0]) / stated
-        s = np.linalg.norm(left.reshape(hi - lo, -1), axis=1)
-        weight = np.maximum(weight_and_cost(soften(rows.robust), s, rows.scale_of(slice(lo, hi)))[0], 1e-12)
-        sigma = stated / np.repeat(np.sqrt(weight), len(stated) // (hi - lo))
-        _, solved = _solve(HPHt, sigma * sigma, right, some)
-    return sigma, solved, float(np.min(weight))
