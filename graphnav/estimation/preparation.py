@@ -28,7 +28,12 @@ from graphnav.estimation.alignment.first import some
 from graphnav.estimation.fixing import fix, split
 from graphnav.estimation.noise.apply import with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.exclusion import estimate_without_faults, excluded_share, without_excluded
+from graphnav.estimation.noise.exclusion import (
+    estimate_without_faults,
+    excluded_share,
+    with_disturbed_intervals,
+    without_excluded,
+)
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe
@@ -172,6 +177,8 @@ def prepare(
             base = build(aligned, detections, parts=True)
             best = estimate_noise(base, aligned.until, best.noise, progress=progress)
             passes.update(filter=best.passes, smoother=best.passes)
+        best = with_disturbed_intervals(base, best)
+        passes.update(filter=best.passes + best.looks, smoother=best.passes)
         noise, known = best.noise, best.points
         passes.update(filter=1)
         plain = NoiseModel(excluded=noise.excluded)

@@ -45,6 +45,7 @@ _ROUNDS, _AGAIN = 8, 3  # passes, from priors and from figures that were estimat
 _MOST = 3 * _ROUNDS  # passes at most, as long as each gains what chance does not
 _AHEAD = 2.0  # times its own length that a step is taken at most (Aitken's extrapolation)
 _TIMES = 30.0  # by which a correlation time may be shorter or longer than usual
+_LOST = 1.0, 10.0  # rad/s, m/s^2: what a vehicle turns and accelerates by, which is lost with an interval's samples
 _GRID = np.linspace(-1.0, 1.0, 21)
 
 
@@ -118,6 +119,7 @@ def estimate_noise(
     start: NoiseModel | None = None,
     near: tuple[Points, Problem] | None = None,
     progress: Callable[[str, float], None] | None = None,
+    intervals: bool = False,
 ) -> NoiseEstimate:
     """Estimate the noise model of a problem posed with stated noise and with the parts of its intervals' noise.
 
@@ -126,6 +128,7 @@ def estimate_noise(
     opening : as for `graphnav.estimation.solvers.ekf.ekf`.
     start : figures to set out from, weights of rows, and what is left out; prior medians when None.
     near : points of all keyframes to linearise at first, and the problem that they are of.
+    intervals : single intervals of the IMU may have more noise than the others.
 
     Raises
     ------
@@ -153,7 +156,7 @@ def estimate_noise(
             now = float(np.sum(forward.log_likelihood)) + prior_then
             if progress is not None:
                 progress("noise", min((k + 1) / rounds, 1.0))
-            _improve(figures, used, forward, smoothed, end)
+            _improve(figures, used, forward, smoothed, end, intervals)
             about = _splice(about, smoothed)
             # chance makes each figure gain a half; with one sensor far off it takes many passes to see which
             if k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log):
@@ -209,12 +212,15 @@ def _cap(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, float]
     return float(np.sum(np.minimum(A, most / freedom * B))) * freedom / mean, float(np.sum(B))
 
 
-def _improve(figures: _Components, problem: Problem, forward: ForwardRecord, smoothed: SmootherPass, end: int) -> None:
+def _improve(
+    figures: _Components, problem: Problem, forward: ForwardRecord, smoothed: SmootherPass, end: int, intervals: bool
+) -> None:
     """One step for all figures and weights."""
     imu = imu_moments(problem, forward, smoothed)
     for i, name in enumerate(NOISE_FIGURES):
         figures.update(f"imu.{name}", *_cap(imu.A[:, i], imu.B[:, i], 3, CHANCE))
-    _weigh_intervals(figures, problem, imu)
+    if intervals:
+        _weigh_intervals(figures, problem, imu)
     driven: dict[str, tuple[Array, Array, Array]] = {}
     for chain in problem.chains:
         if chain.parameter.noise_groups:
@@ -238,13 +244,15 @@ def _improve(figures: _Components, problem: Problem, forward: ForwardRecord, smo
 def _weigh_intervals(figures: _Components, problem: Problem, imu: ImuMoments) -> None:
     """More noise for the intervals whose disturbance is larger than chance allows: until it is as likely as that."""
     t, n = problem.t[1:], len(imu.A)
-    for i, name in enumerate(INTERVALS):
+    densities = problem.imu_noise.gyro_noise_density, problem.imu_noise.accel_noise_density
+    for i, (name, density, lost) in enumerate(zip(INTERVALS, densities, _LOST, strict=True)):
         freedom = imu.freedom[:, i]
         ratio = imu.A[:, i] / np.maximum(imu.B[:, i], 1e-30) * freedom
         # what half of the intervals do is no outlier: the figures have not come to what they are yet
         usual = max(float(np.median(ratio / chdtri(freedom, 0.5))), 1.0)
         more = 1.0 / row_weights(t, figures.model(), name)
-        more[:n] = np.maximum(more[:n] * ratio / chdtri(freedom, CHANCE) / usual, 1.0)
+        most = np.maximum(lost**2 * problem.intervals.T[:n] / density**2, 1.0)
+        more[:n] = np.clip(more[:n] * ratio / chdtri(freedom, CHANCE) / usual, 1.0, most)
         some = more > 1.0
         figures.weights[name] = RowWeights(t[some], 1.0 / more[some])
 

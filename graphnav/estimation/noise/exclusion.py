@@ -22,7 +22,7 @@ is decided with these, and of the two explanations of all measurements the likel
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -149,6 +149,41 @@ def estimate_without_faults(
     return replace(again, passes=found.passes + again.passes, looks=found.looks)
 
 
+def with_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
+    """A noise model in which single intervals of the IMU have more noise than the others.
+
+    An IMU that loses samples for a moment makes fixes look wrong. So where some are left out, all measurements are
+    explained anew with such intervals, and the likelier explanation stands.
+
+    Parameters
+    ----------
+    base : posed with stated noise and the parts of its intervals' noise.
+    found : with all intervals alike.
+    """
+    near = found.points, with_noise(base, found.noise)
+    tried = [estimate_noise(base, None, found.noise, near, intervals=True)]
+    passes, looks = tried[0].passes, 0
+    if found.noise.excluded:
+        free = estimate_noise(base, None, NoiseModel(), near, intervals=True)
+        explained = decide(base, free, find_spans(base, free.noise, free))
+        passes, looks = passes + free.passes, looks + explained.looks + 1
+        if explained.noise.excluded:
+            start = replace(free.noise, excluded=explained.noise.excluded)
+            free = estimate_noise(base, None, start, (free.points, with_noise(base, free.noise)), intervals=True)
+            passes += free.passes
+        tried.append(free)
+    best = max(tried, key=lambda one: _log_evidence(base, one)) if len(tried) > 1 else tried[0]
+    return replace(best, passes=passes, looks=looks)
+
+
+def _log_evidence(base: Problem, found: NoiseEstimate) -> float:
+    """Of all measurements, those that are left out too; each outlier among the others has its cost."""
+    spans = _join(span for some in found.noise.excluded.values() for span in some)
+    whole = decide(base, found, spans).log_evidence if spans else found.log_posterior
+    outliers = sum(int(np.sum(_outside(some, spans).weight < 1.0)) for some in found.noise.weights.values())
+    return whole - _OUTLIER * outliers
+
+
 def exclude(base: Problem, found: NoiseEstimate) -> Explained:
     """A noise model that leaves out what is wrong in spans.
 
@@ -261,8 +296,12 @@ def evidence(problem: Problem, about: Points, spans: list[tuple[float, float]], 
 
 def join_spans(found: tuple[ExcludedSpan, ...]) -> list[tuple[float, float]]:
     """Spans (s) of some faults, those that touch in one; a single fix is no span, its weight says what it is worth."""
+    return _join((fault.t_start, fault.t_end) for fault in found if fault.count > 1)
+
+
+def _join(spans: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
     out: list[tuple[float, float]] = []
-    for a, b in sorted((fault.t_start, fault.t_end) for fault in found if fault.count > 1):
+    for a, b in sorted(spans):
         if out and a <= out[-1][1] + SAME_TIME:
             out[-1] = (out[-1][0], max(b, out[-1][1]))
         else:
