@@ -291,15 +291,15 @@ def test_ctrl_c_is_one_line_and_leaves_nothing_half_done(tmp_path):
 # ------------------------------------------------------------------------------------------------------------ progress
 def test_the_time_left_is_what_the_pace_says():
     pace = Pace(("simulate",))
-    assert pace.left(10.0) is None
+    assert pace.estimate_left(10.0) is None
     pace.reach("driving", 0.5)
     half = pace.done
     assert 0.4 < half < 0.5  # writing is still to come
-    assert pace.left(10.0) == pytest.approx(10.0 * (1 - half) / half)
+    assert pace.estimate_left(10.0) == pytest.approx(10.0 * (1 - half) / half)
     pace.reach("driving", 0.1)  # a second pass
     assert pace.done == half
     pace.reach("writing imu.csv.gz", 1.0)
-    assert pace.left(10.0) == 0.0
+    assert pace.estimate_left(10.0) == 0.0
     pace.reach("something else", 0.0)
     assert pace.done == 1.0
 

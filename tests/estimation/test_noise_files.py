@@ -169,7 +169,7 @@ def test_rows_stand_beside_what_is_stated() -> None:
 
 def test_what_a_noise_model_says_of_nothing_is_told() -> None:
     t = np.arange(10.0)
-    solution: Any = SimpleNamespace(records={"gnss_position": SimpleNamespace(t=t)})
+    solution: Any = SimpleNamespace(t=t, records={"gnss_position": SimpleNamespace(t=t)})
     weights = RowWeights(np.array([3.0, 4.5]), np.array([0.5, 0.5]))
     noise = NoiseModel(
         {
@@ -177,7 +177,7 @@ def test_what_a_noise_model_says_of_nothing_is_told() -> None:
             "gnss_position.up": VarianceComponent(0.0),
             "imu.gyro_bias_walk": VarianceComponent(0.0),
         },
-        weights={"gnss_position": weights},
+        weights={"gnss_position": weights, "imu.gyro": RowWeights(np.array([7.0]), np.array([0.5]))},
         excluded={"gnss_position": ((2.0, 3.0), (20.0, 30.0))},
     )
     said = unused_noise(noise, solution)

@@ -161,19 +161,19 @@ def with_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstima
     found : with all intervals alike.
     """
     near = found.points, with_noise(base, found.noise)
-    tried = [estimate_noise(base, None, found.noise, near, intervals=True)]
-    passes, looks = tried[0].passes, 0
+    passes, looks = 0, 0
     if found.noise.excluded:
-        free = estimate_noise(base, None, NoiseModel(), near, intervals=True)
+        free = estimate_noise(base, None, replace(found.noise, excluded={}), near, intervals=True)
         explained = decide(base, free, find_spans(base, free.noise, free))
-        passes, looks = passes + free.passes, looks + explained.looks + 1
+        passes, looks = free.passes, explained.looks + 1
         if explained.noise.excluded:
             start = replace(free.noise, excluded=explained.noise.excluded)
             free = estimate_noise(base, None, start, (free.points, with_noise(base, free.noise)), intervals=True)
             passes += free.passes
-        tried.append(free)
-    best = max(tried, key=lambda one: _log_evidence(base, one)) if len(tried) > 1 else tried[0]
-    return replace(best, passes=passes, looks=looks)
+        if _log_evidence(base, free) > _log_evidence(base, found):
+            return replace(free, passes=passes, looks=looks)
+    alike = estimate_noise(base, None, found.noise, near, intervals=True)
+    return replace(alike, passes=passes + alike.passes, looks=looks)
 
 
 def _log_evidence(base: Problem, found: NoiseEstimate) -> float:
