@@ -208,8 +208,8 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
 def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[tuple[float, float]]:
     """Spans (s) in which fixes disagree with everything else, by figures that need not be those found."""
     # a fault that rows have lost their weight for, or the IMU its own, is to be seen by the tests
-    hidden = {name: some for name, some in noise.weights.items() if name not in (*FIXES, *INTERVALS)}
-    open_ = with_noise(base, replace(noise, weights=hidden))
+    kept = {name: some for name, some in noise.weights.items() if name not in (*FIXES, *INTERVALS)}
+    open_ = with_noise(base, replace(noise, weights=kept))
     known = values_of(with_noise(base, found.noise), found.points)
     watched = refilter(open_, points_of(open_, found.points.states, known), watch=True)
     return join_spans(faults.fault_spans(faults.weigh_rows(open_, watched.weights)))
