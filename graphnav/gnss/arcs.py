@@ -66,7 +66,7 @@ def find_arcs(raw: RawGnss, still: bool = False, base_arc: NDArray[np.intp] | No
     kept = same & held & ~raw.slip[now] & (raw.half[now] == raw.half[before])
     if base_arc is not None:
         kept &= base_arc[now] == base_arc[before]
-    slipped = _slipped(raw, now[kept], before[kept], epoch, still)
+    slipped = _find_slips(raw, now[kept], before[kept], epoch, still)
     kept[np.flatnonzero(kept)[slipped]] = False
     begins_here = np.concatenate([[True], ~kept])[: len(order)]
     count = np.cumsum(begins_here) - 1
@@ -83,7 +83,7 @@ def find_arcs(raw: RawGnss, still: bool = False, base_arc: NDArray[np.intp] | No
     )  # fmt: skip
 
 
-def _slipped(
+def _find_slips(
     raw: RawGnss, now: NDArray[np.intp], before: NDArray[np.intp], epoch: NDArray[np.intp], still: bool
 ) -> NDArray[np.bool_]:
     """Which of the changes from rows `before` to rows `now` hold a slip."""

@@ -21,7 +21,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.files import Lines, calendar_days, find_moved_points, numbers, read_bytes
 from graphnav.gnss.series import Observations, note_cut, once
-from graphnav.gnss.signals import BEIDOU, GLONASS, GPS, QZSS, SYSTEMS, Ids, known_signal, satellite_id, signal_id
+from graphnav.gnss.signals import BEIDOU, GLONASS, GPS, QZSS, SYSTEMS, Ids, is_known_signal, satellite_id, signal_id
 
 _SYSTEM_OF = np.full(256, -1)
 for _k, _letter in enumerate(SYSTEMS):
@@ -96,9 +96,9 @@ def parse_observations(data: bytes, path: Path) -> Observations:
         unknown |= {
             f"{SYSTEMS[system]} {name}"
             for name, there in zip(named, np.isfinite(value).T, strict=True)
-            if there.any() and name[0] in _KINDS and not known_signal(system, name[1:])
+            if there.any() and name[0] in _KINDS and not is_known_signal(system, name[1:])
         }
-        for signal in dict.fromkeys(name[1:] for name in named if known_signal(system, name[1:])):
+        for signal in dict.fromkeys(name[1:] for name in named if is_known_signal(system, name[1:])):
             at = {kind: [k for k, name in enumerate(named) if name == kind + signal] for kind in _KINDS}
             one = {kind: _first_of(value[:, some]) for kind, some in at.items()}
             there = ~np.isnan(one["C"]) | ~np.isnan(one["L"])

@@ -66,7 +66,7 @@ def signal_name(signal: int) -> str:
     return f"{int(signal) // 100}{chr(int(signal) % 100 + ord('A'))}"
 
 
-def known_signal(system: int, name: str) -> bool:
+def is_known_signal(system: int, name: str) -> bool:
     """Whether a band of a system is in the tables."""
     return name[:1].isdigit() and int(name[0]) in _MHZ[system] and name[1:2].isupper()
 

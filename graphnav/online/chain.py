@@ -120,7 +120,7 @@ class Chain:
             period = float(np.median(np.diff(sensors.fixes)))
             self.window.watch(Watch(watched, period, len(self.window.newest.z)))
 
-    def _weighed(self, problem: Problem) -> Problem:
+    def _weigh(self, problem: Problem) -> Problem:
         """The problem without the fixes in which a fault was found."""
         rows = []
         for c in problem.constraints:
@@ -138,7 +138,7 @@ class Chain:
 
         `ahead` is what was expected of the first of them, if that still holds; `begin` and `end` are of a portion.
         """
-        problem, k, turn = self._weighed(posed), max(first, begin), 0.0
+        problem, k, turn = self._weigh(posed), max(first, begin), 0.0
         while k < (len(problem.t) if end is None else end):
             turn = max(turn, self._push(problem, k, ahead))
             ahead = None
@@ -149,7 +149,7 @@ class Chain:
                     if again <= self.head + SAME_TIME:
                         self.window.forget_tests()
                     return again
-                problem = self._weighed(posed)
+                problem = self._weigh(posed)
                 back = int(problem.t.searchsorted(again - SAME_TIME))
                 self._keep(len(self.window) - (k - back + 1))
                 k = back

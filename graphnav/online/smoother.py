@@ -177,7 +177,7 @@ class Smoother:
             except EstimationError as error:
                 self.notes.append(Note("online.not_aligned", str(error)))
         if self.tracker is not None:
-            self._judged_at_last()
+            self._judge_at_last()
             self._advance(self.tracker, last=True)
             self.tracker.settle(self.sensors)
             self._collect(self.tracker)
@@ -225,7 +225,7 @@ class Smoother:
         sensors.oldest = recording.start
         self._advance(tracker)
         if self._found is not None and self.tracker is tracker:
-            self._have_judged(self._found, tracker)
+            self._note_judgement(self._found, tracker)
 
     def _track(self, found: Alignment, start: float, noise: NoiseModel) -> Tracker:
         """Begin at the first row of what an alignment has seen, s."""
@@ -256,9 +256,9 @@ class Smoother:
             return
         self._judged = span
         self._found = None if enough else found
-        self._have_judged(found, tracker)
+        self._note_judgement(found, tracker)
 
-    def _have_judged(self, found: Alignment, tracker: Tracker) -> None:
+    def _note_judgement(self, found: Alignment, tracker: Tracker) -> None:
         assert self.frame is not None
         times = np.concatenate([self._times, tracker.window.t])
         until = tracker.newest + AFTER
@@ -289,7 +289,7 @@ class Smoother:
         if again.step(self.sensors, tracker):
             self.tracker, self._again, self._tentative = again.tracker, None, False
 
-    def _judged_at_last(self) -> None:
+    def _judge_at_last(self) -> None:
         """Nothing more will come: do not wait for what is being judged."""
         if self._judgement is not None and self.tracker is not None:
             self._use(self._judgement, self.tracker)
@@ -309,7 +309,7 @@ class Smoother:
         later = {name: buffer.rows.copy() for name, buffer in sensors.aiding.items()}
         if self.tracker is not None:
             sensors.imu.drop_after(before)
-            self._judged_at_last()
+            self._judge_at_last()
             self._advance(self.tracker, last=True)
             self.tracker.settle(sensors)
             self._collect(self.tracker)

@@ -117,7 +117,7 @@ class Store:
         head = (csv.HEADER + "\n").encode()
         self._length = 0
         self._file = self.trajectory.open("w+b", buffering=0)
-        self._guarded(lambda: self._file.write(head))
+        self._guard(lambda: self._file.write(head))
         self._length = len(head)
         return self._file
 
@@ -137,7 +137,7 @@ class Store:
         if self._journal is None:
             self._journal = self._path(self._number).open("ab", buffering=0)
         journal = self._journal
-        self._guarded(lambda: journal.write(b"".join(line + b"\n" for line in lines)))
+        self._guard(lambda: journal.write(b"".join(line + b"\n" for line in lines)))
         self.pending.extend(lines)
 
     def append(self, tracks: list[Trajectory]) -> None:
@@ -150,7 +150,7 @@ class Store:
                 done += self._file.write(rows[done:]) or 0
             os.fsync(self._file.fileno())
 
-        self._guarded(write)
+        self._guard(write)
         self._length += len(rows)
 
     def checkpoint(self, online: Online, counts: dict[str, int], done: bool = False) -> None:
@@ -173,7 +173,7 @@ class Store:
             os.replace(fresh, path)
             _sync(self.folder)
 
-        self._guarded(write)
+        self._guard(write)
         if self._journal is not None:
             self._journal.close()
             self._journal = None
@@ -182,7 +182,7 @@ class Store:
 
     def summarise(self, text: str) -> None:
         """Write what is said at the end."""
-        self._guarded(lambda: (self.folder / SUMMARY).write_text(text, encoding="utf-8"))
+        self._guard(lambda: (self.folder / SUMMARY).write_text(text, encoding="utf-8"))
 
     def close(self) -> None:
         """Nothing more will be written."""
@@ -193,7 +193,7 @@ class Store:
     def _path(self, number: int) -> Path:
         return self.folder / f"journal-{number:06d}"
 
-    def _guarded(self, write: Any) -> None:
+    def _guard(self, write: Any) -> None:
         """Write; if that fails, what is on disk stays whole and the reason is one sentence."""
         try:
             write()

@@ -142,7 +142,7 @@ class Tracker(Chain):
         before = self._before(keep, float(times[0]))
         self._keep(keep)
         ahead, self._ahead = self._ahead if self._prepared(float(times[0])) else None, None
-        problem = self._completed(ahead, sensors, before, times)
+        problem = self._complete(ahead, sensors, before, times)
         if problem is None:
             problem, ahead = self._noisy(self._pose(sensors, np.concatenate([before, times])), sensors), None
         self._parameters |= problem.parameters
@@ -193,7 +193,7 @@ class Tracker(Chain):
             self._standing.look(sensors, self.settings, expected, self.head)
         elif self._standing.news or self._dirty < np.inf:
             self.update(sensors, np.empty(0))
-        elif not self._prepared(expected) and self._covered(sensors, expected):
+        elif not self._prepared(expected) and self._is_covered(sensors, expected):
             self._prepare(sensors, expected)
         else:
             return False
@@ -207,7 +207,7 @@ class Tracker(Chain):
         interval = preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0], self._judged_imu)
         self._motions[expected] = ImuFactors(interval, self.frame).prepared()
 
-    def _covered(self, sensors: Sensors, t: float) -> bool:
+    def _is_covered(self, sensors: Sensors, t: float) -> bool:
         """Whether the odometer has come as far as rows at a keyframe ask for."""
         o = sensors.setup.odometer
         return o is None or sensors.odometer.newest >= t + REACH * o.delay_sigma
@@ -217,7 +217,7 @@ class Tracker(Chain):
         before = self._before(len(self.window), expected)
         problem = self._noisy(self._pose(sensors, np.array([*before, expected]), complete=False), sensors)
         self._parameters |= problem.parameters
-        place, _ = self._place(self._weighed(problem), len(before))
+        place, _ = self._place(self._weigh(problem), len(before))
         self._ahead = _Ahead(problem, self.window.expect(place), self.stops, self._readings.wrong)
 
     def _prepared(self, t: float) -> bool:
@@ -231,7 +231,7 @@ class Tracker(Chain):
             and one.wrong is self._readings.wrong
         )
 
-    def _completed(self, ahead: _Ahead | None, sensors: Sensors, before: list[float], times: Array) -> Problem | None:
+    def _complete(self, ahead: _Ahead | None, sensors: Sensors, before: list[float], times: Array) -> Problem | None:
         """What was prepared for a new keyframe with its fix, if it was."""
         if ahead is None or len(times) > 1 or len(ahead.problem.t) != len(before) + 1:
             return None
@@ -267,7 +267,7 @@ class Tracker(Chain):
             return
         last = until == np.inf
         overdue = self.newest - float(self.window.stages[0].place.t) - self.settings.solver.lag
-        if not last and overdue < _LATEST * self.settings.solver.lag and self.window.first_moved() is not None:
+        if not last and overdue < _LATEST * self.settings.solver.lag and self.window.find_first_moved() is not None:
             return  # still being linearised again: the next keyframe will do
         if last:
             count = len(self.window)
@@ -388,7 +388,7 @@ class Tracker(Chain):
         for stop in self.stops if end < len(self.window) else ():
             if stop[0] < times[until - 1] < stop[1]:
                 until = int(np.searchsorted(times, stop[1] + SAME_TIME))
-        problem = self._weighed(self._noisy(self._pose(sensors, times[begin:until]), sensors))
+        problem = self._weigh(self._noisy(self._pose(sensors, times[begin:until]), sensors))
         return [
             replace(stage.place, problem=problem, k=first + skip - begin + i)
             for i, stage in enumerate(self.window.stages[first:end])

@@ -50,7 +50,7 @@ def doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> t
     if not errors:
         met = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
         for solution in met or solutions.values():
-            kind, size, used = _met(solution)
+            kind, size, used = _measure_consistency(solution)
             if used >= _FEWEST and size > _TOO_LARGE[kind]:
                 wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")
     if wrong:
@@ -58,7 +58,7 @@ def doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> t
     return tuple(out)
 
 
-def _met(solution: Solution) -> tuple[str, float, int]:
+def _measure_consistency(solution: Solution) -> tuple[str, float, int]:
     """Of a solution's records: of which kind they are, RMS over sigma, and how many rows tell it."""
     every = [consistency(record) for record in solution.records.values() if len(record.t)]
     every = [c for c in every if np.isfinite(c.mean_nis)]
@@ -181,7 +181,7 @@ def believe(name: str, errors: Errors) -> Raw:
 
 def believe_without_truth(solution: Solution) -> Raw:
     """One sentence on what innovations or residuals say of the sigma, where there is no truth to say it."""
-    kind, size, used = _met(solution)
+    kind, size, used = _measure_consistency(solution)
     name = solution.solver
     missing = "there is no truth to compare with"
     if used < _FEWEST:

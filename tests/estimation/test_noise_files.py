@@ -17,7 +17,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
-from graphnav.estimation.noise.files import known_groups, noise_values, read_noise, read_noise_and_mode, write_noise
+from graphnav.estimation.noise.files import list_groups, noise_values, read_noise, read_noise_and_mode, write_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.table import figure_rows, whole_ratio
 from graphnav.estimation.problem import build_problem
@@ -29,7 +29,7 @@ TOKYO = Path(__file__).resolve().parents[2] / "data" / "tokyo"
 def some_noise(seed: int = 0) -> NoiseModel:
     """Every group there is, with figures of all digits."""
     rng = np.random.default_rng(seed)
-    figures = {name: VarianceComponent(*rng.normal(size=1), *rng.uniform(0.1, 3.0, 4)) for name in known_groups()}
+    figures = {name: VarianceComponent(*rng.normal(size=1), *rng.uniform(0.1, 3.0, 4)) for name in list_groups()}
     t = np.sort(rng.uniform(1.6e9, 1.7e9, 50))  # of a clock that counts from 1970
     return NoiseModel(
         figures,
@@ -64,7 +64,7 @@ def test_every_group_of_a_problem_can_be_written_down() -> None:
     groups = {g for rows in problem.constraints for g in rows.noise_groups()[0]}
     groups |= {g for rows in problem.constraints for p in (*rows.parameters, *rows.processes) for g in p.noise_groups}
     assert {"odometer.forward", "gnss_velocity.seconds.up", "nhc.seconds.right"} <= groups
-    assert groups <= set(known_groups())
+    assert groups <= set(list_groups())
 
 
 def changed(key: str, value: Any) -> dict[str, Any]:

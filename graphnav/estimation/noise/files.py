@@ -137,7 +137,7 @@ def read_noise_and_mode(path: str | Path) -> tuple[NoiseModel, str]:
     return _Reader(path).model(values["noise"])
 
 
-def known_groups() -> tuple[str, ...]:
+def list_groups() -> tuple[str, ...]:
     """Names of all variance components that a recording can have."""
     out = [*(f"imu.{name}" for name in NOISE_FIGURES), STAMPS, *OFFSETS]
     for cls in list_constraints():
@@ -170,7 +170,7 @@ class _Reader:
             raise self.error("noise.mode", mode, f"must be one of {', '.join(MODES)}")
         constraints = [cls.name for cls in list_constraints()]
         return NoiseModel(
-            self.each(values, "figures", known_groups(), self.figure),
+            self.each(values, "figures", list_groups(), self.figure),
             self.each(values, "correlation_times", _list_processes(), self.time),
             self.each(values, "weights", [*constraints, *INTERVALS], self.weights),
             self.each(values, "excluded", constraints, self.spans),

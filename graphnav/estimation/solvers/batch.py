@@ -35,7 +35,7 @@ from graphnav.estimation.solvers.rows import (
     Values,
     column_norms,
     cost,
-    predicted_decrease,
+    predict_decrease,
     whiten,
 )
 
@@ -155,7 +155,7 @@ def _minimise(
         while True:
             eliminated = _eliminate(rows, layout, damping)
             step = layout.unpack(eliminated.solve(layout.keys))
-            gain = predicted_decrease(rows, layout, step)
+            gain = predict_decrease(rows, layout, step)
             candidate = point.moved(step)
             ahead = cost(problem, candidate, layout)
             if ahead < now or gain < settings.tolerance:

@@ -150,7 +150,7 @@ def _forward(
         {c.name: problem.t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
     )
     gains: list[list[Gain]] = [[] for _ in range(n)]
-    begun, P = (x, P), _placed(P, records)
+    begun, P = (x, P), _place(P, records)
     found: list[Any] = [None] * K  # estimates, or errors where points are given
     ahead = found.copy()
     k = 0
@@ -197,7 +197,7 @@ def _forward(
             bank = banks.get(back) or bank.forgetful() if bank else None
             banks = {key: old for key, old in banks.items() if key < back}
             k = back
-            x, P = (found[k - 1], all_P[k - 1]) if k else (begun[0], _placed(begun[1], records))
+            x, P = (found[k - 1], all_P[k - 1]) if k else (begun[0], _place(begun[1], records))
             if about is not None and k == n:
                 x = own.plus(_one(about, k - 1), x)
             continue
@@ -230,7 +230,7 @@ def _forward(
     )
 
 
-def _placed(P: Array, records: dict[str, Innovations]) -> Array:
+def _place(P: Array, records: dict[str, Innovations]) -> Array:
     """What is known at the start, but for the place where the first fix, which tells it, is not used."""
     first = [one.used[0] for one in records.values() if one.rows.fix_of == "p" and len(one.used)]
     return _anywhere(P, "p") if first and first[0] == 0.0 else P

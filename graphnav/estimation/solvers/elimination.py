@@ -157,7 +157,7 @@ def update(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -
                 row += b.size
             top, _ = _under(top, tail)
         if tests is not None:
-            top, beside, fault = _tested(top, tests.copy(), rows, y, passes, place.t, ahead.state)
+            top, beside, fault = _test(top, tests.copy(), rows, y, passes, place.t, ahead.state)
         y, info = dtrtrs(top[:, :D], top[:, D])
         if info:
             raise EstimationError(f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units")
@@ -166,7 +166,7 @@ def update(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -
     return Stage(place, message, ahead.G, ahead.g, ahead.lost, ahead.C, measured, fault=fault), y
 
 
-def _tested(
+def _test(
     top: Array, tests: Watch, rows: Sequence[Measured], y: Array, passes: int, t: float, state: States
 ) -> tuple[Array, Watch, tuple[str, float] | None]:
     """Add the measurements that have tests to the rows [R z Z] of a message, Z = R X (D, C)."""

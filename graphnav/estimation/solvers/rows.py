@@ -167,7 +167,7 @@ def cost_at(problem: Problem, points: Points) -> float:
     return cost(problem, Iterate(points.states, points.nodes(problem)), Layout(problem))
 
 
-def predicted_decrease(rows: Rows, layout: Layout, step: Step) -> float:
+def predict_decrease(rows: Rows, layout: Layout, step: Step) -> float:
     """How much the quadratic model falls by a step."""
     flat = layout.flat(step)
     gain = 0.0

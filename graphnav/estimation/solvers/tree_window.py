@@ -58,7 +58,7 @@ class TreeWindow(Window):
         self._means = None
 
     # ------------------------------------------------------------------------------------------- what the tree knows
-    def first_moved(self, share: float = 1.0) -> int | None:
+    def find_first_moved(self, share: float = 1.0) -> int | None:
         """The first stage that the tree would linearise anew; None if there is none."""
         if self.tree is None or not self.stages:
             return None
@@ -73,10 +73,10 @@ class TreeWindow(Window):
         count = 0
         if always:
             self.tree.linearise_again(range(self._before, len(self.tree)), renewed)
-            self._relinearised(len(self))
+            self._relinearise(len(self))
             share, count = min(share, _FINE), 1
         while count < _ROUNDS and (done := self.tree.relinearise(share, renewed)):
-            self._relinearised(done)
+            self._relinearise(done)
             count += 1
         return count
 
@@ -112,7 +112,7 @@ class TreeWindow(Window):
         """How many stages `smooth_back` is about, 0 if it has not begun."""
         return 0 if self._leaving is None else self._leaving[0]
 
-    def _relinearised(self, count: int) -> None:
+    def _relinearise(self, count: int) -> None:
         self.relinearized += count
         self._adopt(full=True)
 

@@ -237,7 +237,7 @@ class Window:
         )
 
     # ------------------------------------------------------------------------------------------ linearising again
-    def first_moved(self, share: float = 1.0) -> int | None:
+    def find_first_moved(self, share: float = 1.0) -> int | None:
         """The first stage whose point is further than its limit from the smoothed state; None if there is none."""
         far = self._moves() > share
         return int(np.argmax(far)) if far.any() else None
@@ -270,11 +270,11 @@ class Window:
         renewed : gives the places of stages, from an index to another, where they no longer know their rows.
         """
         for count in range(_ROUNDS):
-            first = 0 if always and not count else self.first_moved(share)
+            first = 0 if always and not count else self.find_first_moved(share)
             if first is None:
                 return count
             # what has moved almost as far goes with it: it would be next
-            first = min(first, self.first_moved(_ALMOST * share) or 0) if first else 0
+            first = min(first, self.find_first_moved(_ALMOST * share) or 0) if first else 0
             self.relinearize(first, None if renewed is None else renewed(first, len(self)))
         return _ROUNDS
 
@@ -289,11 +289,11 @@ class Window:
         Keyframes may come and go before the next part, and what has been made of them goes with them.
         """
         if self._revision is None:
-            first = 0 if always and not self._rounds else self.first_moved()
+            first = 0 if always and not self._rounds else self.find_first_moved()
             if first is None or self._rounds == _ROUNDS:
                 self._rounds = 0
                 return False
-            first = min(first, self.first_moved(_ALMOST) or 0) if first else 0
+            first = min(first, self.find_first_moved(_ALMOST) or 0) if first else 0
             self._revision, self._rounds = Revision(self, first), self._rounds + 1
         if self._revision.step(count, renewed):
             self._revision = None
