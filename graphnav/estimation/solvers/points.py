@@ -13,14 +13,15 @@ A pass at given points takes a ninth of the time, and is the better one wherever
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.linearise import Points, linearise, shift, stepping
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.linearise import Points, Step, linearise, node_steps, shift, stepping
 from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.imu.dynamics import SCALE
 
@@ -42,10 +43,10 @@ class AtEstimate:
         self._problem, self._columns, self._scale = problem, problem.columns, problem.columns.get(SCALE)
         self._width = DIM + sum(s.stop - s.start for s in self._columns.values())
         self._I = np.eye(self._width)
-        self._steps: dict[int, list[ParameterChain]] = {}  # that move on to their next node, by keyframe
-        for chain in problem.chains:
-            for k in stepping(chain).tolist():
-                self._steps.setdefault(k, []).append(chain)
+
+    @cached_property
+    def _steps(self) -> dict[int, tuple[Step, ...]]:
+        return node_steps(self._problem)
 
     def step(self, k: int, x: Estimate) -> tuple[Estimate, Array, Array, Array | None]:
         """The estimate at keyframe k from that at the one before, F (D, D), Q (15, 15), and more variance (D,)."""
@@ -56,14 +57,13 @@ class AtEstimate:
         if scale is not None:
             F[:DIM, scale] = motion.scale_columns(at, F15, scale.stop - scale.start)[0]
         values, added = x.values, None
-        for one in self._steps.get(k, ()):
-            if added is None:
-                values, added = values.copy(), np.zeros(self._width)
-            j, column = int(one.node[k]), self._columns[one.parameter.name]
-            own, decay = shift(column), float(one.decay[j])
-            F[column, column] *= decay
-            values[own] = one.mean[j] + decay * (values[own] - one.mean[j - 1])
-            added[column] = one.sigma[j] ** 2
+        if k in self._steps:
+            values, added = values.copy(), np.zeros(self._width)
+            for one in self._steps[k]:
+                column = self._columns[one.name]
+                F[column, column] *= one.decay
+                values[shift(column)] = one.ahead(values[shift(column)])
+                added[column] = one.sigma**2
         return Estimate(ahead, values), F, motion.noise(at, x.state.R_nb)[0], added
 
     def rows(self, some: RowBlock, at: Estimate) -> Rows:
