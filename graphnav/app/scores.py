@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from graphnav.constraints.gnss import LEVER_ARM, TIME_OFFSET
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
@@ -16,6 +17,7 @@ from graphnav.evaluation.against import Foreign, own_solutions, without_attitude
 from graphnav.recording import Recording
 
 if TYPE_CHECKING:
+    from graphnav.evaluation.evaluate import AntennaCalibration
     from graphnav.evaluation.metrics import Metrics
 
 Span = tuple[float, float]
@@ -68,24 +70,34 @@ def score(
     asked: list[Withheld] = [("gnss", span) for _, span in spans]
     if truth is None and any(source == "gnss" and span is None for source, span in withheld):
         asked.append(("gnss", None))
-    reference, swings = np.empty(0), False
-    compared = truth_of(recording)
-    if compared is None and truth is None:
-        compared = withheld_truth(recording, "gnss", [span for _, span in asked])
-    if compared is not None:
-        reference, arm = compared[0].t, compared[1]
-        swings = compared[0].v is not None and arm is not None and bool(np.any(arm))
+    with_truth = truth_of(recording)
     found = {}
     for name, solution in solutions.items():
+        antenna, compared = _calibrated(solution), with_truth
+        if truth is None:
+            compared = withheld_truth(recording, "gnss", [span for _, span in asked], antenna)
+        reference, swings = np.empty(0), False
+        if compared is not None:
+            reference, arm = compared[0].t, compared[1]
+            swings = compared[0].v is not None and arm is not None and bool(np.any(arm))
         at = _epochs(solution, reference)
         wanted = np.union1d(np.union1d(solution.t, at), _thin(reference, solution, _MOST_TURNING)) if swings else at
         track = _score_at(solution, wanted, placed=used.gnss is not None)
-        metrics = evaluate_recording(track, recording, withheld=asked, at=at if len(at) else None)
+        epochs = at if len(at) else None
+        metrics = evaluate_recording(track, recording, withheld=asked, at=epochs, antenna=antenna)
         if metrics is None:
             return {}, None, ()
         borrowed = isinstance(solution, Foreign) and solution.borrowed
         found[name] = without_attitude(metrics) if borrowed else metrics
     return found, against, tuple(name for name, _ in spans)
+
+
+def _calibrated(solution: Solution) -> AntennaCalibration:
+    """The last estimates of the antenna; as stated where none are, as in another program's trajectory."""
+    from graphnav.evaluation.evaluate import AntennaCalibration
+
+    offset, lever = solution.parameters.get(TIME_OFFSET), solution.parameters.get(LEVER_ARM)
+    return AntennaCalibration(float(offset.value[-1, 0]) if offset else 0.0, lever.value[-1] if lever else None)
 
 
 def _epochs(solution: Solution, truth: Array) -> Array:

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,9 +39,9 @@ from graphnav.recording import Recording
 from graphnav.recording.formats.trajectories import WEEK, read_trajectory
 
 __all__ = [
-    "COMPONENTS", "Closure", "Errors", "Metrics", "Nees", "SpanErrors", "Statistic", "average_nees", "chi_square_band",
-    "closure", "comparison_rows", "ensemble_nees", "errors", "evaluate", "evaluate_recording", "measure", "summary",
-    "text", "truth_of", "withheld_truth", "write_comparison_csv",
+    "COMPONENTS", "AntennaCalibration", "Closure", "Errors", "Metrics", "Nees", "SpanErrors", "Statistic",
+    "average_nees", "chi_square_band", "closure", "comparison_rows", "ensemble_nees", "errors", "evaluate",
+    "evaluate_recording", "measure", "summary", "text", "truth_of", "withheld_truth", "write_comparison_csv",
 ]  # fmt: skip
 
 
@@ -72,13 +72,43 @@ def truth_of(recording: Recording) -> tuple[Trajectory, Array | None] | None:
     return Trajectory(truth.t, xyz, v=truth.v, rph=truth.rph, frame="local", name="truth"), lever_arm
 
 
+@dataclass(frozen=True)
+class AntennaCalibration:
+    """What a solution found of the antenna whose withheld fixes it is compared with."""
+
+    clock_offset: float = 0.0  # s, to be added to the fixes' stamps
+    lever_arm: Array | None = None  # (3,) m, right, forward, up; None: that of the recording
+
+
+_AS_STATED = AntennaCalibration()
+
+
 def withheld_truth(
-    recording: Recording, source: str = "gnss", spans: Sequence[tuple[float, float] | None] = (None,)
+    recording: Recording,
+    source: str = "gnss",
+    spans: Sequence[tuple[float, float] | None] = (None,),
+    antenna: AntennaCalibration = _AS_STATED,
 ) -> tuple[Trajectory, Array]:
     """The fixes withheld in `spans` (s from the start; None: all) as the truth of those spans, with their lever arm.
 
-    `recording` is the full one, before `Recording.without`. The fixes' own sigmas go with them, so that
-    the NEES knows the truth is not exact.
+    A withheld fix is met as a used one is: at its stamp on the IMU's clock, with the lever arm that was estimated.
+
+    Parameters
+    ----------
+    recording
+        The full one, before `Recording.without`. The fixes' own sigmas go with them, so that the NEES knows that the
+        truth is not exact.
+    source
+        Whose measurements; only "gnss" has positions.
+    spans
+        s from the recording's start, on the receiver's clock.
+    antenna
+        What the solution to be compared estimated of the antenna.
+
+    Returns
+    -------
+    Trajectory, Array
+        The fixes on the IMU's clock, and the (3,) lever arm, m.
 
     Raises
     ------
@@ -95,12 +125,17 @@ def withheld_truth(
     mask &= np.isfinite(gnss.llh).all(axis=1)
     if not mask.any():
         raise RecordingError(f"'{recording.name}': no GNSS fix in the withheld spans to compare with")
+    notes = [Note("truth.withheld_gnss", "the truth is the withheld GNSS itself")]
+    if antenna.clock_offset:
+        moved = f"stamps of the withheld fixes: {1e3 * antenna.clock_offset:+.1f} ms, the receiver's clock as estimated"
+        notes.append(Note("truth.clock_offset", moved))
     truth = Trajectory(
-        gnss.t[mask], gnss.llh[mask], v=None if gnss.v is None else gnss.v[mask], sd_p=gnss.sd[mask],
+        gnss.t[mask] + antenna.clock_offset, gnss.llh[mask], sd_p=gnss.sd[mask],
+        v=None if gnss.v is None else gnss.v[mask],
         sd_v=None if gnss.sd_v is None else gnss.sd_v[mask], name="withheld GNSS",
-        notes=(Note("truth.withheld_gnss", "the truth is the withheld GNSS itself"),),
+        notes=tuple(notes),
     )  # fmt: skip
-    return truth, gnss.lever_arm
+    return truth, gnss.lever_arm if antenna.lever_arm is None else antenna.lever_arm
 
 
 def evaluate_recording(
@@ -110,6 +145,7 @@ def evaluate_recording(
     withheld: Sequence[tuple[str, tuple[float, float] | None]] = (),
     max_gap: float = MAX_GAP,
     at: Array | None = None,
+    antenna: AntennaCalibration = _AS_STATED,
 ) -> Metrics | None:
     """Metrics of a solution against the best truth there is: the recording's own, a closed loop, or the withheld GNSS.
 
@@ -126,6 +162,8 @@ def evaluate_recording(
         s, between neighbouring rows that are interpolated.
     at
         (N,) s, epochs to compare at; those of the sparser of both when None.
+    antenna
+        What the solution estimated of the antenna, for withheld fixes.
 
     Returns
     -------
@@ -144,14 +182,16 @@ def evaluate_recording(
         sigma = recording.truth.closed_loop_sigma
         note = Note("truth.closed_loop", f"the only truth is that the end is the start, to {sigma:g} m")
         return Metrics(trajectory.name, closure=closure(trajectory), notes=(*trajectory.notes, note))
+    start = recording.start
     if found is None and gnss_spans and recording.gnss is not None:
-        found = withheld_truth(recording, "gnss", gnss_spans)
+        found = withheld_truth(recording, "gnss", gnss_spans, antenna)
+        start += antenna.clock_offset  # spans are on the fixes' clock
     if found is None:
         return None
     truth, lever_arm = found
     alone = recording.gnss is None
     found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, at=at, from_start=alone)
-    return measure(found_errors, trajectory.name, spans, start=recording.start)
+    return measure(found_errors, trajectory.name, spans, start=start)
 
 
 def evaluate(

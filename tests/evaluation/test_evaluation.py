@@ -407,6 +407,26 @@ def test_withheld_fixes_are_the_truth_of_their_span() -> None:
         evaluation.withheld_truth(recording, "gnss", [(500.0, 600.0)])
 
 
+def test_withheld_fixes_are_met_on_the_receivers_clock_and_at_the_antenna_as_estimated() -> None:
+    t = 1000.0 + np.arange(0.0, 60.0, 0.1)
+    arm, late = np.array([0.0, 0.0, 1.5]), 0.3
+    fixes = moved(circle(t - 1000.0), arm).take(slice(None, None, 10))
+    recording = _recording(t, Gnss(fixes.t + 1000.0 + late, fixes.llh, np.full((60, 3), 0.02)))
+    estimate = replace(circle(t - 1000.0), t=t)
+    antenna = evaluation.AntennaCalibration(-late, arm)
+    metrics = evaluation.evaluate_recording(
+        estimate, recording, withheld=[("gnss", (20.05 + late, 30.05 + late))], antenna=antenna
+    )
+    assert metrics is not None
+    assert metrics.spans[0].n == 10  # the span is on the clock of the fixes that were withheld
+    assert metrics.spans[0].max_h < 1e-4
+    assert metrics.components["up"].max < 1e-4
+    assert "truth.clock_offset" in map(key_of, metrics.notes)
+    stated = evaluation.evaluate_recording(estimate, recording, withheld=[("gnss", (20.05, 30.05))])
+    assert stated is not None
+    assert stated.spans[0].max_h > 0.9 * SPEED * late
+
+
 def test_truth_of_a_recording() -> None:
     t = np.arange(0.0, 10.0, 0.1)
     source = circle(t)
