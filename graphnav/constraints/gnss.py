@@ -3,8 +3,8 @@
 Groves (2013), eq. 14.103 and 14.104, without its small-angle approximations. Residuals are in the local
 ENU at the fix, where receivers state their sigmas::
 
-    r_p = R_ln (p + R_nb l + u d - p_meas) + e       u = v + R_nb (omega_nb x l)
-    r_v = R_ln (u + a d) - v_meas                    a = R_nb (f_b - b_a) + g
+    r_p = R_ln (p + R_nb l + u d + a d^2 / 2 - p_meas) + e       u = v + R_nb (omega_nb x l)
+    r_v = R_ln (u + a d) - v_meas                                a = R_nb (f_b - b_a) + g
     omega_nb = omega_b - b_g - R_nb^T omega_ie
 
 d is what must be added to the stamps of the fixes, one constant for positions and one for velocities: a
@@ -78,7 +78,8 @@ def _stamp_error(settings: Settings, t: Array) -> tuple[Parameter, ...]:
     sigma = np.full(1, settings.gnss.time_offset_sigma)
     if not sigma[0] > 0.0:
         return ()
-    spacing = node_spacing((), period(t))
+    # a node at every fix, however soon it follows: two fixes with one stamp error would contradict each other
+    spacing = min(float(np.diff(t).min()), NODE_SPACING) if len(t) > 1 else NODE_SPACING
     own = (STAMPS,)
     return (
         Parameter(STAMP_ERROR, np.zeros(1), sigma, "s", correlation_time=_WHITE, spacing=spacing, noise_groups=own),
@@ -106,6 +107,8 @@ class GnssPosition(Constraint):
     sigma: Array = field(default_factory=lambda: _empty(0, 3))
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
     gyro: Array = field(default_factory=lambda: _empty(0, 3))  # measured rate at the fix
+    accel: Array = field(default_factory=lambda: _empty(0, 3))  # measured force at the fix
+    g_n: Array = field(default_factory=lambda: _empty(0, 3))  # gravity there
     omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
     unit_error: Array = field(default_factory=lambda: _empty(0, 3))  # the same, smoothed: the unit of lasting errors
     usual_error: Array = field(
@@ -129,7 +132,8 @@ class GnssPosition(Constraint):
         used = keyframe >= 0
         if not used.any():
             return None
-        llh, sd = gnss.llh[used], gnss.sd[used]
+        llh, sd, imu = gnss.llh[used], gnss.sd[used], scene.recording.imu
+        p_n = scene.frame.from_llh(llh)
         kinds = None if gnss.type is None or len(np.unique(gnss.type)) < 2 else gnss.type[used]
         common = _common(scene, TIME_OFFSET)
         names = [""] if kinds is None else [f".{FIX_TYPES[int(kind)]}" for kind in np.unique(kinds)]
@@ -146,7 +150,7 @@ class GnssPosition(Constraint):
                 )  # fmt: skip
         return cls(
             keyframe=keyframe[used],
-            p_n=scene.frame.from_llh(llh),
+            p_n=p_n,
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
             sigma=sd,
             unit_error=_running_median(gnss.t[used], sd)
@@ -155,7 +159,9 @@ class GnssPosition(Constraint):
             usual_error=np.median(sd if scene.typical_sigmas is None else scene.typical_sigmas, axis=0),
             type=kinds,
             lever_arm=gnss.lever_arm,
-            gyro=around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
+            gyro=around(imu, imu.gyro, gnss.t[used]),
+            accel=around(imu, imu.accel, gnss.t[used]),
+            g_n=scene.frame.gravity_n(p_n),
             omega_n=scene.frame.omega_n,
             processes=(*processes, *_stamp_error(scene.settings, gnss.t[used])),
             **common,
@@ -183,11 +189,15 @@ class GnssPosition(Constraint):
         offset = _time_offset(parameters, TIME_OFFSET)
         if offset is not None:
             velocity, moved = antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
-            away = away + velocity * offset
+            change, bent = acceleration(states, self.accel[rows], self.g_n[rows])
+            away = away + velocity * offset + change * (0.5 * offset**2)
             for block in ("theta", "v", "bg", LEVER_ARM):
                 if block != LEVER_ARM or LEVER_ARM in parameters:
                     J[block] = J.get(block, 0.0) + moved[block] * offset[..., None]
-            J |= {name: velocity[..., None] for name in (TIME_OFFSET, STAMP_ERROR) if name in parameters}
+            J["theta"] = J["theta"] + bent["theta"] * (0.5 * offset**2)[..., None]
+            J["ba"] = bent["ba"] * (0.5 * offset**2)[..., None]
+            later = (velocity + change * offset)[..., None]
+            J |= {name: later for name in (TIME_OFFSET, STAMP_ERROR) if name in parameters}
         residual, jacobians = mv(C, away), {block: C @ x for block, x in J.items()}
         for name in parameters:
             if name.startswith(ERRORS):
@@ -277,11 +287,11 @@ class GnssVelocity(Constraint):
         jacobians = {block: C @ J for block, J in moved.items() if block != LEVER_ARM or LEVER_ARM in parameters}
         offset = _time_offset(parameters, VELOCITY_TIME_OFFSET)
         if offset is not None:
-            CR, force = C @ states.R_nb, self.accel[rows] - states.ba
-            change = mv(CR, force) + mv(C, self.g_n[rows])
+            change, bent = acceleration(states, self.accel[rows], self.g_n[rows])
+            change = mv(C, change)
             residual = residual + change * offset
-            jacobians["theta"] = jacobians["theta"] - CR @ rotation.skew(force) * offset[..., None]
-            jacobians["ba"] = -CR * offset[..., None]
+            jacobians["theta"] = jacobians["theta"] + C @ bent["theta"] * offset[..., None]
+            jacobians["ba"] = C @ bent["ba"] * offset[..., None]
             some = (VELOCITY_TIME_OFFSET, STAMP_ERROR)
             jacobians |= {name: change[..., None] for name in some if name in parameters}
         if VELOCITY_ERROR in parameters:
@@ -333,6 +343,12 @@ def antenna_velocity(states: States, gyro: Array, omega_n: Array, lever: Array) 
         "bg": RL,
         LEVER_ARM: R @ rotation.skew(omega),
     }
+
+
+def acceleration(states: States, accel: Array, g_n: Array) -> tuple[Array, dict[str, Array]]:
+    """R_nb (f_b - b_a) + g in n, (N, 3), and its derivatives by theta and ba."""
+    R, force = states.R_nb, accel - states.ba
+    return mv(R, force) + g_n, {"theta": -R @ rotation.skew(force), "ba": -R}
 
 
 def around(imu: Imu, x: Array, t: Array) -> Array:

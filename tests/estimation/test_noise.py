@@ -13,7 +13,7 @@ from scipy.special import chdtrc, chdtri
 from graphnav import load
 from graphnav.config import Settings, settings_from
 from graphnav.config.gnss import GnssSettings
-from graphnav.constraints.gnss import STAMPS
+from graphnav.constraints.gnss import STAMP_ERROR, STAMPS
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
@@ -583,6 +583,13 @@ def test_stamps_on_arrival_are_an_error_of_time(late: tuple[Recording, Trajector
     known = settings_from({"gnss": {"time_offset_sigma": 0.0}})
     without = errors(run(recording, known, ("batch",))["batch"].trajectory(), truth)
     assert np.mean(off.horizontal**2) < 0.25 * np.mean(without.horizontal**2)
+
+
+def test_each_fix_has_a_stamp_error_of_its_own(late: tuple[Recording, Trajectory]) -> None:
+    base, _ = posed(late[0])
+    rows = next(rows for rows in base.constraints if rows.name == "gnss_position")
+    chain = next(chain for chain in base.chains if chain.parameter.name == STAMP_ERROR)
+    assert len(np.unique(chain.node[rows.keyframe])) == len(rows)
 
 
 def test_a_constant_far_beyond_its_prior_is_said(late: tuple[Recording, Trajectory]) -> None:
