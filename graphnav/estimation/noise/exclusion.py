@@ -6,13 +6,16 @@ span is put as several models, each with its own likelihood of the innovations f
 next one:
 
     neither     all is as the noise model has it
-    fixes       positions, velocities or both have one unknown error in common in the span, which grows steadily
+    fixes       positions, velocities or both have one unknown error in common in the span, which grows steadily, or
+                each has one of its own
     wheels      what is assumed of wheels, and the odometer, have one such error in common there
     IMU         the intervals there that the smoother needs more noise of have it
+    rows        single rows there have the weights that were found
 
 An unknown error has a Gaussian prior about zero, as wide as such errors get (`_WIDE`), and so has its growth; what that
 width costs in likelihood is the cost of the explanation (MacKay 1992, "Bayesian interpolation": the Occam factor). A
-fault is also as rare beforehand as the tests take it to be. The best model decides what is left out.
+fault is also as rare beforehand as the tests take it to be, an outlier among intervals or rows as rare as `CHANCE`. The
+best model decides what is left out.
 
 Figures that are estimated with a fault in the data may have grown until they hide it. So the tests are made with the
 prior medians of the figures as well; where they find something else, the figures are estimated without that, each span
@@ -22,7 +25,7 @@ is decided with these, and of the two explanations of all measurements the likel
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,11 +48,13 @@ from graphnav.estimation.solvers.watch import FALSE_ALARM
 from graphnav.recording import Recording
 
 FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
-_WRONG: tuple[tuple[str, ...], ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS)
+ROWS = ("rows",)
+_WRONG: tuple[tuple[str, ...], ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS, ROWS)
+_SINGLE = INTERVALS, ROWS  # outliers: nothing is left out for them
 _WIDE = {"m": 100.0, "m/s": 10.0}  # reflections in a city are off by up to a hundred metres; wheels by their speed
 _ODDS = -float(np.log(FALSE_ALARM))  # by which a fault is less likely beforehand than none
 _NONE = 1e-9  # sigma of an error that is not there
-_OUTLIER = -float(np.log(CHANCE))  # the same of one interval of the IMU
+_OUTLIER = -float(np.log(CHANCE))  # the same of one row, and of one interval of the IMU
 _MINUTE = 60.0  # s
 
 
@@ -111,6 +116,22 @@ def with_common_errors(problem: Problem, spans: list[tuple[float, float]], kinds
         )
 
     return replace(problem, constraints=tuple(shifted(rows) for rows in problem.constraints))
+
+
+def with_own_errors(problem: Problem, spans: list[tuple[float, float]], kinds: tuple[str, ...]) -> Problem:
+    """The problem with an unknown error of each row of some constraints in the spans (s), as a frozen receiver has."""
+
+    def loose(rows: Constraint) -> Constraint:
+        if rows.name not in kinds:
+            return rows
+        t = problem.t[rows.keyframe]
+        within = np.any([(t >= a - SAME_TIME) & (t <= b + SAME_TIME) for a, b in spans], axis=0)
+        sigma: Array = rows.sigma  # type: ignore[attr-defined]
+        weight = np.ones(len(rows)) if rows.weight is None else rows.weight
+        wide = np.min(sigma / np.hypot(sigma, _WIDE[rows.unit]), axis=1) ** 2
+        return replace(rows, weight=np.where(within, np.minimum(weight, wide), weight))
+
+    return replace(problem, constraints=tuple(loose(rows) for rows in problem.constraints))
 
 
 @dataclass(frozen=True)
@@ -180,7 +201,7 @@ def _log_evidence(base: Problem, found: NoiseEstimate) -> float:
     """Of all measurements, those that are left out too; each outlier among the others has its cost."""
     spans = _join(span for some in found.noise.excluded.values() for span in some)
     whole = decide(base, found, spans).log_evidence if spans else found.log_posterior
-    outliers = sum(int(np.sum(_outside(some, spans).weight < 1.0)) for some in found.noise.weights.values())
+    outliers = sum(_count(_outside(some, spans)) for some in found.noise.weights.values())
     return whole - _OUTLIER * outliers
 
 
@@ -222,28 +243,41 @@ def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]
     noise = replace(found.noise, excluded={})
     reach = _with_next_fix(base, spans)
     outside = {name: _outside(some, reach if name in INTERVALS else spans) for name, some in noise.weights.items()}
-    used = with_noise(base, replace(noise, weights=outside))
     of_imu = {name: some for name, some in noise.weights.items() if name in INTERVALS}
-    loose = with_noise(base, replace(noise, weights=outside | of_imu))
+    of_rows = {name: some for name, some in noise.weights.items() if name not in INTERVALS}
+    used, disturbed, weighted = (
+        with_noise(base, replace(noise, weights=outside | some)) for some in ({}, of_imu, of_rows)
+    )
     known = values_of(with_noise(base, found.noise), found.points)
-    before, likelihood = evidence(used, points_of(used, found.points.states, known), spans, loose)
+    about = points_of(used, found.points.states, known)
+    before, likelihood = evidence(used, about, spans, {INTERVALS: disturbed, ROWS: weighted})
     excluded: dict[str, tuple[tuple[float, float], ...]] = {}
-    total, of_fixes = before + found.log_prior, []
+    total = before + found.log_prior
+    dropped: dict[tuple[str, ...], list[tuple[float, float]]] = {INTERVALS: [], ROWS: []}
     for k, span in enumerate(spans):
-        outliers = sum(len(some.t) - len(_outside(some, reach[k : k + 1]).t) for some in of_imu.values())
         cost = np.array([0.0 if not kinds else _ODDS for kinds in _WRONG])
-        cost[_WRONG.index(INTERVALS)] = _OUTLIER * outliers if outliers else np.inf
+        for kinds, some, within in ((INTERVALS, of_imu, reach[k]), (ROWS, of_rows, span)):
+            outliers = sum(_count(one) - _count(_outside(one, [within])) for one in some.values())
+            cost[_WRONG.index(kinds)] = _OUTLIER * outliers if outliers else np.inf
         one = likelihood[k] - cost
         best = int(np.argmax(one))
         total += float(one[best])
-        if _WRONG[best] == INTERVALS:
-            continue
-        of_fixes.append(reach[k])
-        excluded |= {name: (*excluded.get(name, ()), span) for name in _WRONG[best]}
+        if _WRONG[best] != INTERVALS:
+            dropped[INTERVALS].append(reach[k])
+        if _WRONG[best] != ROWS:
+            dropped[ROWS].append(span)
+        if _WRONG[best] not in _SINGLE:
+            excluded |= {name: (*excluded.get(name, ()), span) for name in _WRONG[best]}
     present = {rows.name for rows in base.constraints}
     excluded = {name: some for name, some in excluded.items() if name in present}
-    weights = outside | {name: _outside(some, of_fixes) for name, some in of_imu.items()}
+    weights = {name: _outside(some, dropped[INTERVALS]) for name, some in of_imu.items()}
+    weights |= {name: _outside(some, dropped[ROWS]) for name, some in of_rows.items()}
     return Explained(replace(noise, weights=weights, excluded=excluded), total, 0, len(_WRONG))
+
+
+def _count(some: RowWeights) -> int:
+    """How many have less weight; rows of one time are listed together."""
+    return int(np.sum(some.weight < 1.0))
 
 
 def _with_next_fix(problem: Problem, spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -267,30 +301,39 @@ def excluded_share(problem: Problem, noise: NoiseModel) -> float:
     return 0.0 if rows is None else 1.0 - float(np.mean(row_weights(problem.t[rows.keyframe], noise, rows.name)))
 
 
-def evidence(problem: Problem, about: Points, spans: list[tuple[float, float]], loose: Problem) -> tuple[float, Array]:
-    """Log-likelihood of the innovations before all spans, and (M, 6) from each span's beginning on, by `_WRONG`.
+def evidence(
+    problem: Problem, about: Points, spans: list[tuple[float, float]], single: Mapping[tuple[str, ...], Problem]
+) -> tuple[float, Array]:
+    """Log-likelihood of the innovations before all spans, and (M, 7) from each span's beginning on, by `_WRONG`.
 
     Parameters
     ----------
     problem : with its noise model and no fix left out.
     about : points of all keyframes.
     spans : s, first and last wrong fix, in order and apart.
-    loose : the problem with more noise of the IMU where the smoother needs it.
+    single : the problem with more noise of single intervals of the IMU, and with less weight of single rows.
     """
     edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
     known = values_of(problem, about)
-    found, before = [], 0.0
+    found: list[Array] = []
+    before = 0.0
     present = {rows.name for rows in problem.constraints}
     for kinds in _WRONG:
-        possible = present & set(kinds) if kinds == WHEELS else kinds == INTERVALS or present.issuperset(kinds)
+        possible = present & set(kinds) if kinds == WHEELS else kinds in single or present.issuperset(kinds)
         if not possible:
-            found.append([-np.inf] * len(spans))
+            found.append(np.full(len(spans), -np.inf))
             continue
-        shifted = kinds and kinds != INTERVALS
-        one = with_common_errors(problem, spans, kinds) if shifted else loose if kinds else problem
-        likelihood = refilter(one, points_of(one, about.states, known)).log_likelihood
-        before = float(np.sum(likelihood[: edges[0]])) if not kinds else before
-        found.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)])
+        ways = [single.get(kinds, problem)]
+        if kinds and kinds not in single:
+            ways = [with_common_errors(problem, spans, kinds)]
+        if kinds and set(kinds) <= set(FIXES):
+            ways.append(with_own_errors(problem, spans, kinds))
+        each = []
+        for one in ways:
+            likelihood = refilter(one, points_of(one, about.states, known)).log_likelihood
+            before = float(np.sum(likelihood[: edges[0]])) if not kinds else before
+            each.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)])
+        found.append(np.max(each, axis=0))
     return before, np.array(found).T
 
 
