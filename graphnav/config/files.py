@@ -58,7 +58,9 @@ def read_settings(path: str | Path | None = None, profile: str | None = None) ->
         values, text = read_toml(Path(path), ConfigError)
     if profile is not None:
         if profile not in PROFILES:
-            raise ConfigError(f"--profile {profile}: no such profile; known: {', '.join(get_args(Profile))}")
+            raise ConfigError(
+                f"--profile {profile}: no such profile; known: {', '.join(get_args(Profile))}", key="option.value"
+            )
         values = {**values, "profile": profile}
     return settings_from(values, "settings" if path is None else str(path), text)
 
@@ -68,9 +70,13 @@ def _settings_of_run(path: Path) -> Mapping[str, Any]:
     try:
         values = parse_json(read_text(path, ConfigError))["settings"]
     except (ValueError, KeyError, TypeError):
-        raise ConfigError(f"{path}: holds no settings; name a settings file (TOML) or a summary.json") from None
+        raise ConfigError(
+            f"{path}: holds no settings; name a settings file (TOML) or a summary.json", key="settings.none"
+        ) from None
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{path}: holds no settings; name a settings file (TOML) or a summary.json")
+        raise ConfigError(
+            f"{path}: holds no settings; name a settings file (TOML) or a summary.json", key="settings.none"
+        )
     return values
 
 

@@ -61,7 +61,8 @@ def truth_of(recording: Recording) -> tuple[Trajectory, Array | None] | None:
         sensor = getattr(recording, truth.of, None)
         if sensor is None:
             raise RecordingError(
-                f"'{recording.name}': truth is of = \"{truth.of}\" but there is no [{truth.of}] to give its lever arm"
+                f"'{recording.name}': truth is of = \"{truth.of}\" but there is no [{truth.of}] to give its lever arm",
+                key="truth.no_lever_arm",
             )
         lever_arm = sensor.lever_arm
     if truth.llh is not None:
@@ -86,7 +87,9 @@ def withheld_truth(
         If the source has no positions, or no fix falls into the spans.
     """
     if source != "gnss" or recording.gnss is None:
-        raise RecordingError(f"'{recording.name}': withheld '{source}' gives no positions to compare with")
+        raise RecordingError(
+            f"'{recording.name}': withheld '{source}' gives no positions to compare with", key="truth.no_positions"
+        )
     gnss = recording.gnss
     t = gnss.t - recording.start
     mask = np.zeros(len(t), dtype=bool)
@@ -94,7 +97,9 @@ def withheld_truth(
         mask |= np.ones_like(mask) if span is None else (t >= span[0]) & (t <= span[1])
     mask &= np.isfinite(gnss.llh).all(axis=1)
     if not mask.any():
-        raise RecordingError(f"'{recording.name}': no GNSS fix in the withheld spans to compare with")
+        raise RecordingError(
+            f"'{recording.name}': no GNSS fix in the withheld spans to compare with", key="truth.no_withheld_fix"
+        )
     truth = Trajectory(
         gnss.t[mask], gnss.llh[mask], v=None if gnss.v is None else gnss.v[mask], sd_p=gnss.sd[mask],
         sd_v=None if gnss.sd_v is None else gnss.sd_v[mask], name="withheld GNSS",
@@ -198,7 +203,9 @@ def evaluate(
         if found is None:
             metrics = evaluate_recording(trajectory, recording)
             if metrics is None:
-                raise RecordingError(f"{truth_path}: the recording has no [truth] to evaluate against")
+                raise RecordingError(
+                    f"{truth_path}: the recording has no [truth] to evaluate against", key="truth.none"
+                )
             return metrics
         truth, arm = found
         alone = recording.gnss is None
@@ -206,7 +213,9 @@ def evaluate(
     else:
         truth = read_trajectory(truth_path)
     if trajectory.t[-1] < truth.t[0] or truth.t[-1] < trajectory.t[0]:
-        raise RecordingError(f"{trajectory_path}: {ranges(trajectory, truth)}{_shift_hint(trajectory, truth)}")
+        raise RecordingError(
+            f"{trajectory_path}: {ranges(trajectory, truth)}{_shift_hint(trajectory, truth)}", key="truth.no_overlap"
+        )
     found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, from_start=alone)
     hint = _leap_hint(found_errors, trajectory, truth, lever_arm, max_gap)
     return measure(

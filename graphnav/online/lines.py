@@ -71,7 +71,10 @@ def setup_of(line: str) -> Recording:
     """
     word, _, text = line.strip().partition(" ")
     if word != HEAD:
-        raise RecordingError(f"line 1: a live source begins with '{HEAD}' and a setup as JSON, not with '{line[:40]}'")
+        raise RecordingError(
+            f"line 1: a live source begins with '{HEAD}' and a setup as JSON, not with '{line[:40]}'",
+            key="online.first_line",
+        )
     known = registered()
     others: Any = {name: (sensor.figures | None, None) for name, sensor in known.items()}
     model = create_model("_Setup", __base__=_Setup, **others)
@@ -80,7 +83,7 @@ def setup_of(line: str) -> Recording:
     except ValidationError as error:
         raise RecordingError(complaint("line 1: setup", error, model)) from None
     except ValueError as error:
-        raise RecordingError(f"line 1: the setup is not JSON ({error})") from None
+        raise RecordingError(f"line 1: the setup is not JSON ({error})", key="online.setup_json") from None
     stated = found.imu.noise.model_dump(exclude_none=True)  # type: ignore[attr-defined]
     gnss = odometer = None
     if found.gnss is not None:

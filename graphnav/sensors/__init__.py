@@ -39,6 +39,8 @@ def register(sensor: Sensor) -> Sensor:
         If something else has that name.
     """
     if sensor.name in _TAKEN or sensor.name in _find():
-        raise RecordingError(f"sensor '{sensor.name}': graphnav has one of that name; choose another")
+        raise RecordingError(
+            f"sensor '{sensor.name}': graphnav has one of that name; choose another", key="sensor.name_taken"
+        )
     _own[sensor.name] = sensor
     return sensor

@@ -162,11 +162,15 @@ def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limits: Limits) -> I
         from distributed import Client
         from distributed import as_completed as completed
     except ImportError:
-        raise ConfigError("--scheduler: needs Dask; pip install -e '.[fleet]' in the clone") from None
+        raise ConfigError(
+            "--scheduler: needs Dask; pip install -e '.[fleet]' in the clone", key="package.missing"
+        ) from None
     try:
         client = Client(scheduler, timeout=10)
     except (OSError, ValueError, TimeoutError) as error:
-        raise ConfigError(f"--scheduler {scheduler}: no cluster answers there ({error or 'too late'})") from None
+        raise ConfigError(
+            f"--scheduler {scheduler}: no cluster answers there ({error or 'too late'})", key="fleet.no_cluster"
+        ) from None
     with client:
         waiting = iter(tasks)
         of: dict[str, Task] = {}

@@ -355,5 +355,5 @@ def read_description(path: Path) -> RecordingFile:
     except ValueError as error:
         axes = description.imu.axes
         where = "'imu': " if axes is None else f"'imu.axes' = '{axes}' "
-        raise RecordingError(f"{path}: {where}{error}") from None
+        raise RecordingError(f"{path}: {where}{error}", key="key.value") from None
     return description

@@ -65,7 +65,7 @@ def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:
     """
     for finding in findings:
         if finding.severity == "refused":
-            raise RecordingError(f"'{recording.name}': {finding.sentence}")
+            raise RecordingError(f"'{recording.name}': {finding.sentence}", key=finding.key)
 
 
 def screen_recording(recording: Recording) -> tuple[Recording, list[str]]:
