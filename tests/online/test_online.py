@@ -291,7 +291,7 @@ def test_a_stamp_far_ahead_is_dropped(drive: tuple[Recording, Trajectory], rows:
     np.testing.assert_array_equal(track.llh, same.llh)
 
 
-@settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=2, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     seed=st.integers(0, 10**6),
     jitter=st.floats(0.0, 4.0),
@@ -620,14 +620,10 @@ def test_real_recording_settles_on_the_batch_solution(shared_data: Path) -> None
     assert END == "E"
 
 
-@pytest.mark.parametrize(("lag", "near"), [(20.0, 0.05), (40.0, 0.003)])
-def test_a_real_walk_settles_step_by_step(shared_data: Path, lag: float, near: float) -> None:
-    """Shoe with nothing but its IMU: stances are found a second after they are over, and it is batch again.
-
-    Before the end of a lag of 20 s what comes back in every stance is half as well known: heights settle 4 cm off then.
-    """
+def test_a_real_walk_settles_step_by_step(shared_data: Path) -> None:
+    """Shoe with nothing but its IMU: stances are found a second after they are over, and it is batch again."""
     walk = read(shared_data / "pyshoe_vicon" / "2017-11-22-11-23-25.toml")
-    online, parts = Online(without_rows(walk), settings_from({"solver": {"lag": lag}})), []
+    online, parts = Online(without_rows(walk), settings_from({"solver": {"lag": 40.0}})), []
     behind = []
     for row in rows_of(walk)[1]:
         online.add(row)
@@ -640,7 +636,7 @@ def test_a_real_walk_settles_step_by_step(shared_data: Path, lag: float, near: f
     t, states, P = best.at(track.t)
     assert online.frame is not None
     away = online.frame.from_llh(track.llh[np.isin(track.t, t)]) - states.p
-    assert np.abs(away).max() < near
+    assert np.abs(away).max() < 0.003
     np.testing.assert_allclose(track.sd_p[-1], np.sqrt(np.diag(P[-1]))[3:6], rtol=0.15)
     assert np.quantile(behind, 0.9) < 2.5
 
