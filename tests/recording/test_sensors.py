@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
+from helpers import refused
 
 from graphnav.app import cli
 from graphnav.app.convert import convert_log
@@ -77,7 +78,7 @@ def test_what_cannot_be_read_is_left_out_or_refused(drive, name):
     found = inspect(replace(drive, sensors={name: replace(series, values=spiked)}))
     assert len(found.recording.sensors[name]) == len(series) - 1
     assert f"{name}.bounds" in {f.key for f in found.findings}
-    with pytest.raises(RecordingError, match="unit"):
+    with refused(f"{name}.unit", RecordingError):
         inspect(replace(drive, sensors={name: replace(series, values=all_wrong)})).refuse()
 
 
@@ -97,7 +98,7 @@ def test_rows_of_the_line_protocol(drive):
     for wrong in ("S,barometr,1.0,2.0,", "S,barometer,1.0", "S,barometer,1.0,x,", "S"):
         with pytest.raises(ValueError, match=r"barom|needs|number|sensor"):
             row_of(wrong)
-    with pytest.raises(RecordingError, match="needs"):
+    with refused("row.bounds", RecordingError):
         Reading(1.0, registered()["barometer"], pressure=1.0)
     assert Reading(1.0, registered()["barometer"], pressure=1e5)[0] == "barometer"
 
@@ -143,7 +144,7 @@ def test_settings_of_a_sensor(tmp_path):
 
 
 def test_a_name_that_is_taken():
-    with pytest.raises(RecordingError, match="gnss"):
+    with refused("sensor.name_taken", RecordingError, "gnss"):
         register(Sensor("gnss", "", registered()["barometer"].columns, (("height",),)))
 
 

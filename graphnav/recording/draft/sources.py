@@ -283,13 +283,14 @@ def _look(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     try:
         header = read_header(path) if plain is None else list(plain.columns)
     except RecordingError as error:
-        raise _NoSensor(str(error)) from error
+        raise _NoSensor(str(error), key=error.key) from error
     columns = matching.match(header, path.name.split(".")[0])
     sensor = columns.sensor
     if sensor is None:
         raise _NoSensor(
             f"{path}, line 1: no sensor is recognised in the columns {', '.join(header[:12])}; "
-            "rename them (t; gx gy gz ax ay az; lat lon h; speed)"
+            "rename them (t; gx gy gz ax ay az; lat lon h; speed)",
+            key="draft.no_columns",
         )
     if plain is None:
         columns = _with_clock(path, header, columns)

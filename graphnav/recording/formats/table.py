@@ -164,16 +164,16 @@ def _open_bytes(path: Path) -> IO[bytes]:
     if path.is_dir():
         raise RecordingError(f"{path}: is a folder where a CSV file is wanted", key="file.folder")
     file = open_file(path)
-    why = None
+    why, key = None, "file.gzip"
     if not file.size:
-        why = "is empty"
+        why, key = "is empty", "file.empty"
     elif file.packed != (path.suffix == ".gz"):
         why = "is gzip-compressed; its name must end in .gz"
         if not file.packed:
             why = "is not gzip-compressed although its name ends in .gz"
     if why is not None:
         file.close()
-        raise RecordingError(f"{path}: {why}", key="file.gzip")
+        raise RecordingError(f"{path}: {why}", key=key)
     return file
 
 
