@@ -189,7 +189,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     given = request.noise
     solutions = run(used, request.settings, request.solvers, progress, None if given is None else given.model)
     if given is not None:
-        notes += unused_noise(given.model, next(iter(solutions.values())))
+        notes += list_unused_noise(given.model, next(iter(solutions.values())))
     solutions = {
         name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
     }
@@ -224,7 +224,7 @@ def _beside(request: Request, recording: Recording, solutions: Mapping[str, Solu
     return out
 
 
-def unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
+def list_unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
     """Sentences on what a noise model says of measurements that a solution has not."""
     have = dict.fromkeys(INTERVALS, solution.t) | {name: record.t for name, record in solution.records.items()}
     named = {group.split(".")[0] for group in noise.figures} - {"imu"} | set(noise.weights) | set(noise.excluded)

@@ -13,7 +13,7 @@ from graphnav.config.settings import PROFILES, Profile, Settings
 from graphnav.core.complaints import complaint, read_toml
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import parse_json, read_text
-from graphnav.sensors import registered
+from graphnav.sensors import list_sensors
 
 
 def settings_from(values: Mapping[str, Any], source: str = "settings", text: str = "") -> Settings:
@@ -89,7 +89,7 @@ def settings_text(settings: Settings) -> str:
         for name, field in type(section).model_fields.items():
             value = getattr(section, name)
             if name == "sensors":  # a table of each sensor, whether it is set or not
-                nested |= {f"{name}.{sensor}": settings.sensor(sensor) for sensor in registered()}
+                nested |= {f"{name}.{sensor}": settings.sensor(sensor) for sensor in list_sensors()}
                 continue
             if isinstance(value, BaseModel):
                 nested[name] = value

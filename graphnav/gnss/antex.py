@@ -126,7 +126,7 @@ def wind_up(satellite: Ids, epoch: Array, axes: Array, e: Array, enu: Array) -> 
     return cycles
 
 
-def bent(satellite: Array, antenna: Array) -> Array:
+def shapiro_delay(satellite: Array, antenna: Array) -> Array:
     """(N,) m by which the Earth's gravity lengthens ranges (Shapiro; IERS Conventions 2010, equation 11.17)."""
     r, s = np.linalg.norm(antenna, axis=1), np.linalg.norm(satellite, axis=1)
     between = np.linalg.norm(satellite - antenna, axis=1)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.gnss.series import RawGnss
-from graphnav.sensors import Series, registered
+from graphnav.sensors import Series, list_sensors
 
 
 @dataclass(frozen=True)
@@ -276,7 +276,7 @@ def sources() -> tuple[str, ...]:
     tuple of str
         "gnss", "odometer" and those of `graphnav.sensors`.
     """
-    return ("gnss", "odometer", *registered())
+    return ("gnss", "odometer", *list_sensors())
 
 
 def rows_of(sensor: Any, mask: NDArray[np.bool_] | slice) -> Any:

@@ -25,7 +25,7 @@ def _find() -> dict[str, Sensor]:
     return {s.name: s for s in sorted(sensors, key=lambda s: s.name)}
 
 
-def registered() -> dict[str, Sensor]:
+def list_sensors() -> dict[str, Sensor]:
     """All sensors that are known, by their names."""
     return _find() | _own
 

@@ -26,7 +26,7 @@ from graphnav.estimation.problem import build_problem
 from graphnav.estimation.solvers.nonlinear import Exported, state_at
 from graphnav.estimation.solvers.rows import Iterate, Layout, cost
 from graphnav.recording import Recording
-from graphnav.sensors import registered
+from graphnav.sensors import list_sensors
 
 STATED = {"noise": {"mode": "stated"}, "gnss": {"faults": "off", "lever_arm_sigma": 0.1}}
 
@@ -37,7 +37,7 @@ def drive() -> Recording:
     made = made.crop(0.0, 30.0)
     t = np.arange(made.start + 0.2, made.end, 0.5)
     height = made.gnss.llh[0, 2] + 0.5 * np.random.default_rng(1).standard_normal(len(t))
-    return replace(made, sensors={"barometer": registered()["barometer"].series(t, {"height": height})})
+    return replace(made, sensors={"barometer": list_sensors()["barometer"].series(t, {"height": height})})
 
 
 def test_its_optimum_is_that_of_the_batch_solver(drive):

@@ -34,7 +34,7 @@ from graphnav.recording.formats.repair import (
 )
 from graphnav.recording.formats.table import Table, read_table
 from graphnav.recording.formats.trajectories import read_trajectory
-from graphnav.sensors import Sensor, Series, registered
+from graphnav.sensors import Sensor, Series, list_sensors
 from graphnav.sensors.tables import ANGLE
 
 _RAW_FILES = ("rover", "nav", "sp3", "clk", "antex", "base")
@@ -56,7 +56,7 @@ def read_folder(source: str | Path) -> Recording:
     logs: dict[str, Log | None] = {}  # by file; one log may hold several sensors
     zeros: list[float] = []  # of their clocks
     topics: dict[str, tuple[str, ...]] = {}  # asked for of each file
-    known = registered()
+    known = list_sensors()
     for section in (d.imu, d.gnss, d.odometer, *(getattr(d, name) for name in known)):
         if section is not None:
             topics[section.file] = (*topics.get(section.file, ()), *section.topic)
