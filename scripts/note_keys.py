@@ -1,4 +1,4 @@
-"""The page docs/keys.md: the keys of all notes and findings, read off the code.
+"""The page docs/keys.md: the keys of all notes, findings and errors, read off the code.
 
 python scripts/note_keys.py > docs/keys.md
 """
@@ -7,19 +7,23 @@ from __future__ import annotations
 
 import ast
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAD = """\
-# Keys of notes and findings
+# Keys of notes, findings and errors
 
 What a run says of a recording and of itself is in `messages` of `summary.json` and `findings` of `graphnav info
 --json`: a `key` that stays the same, a `severity` and a `sentence`. `*` stands for the name of a sensor or of what a
 row is about. `python scripts/note_keys.py` makes this list from the code.
 
-| what | keys |
-| --- | --- |
 """
+ERRORS = """
+Errors have keys as well, `key` of a `graphnav.GraphnavError`:
+
+"""
+TABLE = "| what | keys |\n| --- | --- |\n"
 
 
 def _text(node: ast.expr) -> str | None:
@@ -43,7 +47,14 @@ def _key(call: ast.Call) -> str | None:
     return None
 
 
-def list_keys() -> list[str]:
+def _error_key(call: ast.Call) -> str | None:
+    """The key that a call gives to an error, whose class may be an argument called `error`."""
+    name = call.func.id if isinstance(call.func, ast.Name) else getattr(call.func, "attr", "")
+    named = [k.value for k in call.keywords if k.arg == "key"]
+    return _text(named[0]) if named and name.lower().endswith("error") else None
+
+
+def list_keys(key_of: Callable[[ast.Call], str | None] = _key) -> list[str]:
     """All keys, sorted."""
     calls = (
         node
@@ -51,16 +62,21 @@ def list_keys() -> list[str]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.Call)
     )
-    return sorted({key for call in calls if (key := _key(call))})
+    return sorted({key for call in calls if (key := key_of(call))})
+
+
+def _table(keys: list[str]) -> str:
+    """A row for each first part of the keys."""
+    groups = defaultdict(list)
+    for key in keys:
+        first, _, rest = key.partition(".")
+        groups[first].append(f"`{rest}`")
+    return TABLE + "".join(f"| `{name}.` | {', '.join(some)} |\n" for name, some in groups.items())
 
 
 def page() -> str:
     """docs/keys.md."""
-    groups = defaultdict(list)
-    for key in list_keys():
-        first, _, rest = key.partition(".")
-        groups[first].append(f"`{rest}`")
-    return HEAD + "".join(f"| `{name}.` | {', '.join(some)} |\n" for name, some in groups.items())
+    return HEAD + _table(list_keys()) + ERRORS + _table(list_keys(_error_key))
 
 
 if __name__ == "__main__":

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import GraphnavError
 from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.problem import Problem
@@ -21,6 +24,17 @@ Array = NDArray[np.float64]
 FRAME = LocalFrame(np.array([np.radians(48.1), np.radians(11.6), 500.0]))
 # central-difference steps per error-state entry: rad, m, m/s, m/s^2, rad/s
 STEPS = np.repeat([1e-5, 1e-1, 1e-1, 1e-3, 1e-5], 3)
+
+
+@contextmanager
+def refused(key: str, kind: type[GraphnavError], *names: str) -> Iterator[pytest.ExceptionInfo[GraphnavError]]:
+    """An error of this key and kind in one line that names files, lines, keys and values; its other words are free."""
+    with pytest.raises(kind) as caught:
+        yield caught
+    sentence = str(caught.value)
+    assert caught.value.key == key, f"{caught.value.key!r}: {sentence}"
+    assert "\n" not in sentence
+    assert [name for name in names if name not in sentence] == [], sentence
 
 
 def difference(f: Callable[[Array], Array], steps: Array, width: int | None = None) -> Array:

@@ -121,14 +121,14 @@ def _disturbed(
 
 
 def oracle_drive(
-    shared_data: Path, seed: int, *, rtk: bool = True, odometer: bool = True
+    shared_data: Path, seed: int, *, rtk: bool = True, odometer: bool = True, rate: float = 200.0
 ) -> tuple[Recording, Trajectory]:
     """The shipped oracle drive's path, stated noise and outage with fresh errors; half a second for a seed.
 
     ``rtk=False`` gives white errors of single-point size (the shipped ones are correlated in time, which no white
     sigma describes, so they cannot serve a consistency test).
     """
-    path = oracle_truth_path(shared_data)
+    path = oracle_truth_path(shared_data, rate)
     spans = json.loads((Path(shared_data) / "oracle_drive" / "outages.json").read_text())["outages"]
     return drive(
         path,

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import inspect
-import os
+import multiprocessing
 import pkgutil
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+import traceback
 import types
+import warnings
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import oracle
 import pytest
@@ -48,13 +52,13 @@ def blocks(kind):
 
 
 # the commands of a block belong together: one may need what another wrote
-COMMANDS = sorted(
-    {
-        lines
-        for _, text in blocks("console")
-        if (lines := "\n".join(line for line in text.splitlines() if not line.startswith("make ")))
-    }
-)
+BLOCKS = {
+    lines
+    for _, text in blocks("console")
+    if (lines := "\n".join(line for line in text.splitlines() if not line.startswith("make ")))
+}
+# what another block begins with is run there
+COMMANDS = sorted(lines for lines in BLOCKS if not any(other.startswith(f"{lines}\n") for other in BLOCKS))
 PYTHON = blocks("python")
 
 
@@ -106,13 +110,27 @@ def test_what_a_page_shows_of_a_command_is_what_it_prints(text, clone, capsys):
         assert numbers[0][:last] == pytest.approx(numbers[1][:last], rel=0.05, abs=0.02)
 
 
+def run_alone(text, said):
+    """Run Python as a program would, in a copy of this process: nothing that it registers or draws stays here."""
+    with said.open("w", encoding="utf-8") as file, redirect_stdout(file), redirect_stderr(file):
+        matplotlib.use("Agg", force=True)
+        warnings.resetwarnings()
+        warnings.filterwarnings("error", category=DeprecationWarning, module="__main__")
+        sys.modules["__main__"] = module = types.ModuleType("__main__")
+        try:
+            exec(compile(text, "<page>", "exec"), module.__dict__)
+        except BaseException:
+            traceback.print_exc(file=file)
+            raise
+
+
 @pytest.mark.parametrize(("page", "text"), PYTHON, ids=[f"{page.stem}-{k}" for k, (page, _) in enumerate(PYTHON)])
 def test_python_runs(page, text, clone):
-    environment = {**os.environ, "MPLBACKEND": "Agg", "PYTHONWARNINGS": "error::DeprecationWarning:__main__"}
-    run = subprocess.run(
-        [sys.executable, "-c", text], cwd=clone, env=environment, capture_output=True, text=True, timeout=300
-    )
-    assert run.returncode == 0, run.stderr
+    said = clone / "said.txt"
+    process = multiprocessing.get_context("fork").Process(target=run_alone, args=(text, said))
+    process.start()
+    process.join(300)
+    assert process.exitcode == 0, said.read_text(encoding="utf-8")
     for name in re.findall(r'savefig\("(.+?)"\)', text):
         assert (clone / name).stat().st_size > 5000
 

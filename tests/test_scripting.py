@@ -14,6 +14,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from helpers import refused
 
 from graphnav.app import cli
 from graphnav.app.terminal import Pace
@@ -190,22 +191,22 @@ def test_a_run_can_be_repeated_with_the_settings_in_its_summary(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "key", "names"),
     [
-        ("[keyframes]\n\nrat = 1", "line 3: unknown key 'keyframes.rat'; did you mean 'rate'?"),
-        ("[keyframes]\nrate = -1", "line 2: 'keyframes.rate' = -1: input should be greater than 0 (Hz, between"),
-        ("[vehicle]\nzero_velocity = false", "did you mean 'zero_velocity' in [standstill]?"),
-        ("[detectors.fft]\nstep = 0", "line 2: 'detectors.fft.step' = 0: input should be greater than or equal to 0.1"),
-        ('profile = "bike"', "line 1: 'profile' = 'bike': input should be 'car', 'car+odometer' or 'foot'"),
-        ("[gnss]\ngate = inf", '\'gnss.gate\': \'inf\' must be "off", "on", "automatic" or a number above 0'),
-        ("keyframes = 3", "line 1: 'keyframes' must be a table: [keyframes]"),
-        ("[keyframes]\nrate = ", "not valid TOML"),
+        ("[keyframes]\n\nrat = 1", "key.unknown", ("line 3", "'keyframes.rat'", "'rate'")),
+        ("[keyframes]\nrate = -1", "key.value", ("line 2", "'keyframes.rate' = -1", "Hz")),
+        ("[vehicle]\nzero_velocity = false", "key.unknown", ("'zero_velocity'", "[standstill]")),
+        ("[detectors.fft]\nstep = 0", "key.value", ("line 2", "'detectors.fft.step' = 0", "0.1")),
+        ('profile = "bike"', "key.value", ("line 1", "'profile' = 'bike'", "'car'", "'car+odometer'", "'foot'")),
+        ("[gnss]\ngate = inf", "key.value", ("'gnss.gate'", "'inf'", '"off"', '"on"', '"automatic"')),
+        ("keyframes = 3", "key.table", ("line 1", "'keyframes'", "[keyframes]")),
+        ("[keyframes]\nrate = ", "toml.syntax", ()),
     ],
 )
-def test_settings_that_cannot_be_are_named_with_line_value_and_unit(text, words, tmp_path):
+def test_settings_that_cannot_be_are_named_with_line_value_and_unit(text, key, names, tmp_path):
     file = tmp_path / "settings.toml"
     file.write_text(text)
-    with pytest.raises(ConfigError, match=re.escape(words)) as caught:
+    with refused(key, ConfigError, *names) as caught:
         read_settings(file)
     assert str(caught.value).startswith(str(file))
 
@@ -231,7 +232,7 @@ def test_a_staged_folder_replaces_at_the_end_or_not_at_all(tmp_path):
         assert old.read_text() == "old"
     assert (old.read_text(), (old.parent / "sub" / "b.txt").read_text()) == ("new", "new")
     assert {p.name for p in old.parent.iterdir()} == {"a.txt", "sub"}
-    with pytest.raises(ConfigError, match=r"cannot be written \(full\); what was there before is unchanged"):
+    with refused("output.cannot_write", ConfigError, "full"):
         stopped(tmp_path / "x" / "y", OSError("full"))
     assert not (tmp_path / "x").exists()
 

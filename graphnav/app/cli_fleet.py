@@ -77,7 +77,7 @@ def fleet(
 
     convert.check_rate(rate)
     if withhold is not None and not withhold > 0.0:
-        raise ConfigError(f"--withhold {withhold:g}: must be a number of seconds above 0")
+        raise ConfigError(f"--withhold {withhold:g}: must be a number of seconds above 0", key="option.value")
     asked = manifest.DriveOptions(
         solver,
         profile,
@@ -132,7 +132,10 @@ def fleet(
         json,
     )
     if not any(row["status"] == DONE for row in rows):
-        raise ConfigError(f"{source}: none of {len(rows)} drives could be solved; {folder / 'fleet.csv'} says why")
+        raise ConfigError(
+            f"{source}: none of {len(rows)} drives could be solved; {folder / 'fleet.csv'} says why",
+            key="fleet.none_solved",
+        )
 
 
 def _processors() -> int:

@@ -45,7 +45,9 @@ def convert(
     from graphnav.core.staging import final_path, stage_results
 
     if export is not None and format is not None:
-        raise ConfigError(f"--format {format}: is for logs; what a trajectory is, is seen from its content")
+        raise ConfigError(
+            f"--format {format}: is for logs; what a trajectory is, is seen from its content", key="option.not_here"
+        )
     if export is not None or conversion.is_export(Path(source), out, format):
         conversion.check_rate(rate)
         alone = bool(out.suffix) and not out.is_dir()
@@ -63,7 +65,7 @@ def convert(
         return
     for option, value in (("--point", point), ("--rate", rate), ("--clock", clock)):
         if value is not None:
-            raise ConfigError(f"{option}: is for trajectories; a log keeps its own")
+            raise ConfigError(f"{option}: is for trajectories; a log keeps its own", key="option.not_here")
     folder = output_folder(out)
     with bar(quiet, "convert"), permit_outside(allow_outside):
         tell("reading")
@@ -103,17 +105,20 @@ def allan(
         else:
             imu = load(log, topics=topic or ()).imu
             if imu is None:
-                raise RecordingError(f"{log}: holds no IMU")
+                raise RecordingError(f"{log}: holds no IMU", key="log.no_imu")
             t, gyro, accel = imu.t, imu.gyro, imu.accel
         since = t - t[0]
         part_asked = (since >= (start or 0.0)) & (since <= (since[-1] if end is None else end))
         if part_asked.sum() < 2:
-            raise ConfigError(f"--start, --end: nothing of {log} lies between them; it runs to {since[-1]:.1f} s")
+            raise ConfigError(
+                f"--start, --end: nothing of {log} lies between them; it runs to {since[-1]:.1f} s",
+                key="log.span_empty",
+            )
         tell("variances")
         try:
             result = allan_of(t[part_asked], gyro[part_asked], accel[part_asked])
         except RecordingError as error:
-            raise RecordingError(f"{log}: {error}") from None
+            raise RecordingError(f"{log}: {error}", key=error.key) from None
         tell("writing")
         with stage_results(folder) as part:
             written = files.write(result, part)
@@ -152,16 +157,18 @@ def init(
 
     out = out / "recording.toml" if out.is_dir() else out
     if out.suffix != ".toml":
-        raise ConfigError(f"-o {out}: name a .toml file, or a folder for recording.toml")
+        raise ConfigError(f"-o {out}: name a .toml file, or a folder for recording.toml", key="output.name")
     if out.exists() and not force:
-        raise ConfigError(f"-o {out}: is there already; name another file, or say --force")
+        raise ConfigError(f"-o {out}: is there already; name another file, or say --force", key="output.exists")
     folder = output_folder(out.parent)
     with bar(quiet, "init"):
         tell("reading")
         drafted = draft(logs, folder, name, topic or ())
         for made in drafted.made:
             if (folder / made).exists() and not force:
-                raise ConfigError(f"{folder / made}: is there already; say --force to write over it")
+                raise ConfigError(
+                    f"{folder / made}: is there already; say --force to write over it", key="output.exists"
+                )
         with stage_results(folder) as part:
             for made, columns in drafted.made.items():
                 write_csv(part / made, list(columns), list(columns.values()))
@@ -202,7 +209,7 @@ def simulate(
         say(catalogue())
         return
     if out is None:
-        raise ConfigError("say where to write the recording: -o DIR")
+        raise ConfigError("say where to write the recording: -o DIR", key="option.missing")
     folder = outputs.output_folder(out)
     options = options_from(scenario, option or [])
     with bar(quiet, "simulate"):

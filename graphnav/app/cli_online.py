@@ -71,7 +71,7 @@ def online(
         return
     settings = firing(_override(read_settings(config, profile), lag, engine), detectors)
     if resume and out is None:
-        raise ConfigError("--resume: say which folder to go on in: -o OUT")
+        raise ConfigError("--resume: say which folder to go on in: -o OUT", key="option.missing")
     folder = None if out is None else output_folder(out)
     live = source == "-" or source.startswith("tcp:")
     recording = None if live else read(source, topic or (), allow_outside)
@@ -100,9 +100,9 @@ def _override(settings: Settings, lag: float | None, engine: str | None) -> Sett
     from graphnav.config import settings_from
 
     if lag is not None and not lag >= 1.0:
-        raise ConfigError(f"--lag {lag:g}: must be at least 1 s")
+        raise ConfigError(f"--lag {lag:g}: must be at least 1 s", key="option.value")
     if engine is not None and engine not in ("window", "isam2"):
-        raise ConfigError(f"--engine {engine}: must be window or isam2")
+        raise ConfigError(f"--engine {engine}: must be window or isam2", key="option.value")
     typed = {key: value for key, value in (("lag", lag), ("engine", engine)) if value is not None}
     return settings_from(settings.model_dump() | {"solver": settings.solver.model_dump() | typed})
 
@@ -183,7 +183,7 @@ def connections(source: str) -> Iterator[bytes]:
     try:
         server = socket.create_server(("127.0.0.1", int(source.removeprefix("tcp:"))))
     except (ValueError, OSError) as error:
-        raise ConfigError(f"{source}: cannot listen there ({error})") from None
+        raise ConfigError(f"{source}: cannot listen there ({error})", key="online.cannot_listen") from None
     with server:
         while True:
             if not select.select([server], [], [], TICK)[0]:

@@ -89,7 +89,8 @@ def only(context: typer.Context, recording: str) -> str:
     if context.args:
         logs = " ".join([recording, *context.args])
         raise ConfigError(
-            f"{logs}: one recording at a time; graphnav init {logs} -o recording.toml joins logs into one"
+            f"{logs}: one recording at a time; graphnav init {logs} -o recording.toml joins logs into one",
+            key="recording.several",
         )
     return recording
 
@@ -99,7 +100,7 @@ def withheld_of(without: list[str] | None, start: float | None, end: float | Non
     from graphnav.app import workflow
 
     if start is not None and end is not None and not start < end:
-        raise ConfigError(f"--end {end:g}: must be later than --start {start:g}")
+        raise ConfigError(f"--end {end:g}: must be later than --start {start:g}", key="option.value")
     return tuple(workflow.parse_withheld(one) for one in without or ())
 
 
@@ -120,5 +121,8 @@ def firing(settings: Settings, names: str | None) -> Settings:
 
     fire = split_names(names, get_args(DetectorName), "--detectors", "detector")
     if FUSED in fire and len(fire) > 1:
-        raise ConfigError(f"--detectors {names}: '{FUSED}' is all detectors together: name it alone, or name detectors")
+        raise ConfigError(
+            f"--detectors {names}: '{FUSED}' is all detectors together: name it alone, or name detectors",
+            key="detectors.fused_alone",
+        )
     return settings.model_copy(update={"detectors": settings.detectors.model_copy(update={"fire": fire})})

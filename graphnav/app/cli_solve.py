@@ -130,7 +130,10 @@ def compare(
     beside = _Beside(against or [], against_point or [], against_shift or [])
     for option, values in (("--against-point", beside.points), ("--against-shift", beside.shifts)):
         if values and len(values) != len(beside.files):
-            raise ConfigError(f"{option} {values[-1]}: say one for each of the {len(beside.files)} files of --against")
+            raise ConfigError(
+                f"{option} {values[-1]}: say one for each of the {len(beside.files)} files of --against",
+                key="option.count",
+            )
     with permit_outside(allow_outside):
         _solve(asked, solvers, "--solvers", export, point, beside)
 
@@ -146,7 +149,7 @@ def report(
     from graphnav.core.staging import final_path, stage_results
 
     if not out.is_dir():
-        raise ConfigError(f"{out}: no such folder; name what smooth or compare wrote into")
+        raise ConfigError(f"{out}: no such folder; name what smooth or compare wrote into", key="file.missing")
     with bar(quiet, "detect"):
         tell("reading")
         with stage_results(out) as part:
@@ -206,7 +209,7 @@ def _solve(
     convert.check_rate(asked.rate)
     chosen, alone = split_names(solvers, pipeline.KNOWN, option, "solver"), option == "--solver"
     if alone and len(chosen) > 1:
-        raise ConfigError(f"--solver {solvers}: smooth uses one; several are for graphnav compare")
+        raise ConfigError(f"--solver {solvers}: smooth uses one; several are for graphnav compare", key="option.value")
     requirements = [gates.parse_requirement(one, chosen) for one in asked.require or ()]
     given: dict[str, Any] = {
         "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
@@ -216,14 +219,14 @@ def _solve(
     }  # fmt: skip
     folder = outputs.output_folder(asked.out, outputs.FILES, () if alone else chosen)
     if point is not None and export is None:
-        raise ConfigError(f"--point {point}: is of the files of --export; name some")
+        raise ConfigError(f"--point {point}: is of the files of --export; name some", key="option.not_here")
     exported = split_names(export, NAMES, "--export", "format to write") if export is not None else ()
     convert.parse_point(point)
     against = []
     for k, file in enumerate(beside.files if beside is not None else ()):
         assert beside is not None
         if not file.is_file():
-            raise ConfigError(f"--against {file}: no such file")
+            raise ConfigError(f"--against {file}: no such file", key="file.missing")
         of = convert.parse_point(beside.points[k] if beside.points else None, "--against-point")
         against.append(workflow.Against(file, of, beside.shifts[k] if beside.shifts else None))
     settings = firing(read_settings(asked.config, asked.profile), asked.detectors)

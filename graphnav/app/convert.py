@@ -55,7 +55,7 @@ def check_rate(rate: float | None) -> None:
         Naming the option.
     """
     if rate is not None and not 0.0 < rate <= 10_000.0:
-        raise ConfigError(f"--rate {rate:g}: must be above 0 and at most 10000 Hz")
+        raise ConfigError(f"--rate {rate:g}: must be above 0 and at most 10000 Hz", key="option.value")
 
 
 def convert_log(source: str, out: Path, name: str | None, topics: Sequence[str] = ()) -> tuple[Log, list[Path]]:
@@ -69,10 +69,12 @@ def convert_log(source: str, out: Path, name: str | None, topics: Sequence[str] 
         If it would be written over itself.
     """
     if name is not None and name not in formats():
-        raise ConfigError(f"--format {name}: no such format; {nearest(name, [*formats(), *NAMES])}")
+        raise ConfigError(
+            f"--format {name}: no such format; {nearest(name, [*formats(), *NAMES])}", key="log.format_unknown"
+        )
     log = _with_measured_noise(load(source, name, topics))
     if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
-        raise ConfigError(f"-o {out}: the recording is read from there; name another folder")
+        raise ConfigError(f"-o {out}: the recording is read from there; name another folder", key="output.is_input")
     with stage_results(out) as part:
         files = write_recording(log, part)
     return log, final_path(files, part, out)
@@ -117,7 +119,9 @@ def parse_point(text: str | None, option: str = "--point") -> str | Array:
     except ValueError:
         arm = np.empty(0)
     if arm.shape != (3,) or not np.isfinite(arm).all():
-        raise ConfigError(f"{option} {text}: write imu, antenna, or x,y,z in m: right, forward, up of the IMU")
+        raise ConfigError(
+            f"{option} {text}: write imu, antenna, or x,y,z in m: right, forward, up of the IMU", key="option.point"
+        )
     return arm
 
 
@@ -141,7 +145,7 @@ def export_file(
     trajectory = read_trajectory(source)
     if out.suffix[1:] in NAMES and not out.is_dir():
         if name is not None and name != out.suffix[1:]:
-            raise ConfigError(f"--export {name}: but {out.name} is to be written")
+            raise ConfigError(f"--export {name}: but {out.name} is to be written", key="option.not_here")
         targets = {out.suffix[1:]: out}
     else:
         assert name is not None
@@ -151,14 +155,16 @@ def export_file(
     if isinstance(arm, str) and arm == "antenna":
         stated = run.get("antenna_lever_arm")
         if stated is None:
-            raise ConfigError(f"--point antenna: no {SUMMARY} beside {source.name} says where it is; say x,y,z")
+            raise ConfigError(
+                f"--point antenna: no {SUMMARY} beside {source.name} says where it is; say x,y,z", key="option.point"
+            )
         arm = np.array(stated, dtype=float)
     gps_zero = run.get("gps_zero")
     if clock is not None:
         try:
             gps_zero = parse_clock(clock, float(trajectory.t[0]))
         except ValueError as error:
-            raise ConfigError(f"--clock {clock}: {error}") from None
+            raise ConfigError(f"--clock {clock}: {error}", key="option.clock") from None
     notes = list(trajectory.notes)
     if gps_zero is None and trajectory.t[0] > 1e9:
         gps_zero = parse_clock("unix", float(trajectory.t[0]))
@@ -185,15 +191,20 @@ def at_point(trajectory: Trajectory, arm: Array | None, rate: float | None = Non
     if arm is None and rate is None:
         return trajectory
     if arm is not None and trajectory.rph is None:
-        raise RecordingError("--point: the trajectory has no attitude, so no other point of the body can be placed")
+        raise RecordingError(
+            "--point: the trajectory has no attitude, so no other point of the body can be placed",
+            key="trajectory.no_attitude",
+        )
     t = trajectory.t
     if rate is not None:
         if (t[-1] - t[0]) * rate > _MOST_ROWS:
-            raise ConfigError(f"--rate {rate:g}: makes {(t[-1] - t[0]) * rate:.3g} rows, more than {_MOST_ROWS:g}")
+            raise ConfigError(
+                f"--rate {rate:g}: makes {(t[-1] - t[0]) * rate:.3g} rows, more than {_MOST_ROWS:g}", key="option.value"
+            )
         t = np.arange(np.ceil(t[0] * rate - 1e-6), np.floor(t[-1] * rate + 1e-6) + 1) / rate
     moved, _ = interpolate(trajectory, t, max_gap=_MAX_GAP, lever_arm=arm)
     if not len(moved):
-        raise ConfigError(f"--rate {rate:g}: leaves no row of this trajectory; say a higher one")
+        raise ConfigError(f"--rate {rate:g}: leaves no row of this trajectory; say a higher one", key="output.no_row")
     return moved
 
 
@@ -223,7 +234,7 @@ def export_run(
         if isinstance(arm, str) and arm == "antenna":
             found = antenna_lever_arm(outcome.recording, solution)
             if found is None:
-                raise ConfigError("--point antenna: the recording has no GNSS")
+                raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
             lever_arm = found
         blocks = solution.blocks(rate)
         if not isinstance(lever_arm, str) and np.any(lever_arm):

@@ -53,21 +53,29 @@ def output_folder(path: str | Path, files: Sequence[str] = (), folders: Sequence
         there = there.parent
     if not there.is_dir():
         what = "is a file; name a folder to write into" if there == folder else f"cannot be made, {there} is a file"
-        raise ConfigError(f"-o {folder}: {what}")
+        raise ConfigError(f"-o {folder}: {what}", key="output.cannot_write")
     if not os.access(there, os.W_OK | os.X_OK):
-        raise ConfigError(f"-o {folder}: no permission to write into {there}")
+        raise ConfigError(f"-o {folder}: no permission to write into {there}", key="output.cannot_write")
     try:  # a file system that cannot be written to, a name that is too long or none: by trying
         (folder / max(FILES, key=len)).resolve().exists()
         os.rmdir(tempfile.mkdtemp(prefix=".graphnav-", dir=there))
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
-        raise ConfigError(f"-o {folder}: nothing can be written into {there} ({why})") from None
+        raise ConfigError(
+            f"-o {folder}: nothing can be written into {there} ({why})", key="output.cannot_write"
+        ) from None
     for name in files:
         if (folder / name).is_dir():
-            raise ConfigError(f"-o {folder}: {name} is a folder there, and a file of that name is to be written")
+            raise ConfigError(
+                f"-o {folder}: {name} is a folder there, and a file of that name is to be written",
+                key="output.cannot_write",
+            )
     for name in folders:
         if exists(folder / name, ConfigError) and not (folder / name).is_dir():
-            raise ConfigError(f"-o {folder}: {name} is a file there, and a folder of that name is to be written")
+            raise ConfigError(
+                f"-o {folder}: {name} is a file there, and a folder of that name is to be written",
+                key="output.cannot_write",
+            )
     return folder
 
 
@@ -227,7 +235,7 @@ def _attempt(write: Callable[[Path], object], path: Path) -> list[str]:
 
 def _insist(failed: Sequence[str]) -> None:
     if failed:
-        raise PartlyWrittenError(f"{'; '.join(failed)}; all other files are there")
+        raise PartlyWrittenError(f"{'; '.join(failed)}; all other files are there", key="output.partly_written")
 
 
 def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) -> None:

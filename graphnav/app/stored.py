@@ -90,7 +90,9 @@ def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
         If there is no such file, or it is none of this version's.
     """
     if not exists(path, ConfigError):
-        raise ConfigError(f"{path.parent}: holds no {path.name}: not the results of smooth or compare")
+        raise ConfigError(
+            f"{path.parent}: holds no {path.name}: not the results of smooth or compare", key="results.none"
+        )
     check_regular(path, ConfigError)
     try:
         with ZipFile(path) as packed:
@@ -99,9 +101,9 @@ def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
             values = parse_json(file["text"].tobytes().decode())
             arrays = [file[f"a{k}"] for k in range(len(file.files) - 1)]
     except (OSError, ValueError, KeyError, BadZipFile, zlib.error, EOFError, RuntimeError, MemoryError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from None
+        raise ConfigError(f"{path}: cannot be read ({error})", key="file.unreadable") from None
     if not isinstance(values, dict) or values.get("form") != _FORM:
-        raise ConfigError(f"{path}: is of another version of graphnav; solve again")
+        raise ConfigError(f"{path}: is of another version of graphnav; solve again", key="results.other_version")
     try:
         outcome, provenance = _unpack(values["outcome"], arrays), _unpack(values["provenance"], arrays)
         names = [name for name in outcome.solutions if name != Path(name).name or name in ("", "..")]
@@ -109,7 +111,9 @@ def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
             raise TypeError(f"a solver called '{names[0]}'" if names else "no outcome")
         return outcome, dict(provenance)
     except (AttributeError, ImportError, LookupError, TypeError, ValueError, RuntimeError) as error:
-        raise ConfigError(f"{path}: is of another version of graphnav ({error}); solve again") from None
+        raise ConfigError(
+            f"{path}: is of another version of graphnav ({error}); solve again", key="results.other_version"
+        ) from None
 
 
 def attach_recording(outcome: Outcome, inputs: Mapping[str, str]) -> Outcome:
@@ -123,9 +127,11 @@ def attach_recording(outcome: Outcome, inputs: Mapping[str, str]) -> Outcome:
     request = outcome.request
     for name, digest in inputs.items():
         if not Path(name).is_file():
-            raise RecordingError(f"{name}: is not there any more; it was read for these results")
+            raise RecordingError(
+                f"{name}: is not there any more; it was read for these results", key="results.input_gone"
+            )
         if sha256(Path(name)) != digest:
-            raise RecordingError(f"{name}: has changed since; solve again")
+            raise RecordingError(f"{name}: has changed since; solve again", key="results.input_changed")
     part = read_part(request.source, request.start, request.end, topics=request.topics)
     recording = screen(part).recording
     return replace(outcome, recording=replace(recording, truth=None) if truth_apart(recording) else recording)

@@ -97,21 +97,26 @@ def parse_withheld(text: str) -> Withheld:
     found = re.fullmatch(r"([^:]*)(?::([^-]+)-([^-]+))?", text.strip())
     if re.fullmatch(r"[\d.]+-[\d.]+", text.strip()):
         sensors = " or ".join(f"{source}:{text.strip()}" for source in sources())
-        raise ConfigError(f"--without {text}: say of which sensor: {sensors}")
+        raise ConfigError(f"--without {text}: say of which sensor: {sensors}", key="option.withheld")
     usage = "write SOURCE or SOURCE:FROM-TO in seconds from the start, such as gnss:600-660"
     if found is None:
-        raise ConfigError(f"--without {text}: not a source and a span; {usage}")
+        raise ConfigError(f"--without {text}: not a source and a span; {usage}", key="option.withheld")
     source, first, last = found.groups()
     if source not in sources():
-        raise ConfigError(f"--without {text}: no source '{source}' can be withheld; {nearest(source, sources())}")
+        raise ConfigError(
+            f"--without {text}: no source '{source}' can be withheld; {nearest(source, sources())}",
+            key="option.withheld",
+        )
     if first is None:
         return source, None
     try:
         span = float(first), float(last)
     except ValueError:
-        raise ConfigError(f"--without {text}: '{first}-{last}' is not a span of two numbers; {usage}") from None
+        raise ConfigError(
+            f"--without {text}: '{first}-{last}' is not a span of two numbers; {usage}", key="option.withheld"
+        ) from None
     if not (np.isfinite(span).all() and span[0] < span[1]):
-        raise ConfigError(f"--without {text}: the span must end after it begins; {usage}")
+        raise ConfigError(f"--without {text}: the span must end after it begins; {usage}", key="option.withheld")
     return source, span
 
 
@@ -132,7 +137,8 @@ def parse_noise(text: str | None, settings: Settings) -> tuple[Settings, GivenNo
     if text not in MODES:
         if not Path(text).is_file():
             raise ConfigError(
-                f"--noise {text}: no such file; write {', '.join(MODES)} or name the summary.json of a run"
+                f"--noise {text}: no such file; write {', '.join(MODES)} or name the summary.json of a run",
+                key="file.missing",
             )
         model, mode = read_noise_and_mode(text)
         given = GivenNoise(model, Path(text))
@@ -162,7 +168,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
         whole = read(request.source, request.topics)
     check_names(request.exported, whole.gps_zero)
     if request.point == "antenna" and whole.gnss is None:
-        raise ConfigError("--point antenna: the recording has no GNSS")
+        raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
     recording = _crop(whole, request)
     zero = recording.start - whole.start if recording is not whole else 0.0
     moved = _move(request.withheld, zero)
@@ -173,7 +179,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     used, notes = _withhold(recording, moved, zero)
     findings = [f.sentence for f in inspection.findings]
     if (sentence := gnss_apart(used)) is not None:  # it would be solved as if there were no GNSS
-        raise RecordingError(f"'{recording.name}': {sentence}")
+        raise RecordingError(f"'{recording.name}': {sentence}", key="gnss.apart")
     if truth_apart(recording):
         recording = replace(recording, truth=None)
 
@@ -183,7 +189,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     given = request.noise
     solutions = run(used, request.settings, request.solvers, progress, None if given is None else given.model)
     if given is not None:
-        notes += unused_noise(given.model, next(iter(solutions.values())))
+        notes += list_unused_noise(given.model, next(iter(solutions.values())))
     solutions = {
         name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
     }
@@ -218,7 +224,7 @@ def _beside(request: Request, recording: Recording, solutions: Mapping[str, Solu
     return out
 
 
-def unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
+def list_unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
     """Sentences on what a noise model says of measurements that a solution has not."""
     have = dict.fromkeys(INTERVALS, solution.t) | {name: record.t for name, record in solution.records.items()}
     named = {group.split(".")[0] for group in noise.figures} - {"imu"} | set(noise.weights) | set(noise.excluded)
@@ -285,7 +291,10 @@ def _crop(whole: Recording, request: Request) -> Recording:
     """The part of the recording that is asked for."""
     if (request.start or 0.0) >= whole.duration or (request.end is not None and request.end <= 0.0):
         option = f"--start {request.start:g}" if (request.start or 0.0) >= whole.duration else f"--end {request.end:g}"
-        raise RecordingError(f"{option}: lies outside '{whole.name}', which runs from 0 to {whole.duration:.1f} s")
+        raise RecordingError(
+            f"{option}: lies outside '{whole.name}', which runs from 0 to {whole.duration:.1f} s",
+            key="option.span_outside",
+        )
     return whole.crop(request.start, request.end)
 
 
@@ -302,7 +311,8 @@ def _withhold(recording: Recording, withheld: tuple[Withheld, ...], zero: float)
         if span is not None and (span[1] <= 0.0 or span[0] >= recording.duration):
             raise RecordingError(
                 f"--without {name}: lies outside '{recording.name}', which runs from {zero:.0f} to "
-                f"{zero + recording.duration:.1f} s"
+                f"{zero + recording.duration:.1f} s",
+                key="option.span_outside",
             )
         if source in recording.aiding and source not in used.aiding:
             continue  # all of it is gone already

@@ -13,7 +13,7 @@ from graphnav.config.settings import PROFILES, Profile, Settings
 from graphnav.core.complaints import complaint, read_toml
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import parse_json, read_text
-from graphnav.sensors import registered
+from graphnav.sensors import list_sensors
 
 
 def settings_from(values: Mapping[str, Any], source: str = "settings", text: str = "") -> Settings:
@@ -58,7 +58,9 @@ def read_settings(path: str | Path | None = None, profile: str | None = None) ->
         values, text = read_toml(Path(path), ConfigError)
     if profile is not None:
         if profile not in PROFILES:
-            raise ConfigError(f"--profile {profile}: no such profile; known: {', '.join(get_args(Profile))}")
+            raise ConfigError(
+                f"--profile {profile}: no such profile; known: {', '.join(get_args(Profile))}", key="option.value"
+            )
         values = {**values, "profile": profile}
     return settings_from(values, "settings" if path is None else str(path), text)
 
@@ -68,9 +70,13 @@ def _settings_of_run(path: Path) -> Mapping[str, Any]:
     try:
         values = parse_json(read_text(path, ConfigError))["settings"]
     except (ValueError, KeyError, TypeError):
-        raise ConfigError(f"{path}: holds no settings; name a settings file (TOML) or a summary.json") from None
+        raise ConfigError(
+            f"{path}: holds no settings; name a settings file (TOML) or a summary.json", key="settings.none"
+        ) from None
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{path}: holds no settings; name a settings file (TOML) or a summary.json")
+        raise ConfigError(
+            f"{path}: holds no settings; name a settings file (TOML) or a summary.json", key="settings.none"
+        )
     return values
 
 
@@ -83,7 +89,7 @@ def settings_text(settings: Settings) -> str:
         for name, field in type(section).model_fields.items():
             value = getattr(section, name)
             if name == "sensors":  # a table of each sensor, whether it is set or not
-                nested |= {f"{name}.{sensor}": settings.sensor(sensor) for sensor in registered()}
+                nested |= {f"{name}.{sensor}": settings.sensor(sensor) for sensor in list_sensors()}
                 continue
             if isinstance(value, BaseModel):
                 nested[name] = value

@@ -14,7 +14,7 @@ from graphnav.config.outliers import Outliers
 from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.config.section import Section
 from graphnav.core.complaints import nearest
-from graphnav.sensors import registered
+from graphnav.sensors import list_sensors
 
 Profile = Literal["car", "car+odometer", "foot"]
 
@@ -123,8 +123,8 @@ class Settings(Section):
     @classmethod
     def _known_sensors(cls, sensors: dict[str, SensorSettings]) -> dict[str, SensorSettings]:
         for name in sensors:
-            if name not in registered():
-                raise ValueError(f"no sensor '{name}' is known; {nearest(name, tuple(registered()))}")
+            if name not in list_sensors():
+                raise ValueError(f"no sensor '{name}' is known; {nearest(name, tuple(list_sensors()))}")
         usual = SensorSettings()  # which need not be kept
         return {name: one for name, one in sensors.items() if one != usual}
 

@@ -40,15 +40,19 @@ def check_own(kinds: Sequence[type[Constraint]]) -> tuple[type[Constraint], ...]
     taken = {kind.name for kind in list_constraints()}
     for kind in kinds:
         if not (isinstance(kind, type) and issubclass(kind, Constraint)):
-            raise ConfigError(f"constraints: {kind!r} is no class derived from graphnav.constraints.base.Constraint")
+            raise ConfigError(
+                f"constraints: {kind!r} is no class derived from graphnav.constraints.base.Constraint", key="class.kind"
+            )
         what = f"constraints: {kind.__name__}"
         missing = [name for name in ("name", "axes", "unit") if not hasattr(kind, name)]
         missing += sorted(kind.__abstractmethods__)
         if kind.linearize is Constraint.linearize and kind.residual is Constraint.residual:
             missing.append("residual (or linearize)")
         if missing:
-            raise ConfigError(f"{what} lacks {', '.join(missing)}")
+            raise ConfigError(f"{what} lacks {', '.join(missing)}", key="class.incomplete")
         if kind.name in taken:
-            raise ConfigError(f"{what}: there is a constraint '{kind.name}' already; choose another name")
+            raise ConfigError(
+                f"{what}: there is a constraint '{kind.name}' already; choose another name", key="class.name_taken"
+            )
         taken.add(kind.name)
     return tuple(sorted(kinds, key=lambda kind: kind.name))

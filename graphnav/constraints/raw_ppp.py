@@ -71,13 +71,15 @@ def _free(scene: BuildContext) -> _Free | None:
     if not whole.precise:
         raise RecordingError(
             f"{scene.recording.name}: raw_gnss.ppp needs precise orbits and clocks; say sp3 and clk in the recording's "
-            "[raw_gnss]"
+            "[raw_gnss]",
+            key="raw.ppp_orbits",
         )
     rows = ionosphere_free(found.raw, whole)
     if rows is None:
         raise RecordingError(
             f"{scene.recording.name}: raw_gnss.ppp needs two signals of a satellite (GPS L1 and L2, Galileo E1 and "
-            "E5a); this receiver has one"
+            "E5a); this receiver has one",
+            key="raw.ppp_signals",
         )
     satellites, which = np.unique(found.raw.satellite[rows.which], return_inverse=True)
     systems, group, many = np.unique(satellites[which] // 100, return_inverse=True, return_counts=True)

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 from graphnav.core.errors import ConfigError, GraphnavError
 from graphnav.core.files import read_text
+from graphnav.core.notes import Note
 
 _TABLE = re.compile(r"\[([^\[\]]+)\]")
 _NAMES = 30  # that a sentence lists
@@ -41,9 +42,9 @@ def read_toml(path: Path, error: type[GraphnavError]) -> tuple[dict[str, Any], s
                 raise ValueError(f"'{key}' is a whole number of more than 64 bits")
         return values, text
     except RecursionError:
-        raise error(f"{path}: not valid TOML (nested too deep)") from None
+        raise error(f"{path}: not valid TOML (nested too deep)", key="toml.syntax") from None
     except ValueError as cause:  # tomllib's own is one, and that of a number of thousands of digits
-        raise error(f"{path}: not valid TOML ({cause})") from None
+        raise error(f"{path}: not valid TOML ({cause})", key="toml.syntax") from None
 
 
 def _leaves(value: Any, key: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
@@ -58,7 +59,7 @@ def _leaves(value: Any, key: str = "", depth: int = 0) -> Iterator[tuple[str, An
         yield key, value
 
 
-def complaint(source: str | Path, error: ValidationError, model: type[BaseModel], text: str = "") -> str:
+def complaint(source: str | Path, error: ValidationError, model: type[BaseModel], text: str = "") -> Note:
     """The first complaint of pydantic; an unknown key goes before the missing one that it may have been meant for.
 
     `text` is that of the file, for the line.
@@ -67,22 +68,23 @@ def complaint(source: str | Path, error: ValidationError, model: type[BaseModel]
     loc = tuple(str(part) for part in first["loc"])
     line = _line_of(text, loc)
     where = f"{source}, line {line}: " if line else f"{source}: "
-    return where + _WORD.sub(lambda word: f"{word[0][:_SHOWN]}...", _describe(first, loc, model))
+    described = _describe(first, loc, model)
+    return Note(described.key, where + _WORD.sub(lambda word: f"{word[0][:_SHOWN]}...", described))
 
 
-def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> str:
+def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
     key = ".".join(loc)
     if first["type"] == "extra_forbidden":
-        return f"unknown key '{key}'{_suggestion(loc, model)}"
+        return Note("key.unknown", f"unknown key '{key}'{_suggestion(loc, model)}")
     if first["type"] == "missing":
-        return f"'{key}' is missing"
+        return Note("key.missing", f"'{key}' is missing")
     if first["type"] == "value_error":  # our own sentence
         what = str(first["ctx"]["error"])
-        return f"'{key}': {what}{_meaning(loc, model)}" if key else what
+        return Note("key.value", f"'{key}': {what}{_meaning(loc, model)}" if key else what)
     if first["type"] in ("model_type", "model_attributes_type"):
-        return f"'{key}' must be a table: [{key}]"
+        return Note("key.table", f"'{key}' must be a table: [{key}]")
     what = f"{first['msg'][0].lower()}{first['msg'][1:]}{_meaning(loc, model)}"
-    return f"'{key}' = {shorten(first['input'])}: {what}"
+    return Note("key.value", f"'{key}' = {shorten(first['input'])}: {what}")
 
 
 def shorten(value: Any) -> str:
@@ -110,9 +112,11 @@ def split_names(text: str, known: Sequence[str], option: str, what: str) -> tupl
     names = tuple(dict.fromkeys(name.strip().lstrip(".") for name in text.split(",") if name.strip()))
     for name in names:
         if name not in known:
-            raise ConfigError(f"{option} {text}: no {what} '{name}'; known: {', '.join(known)}")
+            raise ConfigError(
+                f"{option} {text}: no {what} '{name}'; known: {', '.join(known)}", key="option.unknown_name"
+            )
     if not names:
-        raise ConfigError(f"{option}: names no {what}; known: {', '.join(known)}")
+        raise ConfigError(f"{option}: names no {what}; known: {', '.join(known)}", key="option.no_name")
     return names
 
 

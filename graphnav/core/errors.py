@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+from graphnav.core.notes import key_of
+
 
 class GraphnavError(Exception):
-    """Base of every error a user can cause; the command line prints it and exits with 2."""
+    """Base of every error a user can cause; the command line prints it and exits with 2.
+
+    Attributes
+    ----------
+    key : str
+        What went wrong, such as "table.column": it stays the same whatever the sentence is, for scripts and tests.
+    """
+
+    def __init__(self, sentence: str = "", *, key: str = "") -> None:
+        """The sentence, and its key unless it is a `Note`, which has one."""
+        super().__init__(sentence)
+        self.key = key or key_of(sentence)
 
 
 class RecordingError(GraphnavError):

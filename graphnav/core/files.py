@@ -57,7 +57,8 @@ def beside(source: Path, name: str, key: str, error: Kind = RecordingError) -> P
     if not inside(path, source.parent, error):
         raise error(
             f"{source}: '{key}' names a file outside the folder that it lies in; move it there, or say --allow-outside "
-            "if you trust who wrote this"
+            "if you trust who wrote this",
+            key="file.outside",
         )
     exists(path, error)
     return path
@@ -68,7 +69,7 @@ def inside(path: Path, folder: Path, error: Kind = RecordingError) -> bool:
     try:
         return _outside.get() or path.resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError):  # too long, a null character, a loop of links
-        raise error(f"{_shorten(path)}: is no path of a file") from None
+        raise error(f"{_shorten(path)}: is no path of a file", key="file.name") from None
 
 
 def check_inside(files: Iterable[Path], source: Path, error: Kind = RecordingError) -> None:
@@ -82,7 +83,10 @@ def check_inside(files: Iterable[Path], source: Path, error: Kind = RecordingErr
     folder = source if source.is_dir() else source.parent
     for file in files:
         if file.is_symlink() and not inside(file, folder, error):
-            raise error(f"{file}: is a link to outside of {folder}; say --allow-outside if you trust who made it")
+            raise error(
+                f"{file}: is a link to outside of {folder}; say --allow-outside if you trust who made it",
+                key="file.outside",
+            )
 
 
 def exists(path: Path, error: Kind = RecordingError) -> bool:
@@ -96,7 +100,9 @@ def exists(path: Path, error: Kind = RecordingError) -> bool:
     try:
         return path.exists()
     except (OSError, ValueError) as cause:
-        raise error(f"{_shorten(path)}: {getattr(cause, 'strerror', None) or 'is no path of a file'}") from None
+        raise error(
+            f"{_shorten(path)}: {getattr(cause, 'strerror', None) or 'is no path of a file'}", key="file.name"
+        ) from None
 
 
 def check_regular(path: Path, error: Kind = RecordingError) -> None:
@@ -110,13 +116,15 @@ def check_regular(path: Path, error: Kind = RecordingError) -> None:
     try:
         mode = os.stat(path).st_mode
     except OSError as cause:
-        raise error(f"{_shorten(path)}: cannot be read ({cause.strerror})") from None
+        raise error(f"{_shorten(path)}: cannot be read ({cause.strerror})", key="file.unreadable") from None
     except ValueError:
-        raise error(f"{_shorten(path)}: is no path of a file") from None
+        raise error(f"{_shorten(path)}: is no path of a file", key="file.name") from None
     if stat.S_ISDIR(mode):
-        raise error(f"{path}: cannot be read (it is a folder)")
+        raise error(f"{path}: cannot be read (it is a folder)", key="file.folder")
     if not stat.S_ISREG(mode):
-        raise error(f"{path}: cannot be read (it is a pipe or a device, not a file); write it to a file first")
+        raise error(
+            f"{path}: cannot be read (it is a pipe or a device, not a file); write it to a file first", key="file.pipe"
+        )
 
 
 def open_file(path: Path, error: Kind = RecordingError, text: bool = True, limit: int | None = None) -> Opened:
@@ -135,7 +143,7 @@ def open_file(path: Path, error: Kind = RecordingError, text: bool = True, limit
         magic = plain.read(2)
         plain.seek(0)
     except OSError as cause:
-        raise error(f"{path}: cannot be read ({cause.strerror})") from None
+        raise error(f"{path}: cannot be read ({cause.strerror})", key="file.unreadable") from None
     line = _limit(MAX_LINE, 1000) if text else None
     return Opened(_Bounded(path, plain, magic == _GZIP, size, most, line, error), size, magic == _GZIP)
 
@@ -155,7 +163,7 @@ def check_size(path: Path, count: int, error: Kind = RecordingError) -> None:
         Of the kind given.
     """
     if count > (most := _limit(MAX_FILE, 10**6)):
-        raise error(_too_large(path, most, packed=True))
+        raise error(_too_large(path, most, packed=True), key="file.large")
 
 
 def read_text(path: Path, error: Kind = RecordingError) -> str:
@@ -169,7 +177,7 @@ def read_text(path: Path, error: Kind = RecordingError) -> str:
     try:
         return read_bytes(path, error, text=False, limit=_WRITTEN).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise error(f"{path}: is not UTF-8 text; save it as UTF-8") from None
+        raise error(f"{path}: is not UTF-8 text; save it as UTF-8", key="file.text") from None
 
 
 def parse_json(text: str) -> Any:
@@ -210,7 +218,7 @@ def _limit(name: str, unit: int) -> int:
     except ValueError:
         value = math.nan
     if not 0.0 < value < math.inf:
-        raise ConfigError(f"{name} = {stated!r}: must be a number above 0")
+        raise ConfigError(f"{name} = {stated!r}: must be a number above 0", key="environment.value")
     return int(value * unit)
 
 
@@ -251,16 +259,17 @@ class _Bounded(io.RawIOBase):
         except (EOFError, zlib.error, gzip.BadGzipFile) as cause:
             cut = isinstance(cause, EOFError)
             why = "the compressed file is cut off" if cut else f"the compressed file is damaged ({cause})"
-            raise self.error(f"{self.path}: {why}; copy it again") from None
+            raise self.error(f"{self.path}: {why}; copy it again", key="file.damaged") from None
         except OSError as cause:
-            raise self.error(f"{self.path}: cannot be read ({cause.strerror})") from None
+            raise self.error(f"{self.path}: cannot be read ({cause.strerror})", key="file.unreadable") from None
         self._count += len(chunk)
         if self._count > self._most:
-            raise self.error(_too_large(self.path, self._most, self._packed))
+            raise self.error(_too_large(self.path, self._most, self._packed), key="file.large")
         if self._packed and self._count > _SMALL and self._count > _RATIO * self._size and not os.environ.get(MAX_FILE):
             raise self.error(
                 f"{self.path}: unpacks to more than {_RATIO} times its size, which no log does; if that is right, "
-                f"unpack it, or set {MAX_FILE}"
+                f"unpack it, or set {MAX_FILE}",
+                key="file.unpacks",
             )
         if self._longest is not None:
             self._check_line(chunk)
@@ -273,7 +282,8 @@ class _Bounded(io.RawIOBase):
         if self._longest is not None and self._run > self._longest:
             raise self.error(
                 f"{self.path}: has a line of more than {self._longest / 1000:g} kB, which no table has; if that is "
-                f"right, set {MAX_LINE}"
+                f"right, set {MAX_LINE}",
+                key="file.line_long",
             )
 
     def close(self) -> None:

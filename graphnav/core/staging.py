@@ -51,7 +51,8 @@ def stage_results(folder: Path) -> Iterator[Path]:
         if error.filename and not Path(error.filename).resolve().is_relative_to(folder.resolve()):
             raise  # of a file that was to be read
         raise ConfigError(
-            f"-o {folder}: cannot be written ({error.strerror or error}); what was there before is unchanged"
+            f"-o {folder}: cannot be written ({error.strerror or error}); what was there before is unchanged",
+            key="output.cannot_write",
         ) from None
     finally:
         for path in made:

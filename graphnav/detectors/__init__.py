@@ -114,12 +114,16 @@ def check_own(kinds: Sequence[type[Detector]]) -> tuple[type[Detector], ...]:
     taken = {FUSED, *list_detectors()}
     for kind in kinds:
         if not (isinstance(kind, type) and issubclass(kind, Detector)):
-            raise ConfigError(f"detectors: {kind!r} is no class derived from graphnav.detectors.Detector")
+            raise ConfigError(
+                f"detectors: {kind!r} is no class derived from graphnav.detectors.Detector", key="class.kind"
+            )
         missing = [*(["name"] if not hasattr(kind, "name") else []), *sorted(kind.__abstractmethods__)]
         if missing:
-            raise ConfigError(f"detectors: {kind.__name__} lacks {', '.join(missing)}")
+            raise ConfigError(f"detectors: {kind.__name__} lacks {', '.join(missing)}", key="class.incomplete")
         if kind.name in taken:
-            raise ConfigError(f"detectors: there is a detector '{kind.name}' already; choose another name")
+            raise ConfigError(
+                f"detectors: there is a detector '{kind.name}' already; choose another name", key="class.name_taken"
+            )
         taken.add(kind.name)
     return tuple(sorted(kinds, key=lambda kind: kind.name))
 

@@ -136,14 +136,18 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
     from graphnav.estimation.solvers.batch import batch
 
     if recording.gnss is None or not len(recording.gnss.t):
-        raise EstimationError(f"'{recording.name}': there is no GNSS whose antenna could be found")
+        raise EstimationError(
+            f"'{recording.name}': there is no GNSS whose antenna could be found", key="antenna.no_gnss"
+        )
     settings, frame = Settings(), LocalFrame(origin(recording))
     tell("detection")
     still = detect(recording, settings).stationary
     tell("alignment")
     aligned = align(recording, settings, frame, lambda p, start: batch(p, start, wanted=(0,), reintegrate=False))
     if aligned.motion is None:
-        raise EstimationError(f"'{recording.name}': without motion nothing tells where the antenna is")
+        raise EstimationError(
+            f"'{recording.name}': without motion nothing tells where the antenna is", key="antenna.no_motion"
+        )
     unknown = {"gnss": {"lever_arm_sigma": _UNKNOWN}, "vehicle": {"axle_sigma": _UNKNOWN}}
     sections = {name: getattr(settings, name).model_copy(update=values) for name, values in unknown.items()}
     settings = settings.model_copy(update=sections)

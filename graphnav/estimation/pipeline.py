@@ -117,7 +117,7 @@ def _run(
 ) -> dict[str, Solution]:
     unknown = [name for name in solvers if name not in KNOWN]
     if unknown:
-        raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}")
+        raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}", key="solver.unknown")
     frame = LocalFrame(origin(recording))
     pieces, notes = _pieces(recording, settings)
     notes = [*fitting(recording, settings), *notes]
@@ -137,7 +137,9 @@ def _run(
                 raise
             notes.append(Note("pieces.left_out", f"{_span(recording, part.recording)} left out: {error}"))
     if not found:
-        raise EstimationError(f"'{recording.name}': no piece between its IMU gaps can be solved")
+        raise EstimationError(
+            f"'{recording.name}': no piece between its IMU gaps can be solved", key="pieces.none_solved"
+        )
     return {name: join_solutions([one[name] for one in found], tuple(notes)) for name in solvers}
 
 
@@ -272,7 +274,8 @@ def fitting(recording: Recording, settings: Settings) -> list[str]:
         return []
     if (profile == "foot") != (recording.platform == "foot"):
         raise ConfigError(
-            f"profile '{profile}': but '{recording.name}' says platform = \"{recording.platform}\"; change one of them"
+            f"profile '{profile}': but '{recording.name}' says platform = \"{recording.platform}\"; change one of them",
+            key="profile.platform",
         )
     if profile == "car+odometer" and recording.odometer is None:
         return [

@@ -78,7 +78,7 @@ class Problem:
             at += width
         return out
 
-    def completed(self, recording: Recording, usual: Array | None = None) -> Problem:
+    def complete(self, recording: Recording, usual: Array | None = None) -> Problem:
         """With the constraints that look ahead, from a recording that reaches as far as they look.
 
         `usual` as for `build_problem`.

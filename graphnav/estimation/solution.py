@@ -142,7 +142,9 @@ class Solution:
             If there is no such piece.
         """
         if not 0 <= piece < len(self.graphs):
-            raise EstimationError(f"to_gtsam: no piece {piece}; the solution has {len(self.graphs)}")
+            raise EstimationError(
+                f"to_gtsam: no piece {piece}; the solution has {len(self.graphs)}", key="pieces.none_such"
+            )
         return self.graphs[piece]()
 
     def trajectory(self, rate: float | None = None) -> Trajectory:

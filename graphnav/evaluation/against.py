@@ -102,7 +102,8 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         raise RecordingError(
             f"{asked.path}: {int(inside.sum())} rows in common with '{recording.name}': its time runs from "
             f"{track.t[0]:.3f} to {track.t[-1]:.3f} s, the recording's from {reference.t[0]:.3f} to "
-            f"{reference.t[-1]:.3f} s; --against-shift says what to add"
+            f"{reference.t[-1]:.3f} s; --against-shift says what to add",
+            key="against.no_overlap",
         )
     if track.frame == "local":
         at = track.t[inside]
@@ -118,7 +119,9 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
     if isinstance(arm, str):
         stated = antenna_lever_arm(recording, reference) if arm == "antenna" else np.zeros(3)
         if stated is None:
-            raise RecordingError(f"{asked.path}: is to be of the antenna, and '{recording.name}' has no GNSS")
+            raise RecordingError(
+                f"{asked.path}: is to be of the antenna, and '{recording.name}' has no GNSS", key="against.no_gnss"
+            )
         arm = stated
     borrowed = track.rph is None
     if borrowed:

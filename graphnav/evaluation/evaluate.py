@@ -61,7 +61,8 @@ def truth_of(recording: Recording) -> tuple[Trajectory, Array | None] | None:
         sensor = getattr(recording, truth.of, None)
         if sensor is None:
             raise RecordingError(
-                f"'{recording.name}': truth is of = \"{truth.of}\" but there is no [{truth.of}] to give its lever arm"
+                f"'{recording.name}': truth is of = \"{truth.of}\" but there is no [{truth.of}] to give its lever arm",
+                key="truth.no_lever_arm",
             )
         lever_arm = sensor.lever_arm
     if truth.llh is not None:
@@ -116,7 +117,9 @@ def withheld_truth(
         If the source has no positions, or no fix falls into the spans.
     """
     if source != "gnss" or recording.gnss is None:
-        raise RecordingError(f"'{recording.name}': withheld '{source}' gives no positions to compare with")
+        raise RecordingError(
+            f"'{recording.name}': withheld '{source}' gives no positions to compare with", key="truth.no_positions"
+        )
     gnss = recording.gnss
     t = gnss.t - recording.start
     mask = np.zeros(len(t), dtype=bool)
@@ -124,7 +127,9 @@ def withheld_truth(
         mask |= np.ones_like(mask) if span is None else (t >= span[0]) & (t <= span[1])
     mask &= np.isfinite(gnss.llh).all(axis=1)
     if not mask.any():
-        raise RecordingError(f"'{recording.name}': no GNSS fix in the withheld spans to compare with")
+        raise RecordingError(
+            f"'{recording.name}': no GNSS fix in the withheld spans to compare with", key="truth.no_withheld_fix"
+        )
     notes = [Note("truth.withheld_gnss", "the truth is the withheld GNSS itself")]
     if antenna.clock_offset:
         moved = f"stamps of the withheld fixes: {1e3 * antenna.clock_offset:+.1f} ms, the receiver's clock as estimated"
@@ -238,7 +243,9 @@ def evaluate(
         if found is None:
             metrics = evaluate_recording(trajectory, recording)
             if metrics is None:
-                raise RecordingError(f"{truth_path}: the recording has no [truth] to evaluate against")
+                raise RecordingError(
+                    f"{truth_path}: the recording has no [truth] to evaluate against", key="truth.none"
+                )
             return metrics
         truth, arm = found
         alone = recording.gnss is None
@@ -246,7 +253,9 @@ def evaluate(
     else:
         truth = read_trajectory(truth_path)
     if trajectory.t[-1] < truth.t[0] or truth.t[-1] < trajectory.t[0]:
-        raise RecordingError(f"{trajectory_path}: {ranges(trajectory, truth)}{_shift_hint(trajectory, truth)}")
+        raise RecordingError(
+            f"{trajectory_path}: {ranges(trajectory, truth)}{_shift_hint(trajectory, truth)}", key="truth.no_overlap"
+        )
     found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, from_start=alone)
     hint = _leap_hint(found_errors, trajectory, truth, lever_arm, max_gap)
     return measure(

@@ -73,14 +73,17 @@ def parse_requirement(text: str, solvers: Sequence[str] = ()) -> Requirement:
     found = _FORM.fullmatch(text.strip())
     usage = "write NAME<NUMBER, such as h_rms<0.5, with <, <=, > or >="
     if found is None:
-        raise ConfigError(f"--require {text}: {usage}")
+        raise ConfigError(f"--require {text}: {usage}", key="option.requirement")
     solver, name, sign, number = found.groups()
     if solver is not None and solver not in solvers:
-        raise ConfigError(f"--require {text}: no solver '{solver}' runs; there are {', '.join(solvers) or 'none'}")
+        raise ConfigError(
+            f"--require {text}: no solver '{solver}' runs; there are {', '.join(solvers) or 'none'}",
+            key="option.requirement",
+        )
     try:
         limit = float(number)
     except ValueError:
-        raise ConfigError(f"--require {text}: '{number}' is not a number; {usage}") from None
+        raise ConfigError(f"--require {text}: '{number}' is not a number; {usage}", key="option.requirement") from None
     return Requirement(text, _full(name, text), sign, limit, solver)
 
 
@@ -96,7 +99,7 @@ def _full(name: str, text: str) -> str:
         hint = (
             f"did you mean {' or '.join(close)}?" if close else "known are h_rms, h_max, up_rms, nees_p, span_max_h ..."
         )
-        raise ConfigError(f"--require {text}: no number is called '{name}'; {hint}")
+        raise ConfigError(f"--require {text}: no number is called '{name}'; {hint}", key="option.requirement")
     return known[plain].replace("span_", f"span{span[1]}_", 1) if span else known[plain]
 
 

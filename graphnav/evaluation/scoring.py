@@ -190,7 +190,8 @@ def _fit(
     spread = np.sqrt(np.mean(np.sum((source[:, :2] - source[:, :2].mean(0)) ** 2, axis=1)))
     if spread < 0.1:
         raise RecordingError(
-            f"the {len(source)} shared epochs spread over {spread:.3f} m only: too little to fit a yaw"
+            f"the {len(source)} shared epochs spread over {spread:.3f} m only: too little to fit a yaw",
+            key="truth.too_little",
         )
     yaw, offset = fit_yaw(source, target)
     notes.append(
@@ -246,7 +247,7 @@ def _pair(
         seen, epochs = moving, len(truth)
     estimate, reached = interpolate(trajectory, seen.t, max_gap=max_gap, lever_arm=lever_arm)
     if not reached.any():
-        raise RecordingError(_nothing_shared(trajectory, truth, max_gap))
+        raise RecordingError(_explain_no_overlap(trajectory, truth, max_gap), key="truth.no_overlap")
     seen = seen.take(reached)
     assert seen.v is not None
     return estimate, seen if truth.v is not None else replace(seen, v=None), seen.v[:, :2], epochs
@@ -289,7 +290,7 @@ def _nees(e: Array, cov: Array) -> Array:
     return out
 
 
-def _nothing_shared(trajectory: Trajectory, truth: Trajectory, max_gap: float) -> str:
+def _explain_no_overlap(trajectory: Trajectory, truth: Trajectory, max_gap: float) -> str:
     name = trajectory.name or "the trajectory"
     if trajectory.t[-1] < truth.t[0] or truth.t[-1] < trajectory.t[0]:
         return f"{name}: {ranges(trajectory, truth)}"

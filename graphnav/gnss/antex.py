@@ -37,7 +37,7 @@ def read_antex(path: Path) -> Antennas:
     """
     lines = read_bytes(path).decode("latin-1").splitlines()
     if not lines or "ANTEX VERSION" not in lines[0]:
-        raise RecordingError(f"{path}: not an ANTEX file; its first line names no version")
+        raise RecordingError(f"{path}: not an ANTEX file; its first line names no version", key="file.kind")
     out: dict[int, list[SatelliteAntenna]] = {}
     name, begin, end, band = "", -_ALWAYS, _ALWAYS, 0
     offset: dict[int, Array] = {}
@@ -59,9 +59,11 @@ def read_antex(path: Path) -> Antennas:
             elif label == "END OF ANTENNA" and len(name) == 3 and name[0] in SYSTEMS and name[1:].isdigit():
                 out.setdefault(satellite_id(name), []).append(SatelliteAntenna(begin, end, offset))
         except ValueError:
-            raise RecordingError(f"{path}, line {number}: '{line[:60].strip()}' cannot be read as {label}") from None
+            raise RecordingError(
+                f"{path}, line {number}: '{line[:60].strip()}' cannot be read as {label}", key="table.cell"
+            ) from None
     if not out:
-        raise RecordingError(f"{path}: holds no antennas of satellites")
+        raise RecordingError(f"{path}: holds no antennas of satellites", key="raw.no_antennas")
     return {one: tuple(many) for one, many in out.items()}
 
 
@@ -124,7 +126,7 @@ def wind_up(satellite: Ids, epoch: Array, axes: Array, e: Array, enu: Array) -> 
     return cycles
 
 
-def bent(satellite: Array, antenna: Array) -> Array:
+def shapiro_delay(satellite: Array, antenna: Array) -> Array:
     """(N,) m by which the Earth's gravity lengthens ranges (Shapiro; IERS Conventions 2010, equation 11.17)."""
     r, s = np.linalg.norm(antenna, axis=1), np.linalg.norm(satellite, axis=1)
     between = np.linalg.norm(satellite - antenna, axis=1)

@@ -29,15 +29,16 @@ def read_bytes(path: Path) -> bytes:
             hatanaka = importlib.import_module("hatanaka")
         except ImportError:
             raise RecordingError(
-                f"{path}: compressed RINEX needs the package hatanaka: pip install -e '.[raw]' in the clone"
+                f"{path}: compressed RINEX needs the package hatanaka: pip install -e '.[raw]' in the clone",
+                key="package.missing",
             ) from None
         try:
             data = hatanaka.decompress(data)
         except Exception as error:  # its own kinds, and those of the packers it calls
-            raise RecordingError(f"{path}: cannot be unpacked ({str(error)[:80]})") from None
+            raise RecordingError(f"{path}: cannot be unpacked ({str(error)[:80]})", key="file.damaged") from None
         files.check_size(path, len(data))
     if not data.strip():
-        raise RecordingError(f"{path}: is empty")
+        raise RecordingError(f"{path}: is empty", key="file.empty")
     return data
 
 

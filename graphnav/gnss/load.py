@@ -90,7 +90,9 @@ def load_raw(
         nav = sent if nav is None else nav.with_more(sent)
     precise = read_precise(list(sources.sp3), list(sources.clk)) if sources.sp3 else None
     if nav is None and precise is None:
-        raise RecordingError(f"{sources.rover[0]}: holds no ephemerides; say nav or sp3 in [raw_gnss]")
+        raise RecordingError(
+            f"{sources.rover[0]}: holds no ephemerides; say nav or sp3 in [raw_gnss]", key="raw.no_ephemerides"
+        )
     _same_time(obs, nav, precise, sources)
     if zero is not None:
         obs = obs.on_clock(zero)
@@ -104,10 +106,14 @@ def load_raw(
     )
     one = primary(raw) & np.isfinite(raw.p[:, 0])
     if not one.any():
-        raise RecordingError(f"{sources.rover[0]}: none of its satellites has an ephemeris at its times")
+        raise RecordingError(
+            f"{sources.rover[0]}: none of its satellites has an ephemeris at its times", key="raw.no_ephemeris_then"
+        )
     fixes = solve(raw.take(one))
     if not np.isfinite(fixes.p[:, 0]).any():
-        raise RecordingError(f"{sources.rover[0]}: no epoch has enough satellites for a position")
+        raise RecordingError(
+            f"{sources.rover[0]}: no epoch has enough satellites for a position", key="raw.few_satellites"
+        )
     said = [*obs.remarks, *remarks]
     if raw.klobuchar is None:
         said.append(
@@ -136,12 +142,15 @@ def _difference(
     given = sources.base_position
     position = obs.marker if given is None else np.array(given)
     if position is None:
-        raise RecordingError(f"{sources.base[0]}: states no position; say base_position in [raw_gnss]")
+        raise RecordingError(
+            f"{sources.base[0]}: states no position; say base_position in [raw_gnss]", key="raw.base_position"
+        )
     apart = max(obs.t[0] - raw.t[-1], raw.t[0] - obs.t[-1])
     if apart > 0.0:
         raise RecordingError(
             f"{sources.base[0]}: the base's observations are {apart / 3600.0:.1f} h away from those of the rover; "
-            "it must be of the same time"
+            "it must be of the same time",
+            key="raw.base_time",
         )
     away = float(np.linalg.norm(np.median(raw.antenna, axis=0) - position))
     base, _ = place(obs, nav, precise, position)
@@ -150,7 +159,8 @@ def _difference(
     off = np.nanmedian(np.linalg.norm(base_fixes.p - position, axis=1))
     if not off < _BASE_OFF:
         raise RecordingError(
-            f"{sources.base[0]}: its observations put the base {off:.0f} m from its stated position; see base_position"
+            f"{sources.base[0]}: its observations put the base {off:.0f} m from its stated position; see base_position",
+            key="raw.base_position",
         )
     if given is None:
         sentence = f"the base's position is that of its header, {off:.1f} m from its own single-point positions"
@@ -181,7 +191,8 @@ def _same_time(obs: Observations, nav: Ephemerides | None, precise: Orbits | Non
         if apart > 6.0 * 3600.0:
             raise RecordingError(
                 f"{file[0]}: its ephemerides are {apart / 86400.0:.1f} days from the observations of "
-                f"{sources.rover[0].name}; it must be of the same day"
+                f"{sources.rover[0].name}; it must be of the same day",
+                key="raw.ephemeris_day",
             )
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from graphnav.core import earth
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import gps_to_utc
-from graphnav.gnss.antex import bent, ionosphere_free_offset, satellite_axes, wind_up
+from graphnav.gnss.antex import ionosphere_free_offset, satellite_axes, shapiro_delay, wind_up
 from graphnav.gnss.arcs import Arcs, find_arcs
 from graphnav.gnss.atmosphere import niell, zenith_delays
 from graphnav.gnss.carrier import rows_in
@@ -72,7 +72,7 @@ def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
     place = earth.ecef_to_llh(one.antenna)
     enu = earth.enu_axes(place)
     axes = satellite_axes(geometry.s, sun)
-    extra = bent(geometry.s, one.antenna) - np.sum(geometry.e * solid_tide(one.antenna, sun, moon), axis=1)
+    extra = shapiro_delay(geometry.s, one.antenna) - np.sum(geometry.e * solid_tide(one.antenna, sun, moon), axis=1)
     if raw.antennas:
         bands = np.stack([one.signal // 100, other.signal // 100], -1)
         offset = ionosphere_free_offset(raw.antennas, one.satellite, f1, f2, bands, gps)

@@ -99,13 +99,13 @@ def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
     lines = Lines(read_bytes(path))
     head = lines.text(0)
     if head[:1] != "#" or head[1:2] not in "abcd":
-        raise RecordingError(f"{path}: not an SP3 file; its first line begins '{head[:2]}'")
+        raise RecordingError(f"{path}: not an SP3 file; its first line begins '{head[:2]}'", key="file.kind")
     scale = next((lines.text(k)[9:12] for k in range(min(30, len(lines))) if lines.text(k)[:2] == "%c"), "GPS")
     first = lines.first()
     epoch = np.flatnonzero(first == ord("*"))
     own = np.flatnonzero(first == ord("P"))
     if not len(epoch) or not len(own):
-        raise RecordingError(f"{path}: holds no positions")
+        raise RecordingError(f"{path}: holds no positions", key="raw.no_positions")
     t = _stamps(lines, epoch, 3, scale, path)
     if not lines.whole and own[-1] == len(lines) - 1:
         own = own[:-1]
@@ -119,8 +119,8 @@ def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
                 numbers(lines.block(np.array([k]), 4, 60), 14)
             except ValueError:
                 text = lines.text(int(k))[:60]
-                raise RecordingError(f"{path}, line {k + 1}: '{text}' is not a position") from None
-        raise RecordingError(f"{path}: names a satellite of an unknown system") from None
+                raise RecordingError(f"{path}, line {k + 1}: '{text}' is not a position", key="table.cell") from None
+        raise RecordingError(f"{path}: names a satellite of an unknown system", key="raw.unknown_system") from None
     satellite = np.array([ids[name] for name in names], dtype=np.int16)
     of = np.searchsorted(epoch, own) - 1
     whole = np.isfinite(value[:, :3]).all(axis=1) & (of >= 0) & (satellite >= 0)
@@ -132,7 +132,7 @@ def _read_clk(path: Path) -> tuple[Array, Ids, Array]:
     """Times, satellites and clocks (s) of all satellite records."""
     text = read_bytes(path)
     if b"CLOCK" not in text[:8000] and b"RINEX VERSION" not in text[:200]:
-        raise RecordingError(f"{path}: not a RINEX clock file")
+        raise RecordingError(f"{path}: not a RINEX clock file", key="file.kind")
     scale = "GPS"
     for line in text[:20000].splitlines():
         if line.rstrip().endswith(b"TIME SYSTEM ID"):
@@ -140,7 +140,7 @@ def _read_clk(path: Path) -> tuple[Array, Ids, Array]:
     rows = [line.split() for line in text.splitlines() if line.startswith(b"AS ")]
     rows = [row for row in rows if len(row) >= 10]
     if not rows:
-        raise RecordingError(f"{path}: holds no clocks of satellites")
+        raise RecordingError(f"{path}: holds no clocks of satellites", key="raw.no_clocks")
     names = [row[1].decode("latin-1") for row in rows]
     try:
         table = np.array([[*row[2:8], row[9]] for row in rows]).astype(float)
@@ -149,7 +149,7 @@ def _read_clk(path: Path) -> tuple[Array, Ids, Array]:
         if not np.isfinite(table).all():
             raise ValueError
     except ValueError:
-        raise RecordingError(f"{path}: a record of a satellite's clock cannot be read") from None
+        raise RecordingError(f"{path}: a record of a satellite's clock cannot be read", key="table.cell") from None
     satellite = np.array([ids[name] for name in names], dtype=np.int16)
     return t[satellite >= 0], satellite[satellite >= 0], table[satellite >= 0, 6]
 
@@ -172,8 +172,10 @@ def _stamps(lines: Lines, which: NDArray[np.intp], begin: int, scale: str, path:
                 _dates(np.array([some], dtype=float), scale)
             except ValueError:
                 text = " ".join(some)[:40]
-                raise RecordingError(f"{path}, line {k + 1}: '{text}' is not the date of an epoch") from None
-        raise RecordingError(f"{path}: the date of an epoch cannot be read") from None
+                raise RecordingError(
+                    f"{path}, line {k + 1}: '{text}' is not the date of an epoch", key="table.date"
+                ) from None
+        raise RecordingError(f"{path}: the date of an epoch cannot be read", key="table.date") from None
 
 
 def _dates(fields: Array, scale: str) -> Array:

@@ -59,7 +59,7 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
             names = ", ".join(f"{n} {name}" for name, n in sorted(found.skipped.items()))
             remarks.append(Note("raw.unused_messages", f"{path.name}: messages that are not used: {names}"))
     if not found.kepler and not found.glonass:
-        raise RecordingError(f"{', '.join(str(p) for p in paths)}: no ephemeris in it")
+        raise RecordingError(f"{', '.join(str(p) for p in paths)}: no ephemeris in it", key="raw.no_ephemerides")
     coefficients = None
     if {"a", "b"} <= set(found.klobuchar):
         coefficients = np.array([found.klobuchar["a"], found.klobuchar["b"]])
@@ -71,10 +71,12 @@ def _read(path: Path, found: _Navigation) -> None:
     try:
         version = float(lines[0][:9])
     except ValueError:
-        raise RecordingError(f"{path}: not a RINEX file; its first line says no version") from None
+        raise RecordingError(f"{path}: not a RINEX file; its first line says no version", key="file.kind") from None
     kind = lines[0][20:21]
     if kind not in "NGH" or not 2.0 <= version < 5.0:
-        raise RecordingError(f"{path}: a RINEX {version:g} file of type '{lines[0][20:40].strip()}', not of navigation")
+        raise RecordingError(
+            f"{path}: a RINEX {version:g} file of type '{lines[0][20:40].strip()}', not of navigation", key="file.kind"
+        )
     k = _header(lines, path, found)
     default = {"G": "R", "H": "S"}.get(kind, "G") if version < 3.0 else ""
     message = ""
@@ -202,10 +204,12 @@ def _header(lines: list[str], path: Path, found: _Navigation) -> int:
             elif label == "IONOSPHERIC CORR" and line[:4] in ("GPSA", "GPSB"):
                 found.klobuchar[line[3].lower()] = _coefficients(body[5:])
         except ValueError:
-            raise RecordingError(f"{path}, line {k + 1}: the header's '{label}' cannot be read") from None
+            raise RecordingError(
+                f"{path}, line {k + 1}: the header's '{label}' cannot be read", key="rinex.header"
+            ) from None
         if label == "END OF HEADER":
             return k + 1
-    raise RecordingError(f"{path}: the header has no END OF HEADER; the file is cut off")
+    raise RecordingError(f"{path}: the header has no END OF HEADER; the file is cut off", key="rinex.cut")
 
 
 def _coefficients(body: str) -> list[float]:

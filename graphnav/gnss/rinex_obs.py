@@ -75,7 +75,7 @@ def parse_observations(data: bytes, path: Path) -> Observations:
     remarks: list[str] = []
     stamp, zero, flag, rows, cells = (_version_2 if header.version < 3.0 else _version_3)(lines, header, path, remarks)
     if not len(rows.line):
-        raise RecordingError(f"{path}: holds a header and no observations")
+        raise RecordingError(f"{path}: holds a header and no observations", key="file.no_rows")
     unknown: set[str] = set()
     parts = []
     for system, types in header.types.items():
@@ -113,7 +113,7 @@ def parse_observations(data: bytes, path: Path) -> Observations:
                 )
             )  # fmt: skip
     if not parts:
-        raise RecordingError(f"{path}: no code or carrier of a known signal")
+        raise RecordingError(f"{path}: no code or carrier of a known signal", key="rinex.no_signal")
     if unknown:
         names = ", ".join(sorted(unknown))
         remarks.append(Note("raw.unknown_signals", f"{path.name}: signals not known are left out: {names}"))
@@ -138,7 +138,9 @@ def _header(lines: Lines, path: Path) -> Header:
             if label == "RINEX VERSION / TYPE":
                 out.version = float(body[:9])
                 if body[20:21] != "O":
-                    raise RecordingError(f"{path}: a RINEX file of type '{body[20:40].strip()}', not of observations")
+                    raise RecordingError(
+                        f"{path}: a RINEX file of type '{body[20:40].strip()}', not of observations", key="file.kind"
+                    )
                 out.system = body[40:41].strip() or "G"
             elif label == "SYS / # / OBS TYPES":
                 if body[0] != " ":
@@ -164,23 +166,27 @@ def _header(lines: Lines, path: Path) -> Header:
                 out.end = k + 1
                 break
         except (ValueError, IndexError):
-            raise RecordingError(f"{path}, line {k + 1}: the header's '{label}' cannot be read") from None
+            raise RecordingError(
+                f"{path}, line {k + 1}: the header's '{label}' cannot be read", key="rinex.header"
+            ) from None
         if k == 0 and not out.version:
             break
     if not out.version:
-        raise RecordingError(f"{path}: not a RINEX file; its first line says no version")
+        raise RecordingError(f"{path}: not a RINEX file; its first line says no version", key="file.kind")
     if not out.end:
-        raise RecordingError(f"{path}: the header has no END OF HEADER; the file is cut off")
+        raise RecordingError(f"{path}: the header has no END OF HEADER; the file is cut off", key="rinex.cut")
     if not 2.0 <= out.version < 5.0:
-        raise RecordingError(f"{path}: RINEX version {out.version:g}; 2.11, 3 and 4 are read")
+        raise RecordingError(f"{path}: RINEX version {out.version:g}; 2.11, 3 and 4 are read", key="rinex.version")
     if out.version < 3.0:
         both = out.types.pop(-2, [])
         out.types = dict.fromkeys(range(len(SYSTEMS)), both)
     out.types.pop(-1, None)
     if not any(out.types.values()):
-        raise RecordingError(f"{path}: the header names no types of observations")
+        raise RecordingError(f"{path}: the header names no types of observations", key="rinex.no_types")
     if (most := max(map(len, out.types.values()))) > _MOST_TYPES:
-        raise RecordingError(f"{path}: the header names {most} types of observations of a system, more than there are")
+        raise RecordingError(
+            f"{path}: the header names {most} types of observations of a system, more than there are", key="rinex.types"
+        )
     return out
 
 
@@ -224,7 +230,7 @@ def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
     first[: header.end] = 0
     epoch = np.flatnonzero(first == ord(">"))
     if not len(epoch):
-        raise RecordingError(f"{path}: holds a header and no observations")
+        raise RecordingError(f"{path}: holds a header and no observations", key="file.no_rows")
     try:
         fields = _calendar(lines, epoch, 2, 4)
         flag, count = numbers(lines.block(epoch, 29, 35), 3).T
@@ -243,7 +249,7 @@ def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
     if len(own) and own[-1] == len(lines) - 1 and not lines.whole:
         own, of = own[:-1], of[:-1]  # whether its last field is whole nobody knows
     if not (flag <= 1).any():
-        raise RecordingError(f"{path}: holds a header and no observations")
+        raise RecordingError(f"{path}: holds a header and no observations", key="file.no_rows")
     stamp, zero = _since_week(fields, header.scale, flag <= 1)
     try:
         number = numbers(lines.block(own, 1, 3), 2)[:, 0]
@@ -252,7 +258,7 @@ def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
     wrong = ~(number >= 1)
     if wrong.any():
         k = own[wrong][0]
-        raise RecordingError(f"{path}, line {k + 1}: '{lines.text(k)[:3]}' names no satellite")
+        raise RecordingError(f"{path}, line {k + 1}: '{lines.text(k)[:3]}' names no satellite", key="rinex.satellite")
     satellite = (100 * system[own] + number).astype(np.int16)
     rows = _SatelliteLines(own, of, satellite)
 
@@ -299,9 +305,13 @@ def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
         try:
             flag, count = int(text[26:29] or 0), int(text[29:32])
         except ValueError:
-            raise RecordingError(f"{path}, line {k + 1}: expected the line of an epoch, found '{text[:32]}'") from None
+            raise RecordingError(
+                f"{path}, line {k + 1}: expected the line of an epoch, found '{text[:32]}'", key="rinex.epoch"
+            ) from None
         if flag < 0 or count < 0:
-            raise RecordingError(f"{path}, line {k + 1}: an epoch of {count} satellites with the flag {flag}")
+            raise RecordingError(
+                f"{path}, line {k + 1}: an epoch of {count} satellites with the flag {flag}", key="rinex.epoch"
+            )
         if flag > 1:
             k += 1 + count
             continue
@@ -318,7 +328,9 @@ def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
             try:
                 one = satellite_id(SYSTEMS[max(number, 0)] + name[1:])
             except ValueError:
-                raise RecordingError(f"{path}, line {k + 1}: '{name}' names no satellite") from None
+                raise RecordingError(
+                    f"{path}, line {k + 1}: '{name}' names no satellite", key="rinex.satellite"
+                ) from None
             if number >= 0:
                 satellite.append(one)
                 of.append(len(epochs))
@@ -330,7 +342,7 @@ def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
         remarks.append(note_cut(path.name, "record"))
     epoch = np.array(epochs, dtype=np.intp)
     if not len(epoch):
-        raise RecordingError(f"{path}: holds a header and no observations")
+        raise RecordingError(f"{path}: holds a header and no observations", key="file.no_rows")
     try:
         fields = _calendar(lines, epoch, 0, 3)
     except ValueError:
@@ -378,8 +390,8 @@ def _bad_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int = 2
                 continue
         except (ValueError, IndexError):
             pass
-        return RecordingError(f"{path}, line {k + 1}: '{text[:35]}' is not the line of an epoch")
-    return RecordingError(f"{path}: the line of an epoch cannot be read")
+        return RecordingError(f"{path}, line {k + 1}: '{text[:35]}' is not the line of an epoch", key="rinex.epoch")
+    return RecordingError(f"{path}: the line of an epoch cannot be read", key="rinex.epoch")
 
 
 def _bad_field(
@@ -391,10 +403,10 @@ def _bad_field(
             text = bytes(cell).decode("latin-1").strip()
             where = f"{path}, line {rows.line[k] + 1}, {name}: '{text}'"
             if wrong:
-                return RecordingError(f"{where} does not stand in its columns")
+                return RecordingError(f"{where} does not stand in its columns", key="table.cell")
             try:
                 if not np.isfinite(parse_number(text or "0")):
                     raise ValueError
             except ValueError:
-                return RecordingError(f"{where} is not a number")
-    return RecordingError(f"{path}: a field is not a number")
+                return RecordingError(f"{where} is not a number", key="table.cell")
+    return RecordingError(f"{path}: a field is not a number", key="table.cell")

@@ -102,7 +102,9 @@ def once(obs: Observations) -> Observations:
     obs = _plausible(obs)
     span = float(np.ptp(obs.t)) if len(obs) else 0.0
     if not span <= _LONGEST:
-        raise RecordingError(f"{obs.files[0]}: its observations span {span / 86400.0:.3g} days; is a date wrong?")
+        raise RecordingError(
+            f"{obs.files[0]}: its observations span {span / 86400.0:.3g} days; is a date wrong?", key="raw.span"
+        )
     tick = np.round(obs.t * 1e4).astype(np.int64)
     key = (tick - tick.min(initial=0)) * 10**7 + obs.satellite.astype(np.int64) * 10**4 + obs.signal
     if np.all(np.diff(key) > 0):

@@ -13,6 +13,7 @@ Rows that are far from the others of their epoch lose weight as Cauchy's kernel 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,6 +65,17 @@ class SinglePoint:
     group: NDArray[np.intp]  # (N,) of each row
     residual: Array  # (N,) m
     weight: Array  # (N,)
+
+
+def _padding(epoch: NDArray[np.intp], place: NDArray[np.intp], shape: tuple[int, int]) -> Callable[[Array], Array]:
+    """Lays rows (N, ...) out as (epochs, places, ...), 0 where an epoch has none."""
+
+    def pad(rows: Array) -> Array:
+        out = np.zeros((*shape, *rows.shape[1:]))
+        out[epoch, place] = rows
+        return out
+
+    return pad
 
 
 def look(raw: RawGnss, antenna: Array, ionosphere: Array | None) -> Geometry:
@@ -126,11 +138,7 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True) -> 
     klobuchar_of = coefficients(raw)
     usable = np.isfinite(raw.p).all(axis=1) & np.isfinite(raw.code) & np.isfinite(raw.clock)
 
-    def padded(x: Array) -> Array:
-        out = np.zeros((E, S, *x.shape[1:]))
-        out[of, place] = x
-        return out
-
+    pad = _padding(of, place, (E, S))
     H = np.zeros((len(raw), n))
     H[:, 3] = 1.0
     other = group > 0
@@ -153,9 +161,9 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True) -> 
             weight = 1.0 / (1.0 + (np.nan_to_num(r) / (_KERNEL * sigma)) ** 2)
         w = np.where(good, weight / sigma**2, 0.0)
         H[:, :3] = np.nan_to_num(-geometry.e)
-        Hp, wp = padded(H), padded(w)
+        Hp, wp = pad(H), pad(w)
         information = np.einsum("esi,es,esj->eij", Hp, wp, Hp, optimize=True)
-        right = np.einsum("esi,es->ei", Hp, wp * padded(np.where(good, np.nan_to_num(r), 0.0)), optimize=True)
+        right = np.einsum("esi,es->ei", Hp, wp * pad(np.where(good, np.nan_to_num(r), 0.0)), optimize=True)
         x = x + np.linalg.solve(information + np.eye(n) / _WEAK**2, right[..., None])[..., 0]
     P = np.linalg.inv(information + np.eye(n) / _WEAK**2)
     used = w > 0.0
@@ -195,20 +203,16 @@ def _velocities(
     good = np.isfinite(measured) & np.isfinite(H).all(axis=1) & (geometry.elevation >= mask)
     y, weight = np.zeros((E, 4)), np.ones(len(raw))
 
-    def padded(a: Array) -> Array:
-        out = np.zeros((E, S, *a.shape[1:]))
-        out[of, place] = a
-        return out
-
-    Hp = padded(np.where(good[:, None], H, 0.0))
+    pad = _padding(of, place, (E, S))
+    Hp = pad(np.where(good[:, None], H, 0.0))
     information = np.zeros((E, 4, 4))
     for k in range(6 if robust else 1):
         r = np.where(good, measured - np.sum(np.where(good[:, None], H, 0.0) * y[of], axis=1), 0.0)
         if k:
             weight = 1.0 / (1.0 + (r / (_KERNEL * sigma)) ** 2)
-        wp = padded(np.where(good, weight / sigma**2, 0.0))
+        wp = pad(np.where(good, weight / sigma**2, 0.0))
         information = np.einsum("esi,es,esj->eij", Hp, wp, Hp, optimize=True)
-        right = np.einsum("esi,es->ei", Hp, wp * padded(r), optimize=True)
+        right = np.einsum("esi,es->ei", Hp, wp * pad(r), optimize=True)
         y = y + np.linalg.solve(information + np.eye(4) / _WEAK**2, right[..., None])[..., 0]
     P = np.linalg.inv(information + np.eye(4) / _WEAK**2)
     known = (np.bincount(of, weights=good, minlength=E) >= 4) & np.isfinite(x[:, 0])

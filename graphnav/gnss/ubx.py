@@ -64,7 +64,7 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
     """
     found = _frames(data)
     if not any(len(rows) for rows in found.rows):
-        raise RecordingError(f"{path}: no RXM-RAWX messages; switch them on in the receiver")
+        raise RecordingError(f"{path}: no RXM-RAWX messages; switch them on in the receiver", key="raw.no_messages")
     remarks = []
     if found.broken:
         remarks.append(Note("raw.broken_records", f"{path.name}: {found.broken} broken frames were skipped"))

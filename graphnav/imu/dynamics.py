@@ -105,7 +105,7 @@ class ImuFactors:
         self.step = np.concatenate([intervals.dP, intervals.dV], axis=-1)
         self.expected = np.concatenate([intervals.ba, intervals.bg], axis=-1)
 
-    def prepared(self) -> ImuFactors:
+    def prepare(self) -> ImuFactors:
         """The same, with all that is made when it is asked for first made already."""
         _ = self.whitener
         return self

@@ -108,7 +108,7 @@ class Judgement:
             said, wrong = describe(noise, used), faults.fault_spans(used)
             self._answer = Answer(_in_unit(noise, base, unit), said, stationary, wrong)
         except (EstimationError, np.linalg.LinAlgError) as error:
-            self._answer = EstimationError(str(error))
+            self._answer = EstimationError(str(error), key=getattr(error, "key", "solver.undetermined"))
         except BaseException as error:  # said by whoever asks
             self._answer = error
 

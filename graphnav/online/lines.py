@@ -24,7 +24,7 @@ from graphnav.core.files import parse_json, parse_number
 from graphnav.online.sensors import Row, rows_of
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
 from graphnav.recording.formats.schema import Noise
-from graphnav.sensors import Column, Series, registered
+from graphnav.sensors import Column, Series, list_sensors
 from graphnav.sensors.tables import NotNegative, Positive, Vector
 
 HEAD = "graphnav-online/1"
@@ -71,8 +71,11 @@ def setup_of(line: str) -> Recording:
     """
     word, _, text = line.strip().partition(" ")
     if word != HEAD:
-        raise RecordingError(f"line 1: a live source begins with '{HEAD}' and a setup as JSON, not with '{line[:40]}'")
-    known = registered()
+        raise RecordingError(
+            f"line 1: a live source begins with '{HEAD}' and a setup as JSON, not with '{line[:40]}'",
+            key="online.first_line",
+        )
+    known = list_sensors()
     others: Any = {name: (sensor.figures | None, None) for name, sensor in known.items()}
     model = create_model("_Setup", __base__=_Setup, **others)
     try:
@@ -80,7 +83,7 @@ def setup_of(line: str) -> Recording:
     except ValidationError as error:
         raise RecordingError(complaint("line 1: setup", error, model)) from None
     except ValueError as error:
-        raise RecordingError(f"line 1: the setup is not JSON ({error})") from None
+        raise RecordingError(f"line 1: the setup is not JSON ({error})", key="online.setup_json") from None
     stated = found.imu.noise.model_dump(exclude_none=True)  # type: ignore[attr-defined]
     gnss = odometer = None
     if found.gnss is not None:
@@ -131,9 +134,9 @@ def row_of(line: str) -> Row | None:
 
 
 def _series_row(cells: list[str]) -> Row:
-    name, sensor = cells[0] if cells else "", registered().get(cells[0] if cells else "")
+    name, sensor = cells[0] if cells else "", list_sensors().get(cells[0] if cells else "")
     if sensor is None:
-        raise ValueError(f"no sensor '{name[:20]}' is known; {nearest(name, tuple(registered()))}")
+        raise ValueError(f"no sensor '{name[:20]}' is known; {nearest(name, tuple(list_sensors()))}")
     if len(cells) != 2 + len(sensor.names):
         raise ValueError(f"'S,{name}' needs {1 + len(sensor.names)} numbers, not {len(cells) - 1}")
     try:
@@ -172,7 +175,7 @@ def line_of(row: Row) -> str:
     if sensor == "odometer":
         return f"O,{t!r},{values[0]!r}"
     if sensor != "gnss":
-        columns = registered()[sensor].columns
+        columns = list_sensors()[sensor].columns
         numbers = [x / _usual(column) for x, column in zip(values, columns, strict=True)]
         return f"S,{sensor},{t!r}," + ",".join("" if np.isnan(x) else repr(x) for x in numbers)
     lat, lon = float(np.degrees(values[0])), float(np.degrees(values[1]))

@@ -81,19 +81,19 @@ class Fix(_Row):
     ) -> Fix:
         place = [_number(cls, t, name, x) for name, x in (("lat", lat), ("lon", lon), ("h", h))]
         if not abs(place[0]) <= 90.0 or not -180.0 <= place[1] <= 360.0:
-            raise RecordingError(f"Fix at t = {t}: lat {lat}, lon {lon} is no place in degrees")
+            raise RecordingError(f"Fix at t = {t}: lat {lat}, lon {lon} is no place in degrees", key="row.place")
         if not _HEIGHTS[0] <= place[2] <= _HEIGHTS[1]:
-            raise RecordingError(f"Fix at t = {t}: h {h} is no height of a drive in m")
+            raise RecordingError(f"Fix at t = {t}: h {h} is no height of a drive in m", key="row.height")
         sigmas = _vector(cls, t, "sd", "m", sd, np.inf)
         speeds, of_speeds = _BLANK, _BLANK
         if (v is None) != (sd_v is None):
-            raise RecordingError(f"Fix at t = {t}: v and sd_v go together, m/s east, north, up")
+            raise RecordingError(f"Fix at t = {t}: v and sd_v go together, m/s east, north, up", key="row.velocity")
         if v is not None and sd_v is not None:
             speeds = _vector(cls, t, "v", "m/s", v, FASTEST, "is it in km/h or mm/s?")
             of_speeds = _vector(cls, t, "sd_v", "m/s", sd_v, np.inf)
         for name, values in (("sd", sigmas), ("sd_v", of_speeds)):
             if min(values) <= 0.0:
-                raise RecordingError(f"Fix at t = {t}: {name} {values}: 1-sigmas must be above zero")
+                raise RecordingError(f"Fix at t = {t}: {name} {values}: 1-sigmas must be above zero", key="row.sigma")
         lat_rad, lon_rad = (float(x) for x in np.radians(place[:2]))
         return super().__new__(cls, ("gnss", _time(cls, t), (lat_rad, lon_rad, place[2], *sigmas, *speeds, *of_speeds)))
 
@@ -113,7 +113,7 @@ class WheelSpeed(_Row):
         value = _number(cls, t, "speed", speed)
         if not abs(value) <= FASTEST:
             raise RecordingError(
-                f"WheelSpeed at t = {t}: {speed} m/s, which no vehicle reaches: is it in km/h or mm/s?"
+                f"WheelSpeed at t = {t}: {speed} m/s, which no vehicle reaches: is it in km/h or mm/s?", key="row.speed"
             )
         return super().__new__(cls, ("odometer", _time(cls, t), (value, *_BLANK, *_BLANK[:2])))
 
@@ -132,11 +132,15 @@ class Reading(_Row):
     def __new__(cls, t: float, sensor: Sensor, **columns: float) -> Reading:
         for name in columns:
             if name not in sensor.names:
-                raise RecordingError(f"Reading of {sensor.name} at t = {t}: {nearest(name, sensor.names)}")
+                raise RecordingError(
+                    f"Reading of {sensor.name} at t = {t}: {nearest(name, sensor.names)}", key="row.name"
+                )
         values = np.array([_number(cls, t, n, columns[n]) if n in columns else np.nan for n in sensor.names])
         if not sensor.usable(sensor.within_bounds(values)[None])[0]:
             wanted = " or ".join(" and ".join(some) for some in sensor.needs)
-            raise RecordingError(f"Reading of {sensor.name} at t = {t}: needs {wanted}, in SI and within its bounds")
+            raise RecordingError(
+                f"Reading of {sensor.name} at t = {t}: needs {wanted}, in SI and within its bounds", key="row.bounds"
+            )
         return super().__new__(cls, (sensor.name, _time(cls, t), tuple(values.tolist())))
 
 
@@ -170,7 +174,7 @@ def live_setup(
         If a lever arm has another length.
     """
     if platform not in ("vehicle", "foot"):
-        raise RecordingError(f"live_setup: platform '{platform}': vehicle or foot")
+        raise RecordingError(f"live_setup: platform '{platform}': vehicle or foot", key="row.platform")
     imu = Imu(_NONE, _ROWS, _ROWS, noise or ImuNoise(), noise_assumed=noise is None)
     arms = [None if arm is None else np.array(_vector(None, 0.0, what, "m", arm, np.inf))
             for what, arm in (("antenna", antenna), ("axle", axle))]  # fmt: skip
@@ -206,9 +210,9 @@ def _number(kind: type | None, t: float, name: str, value: float) -> float:
     try:
         found = float(value)
     except (TypeError, ValueError):
-        raise RecordingError(f"{_where(kind, t)}: {name} is no number: {value!r}") from None
+        raise RecordingError(f"{_where(kind, t)}: {name} is no number: {value!r}", key="row.number") from None
     if not np.isfinite(found):
-        raise RecordingError(f"{_where(kind, t)}: {name} is {found}")
+        raise RecordingError(f"{_where(kind, t)}: {name} is {found}", key="row.number")
     return found
 
 
@@ -225,10 +229,11 @@ def _vector(
     except TypeError:
         count = 1
     if count != 3:
-        raise RecordingError(f"{_where(kind, t)}: {name} needs three numbers in {unit}, not {count}")
+        raise RecordingError(f"{_where(kind, t)}: {name} needs three numbers in {unit}, not {count}", key="row.three")
     x, y, z = (_number(kind, t, name, value) for value in values)
     if not max(abs(x), abs(y), abs(z)) <= most:
         raise RecordingError(
-            f"{_where(kind, t)}: {name} of {max(x, y, z, key=abs):g} {unit} is beyond any sensor: {hint}"
+            f"{_where(kind, t)}: {name} of {max(x, y, z, key=abs):g} {unit} is beyond any sensor: {hint}",
+            key="row.bounds",
         )
     return x, y, z

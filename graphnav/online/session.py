@@ -98,13 +98,13 @@ class Session:
         if self.rows_settled:
             return
         if self.online is None:
-            raise RecordingError("the source ended before the line that describes its sensors")
+            raise RecordingError("the source ended before the line that describes its sensors", key="online.no_setup")
         counts, notes = self.online.sensors.counts, self.online.notes
         why = notes[-1] if notes else "too few rows to align with"
         if not counts["imu"]:
             odd = [f"{n} {key}" for key, n in counts.items() if key.startswith("imu:")]
             why = "; ".join(["no row of the IMU was taken in", *odd, *self.complaints[:1]])
-        raise RecordingError(f"nothing could be smoothed: {why}")
+        raise RecordingError(f"nothing could be smoothed: {why}", key="online.nothing")
 
     def stop(self) -> None:
         """Asked to end before the source does: remember where it was."""

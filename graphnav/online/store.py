@@ -76,14 +76,19 @@ class Store:
         self.resumed: Checkpoint | None = None
         if resume:
             if not path.exists():
-                raise ConfigError(f"--resume: {folder} holds no checkpoint to go on from")
+                raise ConfigError(f"--resume: {folder} holds no checkpoint to go on from", key="checkpoint.none")
             self.resumed = _read(path)
             if self.resumed.source != source:
-                raise ConfigError(f"--resume: {folder} was made from '{self.resumed.source}', not from '{source}'")
+                raise ConfigError(
+                    f"--resume: {folder} was made from '{self.resumed.source}', not from '{source}'",
+                    key="checkpoint.other_source",
+                )
             self._length = self.resumed.length
             self._number, self.piece = self.resumed.journal, self.resumed.piece
         elif path.exists():
-            raise ConfigError(f"-o {folder}: holds a run already; go on with --resume or name another folder")
+            raise ConfigError(
+                f"-o {folder}: holds a run already; go on with --resume or name another folder", key="output.holds_run"
+            )
         folder.mkdir(parents=True, exist_ok=True)
         for other in folder.glob("trajectory-*.csv"):  # later than the checkpoint, or of a run before
             if self.resumed is None or _number_of(other) > self.piece:
@@ -97,7 +102,9 @@ class Store:
         else:
             self._file = path.open("r+b" if path.exists() else "w+b", buffering=0)
             if self._file.seek(0, os.SEEK_END) < self._length:
-                raise ConfigError(f"--resume: {path} is shorter than its checkpoint knows it")
+                raise ConfigError(
+                    f"--resume: {path} is shorter than its checkpoint knows it", key="checkpoint.journal_short"
+                )
             self._file.truncate(self._length)
             self._file.seek(self._length)
 
@@ -205,7 +212,9 @@ class Store:
             how = (
                 "what had settled is safe, mend that and go on with --resume" if begun else "mend that and begin again"
             )
-            raise GraphnavError(f"{self.folder}: cannot be written ({error.strerror}); {how}") from None
+            raise GraphnavError(
+                f"{self.folder}: cannot be written ({error.strerror}); {how}", key="output.cannot_write"
+            ) from None
 
 
 class _Digested:
@@ -231,7 +240,7 @@ def _read(path: Path) -> Checkpoint:
             except Exception:  # whatever a pickle made by somebody else stumbles over
                 found = None
     if not isinstance(found, Checkpoint):
-        raise ConfigError(f"--resume: {path} is no checkpoint of this version, or damaged")
+        raise ConfigError(f"--resume: {path} is no checkpoint of this version, or damaged", key="checkpoint.damaged")
     return found
 
 

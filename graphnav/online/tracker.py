@@ -205,7 +205,7 @@ class Tracker(Chain):
         imu = self._around(sensors, T, sensors.imu.newest).imu
         ends = np.array([T, expected])
         interval = preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0], self._judged_imu)
-        self._motions[expected] = ImuFactors(interval, self.frame).prepared()
+        self._motions[expected] = ImuFactors(interval, self.frame).prepare()
 
     def _is_covered(self, sensors: Sensors, t: float) -> bool:
         """Whether the odometer has come as far as rows at a keyframe ask for."""
@@ -236,7 +236,7 @@ class Tracker(Chain):
         if ahead is None or len(times) > 1 or len(ahead.problem.t) != len(before) + 1:
             return None
         recording = sensors.recording(float(ahead.problem.t[0]) - _ROWS_BEFORE, float(times[-1]) + 0.1)
-        problem = ahead.problem.completed(recording, self._usual(sensors, recording))
+        problem = ahead.problem.complete(recording, self._usual(sensors, recording))
         known = {c.name for c in ahead.problem.constraints}
         late = replace(problem, constraints=tuple(c for c in problem.constraints if c.name not in known))
         added = {c.name: c for c in self._noisy(late, sensors, self._noise_of_rows).constraints}

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.gnss.series import RawGnss
-from graphnav.sensors import Series, registered
+from graphnav.sensors import Series, list_sensors
 
 
 @dataclass(frozen=True)
@@ -203,10 +203,14 @@ class Recording:
             If the recording has no such source.
         """
         if source not in sources():
-            raise RecordingError(f"cannot withhold '{source}': only {', '.join(sources())} can be withheld")
+            raise RecordingError(
+                f"cannot withhold '{source}': only {', '.join(sources())} can be withheld", key="withhold.unknown"
+            )
         sensor = self.aiding.get(source)
         if sensor is None:
-            raise RecordingError(f"cannot withhold '{source}': the recording '{self.name}' has none")
+            raise RecordingError(
+                f"cannot withhold '{source}': the recording '{self.name}' has none", key="withhold.none"
+            )
         left = None
         if span is not None:
             t = sensor.t - self.start
@@ -252,7 +256,9 @@ class Recording:
             name: rows_of(series, (series.t >= lo) & (series.t <= hi)) for name, series in self.sensors.items()
         }
         if len(parts["imu"].t) < 2:
-            raise RecordingError(f"nothing is left of '{self.name}' between {start} and {end} s")
+            raise RecordingError(
+                f"nothing is left of '{self.name}' between {start} and {end} s", key="recording.nothing_left"
+            )
         if (
             self.truth is not None
             and self.truth.closed_loop_sigma is not None
@@ -270,7 +276,7 @@ def sources() -> tuple[str, ...]:
     tuple of str
         "gnss", "odometer" and those of `graphnav.sensors`.
     """
-    return ("gnss", "odometer", *registered())
+    return ("gnss", "odometer", *list_sensors())
 
 
 def rows_of(sensor: Any, mask: NDArray[np.bool_] | slice) -> Any:

@@ -35,7 +35,7 @@ def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
 def _page(recording: Recording, found: Detections) -> str:
     spans = found.stationary - recording.start
     rows = [
-        [page.Raw(f"{a:.2f} s"), page.Raw(f"{b:.2f} s"), page.Raw(f"{b - a:.2f} s"), fired_text(stop)]
+        [page.Raw(f"{a:.2f} s"), page.Raw(f"{b:.2f} s"), page.Raw(f"{b - a:.2f} s"), format_fired(stop)]
         for (a, b), stop in zip(spans, stops_of(found.all), strict=True)
     ]
     lead = [page.paragraph(line) for line in _words(recording, found)]
@@ -47,7 +47,7 @@ def _page(recording: Recording, found: Detections) -> str:
     return page.page(f"{recording.name}: detectors", lead, sections)
 
 
-def fired_text(stop: Stop) -> str:
+def format_fired(stop: Stop) -> str:
     """Who found a stop, and which share of it."""
     return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in stop.fired.items())
 

@@ -139,7 +139,7 @@ def write_report(
     ]
     lead = [
         *_doubts(only, every),
-        page.paragraph(words.what_was_done(recording, only, withheld, outages)),
+        page.paragraph(words.describe_run(recording, only, withheld, outages)),
         summary.verdicts(solution, errors),
         *words.closure_note(name, metrics),
         words.tiles(recording, only, every),
@@ -208,7 +208,7 @@ def write_comparison(
     ]
     lead = [
         *_doubts(solutions, every),
-        page.paragraph(words.what_was_done(recording, solutions, withheld, outages)),
+        page.paragraph(words.describe_run(recording, solutions, withheld, outages)),
         *_verdicts(solutions, every),
         *(note for name, values in metrics_of.items() for note in words.closure_note(name, values)),
         words.tiles(recording, solutions, every),

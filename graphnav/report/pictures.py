@@ -196,11 +196,11 @@ def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spa
     fixes, gnss = fixes_of(recording, first), recording.gnss
     base = np.array([0.0, 0.0, 0.0 if gnss is None else float(first.frame.origin[2])])
 
-    def measured(panel: plots.Panel, k: int) -> None:
+    def draw_measured(panel: plots.Panel, k: int) -> None:
         if fixes is not None:
             draw_fixes(panel, replace(fixes, enu=fixes.enu + base), k)
 
-    def doppler(panel: plots.Panel, k: int) -> None:
+    def draw_doppler(panel: plots.Panel, k: int) -> None:
         if gnss is not None and gnss.v is not None and np.isfinite(gnss.v[:, k]).any():
             panel.dots(gnss.t - start, gnss.v[:, k], "ink", "GNSS velocity", 2.5, alpha=0.5)
 
@@ -212,8 +212,8 @@ def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spa
     }  # fmt: skip
     out = []
     for title, series, parts, unit, under in (
-        ("Position", place, ("east", "north", "height"), "m", measured),
-        ("Velocity", speed, ENU, "m/s", doppler),
+        ("Position", place, ("east", "north", "height"), "m", draw_measured),
+        ("Velocity", speed, ENU, "m/s", draw_doppler),
         ("Attitude", turned, RPH, "deg", None),
     ):
         if series:

@@ -68,7 +68,7 @@ def _measure_consistency(solution: Solution) -> tuple[str, float, int]:
     return every[0].kind, float(np.sqrt(sum((c.count - c.rejected) * c.mean_nis / c.dof for c in every) / used)), used
 
 
-def what_was_done(recording: Recording, solutions: Mapping[str, Solution], withheld: Withheld, outages: Spans) -> str:
+def describe_run(recording: Recording, solutions: Mapping[str, Solution], withheld: Withheld, outages: Spans) -> str:
     """The run in a few sentences."""
     used = recording
     for source, span in withheld:

@@ -129,7 +129,7 @@ def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> l
             largest = float(np.nanmax(np.linalg.norm(residual, axis=1)))
             over = float(np.nanmax(np.abs(residual / record.sigma[at[used]])))
             gap = float(np.max(np.diff(fixes.t[used]), initial=0.0))
-        rows.append([*cells, len(used), gap, largest, over, *_stated_of(recording, np.flatnonzero(of_it))])
+        rows.append([*cells, len(used), gap, largest, over, *_list_stated(recording, np.flatnonzero(of_it))])
     head = ["fixes", "count", "withheld", "left out", "used", "longest gap [s]", "largest residual [m]", "over sigma"]
     head.append("stated [m]")
     if recording.gnss is not None and recording.gnss.satellites is not None:
@@ -142,7 +142,7 @@ def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> l
     return out
 
 
-def _stated_of(recording: Recording, rows: Array) -> list[Any]:
+def _list_stated(recording: Recording, rows: Array) -> list[Any]:
     """Median horizontal sigma that fixes state (m) and, where they say it, satellites: the median and the fewest."""
     gnss = recording.gnss
     assert gnss is not None

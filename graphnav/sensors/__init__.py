@@ -25,7 +25,7 @@ def _find() -> dict[str, Sensor]:
     return {s.name: s for s in sorted(sensors, key=lambda s: s.name)}
 
 
-def registered() -> dict[str, Sensor]:
+def list_sensors() -> dict[str, Sensor]:
     """All sensors that are known, by their names."""
     return _find() | _own
 
@@ -39,6 +39,8 @@ def register(sensor: Sensor) -> Sensor:
         If something else has that name.
     """
     if sensor.name in _TAKEN or sensor.name in _find():
-        raise RecordingError(f"sensor '{sensor.name}': graphnav has one of that name; choose another")
+        raise RecordingError(
+            f"sensor '{sensor.name}': graphnav has one of that name; choose another", key="sensor.name_taken"
+        )
     _own[sensor.name] = sensor
     return sensor

@@ -48,9 +48,11 @@ class Sensor:
     def __post_init__(self) -> None:
         names = {c.name for c in self.columns}
         if not self.name.isidentifier():
-            raise RecordingError(f"sensor '{self.name}': its name is to be one word of letters, digits and _")
+            raise RecordingError(
+                f"sensor '{self.name}': its name is to be one word of letters, digits and _", key="sensor.name"
+            )
         if not self.needs or not all(set(some) <= names for some in self.needs):
-            raise RecordingError(f"sensor '{self.name}': needs names columns that it does not have")
+            raise RecordingError(f"sensor '{self.name}': needs names columns that it does not have", key="sensor.needs")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -98,11 +100,13 @@ class Sensor:
         t = np.asarray(t, dtype=float)
         for name, values in columns.items():
             if name not in self.names:
-                raise RecordingError(f"{self.name}: no column '{name}'; known: {', '.join(self.names)}")
+                raise RecordingError(
+                    f"{self.name}: no column '{name}'; known: {', '.join(self.names)}", key="sensor.column"
+                )
             if np.shape(values) != t.shape:
-                raise RecordingError(f"{self.name}: column '{name}' has not the length of t")
+                raise RecordingError(f"{self.name}: column '{name}' has not the length of t", key="sensor.lengths")
         if np.any(np.diff(t) <= 0.0):
-            raise RecordingError(f"{self.name}: t does not ascend")
+            raise RecordingError(f"{self.name}: t does not ascend", key="sensor.not_ascending")
         absent = np.full(len(t), np.nan)
         values = np.stack([np.asarray(columns.get(name, absent), dtype=float) for name in self.names], -1)
         return Series(self, t, values, self.figures(**figures))

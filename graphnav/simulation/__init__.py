@@ -29,7 +29,7 @@ def scenario(name: str) -> Scenario:
     """
     known = scenarios()
     if name not in known:
-        raise ConfigError(f"no scenario '{name}'; {nearest(name, list(known))}")
+        raise ConfigError(f"no scenario '{name}'; {nearest(name, list(known))}", key="simulation.unknown")
     return known[name]
 
 
@@ -59,11 +59,16 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Simulated:
     known = defaults(one)
     for key, value in options.items():
         if key not in known:
-            raise ConfigError(f"scenario '{name}' has no option '{key}'; {nearest(key, list(known))}")
+            raise ConfigError(
+                f"scenario '{name}' has no option '{key}'; {nearest(key, list(known))}", key="simulation.option"
+            )
         if not _alike(value, known[key]):
-            raise ConfigError(f"scenario '{name}': {key} = {value!r} is not of the kind of its default {known[key]!r}")
+            raise ConfigError(
+                f"scenario '{name}': {key} = {value!r} is not of the kind of its default {known[key]!r}",
+                key="simulation.value",
+            )
     if not 0 <= seed < 2**32:
-        raise ConfigError(f"seed {seed}: must be from 0 to {2**32 - 1}")
+        raise ConfigError(f"seed {seed}: must be from 0 to {2**32 - 1}", key="simulation.value")
     return one.run(seed, **options)
 
 
@@ -94,14 +99,14 @@ def options_from(name: str, settings: Sequence[str]) -> dict[str, Any]:
     for setting in settings:
         key, sign, text = (part.strip() for part in setting.partition("="))
         if not sign or not key:
-            raise ConfigError(f"--set {setting}: must be KEY=VALUE")
+            raise ConfigError(f"--set {setting}: must be KEY=VALUE", key="option.value")
         if isinstance(known.get(key), str):
             out[key] = text.strip('"')
             continue
         try:
             out[key] = tomllib.loads(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
-            raise ConfigError(f"--set {setting}: '{text}' is not a number, true or false") from None
+            raise ConfigError(f"--set {setting}: '{text}' is not a number, true or false", key="option.value") from None
     return out
 
 

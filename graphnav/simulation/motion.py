@@ -93,16 +93,18 @@ def drive(
     """
     durations = np.array([m.duration for m in manoeuvres], dtype=float)
     if len(durations) == 0 or durations.min() <= 0:
-        raise ConfigError("a drive needs manoeuvres that each take some time")
+        raise ConfigError("a drive needs manoeuvres that each take some time", key="manoeuvre.time")
     edges = start + np.r_[0.0, np.cumsum(durations)]
     v1 = np.array([m.speed for m in manoeuvres], dtype=float)
     v0 = np.r_[0.0, v1[:-1]]
     way = 0.5 * (v0 + v1) * durations
     for k, m in enumerate(manoeuvres):
         if v0[k] * v1[k] < 0:
-            raise ConfigError(f"manoeuvre {k}: stop before changing between forward and reverse")
+            raise ConfigError(
+                f"manoeuvre {k}: stop before changing between forward and reverse", key="manoeuvre.direction"
+            )
         if m.turn and way[k] == 0:
-            raise ConfigError(f"manoeuvre {k}: cannot turn on the spot")
+            raise ConfigError(f"manoeuvre {k}: cannot turn on the spot", key="manoeuvre.on_the_spot")
 
     t = centres(start, float(edges[-1]), STEP, DEGREE)
     i = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(durations) - 1)

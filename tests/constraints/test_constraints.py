@@ -26,7 +26,7 @@ from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Recording
 from graphnav.sensors import Sensor, Series
-from graphnav.sensors import registered as sensors
+from graphnav.sensors import list_sensors as sensors
 
 STANDING = np.array([[3.0, 14.0], [88.0, 104.0]])  # parts of two stops of the path below, s
 ON_FOOT = {"stance", "foot_lateral", "closed_loop"}  # constraints that only a foot has

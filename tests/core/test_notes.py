@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import copy
 import importlib.util
 import json
@@ -14,6 +15,8 @@ import pytest
 
 from graphnav.app import cli
 from graphnav.app.stored import NAME, read_outcome
+from graphnav.core import errors
+from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, key_of
 from graphnav.recording.formats import load, read
 
@@ -92,3 +95,29 @@ def test_all_that_a_run_says_has_a_key(tmp_path):
     kept, _ = read_outcome(out / NAME)
     notes = kept.solutions["rts"].notes
     assert [key_of(note) for note in notes] == [m["key"] for m in messages if m["sentence"] in notes]
+
+
+def test_an_error_keeps_its_key():
+    error = RecordingError("a.csv: no column 't'", key="table.column")
+    for one in (error, copy.copy(error), pickle.loads(pickle.dumps(error))):
+        assert (str(one), one.key) == ("a.csv: no column 't'", "table.column")
+    assert RecordingError(Note("key.unknown", "unknown key 'a'")).key == "key.unknown"
+
+
+def test_every_error_of_the_code_has_a_key():
+    """It is given one, or the sentence is a note or its own error's, which has."""
+    trees = {path.name: ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "graphnav").rglob("*.py")}
+    kinds = {name for name, kind in vars(errors).items() if isinstance(kind, type)}
+    every = [(name, node) for name, tree in trees.items() for node in ast.walk(tree)]
+    kinds |= {
+        n.name for _, n in every if isinstance(n, ast.ClassDef) and {ast.unparse(base) for base in n.bases} & kinds
+    }
+    without = [
+        f"{name}:{call.lineno}"
+        for name, call in every
+        if isinstance(call, ast.Call)
+        and getattr(call.func, "id", "") in kinds
+        and not any(keyword.arg == "key" for keyword in call.keywords)
+        and not ast.unparse(call.args[0]).startswith("complaint(")
+    ]
+    assert without == []

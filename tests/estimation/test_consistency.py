@@ -18,6 +18,7 @@ from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
 
 SEEDS = 10
+RATE = 100.0  # Hz, of the IMU; keyframes are a second apart
 # Wheels and stops hold exactly on these drives, which no sigma is made for; simulated ones that slip and sway are in
 # `tests/constraints/test_vehicle.py`.
 INERTIAL = {
@@ -77,19 +78,19 @@ def velocity_errors(solution: Solution, truth: Trajectory) -> tuple[Array, Array
 
 @pytest.fixture(scope="module")
 def positions(shared_data: Path) -> dict[str, Score]:
-    drives = [oracle.oracle_drive(shared_data, seed, odometer=False) for seed in range(SEEDS)]
+    drives = [oracle.oracle_drive(shared_data, seed, odometer=False, rate=RATE) for seed in range(SEEDS)]
     return scored(drives, STATED)
 
 
 @pytest.fixture(scope="module")
 def estimated(shared_data: Path) -> dict[str, Score]:
-    drives = [oracle.oracle_drive(shared_data, seed, odometer=False) for seed in range(SEEDS)]
+    drives = [oracle.oracle_drive(shared_data, seed, odometer=False, rate=RATE) for seed in range(SEEDS)]
     return scored(drives, INERTIAL)
 
 
 @pytest.fixture(scope="module")
 def velocities(shared_data: Path) -> dict[str, Score]:
-    path = oracle.oracle_truth_path(shared_data)
+    path = oracle.oracle_truth_path(shared_data, RATE)
     drives = [
         oracle.drive(path, seed=50 + seed, gnss_velocity_sd=(0.05, 0.05, 0.08), outages=((415.0, 475.0),))
         for seed in range(SEEDS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.pipeline import SOLVERS, origin, run
 from graphnav.estimation.problem import Problem, build_problem
+from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass
@@ -448,17 +450,26 @@ def test_intervals_have_factors_that_stay_when_they_are_integrated_anew() -> Non
     assert again.intervals.covariance == pytest.approx(used.intervals.covariance, rel=1e-9)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-@pytest.mark.parametrize("wheels", [True, False])
+def clean(seed: int, wheels: bool) -> tuple[Recording, Trajectory]:
+    """Four minutes in which nothing is wrong, and their truth."""
+    path = oracle.vehicle_path(duration=240, rate=50.0, seed=11)
+    return oracle.drive(path, seed=seed, odometer_rate=20.0 if wheels else None)
+
+
+@functools.cache
+def solved_clean(seed: int, wheels: bool) -> dict[str, Solution]:
+    """What every solver makes of it; nothing changes a solution."""
+    return run(clean(seed, wheels)[0])
+
+
+@pytest.mark.parametrize(("seed", "wheels"), [(0, True), (1, False)])
 def test_a_gyro_that_misses_a_turn_is_not_taken_for_fixes(seed: int, wheels: bool) -> None:
     """Ten degrees of heading lost within half a second, as where samples are dropped."""
-    recording, truth = oracle.drive(
-        oracle.vehicle_path(duration=240, rate=50.0, seed=11), seed=seed, odometer_rate=20.0 if wheels else None
-    )
+    recording, truth = clean(seed, wheels)
     t = recording.imu.t - recording.start
     gyro = recording.imu.gyro + np.outer((t > 60.0) & (t <= 60.5), [0.0, 0.0, 0.35])
     wrong = replace(recording, imu=replace(recording.imu, gyro=gyro))
-    plain, found = (run(one, None, ("rts", "batch")) for one in (recording, wrong))
+    plain, found = solved_clean(seed, wheels), run(wrong, None, ("rts", "batch"))
     for solver in ("rts", "batch"):
         model = found[solver].noise
         assert not any(model.excluded.values()), model.excluded
@@ -481,23 +492,17 @@ def shifted(recording: Recording, begin: float, end: float, by: tuple[float, flo
     return replace(recording, gnss=replace(gnss, llh=llh)), bad
 
 
-def wheeled(seed: int) -> Recording:
-    return oracle.drive(oracle.vehicle_path(duration=240, rate=50.0, seed=11), seed=seed, odometer_rate=20.0)[0]
-
-
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("wheels", [True, False])
 def test_nothing_is_left_out_of_clean_data(seed: int, wheels: bool) -> None:
-    recording = wheeled(seed) if wheels else replace(wheeled(seed), odometer=None)
-    found = run(recording, None, ("ekf",))["ekf"]
+    found = solved_clean(seed, wheels)["ekf"]
     assert found.excluded == ()
     assert not any(found.noise.excluded.values())
 
 
 @pytest.mark.parametrize("wheels", [True, False])
 def test_fixes_that_are_wrong_alike_are_left_out(wheels: bool) -> None:
-    recording = wheeled(0) if wheels else replace(wheeled(0), odometer=None)
-    wrong, bad = shifted(recording, 120.0, 150.0, (8.0, -6.0, 0.0))
+    wrong, bad = shifted(clean(0, wheels)[0], 120.0, 150.0, (8.0, -6.0, 0.0))
     found = run(wrong, None, ("rts",))["rts"]
     assert np.array_equal(found.records["gnss_position"].weight == 0.0, bad)
     assert not set(found.noise.excluded) & set(WHEELS)
@@ -505,7 +510,7 @@ def test_fixes_that_are_wrong_alike_are_left_out(wheels: bool) -> None:
 
 @pytest.mark.parametrize("kind", ["twice", "offset"])
 def test_wheels_that_are_wrong_are_not_taken_for_fixes(kind: str) -> None:
-    recording = wheeled(1)
+    recording, _ = clean(1, True)
     odometer = recording.odometer
     assert odometer is not None
     t = odometer.t - recording.start

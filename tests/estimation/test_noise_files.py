@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from graphnav.app import cli
-from graphnav.app.workflow import unused_noise
+from graphnav.app.workflow import list_unused_noise
 from graphnav.config import Settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError
@@ -180,9 +180,9 @@ def test_what_a_noise_model_says_of_nothing_is_told() -> None:
         weights={"gnss_position": weights, "imu.gyro": RowWeights(np.array([7.0]), np.array([0.5]))},
         excluded={"gnss_position": ((2.0, 3.0), (20.0, 30.0))},
     )
-    said = unused_noise(noise, solution)
+    said = list_unused_noise(noise, solution)
     assert len(said) == 3
     assert "odometer" in said[0]
     assert "1 of the 2 rows" in said[1]
     assert "1 of the 2 spans" in said[2]
-    assert unused_noise(NoiseModel({"gnss_position.up": VarianceComponent(0.0)}), solution) == []
+    assert list_unused_noise(NoiseModel({"gnss_position.up": VarianceComponent(0.0)}), solution) == []

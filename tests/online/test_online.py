@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from helpers import Array, at_rate, truth_states
+from helpers import Array, at_rate, refused, truth_states
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
@@ -291,7 +291,7 @@ def test_a_stamp_far_ahead_is_dropped(drive: tuple[Recording, Trajectory], rows:
     np.testing.assert_array_equal(track.llh, same.llh)
 
 
-@settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=2, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     seed=st.integers(0, 10**6),
     jitter=st.floats(0.0, 4.0),
@@ -387,16 +387,16 @@ def test_bad_lines_say_why(line: str, reason: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "reason"),
+    ("line", "key", "name"),
     [
-        ("I,1,2,3,4,5,6,7", "begins with 'graphnav-online/1'"),
-        ("graphnav-online/1 {", "not JSON"),
-        ('graphnav-online/1 {"platfrom": "vehicle"}', "did you mean 'platform'"),
-        ('graphnav-online/1 {"imu": {"noise": {"gyro": 1}}}', "unknown key 'imu.noise.gyro'"),
+        ("I,1,2,3,4,5,6,7", "online.first_line", "'graphnav-online/1'"),
+        ("graphnav-online/1 {", "online.setup_json", "line 1"),
+        ('graphnav-online/1 {"platfrom": "vehicle"}', "key.unknown", "'platform'"),
+        ('graphnav-online/1 {"imu": {"noise": {"gyro": 1}}}', "key.unknown", "'imu.noise.gyro'"),
     ],
 )
-def test_bad_setups_say_why(line: str, reason: str) -> None:
-    with pytest.raises(RecordingError, match=reason):
+def test_bad_setups_say_why(line: str, key: str, name: str) -> None:
+    with refused(key, RecordingError, name):
         setup_of(line)
 
 
@@ -499,7 +499,7 @@ def test_a_full_disk_leaves_what_had_settled(
         for row in session.rows:
             session.add(row)
 
-    with pytest.raises(GraphnavError, match=r"No space left.*--resume"):
+    with refused("output.cannot_write", GraphnavError, "No space left", "--resume"):
         add_all()
     session.close()
     monkeypatch.undo()
@@ -521,17 +521,17 @@ def test_a_full_disk_leaves_what_had_settled(
 
 def test_folders_and_checkpoints_are_not_mixed_up(drive: tuple[Recording, Trajectory], tmp_path: Path) -> None:
     recording, out = drive[0], tmp_path / "out"
-    with pytest.raises(ConfigError, match="no checkpoint"):
+    with refused("checkpoint.none", ConfigError):
         Session(QUICK, "drive", out, resume=True, recording=recording)
     Session(QUICK, "drive", out, recording=recording).close()
-    with pytest.raises(ConfigError, match="holds a run already"):
+    with refused("output.holds_run", ConfigError):
         Session(QUICK, "drive", out, recording=recording)
-    with pytest.raises(ConfigError, match="was made from 'drive', not from 'other'"):
+    with refused("checkpoint.other_source", ConfigError, "'drive'", "'other'"):
         Session(QUICK, "other", out, resume=True, recording=recording)
     body = bytearray((out / "checkpoint").read_bytes())
     body[-5] ^= 1
     (out / "checkpoint").write_bytes(body)
-    with pytest.raises(ConfigError, match="damaged"):
+    with refused("checkpoint.damaged", ConfigError):
         Session(QUICK, "drive", out, resume=True, recording=recording)
 
 
@@ -620,14 +620,10 @@ def test_real_recording_settles_on_the_batch_solution(shared_data: Path) -> None
     assert END == "E"
 
 
-@pytest.mark.parametrize(("lag", "near"), [(20.0, 0.05), (40.0, 0.003)])
-def test_a_real_walk_settles_step_by_step(shared_data: Path, lag: float, near: float) -> None:
-    """Shoe with nothing but its IMU: stances are found a second after they are over, and it is batch again.
-
-    Before the end of a lag of 20 s what comes back in every stance is half as well known: heights settle 4 cm off then.
-    """
+def test_a_real_walk_settles_step_by_step(shared_data: Path) -> None:
+    """Shoe with nothing but its IMU: stances are found a second after they are over, and it is batch again."""
     walk = read(shared_data / "pyshoe_vicon" / "2017-11-22-11-23-25.toml")
-    online, parts = Online(without_rows(walk), settings_from({"solver": {"lag": lag}})), []
+    online, parts = Online(without_rows(walk), settings_from({"solver": {"lag": 40.0}})), []
     behind = []
     for row in rows_of(walk)[1]:
         online.add(row)
@@ -640,7 +636,7 @@ def test_a_real_walk_settles_step_by_step(shared_data: Path, lag: float, near: f
     t, states, P = best.at(track.t)
     assert online.frame is not None
     away = online.frame.from_llh(track.llh[np.isin(track.t, t)]) - states.p
-    assert np.abs(away).max() < near
+    assert np.abs(away).max() < 0.003
     np.testing.assert_allclose(track.sd_p[-1], np.sqrt(np.diag(P[-1]))[3:6], rtol=0.15)
     assert np.quantile(behind, 0.9) < 2.5
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import refused
 
 from graphnav.core.errors import RecordingError
 from graphnav.recording.formats import read
@@ -135,155 +136,169 @@ def shift_decimal(k: int, factor: float) -> Callable[[list[float]], list[float]]
 IMU_HEADER = "t,gx,gy,gz,ax,ay,az"
 GOOD_ROW = "0.01,0,0,0,0,0,9.8"
 
-# what is broken: (how, fragments that the one line must hold)
+# what is broken: (how, the key of the error and the names that its line must hold)
 BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
     # files
-    "empty file": (content("imu.csv", b""), ("imu.csv", "is empty")),
-    "only blank lines": (content("imu.csv", b"\n\n  \n"), ("imu.csv", "is empty")),
-    "header only": (content("imu.csv", b"t,gx,gy,gz,ax,ay,az\n"), ("imu.csv", "header and no rows")),
-    "binary file": (content("imu.csv", bytes(range(256)) * 20), ("imu.csv", "binary")),
-    "not utf-8": (content("imu.csv", "t,gx,gy,gz,ax,ay,\xe4z\n".encode("latin-1")), ("imu.csv", "line 1", "UTF-8")),
-    "no header": (line("imu.csv", 1, None), ("imu.csv, line 1", "must name the columns")),
+    "empty file": (content("imu.csv", b""), ("file.empty", "imu.csv")),
+    "only blank lines": (content("imu.csv", b"\n\n  \n"), ("file.empty", "imu.csv")),
+    "header only": (content("imu.csv", b"t,gx,gy,gz,ax,ay,az\n"), ("file.no_rows", "imu.csv")),
+    "binary file": (content("imu.csv", bytes(range(256)) * 20), ("file.binary", "imu.csv")),
+    "not utf-8": (content("imu.csv", "t,gx,gy,gz,ax,ay,\xe4z\n".encode("latin-1")), ("file.text", "imu.csv", "line 1")),
+    "no header": (line("imu.csv", 1, None), ("table.no_header", "imu.csv, line 1")),
     "semicolons": (
         content("imu.csv", b"t;gx;gy;gz;ax;ay;az\n1;2;3;4;5;6;7\n"),
-        ("line 1", "by a semicolon", "by commas"),
+        ("table.separator", "line 1"),
     ),
-    "gz that is none": (zipped(b"t,gx\n1,2\n"), ("imu.csv.gz", "not gzip-compressed")),
-    "gz cut off": (zipped(gzip.compress(b"t,gx,gy,gz,ax,ay,az\n" * 50)[:30]), ("imu.csv.gz", "cut off")),
-    "gz without the name": (content("imu.csv", gzip.compress(b"t,gx\n")), ("imu.csv", "must end in .gz")),
-    "missing file": (remove("gnss.csv"), ("gnss.csv", "no such file")),
+    "gz that is none": (zipped(b"t,gx\n1,2\n"), ("file.gzip", "imu.csv.gz")),
+    "gz cut off": (zipped(gzip.compress(b"t,gx,gy,gz,ax,ay,az\n" * 50)[:30]), ("file.damaged", "imu.csv.gz")),
+    "gz without the name": (content("imu.csv", gzip.compress(b"t,gx\n")), ("file.gzip", "imu.csv")),
+    "missing file": (remove("gnss.csv"), ("file.missing", "gnss.csv")),
     "missing file, zipped there": (
         toml('"gnss.csv"', '"imu.csv.gz"'),
-        ("imu.csv.gz", "no such file", "there is imu.csv"),
+        ("file.missing", "imu.csv.gz", "imu.csv"),
     ),
-    "a folder as file": (toml('"gnss.csv"', '"."'), ("is a folder",)),
+    "a folder as file": (toml('"gnss.csv"', '"."'), ("file.folder",)),
     # columns and cells
-    "missing column": (line("imu.csv", 1, "t,gx,gy,gz,ax,ay,acc_z"), ("no column 'az'", "acc_z", "columns = { az")),
-    "renamed column missing": (toml('axes = "RFU"', 'columns = { t = "time" }'), ("imu.csv", "no column 'time'")),
-    "column twice": (line("imu.csv", 1, "t,gx,gx,gz,ax,ay,az"), ("imu.csv", "2 columns are called 'gx'")),
+    "missing column": (
+        line("imu.csv", 1, "t,gx,gy,gz,ax,ay,acc_z"),
+        ("table.column", "'az'", "acc_z", "columns = { az"),
+    ),
+    "renamed column missing": (toml('axes = "RFU"', 'columns = { t = "time" }'), ("table.column", "imu.csv", "'time'")),
+    "column twice": (line("imu.csv", 1, "t,gx,gx,gz,ax,ay,az"), ("table.column_twice", "imu.csv", "'gx'")),
     "non-numeric cell": (
         line("imu.csv", 7, "0.06,0,0,0,0,oops,9.8"),
-        ("imu.csv, line 7", "column 'ay'", "'oops' is not a number"),
+        ("table.cell", "imu.csv, line 7", "'ay'", "'oops'"),
     ),
-    "decimal comma": (line("odometer.csv", 3, "0,1,0,5"), ("odometer.csv, line 3", "4 fields", "header has 2")),
-    "short row": (line("imu.csv", 5, "0.04,0,0,0"), ("imu.csv, line 5", "4 fields", "header has 7")),
-    "all rows short": (content("imu.csv", b"t,gx,gy,gz,ax,ay,az\n1,2\n3,4\n"), ("imu.csv, line 2", "2 fields")),
-    "infinite value": (line("imu.csv", 9, "0.08,0,0,0,0,0,inf"), ("imu.csv, line 9", "column 'az'", "infinite")),
+    "decimal comma": (line("odometer.csv", 3, "0,1,0,5"), ("table.fields", "odometer.csv, line 3")),
+    "short row": (line("imu.csv", 5, "0.04,0,0,0"), ("table.fields", "imu.csv, line 5")),
+    "all rows short": (content("imu.csv", b"t,gx,gy,gz,ax,ay,az\n1,2\n3,4\n"), ("table.fields", "imu.csv, line 2")),
+    "infinite value": (line("imu.csv", 9, "0.08,0,0,0,0,0,inf"), ("table.not_finite", "imu.csv, line 9", "'az'")),
     "infinite after comments": (
         both(line("imu.csv", 1, f"# made by hand\n\n{IMU_HEADER}"), line("imu.csv", 9, "0.06,0,-inf,0,0,0,9")),
-        ("imu.csv, line 9", "column 'gy'", "infinite"),
+        ("table.not_finite", "imu.csv, line 9", "'gy'"),
     ),
-    "NaN everywhere": (every("imu.csv", lambda row: [row[0], *[float("nan")] * 6]), ("imu.csv", "no row holds")),
-    "one row": (content("imu.csv", f"{IMU_HEADER}\n{GOOD_ROW}\n".encode()), ("imu.csv", "at least 2")),
-    "one time": (every("imu.csv", lambda row: [3.0, *row[1:]]), ("imu.csv", "at least 2")),
-    "time in ms": (every("imu.csv", shift_decimal(0, 1e3)), ("imu.csv", "10 s apart", 't = "ms"')),
-    "time in us": (every("imu.csv", shift_decimal(0, 1e6)), ("imu.csv", "10000 s apart", 't = "us"')),
+    "NaN everywhere": (every("imu.csv", lambda row: [row[0], *[float("nan")] * 6]), ("table.all_blank", "imu.csv")),
+    "one row": (content("imu.csv", f"{IMU_HEADER}\n{GOOD_ROW}\n".encode()), ("table.few_rows", "imu.csv")),
+    "one time": (every("imu.csv", lambda row: [3.0, *row[1:]]), ("table.few_rows", "imu.csv")),
+    "time in ms": (every("imu.csv", shift_decimal(0, 1e3)), ("imu.time_unit", "imu.csv", 't = "ms"')),
+    "time in us": (every("imu.csv", shift_decimal(0, 1e6)), ("imu.time_unit", "imu.csv", 't = "us"')),
     # positions
     "lat and lon swapped": (
         both(line("gnss.csv", 1, "t,lon,lat,h,sd_e,sd_n,sd_u")),
-        ("gnss.csv, line 2", "column 'lat'", "100 is not a latitude", "swapped"),
+        ("table.place", "gnss.csv, line 2", "'lat'"),
     ),
     "radians": (
         every("gnss.csv", lambda row: [row[0], row[1] / 57.3, row[2] / 57.3, *row[3:]]),
-        ("gnss.csv", "radians", 'angle = "rad"'),
+        ("table.radians", "gnss.csv", 'angle = "rad"'),
     ),
-    "longitude": (line("gnss.csv", 4, "0.4,50,400,115,1,1,1"), ("gnss.csv, line 4", "column 'lon'", "400")),
-    "height in mm": (every("gnss.csv", shift_decimal(3, 1e3)), ("gnss.csv, line 2", "column 'h'", "millimetres")),
+    "longitude": (line("gnss.csv", 4, "0.4,50,400,115,1,1,1"), ("table.place", "gnss.csv, line 4", "'lon'", "400")),
+    "height in mm": (every("gnss.csv", shift_decimal(3, 1e3)), ("table.height", "gnss.csv, line 2", "'h'")),
     "negative sd in the file": (
         line("gnss.csv", 3, "0.2,50,100,115,1,-1,1"),
-        ("gnss.csv, line 3", "'sd_n'", "above zero"),
+        ("table.sigma", "gnss.csv, line 3", "'sd_n'"),
     ),
     # recording.toml
-    "toml syntax": (toml('platform = "vehicle"', "platform = vehicle"), ("recording.toml", "not valid TOML", "line 3")),
-    "toml not text": (content("recording.toml", b"\xff\xfe\x00"), ("recording.toml", "UTF-8")),
-    "wrong format": (toml("recording/1", "recording/2"), ("recording.toml", "'format'", "graphnav-recording/1")),
-    "no platform": (toml('platform = "vehicle"', ""), ("recording.toml", "'platform' is missing")),
-    "bad platform": (toml('"vehicle"', '"boat"'), ("recording.toml", "'platform' = 'boat'", "'vehicle' or 'foot'")),
-    "no imu": (toml("[imu]", "[imus]"), ("recording.toml", "unknown key 'imus'", "did you mean 'imu'")),
-    "no file": (toml('file = "gnss.csv"', ""), ("recording.toml", "'gnss.file' is missing")),
-    "unknown key": (toml("lever_arm", "leverarm"), ("recording.toml", "unknown key 'gnss.leverarm'", "'lever_arm'")),
-    "unknown noise key": (toml("gyro_bias_walk", "gyro_walk"), ("unknown key 'imu.noise.gyro_walk'", "gyro_bias_walk")),
+    "toml syntax": (toml('platform = "vehicle"', "platform = vehicle"), ("toml.syntax", "recording.toml", "line 3")),
+    "toml not text": (content("recording.toml", b"\xff\xfe\x00"), ("file.text", "recording.toml")),
+    "wrong format": (
+        toml("recording/1", "recording/2"),
+        ("key.value", "recording.toml", "'format'", "graphnav-recording/1"),
+    ),
+    "no platform": (toml('platform = "vehicle"', ""), ("key.missing", "recording.toml", "'platform'")),
+    "bad platform": (
+        toml('"vehicle"', '"boat"'),
+        ("key.value", "recording.toml", "'platform' = 'boat'", "'vehicle'", "'foot'"),
+    ),
+    "no imu": (toml("[imu]", "[imus]"), ("key.unknown", "recording.toml", "'imus'", "'imu'")),
+    "no file": (toml('file = "gnss.csv"', ""), ("key.missing", "recording.toml", "'gnss.file'")),
+    "unknown key": (toml("lever_arm", "leverarm"), ("key.unknown", "recording.toml", "'gnss.leverarm'", "'lever_arm'")),
+    "unknown noise key": (
+        toml("gyro_bias_walk", "gyro_walk"),
+        ("key.unknown", "'imu.noise.gyro_walk'", "gyro_bias_walk"),
+    ),
     "unknown column key": (
         toml('file = "gnss.csv"', 'file = "gnss.csv"\ncolumns = { latt = "lat" }'),
-        ("'gnss.columns'", "'latt'", "did you mean 'lat'"),
+        ("key.value", "'gnss.columns'", "'latt'", "'lat'"),
     ),
-    "wrong type": (toml('file = "gnss.csv"', "file = 7"), ("recording.toml", "'gnss.file' = 7", "string")),
+    "wrong type": (toml('file = "gnss.csv"', "file = 7"), ("key.value", "recording.toml", "'gnss.file' = 7")),
     "number as text": (
         toml("gyro_bias_walk = 1e-6", 'gyro_bias_walk = "1e-6"'),
-        ("'imu.noise.gyro_bias_walk'", "number"),
+        ("key.value", "'imu.noise.gyro_bias_walk'"),
     ),
-    "not a table": (toml("[truth]\nfile =", "truth ="), ("recording.toml", "unknown key 'odometer.truth'")),
+    "not a table": (toml("[truth]\nfile =", "truth ="), ("key.unknown", "recording.toml", "'odometer.truth'")),
     "negative noise": (
         toml("gyro_bias_walk = 1e-6", "gyro_bias_walk = -1e-6"),
-        ("'imu.noise.gyro_bias_walk'", "greater"),
+        ("key.value", "'imu.noise.gyro_bias_walk'"),
     ),
-    "zero noise": (toml("= 1e-3", "= 0.0"), ("'imu.noise.accel_noise_density'", "greater than 0")),
+    "zero noise": (toml("= 1e-3", "= 0.0"), ("key.value", "'imu.noise.accel_noise_density'")),
     "negative scale": (
         toml("gyro_bias_walk = 1e-6", "gyro_bias_walk = 1e-6\ngyro_scale_sigma = -0.1"),
-        ("'imu.noise.gyro_scale_sigma'", "greater than or equal to 0"),
+        ("key.value", "'imu.noise.gyro_scale_sigma'"),
     ),
-    "zero sd": (toml("lever_arm", "sd = [1.0, 0.0, 1.0]\nlever_arm"), ("'gnss.sd'", "above zero")),
-    "two sd": (toml("lever_arm", "sd_v = [1.0, 1.0]\nlever_arm"), ("'gnss.sd_v'", "three numbers")),
-    "lever arm of two": (toml("[0.1, 0.2, 0.3]", "[0.1, 0.2]"), ("'gnss.lever_arm'", "three numbers")),
-    "lever arm of nan": (toml("[0.1, 0.2, 0.3]", "[0.1, 0.2, nan]"), ("'gnss.lever_arm'", "three numbers")),
+    "zero sd": (toml("lever_arm", "sd = [1.0, 0.0, 1.0]\nlever_arm"), ("key.value", "'gnss.sd'")),
+    "two sd": (toml("lever_arm", "sd_v = [1.0, 1.0]\nlever_arm"), ("key.value", "'gnss.sd_v'")),
+    "lever arm of two": (toml("[0.1, 0.2, 0.3]", "[0.1, 0.2]"), ("key.value", "'gnss.lever_arm'")),
+    "lever arm of nan": (toml("[0.1, 0.2, 0.3]", "[0.1, 0.2, nan]"), ("key.value", "'gnss.lever_arm'")),
     "bad unit": (
         toml('axes = "RFU"', 'units = { gyro = "rpm" }'),
-        ("'imu.units.gyro' = 'rpm'", "'rad/s', 'deg/s' or"),
+        ("key.value", "'imu.units.gyro' = 'rpm'", "'rad/s'", "'deg/s'"),
     ),
     "unknown unit key": (
         toml('axes = "RFU"', 'units = { gyros = "rad/s" }'),
-        ("'imu.units.gyros'", "did you mean 'gyro'"),
+        ("key.unknown", "'imu.units.gyros'", "'gyro'"),
     ),
-    "infinite offset": (toml('axes = "RFU"', "time_offset = inf"), ("'imu.time_offset'", "finite")),
+    "infinite offset": (toml('axes = "RFU"', "time_offset = inf"), ("key.value", "'imu.time_offset'")),
     # mounting
-    "left-handed axes": (toml("RFU", "FRU"), ("'imu.axes' = 'FRU'", "left-handed", "FRD")),
-    "axes garbage": (toml("RFU", "XYZ"), ("'imu.axes' = 'XYZ'", "three letters")),
-    "axes repeat": (toml("RFU", "RLU"), ("'imu.axes' = 'RLU'", "one of F/B")),
-    "axes too short": (toml("RFU", "RF"), ("'imu.axes' = 'RF'", "three letters")),
+    "left-handed axes": (toml("RFU", "FRU"), ("key.value", "'imu.axes' = 'FRU'", "FRD")),
+    "axes garbage": (toml("RFU", "XYZ"), ("key.value", "'imu.axes' = 'XYZ'")),
+    "axes repeat": (toml("RFU", "RLU"), ("key.value", "'imu.axes' = 'RLU'")),
+    "axes too short": (toml("RFU", "RF"), ("key.value", "'imu.axes' = 'RF'")),
     "axes and forward": (
         toml('axes = "RFU"', 'axes = "RFU"\nforward = [0, 1, 0]\nup = [0, 0, 1]'),
-        ("'imu'", "not both"),
+        ("key.value", "'imu'"),
     ),
-    "forward alone": (toml('axes = "RFU"', "forward = [0, 1, 0]"), ("'imu'", "give both")),
+    "forward alone": (toml('axes = "RFU"', "forward = [0, 1, 0]"), ("key.value", "'imu'")),
     "forward along up": (
         toml('axes = "RFU"', "forward = [0, 0.1, 1]\nup = [0, 0, 1]"),
-        ("'imu'", "nearly parallel"),
+        ("key.value", "'imu'"),
     ),
-    "zero up": (toml('axes = "RFU"', "forward = [0, 1, 0]\nup = [0, 0, 0]"), ("'imu'", "zero")),
+    "zero up": (toml('axes = "RFU"', "forward = [0, 1, 0]\nup = [0, 0, 0]"), ("key.value", "'imu'")),
     # truth and keep
-    "truth of unknown": (toml('file = "truth.csv"', 'file = "truth.csv"\nof = "camera"'), ("'truth.of' = 'camera'",)),
+    "truth of unknown": (
+        toml('file = "truth.csv"', 'file = "truth.csv"\nof = "camera"'),
+        ("key.value", "'truth.of' = 'camera'"),
+    ),
     "truth of nobody": (
         both(toml('[odometer]\nfile = "odometer.csv"', ""), toml('"truth.csv"', '"truth.csv"\nof = "odometer"')),
-        ("truth.of = 'odometer'", "no [odometer] table"),
+        ("key.value", "'odometer'", "[odometer]"),
     ),
-    "truth of two kinds": (toml('"truth.csv"', '"truth.csv"\nclosed_loop_sigma = 0.1'), ("'truth'", "either file")),
-    "local truth without x": (toml('"truth.csv"', '"truth.csv"\nframe = "local"'), ("truth.csv", "no column 'x'")),
+    "truth of two kinds": (toml('"truth.csv"', '"truth.csv"\nclosed_loop_sigma = 0.1'), ("key.value", "'truth'")),
+    "local truth without x": (
+        toml('"truth.csv"', '"truth.csv"\nframe = "local"'),
+        ("table.column", "truth.csv", "'x'"),
+    ),
     "keep column missing": (
         toml('"truth.csv"', '"truth.csv"\nkeep = { column = "trust", at_least = 1 }'),
-        ("truth.csv", "no column 'trust'"),
+        ("table.column", "truth.csv", "'trust'"),
     ),
     "keep leaves nothing": (
         toml('"truth.csv"', '"truth.csv"\nkeep = { column = "h", at_least = 1000 }'),
-        ("truth.csv", "no row has h of at least 1000"),
+        ("table.keep", "truth.csv"),
     ),
     "keep incomplete": (
         toml('"truth.csv"', '"truth.csv"\nkeep = { column = "h" }'),
-        ("'truth.keep.at_least' is missing",),
+        ("key.missing", "'truth.keep.at_least'"),
     ),
 }
 
 
 @pytest.mark.parametrize("case", BROKEN, ids=lambda name: name.replace(" ", "-"))
 def test_a_broken_recording_gets_one_plain_line(tmp_path: Path, case: str) -> None:
-    change, fragments = BROKEN[case]
+    change, (key, *names) = BROKEN[case]
     change(write_small(tmp_path))
-    with pytest.raises(RecordingError) as caught:
+    with refused(key, RecordingError, *names) as caught:
         read(tmp_path)
-    sentence = str(caught.value)
-    assert "\n" not in sentence
-    assert "Error" not in sentence
-    for fragment in fragments:
-        assert fragment in sentence
+    assert "Error" not in str(caught.value)
 
 
 def test_the_unbroken_recording_loads_without_a_remark(tmp_path: Path) -> None:
@@ -293,17 +308,17 @@ def test_the_unbroken_recording_loads_without_a_remark(tmp_path: Path) -> None:
 
 
 def test_what_is_no_recording_says_what_to_point_at(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"no such file or folder.*kitti"):
+    with refused("file.missing", RecordingError, "kitti"):
         read(tmp_path / "nowhere")
-    with pytest.raises(RecordingError, match=r"holds no recording\.toml$"):
+    with refused("recording.none", RecordingError, "recording.toml"):
         read(tmp_path)
     write_small(tmp_path)
     (tmp_path / "recording.toml").rename(tmp_path / "other.toml")
-    with pytest.raises(RecordingError, match=r"point at one of other\.toml"):
+    with refused("recording.none", RecordingError, "other.toml"):
         read(tmp_path)
-    with pytest.raises(RecordingError, match=r"imu\.csv: not a recording; point at its folder"):
+    with refused("recording.none", RecordingError, "imu.csv"):
         read(tmp_path / "imu.csv")
-    with pytest.raises(RecordingError, match=r"absent\.toml: cannot be read"):
+    with refused("file.unreadable", RecordingError, "absent.toml"):
         read(tmp_path / "absent.toml")
 
 

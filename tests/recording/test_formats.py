@@ -8,7 +8,7 @@ from dataclasses import replace
 import logs
 import numpy as np
 import pytest
-from helpers import same_recording
+from helpers import refused, same_recording
 
 from graphnav.app import convert
 from graphnav.core.errors import ConfigError, RecordingError
@@ -93,7 +93,7 @@ def test_kf_gins_files_without_a_configuration(kf_gins):
     assert any("lever arm" in remark for remark in found.remarks)
     alone = load(kf_gins / "gnss.txt")
     assert alone.imu is None
-    with pytest.raises(RecordingError, match=r"gnss\.txt: holds no IMU, only gnss; 'graphnav init"):
+    with refused("log.no_imu", RecordingError, "gnss.txt", "graphnav init"):
         read(kf_gins / "gnss.txt")
 
 
@@ -120,26 +120,25 @@ def test_kf_gins_increments_after_a_gap_are_those_of_one_period(kf_gins):
 
 
 @pytest.mark.parametrize(
-    ("file", "old", "new", "sentence"),
+    ("file", "old", "new", "key", "names"),
     [
-        ("kf-gins.yaml", "imu.txt", "absent.txt", r"kf-gins\.yaml, imupath: no file dataset/absent\.txt"),
-        ("kf-gins.yaml", "arw: [0.1, 0.1, 0.1]", "arw: fast", r"kf-gins\.yaml, arw: must be a number.*'fast'"),
-        ("kf-gins.yaml", "corrtime: 4.0", "corr: 4.0", r"kf-gins\.yaml, corrtime: must be"),
-        ("kf-gins.yaml", "imunoise:", "noise:", r"no table imunoise"),
-        ("kf-gins.yaml", "antlever: [", "antlever: [ 1,", r"antlever: must be three numbers"),
-        ("kf-gins.yaml", "endtime: -1", "endtime: [", r"kf-gins\.yaml, line \d+: not valid YAML"),
-        ("imu.txt", "345610.02 ", "345610.02 x", r"imu\.txt, line 2, dtheta_x: 'x"),
-        ("imu.txt", "345610.04 ", "345610.01 ", r"imu\.txt, .*t: 345610\.01\d* does not come after"),
-        ("gnss.txt", "345611.0", "345611.0 1.0", r"gnss\.txt, line 2: 8 fields where 7"),
+        ("kf-gins.yaml", "imu.txt", "absent.txt", "file.missing", ["imupath", "dataset/absent.txt"]),
+        ("kf-gins.yaml", "arw: [0.1, 0.1, 0.1]", "arw: fast", "yaml.value", ["arw", "'fast'"]),
+        ("kf-gins.yaml", "corrtime: 4.0", "corr: 4.0", "yaml.value", ["corrtime"]),
+        ("kf-gins.yaml", "imunoise:", "noise:", "yaml.table", ["imunoise"]),
+        ("kf-gins.yaml", "antlever: [", "antlever: [ 1,", "yaml.value", ["antlever"]),
+        ("kf-gins.yaml", "endtime: -1", "endtime: [", "yaml.syntax", ["line "]),
+        ("imu.txt", "345610.02 ", "345610.02 x", "table.cell", ["line 2", "dtheta_x", "'x"]),
+        ("imu.txt", "345610.04 ", "345610.01 ", "table.time_order", ["345610.01"]),
+        ("gnss.txt", "345611.0", "345611.0 1.0", "table.fields", ["line 2"]),
     ],
 )  # fmt: skip
-def test_bad_kf_gins_input_says_where(kf_gins, file, old, new, sentence):
+def test_bad_kf_gins_input_says_where(kf_gins, file, old, new, key, names):
     text = (kf_gins / file).read_text()
     assert old in text
     (kf_gins / file).write_text(text.replace(old, new, 1))
-    with pytest.raises(RecordingError, match=sentence) as caught:
+    with refused(key, RecordingError, file, *names):
         read(kf_gins / "kf-gins.yaml")
-    assert "\n" not in str(caught.value)
 
 
 # ---- RTKLIB
@@ -181,17 +180,17 @@ def test_bad_kitti_input_says_where(tmp_path):
     row = folder / "data" / "0000000007.txt"
     good = row.read_text()
     row.write_text(good.replace(" 0.05 ", " high ", 1))
-    with pytest.raises(RecordingError, match=r"0000000007\.txt, line 1: 'high' is not a number"):
+    with refused("table.cell", RecordingError, "0000000007.txt, line 1", "'high'"):
         read(folder)
     row.write_text(good.rsplit(" ", 2)[0])
-    with pytest.raises(RecordingError, match=r"0000000007\.txt, line 1: 28 numbers where 30"):
+    with refused("table.fields", RecordingError, "0000000007.txt, line 1", "28", "30"):
         read(folder)
     row.unlink()
-    with pytest.raises(RecordingError, match=r"101 time stamps but 100 files"):
+    with refused("log.files_missing", RecordingError, "101", "100"):
         read(folder)
     stamps = (folder / "timestamps.txt").read_text()
     (folder / "timestamps.txt").write_text(stamps.replace("2011-09-30 12:41:09.0", "yesterday", 1))
-    with pytest.raises(RecordingError, match=r"timestamps\.txt, line 1: 'yesterday"):
+    with refused("table.date", RecordingError, "timestamps.txt, line 1", "'yesterday"):
         read(folder)
 
 
@@ -234,7 +233,7 @@ def test_broken_nmea_lines_are_skipped_and_named(tmp_path):
     assert len(log.gnss.t) == len(RECORDING.gnss.t) - 1
     assert any("line 2: not a sound sentence" in remark for remark in log.remarks)
     path.write_text("".join(line.replace("*", "*0") for line in lines))
-    with pytest.raises(RecordingError, match=r"a\.nmea, line 1: not a sound sentence.*no GGA"):
+    with refused("log.no_positions", RecordingError, "a.nmea, line 1", "GGA"):
         load(path)
 
 
@@ -257,10 +256,10 @@ def test_a_recording_may_name_logs_of_other_programs(tmp_path, kf_gins):
     assert found.truth.rph == pytest.approx(TRUTH.rph, abs=1e-9)
     text = (kf_gins / "recording.toml").read_text()
     (kf_gins / "recording.toml").write_text(text.replace('"ride.nmea"', '"ride.nmea"\ncolumns = { t = "time" }'))
-    with pytest.raises(RecordingError, match=r"'gnss\.columns' is only for CSV files"):
+    with refused("key.not_here", RecordingError, "'gnss.columns'"):
         read(kf_gins)
     (kf_gins / "recording.toml").write_text(text.replace("ride.nmea", "imu.txt"))
-    with pytest.raises(RecordingError, match=r"'gnss\.file': imu\.txt holds no gnss"):
+    with refused("log.no_sensor", RecordingError, "'gnss.file'", "imu.txt"):
         read(kf_gins)
 
 
@@ -301,23 +300,23 @@ def test_clock_and_blank_values_survive(tmp_path):
 def test_a_log_without_imu_becomes_a_folder_that_says_what_is_missing(tmp_path):
     log, _ = convert.convert_log(str(logs.write_nmea(tmp_path / "a.nmea", RECORDING)), tmp_path / "out", None)
     assert "no IMU in it" in convert.log_text(log, [])
-    with pytest.raises(RecordingError, match=r"imu\.csv: no such file"):
+    with refused("file.missing", RecordingError, "imu.csv"):
         read(tmp_path / "out")
 
 
 def test_a_recording_is_not_written_over_itself(tmp_path, kf_gins):
     convert.convert_log(str(kf_gins), tmp_path / "out", None)
-    with pytest.raises(ConfigError, match="read from there"):
+    with refused("output.is_input", ConfigError):
         convert.convert_log(str(tmp_path / "out"), tmp_path / "out", None)
 
 
 def test_unknown_formats_and_files_say_what_is_known(tmp_path):
     (tmp_path / "a.txt").write_text("hello\n")
-    with pytest.raises(RecordingError, match=r"a\.txt: not a recording.*kf-gins"):
+    with refused("recording.none", RecordingError, "a.txt", "kf-gins"):
         load(tmp_path / "a.txt")
-    with pytest.raises(RecordingError, match=r"--format nmae: no such format; did you mean 'nmea'"):
+    with refused("log.format_unknown", RecordingError, "--format nmae", "'nmea'"):
         load(tmp_path / "a.txt", "nmae")
-    with pytest.raises(RecordingError, match=r"a\.txt, line 1: not a sound sentence"):
+    with refused("log.no_positions", RecordingError, "a.txt, line 1"):
         load(tmp_path / "a.txt", "nmea")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import logs
 import numpy as np
 import pytest
+from helpers import refused
 
 from graphnav.core.errors import RecordingError
 from graphnav.recording.draft import draft
@@ -68,7 +69,7 @@ def test_ubx_fixes_in_gps_time(tmp_path):
     assert log.gnss.v == pytest.approx(RECORDING.gnss.v, abs=0.51e-3)
     assert log.gnss.sd[0] == pytest.approx([0.028 / np.sqrt(2), 0.028 / np.sqrt(2), 0.030])
     assert log.gnss.sd_v[0] == pytest.approx(0.087 / np.sqrt(3))
-    with pytest.raises(RecordingError, match="holds no IMU"):
+    with refused("log.no_imu", RecordingError):
         read(tmp_path / "a.ubx")
 
 
@@ -111,10 +112,10 @@ def test_broken_ubx_says_so(tmp_path):
     path.write_bytes(bytes(data))
     assert len(load(path).gnss.t) == len(RECORDING.gnss.t) - 1
     path.write_bytes(b"$\x92\x80$GNX\xff" + np.random.default_rng(0).bytes(3000))
-    with pytest.raises(RecordingError, match=r"a\.ubx: no NAV-PVT and no ESF messages in 3008 bytes"):
+    with refused("log.no_messages", RecordingError, "a.ubx", "NAV-PVT", "ESF", "3008"):
         load(path, "ubx")
     path.write_bytes(b"".join(nav_pvt(t, RECORDING.gnss.llh[0], [0, 0, 0], fix=0, ok=0) for t in (0.0, 1.0)))
-    with pytest.raises(RecordingError, match=r"a\.ubx: 2 NAV-PVT messages without a fix"):
+    with refused("log.no_messages", RecordingError, "a.ubx", "2 NAV-PVT"):
         load(path)
 
 
@@ -172,6 +173,5 @@ def test_bags_of_every_kind_hold_the_drive(tmp_path, kind):
 def test_a_broken_bag_is_one_plain_line(tmp_path):
     path = write_bag(tmp_path / "a.bag", "bag")
     path.write_bytes(path.read_bytes()[:5000])
-    with pytest.raises(RecordingError, match=r"a\.bag: cannot be read as a ROS bag") as caught:
+    with refused("file.damaged", RecordingError, "a.bag"):
         read(path)
-    assert "\n" not in str(caught.value)

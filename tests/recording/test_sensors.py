@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
+from helpers import refused
 
 from graphnav.app import cli
 from graphnav.app.convert import convert_log
@@ -21,7 +22,7 @@ from graphnav.recording import Recording
 from graphnav.recording.checks.overview import inspect
 from graphnav.recording.formats import read
 from graphnav.recording.formats.writer import write_folder
-from graphnav.sensors import Sensor, register, registered
+from graphnav.sensors import Sensor, list_sensors, register
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +30,7 @@ def drive() -> Recording:
     made, _ = oracle.drive(oracle.vehicle_path(120.0, 50.0), seed=3)
     made = made.crop(0.0, 20.0)
     rng, series = np.random.default_rng(1), {}
-    for name, sensor in registered().items():
+    for name, sensor in list_sensors().items():
         t = np.arange(made.start + 0.1, made.end, 0.25)
         columns = {c.name: c.lowest + (c.highest - c.lowest) * rng.uniform(0.1, 0.9, len(t)) for c in sensor.columns}
         optional = [c for c in sensor.names if all(c not in some for some in sensor.needs)]
@@ -54,7 +55,7 @@ def test_written_and_read_again(drive, tmp_path):
     same(drive, read(tmp_path / "b"))
 
 
-@pytest.mark.parametrize("name", sorted(registered()))
+@pytest.mark.parametrize("name", sorted(list_sensors()))
 def test_cut_withheld_and_summed_up(drive, name):
     t = drive.sensors[name].t - drive.start
     part = drive.crop(4.0, 12.0)
@@ -65,7 +66,7 @@ def test_cut_withheld_and_summed_up(drive, name):
     assert inspect(drive).facts[name]["rows"] == len(t)
 
 
-@pytest.mark.parametrize("name", sorted(registered()))
+@pytest.mark.parametrize("name", sorted(list_sensors()))
 def test_what_cannot_be_read_is_left_out_or_refused(drive, name):
     series = drive.sensors[name]
     sensor = series.sensor
@@ -77,7 +78,7 @@ def test_what_cannot_be_read_is_left_out_or_refused(drive, name):
     found = inspect(replace(drive, sensors={name: replace(series, values=spiked)}))
     assert len(found.recording.sensors[name]) == len(series) - 1
     assert f"{name}.bounds" in {f.key for f in found.findings}
-    with pytest.raises(RecordingError, match="unit"):
+    with refused(f"{name}.unit", RecordingError):
         inspect(replace(drive, sensors={name: replace(series, values=all_wrong)})).refuse()
 
 
@@ -97,9 +98,9 @@ def test_rows_of_the_line_protocol(drive):
     for wrong in ("S,barometr,1.0,2.0,", "S,barometer,1.0", "S,barometer,1.0,x,", "S"):
         with pytest.raises(ValueError, match=r"barom|needs|number|sensor"):
             row_of(wrong)
-    with pytest.raises(RecordingError, match="needs"):
-        Reading(1.0, registered()["barometer"], pressure=1.0)
-    assert Reading(1.0, registered()["barometer"], pressure=1e5)[0] == "barometer"
+    with refused("row.bounds", RecordingError):
+        Reading(1.0, list_sensors()["barometer"], pressure=1.0)
+    assert Reading(1.0, list_sensors()["barometer"], pressure=1e5)[0] == "barometer"
 
 
 @pytest.mark.parametrize(
@@ -143,13 +144,13 @@ def test_settings_of_a_sensor(tmp_path):
 
 
 def test_a_name_that_is_taken():
-    with pytest.raises(RecordingError, match="gnss"):
-        register(Sensor("gnss", "", registered()["barometer"].columns, (("height",),)))
+    with refused("sensor.name_taken", RecordingError, "gnss"):
+        register(Sensor("gnss", "", list_sensors()["barometer"].columns, (("height",),)))
 
 
 def test_a_command_with_a_sensor_withheld(drive, tmp_path, capsys):
     t = np.arange(drive.start + 0.1, drive.end, 0.25)
-    flat = registered()["barometer"].series(t, {"height": np.full(len(t), 20.0)})
+    flat = list_sensors()["barometer"].series(t, {"height": np.full(len(t), 20.0)})
     write_folder(replace(drive, sensors={"barometer": flat}), tmp_path / "in")
     out = tmp_path / "out"
     command = ["smooth", str(tmp_path / "in"), "-o", str(out), "--solver", "ekf", "--no-report", "--noise", "stated"]

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+from helpers import refused
 from test_recording import describe
 
 from graphnav.core.errors import RecordingError
@@ -53,23 +54,19 @@ def test_the_example_in_every_error_is_understood(key):
 
 
 @pytest.mark.parametrize(
-    ("line", "sentence"),
+    ("line", "names"),
     [
-        (
-            'gyro_noise_density = "7 deg/h"',
-            r"'deg/h' is not a unit of gyro_noise_density; that is a unit of gyro_bias",
-        ),
-        ('gyro_noise_density = "0.15"', r"'0\.15' is not a number and a unit"),
-        ('accel_bias_sigma = "five mg"', r"'five mg' is not a number and a unit, such as \"5 mg\""),
-        ('accel_bias_sigma = "5 furlong"', r"'furlong' is not a unit of accel_bias_sigma; write it as in"),
-        ('gyro_bias_sigma = "-7 deg/h"', r"greater than 0"),
-        ("gyro_bias_sigma = true", r"gyro_bias_sigma' = True"),
+        ('gyro_noise_density = "7 deg/h"', ("'deg/h'", "gyro_noise_density", "gyro_bias")),
+        ('gyro_noise_density = "0.15"', ("'0.15'",)),
+        ('accel_bias_sigma = "five mg"', ("'five mg'", '"5 mg"')),
+        ('accel_bias_sigma = "5 furlong"', ("'furlong'", "accel_bias_sigma")),
+        ('gyro_bias_sigma = "-7 deg/h"', ("gyro_bias_sigma",)),
+        ("gyro_bias_sigma = true", ("gyro_bias_sigma' = True",)),
     ],
 )
-def test_a_figure_that_cannot_be_read_says_why(tmp_path, line, sentence):
-    with pytest.raises(RecordingError, match=rf"recording\.toml, line 6: .*{sentence}") as caught:
+def test_a_figure_that_cannot_be_read_says_why(tmp_path, line, names):
+    with refused("key.value", RecordingError, "recording.toml, line 6", *names):
         read(describe(tmp_path, f"[imu.noise]\n{line}"))
-    assert "\n" not in str(caught.value)
 
 
 def test_figures_with_units_are_read(tmp_path):
@@ -87,9 +84,7 @@ def test_a_model_gives_its_figures_and_the_file_goes_before_it(tmp_path):
     assert found.noise.gyro_bias_walk == pytest.approx(25 * 4.848137e-6 * (2 / 3600) ** 0.5, rel=1e-6)
     assert found.noise.accel_noise_density == pytest.approx(0.2 / 60)
     assert not found.noise_assumed
-    with pytest.raises(
-        RecordingError, match=r"no figures of an IMU called 'ADIS16456' are known; did you mean 'ADIS16465'"
-    ):
+    with refused("key.value", RecordingError, "'ADIS16456'", "'ADIS16465'"):
         read(describe(tmp_path, 'model = "ADIS16456"'))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import oracle_path
 import pandas as pd
 import pytest
-from helpers import Array, truth_states
+from helpers import Array, refused, truth_states
 from pyins import strapdown, transform, util
 
 from graphnav.core import rotation as ro
@@ -280,14 +280,13 @@ def test_the_folder_holds_the_recording(name: str, options: dict[str, float], tm
     assert inspect(walk.recording).warnings == ()
 
 
-@pytest.mark.parametrize(("name", "options", "says"), [
-    ("ren2021", {"walk": 14}, "from 1 to 13"), ("ren2021", {"walk": 2.5}, "from 1 to 13"),
-    ("ren2021", {"rate": 5.0}, "50 to 2000"), ("gait", {"pace": "run"}, "slow, normal, fast"),
-    ("gait", {"imu": "phone"}, "shoe|ellipse2"), ("gait", {"course": "zigzag"}, "laps, bends or straight"),
-    ("gait", {"duration": 5.0}, "from 20"),
+@pytest.mark.parametrize(("name", "options"), [
+    ("ren2021", {"walk": 14}), ("ren2021", {"walk": 2.5}), ("ren2021", {"rate": 5.0}), ("gait", {"pace": "run"}),
+    ("gait", {"imu": "phone"}), ("gait", {"course": "zigzag"}), ("gait", {"duration": 5.0}),
 ])  # fmt: skip
-def test_bad_options_are_refused(name: str, options: dict[str, float | str], says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
+def test_bad_options_are_refused(name: str, options: dict[str, float | str]) -> None:
+    ((option, value),) = options.items()
+    with refused("simulation.value", ConfigError, option, str(value).removesuffix(".0")):
         simulate(name, 0, **options)
 
 

@@ -71,7 +71,7 @@ def solve_drive(task: Task) -> Row:
     return row
 
 
-def lost_row(task: Task, status: str, error: str, seconds: float) -> Row:
+def make_lost_row(task: Task, status: str, error: str, seconds: float) -> Row:
     """The row of a drive that took its process with it, which could not write one."""
     row: Row = {"drive": task.name, "status": status, "source": task.source, "solver": task.solver, "error": error}
     row["time_s"] = round(seconds, 3)

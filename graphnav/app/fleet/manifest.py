@@ -77,20 +77,24 @@ def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, Drive
         If there are none, or the manifest says something that cannot be: naming the file, the line and the field.
     """
     if not exists(source, ConfigError):
-        raise ConfigError(f"{source}: no such folder or manifest")
+        raise ConfigError(f"{source}: no such folder or manifest", key="file.missing")
     if source.is_dir():
         found = [(_name_of(path, source), str(path), asked, str(path)) for path in _recordings(source)]
         if not found:
-            raise ConfigError(f'{source}: holds no recording; each is a .toml that says format = "{_FORM}/1"')
+            raise ConfigError(
+                f'{source}: holds no recording; each is a .toml that says format = "{_FORM}/1"', key="recording.none"
+            )
         return _distinct(found)
     rows = _csv_rows(source) if source.suffix == ".csv" else _toml_rows(source)
     drives = [_drive(source, where, row, asked) for where, row in rows]
     if not drives:
-        raise ConfigError(f"{source}: names no recording")
+        raise ConfigError(f"{source}: names no recording", key="manifest.no_recording")
     twice = [name for name, count in Counter(name for name, *_ in drives).items() if count > 1]
     named = [name for where, row in rows if (name := str(row.get("name") or "")) in twice]
     if named:
-        raise ConfigError(f"{source}: two drives are named '{named[0]}'; each is a folder of its own")
+        raise ConfigError(
+            f"{source}: two drives are named '{named[0]}'; each is a folder of its own", key="manifest.name_twice"
+        )
     return _distinct(drives)
 
 
@@ -106,7 +110,7 @@ def task_of(
     """
     name, source, asked, where = drive
     if asked.solver not in KNOWN:
-        raise ConfigError(f"{where}: no solver '{asked.solver}'; {nearest(asked.solver, KNOWN)}")
+        raise ConfigError(f"{where}: no solver '{asked.solver}'; {nearest(asked.solver, KNOWN)}", key="manifest.solver")
     try:
         without = tuple((asked.without or "").split())
         for one in without:
@@ -118,9 +122,9 @@ def task_of(
                 settings = settings_from(_over(settings.model_dump(exclude_unset=True), _toml(asked.settings)))
             known[key] = parse_noise(asked.noise, settings)[0].model_dump(mode="json")
     except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
+        raise ConfigError(f"{where}: {error}", key=error.key) from None
     if asked.start is not None and asked.end is not None and not asked.start < asked.end:
-        raise ConfigError(f"{where}: end {asked.end:g} must be later than start {asked.start:g}")
+        raise ConfigError(f"{where}: end {asked.end:g} must be later than start {asked.start:g}", key="manifest.span")
     given = asked.noise if asked.noise is not None and Path(asked.noise).is_file() else None
     return Task(
         name, source, str(out / "drives" / name), asked.solver, known[key], given, without,
@@ -183,10 +187,12 @@ def _csv_rows(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
         for row in reader:
             where = f"{path}, line {reader.line_num}"
             if None in row or None in row.values():
-                raise ConfigError(f"{where}: {len(reader.fieldnames or ())} cells are needed, as the header has")
+                raise ConfigError(
+                    f"{where}: {len(reader.fieldnames or ())} cells are needed, as the header has", key="table.fields"
+                )
             rows.append((where, {key: value.strip() for key, value in row.items()}))
     except csv.Error as error:
-        raise ConfigError(f"{path}, line {reader.line_num}: {error}") from None
+        raise ConfigError(f"{path}, line {reader.line_num}: {error}", key="table.unreadable") from None
     return rows
 
 
@@ -194,7 +200,10 @@ def _toml_rows(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
     values, _ = read_toml(path, ConfigError)
     drives = values.get("drive")
     if set(values) != {"drive"} or not isinstance(drives, list) or not all(isinstance(one, dict) for one in drives):
-        raise ConfigError(f'{path}: must be a list of tables [[drive]], each with recording = "...", and nothing else')
+        raise ConfigError(
+            f'{path}: must be a list of tables [[drive]], each with recording = "...", and nothing else',
+            key="manifest.tables",
+        )
     rows: list[tuple[str, Mapping[str, Any]]] = [(f"{path}, drive {k}", one) for k, one in enumerate(drives, 1)]
     for where, row in rows:
         _check_columns(row, where)
@@ -204,9 +213,11 @@ def _toml_rows(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
 def _check_columns(names: Iterable[str], where: str) -> None:
     unknown = [name for name in names if name not in _COLUMNS]
     if unknown:
-        raise ConfigError(f"{where}: no such column '{unknown[0]}'; {nearest(unknown[0], _COLUMNS)}")
+        raise ConfigError(
+            f"{where}: no such column '{unknown[0]}'; {nearest(unknown[0], _COLUMNS)}", key="table.column_unknown"
+        )
     if "recording" not in names:
-        raise ConfigError(f"{where}: 'recording' is missing")
+        raise ConfigError(f"{where}: 'recording' is missing", key="manifest.no_recording")
 
 
 def _drive(source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions) -> tuple[str, str, DriveOptions, str]:
@@ -220,7 +231,9 @@ def _drive(source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions
             try:
                 said[key] = float(value)
             except (TypeError, ValueError):
-                raise ConfigError(f"{where}, '{key}': {value!r} is not a number of seconds") from None
+                raise ConfigError(
+                    f"{where}, '{key}': {value!r} is not a number of seconds", key="manifest.value"
+                ) from None
         elif key == "settings" and isinstance(value, Mapping):
             said[key] = _write(value)
         elif key == "without" and isinstance(value, list):
@@ -228,10 +241,10 @@ def _drive(source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions
         elif isinstance(value, str):
             said[key] = value
         else:
-            raise ConfigError(f"{where}, '{key}': {value!r} is not a text")
+            raise ConfigError(f"{where}, '{key}': {value!r} is not a text", key="manifest.value")
     recording = row.get("recording")
     if not isinstance(recording, str) or not recording:
-        raise ConfigError(f"{where}, 'recording': names no recording")
+        raise ConfigError(f"{where}, 'recording': names no recording", key="manifest.no_recording")
     noise = said.get("noise")
     if noise is not None and noise not in MODES:
         said["noise"] = str(_beside(source, noise, where, "noise"))
@@ -241,7 +254,7 @@ def _drive(source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions
     path = recording if builtin else str(_beside(source, recording, where, "recording"))
     name = row.get("name") or Path(recording.removesuffix("/recording.toml")).name.removesuffix(".toml")
     if not isinstance(name, str):
-        raise ConfigError(f"{where}, 'name': {name!r} is not a text")
+        raise ConfigError(f"{where}, 'name': {name!r} is not a text", key="manifest.value")
     return _plain(name), path, replace(asked, **said), where
 
 
@@ -250,7 +263,8 @@ def _beside(source: Path, name: str, where: str, key: str) -> Path:
     path = source.parent / name
     if not inside(path, source.parent, ConfigError):
         raise ConfigError(
-            f"{where}, '{key}': {name} lies outside its folder; say --allow-outside if you trust who wrote it"
+            f"{where}, '{key}': {name} lies outside its folder; say --allow-outside if you trust who wrote it",
+            key="file.outside",
         )
     return path
 
@@ -260,7 +274,9 @@ def _toml(text: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text if "\n" in text else text.replace(";", "\n"))
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"settings {text!r}: {error}; write key = value, with semicolons between") from None
+        raise ConfigError(
+            f"settings {text!r}: {error}; write key = value, with semicolons between", key="manifest.settings"
+        ) from None
 
 
 def _write(values: Mapping[str, Any], at: str = "") -> str:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import graphnav
-from graphnav.app.fleet.drive import CRASHED, HUNG, Row, lost_row
+from graphnav.app.fleet.drive import CRASHED, HUNG, Row, make_lost_row
 from graphnav.app.fleet.manifest import Task
 from graphnav.core.errors import ConfigError
 
@@ -80,10 +80,10 @@ class Worker:
         self._process = None
         spent = time.monotonic() - began
         if late.is_set():
-            return lost_row(
+            return make_lost_row(
                 task, HUNG, f"not done in {self._limits.seconds:g} s, and ended; --limit gives it longer", spent
             )
-        return lost_row(task, CRASHED, f"the process that solved it {_end_of(code)}", spent)
+        return make_lost_row(task, CRASHED, f"the process that solved it {_end_of(code)}", spent)
 
     def close(self) -> None:
         """End the process, at once."""
@@ -162,11 +162,15 @@ def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limits: Limits) -> I
         from distributed import Client
         from distributed import as_completed as completed
     except ImportError:
-        raise ConfigError("--scheduler: needs Dask; pip install -e '.[fleet]' in the clone") from None
+        raise ConfigError(
+            "--scheduler: needs Dask; pip install -e '.[fleet]' in the clone", key="package.missing"
+        ) from None
     try:
         client = Client(scheduler, timeout=10)
     except (OSError, ValueError, TimeoutError) as error:
-        raise ConfigError(f"--scheduler {scheduler}: no cluster answers there ({error or 'too late'})") from None
+        raise ConfigError(
+            f"--scheduler {scheduler}: no cluster answers there ({error or 'too late'})", key="fleet.no_cluster"
+        ) from None
     with client:
         waiting = iter(tasks)
         of: dict[str, Task] = {}
@@ -186,7 +190,7 @@ def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limits: Limits) -> I
                     yield future.result()
                 else:
                     why = future.exception() if future.status == "error" else future.status
-                    yield lost_row(task, CRASHED, f"the cluster: {type(why).__name__}: {why}", 0.0)
+                    yield make_lost_row(task, CRASHED, f"the cluster: {type(why).__name__}: {why}", 0.0)
                 under_way.update(next_few(1))
         finally:
             client.cancel([*under_way.futures])

@@ -108,7 +108,8 @@ def in_motion(
     if not tried:
         raise EstimationError(
             f"'{recording.name}': no start attitude explains the GNSS fixes between {begin - recording.start:.0f} "
-            f"and {end - recording.start:.0f} s; check the axes, the units and the time stamps"
+            f"and {end - recording.start:.0f} s; check the axes, the units and the time stamps",
+            key="alignment.not_explained",
         )
     best = min(tried, key=lambda one: one.cost)
     R, P = best.states.R_nb[0], best.covariance[0][:3, :3]

@@ -129,11 +129,13 @@ def read_noise_and_mode(path: str | Path) -> tuple[NoiseModel, str]:
     try:
         values = parse_json(read_text(path, ConfigError))
     except json.JSONDecodeError as error:
-        raise ConfigError(f"{path}, line {error.lineno}: not valid JSON ({error.msg}); {what}") from None
+        raise ConfigError(
+            f"{path}, line {error.lineno}: not valid JSON ({error.msg}); {what}", key="json.syntax"
+        ) from None
     except ValueError as error:
-        raise ConfigError(f"{path}: not valid JSON ({error}); {what}") from None
+        raise ConfigError(f"{path}: not valid JSON ({error}); {what}", key="json.syntax") from None
     if not isinstance(values, Mapping) or not isinstance(values.get("noise"), Mapping):
-        raise ConfigError(f"{path}: holds no table 'noise'; {what}")
+        raise ConfigError(f"{path}: holds no table 'noise'; {what}", key="noise.no_model")
     return _Reader(path).model(values["noise"])
 
 
@@ -179,12 +181,13 @@ class _Reader:
 
     def error(self, key: str, value: Any, why: str) -> ConfigError:
         shown = json.dumps(value)
-        return ConfigError(f"{self.path}: '{key}' = {shown if len(shown) <= 40 else shown[:37] + '...'}: {why}")
+        sentence = f"{self.path}: '{key}' = {shown if len(shown) <= 40 else shown[:37] + '...'}: {why}"
+        return ConfigError(sentence, key="key.value")
 
     def names(self, values: Mapping[str, Any], known: Sequence[str], at: str) -> None:
         for name in values:
             if name not in known:
-                raise ConfigError(f"{self.path}: unknown key '{at}.{name}'; {nearest(name, known)}")
+                raise ConfigError(f"{self.path}: unknown key '{at}.{name}'; {nearest(name, known)}", key="key.unknown")
 
     def each(
         self, values: Mapping[str, Any], key: str, known: Sequence[str], read: Callable[[str, Any], Any]
@@ -208,7 +211,9 @@ class _Reader:
         self.names(value, (*_FIGURE, *_BESIDE), key)
         what = "the natural logarithm of a variance factor"
         if "log_factor" not in value and "variance_factor" not in value:
-            raise ConfigError(f"{self.path}: '{key}' has neither log_factor nor variance_factor; give one")
+            raise ConfigError(
+                f"{self.path}: '{key}' has neither log_factor nor variance_factor; give one", key="key.missing"
+            )
         given = None
         if "variance_factor" in value:
             given = math.log(
@@ -220,7 +225,8 @@ class _Reader:
             log = self.number(f"{key}.log_factor", value["log_factor"], _TINY, _HUGE, what)
             if given is not None and abs(given - log) > 1e-9:
                 raise ConfigError(
-                    f"{self.path}: '{key}': log_factor and variance_factor disagree; leave one of them out"
+                    f"{self.path}: '{key}': log_factor and variance_factor disagree; leave one of them out",
+                    key="noise.disagree",
                 )
         assert log is not None
         return VarianceComponent(
@@ -246,9 +252,14 @@ class _Reader:
             lists[name] = np.array([self.number(f"{key}.{name}", x, low, high, what) for x in some], dtype=float)
         t, weight = lists["t"], lists["weight"]
         if len(t) != len(weight):
-            raise ConfigError(f"{self.path}: '{key}' has {len(t)} times and {len(weight)} weights; give one for each")
+            raise ConfigError(
+                f"{self.path}: '{key}' has {len(t)} times and {len(weight)} weights; give one for each",
+                key="noise.lengths",
+            )
         if np.any(np.diff(t) < 0.0):
-            raise ConfigError(f"{self.path}: '{key}.t' is not ascending; sort its rows by time")
+            raise ConfigError(
+                f"{self.path}: '{key}.t' is not ascending; sort its rows by time", key="noise.not_ascending"
+            )
         return RowWeights(t, weight)
 
     def spans(self, key: str, value: Any) -> tuple[tuple[float, float], ...]:

@@ -118,7 +118,9 @@ def predict(
     top[:, :D] *= _upper(D)
     root, info = dtrtri(R[:E, :E]) if E else (np.zeros((0, 0)), 0)
     if info:
-        raise EstimationError(f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units")
+        raise EstimationError(
+            f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units", key="solver.breakdown"
+        )
     root = root * _upper(E)
     g = np.zeros(D0)
     g[DIM:] = values[: D0 - DIM] - before.values
@@ -160,7 +162,10 @@ def update(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -
             top, beside, fault = _test(top, tests.copy(), rows, y, passes, place.t, ahead.state)
         y, info = dtrtrs(top[:, :D], top[:, D])
         if info:
-            raise EstimationError(f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units")
+            raise EstimationError(
+                f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units",
+                key="solver.breakdown",
+            )
     message = Message.of(ahead.state, ahead.values, ahead.columns, top[:, :D], top[:, D], beside)
     measured = (*ahead.measured, *rows)
     return Stage(place, message, ahead.G, ahead.g, ahead.lost, ahead.C, measured, fault=fault), y

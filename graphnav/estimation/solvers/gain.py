@@ -59,7 +59,9 @@ def solve_innovation(HPHt: Array, variance: Array, right: Array, some: RowBlock)
     root, solved, info = dposv(S.T, right, overwrite_a=1)
     if info:
         at = ", ".join(f"'{rows.name}' row {lo}" for rows, lo, _ in some.parts)
-        raise EstimationError(f"the filter's covariance broke down at {at}: check sigmas and units")
+        raise EstimationError(
+            f"the filter's covariance broke down at {at}: check sigmas and units", key="solver.breakdown"
+        )
     return root, solved
 
 

@@ -129,7 +129,9 @@ class Eliminated:
             key, *parents = conditional.keys()
             R_inverse, singular = dtrtri(conditional.R())
             if singular:
-                raise EstimationError("the data leave something undetermined: there is no covariance")
+                raise EstimationError(
+                    "the data leave something undetermined: there is no covariance", key="solver.undetermined"
+                )
             n = len(R_inverse)
             kept = [*parents, *(k for k in where if first.get(k, i) < i and k not in parents)]
             index = [column for p in kept for column in where[p]]

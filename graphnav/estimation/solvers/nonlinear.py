@@ -200,7 +200,9 @@ def _noise(rows: Constraint, i: int) -> Any:
     if rows.robust == "none":
         return unit
     if rows.robust not in _ESTIMATORS:
-        raise EstimationError(f"{rows.name}: GTSAM has no kernel '{rows.robust}'; known: {', '.join(_ESTIMATORS)}")
+        raise EstimationError(
+            f"{rows.name}: GTSAM has no kernel '{rows.robust}'; known: {', '.join(_ESTIMATORS)}", key="solver.kernel"
+        )
     scale = np.asarray(rows.scale_of(slice(i, i + 1))).ravel()[0]
     return gtsam.noiseModel.Robust.Create(_ESTIMATORS[rows.robust].Create(float(scale)), unit)
 

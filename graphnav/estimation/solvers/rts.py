@@ -118,7 +118,8 @@ def _find_disturbances(forward: ForwardRecord, end: int, r: Array, N: Array, pro
 
 
 def _breakdown(problem: Problem, k: int) -> EstimationError:
-    return EstimationError(f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas")
+    sentence = f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas"
+    return EstimationError(sentence, key="solver.breakdown")
 
 
 def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None) -> Solution:

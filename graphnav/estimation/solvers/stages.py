@@ -88,7 +88,9 @@ class Message:
         """(D,) the error state that it makes most likely."""
         found, info = dgesv(self.R, self.z)[2:]  # not triangular any more once its point has turned
         if info:
-            raise EstimationError("the smoother's information broke down: check sigmas and units")
+            raise EstimationError(
+                "the smoother's information broke down: check sigmas and units", key="solver.breakdown"
+            )
         return np.asarray(found)
 
     @property
@@ -224,7 +226,9 @@ def predict_stage(before: Message, place: Place) -> tuple[States, Array, Columns
     try:
         W = motion.whitener[row]
     except np.linalg.LinAlgError:
-        raise EstimationError(f"the noise of the IMU before {place.t:.3f} s is none: check its figures") from None
+        raise EstimationError(
+            f"the noise of the IMU before {place.t:.3f} s is none: check its figures", key="solver.no_imu_noise"
+        ) from None
     link = np.zeros((1, DIM, DIM + D + 1))
     link[:, :, :DIM] = -F
     link[:, :, DIM : 2 * DIM] = _I

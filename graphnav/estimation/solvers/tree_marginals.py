@@ -75,5 +75,7 @@ def _marginal(tree: Tree, x: Variable, t: float) -> Array:
     try:
         found = tree.isam.marginalCovariance(x.key)
     except RuntimeError:
-        raise EstimationError(f"the data leave something undetermined at {t:.3f} s: there is no covariance") from None
+        raise EstimationError(
+            f"the data leave something undetermined at {t:.3f} s: there is no covariance", key="solver.undetermined"
+        ) from None
     return np.asarray(x.unit[:, None] * found * x.unit)

@@ -86,7 +86,9 @@ def update_isam(isam: gtsam.ISAM2, t: float, *change: Any) -> Any:
     try:
         return isam.update(*change)
     except RuntimeError as error:  # GTSAM's for a variable that nothing determines
-        raise EstimationError(f"the smoother's information broke down at {t:.3f} s: check sigmas and units") from error
+        raise EstimationError(
+            f"the smoother's information broke down at {t:.3f} s: check sigmas and units", key="solver.breakdown"
+        ) from error
 
 
 def factor(blocks: Sequence[tuple[Variable, Array]], b: Array) -> Any:

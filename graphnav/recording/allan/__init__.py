@@ -72,16 +72,20 @@ def allan_of(t: Array, gyro: Array, accel: Array) -> Allan:
     if len(gap):
         raise RecordingError(
             f"{len(gap)} gaps, the first of {t[gap[0] + 1] - t[gap[0]]:.3f} s at {t[gap[0]] - t[0]:.1f} s: an Allan "
-            "variance needs a log without any; choose a part with --start and --end"
+            "variance needs a log without any; choose a part with --start and --end",
+            key="allan.gaps",
         )
     duration = len(t) * period
     if duration < _SHORTEST:
-        raise RecordingError(f"{duration:.0f} s are too short; an hour at rest is better, a minute the least")
+        raise RecordingError(
+            f"{duration:.0f} s are too short; an hour at rest is better, a minute the least", key="allan.short"
+        )
     moving = moves_at(t, gyro, accel)
     if moving is not None:
         raise RecordingError(
             f"the log moves, first at {moving:.0f} s: an Allan variance is of an IMU at rest; choose a part with "
-            "--start and --end"
+            "--start and --end",
+            key="allan.moves",
         )
     m = averaging(len(t))
     tau = m * period

@@ -17,7 +17,7 @@ from graphnav.recording import odometer as wheels
 from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.clock import ClockOffsets
 from graphnav.recording.checks.crosschecks import Fit, Track
-from graphnav.recording.checks.stated import exchange_lat_lon, exchanged_finding
+from graphnav.recording.checks.stated import describe_exchange, exchange_lat_lon
 from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
 from graphnav.sensors.tables import TIME
 
@@ -70,7 +70,7 @@ def _unit_of_stamps(t: Array, recording: Recording) -> str | None:
     return None
 
 
-def gnss_coverage(recording: Recording) -> Iterator[Finding]:
+def check_gnss_coverage(recording: Recording) -> Iterator[Finding]:
     gnss = recording.gnss
     assert gnss is not None
     if (sentence := gnss_apart(recording)) is not None:
@@ -95,7 +95,7 @@ def gnss_coverage(recording: Recording) -> Iterator[Finding]:
         )
 
 
-def gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Finding]:
+def check_gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Finding]:
     """Fixes that no motion explains: a step against the velocities, or an acceleration no vehicle has."""
     gnss = recording.gnss
     assert gnss is not None
@@ -127,7 +127,7 @@ def gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Finding]:
         )
 
 
-def imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterator[Finding]:
+def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterator[Finding]:
     """By GNSS speed, and by the positions alone, which in some receivers are of another time.
 
     `odometer` is its fit against GNSS, which tells whose clock it is. What is further off than the stamps of the fixes
@@ -158,16 +158,16 @@ def imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterator[Find
     )
 
 
-def mirrored(recording: Recording) -> Iterator[Finding]:
+def check_mirroring(recording: Recording) -> Iterator[Finding]:
     """Turns against the course that are those of the course with latitude and longitude exchanged."""
     other = exchange_lat_lon(recording.gnss) if recording.gnss is not None else None
     way = crosschecks.track(replace(other, v=None)) if other is not None else None
     yaw = crosschecks.yaw_fit(recording.imu, way) if way is not None else None
     if yaw is not None and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
-        yield exchanged_finding("the turns of the gyro")
+        yield describe_exchange("the turns of the gyro")
 
 
-def imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Finding]:
+def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Finding]:
     """Axes that the drive contradicts: by the mean force, and by the forward force where another fits it better."""
     up = crosschecks.up_of(imu)
     if up[2] > 0.8 and (forward is None or forward.correlation < 0.7):
@@ -210,7 +210,7 @@ def _letters(R_bs: Array, forward: Array, up: Array) -> str | None:
     )
 
 
-def reversed_sign(imu: Imu) -> Iterator[Finding]:
+def check_gyro_sign(imu: Imu) -> Iterator[Finding]:
     """The gyro about the mean force turns against the course: no choice of axes mends that."""
     if crosschecks.up_of(imu)[2] < 0:
         what = "the accelerometer's sign is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
@@ -220,7 +220,7 @@ def reversed_sign(imu: Imu) -> Iterator[Finding]:
         yield Finding("warning", f"{what}; negate it in the file", "imu.gyro_sign")
 
 
-def yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
+def check_yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
     if yaw is None or abs(yaw.correlation) < 0.8:
         return
     scale = abs(float(yaw.coefficients[0]))
@@ -248,7 +248,7 @@ _WHEEL = 0.02  # of the speed by which a wheel may differ: worn tyres differ by 
 _WHEELS = ("front left", "front right", "rear left", "rear right")
 
 
-def odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iterator[Finding]:
+def check_odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iterator[Finding]:
     """What the readings say of themselves, and the IMU of them."""
     odometer = recording.odometer
     assert odometer is not None
@@ -313,7 +313,7 @@ def odometer_findings(recording: Recording, track: Track | None, facts: dict[str
         hint = f'; its stamps are in {unit}: say units = {{ t = "{unit}" }} in [odometer]' if unit else ""
         yield Finding("warning", f"odometer and IMU do not overlap in time{hint}", "odometer.clock")
         return
-    yield from odometer_readings(recording, facts)
+    yield from check_odometer_readings(recording, facts)
     found = crosschecks.odometer_fit(odometer, track) if track is not None else None
     if found is None:
         return

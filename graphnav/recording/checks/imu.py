@@ -15,7 +15,7 @@ from graphnav.recording import Imu, Recording
 STANDARD_GRAVITY = 9.80665  # m/s^2, where the place is unknown
 
 
-def imu_time(imu: Imu) -> Iterator[Finding]:
+def check_imu_time(imu: Imu) -> Iterator[Finding]:
     step, period = np.diff(imu.t), period_of(imu.t)
     gaps = np.flatnonzero(step > gap_limit(imu.t))
     if len(gaps):
@@ -39,7 +39,7 @@ def gap_limit(t: Array) -> float:
     return 2.5 * period_of(t)
 
 
-def repeats(imu: Imu) -> Iterator[Finding]:
+def check_repeats(imu: Imu) -> Iterator[Finding]:
     gyro, accel = imu.gyro[1:] == imu.gyro[:-1], imu.accel[1:] == imu.accel[:-1]
     same = np.logical_and.reduce([*gyro.T, *accel.T])
     if same.mean() > 0.002:
@@ -55,7 +55,7 @@ def repeats(imu: Imu) -> Iterator[Finding]:
         )
 
 
-def saturation(imu: Imu) -> Iterator[Finding]:
+def check_saturation(imu: Imu) -> Iterator[Finding]:
     # in the file's axes: a tilted mount would spread a clipped axis over three
     for what, values, smallest, unit in (("gyro", imu.gyro, 0.5, "rad/s"), ("accelerometer", imu.accel, 5.0, "m/s2")):
         x = imu.R_bs.T @ values.T
@@ -75,7 +75,7 @@ def saturation(imu: Imu) -> Iterator[Finding]:
                     )
 
 
-def gyro_unit(recording: Recording) -> Iterator[Finding]:
+def check_gyro_unit(recording: Recording) -> Iterator[Finding]:
     """Turn rates that a sensor can read, but that its carrier does not reach."""
     x, y, z = np.abs(recording.imu.gyro).T
     rate = float(np.percentile(np.maximum(np.maximum(x, y), z), 99.0))
@@ -88,7 +88,7 @@ def gyro_unit(recording: Recording) -> Iterator[Finding]:
         )
 
 
-def force_at_rest(recording: Recording, rest: Array, facts: dict[str, Any]) -> Iterator[Finding]:
+def check_force_at_rest(recording: Recording, rest: Array, facts: dict[str, Any]) -> Iterator[Finding]:
     f = float(np.linalg.norm(recording.imu.accel[rest].mean(axis=0)))
     if recording.platform == "foot":  # every stance has another attitude
         f = float(np.linalg.norm(recording.imu.accel[rest], axis=1).mean())
@@ -108,7 +108,7 @@ def force_at_rest(recording: Recording, rest: Array, facts: dict[str, Any]) -> I
         )
 
 
-def noise_at_rest(imu: Imu, rest: Array) -> Iterator[Finding]:
+def check_noise_at_rest(imu: Imu, rest: Array) -> Iterator[Finding]:
     """Allan deviation at 1 s, which for white noise is its density (IEEE Std 952-1997, annex C)."""
     n = max(5, round(1.0 / period_of(imu.t)))
     for what, x, stated in (

@@ -17,34 +17,34 @@ from graphnav.core.rotation import Array
 from graphnav.recording import Recording
 from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.aiding import (
-    gnss_coverage,
-    gnss_jumps,
-    imu_axes,
-    mirrored,
+    check_gnss_coverage,
+    check_gnss_jumps,
+    check_gyro_sign,
+    check_imu_axes,
+    check_mirroring,
+    check_yaw_scale,
     odometer_findings,
     overlap_s,
-    reversed_sign,
-    yaw_scale,
 )
 from graphnav.recording.checks.clock import clock_of
 from graphnav.recording.checks.crosschecks import Track
 from graphnav.recording.checks.imu import (
-    force_at_rest,
+    check_force_at_rest,
+    check_gyro_unit,
+    check_imu_time,
+    check_noise_at_rest,
+    check_repeats,
+    check_saturation,
     gap_limit,
-    gyro_unit,
-    imu_time,
-    noise_at_rest,
-    repeats,
-    saturation,
 )
 from graphnav.recording.checks.raw import raw_facts, raw_findings
 from graphnav.recording.checks.series import series_facts, series_findings
 from graphnav.recording.checks.stated import (
-    fix_types,
-    lever_arms,
-    rounded_positions,
-    stated_noise,
-    too_fast_for_a_foot,
+    check_fix_types,
+    check_foot_speed,
+    check_lever_arms,
+    check_rounding,
+    check_stated_noise,
     truth_findings,
     velocities,
 )
@@ -141,28 +141,28 @@ def inspect(recording: Recording) -> Inspection:
     overlap = recording.gnss is not None and overlap_s(recording) > 0
     track = crosschecks.track(recording.gnss) if recording.gnss is not None else None
     rest = _at_rest(recording, track if overlap else None)
-    findings += imu_time(recording.imu)
-    findings += repeats(recording.imu)
-    findings += saturation(recording.imu)
+    findings += check_imu_time(recording.imu)
+    findings += check_repeats(recording.imu)
+    findings += check_saturation(recording.imu)
     if "imu.gyro_unit" not in known:
-        findings += gyro_unit(recording)
-    findings += stated_noise(recording.imu.noise)
-    findings += lever_arms(recording)
-    findings += too_fast_for_a_foot(recording, track)
+        findings += check_gyro_unit(recording)
+    findings += check_stated_noise(recording.imu.noise)
+    findings += check_lever_arms(recording)
+    findings += check_foot_speed(recording, track)
     if rest.any():
         facts["imu"]["still_s"] = float(rest.sum() * period_of(recording.imu.t))
-        findings += force_at_rest(recording, rest, facts["imu"])
+        findings += check_force_at_rest(recording, rest, facts["imu"])
         if vehicle:  # a person who stands still sways
-            findings += noise_at_rest(recording.imu, rest)
+            findings += check_noise_at_rest(recording.imu, rest)
     if recording.gnss is not None:
         facts["gnss"] = _gnss_facts(recording, track)
-        findings += gnss_coverage(recording)
-        findings += rounded_positions(recording.gnss)
-        findings += fix_types(recording.gnss)
+        findings += check_gnss_coverage(recording)
+        findings += check_rounding(recording.gnss)
+        findings += check_fix_types(recording.gnss)
         wrong = list(velocities(recording.gnss))
         if overlap or not wrong:
             # against wrong velocities, or on another clock, every position jumps
-            findings += wrong or (gnss_jumps(recording, track) if overlap else ())
+            findings += wrong or (check_gnss_jumps(recording, track) if overlap else ())
     if recording.raw_gnss is not None and len(recording.raw_gnss):
         facts["raw_gnss"] = raw_facts(recording.raw_gnss)
         findings += raw_findings(recording.raw_gnss)
@@ -172,13 +172,13 @@ def inspect(recording: Recording) -> Inspection:
         yaw = crosschecks.yaw_fit(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
-        if turns_back and (said := list(mirrored(recording))):
+        if turns_back and (said := list(check_mirroring(recording))):
             findings += said
         elif not turned:
-            findings += reversed_sign(recording.imu) if turns_back else imu_axes(recording.imu, forward, track)
-            findings += yaw_scale(yaw)
+            findings += check_gyro_sign(recording.imu) if turns_back else check_imu_axes(recording.imu, forward, track)
+            findings += check_yaw_scale(yaw)
     elif vehicle and not turned:
-        findings += imu_axes(recording.imu, None, None)
+        findings += check_imu_axes(recording.imu, None, None)
     if recording.odometer is not None:
         facts["odometer"] = _sensor_facts(recording.odometer.t)
         step, speed = np.diff(recording.odometer.t), np.abs(recording.odometer.speed)

@@ -29,7 +29,7 @@ _MENDED = 0.3  # of what is off is left by a change that mends it
 _FOOT = 0.3048  # m
 
 
-def stated_noise(noise: ImuNoise) -> Iterator[Finding]:
+def check_stated_noise(noise: ImuNoise) -> Iterator[Finding]:
     """Figures that were typed in a data sheet's unit."""
     for key, (limit, unit, meant) in _IMPOSSIBLE.items():
         value = float(getattr(noise, key))
@@ -41,7 +41,7 @@ def stated_noise(noise: ImuNoise) -> Iterator[Finding]:
             )
 
 
-def lever_arms(recording: Recording) -> Iterator[Finding]:
+def check_lever_arms(recording: Recording) -> Iterator[Finding]:
     """Lever arms in another unit than metres."""
     for name in ("gnss", "odometer"):
         sensor = getattr(recording, name)
@@ -53,7 +53,7 @@ def lever_arms(recording: Recording) -> Iterator[Finding]:
             )
 
 
-def too_fast_for_a_foot(recording: Recording, track: Track | None) -> Iterator[Finding]:
+def check_foot_speed(recording: Recording, track: Track | None) -> Iterator[Finding]:
     """A vehicle's log with a foot's platform."""
     if recording.platform == "foot" and track is not None:
         speed = float(np.percentile(track.speed, 95.0))
@@ -65,7 +65,7 @@ def too_fast_for_a_foot(recording: Recording, track: Track | None) -> Iterator[F
             )
 
 
-def rounded_positions(gnss: Gnss) -> Iterator[Finding]:
+def check_rounding(gnss: Gnss) -> Iterator[Finding]:
     """Positions with fewer digits than their sigma is worth."""
     degrees = np.degrees(gnss.llh[:, :2])
     if len(degrees) < 10 or not np.ptp(degrees, axis=0).all():
@@ -85,7 +85,7 @@ def rounded_positions(gnss: Gnss) -> Iterator[Finding]:
             return
 
 
-def fix_types(gnss: Gnss) -> Iterator[Finding]:
+def check_fix_types(gnss: Gnss) -> Iterator[Finding]:
     """Types in the numbers of GGA's quality, which differ."""
     if gnss.type is None or not gnss.type_assumed:
         return
@@ -121,7 +121,7 @@ def velocities(gnss: Gnss) -> Iterator[Finding]:
                 float(np.median(np.linalg.norm((x[m:] - x[:-m] - said)[moving, :2], axis=1))) for x in (p, q)
             )
             if mended < _MENDED * off:
-                yield exchanged_finding("the velocities")
+                yield describe_exchange("the velocities")
                 return
         yield from _horizontal(way[moving, :2], said[moving, :2])
     climb, meant = way[real, 2], said[real, 2]
@@ -150,7 +150,7 @@ def exchange_lat_lon(gnss: Gnss) -> Gnss | None:
     return replace(gnss, llh=llh) if np.nanmax(np.abs(llh[:, 0])) < 0.5 * np.pi else None
 
 
-def exchanged_finding(witness: str) -> Finding:
+def describe_exchange(witness: str) -> Finding:
     """That they are, by `witness`."""
     return Finding(
         "refused",

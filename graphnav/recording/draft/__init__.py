@@ -180,7 +180,9 @@ class _Writer:
         self._file(source, "gnss", dropped)
         if source.log is None:
             if "h" not in values:
-                raise RecordingError(f"{source.path}: no column of heights beside {source.columns.names['lat']}")
+                raise RecordingError(
+                    f"{source.path}: no column of heights beside {source.columns.names['lat']}", key="draft.no_heights"
+                )
             units = {"t": source.t_unit}
             if numbers is not None and numbers.value is not None:
                 units["type"] = numbers

@@ -72,10 +72,12 @@ def accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
     if size < 0.5 * _G or not lasting:
         raise RecordingError(
             f"{path}: the accelerations are {size:.3g} in size at the median and not lasting: they are without "
-            "gravity; log the raw accelerometer (on iOS 'TotalAcceleration')"
+            "gravity; log the raw accelerometer (on iOS 'TotalAcceleration')",
+            key="draft.no_gravity",
         )
     raise RecordingError(
-        f"{path}: the accelerations are {size:.3g} in size at the median, which is gravity in no unit: raw counts?"
+        f"{path}: the accelerations are {size:.3g} in size at the median, which is gravity in no unit: raw counts?",
+        key="draft.raw_counts",
     )
 
 

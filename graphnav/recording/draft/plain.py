@@ -65,7 +65,8 @@ def read_plain(path: Path) -> Plain | None:
         return None  # notes, not numbers
     if wrong is not None:
         raise RecordingError(
-            f"{path}, line {lines[wrong + 1][0]}: has {len(rows[wrong])} fields where the header has {len(header)}"
+            f"{path}, line {lines[wrong + 1][0]}: has {len(rows[wrong])} fields where the header has {len(header)}",
+            key="table.fields",
         )
     cells = {name: [row[k] for row in rows] for k, name in enumerate(header)}
     done = [f"fields apart by {'a semicolon' if mark == ';' else 'a tab'}"] if mark != "," else []

@@ -151,7 +151,8 @@ def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         there = ", ".join(sensors) or "nothing"
         unread = f" ({refused[0]})" if refused else ""
         raise RecordingError(
-            f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one{unread}"
+            f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one{unread}",
+            key="draft.no_imu",
         )
     parts = [s.path.name for name in ("gyro", "accel", "gravity") for s in every.get(name, ())]
     if "imu" in every and parts:
@@ -169,7 +170,9 @@ def _files(path: Path) -> list[Path]:
     inside = sorted(p for p in every if p.name not in made)
     logs = [p for p in inside if p.name.endswith((".csv", ".csv.gz")) or _is_known(p)]
     if not logs:
-        raise RecordingError(f"{path}: no log in this folder: no CSV file, and none of a kind that is known")
+        raise RecordingError(
+            f"{path}: no log in this folder: no CSV file, and none of a kind that is known", key="draft.no_log"
+        )
     return logs
 
 
@@ -195,7 +198,9 @@ def _choose(sensor: str, some: list[Source], left: list[str]) -> Source | None:
     if not some:
         return None
     if sensor == "imu" and len(some) > 1:
-        raise RecordingError(f"{some[1].path}: a second imu, after {some[0].path}; name only one of them")
+        raise RecordingError(
+            f"{some[1].path}: a second imu, after {some[0].path}; name only one of them", key="draft.two_imus"
+        )
     # what the system has not corrected yet comes second: it is the same, in other units on some phones
     best = min(some, key=lambda s: ("uncalibrated" in s.path.name.lower(), -len(s)))
     if sensor == "odometer":
@@ -231,7 +236,7 @@ def _join_imu(gyro: Source, accel: Source) -> Source:
     t, at = gyro.t, accel.t
     inside = (t >= at[0]) & (t <= at[-1])
     if inside.sum() < 2:
-        raise RecordingError(f"{gyro.path} and {accel.path}: do not overlap in time")
+        raise RecordingError(f"{gyro.path} and {accel.path}: do not overlap in time", key="draft.no_overlap")
     values = {"t": t[inside], **{f"g{x}": gyro.values[f"g{x}"][inside] for x in "xyz"}}
     values |= {f"a{x}": np.interp(t[inside], at, accel.values[f"a{x}"]) for x in "xyz"}
     units = {k: u for s in (gyro, accel) for k, u in s.columns.units.items() if k != "t"}
@@ -270,7 +275,7 @@ class _NoSensor(RecordingError):
 def _look(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     """The sensors of one file."""
     if not path.exists():
-        raise RecordingError(f"{path}: no such file")
+        raise RecordingError(f"{path}: no such file", key="file.missing")
     log = other_log(path, topics)
     if log is not None:
         return {s: Source(path, log=log) for s in ("imu", "gnss", "odometer") if getattr(log, s) is not None}
@@ -278,13 +283,14 @@ def _look(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     try:
         header = read_header(path) if plain is None else list(plain.columns)
     except RecordingError as error:
-        raise _NoSensor(str(error)) from error
+        raise _NoSensor(str(error), key=error.key) from error
     columns = matching.match(header, path.name.split(".")[0])
     sensor = columns.sensor
     if sensor is None:
         raise _NoSensor(
             f"{path}, line 1: no sensor is recognised in the columns {', '.join(header[:12])}; "
-            "rename them (t; gx gy gz ax ay az; lat lon h; speed)"
+            "rename them (t; gx gy gz ax ay az; lat lon h; speed)",
+            key="draft.no_columns",
         )
     if plain is None:
         columns = _with_clock(path, header, columns)
@@ -355,7 +361,9 @@ def _read(path: Path, columns: matching.Columns, role: str, plain: Plain | None)
     if role == "gnss":
         whole &= (table["lat"] != 0.0) | (table["lon"] != 0.0)  # as it will be read: no fix
     if whole.sum() < 2:
-        raise RecordingError(f"{path}: fewer than two rows hold all of {', '.join(names[n] for n in needed)}")
+        raise RecordingError(
+            f"{path}: fewer than two rows hold all of {', '.join(names[n] for n in needed)}", key="table.few_rows"
+        )
     values = {ours: table[ours][whole] for ours in names}
     order = np.argsort(values["t"], kind="stable")
     order = order[np.concatenate([[True], np.diff(values["t"][order]) > 0])]
@@ -368,7 +376,8 @@ def _read(path: Path, columns: matching.Columns, role: str, plain: Plain | None)
         k = int(np.argmax(step))
         raise RecordingError(
             f"{path}, {names['t']}: the stamps jump from {values['t'][k]:g} to {values['t'][k + 1]:g}, which no log "
-            "does; take out what lies beyond"
+            "does; take out what lies beyond",
+            key="table.time_jump",
         )
     if role == "odometer" and "speed" not in values:  # as it will be read
         rear = [w for w in WHEELS[2:] if w in values] or [w for w in WHEELS if w in values]

@@ -83,7 +83,7 @@ def write_parts(
         sentence = str(error)
         for path, part in parts.items():
             sentence = sentence.replace(str(part), str(path))
-        raise RecordingError(sentence) from None
+        raise RecordingError(sentence, key=error.key) from None
     finally:
         for part in parts.values():
             part.unlink(missing_ok=True)
@@ -99,10 +99,13 @@ def check_names(names: Sequence[str], gps_zero: float | None) -> None:
     """
     if "nmea" in names and gps_zero is None:
         raise RecordingError(
-            "--export nmea: needs the time of day, and what t counts from is not known; say clock in recording.toml"
+            "--export nmea: needs the time of day, and what t counts from is not known; say clock in recording.toml",
+            key="export.time_of_day",
         )
     if "parquet" in names and find_spec("pyarrow") is None:
-        raise RecordingError("--export parquet: needs pyarrow; pip install -e '.[parquet]' in the clone")
+        raise RecordingError(
+            "--export parquet: needs pyarrow; pip install -e '.[parquet]' in the clone", key="package.missing"
+        )
 
 
 def write_as(name: str, trajectory: Trajectory, path: Path, utc: Array | None = None) -> None:
@@ -130,4 +133,7 @@ def write_as(name: str, trajectory: Trajectory, path: Path, utc: Array | None = 
 def require_geodetic(trajectory: Trajectory, path: Path) -> None:
     """Refuse a trajectory whose place on Earth is not known."""
     if trajectory.frame != "geodetic":
-        raise RecordingError(f"{path}: a trajectory in a local frame has no latitude and longitude; write it as .tum")
+        raise RecordingError(
+            f"{path}: a trajectory in a local frame has no latitude and longitude; write it as .tum",
+            key="export.local_frame",
+        )

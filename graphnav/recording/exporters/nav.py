@@ -29,7 +29,8 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
             require_geodetic(block, path)
             if block.v is None or block.rph is None:
                 raise RecordingError(
-                    f"{path}: a .nav file needs velocity and attitude, and this trajectory lacks one of them"
+                    f"{path}: a .nav file needs velocity and attitude, and this trajectory lacks one of them",
+                    key="export.no_attitude",
                 )
             week, t = np.zeros(len(block)), block.t
             if utc is not None:

@@ -49,5 +49,7 @@ def _pyarrow(path: Path) -> tuple[Any, Any]:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise RecordingError(f"{path}: needs pyarrow; pip install -e '.[parquet]' in the clone") from None
+        raise RecordingError(
+            f"{path}: needs pyarrow; pip install -e '.[parquet]' in the clone", key="package.missing"
+        ) from None
     return pyarrow, pyarrow.parquet

@@ -27,7 +27,9 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
             nonlocal frame
             R_lb = block.R_lb
             if R_lb is None:
-                raise RecordingError(f"{path}: a TUM file needs an attitude and this trajectory has none")
+                raise RecordingError(
+                    f"{path}: a TUM file needs an attitude and this trajectory has none", key="export.no_attitude"
+                )
             if frame is None:
                 frame = LocalFrame(block.llh[0])
                 file.write(_head(block).encode())

@@ -81,7 +81,7 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
     """
     known = formats()
     if name is not None and name not in known:
-        raise RecordingError(f"--format {name}: no such format; {nearest(name, list(known))}")
+        raise RecordingError(f"--format {name}: no such format; {nearest(name, list(known))}", key="log.format_unknown")
     exists(Path(source))
     chosen = known[name] if name else next((f for f in known.values() if f.recognises(source)), None)
     if chosen is None:
@@ -101,7 +101,8 @@ def _choose(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:
     """The log with these topics."""
     if chosen.choose is None:
         raise RecordingError(
-            f"--topic {topics[0]}: {source} is no ROS bag; in a recording.toml say topic in the sensor's table"
+            f"--topic {topics[0]}: {source} is no ROS bag; in a recording.toml say topic in the sensor's table",
+            key="option.not_here",
         )
     return chosen.choose(source, topics)
 
@@ -113,15 +114,17 @@ def _unknown(source: str | Path, known: dict[str, Format]) -> RecordingError:
     if path.is_dir():
         there = sorted(p.name for p in path.glob("*.toml"))
         hint = f"; point at one of {', '.join(there)} in it" if there else ""
-        return RecordingError(f"{path}: the folder holds no recording.toml{hint}")
+        return RecordingError(f"{path}: the folder holds no recording.toml{hint}", key="recording.none")
     if path.exists():
         if path.suffix == ".csv" or path.name.endswith(".csv.gz"):
             return RecordingError(
-                f"{path}: not a recording; point at its folder or its .toml file (graphnav init drafts one)"
+                f"{path}: not a recording; point at its folder or its .toml file (graphnav init drafts one)",
+                key="recording.none",
             )
         others = ", ".join(name for name, f in known.items() if f.load is not None)
         return RecordingError(
             f"{path}: not a recording; point at its folder or its .toml file, or at a log of a kind that is known "
-            f"({others})"
+            f"({others})",
+            key="recording.none",
         )
-    return RecordingError(f"{path}: no such file or folder (built-in recordings: {builtin})")
+    return RecordingError(f"{path}: no such file or folder (built-in recordings: {builtin})", key="file.missing")

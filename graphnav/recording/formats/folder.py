@@ -34,7 +34,7 @@ from graphnav.recording.formats.repair import (
 )
 from graphnav.recording.formats.table import Table, read_table
 from graphnav.recording.formats.trajectories import read_trajectory
-from graphnav.sensors import Sensor, Series, registered
+from graphnav.sensors import Sensor, Series, list_sensors
 from graphnav.sensors.tables import ANGLE
 
 _RAW_FILES = ("rover", "nav", "sp3", "clk", "antex", "base")
@@ -56,7 +56,7 @@ def read_folder(source: str | Path) -> Recording:
     logs: dict[str, Log | None] = {}  # by file; one log may hold several sensors
     zeros: list[float] = []  # of their clocks
     topics: dict[str, tuple[str, ...]] = {}  # asked for of each file
-    known = registered()
+    known = list_sensors()
     for section in (d.imu, d.gnss, d.odometer, *(getattr(d, name) for name in known)):
         if section is not None:
             topics[section.file] = (*topics.get(section.file, ()), *section.topic)
@@ -87,16 +87,20 @@ def read_folder(source: str | Path) -> Recording:
             logs[section.file] = other_log(beside(path, section.file, f"{name}.file"), topics.get(section.file, ()))
         log = logs[section.file]
         if section.topic and not (log and log.topics):
-            raise RecordingError(f"{path}: '{name}.topic' is only for ROS bags, and {section.file} is none")
+            raise RecordingError(
+                f"{path}: '{name}.topic' is only for ROS bags, and {section.file} is none", key="key.not_here"
+            )
         if log is None:
             return of_table(section, table(name), remarks)
         files.extend(file for file in log.files if file not in files)
         held = log.sensors.get(name) if name in known else getattr(log, name)
         if held is None:
-            raise RecordingError(f"{path}: '{name}.file': {section.file} holds no {name}")
+            raise RecordingError(f"{path}: '{name}.file': {section.file} holds no {name}", key="log.no_sensor")
         for key in ("columns", "units", "keep"):
             if key in section.model_fields_set:
-                raise RecordingError(f"{path}: '{name}.{key}' is only for CSV files, and {section.file} is none")
+                raise RecordingError(
+                    f"{path}: '{name}.{key}' is only for CSV files, and {section.file} is none", key="key.not_here"
+                )
         remarks.extend(r for r in log.remarks if r not in remarks)
         if log.gps_zero is not None:
             zeros.append(log.gps_zero - section.time_offset)
@@ -172,7 +176,10 @@ def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     vague = (sd > VAGUEST).any(axis=1)
     if vague.any():
         if vague.all():
-            raise RecordingError(f"{rows.path}: every fix has a sigma of more than {VAGUEST:g} m and says nothing")
+            raise RecordingError(
+                f"{rows.path}: every fix has a sigma of more than {VAGUEST:g} m and says nothing",
+                key="gnss.sigma_all_vague",
+            )
         remarks.add(
             "gnss.sigma_vague", f"{vague.sum()} of {len(rows)} fixes have a sigma of more than {VAGUEST:g} m: left out"
         )
@@ -218,7 +225,8 @@ def _raw_gnss(
     """The raw observations of [raw_gnss], and the single-point fixes that they make."""
     if zero is None:
         raise RecordingError(
-            f"{path}: 'clock': [raw_gnss] needs to know what t = 0 is: say clock = \"gps week 2130\" or a UTC date"
+            f"{path}: 'clock': [raw_gnss] needs to know what t = 0 is: say clock = \"gps week 2130\" or a UTC date",
+            key="clock.unknown",
         )
     from graphnav.gnss import columns
     from graphnav.gnss.load import Sources, load_raw
@@ -236,11 +244,13 @@ def _raw_gnss(
     given = None
     if sources.rover[0].name.endswith((".csv", ".csv.gz")):
         if len(sources.rover) > 1:
-            raise RecordingError(f"{path}: 'raw_gnss.rover': one CSV file, not {len(sources.rover)}")
+            raise RecordingError(f"{path}: 'raw_gnss.rover': one CSV file, not {len(sources.rover)}", key="key.value")
         rows = read_table(sources.rover[0], columns.REQUIRED, columns.OPTIONAL, d.columns)
         given = columns.observations(rows.columns, zero, sources.rover[0].name)
     elif d.columns:
-        raise RecordingError(f"{path}: 'raw_gnss.columns' is only for a CSV file, and {d.rover[0]} is none")
+        raise RecordingError(
+            f"{path}: 'raw_gnss.columns' is only for a CSV file, and {d.rover[0]} is none", key="key.not_here"
+        )
     raw, found, said = load_raw(sources, zero - d.time_offset, given)
     remarks.extend(said)
     good = np.isfinite(found.p[:, 0])
@@ -263,7 +273,9 @@ def _odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odomete
         wheels = np.stack([rows.get(name, np.full(len(t), np.nan)) for name in schema.WHEELS], -1) * scale
     if d.metres_per_pulse is not None:
         if len(t) < 2:
-            raise RecordingError(f"{rows.path}: {len(t)} usable row; pulses need at least 2 to make a speed")
+            raise RecordingError(
+                f"{rows.path}: {len(t)} usable row; pulses need at least 2 to make a speed", key="table.few_rows"
+            )
         way = d.metres_per_pulse * count_pulses(rows["pulses"], d.pulses, d.signed, remarks)
         # over both neighbouring periods, so that it is the speed at t and not half a period before
         ahead, behind = np.minimum(np.arange(len(t)) + 1, len(t) - 1), np.maximum(np.arange(len(t)) - 1, 0)
@@ -298,7 +310,9 @@ def _list_needed(sensor: Sensor, rows: Table) -> tuple[str, ...]:
             # of several sets a row may have any, which `Sensor.usable` looks at
             return some if len([s for s in sensor.needs if all(name in rows for name in s)]) == 1 else ()
     sets = " or ".join(" and ".join(some) for some in sensor.needs)
-    raise RecordingError(f'{rows.path}: no column {sets}; if it has another name, say columns = {{ name = "..." }}')
+    raise RecordingError(
+        f'{rows.path}: no column {sets}; if it has another name, say columns = {{ name = "..." }}', key="table.column"
+    )
 
 
 def _series(sensor: Sensor, d: Any, rows: Table, remarks: Remarks) -> Series:
@@ -316,7 +330,7 @@ def _truth_of_log(d: schema.TruthTable, file: Path, remarks: Remarks) -> Truth:
     """The truth from a trajectory file of another program."""
     for key in ("columns", "units", "keep"):
         if key in d.model_fields_set:
-            raise RecordingError(f"{file}: 'truth.{key}' is only for CSV files")
+            raise RecordingError(f"{file}: 'truth.{key}' is only for CSV files", key="key.not_here")
     track = read_trajectory(file)
     remarks.extend(track.notes)
     local = track.frame == "local"

@@ -166,7 +166,8 @@ def _pair(path: Path) -> tuple[Path | None, Path | None]:
         if kind is None:
             raise RecordingError(
                 f"{path}: neither an IMU text (seconds of week, three angle and three velocity increments) nor a GNSS "
-                "text (seconds of week, lat, lon, height, three sigmas) of KF-GINS"
+                "text (seconds of week, lat, lon, height, three sigmas) of KF-GINS",
+                key="file.kind",
             )
         return (path, None) if kind == "imu" else (None, path)
     kinds = {p: _kind(p) for p in _data_files(path)}
@@ -175,10 +176,15 @@ def _pair(path: Path) -> tuple[Path | None, Path | None]:
         found = [p for p, kind in kinds.items() if kind == wanted]
         if len(found) > 1:
             names = ", ".join(p.name for p in found)
-            raise RecordingError(f"{path}: {len(found)} {wanted} files ({names}); name one, or the .yaml file")
+            raise RecordingError(
+                f"{path}: {len(found)} {wanted} files ({names}); name one, or the .yaml file", key="log.several_files"
+            )
         out.append(found[0] if found else None)
     if out[0] is None and out[1] is None:
-        raise RecordingError(f"{path}: no KF-GINS configuration (.yaml with imupath or imufile) and no data file in it")
+        raise RecordingError(
+            f"{path}: no KF-GINS configuration (.yaml with imupath or imufile) and no data file in it",
+            key="log.no_configuration",
+        )
     return out[0], out[1]
 
 
@@ -198,7 +204,9 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
     if path.suffix.lower() == ".bin":
         data = read_bytes(path, text=False)
         if len(data) % 56:
-            raise RecordingError(f"{path}: {len(data)} bytes are not a whole number of rows of seven doubles")
+            raise RecordingError(
+                f"{path}: {len(data)} bytes are not a whole number of rows of seven doubles", key="file.size"
+            )
         table = np.frombuffer(data, "<f8").reshape(-1, 7)
         at = [f"row {k + 1}" for k in (0, 1)]
     else:
@@ -206,10 +214,12 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
             (n, line) for n, line in enumerate(text_lines(path), 1) if line.strip() and line.lstrip()[0] not in "#%"
         ]
         if len(rows) < 2:
-            raise RecordingError(f"{path}: {len(rows)} rows; an IMU file needs at least 2")
+            raise RecordingError(f"{path}: {len(rows)} rows; an IMU file needs at least 2", key="table.few_rows")
         width = len(rows[0][1].split())
         if width < 7:
-            raise RecordingError(f"{path}, line {rows[0][0]}: {width} columns where an IMU file has 7 or 8")
+            raise RecordingError(
+                f"{path}, line {rows[0][0]}: {width} columns where an IMU file has 7 or 8", key="table.fields"
+            )
         names = ["t", "dtheta_x", "dtheta_y", "dtheta_z", "dvel_x", "dvel_y", "dvel_z", "odometer", *["other"] * width]
         table = number_table(path, rows, names[:width], None)
         at = [f"line {n}" for n, _ in rows]
@@ -218,10 +228,13 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
     if (step <= 0).any():
         k = int(np.flatnonzero(step <= 0)[0]) + 1
         where = at[k] if k < len(at) else f"row {k + 1}"
-        raise RecordingError(f"{path}, {where}, t: {t[k]:.6f} does not come after {t[k - 1]:.6f}; sort the rows")
+        raise RecordingError(
+            f"{path}, {where}, t: {t[k]:.6f} does not come after {t[k - 1]:.6f}; sort the rows", key="table.time_order"
+        )
     if np.abs(table[:, 1:4]).max() > 2.0 or not np.isfinite(table[:, :7]).all():
         raise RecordingError(
-            f"{path}: increments of more than 2 rad a sample; are these rates, or not increments at all?"
+            f"{path}: increments of more than 2 rad a sample; are these rates, or not increments at all?",
+            key="imu.increments_large",
         )
     period = float(np.median(step))
     gap = step > _GAP * period
@@ -244,23 +257,27 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
 def _read_gnss(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
     rows = [(n, line) for n, line in enumerate(text_lines(path), 1) if line.strip() and line.lstrip()[0] not in "#%"]
     if not rows:
-        raise RecordingError(f"{path}: no rows in it")
+        raise RecordingError(f"{path}: no rows in it", key="file.no_rows")
     width = len(rows[0][1].split())
     names = ["t", "lat", "lon", "h", "sd_n", "sd_e", "sd_u"]
     if width == 13:
         names = ["t", "lat", "lon", "h", "vn", "ve", "vd", "sd_n", "sd_e", "sd_u", "sd_vn", "sd_ve", "sd_vd"]
     elif width != 7:
-        raise RecordingError(f"{path}, line {rows[0][0]}: {width} columns where a GNSS file has 7 (or 13)")
+        raise RecordingError(
+            f"{path}, line {rows[0][0]}: {width} columns where a GNSS file has 7 (or 13)", key="table.fields"
+        )
     table = dict(zip(names, number_table(path, rows, names, None).T, strict=True))
     for k in np.flatnonzero(~np.isfinite(table["t"]))[:1]:
-        raise RecordingError(f"{path}, line {rows[k][0]}, t: must be a finite number")
+        raise RecordingError(f"{path}, line {rows[k][0]}, t: must be a finite number", key="table.cell")
     beyond = np.flatnonzero(~on_earth(np.radians(table["lat"]), np.radians(table["lon"]), table["h"]))
     if len(beyond):
-        raise RecordingError(f"{path}, line {rows[beyond[0]][0]}: lat and lon must be degrees, h a height in m")
+        raise RecordingError(
+            f"{path}, line {rows[beyond[0]][0]}: lat and lon must be degrees, h a height in m", key="table.place"
+        )
     sd = np.stack([table["sd_e"], table["sd_n"], table["sd_u"]], -1)
     bad = np.flatnonzero((sd <= 0).any(-1))
     if len(bad):
-        raise RecordingError(f"{path}, line {rows[bad[0]][0]}: a sigma must be above zero")
+        raise RecordingError(f"{path}, line {rows[bad[0]][0]}: a sigma must be above zero", key="table.sigma")
     order = np.argsort(table["t"], kind="stable")
     keep = order[np.concatenate([[True], np.diff(table["t"][order]) > 0])]
     if len(keep) < len(order) or (np.diff(order) < 0).any():
@@ -292,11 +309,11 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark is not None else ""
         why = " ".join(str(getattr(error, "problem", None) or error).split())
-        raise RecordingError(f"{path}{line}: not valid YAML ({why})") from None
+        raise RecordingError(f"{path}{line}: not valid YAML ({why})", key="yaml.syntax") from None
     except ValueError as error:  # a date that is none, a number of thousands of digits
-        raise RecordingError(f"{path}: not valid YAML ({error})") from None
+        raise RecordingError(f"{path}: not valid YAML ({error})", key="yaml.syntax") from None
     if not isinstance(values, dict):
-        raise RecordingError(f"{path}: not a configuration of KF-GINS or OB_GINS")
+        raise RecordingError(f"{path}: not a configuration of KF-GINS or OB_GINS", key="log.no_configuration")
     return values
 
 
@@ -310,9 +327,13 @@ def _check_tokens(path: Path, yaml: Any, text: str) -> None:
         depth += isinstance(token, opening) - isinstance(token, closing)
         if isinstance(token, yaml.AliasToken):
             line = token.start_mark.line + 1
-            raise RecordingError(f"{path}, line {line}: aliases (*name) are not read; write the values out")
+            raise RecordingError(
+                f"{path}, line {line}: aliases (*name) are not read; write the values out", key="yaml.aliases"
+            )
         if depth > _DEEPEST:
-            raise RecordingError(f"{path}, line {token.start_mark.line + 1}: not valid YAML (nested too deep)")
+            raise RecordingError(
+                f"{path}, line {token.start_mark.line + 1}: not valid YAML (nested too deep)", key="yaml.syntax"
+            )
 
 
 def _find_file(config_file: Path, config: dict[str, Any], keys: tuple[str, ...]) -> Path | None:
@@ -321,7 +342,7 @@ def _find_file(config_file: Path, config: dict[str, Any], keys: tuple[str, ...])
     if key is None:
         return None
     if not isinstance(config[key], str):
-        raise RecordingError(f"{config_file}, {key}: must be the name of a file")
+        raise RecordingError(f"{config_file}, {key}: must be the name of a file", key="yaml.value")
     stated = Path(config[key].replace("\\", "/"))
     folder = config_file.resolve().parent
     for candidate in [
@@ -333,7 +354,8 @@ def _find_file(config_file: Path, config: dict[str, Any], keys: tuple[str, ...])
             return candidate
     raise RecordingError(
         f"{config_file}, {key}: no file {str(stated)[:200]} beside the configuration or below it; elsewhere none is "
-        "read without --allow-outside"
+        "read without --allow-outside",
+        key="file.missing",
     )
 
 
@@ -342,7 +364,8 @@ def _frd(where: Path, config: dict[str, Any], key: str) -> Array:
     value = config.get(key, [0.0, 0.0, 0.0])
     if not (isinstance(value, list) and len(value) == 3 and all(_is_number(x) and abs(x) <= _FARTHEST for x in value)):
         raise RecordingError(
-            f"{where}, {key}: must be three numbers, forward, right, down in m, of {_FARTHEST:g} m at most"
+            f"{where}, {key}: must be three numbers, forward, right, down in m, of {_FARTHEST:g} m at most",
+            key="yaml.value",
         )
     return rotation_from_letters("FRD") @ np.array(value, dtype=float)
 
@@ -355,7 +378,7 @@ def _is_number(value: Any) -> bool:
 def _noise(where: Path, config: dict[str, Any], remarks: Remarks) -> ImuNoise:
     section = config.get("imunoise", config.get("imumodel"))
     if not isinstance(section, dict):
-        raise RecordingError(f"{where}: no table imunoise (KF-GINS) or imumodel (OB_GINS)")
+        raise RecordingError(f"{where}: no table imunoise (KF-GINS) or imumodel (OB_GINS)", key="yaml.table")
 
     def figure(key: str, table: dict[str, Any] = section) -> float:
         value = table.get(key)
@@ -364,7 +387,8 @@ def _noise(where: Path, config: dict[str, Any], remarks: Remarks) -> ImuNoise:
         if len(numbers) not in (1, 3) or len(numbers) < len(stated):
             raise RecordingError(
                 f"{where}, {key}: must be a number above zero, or three, not {repr(value)[:60]} "
-                f"(from {_LEAST:g} to {_MOST:g})"
+                f"(from {_LEAST:g} to {_MOST:g})",
+                key="yaml.value",
             )
         if len(set(numbers)) > 1:
             remarks.add("imu.noise_axes", f"{key} differs between the axes; the root mean square is used for all")

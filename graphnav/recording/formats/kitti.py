@@ -47,7 +47,9 @@ def data_folder() -> Path:
     """
     spec = importlib.util.find_spec("gtsam")
     if spec is None or not spec.submodule_search_locations:
-        raise RecordingError("kitti: the gtsam package, which carries this drive, is not installed")
+        raise RecordingError(
+            "kitti: the gtsam package, which carries this drive, is not installed", key="package.missing"
+        )
     return Path(spec.submodule_search_locations[0]) / "Data"
 
 
@@ -66,7 +68,7 @@ def read_kitti(source: str | Path = "kitti") -> Recording:
         try:
             tables.append(np.loadtxt(file, skiprows=1, delimiter=delimiter))
         except (OSError, ValueError) as error:
-            raise RecordingError(f"kitti: {file} cannot be read ({error})") from None
+            raise RecordingError(f"kitti: {file} cannot be read ({error})", key="file.unreadable") from None
     imu, gps = tables
     # 1.92 s without samples follow row 0 (whose own dt is its time stamp), so the drive starts at row 1.
     imu = imu[1:]

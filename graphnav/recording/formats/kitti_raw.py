@@ -43,18 +43,22 @@ def load(path: Path) -> Log:
     """
     folder = _oxts(path)
     if folder is None:
-        raise RecordingError(f"{path}: no KITTI folder 'oxts' with timestamps.txt and data in it")
+        raise RecordingError(f"{path}: no KITTI folder 'oxts' with timestamps.txt and data in it", key="log.no_folder")
     remarks = Remarks()
     samples = sorted((folder / "data").glob("*.txt"))
     check_inside([folder / "timestamps.txt", *samples], path)
     t, zero = _times(folder / "timestamps.txt")
     if len(samples) != len(t):
-        raise RecordingError(f"{folder}: {len(t)} time stamps but {len(samples)} files in data")
+        raise RecordingError(
+            f"{folder}: {len(t)} time stamps but {len(samples)} files in data", key="log.files_missing"
+        )
     rows = np.array([_row(file) for file in samples])
     for k in np.flatnonzero(~np.isfinite(rows).all(axis=1))[:1]:
-        raise RecordingError(f"{samples[k]}, line 1: a number that is not finite")
+        raise RecordingError(f"{samples[k]}, line 1: a number that is not finite", key="table.not_finite")
     for k in np.flatnonzero(~on_earth(np.radians(rows[:, 0]), np.radians(rows[:, 1]), rows[:, 2]))[:1]:
-        raise RecordingError(f"{samples[k]}, line 1: lat, lon, alt of {rows[k, :3]} are nowhere on Earth")
+        raise RecordingError(
+            f"{samples[k]}, line 1: lat, lon, alt of {rows[k, :3]} are nowhere on Earth", key="table.place"
+        )
     order = np.argsort(t, kind="stable")
     if (np.diff(order) < 0).any():
         remarks.add("log.rows_unordered", f"{(np.diff(t) < 0).sum()} samples out of order were sorted by time")
@@ -70,7 +74,9 @@ def load(path: Path) -> Log:
     _, fixes = np.unique(np.floor((t - t[0]) / _FIX_PERIOD + 1e-6), return_index=True)
     sd, sd_v = (np.repeat(rows[fixes, k, None], 3, 1) for k in (23, 24))
     if not ((sd > 0).all() and (sd_v > 0).all()):
-        raise RecordingError(f"{samples[order[0]]}: accuracies (numbers 24 and 25) must be above zero")
+        raise RecordingError(
+            f"{samples[order[0]]}: accuracies (numbers 24 and 25) must be above zero", key="table.sigma"
+        )
     remarks.add(
         "imu.read_as",
         "IMU: ax ay az and wx wy wz, forward-left-up, m/s2 with gravity and rad/s; noise figures are not stated",
@@ -106,9 +112,11 @@ def _times(path: Path) -> tuple[Array, str]:
             try:
                 stamps.append(np.datetime64(line.strip().replace(" ", "T"), "ns"))
             except ValueError:
-                raise RecordingError(f"{path}, line {number}: '{line.strip()[:40]}' is not a date and time") from None
+                raise RecordingError(
+                    f"{path}, line {number}: '{line.strip()[:40]}' is not a date and time", key="table.date"
+                ) from None
     if len(stamps) < 2:
-        raise RecordingError(f"{path}: {len(stamps)} time stamps; a drive needs at least 2")
+        raise RecordingError(f"{path}: {len(stamps)} time stamps; a drive needs at least 2", key="table.few_rows")
     day = stamps[0].astype("datetime64[D]")
     return (np.array(stamps) - day) / np.timedelta64(1, "ns") * 1e-9, str(day)
 
@@ -119,9 +127,11 @@ def _row(path: Path) -> list[float]:
         values = [parse_number(x) for x in text.split()]
     except ValueError:
         bad = next(x for x in text.split() if not _number(x))
-        raise RecordingError(f"{path}, line 1: '{bad[:40]}' is not a number") from None
+        raise RecordingError(f"{path}, line 1: '{bad[:40]}' is not a number", key="table.cell") from None
     if len(values) != _COLUMNS:
-        raise RecordingError(f"{path}, line 1: {len(values)} numbers where {_COLUMNS} were expected")
+        raise RecordingError(
+            f"{path}, line 1: {len(values)} numbers where {_COLUMNS} were expected", key="table.fields"
+        )
     return values
 
 

@@ -70,7 +70,7 @@ def load(path: Path) -> Log:
     fixes = [e for e in epochs if e.gga is not None and e.gga.quality not in (0, 6, 7, 8) and e.gga.lat != ""]
     if not fixes:
         at = f", line {broken[0]}: not a sound sentence (checksum or form), and" if broken else ":"
-        raise RecordingError(f"{path}{at} no GGA sentence with a position is in it")
+        raise RecordingError(f"{path}{at} no GGA sentence with a position is in it", key="log.no_positions")
     simulated = sum(e.gga is not None and e.gga.quality in (6, 7, 8) for e in epochs)
     if simulated:
         remarks.add(

@@ -46,7 +46,8 @@ class Log:
             held = [name for name in ("gnss", "odometer", "truth") if getattr(self, name) is not None]
             raise RecordingError(
                 f"{source}: holds no IMU, only {' and '.join(held)}; 'graphnav init IMU-LOG {Path(source).name}' "
-                "drafts a recording.toml that joins both"
+                "drafts a recording.toml that joins both",
+                key="log.no_imu",
             )
         return Recording(
             self.name, self.platform, self.imu, self.gnss, self.odometer, self.truth,
@@ -88,7 +89,7 @@ def log_format(
     def load_log(source: str | Path, topics: Sequence[str] = ()) -> Log:
         path = Path(source)
         if not exists(path):
-            raise RecordingError(f"{path}: no such file or folder")
+            raise RecordingError(f"{path}: no such file or folder", key="file.missing")
         if not path.is_dir():
             check_regular(path)
         from graphnav.recording.formats.soundness import sound  # which imports this module

@@ -66,16 +66,20 @@ def usable_rows(
             rows = rows.with_column(name, np.where(np.isinf(rows[name]), np.nan, rows[name]))
         elif len(bad):
             what = "no time" if name == "t" else "infinite"
-            raise RecordingError(f"{rows.where(bad[0], name)}: the value is {what}")
+            raise RecordingError(f"{rows.where(bad[0], name)}: the value is {what}", key="table.not_finite")
     if keep is not None:
         rows = rows.take(rows[Table.KEEP] >= keep.at_least)
         if not len(rows):
-            raise RecordingError(f"{rows.path}: no row has {keep.column} of at least {keep.at_least:g} (keep)")
+            raise RecordingError(
+                f"{rows.path}: no row has {keep.column} of at least {keep.at_least:g} (keep)", key="table.keep"
+            )
     rows = rows.with_column("t", rows["t"] * TIME[unit] + offset)
 
     blank = np.isnan(np.stack([rows[name] for name in needed])).any(0)
     if blank.all():
-        raise RecordingError(f"{rows.path}: no row holds all of {', '.join(needed)} (all blank or NaN)")
+        raise RecordingError(
+            f"{rows.path}: no row holds all of {', '.join(needed)} (all blank or NaN)", key="table.all_blank"
+        )
     if blank.any():
         first = np.flatnonzero(blank)[0]
         at = f" (first at t = {rows['t'][first]:.3f} s)" if np.isfinite(rows["t"][first]) else ""
@@ -99,7 +103,8 @@ def usable_rows(
     if repeated.mean() > 0.6 and (~repeated).sum() > 1:
         raise RecordingError(
             f"{rows.path}: {repeated.sum()} of {len(rows)} rows have the time of the row before: the fraction of the "
-            "seconds was lost; log t with milliseconds"
+            "seconds was lost; log t with milliseconds",
+            key="table.times_repeated",
         )
     if repeated.any():
         remarks.add(
@@ -148,7 +153,8 @@ def _check_passes(rows: Table, label: str) -> None:
             leap = " (GPS time and UTC are 18 s apart)" if abs(jump - 18.0) < 0.5 else ""
             raise RecordingError(
                 f"{rows.path}: the clock of the {label} is set back by {jump:.2f} s after t = {t[k]:.3f} s{leap}: what "
-                "lies between is there twice; write all stamps on one clock"
+                "lies between is there twice; write all stamps on one clock",
+                key="table.clock_back",
             )
 
 
@@ -159,7 +165,9 @@ def _rows(mask: Mask, label: str) -> str:
 
 def _check_imu_time(rows: Table, unit: str) -> None:
     if len(rows) < 2:
-        raise RecordingError(f"{rows.path}: {len(rows)} usable row; an IMU recording needs at least 2")
+        raise RecordingError(
+            f"{rows.path}: {len(rows)} usable row; an IMU recording needs at least 2", key="table.few_rows"
+        )
     step = float(np.median(np.diff(rows["t"])))
     if 1e-5 < step < 0.5:
         return
@@ -167,7 +175,9 @@ def _check_imu_time(rows: Table, unit: str) -> None:
     hint = f'; if t is in {fitting[0]}, say units = {{ t = "{fitting[0]}" }}' if fitting else ""
     if step == 1.0:
         hint += "; if it counts rows, write times instead"
-    raise RecordingError(f"{rows.path}: IMU rows are {step:g} s apart, which no usable IMU is{hint}")
+    raise RecordingError(
+        f"{rows.path}: IMU rows are {step:g} s apart, which no usable IMU is{hint}", key="imu.time_unit"
+    )
 
 
 def on_earth(lat: Array, lon: Array, h: Array) -> Mask:
@@ -199,25 +209,28 @@ def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tup
     if unit is None and np.abs(lat).max() < _RADIANS[0] and np.abs(lon).max() < _RADIANS[1]:
         raise RecordingError(
             f"{rows.path}: lat and lon look like radians (first {lat[0]:g}, {lon[0]:g}); say "
-            'units = { angle = "rad" } if they are, { angle = "deg" } if the drive really is there'
+            'units = { angle = "rad" } if they are, { angle = "deg" } if the drive really is there',
+            key="table.radians",
         )
     beyond = np.flatnonzero(np.abs(lat) * scale > np.pi / 2)
     if len(beyond):
         k = beyond[0]
         swapped = np.abs(lon * scale).max() <= np.pi / 2
         hint = "; are lat and lon swapped?" if swapped else _other_form(lat, lon, label)
-        raise RecordingError(f"{rows.where(k, 'lat')}: {lat[k]:g} is not a latitude{hint}")
+        raise RecordingError(f"{rows.where(k, 'lat')}: {lat[k]:g} is not a latitude{hint}", key="table.place")
     beyond = np.flatnonzero((lon * scale < -np.pi - 1e-9) | (lon * scale > 2 * np.pi))
     if len(beyond):
         hint = _other_form(lat, lon, label)
-        raise RecordingError(f"{rows.where(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude{hint}")
+        raise RecordingError(
+            f"{rows.where(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude{hint}", key="table.place"
+        )
     beyond = np.flatnonzero((h < _LOWEST) | (h > _SKY))
     if not len(beyond) and np.median(h) > _HIGHEST:
         beyond = np.flatnonzero(h > _HIGHEST)
     if len(beyond):
         k = beyond[0]
         hint = "; is it in millimetres?" if abs(h[k]) > _HIGHEST else ""
-        raise RecordingError(f"{rows.where(k, 'h')}: {h[k]:g} m is not the height of a drive{hint}")
+        raise RecordingError(f"{rows.where(k, 'h')}: {h[k]:g} m is not the height of a drive{hint}", key="table.height")
     lon = np.where(lon * scale > np.pi, lon * scale - 2 * np.pi, lon * scale)
     return np.stack([lat * scale, lon, h], -1), rows
 
@@ -265,7 +278,9 @@ def sigmas(
         floor = _floor(sd[used & (sd[:, k] > 0), k])
         bad = np.flatnonzero(used & ((sd[:, k] < 0) | ((sd[:, k] < _SUREST) & ~zero) | (zero & (floor is None))))
         if len(bad):
-            raise RecordingError(f"{rows.where(bad[0], name)}: a 1-sigma must be above zero, not {sd[bad[0], k]:g}")
+            raise RecordingError(
+                f"{rows.where(bad[0], name)}: a 1-sigma must be above zero, not {sd[bad[0], k]:g}", key="table.sigma"
+            )
         if zero.any():
             sd[zero, k] = floor
             remarks.add(
@@ -310,7 +325,9 @@ def fixes_by_type(rows: Table, numbers: str) -> NDArray[np.intp] | None:
         there = ", ".join(f"{k} {FIX_TYPES[ours]}" for k, ours in known.items() if ours)
         hint = "" if numbers == "nmea" else '; if they are GGA\'s, say units = { type = "nmea" }'
         where = rows.where(bad[0], "type")
-        raise RecordingError(f"{where}: {said[bad[0]]:g} is no type of fix: {there}, blank where unknown{hint}")
+        raise RecordingError(
+            f"{where}: {said[bad[0]]:g} is no type of fix: {there}, blank where unknown{hint}", key="gnss.type"
+        )
     return fix_types(said, known)
 
 

@@ -60,10 +60,15 @@ def load(path: Path, wanted: Sequence[str] = ()) -> Log:
     topics, others = _read(path)
     if not topics:
         kinds = ", ".join(sorted(others)[:6]) or "nothing"
-        raise RecordingError(f"{path}: no Imu, NavSatFix, TwistStamped or Odometry messages in it (there are: {kinds})")
+        raise RecordingError(
+            f"{path}: no Imu, NavSatFix, TwistStamped or Odometry messages in it (there are: {kinds})",
+            key="log.no_messages",
+        )
     for name in wanted:
         if name not in (known := [t.name for t in topics]):
-            raise RecordingError(f"{path}: no topic '{name}' that can be used; {nearest(name, known)}")
+            raise RecordingError(
+                f"{path}: no topic '{name}' that can be used; {nearest(name, known)}", key="log.topic_unknown"
+            )
     chosen: dict[str, _Topic] = {}
     ranked: dict[str, list[_Topic]] = {}
     for role, types in _ROLES.items():
@@ -116,7 +121,9 @@ def _read(path: Path) -> tuple[list[_Topic], set[str]]:
                 topic.t.append(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
                 topic.rows.append(_row(message, connection.msgtype))
     except Exception as error:  # a broken bag fails in whatever library reads its storage
-        raise RecordingError(f"{path}: cannot be read as a ROS bag ({' '.join(str(error).split())[:200]})") from None
+        raise RecordingError(
+            f"{path}: cannot be read as a ROS bag ({' '.join(str(error).split())[:200]})", key="file.damaged"
+        ) from None
     return [t for t in topics.values() if t.rows], others
 
 

@@ -54,7 +54,10 @@ def load(path: Path) -> Log:
         )
     sd = track.sd_p
     if sd is None:
-        raise RecordingError(f"{path}: no sigma columns (sdn, sde, sdu); write it again with out-outsolstd or as llh")
+        raise RecordingError(
+            f"{path}: no sigma columns (sdn, sde, sdu); write it again with out-outsolstd or as llh",
+            key="rtklib.no_sigmas",
+        )
     good = np.flatnonzero((sd > 0).all(-1))
     if len(good) < len(t):
         remarks.add("gnss.rows_left_out", f"{len(t) - len(good)} fixes without a sigma above zero left out")
@@ -82,7 +85,7 @@ def _week_of(path: Path, fields: list[str]) -> float:
             return float(WEEK * (day.astype(int) // 7))
         return WEEK * int(fields[0].split(",")[0])
     except ValueError:
-        raise RecordingError(f"{path}: the first row has neither a date nor a GPS week") from None
+        raise RecordingError(f"{path}: the first row has neither a date nor a GPS week", key="rtklib.no_date") from None
 
 
 FORMAT = log_format("rtklib", "positions computed by RTKLIB, .pos", recognises, load)

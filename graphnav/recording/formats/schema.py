@@ -26,7 +26,7 @@ from graphnav.core.timescales import parse_clock
 from graphnav.recording import ImuNoise
 from graphnav.recording.formats.figures import parse_figure
 from graphnav.recording.formats.imu_models import MODELS, find_model
-from graphnav.sensors import registered
+from graphnav.sensors import list_sensors
 from graphnav.sensors.tables import (
     NotNegative,
     Number,
@@ -332,7 +332,7 @@ def rotation_from_vectors(forward: Sequence[float], up: Sequence[float]) -> Arra
 
 def recording_file() -> type[RecordingFile]:
     """The whole of recording.toml, with the tables of all sensors that are known."""
-    tables: dict[str, Any] = {name: (sensor.table | None, None) for name, sensor in registered().items()}
+    tables: dict[str, Any] = {name: (sensor.table | None, None) for name, sensor in list_sensors().items()}
     return create_model("RecordingFile", __base__=RecordingFile, **tables)
 
 
@@ -355,5 +355,5 @@ def read_description(path: Path) -> RecordingFile:
     except ValueError as error:
         axes = description.imu.axes
         where = "'imu': " if axes is None else f"'imu.axes' = '{axes}' "
-        raise RecordingError(f"{path}: {where}{error}") from None
+        raise RecordingError(f"{path}: {where}{error}", key="key.value") from None
     return description

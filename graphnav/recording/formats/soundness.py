@@ -31,7 +31,7 @@ def sound(log: Log, path: Path) -> Log:
         if good.all():
             return True
         if good.sum() < (2 if what == "IMU" else 1):
-            raise RecordingError(f"{path}: {what}: all {len(good)} rows {why}")
+            raise RecordingError(f"{path}: {what}: all {len(good)} rows {why}", key="table.none_sound")
         remarks.append(
             Note(f"{what.lower()}.rows_left_out", f"{what}: {np.sum(~good)} of {len(good)} rows {why}: left out")
         )

@@ -101,17 +101,20 @@ def read_table(
         theirs = renamed.get(name, name)
         if header.count(theirs) > 1:
             raise RecordingError(
-                f"{path}: {header.count(theirs)} columns are called '{theirs}'; give them their own names"
+                f"{path}: {header.count(theirs)} columns are called '{theirs}'; give them their own names",
+                key="table.column_twice",
             )
         if theirs in header:
             file_names[name] = theirs
         elif name in required or name in renamed:
             hint = "" if name in renamed else f'; if it has another name, say columns = {{ {name} = "..." }}'
-            raise RecordingError(f"{path}: no column '{theirs}' (there are: {_list_names(header)}){hint}")
+            raise RecordingError(
+                f"{path}: no column '{theirs}' (there are: {_list_names(header)}){hint}", key="table.column"
+            )
     use = [header.index(theirs) for theirs in file_names.values()]
     values = _parse(path, skip, header, use)
     if not values.shape[1]:
-        raise RecordingError(f"{path}: holds a header and no rows")
+        raise RecordingError(f"{path}: holds a header and no rows", key="file.no_rows")
     return Table(path, dict(zip(file_names, values, strict=True)), file_names, np.arange(values.shape[1]))
 
 
@@ -143,7 +146,9 @@ def first_rows(path: Path, count: int) -> list[list[str]]:
     try:
         return [[cell.strip().strip('"') for cell in line.split(",")] for _, line in islice(_data_lines(path), count)]
     except UnicodeDecodeError:
-        raise RecordingError(f"{path}: holds bytes that are not UTF-8 text; save it as UTF-8") from None
+        raise RecordingError(
+            f"{path}: holds bytes that are not UTF-8 text; save it as UTF-8", key="file.text"
+        ) from None
 
 
 def _open(path: Path) -> IO[str]:
@@ -155,20 +160,20 @@ def _open_bytes(path: Path) -> IO[bytes]:
     if not exists(path):
         other = path.with_suffix("") if path.suffix == ".gz" else path.with_name(path.name + ".gz")
         hint = f"; there is {other.name}" if exists(other) else ""
-        raise RecordingError(f"{path}: no such file{hint}")
+        raise RecordingError(f"{path}: no such file{hint}", key="file.missing")
     if path.is_dir():
-        raise RecordingError(f"{path}: is a folder where a CSV file is wanted")
+        raise RecordingError(f"{path}: is a folder where a CSV file is wanted", key="file.folder")
     file = open_file(path)
-    why = None
+    why, key = None, "file.gzip"
     if not file.size:
-        why = "is empty"
+        why, key = "is empty", "file.empty"
     elif file.packed != (path.suffix == ".gz"):
         why = "is gzip-compressed; its name must end in .gz"
         if not file.packed:
             why = "is not gzip-compressed although its name ends in .gz"
     if why is not None:
         file.close()
-        raise RecordingError(f"{path}: {why}")
+        raise RecordingError(f"{path}: {why}", key=key)
     return file
 
 
@@ -177,9 +182,9 @@ def _header(path: Path) -> tuple[int, list[str]]:
     with _open_bytes(path) as raw:
         start = raw.read(1 << 16)
     if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        raise RecordingError(f"{path}: is UTF-16 text; save it as UTF-8")
+        raise RecordingError(f"{path}: is UTF-16 text; save it as UTF-8", key="file.text")
     if b"\0" in start:
-        raise RecordingError(f"{path}: is a binary file, not a CSV table")
+        raise RecordingError(f"{path}: is a binary file, not a CSV table", key="file.binary")
     text = start.decode("utf-8-sig", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         line = line.split("#")[0].strip()
@@ -187,17 +192,21 @@ def _header(path: Path) -> tuple[int, list[str]]:
             continue
         names = [name.strip().strip('"') for name in line.split(",")]
         if "\ufffd" in line:
-            raise RecordingError(f"{path}, line {number}: is not UTF-8 text")
+            raise RecordingError(f"{path}, line {number}: is not UTF-8 text", key="file.text")
         if len(names) == 1 and (";" in line or "\t" in line):
             mark = "a semicolon" if ";" in line else "a tab"
             raise RecordingError(
                 f"{path}, line {number}: fields are separated by {mark}; they must be by commas, numbers written with "
-                "points (graphnav init makes such a file of it)"
+                "points (graphnav init makes such a file of it)",
+                key="table.separator",
             )
         if all(_is_number(name) for name in names):
-            raise RecordingError(f"{path}, line {number}: the first line must name the columns, and it holds numbers")
+            raise RecordingError(
+                f"{path}, line {number}: the first line must name the columns, and it holds numbers",
+                key="table.no_header",
+            )
         return number, names
-    raise RecordingError(f"{path}: is empty")
+    raise RecordingError(f"{path}: is empty", key="file.empty")
 
 
 def _is_number(text: str) -> bool:
@@ -265,7 +274,8 @@ def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
             cells = [cell.strip() for cell in line.split(",")]
             if len(cells) != len(header):
                 raise RecordingError(
-                    f"{path}, line {number}: has {len(cells)} fields where the header has {len(header)}"
+                    f"{path}, line {number}: has {len(cells)} fields where the header has {len(header)}",
+                    key="table.fields",
                 )
             row = []
             for column in use:
@@ -274,9 +284,10 @@ def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
                     row.append(parse_number(cell) if cell else np.nan)
                 except ValueError:
                     raise RecordingError(
-                        f"{path}, line {number}, column '{header[column]}': '{cell[:40]}' is not a number"
+                        f"{path}, line {number}, column '{header[column]}': '{cell[:40]}' is not a number",
+                        key="table.cell",
                     ) from None
             rows.append(row)
     except UnicodeDecodeError:
-        raise RecordingError(f"{path}: is not UTF-8 text") from None
+        raise RecordingError(f"{path}: is not UTF-8 text", key="file.text") from None
     return np.array(rows, dtype=float).reshape(-1, len(use))

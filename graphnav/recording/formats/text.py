@@ -16,11 +16,11 @@ Rows = list[tuple[int, str]]  # line number in the file (from 1) and text
 def text_lines(path: Path) -> list[str]:
     data = read_bytes(path)
     if b"\0" in data[:4096]:
-        raise RecordingError(f"{path}: a binary file; expected text")
+        raise RecordingError(f"{path}: a binary file; expected text", key="file.binary")
     try:
         return data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
-        raise RecordingError(f"{path}: not a text file (it is not UTF-8)") from None
+        raise RecordingError(f"{path}: not a text file (it is not UTF-8)", key="file.text") from None
 
 
 def number_table(
@@ -49,15 +49,17 @@ def number_table(
     for number, line in rows:  # only to say where; the fast reader does not
         fields = line.split(delimiter)
         if len(fields) != len(names):
-            raise RecordingError(f"{path}, line {number}: {len(fields)} fields where {len(names)} were expected")
+            raise RecordingError(
+                f"{path}, line {number}: {len(fields)} fields where {len(names)} were expected", key="table.fields"
+            )
         for k in use:
             try:
                 parse_number(fields[k].strip() or "nan")
             except ValueError:
                 raise RecordingError(
-                    f"{path}, line {number}, {names[k]}: '{fields[k].strip()[:40]}' is not a number"
+                    f"{path}, line {number}, {names[k]}: '{fields[k].strip()[:40]}' is not a number", key="table.cell"
                 ) from None
-    raise RecordingError(f"{path}: cannot be read as a table of numbers")
+    raise RecordingError(f"{path}: cannot be read as a table of numbers", key="table.unreadable")
 
 
 def _fill(line: str) -> str:

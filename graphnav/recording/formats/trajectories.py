@@ -65,12 +65,14 @@ def read_trajectory(path: str | Path) -> Trajectory:
     numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
     rows = [(number, line) for number, line in numbered if line.lstrip()[0] not in "#%"]
     if not rows:
-        raise RecordingError(f"{path}: no rows in it; a trajectory file needs at least one")
+        raise RecordingError(f"{path}: no rows in it; a trajectory file needs at least one", key="file.no_rows")
     first = rows[0][1]
     if any(line.lstrip().startswith("%") for _, line in numbered[:100]):
         return _rtklib(path, [line for _, line in numbered if line.lstrip().startswith("%")], rows)
     if re.match(r"\s*\d{4}/\d\d/\d\d[\s,]", first):
-        raise RecordingError(f"{path}: an RTKLIB solution without its header; write it again with out-outhead=on")
+        raise RecordingError(
+            f"{path}: an RTKLIB solution without its header; write it again with out-outhead=on", key="rtklib.no_header"
+        )
     if re.search(r"[A-Za-z_]{1,}", re.sub(r"(?i)\bnan\b|\d[eE][-+]?\d", "", first)):
         return _csv(path, rows)
     width = len(first.split())
@@ -80,7 +82,8 @@ def read_trajectory(path: str | Path) -> Trajectory:
         return _tum(path, rows)
     raise RecordingError(
         f"{path}, line {rows[0][0]}: {width} columns without a header; expected a CSV header with t, lat, lon, h, "
-        "11 columns (KF-GINS .nav), 8 columns (TUM) or an RTKLIB .pos"
+        "11 columns (KF-GINS .nav), 8 columns (TUM) or an RTKLIB .pos",
+        key="table.no_header",
     )
 
 
@@ -96,22 +99,25 @@ def _build(
     """Check time and position, leave out what cannot be used, and say so."""
     numbers = np.array([number for number, _ in rows])
     if (bad := ~(np.abs(t) <= LATEST)).any():
-        raise RecordingError(f"{path}, line {numbers[bad][0]}, t: {t[bad][0]:g} is no time in s")
+        raise RecordingError(f"{path}, line {numbers[bad][0]}, t: {t[bad][0]:g} is no time in s", key="table.cell")
     if (bad := np.diff(t) < 0).any():
         k = int(np.flatnonzero(bad)[0])
         raise RecordingError(
-            f"{path}, line {numbers[k + 1]}, t: {t[k + 1]:.6f} comes after {t[k]:.6f}; sort the rows by time"
+            f"{path}, line {numbers[k + 1]}, t: {t[k + 1]:.6f} comes after {t[k]:.6f}; sort the rows by time",
+            key="table.time_order",
         )
     if not local:
         limits = np.array([90.0 * _DEG, 360.0 * _DEG])
         if (bad := np.abs(position[:, :2]) > limits * (1 + 1e-12)).any():
             k, axis = (int(i) for i in np.argwhere(bad)[0])
+            name = ("lat", "lon")[axis]
             raise RecordingError(
-                f"{path}, line {numbers[k]}, {('lat', 'lon')[axis]}: {position[k, axis] / _DEG:.6f} deg is out of range"
+                f"{path}, line {numbers[k]}, {name}: {position[k, axis] / _DEG:.6f} deg is out of range",
+                key="table.place",
             )
     if np.isinf(position).any():
         k = int(np.flatnonzero(np.isinf(position).any(axis=1))[0])
-        raise RecordingError(f"{path}, line {numbers[k]}: a position that is infinite")
+        raise RecordingError(f"{path}, line {numbers[k]}: a position that is infinite", key="table.not_finite")
     usable = np.isfinite(position[:, :2]).all(1) if local else np.isfinite(position).all(1)
     fresh = np.concatenate([[True], np.diff(t) > 0])
     if not usable.all():
@@ -125,7 +131,7 @@ def _build(
         )
     keep = usable & fresh
     if not keep.any():
-        raise RecordingError(f"{path}: no row has a position")
+        raise RecordingError(f"{path}: no row has a position", key="table.all_blank")
     present = {
         key: value[keep] for key, value in optional.items() if value is not None and not np.isnan(value[keep]).all()
     }
@@ -143,14 +149,16 @@ def _csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     names = [field.strip().strip('"') for field in rows[0][1].split(",")]
     rows = rows[1:]
     if not rows:
-        raise RecordingError(f"{path}: a header and no rows")
+        raise RecordingError(f"{path}: a header and no rows", key="file.no_rows")
     # A unit that is ours may be part of the name; any other is left as it is and so not found.
     columns = {(base if _UNITS.get(base := name.rpartition("_")[0]) == name.rpartition("_")[2] else name): k
                for k, name in enumerate(names)}  # fmt: skip
     local = "lat" not in columns and {"x", "y"} <= columns.keys()
     needed = ("t", "x", "y") if local else ("t", "lat", "lon", "h")
     if missing := [name for name in needed if name not in columns]:
-        raise RecordingError(f"{path}, line 1: no column '{missing[0]}'; found {', '.join(names)[:300]}")
+        raise RecordingError(
+            f"{path}, line 1: no column '{missing[0]}'; found {', '.join(names)[:300]}", key="table.column"
+        )
     wanted = {names[k] for name, k in columns.items() if name in _KNOWN}
     table = number_table(path, rows, names, ",", wanted)
 
@@ -192,7 +200,8 @@ def _tum(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     if (bad := ~(np.abs(norm - 1.0) <= 1e-2)).any():
         k = int(np.flatnonzero(bad)[0])
         raise RecordingError(
-            f"{path}, line {rows[k][0]}, qx qy qz qw: a norm of {norm[k]:.4f}; expected a unit quaternion"
+            f"{path}, line {rows[k][0]}, qx qy qz qw: a norm of {norm[k]:.4f}; expected a unit quaternion",
+            key="table.quaternion",
         )
     rph = rotation.to_rph(rotation.from_quaternion(table[:, [7, 4, 5, 6]]))
     return _build(path, rows, table[:, 0], table[:, 1:4], [], rph=rph, local=True)
@@ -201,17 +210,23 @@ def _tum(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
 def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Trajectory:
     titles = next((line for line in reversed(head) if re.search(r"\bQ\b.*\bns\b", line) and "=" not in line), None)
     if titles is None:
-        raise RecordingError(f"{path}: no RTKLIB line '%  GPST  latitude(deg) ...' that names the columns")
+        raise RecordingError(
+            f"{path}: no RTKLIB line '%  GPST  latitude(deg) ...' that names the columns", key="rtklib.no_header"
+        )
     if "baseline" in titles:
         raise RecordingError(
             f"{path}: an RTKLIB solution as east-north-up baseline to a base station whose place the columns do not "
-            "give; write it again with out-solformat=llh"
+            "give; write it again with out-solformat=llh",
+            key="rtklib.baseline",
         )
     if "latitude(d'" in titles:
-        raise RecordingError(f"{path}: latitude in degrees, minutes, seconds; write it again with out-degform=deg")
+        raise RecordingError(
+            f"{path}: latitude in degrees, minutes, seconds; write it again with out-degform=deg", key="rtklib.degrees"
+        )
     if "latitude(deg)" not in titles:
         raise RecordingError(
-            f"{path}: an RTKLIB solution not in lat/lon/height degrees; write it again with out-solformat=llh"
+            f"{path}: an RTKLIB solution not in lat/lon/height degrees; write it again with out-solformat=llh",
+            key="rtklib.form",
         )
     scale_name = re.split(r"[\s,]+", titles.strip().lstrip("% "))[0]
     separator = "," if "," in rows[0][1] else None
@@ -226,7 +241,9 @@ def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Traject
             )
         )
     if any("lat/lon/height=Tokyo" in line for line in head):
-        raise RecordingError(f"{path}: coordinates on the Tokyo datum; write it again with out-datum=wgs84")
+        raise RecordingError(
+            f"{path}: coordinates on the Tokyo datum; write it again with out-datum=wgs84", key="rtklib.datum"
+        )
     if any("lat/lon/height=WGS84/geodetic" in line for line in head):
         notes.append(
             Note("trajectory.height", f"{path.name}: heights are above mean sea level, not above the ellipsoid")
@@ -243,7 +260,9 @@ def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Traject
 
     position = take("latitude", "longitude", "height")
     if position is None:
-        raise RecordingError(f"{path}: the RTKLIB header does not name latitude, longitude and height")
+        raise RecordingError(
+            f"{path}: the RTKLIB header does not name latitude, longitude and height", key="rtklib.columns"
+        )
     position = position * np.array([_DEG, _DEG, 1.0])
     return _build(
         path, rows, t, position, notes,
@@ -272,7 +291,7 @@ def _rtklib_times(
                 np.datetime64(stamp, "us")
             except ValueError:
                 raise RecordingError(
-                    f"{path}, line {number}: '{stamp.replace('T', ' ')[:60]}' is not a date and time"
+                    f"{path}, line {number}: '{stamp.replace('T', ' ')[:60]}' is not a date and time", key="table.date"
                 ) from None
         raise
     seconds = (when - _GPS_EPOCH) / np.timedelta64(1, "us") * 1e-6

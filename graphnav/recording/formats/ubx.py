@@ -62,7 +62,7 @@ def load(path: Path) -> Log:
     fixes = [m for m in content.pvt if m.gnssFixOk and m.fixType in (3, 4)]
     if not fixes and not content.samples:
         what = f"{len(content.pvt)} NAV-PVT messages without a fix" if content.pvt else "no NAV-PVT and no ESF messages"
-        raise RecordingError(f"{path}: {what} in {path.stat().st_size} bytes; nothing to use")
+        raise RecordingError(f"{path}: {what} in {path.stat().st_size} bytes; nothing to use", key="log.no_messages")
     dated = [start for start in map(_week_start, fixes) if start is not None]
     zero = dated[0] if dated else None
     if fixes and zero is None:

@@ -71,9 +71,9 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
             )
         )
     if len(gnss.t) >= 10:
-        findings += sigmas_denied(gnss, p)
-        findings += two_groups(gnss, p)
-        findings += stamped_on_arrival(gnss, p)
+        findings += check_sigmas(gnss, p)
+        findings += check_two_groups(gnss, p)
+        findings += check_arrival_stamps(gnss, p)
     return replace(recording, gnss=gnss), findings
 
 
@@ -149,7 +149,7 @@ def _steps(gnss: Gnss) -> tuple[Array, float, NDArray[np.bool_]]:
     return dt, period, dt < 1.9 * period
 
 
-def sigmas_denied(gnss: Gnss, p: Array) -> Iterator[Finding]:
+def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
     """Sigmas smaller than a phase can be measured, or that the scatter of the fixes denies; they are not changed."""
     sd = float(np.median(gnss.sd[:, :2]))
     _, period, near = _steps(gnss)
@@ -191,7 +191,7 @@ def sigmas_denied(gnss: Gnss, p: Array) -> Iterator[Finding]:
             )
 
 
-def two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
+def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     """Fixes that go back and forth between two places a constant step apart: no vote tells which are right."""
     there: NDArray[np.bool_] = np.asarray(np.isfinite(p).all(axis=1))
     if there.sum() < 2 * _WINDOW:
@@ -246,7 +246,7 @@ def _groups(jump: Array, size: float) -> NDArray[np.intp]:
     return group
 
 
-def stamped_on_arrival(gnss: Gnss, p: Array) -> Iterator[Finding]:
+def check_arrival_stamps(gnss: Gnss, p: Array) -> Iterator[Finding]:
     """Stamps that are uneven where positions advance evenly: of the arrival, not of the measurement."""
     dt = np.diff(gnss.t)
     p = p[:, :2]

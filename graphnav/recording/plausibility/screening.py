@@ -20,7 +20,7 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, rows_of
 from graphnav.recording.checks import crosschecks
-from graphnav.recording.checks.aiding import imu_axes, imu_clock, overlap_s
+from graphnav.recording.checks.aiding import check_imu_axes, check_imu_clock, overlap_s
 from graphnav.recording.checks.clock import ClockOffsets, clock_of
 from graphnav.recording.checks.crosschecks import Fit, Track
 from graphnav.recording.checks.series import screen_series
@@ -65,7 +65,7 @@ def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:
     """
     for finding in findings:
         if finding.severity == "refused":
-            raise RecordingError(f"'{recording.name}': {finding.sentence}")
+            raise RecordingError(f"'{recording.name}': {finding.sentence}", key=finding.key)
 
 
 def screen_recording(recording: Recording) -> tuple[Recording, list[str]]:
@@ -108,12 +108,12 @@ def screen(recording: Recording) -> Screened:
     """
     if recording.screened:
         return Screened(recording)
-    findings = list(imu_scale(recording))
+    findings = list(check_imu_scale(recording))
     wrong_unit = bool(findings)
     imu, spikes = without_spikes(recording.imu, recording.start, wrong_unit)
     findings += spikes
     recording = replace(recording, imu=imu, screened=True)
-    findings += dead_axes(recording)
+    findings += check_dead_axes(recording)
     recording, said = screen_series(recording)
     findings += said
     track = None
@@ -139,14 +139,14 @@ def screen(recording: Recording) -> Screened:
             forward = clock.by_velocity if track.instant else clock.by_places
         else:
             forward = crosschecks.forward_fit(recording.imu, way) if way is not None else None
-        findings += forward_sign(recording.imu, way, forward)
+        findings += check_forward_sign(recording.imu, way, forward)
         if clock is not None and track is not None:
             odometer = crosschecks.odometer_fit(recording.odometer, track) if recording.odometer is not None else None
-            findings += imu_clock(clock, None if odometer is None else odometer[0])
+            findings += check_imu_clock(clock, None if odometer is None else odometer[0])
     return Screened(recording, tuple(findings), clock)
 
 
-def imu_scale(recording: Recording) -> Iterator[Finding]:
+def check_imu_scale(recording: Recording) -> Iterator[Finding]:
     """A force at rest that is not gravity, and a turn rate that no sensor reads: units and scales."""
     imu = recording.imu
     rate = np.abs(imu.gyro).max(axis=1)
@@ -227,7 +227,7 @@ def without_spikes(imu: Imu, start: float, wrong_unit: bool = False) -> tuple[Im
     return rows_of(imu, ~bad), [Finding("warning", f"{sentence}: left out, as a gap", "imu.spike")]
 
 
-def dead_axes(recording: Recording) -> Iterator[Finding]:
+def check_dead_axes(recording: Recording) -> Iterator[Finding]:
     """An axis that repeats one value while the others of its sensor move."""
     imu = recording.imu
     period = period_of(imu.t)
@@ -280,7 +280,7 @@ def _moves(x: Array, same: Array, least: float) -> bool:
 _SURE = 0.7  # of a correlation, and of a unit vector's component
 
 
-def forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iterator[Finding]:
+def check_forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iterator[Finding]:
     """The forward force falls when the speed rises: one axis of the accelerometer is reversed, or all of the IMU."""
     up = crosschecks.up_of(imu)
     if way is None or forward is None or forward.correlation < _SURE or up[2] < 0.8:
@@ -298,7 +298,7 @@ def forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iterator[F
             "imu.forward_reversed",
         )
         return
-    for said in imu_axes(imu, forward, way):
+    for said in check_imu_axes(imu, forward, way):
         yield Finding("refused", f"{said.sentence}; {along}", "imu.axes_turned")
 
 

@@ -8,11 +8,11 @@ from graphnav.report.plots.consistency import nees, residuals, timeline
 from graphnav.report.plots.detections import detections
 from graphnav.report.plots.figure import SHADES, TIME, Figure, Panel, Spans, limits
 from graphnav.report.plots.series import Series, Shades, bands, sigmas, span_zoom
-from graphnav.report.plots.thinning import BINS, chosen_rows, thin, with_breaks
+from graphnav.report.plots.thinning import BINS, choose_rows, thin, with_breaks
 from graphnav.report.plots.way import FIX_COLOURS, Fixes, profile, trajectory
 
 __all__ = [
     "BINS", "FIX_COLOURS", "PALETTE", "SHADES", "TIME", "Figure", "Fixes", "Panel", "Series", "Shades", "Spans",
-    "bands", "chosen_rows", "css_colours", "detections", "limits", "nees", "profile", "residuals",
+    "bands", "choose_rows", "css_colours", "detections", "limits", "nees", "profile", "residuals",
     "sigmas", "span_zoom", "thin", "timeline", "trajectory", "with_breaks",
 ]  # fmt: skip

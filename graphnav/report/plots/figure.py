@@ -14,7 +14,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.report.plots.colours import PALETTE
-from graphnav.report.plots.thinning import BINS, chosen_rows, thin, with_breaks
+from graphnav.report.plots.thinning import BINS, choose_rows, thin, with_breaks
 
 SHADES = {"withheld": "withheld", "no GNSS": "outage", "excluded": "alert", "stands": "stop"}  # span -> colour
 TIME = "time from the start [s]"
@@ -58,7 +58,7 @@ class Panel:
         self, xy: Array, name: str, label: str, t: Array | None = None, width: float = 1.8, alpha: float = 1.0
     ) -> None:
         """A line through places (N, 2), passed at t."""
-        rows = chosen_rows(*xy.T)
+        rows = choose_rows(*xy.T)
         at: dict[str, Any] = {} if t is None else {"customdata": numbers(t[rows])}
         look = {"color": colour(name), "width": width}
         places = {"x": numbers(xy[rows, 0]), "y": numbers(xy[rows, 1])}
@@ -70,7 +70,7 @@ class Panel:
         alpha: float = 1.0, t: Array | None = None, way: bool = False,
     ) -> None:  # fmt: skip
         """A marker (o, x, s, ^, D) at every row."""
-        rows = chosen_rows(x, y) if way else thin(x, y)
+        rows = choose_rows(x, y) if way else thin(x, y)
         look = {"color": colour(name), "size": size, "symbol": _SYMBOLS[marker], "opacity": alpha}
         if marker == "x":
             look["line"] = {"color": colour(name), "width": 2}

@@ -51,7 +51,7 @@ def with_breaks(t: Array, rows: np.ndarray, *columns: Array) -> Any:
     return (np.insert(t[rows], at, t[long.astype(int)]), *(np.insert(c[rows], at, np.nan) for c in columns))
 
 
-def chosen_rows(x: Array, y: Array, bins: int = BINS) -> np.ndarray:
+def choose_rows(x: Array, y: Array, bins: int = BINS) -> np.ndarray:
     """Indices (sorted) of the rows of a way (x, y) that is drawn with `bins` columns: extremes of both are kept."""
     k = np.arange(len(x), dtype=float)
     return np.union1d(thin(k, x, bins), thin(k, y, bins))

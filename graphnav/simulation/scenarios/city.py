@@ -57,9 +57,9 @@ def _town(
     barometer: bool, antennas: bool, exact: bool, rate: float,
 ) -> Simulated:  # fmt: skip
     if duration < 240.0:
-        raise ConfigError(f"duration = {duration:g}: a town takes at least 240 s")
+        raise ConfigError(f"duration = {duration:g}: a town takes at least 240 s", key="simulation.value")
     if gnss not in ("rtk", "single"):
-        raise ConfigError(f"gnss = '{gnss}': must be rtk or single")
+        raise ConfigError(f"gnss = '{gnss}': must be rtk or single", key="simulation.value")
     rng = stream(seed, "way")
     parking = [
         Manoeuvre(4.0, 4.0), Manoeuvre(4.0, 0.0, 15.0), Manoeuvre(3.0, 0.0),

@@ -51,7 +51,7 @@ def run(
     stops and all along, `rate` the IMU's.
     """
     if not 5.0 <= engine_hz <= 50.0:
-        raise ConfigError(f"engine_hz = {engine_hz:g}: must be from 5 to 50 Hz")
+        raise ConfigError(f"engine_hz = {engine_hz:g}: must be from 5 to 50 Hz", key="simulation.value")
     start, end = (START, START + 900.0) if short else (START, END)
     edges = tuple(START + x for x in (150.0, 210.0, 380.0, 500.0, 680.0, 770.0)) if short else STOPS
     rng = stream(seed, "way")

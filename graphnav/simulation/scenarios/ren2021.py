@@ -44,7 +44,7 @@ def ren2021(
 ) -> Simulated:
     """Walk `walk` (1 to 13) of table 2: laps to the left around a rectangle, back onto the first footprint."""
     if not (isinstance(walk, int) and 1 <= walk <= len(WALKS)):
-        raise ConfigError(f"walk = {walk}: must be from 1 to {len(WALKS)}")
+        raise ConfigError(f"walk = {walk}: must be from 1 to {len(WALKS)}", key="simulation.value")
     perimeter, laps, duration = WALKS[walk - 1]
     return _walk(
         "ren2021", seed, duration, rectangle(perimeter, laps), ELLIPSE2.at(_usable(rate)), exact, compensated, True,
@@ -63,9 +63,9 @@ def free(
     """
     for key, value, known in (("pace", pace, PACES), ("imu", imu, PRESETS)):
         if value not in known:
-            raise ConfigError(f"{key} = '{value}': must be {', '.join(known)}")
+            raise ConfigError(f"{key} = '{value}': must be {', '.join(known)}", key="simulation.value")
     if not 20.0 <= duration <= 7200.0:
-        raise ConfigError(f"duration = {duration:g}: must be from 20 to 7200 s")
+        raise ConfigError(f"duration = {duration:g}: must be from 20 to 7200 s", key="simulation.value")
     length = PACES[pace] * (duration - _rest(seed).sum())
     rng = stream(seed, "course")
     if course == "laps":
@@ -81,7 +81,7 @@ def free(
             left -= side + parts[-1][0]
         parts.append((left, 0.0))
     else:
-        raise ConfigError(f"course = '{course}': must be laps, bends or straight")
+        raise ConfigError(f"course = '{course}': must be laps, bends or straight", key="simulation.value")
     return _walk(
         "gait", seed, duration, parts, PRESETS[imu].at(_usable(rate)), exact, compensated, course == "laps",
         {"pace": pace, "course": course},
@@ -90,7 +90,7 @@ def free(
 
 def _usable(rate: float) -> float:
     if not 50.0 <= rate <= 2000.0:
-        raise ConfigError(f"rate = {rate:g}: must be from 50 to 2000 Hz")
+        raise ConfigError(f"rate = {rate:g}: must be from 50 to 2000 Hz", key="simulation.value")
     return rate
 
 

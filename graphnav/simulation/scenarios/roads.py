@@ -32,7 +32,7 @@ def _shake(path: Path, seed: int, rate: float, road: float) -> Shake:
 def motorway(seed: int, *, duration: float = 1500.0, exact: bool = False, rate: float = 100.0) -> Simulated:
     """Up to 36 m/s for `duration` s: long bends, lane changes, a jam without a stop, two bridges, and a rest area."""
     if duration < 300.0:
-        raise ConfigError(f"duration = {duration:g}: a motorway takes at least 300 s")
+        raise ConfigError(f"duration = {duration:g}: a motorway takes at least 300 s", key="simulation.value")
     rng = stream(seed, "way")
     plan = [Manoeuvre(20.0, 0.0), Manoeuvre(10.0, 12.0), Manoeuvre(12.0, 14.0, 100.0, 0.02), Manoeuvre(15.0, 30.0)]
     left, v = duration - 57.0 - 65.0, 30.0
@@ -67,9 +67,11 @@ def crawl(
     The road is smooth: what tells creeping from standing is next to nothing.
     """
     if not 0.0 < slowest <= fastest <= 3.0:
-        raise ConfigError("slowest and fastest must be above 0, in this order, and at most 3 m/s")
+        raise ConfigError(
+            "slowest and fastest must be above 0, in this order, and at most 3 m/s", key="simulation.value"
+        )
     if jam < 120.0:
-        raise ConfigError(f"jam = {jam:g}: must be at least 120 s")
+        raise ConfigError(f"jam = {jam:g}: must be at least 120 s", key="simulation.value")
     rng = stream(seed, "way")
 
     def flow() -> list[Manoeuvre]:

@@ -51,9 +51,9 @@ def run(
         drift = rise if growth_in_velocity else (0.0, 0.0, 0.0)
         faults = tuple(SimulatedFault(a, b, growth=rise, velocity=drift) for a, b in FAULTS)
     elif fault != "none":
-        raise ConfigError(f"fault = '{fault}': must be none, noise, growing or outage")
+        raise ConfigError(f"fault = '{fault}': must be none, noise, growing or outage", key="simulation.value")
     if stops_every and stops_every < 4.0:
-        raise ConfigError(f"stops_every = {stops_every:g}: must be 0 or at least 4 min")
+        raise ConfigError(f"stops_every = {stops_every:g}: must be 0 or at least 4 min", key="simulation.value")
 
     plan = _square(60.0 * stops_every)
     path = drive(plan, heading=90.0)

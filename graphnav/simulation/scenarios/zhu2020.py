@@ -38,7 +38,7 @@ def run(
     heading of one to two degrees against the vehicle.
     """
     if gnss_s < 40.0 or after_s < 30.0:
-        raise ConfigError("gnss_s must be at least 40 s and after_s at least 30 s")
+        raise ConfigError("gnss_s must be at least 40 s and after_s at least 30 s", key="simulation.value")
     lost, end = float(gnss_s), float(gnss_s + after_s)
     rng = stream(seed, "way")
     plan, t, v = [Manoeuvre(8.0, 0.0), Manoeuvre(6.0, 8.0)], 14.0, 8.0
