@@ -299,7 +299,7 @@ def forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iterator[F
         )
         return
     for said in imu_axes(imu, forward, way):
-        yield Finding("refused", f"{said.sentence}; {along}", "imu.axes_turned")
+        yield Finding("refused", f"{along}: {said.sentence}", "imu.axes_turned")
 
 
 def _sideways(imu: Imu, way: Track) -> float | None:
