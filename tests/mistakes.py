@@ -39,8 +39,8 @@ and read from the top: the first finding may be the cause of the others.
 | untrusted | the result may be wrong whatever its sigmas say |
 | refused | nothing is solved |
 
-Findings have a [key](keys.md) that stays the same whatever their words. Lines without one are errors, exit code 2, which
-begin with file, line and column.
+Findings have a [key](keys.md) that stays the same whatever their words. Lines without one are errors, exit code 2,
+which begin with file, line and column.
 """
 _WHOLE = 10  # words of a line that is shown whole
 _PLACE = re.compile(r"^(?:(?:drive|settings)\S*|'tokyo'|--?\w+ \S+)(?:, line \d+)?(?:, column '\w+')?: ")

@@ -31,7 +31,7 @@ from graphnav.estimation.dense import times_between
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
 from graphnav.recording.checks.stated import truth_apart
-from graphnav.recording.plausibility.screening import screen
+from graphnav.recording.plausibility.screening import screen_again
 
 NAME = "run.npz"
 _FORM = "graphnav-run/1"
@@ -127,7 +127,7 @@ def attach_recording(outcome: Outcome, inputs: Mapping[str, str]) -> Outcome:
         if sha256(Path(name)) != digest:
             raise RecordingError(f"{name}: has changed since; solve again")
     part = read_part(request.source, request.start, request.end, topics=request.topics)
-    recording = screen(part).recording
+    recording = screen_again(part)
     return replace(outcome, recording=replace(recording, truth=None) if truth_apart(recording) else recording)
 
 

@@ -44,6 +44,7 @@ _MOVES = 20.0  # steps of its own resolution by which an axis has moved and not 
 _STIRS = {"accelerometer": 1e-3 * _STANDARD_GRAVITY, "gyro": 7.3e-5}  # m/s^2, rad/s
 _NOISY = 0.05  # of the steps go back on the one before; of noise up to a band B and a rate f it is 1.5 B / f
 _AXIS = "xyz"
+_UNITS = ("imu.gyro_unit", "imu.force_scale")  # findings of `imu_scale`: nothing is known of single rows then
 
 
 @dataclass(frozen=True)
@@ -108,26 +109,10 @@ def screen(recording: Recording) -> Screened:
     """
     if recording.screened:
         return Screened(recording)
-    findings = list(imu_scale(recording))
-    wrong_unit = bool(findings)
-    imu, spikes = without_spikes(recording.imu, recording.start, wrong_unit)
-    findings += spikes
-    recording = replace(recording, imu=imu, screened=True)
-    findings += dead_axes(recording)
-    recording, said = screen_series(recording)
-    findings += said
-    track = None
-    if recording.gnss is not None and len(recording.gnss.t):
-        recording, said = plausibility_gnss.screen(recording)
-        findings += said
-        assert recording.gnss is not None
-        track = crosschecks.track(recording.gnss)
-        if track is not None and overlap_s(recording) <= 0:
-            track = None
-    if recording.odometer is not None and len(recording.odometer.t):
-        recording, said = plausibility_odometer.screen(recording, track)
-        findings += said
-    dead, clock = any(f.key == "imu.dead_axis" for f in findings), None
+    recording, of_imu, of_aiding, track = _without_the_impossible(recording)
+    dead, clock = list(dead_axes(recording)), None
+    findings = [*of_imu, *dead, *of_aiding]
+    wrong_unit = any(f.key in _UNITS for f in of_imu)
     if recording.platform == "vehicle" and not dead and not wrong_unit:
         way = track
         if way is None and recording.odometer is not None:
@@ -144,6 +129,31 @@ def screen(recording: Recording) -> Screened:
             odometer = crosschecks.odometer_fit(recording.odometer, track) if recording.odometer is not None else None
             findings += imu_clock(clock, None if odometer is None else odometer[0])
     return Screened(recording, tuple(findings), clock)
+
+
+def screen_again(recording: Recording) -> Recording:
+    """The recording as `screen` left it when it was solved, without looking for findings again."""
+    return recording if recording.screened else _without_the_impossible(recording)[0]
+
+
+def _without_the_impossible(recording: Recording) -> tuple[Recording, list[Finding], list[Finding], Track | None]:
+    """The recording without what cannot be right, findings of the IMU and of the others, and the way by the fixes."""
+    of_imu: list[Finding] = list(imu_scale(recording))
+    imu, spikes = without_spikes(recording.imu, recording.start, wrong_unit=bool(of_imu))
+    of_imu += spikes
+    recording, of_aiding = screen_series(replace(recording, imu=imu, screened=True))
+    track = None
+    if recording.gnss is not None and len(recording.gnss.t):
+        recording, said = plausibility_gnss.screen(recording)
+        of_aiding += said
+        assert recording.gnss is not None
+        track = crosschecks.track(recording.gnss)
+        if track is not None and overlap_s(recording) <= 0:
+            track = None
+    if recording.odometer is not None and len(recording.odometer.t):
+        recording, said = plausibility_odometer.screen(recording, track)
+        of_aiding += said
+    return recording, of_imu, of_aiding, track
 
 
 def imu_scale(recording: Recording) -> Iterator[Finding]:
