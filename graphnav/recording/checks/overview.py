@@ -21,6 +21,7 @@ from graphnav.recording.checks.aiding import (
     gnss_jumps,
     imu_axes,
     mirrored,
+    mirrored_places,
     odometer_findings,
     overlap_s,
     reversed_sign,
@@ -159,7 +160,7 @@ def inspect(recording: Recording) -> Inspection:
         findings += gnss_coverage(recording)
         findings += rounded_positions(recording.gnss)
         findings += fix_types(recording.gnss)
-        wrong = list(velocities(recording.gnss))
+        wrong = mirrored_places(recording, list(velocities(recording.gnss)))
         if overlap or not wrong:
             # against wrong velocities, or on another clock, every position jumps
             findings += wrong or (gnss_jumps(recording, track) if overlap else ())
@@ -172,7 +173,7 @@ def inspect(recording: Recording) -> Inspection:
         yaw = crosschecks.yaw_fit(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
-        if turns_back and (said := list(mirrored(recording))):
+        if turns_back and (said := list(mirrored(recording, track))):
             findings += said
         elif not turned:
             findings += reversed_sign(recording.imu) if turns_back else imu_axes(recording.imu, forward, track)

@@ -299,7 +299,9 @@ def forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iterator[F
     if ahead[1] > -_SURE:
         return
     along = f"the forward force falls when the speed rises (correlation {-forward.correlation:.2f})"
-    if (side := _sideways(imu, way)) is not None and side > 0:  # then nothing is turned: the other axes are right
+    if (
+        side := crosschecks.sideways_correlation(imu, way)
+    ) is not None and side > 0:  # then nothing is turned: the other axes are right
         column = "a" + _AXIS[int(np.argmax(np.abs(imu.R_bs[1])))]
         yield Finding(
             "refused",
@@ -310,22 +312,3 @@ def forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iterator[F
         return
     for said in imu_axes(imu, forward, way):
         yield Finding("refused", f"{along}: {said.sentence}", "imu.axes_turned")
-
-
-def _sideways(imu: Imu, way: Track) -> float | None:
-    """Correlation of the force to the right with what curves ask for; None where there are none."""
-    seconds = np.arange(max(way.t[0], imu.t[0]), min(way.t[-1], imu.t[-1]) - 1.0)
-    if len(seconds) < crosschecks.MIN_PAIRS:
-        return None
-    edge = np.searchsorted(imu.t, np.r_[seconds, seconds[-1] + 1.0])
-    count = np.diff(edge)
-    force, turn = (
-        np.diff(np.r_[0.0, np.cumsum(x)][edge]) / np.maximum(count, 1) for x in (imu.accel[:, 0], imu.gyro[:, 2])
-    )
-    wanted = -np.interp(seconds + 0.5, way.t, way.speed) * turn  # to the left in a curve to the left
-    used = count > 0
-    if used.sum() < crosschecks.MIN_PAIRS or wanted[used].std() == 0.0 or force[used].std() == 0.0:
-        return None
-    alike = float(np.corrcoef(wanted[used], force[used])[0, 1])
-    # 4 sigma of the correlation of that many that have nothing to do with each other
-    return alike if abs(alike) > 4.0 / np.sqrt(used.sum()) else None
