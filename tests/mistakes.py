@@ -29,16 +29,22 @@ Table = dict[str, Array]  # the columns of a CSV file by name
 HEAD = """\
 # What can go wrong
 
-Common mistakes and what graphnav says of each, made by the tests on `data/tokyo`. Run `graphnav info` first and read
-from the top: the first finding may be the cause of the others.
+Common mistakes, made by the tests on `data/tokyo`, and the end of what graphnav says of each. Run `graphnav info` first
+and read from the top: the first finding may be the cause of the others.
 
-A finding has a severity, a [key](keys.md) that stays the same whatever its words, and a sentence, of which the end is
-shown here. A *note* changes nothing; results suffer from a *warning*; with *untrusted* they may be wrong whatever
-their sigmas say; with *refused* nothing is solved. All other lines are errors, exit code 2: one sentence behind the
-file, line and column, which are left out here.
+| severity of a finding | means |
+| --- | --- |
+| note | nothing changes |
+| warning | the result suffers |
+| untrusted | the result may be wrong whatever its sigmas say |
+| refused | nothing is solved |
+
+Findings have a [key](keys.md) that stays the same whatever their words. Lines without one are errors, exit code 2,
+which begin with file, line and column.
 """
-_WHOLE, _HEAD, _TAIL = 11, 5, 6  # words of a line that is shown whole; of either end of one that is not
-_PLACE = re.compile(r"^(?:(?:drive|settings)\S*|'tokyo')(?:, line \d+)?(?:, column '\w+')?: ")
+_WHOLE = 10  # words of a line that is shown whole
+_PLACE = re.compile(r"^(?:(?:drive|settings)\S*|'tokyo'|--?\w+ \S+)(?:, line \d+)?(?:, column '\w+')?: ")
+_ASIDE = re.compile(r" \((?:[^()]|\([^()]*\))*\)")
 
 
 @dataclass(frozen=True)
@@ -176,15 +182,14 @@ def row(mistake: Mistake, lines: list[str]) -> str:
     """The mistake's line of the page."""
     (line, *_) = said(mistake, lines) or lines or [""]
     severity, key = line.split(": ")[0], key_of(line)
+    if key and severity == "note":
+        return f"| {mistake.what} | {severity} `{key}` |"
     text = line.removeprefix(f"{severity}: ") if key else _PLACE.sub("", line.removeprefix("graphnav: "))
-    words = text.split()
-    if len(words) > _WHOLE:
-        words = re.sub(r" \([^()]*\)", "", text).split()
-    if len(words) > _WHOLE:
-        end = re.split("[;:] ", " ".join(words))[-1].split()
-        end = end if 3 <= len(end) <= _WHOLE + 2 else words[-_TAIL:]
-        words = end if key else [*words[:_HEAD], "...", *end]
-    text = " ".join(words).replace("|", "\\|").replace("<", "&lt;")
+    if len(text.split()) > _WHOLE:
+        text = re.split("[;:] ", _ASIDE.sub("", text))[-1]
+    if len(words := text.split()) > _WHOLE + 2:
+        text = " ".join(["...", *words[-_WHOLE:]])
+    text = text.replace("|", "\\|").replace("<", "&lt;")
     return f"| {mistake.what} | {severity} `{key}`: {text} |" if key else f"| {mistake.what} | {text} |"
 
 

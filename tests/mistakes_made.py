@@ -195,6 +195,30 @@ MISTAKES: dict[str, list[Mistake]] = {
             error=True,
         ),
         Mistake(
+            "a line of units under the header",
+            text("odometer", lambda s: s.replace("\n", "\ns,m/s,-\n", 1)),
+            ("line 2", "units"),
+            error=True,
+        ),
+        Mistake(
+            "two logs in one file",
+            text("imu", lambda s: s + s),
+            ("header is there again",),
+            error=True,
+        ),
+        Mistake(
+            "hours, minutes and seconds for seconds",
+            text("gnss", lambda s: s.replace("\n1580.0,", "\n00:26:20.0,", 1)),
+            ("line 2", "time of day"),
+            error=True,
+        ),
+        Mistake(
+            "blanks between the fields",
+            text("imu", lambda s: s.replace(",", " ")),
+            ("separated by blanks",),
+            error=True,
+        ),
+        Mistake(
             "the file is cut off",
             lambda f: (f / "imu.csv.gz").write_bytes((f / "imu.csv.gz").read_bytes()[:50_000]) and None,
             ("imu.csv.gz", "cut off"),
@@ -368,6 +392,21 @@ MISTAKES: dict[str, list[Mistake]] = {
             "the same without velocities",
             both(change("gnss", _exchanged), toml(', ve = "ve_mps", vn = "vn_mps", vu = "vu_mps"', "")),
             ("refused", "latitude and longitude are exchanged"),
+        ),
+        Mistake(
+            "the west's sign lost",
+            scaled("gnss", "lon_deg", -1.0),
+            ("refused", "the longitudes have the wrong sign"),
+        ),
+        Mistake(
+            "the south's sign lost",
+            scaled("gnss", "lat_deg", -1.0),
+            ("refused", "the latitudes have the wrong sign"),
+        ),
+        Mistake(
+            "either lost, without velocities",
+            both(scaled("gnss", "lat_deg", -1.0), toml(', ve = "ve_mps", vn = "vn_mps", vu = "vu_mps"', "")),
+            ("refused", "latitudes or longitudes have the wrong sign"),
         ),
         Mistake(
             "the antenna below the IMU, not above",

@@ -33,20 +33,31 @@ def write_json(path: Path, values: Any) -> None:
 
 
 def json_text(values: Any) -> str:
-    """Values as indented JSON, as `write_json` writes them."""
-    return json.dumps(_plain(values), indent=2, ensure_ascii=False)
+    """Values as JSON, as `write_json` writes them: indented, a list of numbers or words on one line."""
+    return _text(values, "\n")
 
 
-def _plain(value: Any) -> Any:
+_ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)  # of the C library, as it has no indent
+
+
+def _text(value: Any, line: str) -> str:
+    """A value as JSON; `line` is the end of a line and the indent of the next."""
+    deeper = line + "  "
     if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, np.ndarray):
-        plain = value.dtype.kind in "bi" or (value.dtype.kind == "f" and bool(np.isfinite(value).all()))
-        return value.tolist() if plain else _plain(value.tolist())
-    if isinstance(value, np.generic):
-        return _plain(value.item())
+        inner = [f"{_ENCODER.encode(str(key))}: {_text(one, deeper)}" for key, one in value.items()]
+        return f"{{{deeper}{f',{deeper}'.join(inner)}{line}}}" if inner else "{}"
+    if isinstance(value, np.ndarray | np.generic):
+        if value.ndim == 2 and value.dtype.kind in "iuf" and np.isfinite(value).all():  # a row a line, all at once
+            rows = _ENCODER.encode(value.tolist())[1:-1].replace("], [", f"],{deeper}[")
+            return f"[{deeper}{rows}{line}]" if rows else "[]"
+        value = value.tolist()
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(one) for one in value]
+        try:
+            if not any(isinstance(one, Mapping | np.ndarray | list | tuple) for one in value):
+                return _ENCODER.encode(value)
+        except (TypeError, ValueError):
+            return f"[{', '.join(_text(one, deeper) for one in value)}]"
+        return f"[{deeper}{f',{deeper}'.join(_text(one, deeper) for one in value)}{line}]"
     if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value if value is None or isinstance(value, str | int | float | bool) else str(value)
+        return "null"
+    return _ENCODER.encode(value if value is None or isinstance(value, str | int | float | bool) else str(value))

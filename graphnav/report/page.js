@@ -106,9 +106,9 @@
   addEventListener("beforeprint", () => places.forEach(place => {
     if (place.closest("details:not([open])")) return;
     draw(place);
-    const whole = place.closest(".large, figure:only-child"), height = place.layout.height || place.offsetHeight;
-    place.dataset.height = place.style.height;
-    const size = {width: whole ? 700 : 226, height: Math.min(whole ? 300 : 225, 0.65 * height)};
+    place.dataset.height ||= place.style.height;
+    const whole = place.closest(".large, figure:only-child"), height = parseFloat(place.dataset.height);
+    const size = {width: whole ? 700 : 226, height: Math.min(whole ? 260 : 200, 0.65 * height)};
     place.style.height = `${size.height}px`;
     Plotly.relayout(place, {autosize: false, "font.size": 8, "margin.t": 15, "margin.b": 30, ...size});
   }));

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from graphnav.estimation.noise.table import FigureRow
     from graphnav.evaluation.metrics import Errors
 
-_LISTED = 40  # rejected measurements
-_SHOWN = 10  # excluded spans; the others open on demand
+_LISTED = 40  # rejected measurements, stops
+_SHOWN = 10  # excluded spans, stops; the others open on demand
 Withheld = Sequence[tuple[str, tuple[float, float] | None]]
 
 
@@ -264,8 +264,12 @@ def excluded_table(solution: Solution, start: float) -> list[Raw]:
     if not parts:
         return []
     rows = [[Raw(f"{p.t_start - start:.1f} to {p.t_end - start:.1f} s"), p.kind, int(p.count), p.reason] for p in parts]
-    head = ["when", "what", "rows", "why"]
-    out = [page.heading("What was excluded"), page.table(head, rows[:_SHOWN])]
+    return [page.heading("What was excluded"), *_long_table(["when", "what", "rows", "why"], rows)]
+
+
+def _long_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[Raw]:
+    """A table whose later rows are folded."""
+    out = [page.table(head, rows[:_SHOWN])]
     if len(rows) > _SHOWN:
         out.append(page.fold(f"{len(rows) - _SHOWN} more", page.table(head, rows[_SHOWN:])))
     return out
@@ -386,7 +390,7 @@ def stop_table(solution: Solution, start: float) -> list[Raw]:
     note = "Share: of the stop that a detector by itself calls stationary."
     if len(stops) > _LISTED:
         note += f" {len(stops) - _LISTED} more are in detections.csv."
-    return [page.table(["stands from", "for", "share by detector", "rows"], rows), page.paragraph(note, "soft")]
+    return [*_long_table(["stands from", "for", "share by detector", "rows"], rows), page.paragraph(note, "soft")]
 
 
 def odd(recording: Recording, findings: Sequence[str]) -> list[Raw]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from mistakes import ROOT, made, page, row, said
+from mistakes import HEAD, ROOT, made, row, said
 from mistakes_made import MISTAKES
 
 PAGE = (ROOT / "docs" / "mistakes.md").read_text(encoding="utf-8")
@@ -39,8 +39,10 @@ def test_the_recording_without_a_mistake_gives_no_warning(tmp_path):
 
 def test_the_page_is_made_of_these_mistakes_alone():
     rows = [
-        line for line in PAGE.splitlines() if line.startswith("| ") and not line.startswith(("| ---", "| what was"))
+        line
+        for line in PAGE.removeprefix(HEAD).splitlines()
+        if line.startswith("| ") and not line.startswith(("| ---", "| what was"))
     ]
     assert [line.split(" | ")[0].removeprefix("| ") for line in rows] == list(CASES)
-    assert page({head: [] for head in MISTAKES}).splitlines()[:8] == PAGE.splitlines()[:8]
+    assert PAGE.startswith(HEAD)
     assert len(CASES) >= 30

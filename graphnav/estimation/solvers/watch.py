@@ -31,7 +31,7 @@ from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import ExcludedSpan
 
-_PATIENCE = 60.0  # s
+_PATIENCE = 60.0  # s, after which fixes that are refused may be the ones that are right
 _CHANCE = 3  # fixes that agree after a fault, below which the next that does not says that they did by chance
 _EVERY = 8  # fixes between two looks at what is usual
 LARGE = 3.0  # sigmas that are stated or that clocks can be off: less is no fault, however certain

@@ -320,3 +320,25 @@ def odometer_fit(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
     if moving.sum() < MIN_PAIRS:
         return None
     return fit, float(np.median(track.speed[rows][moving] / x[moving]))
+
+
+def sideways_correlation(imu: Imu, way: Track) -> float | None:
+    """Correlation of the force to the right with what the gyro's turns ask for at the way's speed.
+
+    None where there are no curves.
+    """
+    seconds = np.arange(max(way.t[0], imu.t[0]), min(way.t[-1], imu.t[-1]) - 1.0)
+    if len(seconds) < MIN_PAIRS:
+        return None
+    edge = np.searchsorted(imu.t, np.r_[seconds, seconds[-1] + 1.0])
+    count = np.diff(edge)
+    force, turn = (
+        np.diff(np.r_[0.0, np.cumsum(x)][edge]) / np.maximum(count, 1) for x in (imu.accel[:, 0], imu.gyro[:, 2])
+    )
+    wanted = -np.interp(seconds + 0.5, way.t, way.speed) * turn  # to the left in a curve to the left
+    used = count > 0
+    if used.sum() < MIN_PAIRS or wanted[used].std() == 0.0 or force[used].std() == 0.0:
+        return None
+    alike = float(np.corrcoef(wanted[used], force[used])[0, 1])
+    # 4 sigma of the correlation of that many that have nothing to do with each other
+    return alike if abs(alike) > 4.0 / np.sqrt(used.sum()) else None

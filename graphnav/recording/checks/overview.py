@@ -23,6 +23,7 @@ from graphnav.recording.checks.aiding import (
     check_imu_axes,
     check_mirroring,
     check_yaw_scale,
+    mirrored_places,
     odometer_findings,
     overlap_s,
 )
@@ -159,7 +160,7 @@ def inspect(recording: Recording) -> Inspection:
         findings += check_gnss_coverage(recording)
         findings += check_rounding(recording.gnss)
         findings += check_fix_types(recording.gnss)
-        wrong = list(velocities(recording.gnss))
+        wrong = mirrored_places(recording, list(velocities(recording.gnss)))
         if overlap or not wrong:
             # against wrong velocities, or on another clock, every position jumps
             findings += wrong or (check_gnss_jumps(recording, track) if overlap else ())
@@ -172,7 +173,7 @@ def inspect(recording: Recording) -> Inspection:
         yaw = crosschecks.yaw_fit(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
-        if turns_back and (said := list(check_mirroring(recording))):
+        if turns_back and (said := list(check_mirroring(recording, track))):
             findings += said
         elif not turned:
             findings += check_gyro_sign(recording.imu) if turns_back else check_imu_axes(recording.imu, forward, track)

@@ -160,6 +160,15 @@ def describe_exchange(witness: str) -> Finding:
     )
 
 
+def describe_mirroring(which: str, witness: str) -> Finding:
+    """That positions have the wrong sign, by `witness`."""
+    return Finding(
+        "refused",
+        f"{which} the wrong sign, by {witness}: south and west are negative; negate the column in the file",
+        "gnss.mirrored",
+    )
+
+
 def _horizontal(way: Array, said: Array) -> Iterator[Finding]:
     """Which change of the velocities (N, 2) agrees with the ways (N, 2), if they do not themselves."""
 

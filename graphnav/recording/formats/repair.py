@@ -220,7 +220,8 @@ def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tup
         raise RecordingError(f"{rows.where(k, 'lat')}: {lat[k]:g} is not a latitude{hint}", key="table.place")
     beyond = np.flatnonzero((lon * scale < -np.pi - 1e-9) | (lon * scale > 2 * np.pi))
     if len(beyond):
-        hint = _other_form(lat, lon, label)
+        turned = lon.min() * scale >= -2 * np.pi and lon.max() * scale <= 2 * np.pi
+        hint = "; is it a whole turn off? Add 360 deg" if turned else _other_form(lat, lon, label)
         raise RecordingError(
             f"{rows.where(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude{hint}", key="table.place"
         )

@@ -20,6 +20,7 @@ from graphnav.core.rotation import Array
 from graphnav.recording.formats.decimals import read_decimals
 
 _BLANK = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that has cells
+_MARKS = {";": "a semicolon", "\t": "a tab", " ": "blanks"}  # between fields, in the order in which they are looked for
 
 
 Mask = Any  # an array of bool, or of row numbers
@@ -193,11 +194,11 @@ def _header(path: Path) -> tuple[int, list[str]]:
         names = [name.strip().strip('"') for name in line.split(",")]
         if "\ufffd" in line:
             raise RecordingError(f"{path}, line {number}: is not UTF-8 text", key="file.text")
-        if len(names) == 1 and (";" in line or "\t" in line):
-            mark = "a semicolon" if ";" in line else "a tab"
+        mark = next((words for one, words in _MARKS.items() if one in line), None)
+        if len(names) == 1 and mark is not None:
             raise RecordingError(
                 f"{path}, line {number}: fields are separated by {mark}; they must be by commas, numbers written with "
-                "points (graphnav init makes such a file of it)",
+                f"points{'' if mark == _MARKS[' '] else ' (graphnav init makes such a file of it)'}",
                 key="table.separator",
             )
         if all(_is_number(name) for name in names):
@@ -266,6 +267,17 @@ def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
             seen_header = seen_header or bool(line)
 
 
+def _hint(cell: str, cells: list[str], header: list[str], use: list[int]) -> str:
+    """What a cell that is no number may be, and what to do."""
+    if [one.strip('"') for one in cells] == header:
+        return "; the header is there again: cut the file in two there, or take the line out"
+    if re.fullmatch(r"(\d+-\d+-\d+[T ])?\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?Z?", cell):
+        return "; it is a time of day: write seconds"
+    if not any(_is_number(cells[k].strip('"')) for k in use):
+        return "; if the line holds units, take it out"
+    return ""
+
+
 def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
     """The slow and careful way, which says what is wrong and where."""
     rows = []
@@ -284,7 +296,8 @@ def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
                     row.append(parse_number(cell) if cell else np.nan)
                 except ValueError:
                     raise RecordingError(
-                        f"{path}, line {number}, column '{header[column]}': '{cell[:40]}' is not a number",
+                        f"{path}, line {number}, column '{header[column]}': '{cell[:40]}' is not a number"
+                        f"{_hint(cell, cells, header, use)}",
                         key="table.cell",
                     ) from None
             rows.append(row)

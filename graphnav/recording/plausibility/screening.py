@@ -44,6 +44,7 @@ _MOVES = 20.0  # steps of its own resolution by which an axis has moved and not 
 _STIRS = {"accelerometer": 1e-3 * _STANDARD_GRAVITY, "gyro": 7.3e-5}  # m/s^2, rad/s
 _NOISY = 0.05  # of the steps go back on the one before; of noise up to a band B and a rate f it is 1.5 B / f
 _AXIS = "xyz"
+_UNITS = ("imu.gyro_unit", "imu.force_scale")  # findings of `imu_scale`: nothing is known of single rows then
 
 
 @dataclass(frozen=True)
@@ -108,26 +109,10 @@ def screen(recording: Recording) -> Screened:
     """
     if recording.screened:
         return Screened(recording)
-    findings = list(check_imu_scale(recording))
-    wrong_unit = bool(findings)
-    imu, spikes = without_spikes(recording.imu, recording.start, wrong_unit)
-    findings += spikes
-    recording = replace(recording, imu=imu, screened=True)
-    findings += check_dead_axes(recording)
-    recording, said = screen_series(recording)
-    findings += said
-    track = None
-    if recording.gnss is not None and len(recording.gnss.t):
-        recording, said = plausibility_gnss.screen(recording)
-        findings += said
-        assert recording.gnss is not None
-        track = crosschecks.track(recording.gnss)
-        if track is not None and overlap_s(recording) <= 0:
-            track = None
-    if recording.odometer is not None and len(recording.odometer.t):
-        recording, said = plausibility_odometer.screen(recording, track)
-        findings += said
-    dead, clock = any(f.key == "imu.dead_axis" for f in findings), None
+    recording, of_imu, of_aiding, track = _without_the_impossible(recording)
+    dead, clock = list(check_dead_axes(recording)), None
+    findings = [*of_imu, *dead, *of_aiding]
+    wrong_unit = any(f.key in _UNITS for f in of_imu)
     if recording.platform == "vehicle" and not dead and not wrong_unit:
         way = track
         if way is None and recording.odometer is not None:
@@ -144,6 +129,31 @@ def screen(recording: Recording) -> Screened:
             odometer = crosschecks.odometer_fit(recording.odometer, track) if recording.odometer is not None else None
             findings += check_imu_clock(clock, None if odometer is None else odometer[0])
     return Screened(recording, tuple(findings), clock)
+
+
+def screen_again(recording: Recording) -> Recording:
+    """The recording as `screen` left it when it was solved, without looking for findings again."""
+    return recording if recording.screened else _without_the_impossible(recording)[0]
+
+
+def _without_the_impossible(recording: Recording) -> tuple[Recording, list[Finding], list[Finding], Track | None]:
+    """The recording without what cannot be right, findings of the IMU and of the others, and the way by the fixes."""
+    of_imu: list[Finding] = list(check_imu_scale(recording))
+    imu, spikes = without_spikes(recording.imu, recording.start, wrong_unit=bool(of_imu))
+    of_imu += spikes
+    recording, of_aiding = screen_series(replace(recording, imu=imu, screened=True))
+    track = None
+    if recording.gnss is not None and len(recording.gnss.t):
+        recording, said = plausibility_gnss.screen(recording)
+        of_aiding += said
+        assert recording.gnss is not None
+        track = crosschecks.track(recording.gnss)
+        if track is not None and overlap_s(recording) <= 0:
+            track = None
+    if recording.odometer is not None and len(recording.odometer.t):
+        recording, said = plausibility_odometer.screen(recording, track)
+        of_aiding += said
+    return recording, of_imu, of_aiding, track
 
 
 def check_imu_scale(recording: Recording) -> Iterator[Finding]:
@@ -289,7 +299,9 @@ def check_forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iter
     if ahead[1] > -_SURE:
         return
     along = f"the forward force falls when the speed rises (correlation {-forward.correlation:.2f})"
-    if (side := _sideways(imu, way)) is not None and side > 0:  # then nothing is turned: the other axes are right
+    if (
+        side := crosschecks.sideways_correlation(imu, way)
+    ) is not None and side > 0:  # then nothing is turned: the other axes are right
         column = "a" + _AXIS[int(np.argmax(np.abs(imu.R_bs[1])))]
         yield Finding(
             "refused",
@@ -299,23 +311,4 @@ def check_forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iter
         )
         return
     for said in check_imu_axes(imu, forward, way):
-        yield Finding("refused", f"{said.sentence}; {along}", "imu.axes_turned")
-
-
-def _sideways(imu: Imu, way: Track) -> float | None:
-    """Correlation of the force to the right with what curves ask for; None where there are none."""
-    seconds = np.arange(max(way.t[0], imu.t[0]), min(way.t[-1], imu.t[-1]) - 1.0)
-    if len(seconds) < crosschecks.MIN_PAIRS:
-        return None
-    edge = np.searchsorted(imu.t, np.r_[seconds, seconds[-1] + 1.0])
-    count = np.diff(edge)
-    force, turn = (
-        np.diff(np.r_[0.0, np.cumsum(x)][edge]) / np.maximum(count, 1) for x in (imu.accel[:, 0], imu.gyro[:, 2])
-    )
-    wanted = -np.interp(seconds + 0.5, way.t, way.speed) * turn  # to the left in a curve to the left
-    used = count > 0
-    if used.sum() < crosschecks.MIN_PAIRS or wanted[used].std() == 0.0 or force[used].std() == 0.0:
-        return None
-    alike = float(np.corrcoef(wanted[used], force[used])[0, 1])
-    # 4 sigma of the correlation of that many that have nothing to do with each other
-    return alike if abs(alike) > 4.0 / np.sqrt(used.sum()) else None
+        yield Finding("refused", f"{along}: {said.sentence}", "imu.axes_turned")
