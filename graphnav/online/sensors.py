@@ -72,6 +72,8 @@ class Sensors:
 
     def newest(self, sensor: str) -> float:
         """Newest time of a sensor, s."""
+        if sensor == RAW and self.raw is None:
+            return -np.inf
         return self.imu.newest if sensor == "imu" else self.aiding[sensor].newest
 
     def anchors(self, sensor: str) -> bool:
