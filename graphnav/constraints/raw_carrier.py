@@ -186,7 +186,6 @@ class GnssCarrier(SatelliteConstraint):
     odd: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) which of `CLONES` is of that epoch
     which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite, in the order of their rates
     slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) change of the ionosphere's delay over the zenith's
-    towards: Array = field(default_factory=lambda: np.empty(0))  # (N,) way through the atmosphere over the zenith's
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -235,7 +234,6 @@ class GnssCarrier(SatelliteConstraint):
             odd=(pairs.epoch - 1) % 2,
             which=which,
             slant=delay[k] - delay[j],
-            towards=obliquity(found.elevation[k]),
             sigma=sigma[:, None],
             processes=(drift,),
             **common,
@@ -260,8 +258,7 @@ class GnssCarrier(SatelliteConstraint):
         time = self.time[rows]
         own, chosen = select_columns(parameters[RATES], self.which[rows])
         shift, more = self._lasting(parameters, (DRIFT,), rows, e)
-        along = self.towards[rows] * time
-        residual = residual + self.slant[rows] * parameters[IONOSPHERE][:, 0] + own * along + shift * time
-        J |= {IONOSPHERE: self.slant[rows, None, None], RATES: chosen * along[:, None, None]}
+        residual = residual + self.slant[rows] * parameters[IONOSPHERE][:, 0] + (own + shift) * time
+        J |= {IONOSPHERE: self.slant[rows, None, None], RATES: chosen * time[:, None, None]}
         J |= {name: by * time[:, None, None] for name, by in more.items()}
         return Linearized(residual[:, None], J, self.sigma[rows])
