@@ -23,7 +23,7 @@ ROOMS = {
     "simulation": ["core", "sensors", "recording"],
     "constraints": ["core", "sensors", "config", "gnss", "recording", "imu"],
     "estimation": ["core", "config", "gnss", "recording", "imu", "detectors", "constraints"],
-    "online": ["core", "sensors", "config", "recording", "imu", "detectors", "constraints", "estimation"],
+    "online": ["core", "sensors", "config", "gnss", "recording", "imu", "detectors", "constraints", "estimation"],
     "evaluation": ["core", "recording", "estimation"],
     "report": ["core", "recording", "detectors", "constraints", "estimation", "evaluation"],
     "app": [

@@ -158,7 +158,6 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
 
 
 def _run(request: Request, progress: Progress | None) -> Outcome:
-    from graphnav.recording.checks.aiding import gnss_apart
     from graphnav.recording.checks.overview import inspect
     from graphnav.recording.checks.stated import truth_apart
     from graphnav.recording.formats import read
@@ -178,8 +177,6 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     recording = inspection.recording
     used, notes = _withhold(recording, moved, zero)
     findings = [f.sentence for f in inspection.findings]
-    if (sentence := gnss_apart(used)) is not None:  # it would be solved as if there were no GNSS
-        raise RecordingError(f"'{recording.name}': {sentence}", key="gnss.apart")
     if truth_apart(recording):
         recording = replace(recording, truth=None)
 

@@ -46,8 +46,8 @@ from graphnav.constraints.raw_gnss import (
     prepare_rows,
     range_change,
     select_columns,
-    select_observations,
 )
+from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
@@ -203,7 +203,7 @@ class GnssCarrier(SatelliteConstraint):
         if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
             common["robust"] = "cauchy"
         E = len(pairs.epochs)
-        satellites, which = np.unique(raw.satellite[k], return_inverse=True)
+        satellites, which = raw.take(k).satellites
         many = len(satellites)
         minutes, hours = scene.settings.gnss.slow_times
         common["parameters"] = (

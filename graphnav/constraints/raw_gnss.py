@@ -25,15 +25,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
+from graphnav.config.raw_gnss import RawGnssSettings
+from graphnav.constraints.base import BuildContext, Constraint, Linearized
 from graphnav.constraints.gnss import LEVER_ARM, TIMES, antenna_velocity, around, node_spacing, period
+from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import earth, rotation
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.gnss.atmosphere import obliquity
 from graphnav.gnss.ephemeris import rotate_earth
-from graphnav.gnss.series import RawGnss, primary
+from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import code_sigma, rate_sigma
 from graphnav.gnss.signals import L1, NAMES, C, signal_name
 from graphnav.gnss.single_point import coefficients, look, signal_groups, stretch
@@ -60,31 +62,6 @@ _GRADIENT = 2e-6  # of the zenith's delay over the distance to a base station, o
 _RATE_ERROR = np.array([0.05, 0.05, 0.1])  # m/s
 _LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have a variance factor of their own
 _CLASSES = ("strong", "fair", "weak", "faint")
-
-
-def select_observations(recording: Recording, settings: Settings) -> RawGnss | None:
-    """The rows to be used: of one signal for each satellite, strong enough, where the IMU is."""
-    s, raw = settings.raw_gnss, recording.raw_gnss
-    if raw is None or not recording.tight(s.coupling) or not len(raw):
-        return None
-    used = (raw.t >= recording.start - SAME_TIME) & (raw.t <= recording.end + SAME_TIME)
-    used &= np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock) & ~(raw.cn0 < s.cn0)
-    if raw.differenced:
-        used &= np.isfinite(raw.difference)
-    if s.period > 0.0 and used.any():
-        used &= np.isin(raw.t, _apart(np.unique(raw.t[used]), s.period))
-    raw = raw.take(used)
-    raw = raw.take(primary(raw))
-    return raw if len(raw) else None
-
-
-def _apart(t: Array, least: float) -> Array:
-    """Those of some times that are so far apart at least."""
-    out = [float(t[0])]
-    for x in t.tolist():
-        if x - out[-1] >= least - 0.05:
-            out.append(x)
-    return np.array(out)
 
 
 @dataclass(frozen=True)
@@ -132,8 +109,13 @@ def prepare_rows(scene: BuildContext) -> PreparedRows | None:
         clock=Parameter(
             CLOCK, raw.receiver_clock[first], np.tile(_CLOCK_SIGMA, (len(epochs), 1)), "m, m/s", begins=epochs
         ),
-        spacing=node_spacing(scene.settings.gnss.slow_times, period(epochs)),
+        spacing=node_spacing(scene.settings.gnss.slow_times, _period(raw, scene.settings.raw_gnss)),
     )
+
+
+def _period(raw: RawGnss, settings: RawGnssSettings) -> float:
+    """s between the epochs that are used; a piece of a series may have too few to tell."""
+    return period(raw.epochs[0]) if raw.catalogue is None else max(raw.catalogue.period, settings.period)
 
 
 def common_fields(scene: BuildContext, found: PreparedRows) -> dict[str, Any]:
@@ -284,7 +266,7 @@ class GnssCode(RangeConstraint):
                 ),
             )
         common["parameters"] += more
-        satellites, which = np.unique(raw.satellite, return_inverse=True)
+        satellites, which = raw.satellites
         sigma, many = code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)
         minutes, hours = settings.gnss.slow_times
         common["parameters"] += (

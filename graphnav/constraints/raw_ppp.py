@@ -29,8 +29,8 @@ from graphnav.constraints.raw_gnss import (
     common_fields,
     prepare_rows,
     select_columns,
-    select_observations,
 )
+from graphnav.constraints.raw_selection import select_observations
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States

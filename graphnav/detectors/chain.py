@@ -7,7 +7,9 @@ saw, integrates to the difference of their speeds:
     dv = integral (f_y - f_y0 + g dpitch) dt,     dpitch = integral (omega_x - bias) dt
 
 so that from one known speed those of all linked stretches follow, and where none is known the faster of two cannot
-be a stop. The same integral decides whether a disturbance between two stops moved the vehicle or shook it only.
+be a stop. The same integral decides whether a disturbance between two stops moved the vehicle or shook it only, and,
+from one stretch out to where a speed was measured last or is measured next, whether the stretch may be a stop at all:
+were it one, the integral would be that speed.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from graphnav.core.rotation import Array
 from graphnav.detectors.windows import Blocks
 
 _INNER = 1.5  # s of a stretch that say what its force and rate are
-_LONGEST = 60.0  # s between stretches over which a difference of speed still means something
+LONGEST = 60.0  # s between stretches over which a difference of speed still means something
 _LEAST = 0.02  # m/s, 1-sigma of any such difference
 _SIGMAS = 3.0
 _G = 9.81  # m/s^2
@@ -50,7 +52,7 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
     i = int(np.searchsorted(b.t, max(before[0], before[1] - _INNER)))
     j = int(np.searchsorted(b.t, min(after[1], after[0] + _INNER)))
     n0, n1 = (int(k) - i for k in np.searchsorted(b.t, [before[1], after[0]]))
-    if T > _LONGEST or n0 < 3 or j - i - n1 < 3 or not b.whole[i + 1 : j].all():
+    if T > LONGEST or n0 < 3 or j - i - n1 < 3 or not b.whole[i + 1 : j].all():
         return _UNKNOWN
     rate = b.rate[i:j]
     bias = 0.5 * (rate[:n0].mean(axis=0) + rate[n1:].mean(axis=0))
@@ -73,6 +75,59 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
     way -= share * way[-1]
     tolerance = _SIGMAS * float(np.hypot(_LEAST, np.linalg.norm(doubt)))
     return Link(float(v.imag), tolerance, float(np.abs(way).max()), float(np.abs(way.mean())))
+
+
+@dataclass(frozen=True)
+class Outwards:
+    """What the speed beside a still stretch is if that is a stop, from its end on outwards."""
+
+    way: int  # 1 on from its end, -1 back from its start
+    t: Array  # (n,) s
+    speed: Array  # (n,) m/s, horizontal
+    tolerance: Array  # (n,) m/s, 3 sigma of it
+
+    def within(self, first: float, last: float) -> NDArray[np.bool_] | None:
+        """(n,) which rows lie between two times; None where one of these is further out than they go, or none does."""
+        there = (self.t >= first) & (self.t <= last)
+        outer = last if self.way > 0 else first
+        return there if there.any() and self.way * (self.t[-1] - outer) >= 0.0 else None
+
+
+def speed_beside(b: Blocks, span: Array, way: int) -> Outwards | None:
+    """Speeds beside a still span (2,) s, were it a stop, up to a gap or a turn; None where there are too few rows.
+
+    What rate and force are at rest is their mean over the span, as sure as they scatter in it.
+
+    Parameters
+    ----------
+    way : 1 goes on from its end, -1 back from its start.
+    """
+    end, other = (float(x) for x in (span[::-1] if way > 0 else span))
+    i, k, j = np.searchsorted(b.t, sorted((other, end, end + way * LONGEST)))
+    torn = np.flatnonzero(~b.whole[i + 1 : j]) + i + 1
+    outside = torn[torn >= k] if way > 0 else torn[torn <= k]
+    if len(outside):
+        i, j = (i, int(outside[0])) if way > 0 else (int(outside[-1]), j)
+    n0 = int(k - i if way > 0 else j - k)
+    if n0 < 3 or j - i <= n0:
+        return None
+    force, rate, t = b.force[i:j][::way], b.rate[i:j][::way], b.t[i:j][::way]
+    left, yaw = _level(force, way * (rate - rate[:n0].mean(axis=0)), n0, b.period)
+    n = int(np.argmax(np.append(np.abs(yaw[n0:]) > _STRAIGHT, True)))
+    left, yaw, T = left[n0 : n0 + n], np.abs(yaw[n0 : n0 + n]), b.period * np.arange(1, n + 1)
+    # densities of white noise, by the scatter in the stretch, and what they leave of its means
+    of_force, of_rate = (float(np.sqrt(x[:n0].var(axis=0).max() * b.period)) for x in (force, rate))
+    known = 1.0 / (n0 * b.period)
+    doubt = (
+        np.full(n, _LEAST),
+        0.5 * _G * T**2 * np.hypot(_TURN_ON, of_rate * np.sqrt(known)),
+        _G * of_rate * np.sqrt(T**3 / 3.0),
+        of_force * np.sqrt(T + T**2 * known),
+        _G * _CROSS * np.cumsum(yaw) * b.period,
+        _MISALIGNED * np.cumsum(np.abs(left.real)) * b.period,
+    )
+    speed, tolerance = np.abs(np.cumsum(left)) * b.period, _SIGMAS * np.sqrt(np.sum(np.square(doubt), axis=0))
+    return Outwards(way, t[n0 : n0 + n], speed, tolerance)
 
 
 def at_rest_until(b: Blocks, span: Array, way: int, most: float, limit: float) -> float:

@@ -4,7 +4,8 @@
    whoever decides alone. Their ends are moved to where the low-passed force and rate leave what they are inside (never
    outwards past a disturbance).
 2. Nothing changed in a candidate, so neither did its speed: if the speeds known inside say motion, all of it moves,
-   and so does what the force links to it (`graphnav.detectors.chain`).
+   and so does what the force links to it (`graphnav.detectors.chain`). Where no sensor looked, the speed measured last
+   before it, and first after it, must be one that the force leads to from rest.
 3. Two candidates are one stop if the force between them, integrated, leads from rest to rest without reaching a
    speed in between: a passenger moved, not the vehicle. In the fusion what the FFT detector calls stationary next to
    a stop joins it under the same condition.
@@ -22,9 +23,9 @@ from graphnav.config.detectors import FusionSettings
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, longer_than, merge_spans, spans_of, subtract_spans, union, within
-from graphnav.detectors.chain import Link, at_rest_until, link, moving_by_chain
+from graphnav.detectors.chain import LONGEST, Link, Outwards, at_rest_until, link, moving_by_chain, speed_beside
 from graphnav.detectors.low_band import Scale, low_band
-from graphnav.detectors.motion import Speeds
+from graphnav.detectors.motion import Speeds, of_three
 from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.windows import Blocks, kernel, share_of, smooth
 
@@ -114,7 +115,9 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
         return NONE, certain, ()
     certain = _certain_motion(b, spans, speeds, certain)
     known = np.array([_known_speed(speeds, span) for span in spans])
-    moves = moving_by_chain([link(b, one, next_one) for one, next_one in pairwise(spans)], known)
+    moves = np.array([_leads_to_speed(b, span, speeds, scene.settings.fusion) for span in spans]) & np.isnan(known)
+    rest = np.flatnonzero(~moves)  # one that moves may brake steadily: the force over it counts, not its mean
+    moves[rest] = moving_by_chain([link(b, *pair) for pair in pairwise(spans[rest])], known[rest])
     notes = []
     measured = int((np.nan_to_num(known) > 0.0).sum())
     if measured:
@@ -167,6 +170,36 @@ def _still_in_motion(found: Detection, certain: Array) -> float:
     step = float(found.t[1] - found.t[0]) if len(found.t) > 1 else 0.0
     moving = within(found.t, certain, _INNER) & np.isfinite(found.statistic)
     return float(found.mask[moving].mean()) if moving.sum() * step > _ENOUGH else 0.0
+
+
+def _leads_to_speed(b: Blocks, span: Array, speeds: list[Speeds], settings: FusionSettings) -> bool:
+    """Whether the speeds measured last before a still stretch, or first after it, are none that a stop there leads to.
+
+    Single epochs count no more than elsewhere, and all may be as late as an odometer.
+    """
+    for way in (-1, 1):
+        beside: Outwards | None = None
+        for s in speeds:
+            edge = span[0] if way < 0 else span[1]
+            at = np.flatnonzero(way * (s.t - edge) > s.half)
+            at = at[np.argsort(np.abs(s.t[at] - edge), kind="stable")[:3]]
+            if len(at) < 3 or np.abs(s.t[at] - edge).max() > LONGEST:
+                continue
+            beside = beside or speed_beside(b, span, way)
+            if beside is None:
+                break
+            excess = [_excess(beside, s, k, max(s.late, settings.odometer_delay)) for k in at.tolist()]
+            if of_three(*np.array(excess)) > 0.0:
+                return True
+    return False
+
+
+def _excess(beside: Outwards, s: Speeds, k: int, late: float) -> float:
+    """m/s by which a measured speed is greater than all that a stop leads to while it was measured; -inf if unknown."""
+    there = beside.within(s.t[k] - s.half - late, s.t[k] + s.half)
+    if there is None:
+        return -np.inf
+    return float(s.speed[k] - np.max(beside.speed[there] + np.hypot(beside.tolerance[there], s.limit[k])))
 
 
 def _zero(speeds: list[Speeds], span: Array) -> bool:

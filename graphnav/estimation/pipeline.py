@@ -17,7 +17,7 @@ from graphnav.constraints import check_own as check_constraints
 from graphnav.constraints.base import Constraint
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core.earth import LocalFrame
-from graphnav.core.errors import ConfigError, EstimationError
+from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, listening, tell
 from graphnav.core.state import BLOCKS
@@ -36,6 +36,7 @@ from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.imu.onboard_offset import without_onboard_offset
 from graphnav.recording import Own, Recording
+from graphnav.recording.checks.aiding import gnss_apart
 from graphnav.recording.plausibility.screening import screen_recording
 
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
@@ -78,7 +79,7 @@ def run(
     Raises
     ------
     RecordingError
-        If a sensor is wrong throughout.
+        If a sensor is wrong throughout, or GNSS and IMU share no time.
     EstimationError
         If the recording does not determine a trajectory.
     ConfigError
@@ -87,6 +88,8 @@ def run(
     settings = settings or Settings()
     recording = with_own(recording, constraints, detectors)
     recording, found = screen_recording(recording)
+    if (apart := gnss_apart(recording)) is not None:  # it would be solved as if there were no GNSS
+        raise RecordingError(f"'{recording.name}': {apart}", key="gnss.apart")
     with listening(progress):
         solutions = _run(recording, settings, solvers, progress, noise)
     return {name: replace(one, notes=(*found, *one.notes)) for name, one in solutions.items()}

@@ -133,6 +133,16 @@ def _plausible(obs: Observations) -> Observations:
 
 
 @dataclass(frozen=True)
+class Catalogue:
+    """What a series has rows of, for pieces of it: they number satellites and signals alike."""
+
+    satellites: tuple[int, ...]  # ascending
+    groups: tuple[tuple[int, int], ...]  # systems with their signals, the reference first
+    differenced: bool  # against a base station
+    period: float  # s between epochs
+
+
+@dataclass(frozen=True)
 class RawGnss:
     """Observations of a rover with their satellites placed: N rows on the recording's clock, in order of time."""
 
@@ -166,6 +176,7 @@ class RawGnss:
     files: tuple[str, ...] = ()
     precise: bool = False  # placed by precise orbits and clocks
     antennas: Antennas = field(default_factory=dict)  # of the satellites, where an ANTEX file is given
+    catalogue: Catalogue | None = None  # of the series that this is a piece of
 
     def __len__(self) -> int:
         return len(self.t)
@@ -182,7 +193,15 @@ class RawGnss:
     @property
     def differenced(self) -> bool:
         """Whether a base station is there."""
-        return bool(np.isfinite(self.difference).any())
+        return bool(np.isfinite(self.difference).any()) if self.catalogue is None else self.catalogue.differenced
+
+    @property
+    def satellites(self) -> tuple[Ids, NDArray[np.intp]]:
+        """Satellites (S,), ascending, and which of them each row is of."""
+        if self.catalogue is None:
+            return np.unique(self.satellite, return_inverse=True)
+        every = np.array(self.catalogue.satellites, dtype=self.satellite.dtype)
+        return every, np.searchsorted(every, self.satellite)
 
     @property
     def seconds_of_week(self) -> Array:

@@ -112,6 +112,9 @@ def coefficients(raw: RawGnss) -> Array:
 def signal_groups(raw: RawGnss) -> tuple[tuple[tuple[int, int], ...], NDArray[np.intp]]:
     """Systems with their signals, the one with most rows first, and which of them each row (N,) has."""
     key = (raw.satellite // 100).astype(np.int64) * 1000 + raw.signal
+    if raw.catalogue is not None:
+        known = np.array([1000 * system + signal for system, signal in raw.catalogue.groups])
+        return raw.catalogue.groups, np.argmax(key[:, None] == known, axis=1)
     found, of, many = np.unique(key, return_inverse=True, return_counts=True)
     order = np.argsort(-many, kind="stable")
     rank = np.empty(len(found), dtype=np.intp)

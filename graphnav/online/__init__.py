@@ -1,8 +1,9 @@
 """Smoothing while the drive happens: rows of sensors in, a live state and a settled trajectory out."""
 
 from graphnav.online.ahead import Live
+from graphnav.online.replay import rows_of, without_rows
 from graphnav.online.rows import Fix, ImuSample, Reading, WheelSpeed, live_setup, live_trajectory
-from graphnav.online.sensors import Row, Sensors, rows_of, without_rows
+from graphnav.online.sensors import Row, Sensors
 from graphnav.online.session import Session
 from graphnav.online.steady import Online
 from graphnav.online.tracker import Tracker

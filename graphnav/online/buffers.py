@@ -59,6 +59,10 @@ class Buffer:
         self._end += 1
         return True
 
+    def after(self, t: float) -> list[tuple[float, tuple[float, ...]]]:
+        """The rows after a time, each as it was put in."""
+        return [(float(row[0]), tuple(row[1:].tolist())) for row in self.rows[self.t > t]]
+
     def drop_before(self, t: float) -> None:
         """Forget the rows before a time."""
         self._begin += int(np.searchsorted(self.t, t))

@@ -181,6 +181,11 @@ class Chain:
                     place = self.window.newest.state.p[0]
                     steps.append(Step(name, place, np.full(3, _PLACE_SIGMA)))
                     nodes[name] = stop
+            elif p.begins is not None:
+                j = int(np.searchsorted(p.begins, t + SAME_TIME, side="right")) - 1
+                if (j >= 0 and nodes.get(name) != p.begins[j]) or name not in nodes:
+                    steps.append(Step(name, p.initial[max(j, 0)], p.sigma[max(j, 0)]))
+                    nodes[name] = float(p.begins[max(j, 0)])
             elif name not in nodes:
                 steps.append(Step(name, np.atleast_2d(p.initial)[0], np.atleast_2d(p.sigma)[0]))
                 nodes[name] = t

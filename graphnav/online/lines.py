@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -21,7 +21,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 from graphnav.core.complaints import complaint, nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_json, parse_number
-from graphnav.online.sensors import Row, rows_of
+from graphnav.online.replay import rows_of
+from graphnav.online.sensors import Row
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
 from graphnav.recording.formats.schema import Noise
 from graphnav.sensors import Column, Series, list_sensors
@@ -186,7 +187,7 @@ def line_of(row: Row) -> str:
 def lines_of(recording: Recording) -> Iterator[tuple[float, str]]:
     """A recording as a live source would send it: time and line, the first line and the end included."""
     yield recording.start, head_of(recording)
-    for row in rows_of(recording)[1]:
+    for row in rows_of(replace(recording, raw_gnss=None))[1]:  # of which there are no lines
         yield row[1], line_of(row)
     yield recording.end, END
 

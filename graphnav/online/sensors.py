@@ -8,10 +8,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.constraints.gnss import period
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.spacing import best_fixes, grid_start
 from graphnav.online.buffers import SAME, Buffer
+from graphnav.online.raw import RAW, RawEpochs
 from graphnav.online.sanity import ClockGuard, Reach, Row, fix_odds, imu_reads, odometer_reads, with_sane_velocity
 from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.recording.formats.repair import LATEST
@@ -32,15 +34,18 @@ class Sensors:
     ----------
     setup : a recording without rows: platform, noise figures, lever arms.
     longest_gap : s between IMU rows beyond which a stamp is wrong, or the IMU was away.
+    raw_settings : of raw observations; which epochs and satellites are used.
     """
 
     setup: Recording
     longest_gap: float = 2.0
+    raw_settings: RawGnssSettings = field(default_factory=RawGnssSettings)
     counts: Counter[str] = field(default_factory=Counter)
     imu: Buffer = field(default_factory=lambda: Buffer(_WIDTH["imu"]))
     gnss: Buffer = field(default_factory=lambda: Buffer(_WIDTH["gnss"]))
     odometer: Buffer = field(default_factory=lambda: Buffer(_WIDTH["odometer"]))
     others: dict[str, Buffer] = field(init=False)  # of the sensors of `Recording.sensors`
+    raw: RawEpochs | None = field(init=False)  # of a receiver whose single satellites are used in place of its fixes
     oldest: float = -np.inf  # s; rows up to here come too late
     _unit: Array | None = None  # `unit`, once asked for
     _means: dict[str, tuple[float, tuple[float, ...]]] = field(default_factory=dict)  # usual sigmas, and since when
@@ -56,19 +61,32 @@ class Sensors:
 
     def __post_init__(self) -> None:
         self.others = {name: Buffer(len(series.sensor.names)) for name, series in self.setup.sensors.items()}
+        raw, tight = self.setup.raw_gnss, self.setup.tight(self.raw_settings.coupling)
+        self.raw = RawEpochs(raw, self.raw_settings) if raw is not None and tight else None
 
     @property
-    def aiding(self) -> dict[str, Buffer]:
+    def aiding(self) -> dict[str, Buffer | RawEpochs]:
         """The buffers of all sensors but the IMU, by their names."""
-        return {"gnss": self.gnss, "odometer": self.odometer, **self.others}
+        of_raw = {} if self.raw is None else {RAW: self.raw}
+        return {"gnss": self.gnss, "odometer": self.odometer, **self.others, **of_raw}
 
     def newest(self, sensor: str) -> float:
         """Newest time of a sensor, s."""
+        if sensor == RAW and self.raw is None:
+            return -np.inf
         return self.imu.newest if sensor == "imu" else self.aiding[sensor].newest
 
     def anchors(self, sensor: str) -> bool:
         """Whether each row of a sensor wants a keyframe."""
-        return sensor == "gnss" or (sensor in self.others and self.setup.sensors[sensor].sensor.keyframes)
+        if sensor in self.others:
+            return self.setup.sensors[sensor].sensor.keyframes
+        return sensor == ("gnss" if self.raw is None else RAW)
+
+    def anchors_of_all(self) -> Array:
+        """Times (N,) of the rows that want a keyframe, s."""
+        times = [self.fixes] if self.anchors("gnss") else []
+        times += [b.t for name, b in self.aiding.items() if name != "gnss" and self.anchors(name)]
+        return np.unique(np.concatenate([*times, np.empty(0)]))
 
     def add(self, sensor: str, t: float, values: tuple[float, ...], released: bool = False) -> bool:
         """Take in a row; False if it is of no use (`counts` says why), or is held until an IMU row tells its clock.
@@ -80,6 +98,8 @@ class Sensors:
         """
         if sensor in self.others:
             return self._add_other(sensor, t, values, released)
+        if sensor == RAW:
+            return self._add_epoch(t, values, released)
         known = values[: 6 if sensor != "odometer" else 1]
         if not math.isfinite(sum(known)) or not abs(t) <= LATEST or (sensor == "gnss" and min(values[3:6]) <= 0.0):
             self.counts[f"{sensor}: not a number"] += 1
@@ -153,6 +173,22 @@ class Sensors:
         elif not self.others[name].add(t, tuple(row[0].tolist())):
             why = "repeated"
         self.counts[name if why is None else f"{name}: {why}"] += 1
+        return why is None
+
+    def _add_epoch(self, t: float, values: tuple[float, ...], released: bool) -> bool:
+        if self.raw is None:
+            why: str | None = "fixes are used in place of them"
+        elif not abs(t) <= LATEST:
+            why = "not a number"
+        elif (why := self.raw.odds(values)) is not None:
+            pass
+        elif not self._in_time(RAW, t, values, (RAW, t, len(values)), released):
+            return False
+        elif not self.raw.wanted(t):
+            why = "closer than they are used"
+        else:
+            self.raw.add(t, values)
+        self.counts[RAW if why is None else f"{RAW}: {why}"] += 1
         return why is None
 
     def add_next(self, t: float, values: tuple[float, ...], newest: float) -> bool:
@@ -256,6 +292,8 @@ class Sensors:
                 for name, buffer in self.others.items():
                     again = {_identify(name, t, tuple(values)) for t, *values in buffer.rows.tolist()}
                     self._before = {one for one in self._before if one[0] != name} | again
+                for t_before, values_before in [] if self.raw is None else self.raw.after(-math.inf):
+                    self._before.add((RAW, t_before, len(values_before)))
             self._sort_out()
             return False
         if len(self.imu) and t > self.imu.newest + self.longest_gap:
@@ -303,8 +341,11 @@ class Sensors:
         for name, buffer in self.others.items():
             rows = buffer.between(begin, end)
             sensors[name] = replace(self.setup.sensors[name], t=rows[:, 0], values=rows[:, 1:])
-        gnss = self._gnss(begin, end, every)
-        return replace(self.setup, imu=imu, gnss=gnss, odometer=self._odometer(begin, end), sensors=sensors)
+        raw = None if self.raw is None else self.raw.between(begin, end)
+        return replace(
+            self.setup, imu=imu, gnss=self._gnss(begin, end, every), odometer=self._odometer(begin, end),
+            sensors=sensors, raw_gnss=raw,
+        )  # fmt: skip
 
     def _gnss(self, begin: float, end: float, every: bool = False) -> Gnss | None:
         rows = self.gnss.between(begin, end)
@@ -337,48 +378,3 @@ def unit_of(sd: Array) -> Array:
     east, north, up = np.median(sd, axis=0)
     level = np.sqrt(0.5 * (east**2 + north**2))
     return np.array([level, level, up])
-
-
-def without_rows(recording: Recording) -> Recording:
-    """The setup of a recording's sensors."""
-    none, rows = np.empty(0), np.empty((0, 3))
-    gnss, odometer = recording.gnss, recording.odometer
-    return replace(
-        recording,
-        imu=replace(recording.imu, t=none, gyro=rows, accel=rows),
-        gnss=gnss and replace(gnss, t=none, llh=rows, sd=rows, v=None, sd_v=None, type=None),
-        odometer=odometer and replace(odometer, t=none, speed=none, way=None, wheels=None),
-        truth=None,
-        sensors={name: replace(s, t=none, values=s.values[:0]) for name, s in recording.sensors.items()},
-    )
-
-
-def rows_of(recording: Recording) -> tuple[Array, list[Row]]:
-    """Every row of a recording in the order in which sensors without delay would have sent them, and their times."""
-    parts: list[tuple[Array, str, Array]] = []
-    if recording.odometer is not None:
-        o = recording.odometer
-        blank = np.full((len(o.t), 6), np.nan)
-        blank[:, 0] = o.speed
-        if o.way is not None:
-            blank[:, 1] = o.way
-        if o.wheels is not None:
-            blank[:, 2:] = o.wheels
-        parts.append((o.t, "odometer", blank))
-    if recording.gnss is not None:
-        g = recording.gnss
-        blank = np.full((len(g.t), 12), np.nan)
-        blank[:, :3], blank[:, 3:6] = g.llh, g.sd
-        if g.v is not None and g.sd_v is not None:
-            blank[:, 6:9], blank[:, 9:] = g.v, g.sd_v
-        parts.append((g.t, "gnss", blank))
-    parts += [(series.t, name, series.values) for name, series in recording.sensors.items()]
-    parts.append((recording.imu.t, "imu", np.concatenate([recording.imu.gyro, recording.imu.accel], axis=1)))
-    t = np.concatenate([part[0] for part in parts])
-    order = np.argsort(t, kind="stable")
-    every = [
-        (name, x, tuple(row))
-        for times, name, rows in parts
-        for x, row in zip(times.tolist(), rows.tolist(), strict=True)
-    ]
-    return t[order], [every[i] for i in order]

@@ -11,7 +11,8 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import key_of
 from graphnav.core.trajectory import Trajectory
 from graphnav.online.lines import END, row_of, setup_of
-from graphnav.online.sensors import Row, rows_of, without_rows
+from graphnav.online.replay import rows_of, without_rows
+from graphnav.online.sensors import Row
 from graphnav.online.steady import Online
 from graphnav.online.store import Store
 from graphnav.recording import Recording

@@ -29,6 +29,7 @@ from graphnav.estimation.solvers.window import first_message
 from graphnav.online.ahead import Live
 from graphnav.online.judging import CatchUp, Judgement
 from graphnav.online.looks import CONTEXT, SURE
+from graphnav.online.raw import settings_online
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import Tracker
 from graphnav.online.walker import Walker
@@ -57,11 +58,12 @@ class Smoother:
     """
 
     def __init__(self, setup: Recording, settings: Settings | None = None) -> None:
-        self.settings, self._setup = settings or Settings(), setup
-        self.sensors = Sensors(setup, self.settings.keyframes.bridge)
+        self._setup = setup
+        self.settings, said = settings_online(settings or Settings(), setup)
+        self.sensors = Sensors(setup, self.settings.keyframes.bridge, self.settings.raw_gnss)
         self.frame: LocalFrame | None = None
         self.tracker: Tracker | None = None
-        self.notes: list[str] = []
+        self.notes: list[str] = [*said]
         self.late: Counter[str] = Counter()  # rows that came after the keyframe they belong before, and were used
         self._judgement: Judgement | None = None  # being made
         self._again: CatchUp | None = None  # going through what has not settled with it
@@ -219,8 +221,7 @@ class Smoother:
         if told and self.settings.noise.mode == "estimated":
             self._found, self._tentative = found, True
             sensors.space(self.settings.noise.spacing)
-        anchors = [sensors.fixes, *(b.t for name, b in sensors.others.items() if sensors.anchors(name))]
-        self._fixes = [t for t in np.unique(np.concatenate(anchors)).tolist() if t >= recording.start - SAME_TIME]
+        self._fixes = [t for t in sensors.anchors_of_all().tolist() if t >= recording.start - SAME_TIME]
         self._began, self._judged = recording.start, recording.duration
         sensors.oldest = recording.start
         self._advance(tracker)
@@ -306,7 +307,7 @@ class Smoother:
         sensors = self.sensors
         self.notes.append(Note("online.anew", f"{why}: aligning anew"))
         after = sensors.imu.rows[sensors.imu.t > before].copy()
-        later = {name: buffer.rows.copy() for name, buffer in sensors.aiding.items()}
+        later = {name: buffer.after(before) for name, buffer in sensors.aiding.items()}
         if self.tracker is not None:
             sensors.imu.drop_after(before)
             self._judge_at_last()
@@ -318,8 +319,8 @@ class Smoother:
         for row in after:
             sensors.imu.add(float(row[0]), tuple(row[1:]))
         for name, rows in later.items():
-            for row in rows[rows[:, 0] > before]:
-                sensors.aiding[name].add(float(row[0]), tuple(row[1:]))
+            for row in rows:
+                sensors.aiding[name].add(*row)
         sensors.space(0.0)  # all of them, until there is a start again
         self._due = self._awake = sensors.imu.newest + _TRY
 

@@ -193,8 +193,8 @@ class Tracker(Chain):
             self._standing.look(sensors, self.settings, expected, self.head)
         elif self._standing.news or self._dirty < np.inf:
             self.update(sensors, np.empty(0))
-        elif not self._prepared(expected) and self._is_covered(sensors, expected):
-            self._prepare(sensors, expected)
+        elif sensors.raw is None and not self._prepared(expected) and self._is_covered(sensors, expected):
+            self._prepare(sensors, expected)  # with raw observations a clock begins anew, which only the epoch tells
         else:
             return False
         return True

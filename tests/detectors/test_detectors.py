@@ -278,6 +278,25 @@ def test_a_measured_speed_overrules_a_smooth_ride():
         assert "detectors.speed_known" in map(key_of, found.notes)
 
 
+@pytest.mark.parametrize("stop", [False, True])
+def test_a_smooth_road_without_fixes_is_no_stop_after_a_measured_speed(stop):
+    # rough roads before and after, so that the smooth one is the exception
+    legs = [(20, 0), (8, 15), (66, 15), *([(8, 0), (10, 0), (8, 15)] if stop else [(26, 15)]), (10, 10), (40, 12)]
+    rough, t, v = made(21, legs)
+    smooth, _, _ = made(21, legs, road=0.0)
+    even = covered(t, np.array([[90.0, 98.0 if stop else 114.0]]))[:, None]
+    imu = replace(
+        rough.imu,
+        gyro=np.where(even, smooth.imu.gyro, rough.imu.gyro),
+        accel=np.where(even, smooth.imu.accel, rough.imu.accel),
+    )
+    recording = replace(rough, imu=imu)
+    found = detect(with_gnss(recording, t, v, (90.0, 130.0)))
+    assert np.abs(v[covered(t, found.stationary)]).max() < 2e-3
+    assert rates(found.stationary, base.spans_of(v == 0.0, t), t[0], t[-1])[0] > 0.85
+    assert "detectors.speed_felt" in map(key_of, found.notes)
+
+
 def test_an_odometer_late_quantised_or_unplugged_costs_no_stop():
     recording, t, v = made(16, [(20, 0), (8, 10), (30, 10), (6, 0), (25, 0), (6, 10), (20, 10)])
     alone = detect(recording).stationary

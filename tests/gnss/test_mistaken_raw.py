@@ -6,6 +6,7 @@ import gzip
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from graphnav.config import Settings
 from graphnav.constraints.raw_gnss import GnssCode
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import key_of
+from graphnav.estimation.pipeline import run
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import satellite_id, signal_id
@@ -110,6 +112,9 @@ def test_a_base_that_ends_early_leaves_the_rovers_own_observations(changed, whol
 def test_a_wrong_week_is_told(changed):
     one = changed("recording.toml", lambda text: text.replace("2021-09-22T", "2021-09-29T"))
     assert gnss_apart(one) is not None  # with which the program refuses
+    for script in (one, replace(one, gnss=None)):
+        with pytest.raises(RecordingError):
+            run(script, solvers=("ekf",))
     assert GnssCode.epochs(one, Settings(), np.empty((0, 2))).size == 0
 
 

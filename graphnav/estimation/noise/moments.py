@@ -86,7 +86,10 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: SmootherPass, n: i
     values = values_of(problem, smoothed)
     linear = linearise(rows, smoothed, problem.columns, which)
     H = linear.H
-    HPH = np.einsum("nij,nij->ni", H @ smoothed.P[at], H)
+    HPH = np.empty(H.shape[:2])
+    for lo in range(0, n, _BLOCK):  # each row has a covariance of its own beside it
+        some = slice(lo, lo + _BLOCK)
+        HPH[some] = np.einsum("nij,nij->ni", H[some] @ smoothed.P[at[some]], H[some])
     w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
     R = linear.stated**2
     B = np.clip(1.0 - w * HPH / R, 1e-6, 1.0)

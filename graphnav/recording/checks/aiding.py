@@ -33,22 +33,24 @@ def overlap_s(recording: Recording) -> float:
 
 def gnss_apart(recording: Recording) -> str | None:
     """That GNSS and IMU share no time, and what may mend it; None if they do."""
-    gnss = recording.gnss
-    if gnss is None or not len(gnss.t) or overlap_s(recording) >= 0:
+    gnss, raw = recording.gnss, recording.raw_gnss
+    own = gnss is not None and not gnss.derived  # fixes of a receiver, in place of which no observations are used
+    t = raw.t if raw is not None and not own else gnss.t if gnss is not None else np.empty(0)
+    if not len(t) or min(t[-1], recording.end) >= max(t[0], recording.start):
         return None
-    offset = recording.start - gnss.t[0]
+    offset = recording.start - t[0]
     apart = (
-        f"GNSS ({gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) do not "
+        f"GNSS ({t[0]:.3f} to {t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) do not "
         "overlap in time"
     )
-    if gnss.derived:  # of raw observations, whose receiver knows the date
+    if not own:  # raw observations, whose receiver knows the date
         weeks = round(offset / WEEK)
         near = f", {abs(weeks)} week(s) too {'late' if weeks > 0 else 'early'}" if weeks else ""
         return f"{apart}: the observations' times are GPS time, so what clock says of the IMU's t = 0 is wrong{near}"
-    known = between_clocks(recording.start, recording.gps_zero, float(gnss.t[0]), None)
-    if (unit := _unit_of_stamps(gnss.t, recording)) is not None:
+    known = between_clocks(recording.start, recording.gps_zero, float(t[0]), None)
+    if (unit := _unit_of_stamps(t, recording)) is not None:
         return f'{apart}: the stamps of the fixes are in {unit}; say units = {{ t = "{unit}" }} in [gnss]'
-    left = gnss.t[0] + known.offset - recording.start if known is not None else np.inf
+    left = t[0] + known.offset - recording.start if known is not None else np.inf
     if known is not None and abs(left) < NEAR:
         return (
             f"{apart}: {known.words}; say time_offset = {known.offset:.0f} in [gnss], with which "
