@@ -72,7 +72,7 @@ class Replay:
 
     settled: Solution
     live: Solution
-    seconds: Array  # (K,) of process time per keyframe
+    seconds: Array  # (K,) processor time of the thread per keyframe
 
 
 def incremental(
@@ -111,7 +111,7 @@ def begin_at(problem: Problem, start: States | None) -> Message:
 
 @dataclass(frozen=True)
 class Live:
-    """Each keyframe as it was known when it had come, and the process time that it took."""
+    """Each keyframe as it was known when it had come, and the processor time that it took."""
 
     states: States
     P: Array  # (K, 15, 15)
@@ -129,11 +129,11 @@ def replay(
     K, steps = len(problem.t), node_steps(problem)
     states, values, P, seconds = [], [], np.empty((K, DIM, DIM)), np.empty(K)
     for k in range(K):
-        before = time.process_time()
+        before = time.thread_time()
         newest, P[k] = add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
         states.append(newest.state)
         values.append(newest.values)
-        seconds[k] = time.process_time() - before
+        seconds[k] = time.thread_time() - before
         if progress is not None and k % 64 == 0:
             progress(solver, k / K)
     return Live(States.stack(states), P, np.array(values), seconds)
