@@ -98,6 +98,10 @@ class Eliminated:
         values = self._net.optimize()
         return [values.at(int(k)) for k in keys]
 
+    def decrease(self) -> float:
+        """How much half the squared residuals fall from no variable moved to the optimum: |R x - d|^2 / 2 at x = 0."""
+        return float(self._net.error(gtsam.VectorValues.Zero(self._net.optimize())))
+
     def covariances(self, keys: set[int] | None = None) -> dict[int, Array]:
         """Marginal covariance of every variable (or of `keys`).
 
