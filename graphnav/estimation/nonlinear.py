@@ -28,8 +28,7 @@ from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.graph import jacobian_factor
 from graphnav.estimation.solvers.linearise import Points, linearise, linearise_links, shift
-from graphnav.estimation.solvers.passes import points_of
-from graphnav.estimation.solvers.rows import Layout, chain_rows
+from graphnav.estimation.solvers.rows import Iterate, Layout, chain_rows
 from graphnav.imu.dynamics import SCALE
 
 _ESTIMATORS: dict[str, Any] = {
@@ -82,9 +81,8 @@ def _with_places(problem: Problem, states: States, values: dict[str, Array]) -> 
 
     Rows are linear in them, or they are where one step of Gauss and Newton leads.
     """
-    points = points_of(problem, states, {c.parameter.name: values[c.parameter.name][c.node] for c in problem.chains
-                                         if c.parameter.name in values})  # fmt: skip
-    out = dict(values)
+    out = {c.parameter.name: c.mean for c in problem.chains} | values
+    points = Iterate(states, out).points(problem)
     for chain in problem.chains:
         name = chain.parameter.name
         if name in values:
