@@ -153,7 +153,7 @@ def _minimise(
             progress("batch", iteration / settings.max_iterations)
         rows = whiten(problem, point, layout)
         while True:
-            eliminated, step, gain = _solve(rows, layout, damping)
+            eliminated, step, gain = solve_rows(rows, layout, damping)
             candidate = point.moved(step)
             ahead = cost(problem, candidate, layout)
             if ahead < now or gain < settings.tolerance:
@@ -161,7 +161,7 @@ def _minimise(
             if damping == 0.0:
                 # an early heading swings all that comes after it along tangents, off the track by the square of
                 # the angle; the step after this one takes that back, and only then is it seen what both bring
-                beyond = candidate.moved(_solve(whiten(problem, candidate, layout), layout)[1])
+                beyond = candidate.moved(solve_rows(whiten(problem, candidate, layout), layout)[1])
                 behind = cost(problem, beyond, layout)
                 if behind < now:
                     candidate, ahead = beyond, behind
@@ -192,7 +192,7 @@ def _minimise(
                 now = cost(problem, point, layout)
                 renewed += again
     if eliminated is None and iterations is None:
-        eliminated = _solve(whiten(problem, point, layout), layout)[0]
+        eliminated = solve_rows(whiten(problem, point, layout), layout)[0]
     notes = []
     if refused:
         stopped += f" ({refused} steps taken back and damped)"
@@ -203,7 +203,7 @@ def _minimise(
     return _Minimum(problem, point, layout, eliminated, now, iteration, stopped, tuple(notes))
 
 
-def _solve(rows: Rows, layout: Layout, damping: float = 0.0) -> tuple[Eliminated, Step, float]:
+def solve_rows(rows: Rows, layout: Layout, damping: float = 0.0) -> tuple[Eliminated, Step, float]:
     """The rows eliminated, the step that leads to their optimum, and by how much they fall on the way."""
     graph, size = LinearGraph(), np.sqrt(damping) * column_norms(rows, layout) if damping else None
     for blocks, b in rows:

@@ -85,16 +85,15 @@ class Eliminated:
     """The graph as a Bayes net: solution and covariances by substitution."""
 
     def __init__(self, net: gtsam.GaussianBayesNet) -> None:
-        self._net = net
+        self._net, self._optimum = net, net.optimize()
 
     def solve(self, keys: Sequence[int]) -> list[Array]:
         """The optimum, one vector per key."""
-        values = self._net.optimize()
-        return [values.at(int(k)) for k in keys]
+        return [self._optimum.at(int(k)) for k in keys]
 
     def decrease(self) -> float:
         """How much half the squared residuals fall from no variable moved to the optimum: |R x - d|^2 / 2 at x = 0."""
-        return float(self._net.error(gtsam.VectorValues.Zero(self._net.optimize())))
+        return float(self._net.error(gtsam.VectorValues.Zero(self._optimum)))
 
     def covariances(self, keys: set[int] | None = None) -> dict[int, Array]:
         """Marginal covariance of every variable (or of `keys`).
