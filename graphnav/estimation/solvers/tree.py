@@ -237,15 +237,15 @@ class Tree:
 
     def moved(self, share: float = 1.0) -> Array:
         """Which keyframes' estimates are further from where their rows were linearised than a share of the limits."""
-        if not self.keyframes:
+        if len(self) <= self._held:
             return np.empty(0, dtype=int)
         off = np.array([k.state.delta[:3] - k.state.point[:3] for k in self.keyframes])
         far = np.einsum("ki,ki->k", off, off) > (share * self.turn) ** 2
-        own = self.keyframes[self._held :]
-        nodes = {id(n): n for k in own for n, _ in k.nodes.values() if np.isfinite(n.limit).any()}
-        gone = {i for i, n in nodes.items() if np.any(np.abs(n.delta - n.point) > share * n.limit)}
+        first = self.keyframes[self._held].number
+        limited = (x for x in self.variables.values() if x.last >= first and np.isfinite(x.limit).any())
+        gone = {x.key for x in limited if np.any(np.abs(x.delta - x.point) > share * x.limit)}
         if gone:
-            far |= np.array([any(id(n) in gone for n, _ in k.nodes.values()) for k in self.keyframes])
+            far |= np.array([any(n.key in gone for n, _ in k.nodes.values()) for k in self.keyframes])
         far[: self._held] = False
         return np.flatnonzero(far)
 
