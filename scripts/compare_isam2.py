@@ -3,9 +3,11 @@
     python scripts/compare_isam2.py --minutes 60
     python scripts/compare_isam2.py --minutes 600 --no-whole
 
-The same rows of the same simulated drive, posed beforehand, with all vehicle constraints at keyframes of 1 Hz; each in
-a process of its own, by blocks of ten minutes. And how
-far what settled is from the window's, in centimetres and sigmas.
+The same rows of the same simulated drive, posed beforehand, with all vehicle constraints at keyframes of 1 Hz; each
+solver in a process of its own, by blocks of ten minutes. Times are processor time of the thread, so that other
+programs show in them only by what the caches lose. Memory is what the process has grown by at the end of a block,
+with the states and covariances that it has found by then (4 kB a keyframe), and in the last line with the whole
+solution. What settled is compared with the window's, in centimetres and sigmas.
 """
 
 from __future__ import annotations
@@ -15,13 +17,14 @@ import multiprocessing
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import oracle
-from benchmark_online import memory_mb, posed
+from benchmark_online import LAP, RATE, memory_mb, posed
 
 from graphnav.config import Settings
 from graphnav.estimation.problem import Problem
@@ -29,9 +32,20 @@ from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.incremental import Replay, incremental
 from graphnav.estimation.solvers.isam import isam2
+from graphnav.estimation.solvers.passes import Progress
 
 LAG = 120.0
-BLOCKS = 60  # of ten minutes
+BLOCK = 600.0  # s
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a solver took: s of each keyframe, and MB by which its process had grown."""
+
+    seconds: np.ndarray
+    grown: np.ndarray  # (n, 2) share of the drive, MB
+    end: float  # MB, with the solution put together
+    found: Replay | None = None
 
 
 def main() -> None:
@@ -39,63 +53,73 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--no-whole", action="store_true", help="leave out what grows with the drive")
     options = parser.parse_args()
-    path = oracle.vehicle_path(60.0 * options.minutes, 200.0)
+    seconds = 60.0 * options.minutes
+    laps = max(1, round(seconds / LAP))
+    path = oracle.vehicle_path(seconds / laps, RATE).tiled(laps)
     spans = oracle.moving_spans(path, 60.0, max(1, round(options.minutes / 20.0)))
     recording, _ = oracle.drive(path, seed=1, outages=spans, odometer_rate=20.0)
+    del path
     problem = posed(recording, Settings())
-    count = min(max(1, round(options.minutes / 10.0)), BLOCKS)
-    parts = np.array_split(np.arange(len(problem.t)), count)
-    ends = " | ".join(f"{(problem.t[p[-1]] - problem.t[0]) / 60:.0f} min" for p in parts)
-    print("ms a keyframe: median / 99 % / most\n")
-    print(f"| until | {ends} | all | memory grows by, MB |")
-    print("| --- " * (len(parts) + 3) + "|", flush=True)
-    runs = {
-        "filter, means of 256": lambda: filtered(problem),
-        "window": lambda: incremental(problem, LAG),
-        "iSAM2": lambda: isam2(problem, LAG),
+    runs: dict[str, Run] = {}
+    solvers: dict[str, Callable[[Progress], Replay | np.ndarray]] = {
+        "filter, means of 256": lambda progress: filtered(problem, progress),
+        "window": lambda progress: incremental(problem, LAG, progress),
+        "iSAM2": lambda progress: isam2(problem, LAG, progress),
     }
     if not options.no_whole:
-        runs["iSAM2, whole drive"] = lambda: isam2(problem)
-    found: dict[str, Replay] = {}
-    for name, run in runs.items():
-        seconds, memory, replayed = alone(run)
-        if replayed is not None:
-            found[name] = replayed
-        cells = [of(1e3 * seconds[p]) for p in [*parts, slice(None)]]
-        print(f"| {name} | " + " | ".join(cells) + f" | {memory:.0f} |", flush=True)
+        solvers["iSAM2, whole drive"] = lambda progress: isam2(problem, progress=progress)
+    for name, solve in solvers.items():
+        runs[name] = alone(solve)
+        print(f"{name}: {of(runs[name].seconds)}", file=sys.stderr, flush=True)
+    print("Processor time of the thread, ms a keyframe: median / 99 % / most; memory the process has grown by, MB\n")
+    print("| until, min | " + " | ".join(f"{name} | MB" for name in runs) + " |")
+    print("| ---: " + "| --- | ---: " * len(runs) + "|")
+    parts = np.array_split(np.arange(len(problem.t)), max(1, round(seconds / BLOCK)))
+    for part in parts:
+        share = (part[-1] + 1) / len(problem.t)
+        cells = [f"{of(run.seconds[part])} | {np.interp(share, *run.grown.T):.0f}" for run in runs.values()]
+        print(f"| {(problem.t[part[-1]] - problem.t[0]) / 60:.0f} | " + " | ".join(cells) + " |")
+    print("| all | " + " | ".join(f"{of(run.seconds)} | {run.end:.0f}" for run in runs.values()) + " |")
+    tree, window = runs["iSAM2"].found, runs["window"].found
     for kind in ("settled", "live"):
-        print(
-            f"\niSAM2 and the window, {kind}: " + apart(getattr(found["iSAM2"], kind), getattr(found["window"], kind))
-        )
+        print(f"\niSAM2 and the window, {kind}: " + apart(getattr(tree, kind), getattr(window, kind)))
 
 
-def filtered(problem: Problem) -> np.ndarray:
-    """Process time of the filter at each keyframe (s), the mean of the 256 that it is one of."""
-    met = [(0.0, time.process_time())]
-    ekf(problem, lambda _, share: met.append((share, time.process_time())))
-    share, at = np.array([*met, (1.0, time.process_time())]).T
+def filtered(problem: Problem, progress: Progress) -> np.ndarray:
+    """Processor time of the filter at each keyframe (s), the mean of the 256 that it is one of."""
+    met = [(0.0, time.thread_time())]
+
+    def tell(solver: str, share: float) -> None:
+        met.append((share, time.thread_time()))
+        progress(solver, share)
+
+    ekf(problem, tell)
+    share, at = np.array([*met, (1.0, time.thread_time())]).T
     whole = np.arange(len(problem.t) + 1) / len(problem.t)
     return np.diff(np.interp(whole, share, at))
 
 
-def alone(run: Callable[[], Replay | np.ndarray]) -> tuple[np.ndarray, float, Replay | None]:
-    """What a run gives in a process of its own: seconds of each keyframe, MB by which it grew, and the rest."""
+def alone(solve: Callable[[Progress], Replay | np.ndarray]) -> Run:
+    """A solver in a process of its own."""
     here, there = multiprocessing.Pipe(duplex=False)
 
     def work() -> None:
         before = memory_mb()
-        result = run()
-        there.send((result, memory_mb() - before))
+        grown = [(0.0, 0.0)]
+        result = solve(lambda _, share: grown.append((share, memory_mb() - before)))
+        found = result if isinstance(result, Replay) else None
+        seconds = result if isinstance(result, np.ndarray) else result.seconds
+        there.send(Run(seconds, np.array(grown), memory_mb() - before, found))
 
     process = multiprocessing.get_context("fork").Process(target=work)
     process.start()
-    result, memory = here.recv()
+    run: Run = here.recv()
     process.join()
-    return (result, memory, None) if isinstance(result, np.ndarray) else (result.seconds, memory, result)
+    return run
 
 
-def of(ms: np.ndarray) -> str:
-    return " / ".join(f"{x:.1f}" for x in np.quantile(ms, [0.5, 0.99, 1.0]))
+def of(seconds: np.ndarray) -> str:
+    return " / ".join(f"{1e3 * x:.1f}" for x in np.quantile(seconds, [0.5, 0.99, 1.0]))
 
 
 def apart(a: Solution, b: Solution) -> str:

@@ -256,7 +256,7 @@ def _graph_of(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, A
     """What makes the problem GTSAM's, with a solution's values of parameters."""
 
     def export() -> tuple[Any, Any]:
-        from graphnav.estimation.solvers.nonlinear import Exported  # which needs GTSAM
+        from graphnav.estimation.nonlinear import Exported  # which needs GTSAM
 
         values = {name: estimate.value for name, estimate in solution.parameters.items()}
         return Exported(problem, solution.states, values)()

@@ -21,9 +21,9 @@ from graphnav.core.state import DIM
 from graphnav.detectors import detect
 from graphnav.detectors.base import Detection
 from graphnav.detectors.scene import Detector
+from graphnav.estimation.nonlinear import Exported, state_at
 from graphnav.estimation.pipeline import run, with_own
 from graphnav.estimation.problem import build_problem
-from graphnav.estimation.solvers.nonlinear import Exported, state_at
 from graphnav.estimation.solvers.rows import Iterate, Layout, cost
 from graphnav.recording import Recording
 from graphnav.sensors import list_sensors

@@ -23,9 +23,10 @@ from graphnav.estimation.noise.model import STATED, NoiseModel, VarianceComponen
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.solvers.batch import batch, solve_rows
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.robust import weight_and_cost
+from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
 from graphnav.estimation.solvers.rts import rts
 from graphnav.imu.dynamics import SCALE
 from graphnav.recording import Gnss, Recording
@@ -229,6 +230,27 @@ def test_the_cost_is_half_the_squared_rows(solved_lap: tuple[Problem, Solution])
     problem, solution = solved_lap
     parts, _ = at_solution(problem, solution)
     assert solution.cost == pytest.approx(0.5 * sum(float(b @ b) for _, b in parts), rel=1e-6)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.1])
+def test_the_gain_of_a_step_is_by_what_the_linear_rows_fall(
+    solved_lap: tuple[Problem, Solution], damping: float
+) -> None:
+    """Damped or not, of the rows themselves; from a point that is not the optimum."""
+    problem, solution = solved_lap
+    rng, layout = np.random.default_rng(6), Layout(problem)
+    values = {c.parameter.name: c.mean for c in problem.chains}
+    point = Iterate(solution.states.plus(1e-2 * rng.standard_normal((len(problem.t), DIM))), values)
+    rows = whiten(problem, point, layout)
+    _, step, gain = solve_rows(rows, layout, damping)
+    by_key = [*step[0], *(np.concatenate([step[1][n][j] for n in g.columns]) for g in layout.groups for j in
+                          range(len(g.keys)))]  # fmt: skip
+    fall = 0.0
+    for blocks, b in rows:
+        for i, own in enumerate(b):
+            left = own - sum(A[i] @ by_key[keys[i]] for keys, A in blocks)
+            fall += 0.5 * float(own @ own - left @ left)
+    assert gain == pytest.approx(fall, rel=1e-6)
 
 
 def test_covariances_of_some_keyframes_only(lap: tuple[Recording, Trajectory]) -> None:

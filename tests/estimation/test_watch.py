@@ -16,7 +16,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers import watch
-from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import node_steps
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.watch import Bank
@@ -46,7 +46,7 @@ def test_tests_beside_a_message_are_those_of_the_filter(posed: Problem, monkeypa
     kept: list[Bank] = []
     updated = Bank.updated
     monkeypatch.setattr(Bank, "updated", lambda self, *a: (kept.append(self), updated(self, *a))[1])
-    ekf(problem, watch=True)
+    refilter(problem, ekf(problem), watch=True)
     mean = problem.prior.mean
     assert mean is not None
     message = first_message(mean, problem.prior.sigma[0])

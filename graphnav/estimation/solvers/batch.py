@@ -32,10 +32,10 @@ from graphnav.estimation.solvers.rows import (
     Iterate,
     Layout,
     Rows,
+    Step,
     Values,
     column_norms,
     cost,
-    predict_decrease,
     whiten,
 )
 
@@ -153,9 +153,7 @@ def _minimise(
             progress("batch", iteration / settings.max_iterations)
         rows = whiten(problem, point, layout)
         while True:
-            eliminated = _eliminate(rows, layout, damping)
-            step = layout.unpack(eliminated.solve(layout.keys))
-            gain = predict_decrease(rows, layout, step)
+            eliminated, step, gain = solve_rows(rows, layout, damping)
             candidate = point.moved(step)
             ahead = cost(problem, candidate, layout)
             if ahead < now or gain < settings.tolerance:
@@ -163,8 +161,7 @@ def _minimise(
             if damping == 0.0:
                 # an early heading swings all that comes after it along tangents, off the track by the square of
                 # the angle; the step after this one takes that back, and only then is it seen what both bring
-                second = layout.unpack(_eliminate(whiten(problem, candidate, layout), layout, 0.0).solve(layout.keys))
-                beyond = candidate.moved(second)
+                beyond = candidate.moved(solve_rows(whiten(problem, candidate, layout), layout)[1])
                 behind = cost(problem, beyond, layout)
                 if behind < now:
                     candidate, ahead = beyond, behind
@@ -195,7 +192,7 @@ def _minimise(
                 now = cost(problem, point, layout)
                 renewed += again
     if eliminated is None and iterations is None:
-        eliminated = _eliminate(whiten(problem, point, layout), layout, 0.0)
+        eliminated = solve_rows(whiten(problem, point, layout), layout)[0]
     notes = []
     if refused:
         stopped += f" ({refused} steps taken back and damped)"
@@ -206,16 +203,20 @@ def _minimise(
     return _Minimum(problem, point, layout, eliminated, now, iteration, stopped, tuple(notes))
 
 
-def _eliminate(rows: Rows, layout: Layout, damping: float) -> Eliminated:
-    graph = LinearGraph()
+def solve_rows(rows: Rows, layout: Layout, damping: float = 0.0) -> tuple[Eliminated, Step, float]:
+    """The rows eliminated, the step that leads to their optimum, and by how much they fall on the way."""
+    graph, size = LinearGraph(), np.sqrt(damping) * column_norms(rows, layout) if damping else None
     for blocks, b in rows:
         graph.add(blocks, b)
-    if damping:
-        size = np.sqrt(damping) * column_norms(rows, layout)
+    if size is not None:
         for width in sorted(set(layout.width)):
             keys = np.array([k for k in layout.keys if layout.width[k] == width])
             graph.add([(keys, size[keys, :width, None] * np.eye(width))], np.zeros((len(keys), width)))
-    return graph.eliminate(layout.order)
+    eliminated = graph.eliminate(layout.order)
+    found, gain = eliminated.solve(layout.keys), eliminated.decrease()
+    if size is not None:  # what damping takes from the step is not among the rows
+        gain += 0.5 * sum(float(np.sum((s[: len(x)] * x) ** 2)) for s, x in zip(size, found, strict=True))
+    return eliminated, layout.unpack(found), gain
 
 
 def _estimates(

@@ -65,7 +65,6 @@ def ekf(
     problem: Problem,
     progress: Progress | None = None,
     opening: float | None = None,
-    watch: bool = False,
     known: Points | None = None,
     decide: Decide | None = None,
 ) -> FilterPass:
@@ -75,15 +74,14 @@ def ekf(
     ----------
     opening : s, the end of what the alignment has seen of the recording; up to there the filter runs twice. Estimates
         after it depend on nothing later than themselves.
-    watch : look for errors that last in the rows that are to be watched, and go back to before them.
     known : where the opening is linearised, from its first keyframe on, if that is known better than by a first pass.
     decide : asked after the updates of each keyframe; a smoother is not to rest on what comes of it.
     """
     began = time.perf_counter()
     K, about = len(problem.t), None
     if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
-        about = backward(problem, _forward(problem, n, watch=watch)) if known is None else known.first(n)
-    one = _forward(problem, K, about, progress, watch, decide)
+        about = backward(problem, _forward(problem, n)) if known is None else known.first(n)
+    one = _forward(problem, K, about, progress, decide=decide)
     seconds = time.perf_counter() - began
     filtered, P = one.states, one.P[:, :DIM, :DIM]
     if about is not None:
@@ -114,7 +112,7 @@ def refilter(problem: Problem, about: Points, progress: Progress | None = None, 
     Parameters
     ----------
     about : of these keyframes, near enough for what is left to be linear: an earlier pass.
-    watch : as for `ekf`.
+    watch : look for errors that last in the rows that are to be watched, and go back to before them.
     """
     return _forward(problem, len(about.values), about, progress, watch)
 
@@ -198,8 +196,6 @@ def _forward(
             banks = {key: old for key, old in banks.items() if key < back}
             k = back
             x, P = (found[k - 1], all_P[k - 1]) if k else (begun[0], _place(begun[1], records))
-            if about is not None and k == n:
-                x = own.plus(_one(about, k - 1), x)
             continue
         found[k], all_P[k] = x, P
         if progress is not None and k % 256 == 0:

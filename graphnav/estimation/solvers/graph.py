@@ -62,22 +62,16 @@ class LinearGraph:
         # GTSAM keeps matrices by columns: handing them over that way saves it a strided copy
         columns = [np.ascontiguousarray(np.swapaxes(A, 1, 2)).swapaxes(1, 2) for _, A in blocks]
         keys = [k.tolist() for k, _ in blocks]
-        push, factor = self._graph.push_back, gtsam.JacobianFactor
-        if len(blocks) == 1:
-            (k0,), (A0,) = keys, columns
-            for i in range(n):
-                push(factor(k0[i], A0[i], b[i], unit))
-        elif len(blocks) == 2:
-            (k0, k1), (A0, A1) = keys, columns
-            for i in range(n):
-                push(factor(k0[i], A0[i], k1[i], A1[i], b[i], unit))
-        elif len(blocks) == 3:
-            (k0, k1, k2), (A0, A1, A2) = keys, columns
-            for i in range(n):
-                push(factor(k0[i], A0[i], k1[i], A1[i], k2[i], A2[i], b[i], unit))
-        else:
-            for i in range(n):
-                push(jacobian_factor([(k[i], A[i]) for k, A in zip(keys, columns, strict=True)], b[i]))
+        push = self._graph.push_back
+        make: Any = gtsam.JacobianFactor
+        if len(blocks) <= 3:
+            parts: list[Any] = [part for pair in zip(keys, columns, strict=True) for part in pair]
+            for row in zip(*parts, b, strict=True):
+                push(make(*row, unit))
+            return
+        for i in range(n):
+            rows = [(k[i], A[i]) for k, A in zip(keys, columns, strict=True)]
+            push(jacobian_factor(rows, b[i]))
 
     def eliminate(self, order: Sequence[int]) -> Eliminated:
         """Eliminate the variables in this order."""
@@ -91,12 +85,15 @@ class Eliminated:
     """The graph as a Bayes net: solution and covariances by substitution."""
 
     def __init__(self, net: gtsam.GaussianBayesNet) -> None:
-        self._net = net
+        self._net, self._optimum = net, net.optimize()
 
     def solve(self, keys: Sequence[int]) -> list[Array]:
         """The optimum, one vector per key."""
-        values = self._net.optimize()
-        return [values.at(int(k)) for k in keys]
+        return [self._optimum.at(int(k)) for k in keys]
+
+    def decrease(self) -> float:
+        """How much half the squared residuals fall from no variable moved to the optimum: |R x - d|^2 / 2 at x = 0."""
+        return float(self._net.error(gtsam.VectorValues.Zero(self._optimum)))
 
     def covariances(self, keys: set[int] | None = None) -> dict[int, Array]:
         """Marginal covariance of every variable (or of `keys`).

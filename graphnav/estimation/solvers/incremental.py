@@ -8,8 +8,8 @@ came before, and keyframes older than the lag settle, each with at least the lag
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -26,7 +26,24 @@ from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, Window, first_message, turn_limit
 
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
-_FINE = 0.02  # of the usual limits, within which the last window is converged
+FINE = 0.02  # of the usual limits, within which what is left at the end is converged
+
+
+class Engine(Protocol):
+    """What smooths keyframes as they come."""
+
+    settled: list[SettledStates]  # in turn; whoever reads them may clear them
+
+    def add(self, place: Place) -> tuple[Message, Array]:
+        """Take in one more keyframe: it as it is known now, and the covariance (15, 15) of its state."""
+
+    def finish(self, problem: Problem) -> tuple[Problem, int]:
+        """Nothing more will come: settle all; the problem as it was solved, and how many keyframes again."""
+
+
+def are_due(first: float, last: float, lag: float) -> bool:
+    """Whether of keyframes between two times (s) a group is older than a lag, which then settles."""
+    return last - first > lag * (1.0 + 1.0 / _PORTIONS)
 
 
 @dataclass
@@ -41,29 +58,25 @@ class Incremental:
 
     window: Window
     lag: float = 120.0
-    settled: list[SettledStates] = field(default_factory=list)  # whoever reads them may clear them
+    settled: list[SettledStates] = field(default_factory=list)
 
-    def add(self, place: Place) -> None:
-        """Take in one more keyframe."""
-        turn = self.window.push(place)
-        if turn > self.window.turn:
+    def add(self, place: Place) -> tuple[Message, Array]:
+        """As of `Engine`."""
+        if self.window.push(place) > self.window.turn:
             self.window.converge()
-        t = self.window.stages[-1].place.t
-        if t - self.window.stages[0].place.t > self.lag * (1.0 + 1.0 / _PORTIONS):
-            self.settle_until(t - self.lag)
+        if are_due(self.window.stages[0].place.t, place.t, self.lag):
+            assert place.problem is not None
+            self.window.converge(always=any(c.robust != "none" for c in place.problem.constraints))
+            self.settled.append(self.window.settle(int(np.searchsorted(self.window.t, place.t - self.lag))))
+        newest = self.window.newest
+        return newest, newest.covariance[:DIM, :DIM]
 
-    def settle_until(self, t: float) -> None:
-        """Let go of the keyframes before a time."""
-        count = int(np.searchsorted(self.window.t, t))
-        if count:
-            self.window.converge(always=_robust(self.window))
-            self.settled.append(self.window.settle(count))
-
-    def finish(self) -> None:
-        """Nothing more will come: settle all."""
+    def finish(self, problem: Problem) -> tuple[Problem, int]:
+        """As of `Engine`."""
         if len(self.window):
-            self.window.converge(_FINE, always=True)
+            self.window.converge(FINE, always=True)
             self.settled.append(self.window.settle(len(self.window)))
+        return problem, self.window.relinearized
 
 
 @dataclass(frozen=True)
@@ -72,7 +85,7 @@ class Replay:
 
     settled: Solution
     live: Solution
-    seconds: Array  # (K,) of process time per keyframe
+    seconds: Array  # (K,) processor time of the thread per keyframe
 
 
 def incremental(
@@ -88,18 +101,8 @@ def incremental(
     lag : s, see `Incremental`.
     start : one state to begin at, where that is not the prior's mean.
     """
-    began = time.perf_counter()
-    solver = Incremental(Window(begin_at(problem, start), turn_limit(problem.imu_noise)), lag)
-
-    def add(place: Place) -> tuple[Message, Array]:
-        solver.add(place)
-        newest = solver.window.newest
-        return newest, newest.covariance[:DIM, :DIM]
-
-    live = replay(problem, "incremental", add, progress)
-    solver.finish()
-    spent = time.perf_counter() - began
-    return assemble_replay(problem, "incremental", solver.settled, live, solver.window.relinearized, spent, lag)
+    window = Window(begin_at(problem, start), turn_limit(problem.imu_noise))
+    return replay(problem, "incremental", Incremental(window, lag), lag, progress)
 
 
 def begin_at(problem: Problem, start: States | None) -> Message:
@@ -109,56 +112,30 @@ def begin_at(problem: Problem, start: States | None) -> Message:
     return message if start is None else message.moved(start.minus(problem.prior.mean)[0])
 
 
-@dataclass(frozen=True)
-class Live:
-    """Each keyframe as it was known when it had come, and the process time that it took."""
-
-    states: States
-    P: Array  # (K, 15, 15)
-    values: Array  # (K, D-15)
-    seconds: Array  # (K,)
-
-
-def replay(
-    problem: Problem, solver: str, add: Callable[[Place], tuple[Message, Array]], progress: Progress | None
-) -> Live:
-    """Have all keyframes of a problem added in turn.
-
-    `add` gives the newest keyframe as it is known then, and the covariance (15, 15) of its state.
-    """
+def replay(problem: Problem, solver: str, engine: Engine, lag: float, progress: Progress | None) -> Replay:
+    """Have all keyframes of a problem added in turn, and what is found as solutions."""
+    began = time.perf_counter()
     K, steps = len(problem.t), node_steps(problem)
-    states, values, P, seconds = [], [], np.empty((K, DIM, DIM)), np.empty(K)
+    points, P, seconds = [], np.empty((K, DIM, DIM)), np.empty(K)
     for k in range(K):
-        before = time.process_time()
-        newest, P[k] = add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
-        states.append(newest.state)
-        values.append(newest.values)
-        seconds[k] = time.process_time() - before
+        before = time.thread_time()
+        newest, P[k] = engine.add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
+        points.append(newest)
+        seconds[k] = time.thread_time() - before
         if progress is not None and k % 64 == 0:
             progress(solver, k / K)
-    return Live(States.stack(states), P, np.array(values), seconds)
-
-
-def assemble_replay(
-    problem: Problem, solver: str, parts: list[SettledStates], live: Live, again: int, spent: float, lag: float
-) -> Replay:
-    """What an incremental solver has found, as solutions.
-
-    Parameters
-    ----------
-    parts : what settled, in turn.
-    again : how many keyframes were linearised again.
-    spent, lag : s
-    """
-    columns, K = parts[-1].columns[-1], len(problem.t)
-    states = States.stack([part.states for part in parts])
+    problem, again = engine.finish(problem)
+    spent = time.perf_counter() - began
+    parts, live = engine.settled, States.stack([newest.state for newest in points])
     # in the order that the problem has its parameters in
+    columns = parts[-1].columns[-1]
     order = np.concatenate([np.empty(0, dtype=int), *(np.r_[shift(columns[name])] for name in problem.columns)])
     values = np.array([row for part in parts for row in part.values])[:, order]
     sigma = np.array([row for part in parts for row in part.sigma])[:, order]
+    states = States.stack([part.states for part in parts])
     covariance = np.concatenate([part.covariance for part in parts])
-    points = Points(states, values)
-    records = {rows.name: residual_record(problem, rows, points, robust=True) for rows in problem.constraints}
+    at = Points(states, values)
+    records = {rows.name: residual_record(problem, rows, at, robust=True) for rows in problem.constraints}
     whole = "all there was" if np.isinf(lag) else f"{lag:g} s of the future, or all there was"
     settled = Solution(
         solver=solver,
@@ -170,32 +147,28 @@ def assemble_replay(
         records=records,
         counts={"initial_prior": 1, "imu": K - 1, **{c.name: len(c) for c in problem.constraints}},
         iterations=1,
-        cost=cost_at(problem, points),
+        cost=cost_at(problem, at),
         stopped=f"every keyframe settled with {whole}",
         timings={solver: spent},
         notes=(
             *problem.notes,
-            Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe(live.seconds)),
+            Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe(seconds)),
             Note("solver.relinearised", f"{again} keyframes were linearised again"),
         ),
         between=(dense(problem, states, covariance, scale_at(problem.columns, values), smooth=True),),
     )
+    scale = scale_at(problem.columns, np.array([newest.values for newest in points])[:, order])
     now = replace(
         settled,
         solver="live",
-        states=live.states,
-        covariance=live.P,
+        states=live,
+        covariance=P,
         parameters={},
         records={},
         stopped="each keyframe as it was known when it came",
-        between=(dense(problem, live.states, live.P, scale_at(problem.columns, live.values[:, order]), smooth=False),),
+        between=(dense(problem, live, P, scale, smooth=False),),
     )
-    return Replay(settled, now, live.seconds)
-
-
-def _robust(window: Window) -> bool:
-    problem = window.stages[-1].place.problem
-    return problem is not None and any(c.robust != "none" for c in problem.constraints)
+    return Replay(settled, now, seconds)
 
 
 def describe(seconds: Array) -> str:

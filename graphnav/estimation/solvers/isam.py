@@ -6,7 +6,6 @@ than it are settled and marginalised; without one, the whole drive is relinearis
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.incremental import Replay, assemble_replay, begin_at, replay
+from graphnav.estimation.solvers.incremental import FINE, Replay, are_due, begin_at, replay
 from graphnav.estimation.solvers.passes import Progress
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.tree import Tree
@@ -22,9 +21,46 @@ from graphnav.estimation.solvers.tree_marginals import newest_covariance, smooth
 from graphnav.estimation.solvers.window import SettledStates, turn_limit
 
 _SKIP = 10  # keyframes between two looks at what has moved, as GTSAM's relinearizeSkip
-_PORTIONS = 8  # of the lag: keyframes settle in groups this long, as in the window
-_FINE = 0.02  # of the usual limits, within which the whole drive is converged
 _ROUNDS = 30
+
+
+class TreeSmoother:
+    """Keyframes in a `Tree`, as an `Engine`.
+
+    Parameters
+    ----------
+    prior : message on the first keyframe.
+    problem : that all keyframes are of; its intervals are integrated again where biases have moved too far.
+    lag : s of future that every settled state has seen; infinite smooths the whole drive.
+    """
+
+    def __init__(self, prior: Message, problem: Problem, lag: float) -> None:
+        self.tree, self.lag = Tree(prior, turn_limit(problem.imu_noise)), lag
+        self.settled: list[SettledStates] = []
+        self._problem = problem
+
+    def add(self, place: Place) -> tuple[Message, Array]:
+        """As of `Engine`."""
+        tree = self.tree
+        turn = tree.add(replace(place, problem=self._problem))
+        if turn > tree.turn or place.k % _SKIP == 0:
+            tree.relinearise()
+        oldest = tree.keyframes[0].place
+        if are_due(oldest.t, place.t, self.lag):
+            count = int(np.searchsorted(self._problem.t[: place.k], place.t - self.lag)) - oldest.k
+            self._problem, _ = tree.integrate_again(self._problem)
+            self.settled.append(smooth_keyframes(tree, count))
+            tree.marginalise(count)
+        return tree.newest, newest_covariance(tree)
+
+    def finish(self, problem: Problem) -> tuple[Problem, int]:
+        """As of `Engine`."""
+        for _ in range(_ROUNDS):
+            self._problem, again = self.tree.integrate_again(self._problem)
+            if not self.tree.relinearise(FINE) and not again:
+                break
+        self.settled.append(smooth_keyframes(self.tree, len(self.tree)))
+        return self._problem, self.tree.relinearised
 
 
 def isam2(
@@ -40,28 +76,4 @@ def isam2(
     lag : s of future that every settled state has seen; infinite smooths the whole drive.
     start : one state to begin at, where that is not the prior's mean.
     """
-    began = time.perf_counter()
-    tree = Tree(begin_at(problem, start), turn_limit(problem.imu_noise))
-    settled: list[SettledStates] = []
-    posed = problem
-
-    def add(place: Place) -> tuple[Message, Array]:
-        nonlocal problem
-        turn = tree.add(replace(place, problem=problem))
-        if turn > tree.turn or place.k % _SKIP == 0:
-            tree.relinearise()
-        oldest = tree.keyframes[0].place
-        if place.t - oldest.t > lag * (1.0 + 1.0 / _PORTIONS):
-            count = int(np.searchsorted(problem.t[: place.k], place.t - lag)) - oldest.k
-            problem, _ = tree.integrate_again(problem)
-            settled.append(smooth_keyframes(tree, count))
-            tree.marginalise(count)
-        return tree.newest, newest_covariance(tree)
-
-    live = replay(posed, "isam2", add, progress)
-    for _ in range(_ROUNDS):
-        problem, again = tree.integrate_again(problem)
-        if not tree.relinearise(_FINE) and not again:
-            break
-    settled.append(smooth_keyframes(tree, len(tree)))
-    return assemble_replay(problem, "isam2", settled, live, tree.relinearised, time.perf_counter() - began, lag)
+    return replay(problem, "isam2", TreeSmoother(begin_at(problem, start), problem, lag), lag, progress)

@@ -93,11 +93,6 @@ class AtEstimate:
         """The error state (D,) that leads from `at` to x."""
         return np.concatenate([x.state.minus(at.state)[0], x.values - at.values])
 
-    @staticmethod
-    def speed(k: int, x: Estimate) -> float:
-        """m/s."""
-        return float(np.linalg.norm(x.state.v))
-
 
 class AtPoints:
     """Steps and rows of the first n keyframes, all linearised at n points.

@@ -92,15 +92,6 @@ class Layout:
             nodes |= {name: stacked[:, at] for name, at in group.columns.items()}
         return np.stack(vectors[: self.K]), nodes
 
-    def flat(self, step: Step) -> Array:
-        """(keys, widest) with zeros behind narrower variables."""
-        out = np.zeros((len(self.keys), max(self.width)))
-        out[: self.K, :DIM] = step[0]
-        for group in self.groups:
-            for name, at in group.columns.items():
-                out[group.keys, at] = step[1][name]
-        return out
-
     def parameter_blocks(self, keyframe: Array, jacobians: dict[str, Array]) -> list[tuple[Array, Array]]:
         """Blocks of the parameter variables that rows at `keyframe` touch."""
         blocks = []
@@ -132,7 +123,7 @@ def whiten(problem: Problem, point: Iterate, layout: Layout) -> Rows:
         blocks = [(rows.keyframe, H[:, :, :DIM])]
         out += _touching(blocks + layout.parameter_blocks(rows.keyframe, weighted), -scale * linear.residual)
     for chain in problem.chains:
-        out += _chain_rows(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name])
+        out += chain_rows(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name])
     return out
 
 
@@ -157,7 +148,7 @@ def cost(problem: Problem, point: Iterate, layout: Layout) -> float:
     for rows in (problem.prior, *problem.constraints):
         total += float(np.sum(linearise(rows, points, problem.columns).kernel()[1]))
     for chain in problem.chains:
-        for _, b in _chain_rows(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name]):
+        for _, b in chain_rows(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name]):
             total += 0.5 * float(np.sum(b * b))
     return total
 
@@ -165,16 +156,6 @@ def cost(problem: Problem, point: Iterate, layout: Layout) -> float:
 def cost_at(problem: Problem, points: Points) -> float:
     """`cost` at points of all keyframes."""
     return cost(problem, Iterate(points.states, points.nodes(problem)), Layout(problem))
-
-
-def predict_decrease(rows: Rows, layout: Layout, step: Step) -> float:
-    """How much the quadratic model falls by a step."""
-    flat = layout.flat(step)
-    gain = 0.0
-    for blocks, b in rows:
-        moved = b - sum(mv(A, flat[keys, : A.shape[-1]]) for keys, A in blocks)
-        gain += 0.5 * float(np.sum(b * b) - np.sum(moved * moved))
-    return gain
 
 
 def column_norms(rows: Rows, layout: Layout) -> Array:
@@ -186,7 +167,7 @@ def column_norms(rows: Rows, layout: Layout) -> Array:
     return np.sqrt(total)
 
 
-def _chain_rows(chain: ParameterChain, group: _Group, value: Array) -> Rows:
+def chain_rows(chain: ParameterChain, group: _Group, value: Array) -> Rows:
     """The prior on a parameter's first node and its way from node to node."""
     pick = np.eye(group.width)[group.columns[chain.parameter.name]]  # (k, width)
     keys, off = group.keys, value - chain.mean

@@ -20,19 +20,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-import gtsam
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM, States
+from graphnav.core.state import DIM
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.linearise import Step, shift
+from graphnav.estimation.solvers.linearise import Step, scale_at, shift
 from graphnav.estimation.solvers.passes import integrate_again
 from graphnav.estimation.solvers.revision import Renewed
 from graphnav.estimation.solvers.robust import PASSES
 from graphnav.estimation.solvers.stages import (
-    Columns,
     Measured,
     Message,
     Place,
@@ -44,19 +42,22 @@ from graphnav.estimation.solvers.stages import (
 from graphnav.estimation.solvers.tree_nodes import (
     LINK,
     Keyframe,
+    Made,
     Variable,
     factor,
-    file,
     fresh_isam,
+    interval_factor,
     is_constant,
+    key_list,
+    read_estimates,
     read_factors,
-    rotate_columns,
+    row_factor,
+    states_of,
     units_of,
     update_isam,
     write_factors,
 )
 from graphnav.estimation.solvers.window import limits
-from graphnav.imu.dynamics import SCALE
 
 NODE_EVERY = 30.0  # s from one node of a constant to the next
 _TIED = 1e-5  # of its prior sigma, by which a constant may differ from node to node: 0.03 % of it in ten hours
@@ -112,11 +113,10 @@ class Tree:
             rows = measure(place, state, values, columns).measured
         else:
             state, values, columns, link = ahead.state, ahead.values, ahead.columns, ahead.link
-        graph, new = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        fresh: list[tuple[Variable, Any]] = []  # variables that begin here, and what is known of parameters among them
         x = self._variable(np.zeros(DIM), _UNIT, place.t)
-        nodes = self._open(place, graph, new)
+        nodes = self._open(place, fresh)
         keyframe = Keyframe(self._number, place, x, state, columns, nodes, {})
-        new.insert(x.key, np.zeros(DIM))
         for node, _ in nodes.values():
             node.last = self._number
         for name, at in columns.items():
@@ -124,59 +124,48 @@ class Tree:
             node.delta[own] = values[shift(at)] - node.anchor[own]
             if node.t == place.t:
                 node.point[own] = node.delta[own]
+        made: list[Made] = []
         if link is None:
-            prior = self._prior
-            graph.push_back(factor([(x, prior.R[:, :DIM])], prior.z))
-        made: list[tuple[str, Any]] = []
-        if link is not None:
-            last = self.keyframes[-1]
-            blocks = [(last.state, rotate_columns(link[:, :DIM], last.state.delta)), (x, link[:, DIM : 2 * DIM])]
-            made.append((LINK, self._about(link[:, DIM:-1], link[:, -1], blocks, last.columns, last.nodes)))
-        made += [(one.name, self._rows(keyframe, one, weighted=False)) for one in rows]
+            fresh.append((x, factor([(x, self._prior.R[:, :DIM])], self._prior.z)))
+        else:
+            fresh.append((x, None))
+            made.append((keyframe, LINK, interval_factor(self.keyframes[-1], x, link)))
+        made += [(keyframe, one.name, row_factor(keyframe, one, weighted=False)) for one in rows]
         self.keyframes.append(keyframe)
-        begin = graph.size()
-        for _, one in made:
-            graph.push_back(one)
         # along time, where the order is free; CCOLAMD wants labels below the number of variables it is to order
-        most = min(3, len({key for _, one in made for key in list(one.keys())}) - 1)
-        groups = gtsam.KeyGroupMap()
-        for variable in self._recent():
-            groups.insert2(variable.key, max(variable.last - self._number + most, 0))
-        result = update_isam(self.isam, place.t, graph, new, [], groups)
+        most = min(3, len({key for _, _, one in made for key in list(one.keys())}) - 1)
+        order = [(v, max(v.last - self._number + most, 0)) for v in self._recent()]
+        update_isam(self.isam, place.t, made, order, fresh=fresh)
         self._number += 1
-        file(keyframe, made, list(result.getNewFactorsIndices())[begin:])
-        self._read([x, *(node for node, _ in nodes.values())])
+        keyframe.read(self.isam)
         for _ in range(PASSES - 1 if any(one.kernel != "none" for one in rows) else 0):
             self.linearise_again([len(self.keyframes) - 1])
-            self._read([x, *(node for node, _ in nodes.values())])
+            keyframe.read(self.isam)
         return float(np.linalg.norm(x.delta[:3]))
 
     def _begin(self, place: Place) -> None:
         """Have the message that all goes on from as a keyframe before the first."""
         prior = self._prior
-        x = self._variable(np.zeros(DIM), _UNIT, place.t)
-        new, graph, nodes = gtsam.Values(), gtsam.NonlinearFactorGraph(), {}
-        new.insert(x.key, np.zeros(DIM))
+        x, nodes, fresh = self._variable(np.zeros(DIM), _UNIT, place.t), {}, []
         blocks = [(x, prior.R[:, :DIM])]
         if prior.columns:
             node = self._variable(prior.values, np.ones(len(prior.values)), place.t)
-            new.insert(node.key, np.zeros(len(prior.values)))
+            fresh.append((node, None))
             node.limit = limits(prior.columns, units_of(place))[1]
             nodes = {name: (node, shift(at)) for name, at in prior.columns.items()}
             blocks.append((node, prior.R[:, DIM:]))
-        graph.push_back(factor(blocks, prior.z))
         assert place.problem is not None
         for name, p in place.problem.parameters.items():
             if name in prior.columns and p.constant:
                 self._constant.add(name)
                 self._first_sigma[name] = p.sigma
-        update_isam(self.isam, place.t, graph, new)
         self._in_force = nodes
         before = Place(place.t, None)
         self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, {}))
+        update_isam(self.isam, place.t, fresh=[*fresh, (x, factor(blocks, prior.z))])
         self._number += 1
         self._held = 1
-        self._read([x, *(node for node, _ in nodes.values())])
+        self.keyframes[0].read(self.isam)
 
     def _recent(self) -> Iterable[Variable]:
         for keyframe in self.keyframes[-3:]:
@@ -191,7 +180,7 @@ class Tree:
         self._key += 1
         return out
 
-    def _open(self, place: Place, graph: Any, new: Any) -> dict[str, tuple[Variable, slice]]:
+    def _open(self, place: Place, fresh: list[tuple[Variable, Any]]) -> dict[str, tuple[Variable, slice]]:
         """Begin the nodes of parameters that step at a keyframe, and the next ones of constants; which are in force."""
         steps = list(place.steps)
         self._constant |= {s.name for s in steps if is_constant(place, s.name)}
@@ -226,87 +215,37 @@ class Tree:
                     node.anchor[at] = step.ahead(old.anchor[was])
                     old_A[at, was] = -step.decay * own_A[at, at]
                 in_force[step.name] = node, at
-            new.insert(node.key, np.zeros(len(node.unit)))
             blocks = [(node, own_A)] + ([(old, old_A)] if old is not None and old_A.any() else [])
-            graph.push_back(factor(blocks, np.zeros(edge[-1])))
+            fresh.append((node, factor(blocks, np.zeros(edge[-1]))))
         self._in_force = in_force
         return in_force
 
-    def _about(
-        self,
-        H: Array,
-        b: Array,
-        blocks: list[tuple[Variable, Array]],
-        columns: Columns,
-        nodes: dict[str, tuple[Variable, slice]],
-    ) -> Any:
-        """A factor of rows over states, `blocks`, and parameters, H (m, D), linearised where they are now."""
-        b = b + sum(A @ x.delta for x, A in blocks)
-        touched: dict[int, tuple[Variable, Array]] = {}
-        for name, at in columns.items():
-            if not H[:, at].any():
-                continue
-            node, own = nodes[name]
-            _, A = touched.setdefault(node.key, (node, np.zeros((len(b), len(node.unit)))))
-            A[:, own] = H[:, at]
-            b = b + H[:, at] @ node.delta[own]
-        return factor([*blocks, *touched.values()], b)
-
-    def _rows(self, keyframe: Keyframe, one: Measured, weighted: bool) -> Any:
-        """A factor of measurements linearised where keyframe and parameters are now."""
-        H, b, _ = one.weighted(np.zeros(one.H.shape[-1]), int(weighted))
-        H, x = H.reshape(-1, H.shape[-1]), keyframe.state
-        return self._about(H, b.ravel(), [(x, rotate_columns(H[:, :DIM], x.delta))], keyframe.columns, keyframe.nodes)
-
-    def _update(self, made: Sequence[tuple[Keyframe, str, Any]], gone: list[int], first: int) -> None:
-        """Have factors in place of others, on keyframes from one on."""
-        graph = gtsam.NonlinearFactorGraph()
-        for _, _, one in made:
-            graph.push_back(one)
+    def _replace(self, made: Sequence[Made], gone: Sequence[int], first: int) -> None:
+        """Have factors in place of others, on keyframes from number `first` on."""
         # the order stays that of time; once it has much to do, GTSAM makes the whole tree anew
         late = [v for v in self.variables.values() if v.last >= first]
-        every = None
-        if 2 * len(late) > len(self.variables):
+        every = 2 * len(late) > len(self.variables)
+        if every:
             late, first = list(self.variables.values()), self.keyframes[0].number
-            every = gtsam.KeyList()
-            for variable in late:
-                every.push_back(variable.key)
-        groups = gtsam.KeyGroupMap()
-        for variable in late:
-            groups.insert2(variable.key, variable.last - first)
-        t = self.keyframes[-1].place.t
-        result = update_isam(self.isam, t, graph, gtsam.Values(), gone, groups, None, every)
-        for (keyframe, name, _), index in zip(made, result.getNewFactorsIndices(), strict=True):
-            keyframe.slots.setdefault(name, []).append(index)
+        t, order = self.keyframes[-1].place.t, [(v, v.last - first) for v in late]
+        update_isam(self.isam, t, made, order, gone, anew=late if every else None)
 
     # ------------------------------------------------------------------------------------------ linearising again
     def read(self) -> None:
         """Bring all estimates up to date."""
-        self._read(list(self.variables.values()), all_at_once=True)
-
-    def _read(self, variables: Sequence[Variable], all_at_once: bool = False) -> None:
-        if not all_at_once:
-            for x in variables:
-                x.delta = x.unit * self.isam.calculateEstimateVector(x.key)
-            return
-        flat = np.asarray(self.isam.getDelta().vector([x.key for x in variables])).ravel()
-        begin = 0
-        for x in variables:
-            end = begin + len(x.unit)
-            x.delta = x.unit * flat[begin:end]
-            begin = end
+        read_estimates(self.isam, self.variables.values())
 
     def moved(self, share: float = 1.0) -> Array:
         """Which keyframes' estimates are further from where their rows were linearised than a share of the limits."""
-        if not self.keyframes:
+        if len(self) <= self._held:
             return np.empty(0, dtype=int)
         off = np.array([k.state.delta[:3] - k.state.point[:3] for k in self.keyframes])
         far = np.einsum("ki,ki->k", off, off) > (share * self.turn) ** 2
-        own = self.keyframes[self._held :]
-        nodes = {id(n): n for k in own for n, _ in k.nodes.values() if np.isfinite(n.limit).any()}
-        gone = {i for i, n in nodes.items() if np.any(np.abs(n.delta - n.point) > share * n.limit)}
+        first = self.keyframes[self._held].number
+        limited = (x for x in self.variables.values() if x.last >= first and np.isfinite(x.limit).any())
+        gone = {x.key for x in limited if np.any(np.abs(x.delta - x.point) > share * x.limit)}
         if gone:
-            far |= np.array([any(id(n) in gone for n, _ in k.nodes.values()) for k in self.keyframes])
+            far |= np.array([any(n.key in gone for n, _ in k.nodes.values()) for k in self.keyframes])
         far[: self._held] = False
         return np.flatnonzero(far)
 
@@ -324,12 +263,8 @@ class Tree:
         """Where biases have moved too far, have their intervals integrated about them; all are of one problem."""
         self.read()
         own = self.keyframes
-        states = States.stack([k.anchor for k in own]).plus(np.array([k.state.delta for k in own]))
-        scale = None
-        if SCALE in own[-1].nodes:
-            node, at = own[-1].nodes[SCALE]
-            scale = node.value[at]
-        problem, count = integrate_again(problem, states, scale, own[0].place.k)
+        scale = scale_at(own[-1].columns, own[-1].values)
+        problem, count = integrate_again(problem, states_of(own), scale, own[0].place.k)
         if count:
             for k in own:
                 k.place = replace(k.place, problem=problem)
@@ -342,7 +277,7 @@ class Tree:
         if not rows:
             return
         links = {k for i in rows for k in (i, i + 1) if k < len(self) and LINK in self.keyframes[k].slots}
-        made: list[tuple[Keyframe, str, Any]] = []
+        made: list[Made] = []
         gone: list[int] = []
         for run in list(self._runs(sorted(rows | links), posed=renewed is not None)):
             own = self.keyframes[run[0] : run[-1] + 1]
@@ -356,23 +291,16 @@ class Tree:
             for row, keyframe in zip(values, around, strict=True):
                 known = keyframe.values
                 row[: len(known)] = known
-            states = States.stack([k.anchor for k in around]).plus(np.array([k.state.delta for k in around]))
-            for i, linear in zip(run, at_points(places, states, values, columns, linked), strict=True):
+            for i, linear in zip(run, at_points(places, states_of(around), values, columns, linked), strict=True):
                 keyframe = self.keyframes[i]
                 if i in links:
                     assert linear.link is not None
-                    last, link = self.keyframes[i - 1], linear.link
-                    blocks = [
-                        (last.state, rotate_columns(link[:, :DIM], last.state.delta)),
-                        (keyframe.state, rotate_columns(link[:, DIM : 2 * DIM], keyframe.state.delta)),
-                    ]
-                    made.append((keyframe, LINK, self._about(
-                        link[:, DIM:-1], link[:, -1], blocks, last.columns, last.nodes)))  # fmt: skip
+                    made.append((keyframe, LINK, interval_factor(self.keyframes[i - 1], keyframe.state, linear.link)))
                     gone += keyframe.slots.pop(LINK)
                 if i in rows:
                     for one in linear.measured:
                         if one.name in keyframe.slots:
-                            made.append((keyframe, one.name, self._rows(keyframe, one, weighted=True)))
+                            made.append((keyframe, one.name, row_factor(keyframe, one, weighted=True)))
                             gone += keyframe.slots.pop(one.name)
         for i in rows:
             x = self.keyframes[i].state
@@ -380,7 +308,7 @@ class Tree:
             for node, _ in self.keyframes[i].nodes.values():
                 node.point = node.delta.copy()
         self.relinearised += len(rows)
-        self._update(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
+        self._replace(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
 
     def _runs(self, which: Sequence[int], posed: bool) -> Iterable[list[int]]:
         """Indices that can be linearised together: keyframe after keyframe of one problem, the same columns.
@@ -404,8 +332,7 @@ class Tree:
     # ---------------------------------------------------------------------------------------------------- leaving
     def truncate(self, keep: int) -> None:
         """Forget all but the first keyframes: something before what follows has changed."""
-        gone = self.keyframes[keep:]
-        if not gone:
+        if keep >= len(self):
             return
         del self.keyframes[keep:]
         last = self.keyframes[-1]
@@ -413,15 +340,14 @@ class Tree:
         # whatever touches a variable that began later goes with it
         late = {x.key for x in self.variables.values() if x.first > last.number}
         factors = self.isam.getFactorsUnsafe()
-        own = [
-            i for i in range(factors.size()) if factors.at(i) is not None and not late.isdisjoint(factors.at(i).keys())
-        ]
+        alive = ((i, factors.at(i)) for i in range(factors.size()))
+        own = [i for i, one in alive if one is not None and not late.isdisjoint(one.keys())]
         for key in late:
             del self.variables[key]
         for x in self.variables.values():
             x.last = min(x.last, last.number)
-        self._update([], own, last.number)
-        self._read([last.state, *(node for node, _ in last.nodes.values())])
+        self._replace([], own, last.number)
+        last.read(self.isam)
 
     def hold(self) -> None:
         """The first keyframe is behind the window from now on, and stays as it is."""
@@ -441,12 +367,8 @@ class Tree:
     def marginalise(self, count: int) -> None:
         """Let the first keyframes go, and the parameters' nodes that only they touch."""
         first = self.keyframes[count].number
-        keys = gtsam.KeyList()
         gone = [x for x in self.variables.values() if x.last < first]
-        for x in gone:
-            keys.push_back(x.key)
-        _, indices = self.isam.marginalizeLeavesWithIndices(keys)
-        left = set(indices)
+        left = set(self.isam.marginalizeLeavesWithIndices(key_list(gone))[1])
         for x in gone:
             del self.variables[x.key]
         del self.keyframes[:count]

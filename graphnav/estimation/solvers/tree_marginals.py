@@ -7,11 +7,11 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM, States
+from graphnav.core.state import DIM
 from graphnav.estimation.solvers.linearise import Columns, shift
 from graphnav.estimation.solvers.points import move_covariance
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_nodes import Variable
+from graphnav.estimation.solvers.tree_nodes import Variable, states_of
 from graphnav.estimation.solvers.window import SettledStates
 
 
@@ -63,7 +63,7 @@ def smooth_keyframes(tree: Tree, count: int, first: int = 0) -> SettledStates:
         sigma.append(out)
     return SettledStates(
         t=np.array([k.place.t for k in own]),
-        states=States.stack([k.anchor for k in own]).plus(delta),
+        states=states_of(own),
         covariance=covariance,
         columns=tuple(k.columns for k in own),
         values=tuple(k.values for k in own),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +15,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.graph import jacobian_factor
 from graphnav.estimation.solvers.linearise import Columns, shift
-from graphnav.estimation.solvers.stages import Place
+from graphnav.estimation.solvers.stages import Measured, Place
 from graphnav.estimation.solvers.stages import rotate_columns as turned_by
 
 LINK = "imu"  # among the constraints of a keyframe: the interval before it
@@ -66,11 +66,13 @@ class Keyframe:
             out[shift(at)] = node.anchor[own] + node.delta[own]
         return out
 
+    def read(self, isam: gtsam.ISAM2) -> None:
+        """Bring its variables up to date."""
+        for x in (self.state, *(node for node, _ in self.nodes.values())):
+            x.delta = x.unit * isam.calculateEstimateVector(x.key)
 
-def file(keyframe: Keyframe, made: Sequence[tuple[str, Any]], indices: Sequence[int]) -> None:
-    """Note where a keyframe's factors are."""
-    for (name, _), index in zip(made, indices, strict=True):
-        keyframe.slots.setdefault(name, []).append(index)
+
+Made = tuple[Keyframe, str, Any]  # a factor of a keyframe, by the name of its constraint
 
 
 def fresh_isam() -> gtsam.ISAM2:
@@ -82,13 +84,69 @@ def fresh_isam() -> gtsam.ISAM2:
     return gtsam.ISAM2(parameters)
 
 
-def update_isam(isam: gtsam.ISAM2, t: float, *change: Any) -> Any:
+def update_isam(
+    isam: gtsam.ISAM2,
+    t: float,
+    made: Sequence[Made] = (),
+    order: Iterable[tuple[Variable, int]] | None = None,
+    gone: Sequence[int] = (),
+    fresh: Sequence[tuple[Variable, Any]] = (),
+    anew: Iterable[Variable] | None = None,
+) -> None:
+    """Have factors in a tree, and others not any more.
+
+    Parameters
+    ----------
+    t : s, of the newest keyframe.
+    made : their keyframes note where they are.
+    order : when variables are eliminated; None leaves it to GTSAM.
+    gone : indices.
+    fresh : variables that begin, each with a factor that comes with it or None.
+    anew : variables that are all eliminated again.
+
+    Raises
+    ------
+    EstimationError
+        For a variable that nothing determines.
+    """
+    graph, new, groups = gtsam.NonlinearFactorGraph(), gtsam.Values(), None
+    for variable, known in fresh:
+        new.insert(variable.key, np.zeros(len(variable.unit)))
+        if known is not None:
+            graph.push_back(known)
+    begin = graph.size()
+    for _, _, one in made:
+        graph.push_back(one)
+    if order is not None:
+        groups = gtsam.KeyGroupMap()
+        for variable, group in order:
+            groups.insert2(variable.key, group)
     try:
-        return isam.update(*change)
+        result = isam.update(graph, new, list(gone), groups, None, None if anew is None else key_list(anew))
     except RuntimeError as error:  # GTSAM's for a variable that nothing determines
         raise EstimationError(
             f"the smoother's information broke down at {t:.3f} s: check sigmas and units", key="solver.breakdown"
         ) from error
+    for (keyframe, name, _), index in zip(made, list(result.getNewFactorsIndices())[begin:], strict=True):
+        keyframe.slots.setdefault(name, []).append(index)
+
+
+def read_estimates(isam: gtsam.ISAM2, variables: Collection[Variable]) -> None:
+    """Bring many variables up to date."""
+    flat = np.asarray(isam.getDelta().vector([x.key for x in variables])).ravel()
+    begin = 0
+    for x in variables:
+        end = begin + len(x.unit)
+        x.delta = x.unit * flat[begin:end]
+        begin = end
+
+
+def key_list(variables: Iterable[Variable]) -> gtsam.KeyList:
+    """The keys of variables."""
+    out = gtsam.KeyList()
+    for x in variables:
+        out.push_back(x.key)
+    return out
 
 
 def factor(blocks: Sequence[tuple[Variable, Array]], b: Array) -> Any:
@@ -96,9 +154,41 @@ def factor(blocks: Sequence[tuple[Variable, Array]], b: Array) -> Any:
     return gtsam.LinearContainerFactor(jacobian_factor([(x.key, A * x.unit) for x, A in blocks], b))
 
 
-def rotate_columns(A: Array, d: Array) -> Array:
-    """Columns of rows about the anchor moved by d, as columns of the errors about the anchor itself."""
-    return turned_by(A, rotation.right_jacobian(d[None, :3])[0]) if d[:3].any() else A
+def interval_factor(last: Keyframe, x: Variable, link: Array) -> Any:
+    """A factor of an interval's whitened rows (15, 15 + D + 1), from the keyframe before to a state."""
+    return _about(last, [(last.state, link[:, :DIM]), (x, link[:, DIM : 2 * DIM])], link[:, DIM:-1], link[:, -1])
+
+
+def row_factor(keyframe: Keyframe, one: Measured, weighted: bool) -> Any:
+    """A factor of measurements linearised where keyframe and parameters are now."""
+    H, b, _ = one.weighted(np.zeros(one.H.shape[-1]), int(weighted))
+    H = H.reshape(-1, H.shape[-1])
+    return _about(keyframe, [(keyframe.state, H[:, :DIM])], H, b.ravel())
+
+
+def _about(keyframe: Keyframe, blocks: list[tuple[Variable, Array]], H: Array, b: Array) -> Any:
+    """A factor of rows over states and a keyframe's parameters, H (m, D), linearised where they are now.
+
+    Columns of a state about the anchor moved by d become those of the errors about the anchor itself.
+    """
+    blocks = [
+        (x, turned_by(A, rotation.right_jacobian(x.delta[None, :3])[0]) if x.delta[:3].any() else A) for x, A in blocks
+    ]
+    b = b + sum(A @ x.delta for x, A in blocks)
+    touched: dict[int, tuple[Variable, Array]] = {}
+    for name, at in keyframe.columns.items():
+        if not H[:, at].any():
+            continue
+        node, own = keyframe.nodes[name]
+        _, A = touched.setdefault(node.key, (node, np.zeros((len(b), len(node.unit)))))
+        A[:, own] = H[:, at]
+        b = b + H[:, at] @ node.delta[own]
+    return factor([*blocks, *touched.values()], b)
+
+
+def states_of(keyframes: Sequence[Keyframe]) -> States:
+    """Their states as they are known now."""
+    return States.stack([k.anchor for k in keyframes]).plus(np.array([k.state.delta for k in keyframes]))
 
 
 def is_constant(place: Place, name: str) -> bool:

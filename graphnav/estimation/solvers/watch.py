@@ -290,11 +290,6 @@ class Verdicts:
         self._tried: set[tuple[str, float]] = set()
         self._trial: tuple[str, int, int, dict[str, Array]] | None = None  # fixes taken back, and what was used before
 
-    @property
-    def refused(self) -> float:
-        """The largest share of a kind that is not used."""
-        return max((float(np.mean(used == 0.0)) for used in self.used.values() if len(used)), default=0.0)
-
     def faults(self) -> tuple[ExcludedSpan, ...]:
         """Spans of fixes that are not used."""
         out = []
