@@ -232,7 +232,7 @@ class Smoother:
         assert self.frame is not None
         stated = with_known_heading(found, self.settings)
         self.notes += [note for note in stated.notes if note not in self.notes]
-        message = first_message(stated.state, start_sigma(stated))
+        message = first_message(stated.state, start_sigma(stated), turns=self.settings.solver.engine == "window")
         kind = Walker if self._setup.platform == "foot" else Tracker
         tracker = kind(self.settings, self.frame, message, start, self._setup, noise)
         if found is not stated:
