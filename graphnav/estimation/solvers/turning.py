@@ -1,9 +1,9 @@
 """Moving states by an error state so that a turn of them all about the vertical stays what it is.
 
-Without fixes nothing tells the heading: IMU, stances and wheels say the same of a trajectory that is turned as a whole
-about the vertical at the origin of n. Their rows, linear in an error state e, say it too, but of the tangent: where
-the heading is known to 20 deg, a correction bends what it should only turn, and a row that is linearised about a moved
-point and one about the old one disagree on which turn it is that nothing tells, so that heading is learned of nothing
+Without fixes nothing tells the heading: IMU and stances say the same of a trajectory that is turned as a whole about
+the vertical at the origin of n. Their rows, linear in an error state e, say it too, but of the tangent: where the
+heading is known to 20 deg, a correction bends what it should only turn; and of two rows, one linearised at the old
+point and one where it has moved to, each is blind to another turn, so that together they pretend to know the heading
 (Huang, Mourikis, Roumeliotis 2010, "Observability-based rules for designing consistent EKF SLAM estimators"). So e is
 followed along the turn. With u = R_nb^T z the vertical in the body, psi = u . theta, and with what is left of e beside
 the turn,
