@@ -9,6 +9,10 @@ done beside, at rows before and after it, is told by keyframe and by the longest
 whole process: rows that wait for nothing, and judging in its own thread, are in it.
 
     python scripts/benchmark_online.py --hours 10
+
+With `--foot` it is a simulated walk at 250 Hz without fixes, and told are all rows that did more than to be kept.
+
+    python scripts/benchmark_online.py --foot --hours 0.5 --lag 60
 """
 
 from __future__ import annotations
@@ -37,8 +41,10 @@ from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.online import Online, Row, rows_of, without_rows
 from graphnav.recording import Recording
+from graphnav.simulation import simulate
 
 RATE, LAP = 200.0, 3600.0
+WALK_RATE, EVERY = 250.0, 300.0  # Hz, s
 PARTS = ("posing", "solving")
 A_ROW = 1e-4  # s; a row that takes longer did more than to be kept
 PORTION = 600.0  # s of rows that are in memory as rows
@@ -48,10 +54,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hours", type=float, default=10.0)
     parser.add_argument("--lag", type=float, default=Settings().solver.lag, help="s (%(default)s)")
+    parser.add_argument("--foot", action="store_true", help="a walk")
     parser.add_argument("--engine", choices=["window", "isam2"], default=Settings().solver.engine)
     options = parser.parse_args()
     settings = settings_from({"solver": {"lag": options.lag, "engine": options.engine}})
     seconds = 3600.0 * options.hours
+    if options.foot:
+        walk(seconds, settings)
+        return
     laps = max(1, round(seconds / LAP))
     path = oracle.vehicle_path(seconds / laps, RATE).tiled(laps)
     spans = oracle.moving_spans(path, 60.0, max(1, round(3 * options.hours)))
@@ -93,6 +103,35 @@ def main() -> None:
             hour, found, errors, began = hour + 1, [], [], time.process_time()
         if row[1] >= recording.end - 1e-6:
             break
+
+
+def walk(seconds: float, settings: Settings) -> None:
+    """Times of the rows of a walk, five minutes after five minutes."""
+    recording = simulate("gait", 1, duration=seconds, rate=WALK_RATE).recording
+    online, found = Online(without_rows(recording), settings), []
+    until, again, began = recording.start + EVERY, 0, time.process_time()
+    print("| min | ms a row that does something: median, 99 %, most | of all rows | settled | linearised again", end="")
+    print(" | heading, deg | all, s | memory, MB |\n" + "| --- " * 8 + "|", flush=True)
+    for _, t, values in rows_of(recording)[1]:
+        before = time.thread_time()
+        online.add(("imu", t, values))
+        found.append(time.thread_time() - before)
+        if t < until and t < recording.end - 1e-6:
+            continue
+        tracker, spent = online.tracker, np.array(found)
+        assert tracker is not None
+        newest, window = tracker.window.newest, tracker.window
+        up = newest.state.R_nb[0, 2]
+        heading = np.degrees(np.sqrt(up @ newest.covariance[:3, :3] @ up))
+        working = spent[spent > A_ROW]
+        times = " / ".join(f"{1e3 * x:.1f}" for x in np.quantile(working, [0.5, 0.99, 1.0]))
+        made = sum(len(track.t) for track in online.settled())
+        print(
+            f"| {(t - recording.start) / 60.0:.0f} | {times} | {100.0 * len(working) / len(spent):.0f} % | {made} | "
+            f"{window.relinearized - again} | {heading:.1f} | {time.process_time() - began:.1f} | {memory_mb():.0f} |",
+            flush=True,
+        )
+        until, again, found, began = until + EVERY, window.relinearized, [], time.process_time()
 
 
 def lazily(recording: Recording) -> Iterator[Row]:

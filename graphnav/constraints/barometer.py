@@ -32,6 +32,7 @@ class BarometricHeight(Constraint):
     """The body was as high as its barometer said."""
 
     name: ClassVar[str] = "barometer"
+    turns: ClassVar[bool] = True
     axes: ClassVar[tuple[str, ...]] = ("up",)
     noise_axes: ClassVar[tuple[str, ...]] = ("up",)
     unit: ClassVar[str] = "m"

@@ -74,6 +74,8 @@ class Constraint(ABC):
     unit: ClassVar[str]
     looks_ahead: ClassVar[bool] = True  # False: once the intervals and the odometer are there, rows can be built
     of_stops: ClassVar[bool] = False  # True: its rows are there because the platform stands
+    turns: ClassVar[bool] = False  # True: a turn of all states about the vertical changes nothing but what the Earth's
+    # rate does, neither of the residuals nor of their sigmas
     passes: ClassVar[int] = 1  # of a filter's update; more for rows that are far from linear over its uncertainty
     depends_on: ClassVar[tuple[str, ...]] = tuple(BLOCKS)  # blocks to differentiate by, where `linearize` does not say
     words: ClassVar[Mapping[str, tuple[tuple[str, str, float], ...]]] = {}  # of its parameters' numbers, for people:

@@ -63,6 +63,7 @@ class Stance(Constraint):
     """Where the shoe touches the floor it does not move."""
 
     name: ClassVar[str] = "stance"
+    turns: ClassVar[bool] = True
     of_stops: ClassVar[bool] = True
     axes: ClassVar[tuple[str, ...]] = ("right", "forward", "up")
     unit: ClassVar[str] = "m/s"
@@ -149,6 +150,7 @@ class FootLateral(Constraint):
     """In the air a foot goes where it points."""
 
     name: ClassVar[str] = "foot_lateral"
+    turns: ClassVar[bool] = True
     axes: ClassVar[tuple[str, ...]] = ("sideways",)
     unit: ClassVar[str] = "m/s"
 

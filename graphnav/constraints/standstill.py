@@ -149,6 +149,7 @@ class ZeroRate(_Standing):
     """The platform does not turn: the gyro reads its bias and the Earth (ZARU)."""
 
     name: ClassVar[str] = "zero_rate"
+    turns: ClassVar[bool] = True
     axes: ClassVar[tuple[str, ...]] = ("right", "forward", "up")
     unit: ClassVar[str] = "rad/s"
 

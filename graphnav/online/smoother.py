@@ -233,7 +233,9 @@ class Smoother:
         assert self.frame is not None
         stated = with_known_heading(found, self.settings)
         self.notes += [note for note in stated.notes if note not in self.notes]
-        message = first_message(stated.state, start_sigma(stated))
+        # whether it tells the heading shows with the rows; the tree of iSAM2 moves its states by itself
+        turns = self._setup.gnss is None and self.settings.solver.engine == "window"
+        message = first_message(stated.state, start_sigma(stated), turns)
         kind = Walker if self._setup.platform == "foot" else Tracker
         tracker = kind(self.settings, self.frame, message, start, self._setup, noise)
         if found is not stated:

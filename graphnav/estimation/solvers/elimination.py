@@ -16,7 +16,6 @@ from functools import cache
 import numpy as np
 from scipy.linalg.lapack import dgeqrf, dtpmqrt, dtpqrt, dtrtri, dtrtrs
 
-from graphnav.core import rotation
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
@@ -87,7 +86,8 @@ def predict(
     apart = np.zeros(DIM) if place.linked else state.minus(before.state)[0]
     if np.any(apart):  # one and the same state, but about its new point
         head[:D0, -1] -= R0[:, :DIM] @ apart
-        head[:D0, E : E + 3] = head[:D0, E : E + 3] @ rotation.right_jacobian_inverse(apart[None, :3])[0]
+        J = before.change_of_point(apart)
+        head[:D0, E : E + len(J)] = head[:D0, E : E + len(J)] @ J
     moved = values[: D0 - DIM] - before.values
     for at in gone:
         moved[shift(at)] = 0.0
@@ -126,8 +126,10 @@ def predict(
     g[DIM:] = values[: D0 - DIM] - before.values
     G, g[lost], noise = -root @ R[:E, E : E + D], root @ R[:E, E + D], root @ root.T
     if not place.linked:  # nothing is eliminated of the state, but its attitude is about another point
-        J = rotate_columns(np.eye(3, D), rotation.right_jacobian_inverse(apart[None, :3])[0])
-        G, lost, noise = np.concatenate([J, G]), np.concatenate([np.arange(3), lost]), np.pad(noise, (3, 0))
+        J = before.change_of_point(apart)
+        k = len(J)
+        J = rotate_columns(np.eye(k, D), J)
+        G, lost, noise = np.concatenate([J, G]), np.concatenate([np.arange(k), lost]), np.pad(noise, (k, 0))
         g[:DIM] += apart
     return Predicted(before, place, state, values, columns, link, top, G, g, lost, noise, tuple(rows))
 
@@ -166,8 +168,9 @@ def update(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -
                 f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units",
                 key="solver.breakdown",
             )
-    message = Message.of(ahead.state, ahead.values, ahead.columns, top[:, :D], top[:, D], beside)
     measured = (*ahead.measured, *rows)
+    turns = ahead.before.turns and all(one.turns for one in measured)
+    message = Message.of(ahead.state, ahead.values, ahead.columns, top[:, :D], top[:, D], beside, turns)
     return Stage(place, message, ahead.G, ahead.g, ahead.lost, ahead.C, measured, fault=fault), y
 
 

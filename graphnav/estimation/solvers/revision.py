@@ -15,7 +15,7 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.elimination import predict, update
-from graphnav.estimation.solvers.stages import Columns, Message, Place, Stage, at_points, width
+from graphnav.estimation.solvers.stages import Columns, Message, Place, Stage, at_points, plus, width
 
 if TYPE_CHECKING:
     from graphnav.estimation.solvers.window import Window
@@ -77,7 +77,7 @@ class Revision:
         message = before.message if isinstance(before, Stage) else before
         around = [message, *(stage.message for stage in old)]
         moves = [np.zeros(len(message.z)), *means]
-        states = States.stack([m.state for m in around]).plus(np.array([e[:DIM] for e in moves]))
+        states = plus(States.stack([m.state for m in around]), np.array([e[:DIM] for e in moves]), message.turns)
         points = [
             LinearisationPoint(states[k : k + 1], m.values + e[DIM:], m.columns)
             for k, (m, e) in enumerate(zip(around, moves, strict=True))

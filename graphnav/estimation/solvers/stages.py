@@ -33,6 +33,7 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Columns, Points, Step, linearise, linearise_links, scale_at, shift
 from graphnav.estimation.solvers.robust import soften, weight_and_cost
+from graphnav.estimation.solvers.turning import change_of_point, plus_turning, split_turn
 from graphnav.estimation.solvers.watch import Watch
 from graphnav.imu.dynamics import SCALE, ImuFactors
 
@@ -57,23 +58,32 @@ class Place:
 class Message:
     """R y = z about a point; `columns` says where the parameters stand behind the fifteen states.
 
-    R is a triangle whose first three columns may be turned. A window of hundreds of keyframes is made of such
-    matrices, so of each is kept what may be other than zero (`Message.of`).
+    R is a triangle whose first nine columns may have been mixed: its point has moved. A window of hundreds of keyframes
+    is made of such matrices, so of each is kept what may be other than zero (`Message.of`).
     """
 
     state: States  # one
     values: Array  # (D-15,)
     columns: Columns
-    packed: Array  # (D (D + 1) / 2 + 3,) of R, row by row
+    packed: Array  # (D (D + 1) / 2 + 36,) of R, row by row
     z: Array  # (D,)
     tests: Watch | None = None
+    # whether nothing that it was made of, but for the prior, changes when all is turned about the vertical
+    turns: bool = False
 
     @classmethod
     def of(
-        cls, state: States, values: Array, columns: Columns, R: Array, z: Array, tests: Watch | None = None
+        cls,
+        state: States,
+        values: Array,
+        columns: Columns,
+        R: Array,
+        z: Array,
+        tests: Watch | None = None,
+        turns: bool = False,
     ) -> Message:
-        """One with R (D, D), of which nothing is looked at below the triangle and its first three rows."""
-        return cls(state, values, columns, R[_triangle(len(z))], np.array(z), tests)
+        """One with R (D, D), of which nothing is looked at below the triangle and its first nine rows."""
+        return cls(state, values, columns, R[_triangle(len(z))], np.array(z), tests, turns)
 
     @property
     def R(self) -> Array:
@@ -99,11 +109,18 @@ class Message:
         root = np.linalg.inv(self.R)
         return np.asarray(root @ root.T)
 
+    def change_of_point(self, e: Array) -> Array:
+        """(k, k) of the first k columns, 3 or 9: errors about the point moved by e (D,) as those about this one."""
+        if self.turns:
+            return change_of_point(self.state, e[None, :DIM])[0]
+        return np.asarray(rotation.right_jacobian_inverse(e[None, :3])[0])
+
     def moved(self, e: Array, J: Array | None = None) -> Message:
-        """The same about the point moved by the error state e (D,); J is Jr^-1 of its turn, if known."""
-        J = rotation.right_jacobian_inverse(e[None, :3])[0] if J is None else J
-        state, values, R = self.state.plus(e[None, :DIM]), self.values + e[DIM:], self.R
-        return Message.of(state, values, self.columns, rotate_columns(R, J), self.z - R @ e, self.tests)
+        """The same about the point moved by the error state e (D,); J is `change_of_point`, if known."""
+        J = self.change_of_point(e) if J is None else J
+        state = plus(self.state, e[None, :DIM], self.turns)
+        values, R = self.values + e[DIM:], self.R
+        return Message.of(state, values, self.columns, rotate_columns(R, J), self.z - R @ e, self.tests, self.turns)
 
     def value(self, name: str) -> Array:
         """A parameter at the point."""
@@ -121,6 +138,7 @@ class Measured:
     sigma: Array  # (n, m) that they were whitened with
     kernel: str
     scale: float | Array
+    turns: bool = False  # whether a turn of all about the vertical changes nothing of them
 
     def weighted(self, y: Array, passes: int) -> tuple[Array, Array, Array]:
         """H, b and sigma, by the kernel's weights for the error state y once `passes` is not 0."""
@@ -147,12 +165,14 @@ class Stage:
     C: Array  # (lost, lost)
     measured: tuple[Measured, ...] = ()
     fault: tuple[str, float] | None = None  # whose fixes are wrong, and since when (s)
+    psi: float = 0.0  # rad, how far its point has turned about the vertical since its rows were linearised
 
     def moved(self, e: Array) -> Stage:
         """The same about the point moved by the error state e."""
-        J = rotation.right_jacobian_inverse(e[None, :3])[0]
+        J = self.message.change_of_point(e)
         message, G, g = self.message.moved(e, J), rotate_columns(self.G, J), self.g + self.back(e)
-        return Stage(self.place, message, G, g, self.lost, self.C, self.measured, self.fault)
+        psi = self.psi + float(split_turn(self.message.state, e[None])[0][0]) if message.turns else 0.0
+        return Stage(self.place, message, G, g, self.lost, self.C, self.measured, self.fault, psi)
 
     def back(self, A: Array) -> Array:
         """What smooths back, without g, times A (D, ...)."""
@@ -173,15 +193,25 @@ class Stage:
 
 @cache
 def _triangle(D: int) -> tuple[Array, Array]:
-    """Rows and columns of what may be other than zero in R: an upper triangle, and its first three columns turned."""
-    rows, columns = np.nonzero(np.triu(np.ones((D, D))) + np.pad(np.ones((3, 3)), (0, max(D - 3, 0)))[:D, :D])
+    """Rows and columns of what may be other than zero in R: an upper triangle, and its first nine columns mixed."""
+    R = np.triu(np.ones((D, D)))
+    R[:9, :9] = 1.0
+    rows, columns = np.nonzero(R)
     return rows, columns
 
 
+def plus(states: States, e: Array, turns: bool) -> States:
+    """States moved by error states (K, 15), along the turns about the vertical where nothing tells those."""
+    return plus_turning(states, e) if turns else states.plus(e)
+
+
 def rotate_columns(A: Array, J: Array) -> Array:
-    """Columns about a point turned by e, of which J is Jr^-1: log(Exp(e) Exp(d)) = e + Jr^-1(e) d."""
-    out = A.copy()
-    out[:, :3] = A[:, :3] @ J
+    """Columns about another point, of which J is `Message.change_of_point`.
+
+    With three columns it is Jr^-1(e): log(Exp(e) Exp(d)) = e + Jr^-1(e) d.
+    """
+    out, k = A.copy(), len(J)
+    out[:, :k] = A[:, :k] @ J
     return out
 
 
@@ -293,6 +323,14 @@ def at_points(
             c = constraint
             kernel = soften(c.robust) if c.robust == "gnc" else c.robust
             parts[i].append(
-                Measured(c.name, H[own], b[own], sigma[own], kernel, c.scale_of(slice(lo + own.start, lo + own.stop)))
+                Measured(
+                    c.name,
+                    H[own],
+                    b[own],
+                    sigma[own],
+                    kernel,
+                    c.scale_of(slice(lo + own.start, lo + own.stop)),
+                    c.turns,
+                )
             )
     return [Linear(link, tuple(part)) for link, part in zip(links, parts, strict=True)]

@@ -27,9 +27,11 @@ from graphnav.estimation.solvers.stages import (
     Stage,
     append_columns,
     measure,
+    plus,
     predict_stage,
     width,
 )
+from graphnav.estimation.solvers.turning import covariance_turning, split_turn
 from graphnav.estimation.solvers.watch import Watch
 from graphnav.recording import ImuNoise
 
@@ -134,12 +136,14 @@ class Window:
         ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
         columns = ahead.columns
         stage, e = update(ahead, measure(place, ahead.state, ahead.values, columns, late=True).measured)
-        self.stages.append(stage.moved(e))
+        moved, turns = stage.moved(e), stage.message.turns
+        self.stages.append(moved)
         self._means = None
         if columns != self._limit[0]:
             assert place.problem is not None
             self._limit = limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})
-        return float(np.linalg.norm(e[:3]))
+        turn = split_turn(stage.message.state, e[None])[1][0] if turns else e
+        return float(np.linalg.norm(turn[:3]))
 
     def watch(self, tests: Watch) -> None:
         """Have the fixes from the next keyframe on tested."""
@@ -220,8 +224,9 @@ class Window:
         values = tuple(stage.message.values + e[DIM:] for stage, e in zip(gone, means, strict=True))
         states = self.head.state[:0]
         if gone:
-            moved = np.array([e[:DIM] for e in means])
-            states, covariance = States.stack(rows).plus(moved), move_covariance(covariance, moved)
+            moved, states, turns = np.array([e[:DIM] for e in means]), States.stack(rows), gone[-1].message.turns
+            covariance = covariance_turning(covariance, states, moved) if turns else move_covariance(covariance, moved)
+            states = plus(states, moved, turns)
             self.head = gone[-1].message
             del self.stages[:count]
             self._means = None
@@ -249,9 +254,21 @@ class Window:
             e = np.zeros((len(means), max(len(x) for x in means)))
             for row, x in zip(e, means, strict=True):
                 row[: len(x)] = x
-            turn = np.linalg.norm(e[:, :3], axis=1) / self.turn
+            turn = self._turned(e) / self.turn
             self._moved = np.maximum(turn, np.abs(e[:, DIM:] / limit[: e.shape[1] - DIM]).max(axis=1, initial=0.0))
         return np.empty(0) if self._moved is None else self._moved
+
+    def _turned(self, e: Array) -> Array:
+        """(n,) rad, how far attitudes move by e (n, D) from where their rows are linearised.
+
+        Of a turn about the vertical only what it has beside that of the keyframe before, where nothing tells headings.
+        """
+        if not self.newest.turns:
+            return np.asarray(np.linalg.norm(e[:, :3], axis=1))
+        psi, left = split_turn(States.stack([stage.message.state for stage in self.stages]), e)
+        before = split_turn(self.head.state, self.means()[0][None])[0]
+        beside = psi + [stage.psi for stage in self.stages] - np.concatenate([before, psi[:-1]])
+        return np.hypot(np.linalg.norm(left[:, :3], axis=1), beside)
 
     def relinearize(self, first: int, places: Sequence[Place] | None = None) -> None:
         """Make the stages from `first` on anew about the smoothed states.
@@ -310,9 +327,9 @@ def turn_limit(noise: ImuNoise) -> float:
     return float(np.clip(np.sqrt(2.0 * _SHARE * noise.accel_noise_density / _G), 3e-4, 1e-2))
 
 
-def first_message(state: States, sigma: Array) -> Message:
-    """A prior: one state and its fifteen sigmas."""
-    return Message.of(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM))
+def first_message(state: States, sigma: Array, turns: bool = False) -> Message:
+    """A prior: one state and its fifteen sigmas; `turns` as of `Message`."""
+    return Message.of(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM), turns=turns)
 
 
 def limits(columns: Columns, units: dict[str, str]) -> tuple[Columns, Array]:

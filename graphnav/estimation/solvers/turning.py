@@ -1,0 +1,109 @@
+"""Moving states by an error state so that a turn of them all about the vertical stays what it is.
+
+Without fixes nothing tells the heading: IMU and stances say the same of a trajectory that is turned as a whole about
+the vertical at the origin of n. Their rows, linear in an error state e, say it too, but of the tangent: where the
+heading is known to 20 deg, a correction bends what it should only turn; and of two rows, one linearised at the old
+point and one where it has moved to, each is blind to another turn, so that together they pretend to know the heading
+(Huang, Mourikis, Roumeliotis 2010, "Observability-based rules for designing consistent EKF SLAM estimators"). So e is
+followed along the turn. With u = R_nb^T z the vertical in the body, psi = u . theta, and with what is left of e beside
+the turn,
+
+    theta' = theta - psi u     p' = dp - psi z x p     v' = dv - psi z x v
+
+a state moves to
+
+    R_nb <- Rz(psi) R_nb Exp(theta')     p <- Rz(psi) (p + p')     v <- Rz(psi) (v + v')
+
+which to first order is `graphnav.core.state.States.plus`. A row that no turn changes depends on theta', p', v' alone,
+so with its old Jacobian it is as good after any turn as before, and two points on the way have the turn in common.
+The rate of the Earth does change, by less than a turn of its own size.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.rotation import Array, mv
+from graphnav.core.state import DIM, States
+
+_Z = rotation.skew(np.array([0.0, 0.0, 1.0]))
+_I3 = np.eye(3)
+_MOVING = 9  # numbers of an error state that a turn changes: theta, p, v
+
+
+def split_turn(states: States, e: Array) -> tuple[Array, Array]:
+    """An error state as a turn about the vertical and what is left beside it.
+
+    Parameters
+    ----------
+    states : K states.
+    e : (K, 15) or more columns.
+
+    Returns
+    -------
+    psi : (K,) rad, counter-clockwise seen from above.
+    left : (K, 9) theta' (rad, body), p' (m) and v' (m/s) in n.
+    """
+    u = states.R_nb[:, 2]
+    psi = np.sum(u * e[:, :3], axis=1)
+    turned = np.concatenate([u, states.p @ _Z.T, states.v @ _Z.T], axis=1)
+    return psi, e[:, :_MOVING] - psi[:, None] * turned
+
+
+def plus_turning(states: States, e: Array) -> States:
+    """K states moved by error states (K, 15) along the turns about the vertical."""
+    psi, left = split_turn(states, e)
+    Rz = _about_vertical(psi)
+    return States(
+        Rz @ states.R_nb @ rotation.exp(left[:, :3]),
+        mv(Rz, states.p + left[:, 3:6]),
+        mv(Rz, states.v + left[:, 6:9]),
+        states.ba + e[:, 9:12],
+        states.bg + e[:, 12:DIM],
+    )
+
+
+def change_of_point(states: States, e: Array) -> Array:
+    """How error states about a moved point are error states about the point it was moved from.
+
+    Moved from there by e + T x, a state is where x moves it from the new point, to first order in x.
+
+    Parameters
+    ----------
+    states : K states, the old points.
+    e : (K, 15) what `plus_turning` moves them by.
+
+    Returns
+    -------
+    (K, 9, 9) T over theta, p and v; of the rest nothing changes.
+    """
+    psi, left = split_turn(states, e)
+    u, tilt = states.R_nb[:, 2], left[:, :3]
+    # Exp(tilt) Exp(x) = Rz in the body by w . x, and Exp(tilt + what x adds at right angles to u)
+    J = rotation.right_jacobian_inverse(tilt)
+    after = mv(np.swapaxes(rotation.exp(tilt), -1, -2), u)  # the vertical in the body there
+    w = np.einsum("ki,kij->kj", u, J)
+    w /= np.sum(w * after, axis=1)[:, None]
+    T, back = np.zeros((len(e), _MOVING, _MOVING)), np.swapaxes(_about_vertical(psi), -1, -2)
+    T[:, :3, :3] = u[:, :, None] * w[:, None] + J @ (_I3 - after[:, :, None] * w[:, None])
+    for at in (slice(3, 6), slice(6, 9)):
+        T[:, at, :3] = -(left[:, at] @ _Z.T)[:, :, None] * w[:, None]
+        T[:, at, at] = back
+    return T
+
+
+def covariance_turning(P: Array, states: States, e: Array) -> Array:
+    """Covariances (K, 15, 15) of errors about points turned into those about the points moved by e (K, 15)."""
+    back = np.linalg.inv(change_of_point(states, e))
+    P = P.copy()
+    P[:, :_MOVING] = back @ P[:, :_MOVING]
+    P[:, :, :_MOVING] = P[:, :, :_MOVING] @ np.swapaxes(back, -1, -2)
+    return P
+
+
+def _about_vertical(psi: Array) -> Array:
+    """(K, 3, 3) Rz"""
+    c, s, out = np.cos(psi), np.sin(psi), np.zeros((len(psi), 3, 3))
+    out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1], out[:, 2, 2] = c, -s, s, c, 1.0
+    return out
