@@ -32,13 +32,13 @@ from graphnav.estimation.solvers.passes import (
     ForwardRecord,
     Progress,
     SmootherPass,
+    Updates,
     move_points,
     parameters_of,
     residual_record,
     sigmas_of,
 )
-
-_BLOCK = 32  # keyframes whose covariances stay in a processor's cache
+from graphnav.estimation.solvers.recursion import STRETCH, find_disturbances, move, smooth_points
 
 
 def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None = None) -> SmootherPass:
@@ -60,13 +60,10 @@ def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None
             if info:
                 raise _breakdown(problem, end)
             r[end], N[end] = inverse @ away, inverse @ (ahead - P[end]) @ inverse
-        _find_disturbances(forward, end, r, N, progress)
-        errors = forward.errors_predicted[:end] + (forward.P_predicted[:end] @ r[:end, :, None])[..., 0]
-        for k in range(0, end, _BLOCK):
-            some = slice(k, min(k + _BLOCK, end))
-            ahead = forward.P_predicted[some]
-            smoothed = ahead - ahead @ N[some] @ ahead
-            P[some] = 0.5 * (smoothed + np.swapaxes(smoothed, -1, -2))
+        if forward.updates is not None:
+            _find_disturbances(forward, forward.updates, end, r, N, progress)
+        errors = np.empty((end, D))
+        smooth_points(forward.errors_predicted[:end], forward.P_predicted[:end], r[:end], N[:end], errors, P[:end])
         first = move_points(forward.about.first(end), errors)
         values[:end] = first.values
         states = [first.states, *states]
@@ -83,7 +80,7 @@ def _smooth_filtered(
     for k in range(K - 1, end - 1, -1):
         if k < K - 1:
             Pp, at, ahead = forward.P_predicted[k + 1], slice(k, k + 1), slice(k + 1, k + 2)
-            _, gain, info = dposv(Pp, forward.F[k] @ forward.P[k])
+            _, gain, info = dposv(Pp, move(forward.F[k], forward.decay[k], forward.P[k]))
             if info:
                 raise _breakdown(problem, k)
             C = gain.T
@@ -98,23 +95,22 @@ def _smooth_filtered(
     return States.stack(states[::-1])
 
 
-def _find_disturbances(forward: ForwardRecord, end: int, r: Array, N: Array, progress: Progress | None) -> None:
+def _find_disturbances(
+    forward: ForwardRecord, one: Updates, end: int, r: Array, N: Array, progress: Progress | None
+) -> None:
     """r and N before keyframes 0 to `end`, that of `end` known if there is one."""
-    K, D = forward.P.shape[:2]
+    D = N.shape[1]
     r_k, N_k = (r[end], N[end]) if end < len(r) else (np.zeros(D), np.zeros((D, D)))
-    I = np.eye(D)
-    for k in range(end - 1, -1, -1):
-        if k < K - 1:
-            F = forward.F[k]
-            r_k, N_k = r_k @ F, F.T @ N_k @ F
-        for gain, H, w, W in reversed(forward.gains[k]):
-            # I - K H as a whole: after a first fix it is what is left of a wide prior, of ten orders
-            M = I - gain @ H
-            r_k = r_k @ M + w @ H
-            N_k = M.T @ N_k @ M + H.T @ W
-        r[k], N[k] = r_k, 0.5 * (N_k + N_k.T)
-        if progress is not None and k % 256 == 0:
-            progress("smoother", 1.0 - k / K)
+    blocks = one.blocks
+    for hi in range(end, 0, -STRETCH):
+        lo = max(hi - STRETCH, 0)
+        find_disturbances(
+            lo, hi, r_k, N_k, forward.F, forward.decay, one.Kt, one.H, one.w, one.SH,
+            blocks.first, blocks.begin, blocks.end, one.taken, r, N,
+        )  # fmt: skip
+        r_k, N_k = r[lo], N[lo]
+        if progress is not None:
+            progress("smoother", 1.0 - lo / len(forward.P))
 
 
 def _breakdown(problem: Problem, k: int) -> EstimationError:

@@ -1,0 +1,227 @@
+"""The linear recursions of filter and smoother, on arrays alone: compiled where Numba is there.
+
+A step moves the D error states by a matrix of which F (15, w) are the rows of the fifteen states, which depend on
+themselves and on the scale errors of the IMU behind them; each parameter beyond shrinks by a factor of its own, `decay`
+(D-15). Rows of a keyframe stand one behind the other and are taken in block by block, block b from `begin[b]` to
+`end[b]`, those of keyframe k being `first[k]` to `first[k+1]`. Covariances are symmetric and C-contiguous.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.core.compiled import compiled
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM
+
+STRETCH = 256  # keyframes from one word of how far it has come to the next
+
+
+@compiled
+def move(F: Array, decay: Array, X: Array) -> Array:
+    """A step of columns X (D, n)."""
+    out = np.empty(X.shape)
+    out[:DIM] = np.dot(F, X[: F.shape[1]])
+    out[DIM:] = decay.reshape(-1, 1) * X[DIM:]
+    return out
+
+
+@compiled
+def move_back(F: Array, decay: Array, X: Array) -> Array:
+    """X (n, D) times the matrix of a step."""
+    w = F.shape[1]
+    out = np.empty(X.shape)
+    out[:, DIM:] = X[:, DIM:] * decay
+    top = np.dot(np.ascontiguousarray(X[:, :DIM]), F)
+    out[:, :DIM] = top[:, :DIM]
+    out[:, DIM:w] += top[:, DIM:]
+    return out
+
+
+@compiled
+def predict(P: Array, F: Array, decay: Array, Q: Array, added: Array, out: Array) -> None:
+    """The covariance (D, D) after a step, in `out`: with Q (15, 15) of the states and `added` (D-15) of parameters."""
+    top = np.dot(F, P[: F.shape[1]])
+    out[:DIM, :DIM] = np.dot(np.ascontiguousarray(top[:, : F.shape[1]]), F.T) + Q
+    out[:DIM, DIM:] = top[:, DIM:] * decay
+    out[DIM:, DIM:] = P[DIM:, DIM:] * decay * decay.reshape(-1, 1)
+    for i in range(len(added)):
+        out[DIM + i, DIM + i] += added[i]
+    out[DIM:, :DIM] = out[:DIM, DIM:].T
+
+
+@compiled
+def solve(L: Array, X: Array) -> None:
+    """X (m, n) <- S^-1 X for S = L L^T."""
+    m = len(L)
+    for i in range(m):
+        if i:
+            X[i] -= np.dot(L[i, :i], X[:i])
+        X[i] /= L[i, i]
+    U = np.ascontiguousarray(L.T)
+    for i in range(m - 1, -1, -1):
+        if i < m - 1:
+            X[i] -= np.dot(U[i, i + 1 :], X[i + 1 :])
+        X[i] /= L[i, i]
+
+
+@compiled
+def gain(HP: Array, HPHt: Array, variance: Array, r: Array) -> tuple[Array, Array, Array]:
+    """The lower root (m, m) of S = H P H^T + R, S^-1 r, and the gain transposed (m, D)."""
+    m, D = HP.shape
+    S = HPHt.copy()
+    for i in range(m):
+        S[i, i] += variance[i]
+    L = np.linalg.cholesky(S)
+    right = np.empty((m, D + 1))
+    right[:, :D], right[:, D] = HP, r
+    solve(L, right)
+    return L, right[:, D].copy(), np.ascontiguousarray(right[:, :D])
+
+
+@compiled
+def update(P: Array, HP: Array, H: Array, Kt: Array, variance: Array) -> Array:
+    """The covariance after an update, by Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T."""
+    one = P - np.dot(Kt.T, HP)
+    two = one - np.dot((np.dot(H, one.T) - variance.reshape(-1, 1) * Kt).T, Kt)
+    # rounding's asymmetry would grow, past what a stop leaves between its place and the state
+    return 0.5 * (two + two.T)
+
+
+@compiled
+def filter_rows(
+    k0: int,
+    k1: int,
+    e: Array,
+    P: Array,
+    F: Array,
+    decay: Array,
+    gap: Array,
+    Q: Array,
+    added: Array,
+    r: Array,
+    H: Array,
+    variance: Array,
+    first: Array,
+    begin: Array,
+    end: Array,
+    used: Array,
+    errors_predicted: Array,
+    P_predicted: Array,
+    errors: Array,
+    P_filtered: Array,
+    root: Array,
+    solved: Array,
+    Kt: Array,
+    SH: Array,
+    at: Array,
+) -> None:
+    """Filter keyframes k0 to k1, linearised throughout, from errors e (D,) and P before them.
+
+    Parameters
+    ----------
+    gap : (n-1, D) where a step leads from a point, less the next point.
+    Q, added : (n-1, 15, 15) and (n-1, D-15) as for `predict`.
+    r, H, variance : (n, M), (n, M, D), (n, M) of the rows at the points.
+    used : (B,) whether a block is taken in; of one that is not there is an innovation only.
+    root, solved : (n, M, M), (n, M), filled with roots of S and S^-1 (r + H e).
+    Kt, SH : (n, M, D), filled with gains transposed and S^-1 H.
+    at : (1,), the block that is taken in.
+    """
+    w = F.shape[2]
+    for k in range(k0, k1):
+        if k:
+            ahead = gap[k - 1].copy()
+            ahead[:DIM] += np.dot(F[k - 1], e[:w])
+            ahead[DIM:] += decay[k - 1] * e[DIM:]
+            e = ahead
+            predict(P, F[k - 1], decay[k - 1], Q[k - 1], added[k - 1], P_predicted[k])
+        else:
+            P_predicted[k] = P
+        P = P_predicted[k]
+        errors_predicted[k] = e
+        for b in range(first[k], first[k + 1]):
+            at[0] = b
+            lo, hi = begin[b], end[b]
+            own, R = H[k, lo:hi], variance[k, lo:hi]
+            HP = np.dot(own, P)
+            left = r[k, lo:hi] + np.dot(own, e)
+            L, w_b, Kt_b = gain(HP, np.dot(HP, own.T), R, left)
+            root[k, lo:hi, lo:hi], solved[k, lo:hi] = L, w_b
+            if used[b]:
+                Kt[k, lo:hi], SH[k, lo:hi] = Kt_b, own
+                solve(L, SH[k, lo:hi])
+                e = e - np.dot(left, Kt_b)
+                P = update(P, HP, own, Kt_b, R)
+        errors[k], P_filtered[k] = e, P
+
+
+@compiled
+def find_disturbances(
+    k0: int,
+    k1: int,
+    r_k: Array,
+    N_k: Array,
+    F: Array,
+    decay: Array,
+    Kt: Array,
+    H: Array,
+    w: Array,
+    SH: Array,
+    first: Array,
+    begin: Array,
+    end: Array,
+    taken: Array,
+    r: Array,
+    N: Array,
+) -> None:
+    """r (n, D) and N (n, D, D) of keyframes k1 - 1 down to k0, from those of k1, zero where there is none.
+
+    Parameters
+    ----------
+    Kt, H, w, SH : of the updates: gains transposed, rows, S^-1 nu and S^-1 H.
+    taken : (B,) whether a block was taken in.
+    """
+    I = np.eye(len(r_k))
+    for k in range(k1 - 1, k0 - 1, -1):
+        if k < len(F):
+            r_k = move_back(F[k], decay[k], r_k.reshape(1, -1)).ravel()
+            N_k = move_back(F[k], decay[k], N_k)
+            N_k = move_back(F[k], decay[k], np.ascontiguousarray(N_k.T))
+        for b in range(first[k + 1] - 1, first[k] - 1, -1):
+            if taken[b]:
+                lo, hi = begin[b], end[b]
+                own = H[k, lo:hi]
+                # I - K H as a whole: after a first fix it is what is left of a wide prior, of ten orders
+                M = I - np.dot(Kt[k, lo:hi].T, own)
+                r_k = np.dot(r_k, M) + np.dot(w[k, lo:hi], own)
+                N_k = np.dot(M.T, np.dot(N_k, M)) + np.dot(own.T, SH[k, lo:hi])
+        N_k = 0.5 * (N_k + N_k.T)
+        r[k], N[k] = r_k, N_k
+
+
+@compiled
+def smooth_points(errors: Array, P: Array, r: Array, N: Array, smoothed: Array, P_smoothed: Array) -> None:
+    """Errors (n, D) and covariances of the smoother, from those predicted and the disturbances."""
+    for k in range(len(errors)):
+        smoothed[k] = errors[k] + np.dot(P[k], r[k])
+        one = P[k] - np.dot(np.dot(P[k], N[k]), P[k])
+        P_smoothed[k] = 0.5 * (one + one.T)
+
+
+@compiled
+def lag_covariances(
+    k: Array, begin: int, end: int, P: Array, P_predicted: Array, F: Array, decay: Array, N: Array
+) -> Array:
+    """(n, end - begin) smoothed covariances of error states `begin` to `end` at keyframes k - 1 and k (n,).
+
+    Cov(x_k-1, x_k) = P_k-1 F^T P-_k^-1 P^s_k = P_k-1 F^T (I - N P-_k)
+    """
+    out = np.empty((len(k), end - begin))
+    for i in range(len(k)):
+        j = k[i]
+        ahead = move(F[j - 1], decay[j - 1], np.ascontiguousarray(P[j - 1][:, begin:end]))
+        rest = np.dot(N[j], np.ascontiguousarray(P_predicted[j][:, begin:end]))
+        for c in range(end - begin):
+            out[i, c] = ahead[begin + c, c] - np.dot(ahead[:, c].copy(), rest[:, c].copy())
+    return out
