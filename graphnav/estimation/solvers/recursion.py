@@ -21,8 +21,8 @@ STRETCH = 256  # keyframes from one word of how far it has come to the next
 def move(F: Array, decay: Array, X: Array) -> Array:
     """A step of columns X (D, n)."""
     out = np.empty(X.shape)
-    out[:DIM] = np.dot(F, X[: F.shape[1]])
-    out[DIM:] = decay.reshape(-1, 1) * X[DIM:]
+    np.dot(F, X[: F.shape[1]], out[:DIM])
+    np.multiply(decay.reshape(-1, 1), X[DIM:], out[DIM:])
     return out
 
 
@@ -31,38 +31,40 @@ def move_back(F: Array, decay: Array, X: Array) -> Array:
     """X (n, D) times the matrix of a step."""
     w = F.shape[1]
     out = np.empty(X.shape)
-    out[:, DIM:] = X[:, DIM:] * decay
     top = np.dot(np.ascontiguousarray(X[:, :DIM]), F)
-    out[:, :DIM] = top[:, :DIM]
-    out[:, DIM:w] += top[:, DIM:]
+    np.positive(top[:, :DIM], out[:, :DIM])
+    np.multiply(X[:, DIM:], decay, out[:, DIM:])
+    np.add(out[:, DIM:w], top[:, DIM:], out[:, DIM:w])
     return out
 
 
 @compiled
 def predict(P: Array, F: Array, decay: Array, Q: Array, added: Array, out: Array) -> None:
     """The covariance (D, D) after a step, in `out`: with Q (15, 15) of the states and `added` (D-15) of parameters."""
-    top = np.dot(F, P[: F.shape[1]])
-    out[:DIM, :DIM] = np.dot(np.ascontiguousarray(top[:, : F.shape[1]]), F.T) + Q
-    out[:DIM, DIM:] = top[:, DIM:] * decay
-    out[DIM:, DIM:] = P[DIM:, DIM:] * decay * decay.reshape(-1, 1)
+    w = F.shape[1]
+    top = np.dot(F, P[:w])
+    np.add(np.dot(np.ascontiguousarray(top[:, :w]), F.T), Q, out[:DIM, :DIM])
+    np.multiply(top[:, DIM:], decay, out[:DIM, DIM:])
+    np.multiply(P[DIM:, DIM:] * decay, decay.reshape(-1, 1), out[DIM:, DIM:])
     for i in range(len(added)):
         out[DIM + i, DIM + i] += added[i]
-    out[DIM:, :DIM] = out[:DIM, DIM:].T
+    np.positive(out[:DIM, DIM:].T, out[DIM:, :DIM])
 
 
 @compiled
 def solve(L: Array, X: Array) -> None:
     """X (m, n) <- S^-1 X for S = L L^T."""
-    m = len(L)
+    m, U = len(L), np.ascontiguousarray(L.T)
     for i in range(m):
+        own = X[i]
         if i:
-            X[i] -= np.dot(L[i, :i], X[:i])
-        X[i] /= L[i, i]
-    U = np.ascontiguousarray(L.T)
+            own -= np.dot(L[i, :i], X[:i])
+        own /= L[i, i]
     for i in range(m - 1, -1, -1):
+        own = X[i]
         if i < m - 1:
-            X[i] -= np.dot(U[i, i + 1 :], X[i + 1 :])
-        X[i] /= L[i, i]
+            own -= np.dot(U[i, i + 1 :], X[i + 1 :])
+        own /= L[i, i]
 
 
 @compiled
@@ -74,7 +76,8 @@ def gain(HP: Array, HPHt: Array, variance: Array, r: Array) -> tuple[Array, Arra
         S[i, i] += variance[i]
     L = np.linalg.cholesky(S)
     right = np.empty((m, D + 1))
-    right[:, :D], right[:, D] = HP, r
+    np.positive(HP, right[:, :D])
+    np.positive(r, right[:, D])
     solve(L, right)
     return L, right[:, D].copy(), np.ascontiguousarray(right[:, :D])
 
@@ -83,7 +86,8 @@ def gain(HP: Array, HPHt: Array, variance: Array, r: Array) -> tuple[Array, Arra
 def update(P: Array, HP: Array, H: Array, Kt: Array, variance: Array) -> Array:
     """The covariance after an update, by Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T."""
     one = P - np.dot(Kt.T, HP)
-    two = one - np.dot((np.dot(H, one.T) - variance.reshape(-1, 1) * Kt).T, Kt)
+    left = np.dot(H, one.T) - variance.reshape(-1, 1) * Kt
+    two = one - np.dot(left.T, Kt)
     # rounding's asymmetry would grow, past what a stop leaves between its place and the state
     return 0.5 * (two + two.T)
 
@@ -128,18 +132,14 @@ def filter_rows(
     Kt, SH : (n, M, D), filled with gains transposed and S^-1 H.
     at : (1,), the block that is taken in.
     """
-    w = F.shape[2]
     for k in range(k0, k1):
         if k:
-            ahead = gap[k - 1].copy()
-            ahead[:DIM] += np.dot(F[k - 1], e[:w])
-            ahead[DIM:] += decay[k - 1] * e[DIM:]
-            e = ahead
+            e = gap[k - 1] + move(F[k - 1], decay[k - 1], e.reshape(-1, 1)).ravel()
             predict(P, F[k - 1], decay[k - 1], Q[k - 1], added[k - 1], P_predicted[k])
         else:
-            P_predicted[k] = P
+            np.positive(P, P_predicted[k])
         P = P_predicted[k]
-        errors_predicted[k] = e
+        np.positive(e, errors_predicted[k])
         for b in range(first[k], first[k + 1]):
             at[0] = b
             lo, hi = begin[b], end[b]
@@ -147,13 +147,16 @@ def filter_rows(
             HP = np.dot(own, P)
             left = r[k, lo:hi] + np.dot(own, e)
             L, w_b, Kt_b = gain(HP, np.dot(HP, own.T), R, left)
-            root[k, lo:hi, lo:hi], solved[k, lo:hi] = L, w_b
+            np.positive(w_b, solved[k, lo:hi])
+            np.positive(L, root[k, lo:hi, lo:hi])
             if used[b]:
-                Kt[k, lo:hi], SH[k, lo:hi] = Kt_b, own
+                np.positive(Kt_b, Kt[k, lo:hi])
+                np.positive(own, SH[k, lo:hi])
                 solve(L, SH[k, lo:hi])
                 e = e - np.dot(left, Kt_b)
                 P = update(P, HP, own, Kt_b, R)
-        errors[k], P_filtered[k] = e, P
+        np.positive(e, errors[k])
+        np.positive(P, P_filtered[k])
 
 
 @compiled
@@ -197,16 +200,17 @@ def find_disturbances(
                 r_k = np.dot(r_k, M) + np.dot(w[k, lo:hi], own)
                 N_k = np.dot(M.T, np.dot(N_k, M)) + np.dot(own.T, SH[k, lo:hi])
         N_k = 0.5 * (N_k + N_k.T)
-        r[k], N[k] = r_k, N_k
+        np.positive(r_k, r[k])
+        np.positive(N_k, N[k])
 
 
 @compiled
 def smooth_points(errors: Array, P: Array, r: Array, N: Array, smoothed: Array, P_smoothed: Array) -> None:
     """Errors (n, D) and covariances of the smoother, from those predicted and the disturbances."""
     for k in range(len(errors)):
-        smoothed[k] = errors[k] + np.dot(P[k], r[k])
+        np.add(errors[k], np.dot(P[k], r[k]), smoothed[k])
         one = P[k] - np.dot(np.dot(P[k], N[k]), P[k])
-        P_smoothed[k] = 0.5 * (one + one.T)
+        np.multiply(0.5, one + one.T, P_smoothed[k])
 
 
 @compiled
