@@ -26,7 +26,7 @@ from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import linearise, shift, stepping
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, values_of
-from graphnav.estimation.solvers.recursion import lag_covariances
+from graphnav.estimation.solvers.recursion import lag_covariances, row_variances
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: SmootherPass, n: i
     values = values_of(problem, smoothed)
     linear = linearise(rows, smoothed, problem.columns, which)
     H = linear.H
-    HPH = np.einsum("nij,nij->ni", H @ smoothed.P[at], H)
+    HPH = row_variances(H, smoothed.P, at)
     w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
     R = linear.stated**2
     B = np.clip(1.0 - w * HPH / R, 1e-6, 1.0)

@@ -49,6 +49,7 @@ from graphnav.estimation.solvers.passes import (
 )
 from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate, move_covariance
 from graphnav.estimation.solvers.recursion import STRETCH, filter_rows, predict, solve, update
+from graphnav.estimation.solvers.retest import finds_fault
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
 from graphnav.estimation.solvers.watch import Bank, Verdicts
@@ -154,12 +155,15 @@ def _forward(
     found: list[Any] = [None] * K  # estimates, or errors where points are given
     ahead = found.copy()
     k = 0
-    if about is not None and given and updates and not decided and bank is None and decide is None:
+    # a fix that is not used at the end may be taken back there
+    untested = not watched or (n == K and all(records[c.name].used[-1] > 0.0 for c in watched))
+    if about is not None and given and updates and untested and not decided and decide is None:
         errors, errors_ahead = np.empty((n, D)), np.empty((n, D))
         _filter_points(given, steps, stack, updates, x, P, errors_ahead, all_Pp, errors, all_P, progress)
-        found[:n], ahead[:n] = errors, errors_ahead
-        k = n
-        x, P = _leave_points(about, own, all_P, k, errors[k - 1])
+        if not watched or not finds_fault(Bank(watched, problem.t, D), given, steps.decay, stack, updates):
+            found[:n], ahead[:n] = errors, errors_ahead
+            k = n
+            x, P = _leave_points(about, own, all_P, k, errors[k - 1])
     while k < K:
         where: AtEstimate | AtPoints = given if given is not None and k < n else own
         if bank is not None and k in met:

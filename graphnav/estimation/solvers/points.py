@@ -145,7 +145,7 @@ class AtPoints:
         """The points moved by an error state."""
         return d
 
-    def speed(self, k: int, x: Array) -> float:
+    def speed(self, k: int, x: Array | None = None) -> float:
         """m/s."""
         return float(self._speed[k])
 

@@ -224,8 +224,21 @@ def lag_covariances(
     out = np.empty((len(k), end - begin))
     for i in range(len(k)):
         j = k[i]
-        ahead = move(F[j - 1], decay[j - 1], np.ascontiguousarray(P[j - 1][:, begin:end]))
-        rest = np.dot(N[j], np.ascontiguousarray(P_predicted[j][:, begin:end]))
+        rest = -np.dot(P_predicted[j, begin:end], N[j])
         for c in range(end - begin):
-            out[i, c] = ahead[begin + c, c] - np.dot(ahead[:, c].copy(), rest[:, c].copy())
+            rest[c, begin + c] += 1.0
+        rest = move_back(F[j - 1], decay[j - 1], rest)
+        for c in range(end - begin):
+            out[i, c] = np.dot(P[j - 1, begin + c], rest[c])
+    return out
+
+
+@compiled
+def row_variances(H: Array, P: Array, k: Array) -> Array:
+    """(n, m) diagonals of H P_k H^T of rows H (n, m, D) at keyframes k (n,)."""
+    out = np.empty(H.shape[:2])
+    for i in range(len(H)):
+        HP = np.dot(H[i], P[k[i]])
+        for j in range(H.shape[1]):
+            out[i, j] = np.dot(HP[j], H[i, j])
     return out
