@@ -57,11 +57,12 @@ class Drive:
             self.first, self.begin, self.end, self.used, out["ahead"], out["P_ahead"], out["errors"], out["P"],
             out["root"], out["solved"], out["Kt"], out["SH"], np.zeros(1, dtype=int),
         )  # fmt: skip
-        recursion.find_disturbances(
+        recursion.smooth_rows(
             0, n, np.zeros(D), np.zeros((D, D)), self.F, self.decay, out["Kt"], self.H, -out["solved"], out["SH"],
-            self.first, self.begin, self.end, self.used, out["r"], out["N"],
+            self.first, self.begin, self.end, self.used,
+            out["ahead"], out["P_ahead"], out["errors"], out["P"],
+            out["r"], out["N"], out["smoothed"], out["P_smoothed"],
         )  # fmt: skip
-        recursion.smooth_points(out["ahead"], out["P_ahead"], out["r"], out["N"], out["smoothed"], out["P_smoothed"])
         k = np.arange(1, n)
         out["lag"] = recursion.lag_covariances(k, 0, D, out["P"], out["P_ahead"], self.F, self.decay, out["N"])
         return out

@@ -160,7 +160,15 @@ def filter_rows(
 
 
 @compiled
-def find_disturbances(
+def smooth_point(e: Array, P: Array, r: Array, N: Array, smoothed: Array, P_smoothed: Array) -> None:
+    """Errors (D,) and covariance (D, D) of the smoother, from those of the filter and the disturbance behind them."""
+    np.add(e, np.dot(P, r), smoothed)
+    one = P - np.dot(np.dot(P, N), P)
+    np.multiply(0.5, one + one.T, P_smoothed)
+
+
+@compiled
+def smooth_rows(
     k0: int,
     k1: int,
     r_k: Array,
@@ -175,10 +183,19 @@ def find_disturbances(
     begin: Array,
     end: Array,
     taken: Array,
+    errors_predicted: Array,
+    P_predicted: Array,
+    errors: Array,
+    P: Array,
     r: Array,
     N: Array,
+    smoothed: Array,
+    P_smoothed: Array,
 ) -> None:
     """r (n, D) and N (n, D, D) of keyframes k1 - 1 down to k0, from those of k1, zero where there is none.
+
+    And errors (n, D) and covariances of the smoother there: from the filtered ones, since those predicted, of a place
+    that only the first fix tells, are larger by ten orders than what is left of them.
 
     Parameters
     ----------
@@ -191,6 +208,7 @@ def find_disturbances(
             r_k = move_back(F[k], decay[k], r_k.reshape(1, -1)).ravel()
             N_k = move_back(F[k], decay[k], N_k)
             N_k = move_back(F[k], decay[k], np.ascontiguousarray(N_k.T))
+            smooth_point(errors[k], P[k], r_k, N_k, smoothed[k], P_smoothed[k])
         for b in range(first[k + 1] - 1, first[k] - 1, -1):
             if taken[b]:
                 lo, hi = begin[b], end[b]
@@ -202,15 +220,8 @@ def find_disturbances(
         N_k = 0.5 * (N_k + N_k.T)
         np.positive(r_k, r[k])
         np.positive(N_k, N[k])
-
-
-@compiled
-def smooth_points(errors: Array, P: Array, r: Array, N: Array, smoothed: Array, P_smoothed: Array) -> None:
-    """Errors (n, D) and covariances of the smoother, from those predicted and the disturbances."""
-    for k in range(len(errors)):
-        np.add(errors[k], np.dot(P[k], r[k]), smoothed[k])
-        one = P[k] - np.dot(np.dot(P[k], N[k]), P[k])
-        np.multiply(0.5, one + one.T, P_smoothed[k])
+        if k == len(F):  # the last of all: its filtered covariance is of errors about the estimate already
+            smooth_point(errors_predicted[k], P_predicted[k], r_k, N_k, smoothed[k], P_smoothed[k])
 
 
 @compiled

@@ -10,6 +10,7 @@ the disturbance smoother (Bryson and Frazier 1963; Koopman 1993), through every 
     r <- (I - K H)^T r + H^T S^-1 nu     N <- (I - K H)^T N (I - K H) + H^T S^-1 H     r <- F^T r     N <- F^T N F
     x^s_k = x^-_k + P^-_k r_k            P^s_k = P^-_k - P^-_k N_k P^-_k
 
+and likewise of x_k, P_k and the r and N behind the updates of k, which leave more digits after a first fix.
 r and N are what the noise model is estimated by (`graphnav.estimation.noise.moments`).
 """
 
@@ -38,7 +39,7 @@ from graphnav.estimation.solvers.passes import (
     residual_record,
     sigmas_of,
 )
-from graphnav.estimation.solvers.recursion import STRETCH, find_disturbances, move, smooth_points
+from graphnav.estimation.solvers.recursion import STRETCH, move, smooth_rows
 
 
 def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None = None) -> SmootherPass:
@@ -60,10 +61,9 @@ def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None
             if info:
                 raise _breakdown(problem, end)
             r[end], N[end] = inverse @ away, inverse @ (ahead - P[end]) @ inverse
-        if forward.updates is not None:
-            _find_disturbances(forward, forward.updates, end, r, N, progress)
         errors = np.empty((end, D))
-        smooth_points(forward.errors_predicted[:end], forward.P_predicted[:end], r[:end], N[:end], errors, P[:end])
+        if forward.updates is not None:
+            _smooth_points(forward, forward.updates, r, N, errors, P, progress)
         first = move_points(forward.about.first(end), errors)
         values[:end] = first.values
         states = [first.states, *states]
@@ -95,18 +95,19 @@ def _smooth_filtered(
     return States.stack(states[::-1])
 
 
-def _find_disturbances(
-    forward: ForwardRecord, one: Updates, end: int, r: Array, N: Array, progress: Progress | None
+def _smooth_points(
+    forward: ForwardRecord, one: Updates, r: Array, N: Array, errors: Array, P: Array, progress: Progress | None
 ) -> None:
-    """r and N before keyframes 0 to `end`, that of `end` known if there is one."""
-    D = N.shape[1]
+    """Smoothed errors (end, D), covariances, r and N of the first keyframes; r and N behind them known if there are."""
+    end, D = errors.shape
     r_k, N_k = (r[end], N[end]) if end < len(r) else (np.zeros(D), np.zeros((D, D)))
     blocks = one.blocks
     for hi in range(end, 0, -STRETCH):
         lo = max(hi - STRETCH, 0)
-        find_disturbances(
+        smooth_rows(
             lo, hi, r_k, N_k, forward.F, forward.decay, one.Kt, one.H, one.w, one.SH,
-            blocks.first, blocks.begin, blocks.end, one.taken, r, N,
+            blocks.first, blocks.begin, blocks.end, one.taken,
+            forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, r, N, errors, P,
         )  # fmt: skip
         r_k, N_k = r[lo], N[lo]
         if progress is not None:
