@@ -25,9 +25,9 @@ docs: $(VENV)/installed-dev
 
 # Stamps: installed again only when pyproject.toml has changed.
 $(VENV)/installed: pyproject.toml
-	@echo "installing graphnav and what it needs into $(VENV), once: about 600 MB, a minute or two"
+	@echo "installing graphnav and what it needs into $(VENV), once: about 800 MB, a minute or two"
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet -e .
+	$(BIN)/pip install --quiet -e '.[fast]'
 	@touch $@
 
 $(VENV)/installed-dev: pyproject.toml

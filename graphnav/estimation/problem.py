@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -209,7 +209,7 @@ def _chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterChain, 
         if p.begins is not None:
             nodes, mean, sigma, decay = p.begins, p.initial, p.sigma, np.zeros(len(p.begins))
         else:
-            nodes = t[:1] if p.constant else _keep_apart(t, p.spacing)
+            nodes = t[:1] if p.constant else _keep_apart(t.tobytes(), p.spacing)
             ahead, added = p.step(np.diff(nodes))
             mean = np.tile(p.initial, (len(nodes), 1))
             sigma, decay = np.concatenate([p.sigma[None], added]), np.concatenate([[0.0], ahead])
@@ -218,8 +218,10 @@ def _chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterChain, 
     return tuple(chains)
 
 
-def _keep_apart(t: Array, spacing: float) -> Array:
+@lru_cache(maxsize=16)  # a noise model's passes pose the same problem again and again
+def _keep_apart(keyframes: bytes, spacing: float) -> Array:
     """Those of the keyframes that lie so far apart at least; the same ones however long the drive goes on."""
+    t = np.frombuffer(keyframes)
     out = [float(t[0])]
     for x in t.tolist():
         if x - out[-1] >= spacing - SAME_TIME:

@@ -23,11 +23,13 @@ from graphnav.estimation.pipeline import origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf, refilter
-from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.linearise import Points, advance
 from graphnav.estimation.solvers.near import near
 from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate
+from graphnav.estimation.solvers.recursion import move
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Stack
+from graphnav.imu.dynamics import SCALE
 
 
 @pytest.fixture(scope="module")
@@ -70,8 +72,9 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed:
     )
     points = Points(smoothed.states.plus(off), smoothed.values)
     K, D = len(posed.t), DIM + points.values.shape[1]
-    stack = Stack(posed, K)
-    given, own = AtPoints(posed, points, stack, np.empty((K - 1, D, D))), AtEstimate(posed)
+    stack, steps = Stack(posed, K), advance(posed, K)
+    F = np.empty((K - 1, DIM, posed.columns[SCALE].stop))
+    given, own = AtPoints(posed, points, stack, steps, F), AtEstimate(posed, steps)
 
     def here(k: int, e: Array) -> Estimate:
         return own.plus(Estimate(points.states[k : k + 1], points.values[k]), e)
@@ -83,7 +86,8 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed:
             return own.minus(own.step(k, here(k - 1, e))[0], here(k, np.zeros(D)))
 
         np.testing.assert_allclose(linear[0], ahead(np.zeros(D)), atol=1e-9)
-        np.testing.assert_allclose(linear[1], derivative(ahead, D), atol=2e-5, rtol=1e-4)
+        whole = move(linear[1], steps.decay[k - 1], np.eye(D))
+        np.testing.assert_allclose(whole, derivative(ahead, D), atol=2e-5, rtol=1e-4)
         for some in stack.together(k, one_by_one=True):
             r, H, sigma = given.rows(some, None)
             mine, H_own, sigma_own = own.rows(some, here(k, np.zeros(D)))

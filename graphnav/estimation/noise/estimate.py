@@ -226,8 +226,9 @@ def _improve(
         if chain.parameter.noise_groups:
             driven[chain.parameter.name] = process_moments(problem, chain, smoothed, end)
             _improve_process(figures, chain, driven[chain.parameter.name])
-            if chain.parameter.correlation_time is not None:
-                _improve_time(figures, chain, lag_moments(problem, chain, forward, smoothed, end))
+            told = _told(figures, chain)
+            if chain.parameter.correlation_time is not None and told.any():
+                _improve_time(figures, chain, told, lag_moments(problem, chain, forward, smoothed, end))
     for rows in problem.constraints:
         names, index = rows.noise_groups()
         if not names:
@@ -265,13 +266,20 @@ def _improve_process(figures: _Components, chain: ParameterChain, moments: tuple
         figures.update(group, *_cap(A[:, own], B[:, own], 1, _USUAL))
 
 
-def _improve_time(figures: _Components, chain: ParameterChain, lags: tuple[Array, ...]) -> None:
-    """The correlation time by expectation and maximisation, on a grid, with a log-normal prior about what it was."""
+def _told(figures: _Components, chain: ParameterChain) -> Array:
+    """(k,) whether the data say anything of each number of a process."""
+    return np.array([figures.freedom.get(group, 0.0) > 1.0 for group in chain.parameter.noise_groups])
+
+
+def _improve_time(figures: _Components, chain: ParameterChain, told: Array, lags: tuple[Array, ...]) -> None:
+    """The correlation time by expectation and maximisation, on a grid, with a log-normal prior about what it was.
+
+    `told` (k,) of its numbers are used.
+    """
     dt, later, cross, before = lags
     p = chain.parameter
     assert p.correlation_time is not None
-    told = np.array([figures.freedom.get(group, 0.0) > 1.0 for group in p.noise_groups])
-    if not told.any() or not len(dt):
+    if not len(dt):
         return
     times = p.correlation_time * np.exp(_GRID)
     a = np.exp(-dt[:, None] / times)[..., None]

@@ -24,10 +24,9 @@ from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.linearise import linearise
+from graphnav.estimation.solvers.linearise import linearise, shift, stepping
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, values_of
-
-_BLOCK = 64  # keyframes whose covariances stay in a processor cache
+from graphnav.estimation.solvers.recursion import lag_covariances, row_variances
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def process_moments(
 ) -> tuple[Array, Array, Array]:
     """Keyframes (n,) at which a process is driven, and A and B (n, k) there; the first is its steady variance."""
     at = problem.columns[chain.parameter.name]
-    k = np.concatenate([[0], np.flatnonzero(np.diff(chain.node[:end])) + 1])
+    k = np.concatenate([[0], stepping(chain, end)])
     q = chain.sigma[chain.node[k]] ** 2
     N = np.diagonal(smoothed.N[:, at, at], axis1=-2, axis2=-1)[k]
     return k, q * smoothed.r[k, at] ** 2, q * np.maximum(N, 0.0)
@@ -86,10 +85,7 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: SmootherPass, n: i
     values = values_of(problem, smoothed)
     linear = linearise(rows, smoothed, problem.columns, which)
     H = linear.H
-    HPH = np.empty(H.shape[:2])
-    for lo in range(0, n, _BLOCK):  # each row has a covariance of its own beside it
-        some = slice(lo, lo + _BLOCK)
-        HPH[some] = np.einsum("nij,nij->ni", H[some] @ smoothed.P[at[some]], H[some])
+    HPH = row_variances(H, smoothed.P, at)
     w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
     R = linear.stated**2
     B = np.clip(1.0 - w * HPH / R, 1e-6, 1.0)
@@ -111,16 +107,9 @@ def lag_moments(
 ) -> tuple[Array, Array, Array, Array]:
     """Of a process, from node to node: times between (n,), E[c' c'], E[c' c] and E[c c] (n, k), c' the later."""
     at = problem.columns[chain.parameter.name]
-    own = slice(at.start - DIM, at.stop - DIM)
-    k = np.flatnonzero(np.diff(chain.node[:end])) + 1
-    # Cov(x_k-1, x_k) = P_k-1 F^T P-_k^-1 P^s_k = P_k-1 F^T (I - N P-_k), of the columns of the process
-    cross = np.empty((len(k), at.stop - at.start))
-    one = np.eye(forward.P.shape[-1])[:, at]
-    for lo in range(0, len(k), _BLOCK):
-        some = k[lo : lo + _BLOCK]
-        ahead = forward.P[some - 1, at] @ np.swapaxes(forward.F[some - 1], -1, -2)
-        rest = one - smoothed.N[some] @ forward.P_predicted[some, :, at]
-        cross[lo : lo + _BLOCK] = np.einsum("kid,kdi->ki", ahead, rest)
+    own = shift(at)
+    k = stepping(chain, end)
+    cross = lag_covariances(k, at.start, at.stop, forward.P, forward.P_predicted, forward.F, forward.decay, smoothed.N)
     c0, c1 = smoothed.values[k - 1, own], smoothed.values[k, own]
     variance = np.diagonal(smoothed.P[:, at, at], axis1=-2, axis2=-1)
     v0, v1 = variance[k - 1], variance[k]

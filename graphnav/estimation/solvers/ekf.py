@@ -35,28 +35,25 @@ from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.decision import Decide, hold
-from graphnav.estimation.solvers.gain import (
-    predict_covariance,
-    solve_innovation,
-    solve_robust,
-    update_covariance,
-    weights_of,
-)
-from graphnav.estimation.solvers.linearise import Points, scale_at
+from graphnav.estimation.solvers.gain import breakdown, solve_innovation, solve_robust, weights_of
+from graphnav.estimation.solvers.linearise import Advance, Points, advance, scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
-    Gain,
     Progress,
+    Updates,
     join_passes,
     move_points,
     parameters_of,
     sigmas_of,
 )
 from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate, move_covariance
+from graphnav.estimation.solvers.recursion import STRETCH, filter_rows, predict, solve, update
+from graphnav.estimation.solvers.retest import finds_fault
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
 from graphnav.estimation.solvers.watch import Bank, Verdicts
+from graphnav.imu.dynamics import SCALE
 
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
 
@@ -127,12 +124,17 @@ def _forward(
 ) -> ForwardRecord:
     """Filter the first K keyframes, of which the first n are linearised at given points."""
     n = 0 if about is None else len(about.values)
-    D = DIM + sum(c.parameter.size for c in problem.chains)
-    all_P, all_Pp, all_F = np.empty((K, D, D)), np.empty((K, D, D)), np.empty((K - 1, D, D))
+    scale, steps = problem.columns.get(SCALE), advance(problem, K)
+    D = DIM + steps.decay.shape[1]
+    all_P, all_Pp = np.empty((K, D, D)), np.empty((K, D, D))
+    all_F = np.empty((K - 1, DIM, DIM if scale is None else scale.stop))
     fixes = [c for c in problem.constraints if watch and c.fix_of]
     decided = {c.name for c in problem.constraints if c.gate is not None or c.robust != "none"}
-    stack, own = Stack(problem, K, decided.union(c.name for c in fixes)), AtEstimate(problem)
-    given = None if about is None else AtPoints(problem, about, stack, all_F)
+    stack, own = Stack(problem, K, decided.union(c.name for c in fixes)), AtEstimate(problem, steps)
+    given, updates = None, None
+    if about is not None:
+        given = AtPoints(problem, about, stack, steps, all_F)
+        updates = Updates.none(stack.joint, given.H)
     state = problem.prior.mean
     assert state is not None
     x: Any = Estimate(state, np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)]))
@@ -147,11 +149,19 @@ def _forward(
     verdicts = Verdicts(
         {c.name: problem.t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
     )
-    gains: list[list[Gain]] = [[] for _ in range(n)]
     begun, P = (x, P), _place(P, records)
     found: list[Any] = [None] * K  # estimates, or errors where points are given
     ahead = found.copy()
     k = 0
+    # a fix that is not used at the end may be taken back there
+    untested = not watched or (n == K and all(records[c.name].used[-1] > 0.0 for c in watched))
+    if about is not None and given and updates and untested and not decided and decide is None:
+        errors, errors_ahead = np.empty((n, D)), np.empty((n, D))
+        _filter_points(given, steps, stack, updates, x, P, errors_ahead, all_Pp, errors, all_P, progress)
+        if not watched or not finds_fault(Bank(watched, problem.t, D), given, steps.decay, stack, updates):
+            found[:n], ahead[:n] = errors, errors_ahead
+            k = n
+            x, P = _leave_points(about, own, all_P, k, errors[k - 1])
     while k < K:
         where: AtEstimate | AtPoints = given if given is not None and k < n else own
         if bank is not None and k in met:
@@ -159,29 +169,23 @@ def _forward(
             if len(banks) > _REMEMBERED:
                 del banks[next(iter(banks))]
         if k:
-            x, F, Q, added = where.step(k, x)
+            x, F, Q = where.step(k, x)
             if where is own:
                 all_F[k - 1] = F
-            P = predict_covariance(P, F, Q, added, all_Pp[k])
+            predict(P, all_F[k - 1], steps.decay[k - 1], Q, steps.added[k - 1], all_Pp[k])
+            P = all_Pp[k]
             if bank is not None:
-                bank.predicted(F)
+                bank.predicted(all_F[k - 1], steps.decay[k - 1])
         for kind in watched if verdicts.anew else ():
             if (kind.name, problem.t[k]) in verdicts.anew:
                 P = _anywhere(P, kind.fix_of)
         ahead[k], all_Pp[k] = x, P
         back: int | None = None
-        taken: list[Gain] | None = None
-        if k < n:
-            taken = gains[k] = []
+        taken = updates if k < n else None
+        if taken is not None:
+            taken.forget(k)
         # at its own estimate, each kind is linearised where those before it have led
         for some in stack.together(k, one_by_one=where is own):
-            if not some.alone:
-                assert given is not None
-                x, P, gain = _update_all(some, x, P, given, stack)
-                gains[k].append(gain)
-                if bank is not None:
-                    bank.taken(gain[0], gain[1])
-                continue
             x, P, fault = _update(some, x, P, where, stack, bank, taken)
             if fault is not None:
                 again = verdicts.settle(some.parts[0][0].name, fault, float(problem.t[k]))
@@ -202,8 +206,7 @@ def _forward(
             progress("filter", k / K)
         k += 1
         if about is not None and k == n:  # from here on linearised where the filter is
-            all_P[k - 1] = P = move_covariance(P, x[:3])
-            x = own.plus(_one(about, k - 1), x)
+            x, P = _leave_points(about, own, all_P, k, x)
     stack.finish()
     weights = {c.name: records[c.name].decided for c in fixes}
     errors, errors_ahead = np.array(found[:n]).reshape(n, D), np.array(ahead[:n]).reshape(n, D)
@@ -215,13 +218,14 @@ def _forward(
         predicted,
         all_Pp,
         all_F,
+        steps.decay,
         records,
         weights,
         bool(verdicts.anew),
         about,
         errors,
         errors_ahead,
-        gains,
+        updates,
         stack.log_likelihood,
     )
 
@@ -243,6 +247,12 @@ def _one(points: Points, k: int) -> Estimate:
     return Estimate(points.states[k : k + 1], points.values[k])
 
 
+def _leave_points(about: Points, own: AtEstimate, all_P: Array, n: int, e: Array) -> tuple[Estimate, Array]:
+    """The estimate after the last of n given points, and its covariance, also in its place, by the error e there."""
+    all_P[n - 1] = move_covariance(all_P[n - 1], e[:3])
+    return own.plus(_one(about, n - 1), e), all_P[n - 1]
+
+
 def _points(about: Points | None, errors: Array, own: list[Estimate]) -> Points:
     """Errors about given points, and the estimates that follow, as points."""
     parts = [] if about is None else [move_points(about, errors)]
@@ -251,65 +261,84 @@ def _points(about: Points | None, errors: Array, own: list[Estimate]) -> Points:
     return join_passes(parts)
 
 
-def _update_all(some: RowBlock, e: Array, P: Array, given: AtPoints, stack: Stack) -> tuple[Array, Array, Gain]:
-    """One update with rows linearised at given points about which nothing is to be decided."""
-    D, at = len(P), some.at
-    H, variance = given.H[at], given.variance[at]
-    r, PHt = given.r[at] + H @ e, P @ H.T
-    root, solved = solve_innovation(H @ PHt, variance, np.concatenate([r[None], PHt, H.T]).T, some)
-    stack.seen(some, root, solved[:, 0])
-    K = solved[:, 1 : D + 1].T
-    gain = K, H, -solved[:, 0], solved[:, D + 1 :]
-    return e - K @ r, update_covariance(P, PHt, H, K, variance), gain
+def _filter_points(
+    given: AtPoints,
+    steps: Advance,
+    stack: Stack,
+    updates: Updates,
+    e: Array,
+    P: Array,
+    errors_predicted: Array,
+    P_predicted: Array,
+    errors: Array,
+    P_filtered: Array,
+    progress: Progress | None,
+) -> None:
+    """All keyframes that are linearised at given points, where nothing is to be decided on the way."""
+    blocks, at, n = stack.joint, np.zeros(1, dtype=int), len(errors)
+    updates.taken[:] = blocks.used
+    for k in range(0, n, STRETCH):
+        try:
+            filter_rows(
+                k, min(k + STRETCH, n), e, P, given.F, steps.decay, given.gap, given.Q, steps.added,
+                given.r, given.H, given.variance, blocks.first, blocks.begin, blocks.end, blocks.used,
+                errors_predicted, P_predicted, errors, P_filtered,
+                stack.root, stack.solved, updates.Kt, updates.SH, at,
+            )  # fmt: skip
+        except np.linalg.LinAlgError:
+            raise breakdown(stack.block(int(at[0]))) from None
+        last = min(k + STRETCH, n) - 1
+        e, P = errors[last], P_filtered[last]
+        if progress is not None:
+            progress("filter", k / stack.K)
+    np.negative(stack.solved[:n], out=updates.w)
 
 
 def _update(
-    some: RowBlock, x: Any, P: Array, where: Any, stack: Stack, bank: Bank | None, taken: list[Gain] | None
+    some: RowBlock, x: Any, P: Array, where: Any, stack: Stack, bank: Bank | None, taken: Updates | None
 ) -> tuple[Any, Array, float | None]:
-    """One update with rows of one kind, added to what the keyframe has taken in; when a fault began comes last."""
-    D, (rows, lo, hi) = len(P), some.parts[0]
-    end = D + 1 if taken is None else 2 * D + 1
+    """One update with rows of a keyframe, added to what that has taken in; when a fault began comes last."""
+    rows, lo, hi = some.parts[0]
     record = stack.records[rows.name]
-    weight, root_weight = weights_of(record, lo, hi)
+    weight, root_weight = weights_of(record, lo, hi) if some.alone else (1.0, stack.root_weight[some.at])
     tests = bank if bank is not None and weight > 0.0 and rows.name in bank else None
     at, e = where.about(x)
     for left in range(where.passes(some) - 1, -1, -1):
         r, H, sigma = where.rows(some, at)
         r, sigma = r if e is None else r + H @ e, sigma / root_weight
-        PHt = P @ H.T
-        HPHt = H @ PHt
-        right = [r[None], PHt] if taken is None else [r[None], PHt, H.T]
-        if not left and tests is not None:
-            G = tests.signature(rows.name, some.k, H)
-            right.append(tests.own(rows.name, G).T)
-        sides = np.concatenate(right).T
-        root, solved = solve_innovation(HPHt, sigma * sigma, sides, some)
+        HP = H @ P
+        HPHt = HP @ H.T
+        root, solved, Kt = solve_innovation(HP, HPHt, sigma * sigma, r, some)
         if not left:
-            stack.seen(some, root, solved[:, 0])
-            nis, bent = float(r @ solved[:, 0]), 1.0
+            stack.seen(some, root, solved)
+            nis, bent = float(r @ solved), 1.0
             if rows.robust != "none" and rows.gate is None:  # a gate stands in place of a kernel
-                sigma, solved, bent = solve_robust(HPHt, sigma, sides, solved, some)
-        K = solved[:, 1 : D + 1].T
-        d = -(K @ r) if e is None else e - K @ r
+                sigma, bent = solve_robust(HP, HPHt, sigma, r, solved, some)
+                root, solved, Kt = solve_innovation(HP, HPHt, sigma * sigma, r, some)
+        d = -(r @ Kt) if e is None else e - r @ Kt
         if left:  # again about where this leads (Jazwinski 1970, theorem 8.2)
             at = where.plus(at, d)
             e = where.minus(x, at)
-    refused = rows.gate is not None and nis > rows.gate**2
-    weight = 0.0 if refused else weight * bent
-    record.weight[lo:hi] = weight if hi - lo == 1 else record.used[lo:hi] * (0.0 if refused else bent)
-    record.refused[lo:hi] = refused
+    if some.alone:
+        refused = rows.gate is not None and nis > rows.gate**2
+        weight = 0.0 if refused else weight * bent
+        record.weight[lo:hi] = weight if hi - lo == 1 else record.used[lo:hi] * (0.0 if refused else bent)
+        record.refused[lo:hi] = refused
     if bank is not None:
         bank.seen(rows.name, some.k, nis, weight > 0.0)
     if weight == 0.0:
         return x, P, None
     if taken is not None:
-        taken.append((K, H, -solved[:, 0], solved[:, D + 1 : end]))
-    P = update_covariance(P, PHt, H, K, sigma * sigma)
+        taken.add(some, Kt, -solved, root)
+    P = update(P, HP, H, Kt, sigma * sigma)
     fault = None
     if tests is not None:
-        fault = tests.updated(rows.name, K, G, solved[:, end:], r, where.speed(some.k, x))
+        G = tests.signature(rows.name, some.k, H)
+        weighted = tests.own(rows.name, G).copy()
+        solve(root, weighted)
+        fault = tests.updated(rows.name, Kt.T, G, weighted, r, where.speed(some.k, x))
     elif bank is not None:
-        bank.taken(K, H)
+        bank.taken(Kt.T, H)
     return where.plus(at, d), P, fault
 
 

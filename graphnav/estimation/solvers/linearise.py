@@ -90,6 +90,35 @@ class Step:
         return self.mean + self.decay * (before - self.mean_before)
 
 
+@dataclass(frozen=True)
+class Advance:
+    """All parameters, from each of n keyframes to the next: value <- mean + decay (value - before) + noise.
+
+    Where none moves on to its next node it stays: 0, 0, 1, and no noise.
+    """
+
+    mean: Array  # (n-1, D-15)
+    before: Array  # (n-1, D-15)
+    decay: Array  # (n-1, D-15)
+    added: Array  # (n-1, D-15) variance
+
+    def ahead(self, rows: int | slice, values: Array) -> Array:
+        """The values that are expected after the steps `rows`."""
+        return np.asarray(self.mean[rows] + self.decay[rows] * (values - self.before[rows]))
+
+
+def advance(problem: Problem, n: int) -> Advance:
+    """Of the first n keyframes."""
+    width = sum(at.stop - at.start for at in problem.columns.values())
+    out = Advance(*(np.full((n - 1, width), x) for x in (0.0, 0.0, 1.0, 0.0)))
+    for chain in problem.chains:
+        k, own = stepping(chain, n), shift(problem.columns[chain.parameter.name])
+        j = chain.node[k]
+        out.mean[k - 1, own], out.before[k - 1, own] = chain.mean[j], chain.mean[j - 1]
+        out.decay[k - 1, own], out.added[k - 1, own] = chain.decay[j, None], chain.sigma[j] ** 2
+    return out
+
+
 def node_steps(problem: Problem) -> dict[int, tuple[Step, ...]]:
     """The parameters that begin or move on to their next node, by keyframe."""
     out: dict[int, list[Step]] = {}

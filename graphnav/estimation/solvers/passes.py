@@ -13,13 +13,13 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.estimation.solvers.linearise import Points, last_of, linearise, shift
+from graphnav.estimation.solvers.recursion import solve
 from graphnav.estimation.solvers.robust import weight_and_cost
-from graphnav.estimation.solvers.stack import Innovations
+from graphnav.estimation.solvers.stack import Blocks, Innovations, RowBlock
 from graphnav.imu.dynamics import as_biases
 
 _TURN = 0.02  # rad; what is linear in an error of attitude is wrong by half its square
 Progress = Callable[[str, float], None]
-Gain = tuple[Array, Array, Array, Array]  # of an update: K (D, m), H (m, D), S^-1 nu (m,) and S^-1 H (m, D)
 
 
 @dataclass(frozen=True)
@@ -33,20 +33,51 @@ class SmootherPass(Points):
 
 
 @dataclass(frozen=True)
+class Updates:
+    """The updates of n keyframes, block by block as `graphnav.estimation.solvers.stack.Blocks` has them."""
+
+    blocks: Blocks
+    Kt: Array  # (n, M, D) gains transposed
+    H: Array  # (n, M, D)
+    w: Array  # (n, M) S^-1 nu
+    SH: Array  # (n, M, D) S^-1 H
+    taken: Array  # (B,) whether a block was taken in
+
+    @classmethod
+    def none(cls, blocks: Blocks, H: Array) -> Updates:
+        """None yet, of rows H (n, M, D)."""
+        return cls(
+            blocks, np.zeros_like(H), H, np.zeros(H.shape[:2]), np.zeros_like(H), np.zeros(len(blocks.begin), bool)
+        )
+
+    def forget(self, k: int) -> None:
+        """Take those of keyframe k back."""
+        self.taken[self.blocks.first[k] : self.blocks.first[k + 1]] = False
+
+    def add(self, some: RowBlock, Kt: Array, w: Array, root: Array) -> None:
+        """An update, with the lower root of S."""
+        at = some.at
+        self.Kt[at], self.w[at], self.SH[at] = Kt, w, self.H[at]
+        solve(root, self.SH[at])
+        self.taken[some.number] = True
+
+
+@dataclass(frozen=True)
 class ForwardRecord(Points):
     """A forward pass over the first K keyframes, with what the backward pass needs."""
 
     P: Array  # (K, D, D) filtered
     predicted: Points
     P_predicted: Array  # (K, D, D)
-    F: Array  # (K-1, D, D)
+    F: Array  # (K-1, 15, w) and
+    decay: Array  # (K-1, D-15) of the steps, as `graphnav.estimation.solvers.recursion` has them
     records: dict[str, Innovations]
     weights: dict[str, Array]  # (N,) of fixes: 0 where a fault was found, less than 1 where noisy
     anew: bool  # it began anew somewhere, which no other solver can: its estimates are not to be used
     about: Points | None  # where the first n keyframes were linearised; up to the last of them P is of errors about
     errors: Array  # (n, D) these points, and the filtered
     errors_predicted: Array  # (n, D) and the predicted state is these errors away from them
-    gains: list[list[Gain]]  # (n,) of the updates there, in their order
+    updates: Updates | None  # of the keyframes there
     log_likelihood: Array  # (K,) of the innovations at each keyframe, but for a constant
 
     @property

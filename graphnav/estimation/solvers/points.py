@@ -13,7 +13,6 @@ A pass at given points takes a ninth of the time, and is the better one wherever
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.linearise import Points, Step, linearise, node_steps, shift, stepping
+from graphnav.estimation.solvers.linearise import Advance, Points, linearise, shift
 from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.imu.dynamics import SCALE
 
@@ -39,32 +38,19 @@ class Estimate:
 class AtEstimate:
     """Steps and rows linearised where the filter is."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, steps: Advance) -> None:
         self._problem, self._columns, self._scale = problem, problem.columns, problem.columns.get(SCALE)
-        self._width = DIM + sum(s.stop - s.start for s in self._columns.values())
-        self._I = np.eye(self._width)
+        self._steps, self._width = steps, DIM + steps.decay.shape[1]
 
-    @cached_property
-    def _steps(self) -> dict[int, tuple[Step, ...]]:
-        return node_steps(self._problem)
-
-    def step(self, k: int, x: Estimate) -> tuple[Estimate, Array, Array, Array | None]:
-        """The estimate at keyframe k from that at the one before, F (D, D), Q (15, 15), and more variance (D,)."""
-        motion, at, scale = self._problem.motion, slice(k - 1, k), self._scale
-        ahead, F15 = motion.propagate(at, x.state, None if scale is None else x.values[None, shift(scale)])
-        F = self._I.copy()
-        F[:DIM, :DIM] = F15[0]
-        if scale is not None:
-            F[:DIM, scale] = motion.scale_columns(at, F15, scale.stop - scale.start)[0]
-        values, added = x.values, None
-        if k in self._steps:
-            values, added = values.copy(), np.zeros(self._width)
-            for one in self._steps[k]:
-                column = self._columns[one.name]
-                F[column, column] *= one.decay
-                values[shift(column)] = one.ahead(values[shift(column)])
-                added[column] = one.sigma**2
-        return Estimate(ahead, values), F, motion.noise(at, x.state.R_nb)[0], added
+    def step(self, k: int, x: Estimate) -> tuple[Estimate, Array, Array]:
+        """The estimate at keyframe k from that at the one before, and F (15, w) and Q (15, 15) of the states."""
+        at = slice(k - 1, k)
+        ahead, F = _transition(self._problem, at, x.state, x.values[None])
+        return (
+            Estimate(ahead, self._steps.ahead(k - 1, x.values)),
+            F[0],
+            self._problem.motion.noise(at, x.state.R_nb)[0],
+        )
 
     def rows(self, some: RowBlock, at: Estimate) -> Rows:
         """Rows of one constraint linearised at an estimate."""
@@ -99,36 +85,22 @@ class AtPoints:
 
     Parameters
     ----------
-    F : (n-1, D, D) or more, for the transition matrices.
+    F : (n-1, 15, w) or more, for the transition matrices.
     """
 
-    def __init__(self, problem: Problem, points: Points, stack: Stack, F: Array) -> None:
-        n, columns, motion = len(points.values), problem.columns, problem.motion
+    def __init__(self, problem: Problem, points: Points, stack: Stack, steps: Advance, F: Array) -> None:
+        n, columns, self._steps = len(points.values), problem.columns, steps
         D = DIM + points.values.shape[1]
         begin, end, at = points.states[: n - 1], points.states[1:n], slice(0, n - 1)
-        scale = columns.get(SCALE)
-        ahead, F15 = motion.propagate(at, begin, None if scale is None else points.values[: n - 1, shift(scale)])
-        self.F = F[: n - 1]
-        self.F[:] = np.eye(D)
-        self.F[:, :DIM, :DIM] = F15
-        if scale is not None:
-            self.F[:, :DIM, scale] = motion.scale_columns(at, F15, scale.stop - scale.start)
-        self._Q = motion.noise(at, begin.R_nb)
-        values = points.values[: n - 1].copy()
-        self._added = np.zeros((n, D))
-        for chain in problem.chains:
-            column, k = columns[chain.parameter.name], stepping(chain, n)
-            j, own, each = chain.node[k], shift(column), np.arange(column.start, column.stop)
-            self.F[k[:, None] - 1, each, each] *= chain.decay[j, None]
-            values[k - 1, own] = chain.mean[j] + chain.decay[j, None] * (values[k - 1, own] - chain.mean[j - 1])
-            self._added[k, column] = chain.sigma[j] ** 2
-        self._steps: list[bool] = np.any(self._added, axis=1).tolist()
-        self._gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
+        ahead, F[: n - 1] = _transition(problem, at, begin, points.values[: n - 1])
+        self.F, self.Q = F[: n - 1], problem.motion.noise(at, begin.R_nb)
+        values = steps.ahead(at, points.values[: n - 1])
+        self.gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
         # Exp(gap) Exp(F e) = Exp(gap + J_r^-1(gap) F e)
-        turned = rotation.right_jacobian_inverse(self._gap[:, :3])
+        turned = rotation.right_jacobian_inverse(self.gap[:, :3])
         self.F[:, :3] = turned @ self.F[:, :3]
-        self._Q[:, :3] = turned @ self._Q[:, :3]
-        self._Q[:, :, :3] = self._Q[:, :, :3] @ np.swapaxes(turned, -1, -2)
+        self.Q[:, :3] = turned @ self.Q[:, :3]
+        self.Q[:, :, :3] = self.Q[:, :, :3] @ np.swapaxes(turned, -1, -2)
         self._speed = np.linalg.norm(points.states.v, axis=1)
         self.r, self._sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
         self.H = np.zeros((n, stack.M, D))
@@ -139,13 +111,14 @@ class AtPoints:
                 place = at_k[:, None], stack.places[rows.name][1][: len(at_k)]
                 self.r[place], self._sigma[place] = linear.residual, linear.stated
                 self.H[place] = linear.H
-        with np.errstate(divide="ignore"):
-            self.variance = (self._sigma / stack.root_weight[:n]) ** 2
+        self.variance = (self._sigma / stack.root_weight[:n]) ** 2
 
-    def step(self, k: int, x: Array) -> tuple[Array, Array, Array, Array | None]:
+    def step(self, k: int, x: Array) -> tuple[Array, Array, Array]:
         """As `AtEstimate.step`, of error states (D,)."""
-        F = self.F[k - 1]
-        return self._gap[k - 1] + F @ x, F, self._Q[k - 1], self._added[k] if self._steps[k] else None
+        F, ahead = self.F[k - 1], self.gap[k - 1].copy()
+        ahead[:DIM] += F @ x[: F.shape[1]]
+        ahead[DIM:] += self._steps.decay[k - 1] * x[DIM:]
+        return ahead, F, self.Q[k - 1]
 
     def rows(self, some: RowBlock, at: None) -> Rows:
         """As `AtEstimate.rows`, linearised at the points."""
@@ -167,9 +140,18 @@ class AtPoints:
         """The points moved by an error state."""
         return d
 
-    def speed(self, k: int, x: Array) -> float:
+    def speed(self, k: int, x: Array | None = None) -> float:
         """m/s."""
         return float(self._speed[k])
+
+
+def _transition(problem: Problem, at: slice, states: States, values: Array) -> tuple[States, Array]:
+    """The states at the ends of intervals `at`, and F (n, 15, w) there, by the states and by the scale errors."""
+    scale, motion = problem.columns.get(SCALE), problem.motion
+    if scale is None:
+        return motion.propagate(at, states)
+    ahead, F = motion.propagate(at, states, values[:, shift(scale)])
+    return ahead, np.concatenate([F, motion.scale_columns(at, F, scale.stop - scale.start)], axis=2)
 
 
 def move_covariance(P: Array, e: Array) -> Array:

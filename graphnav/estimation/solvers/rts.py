@@ -10,6 +10,7 @@ the disturbance smoother (Bryson and Frazier 1963; Koopman 1993), through every 
     r <- (I - K H)^T r + H^T S^-1 nu     N <- (I - K H)^T N (I - K H) + H^T S^-1 H     r <- F^T r     N <- F^T N F
     x^s_k = x^-_k + P^-_k r_k            P^s_k = P^-_k - P^-_k N_k P^-_k
 
+and likewise of x_k, P_k and the r and N behind the updates of k, which leave more digits after a first fix.
 r and N are what the noise model is estimated by (`graphnav.estimation.noise.moments`).
 """
 
@@ -32,13 +33,15 @@ from graphnav.estimation.solvers.passes import (
     ForwardRecord,
     Progress,
     SmootherPass,
+    Updates,
     move_points,
     parameters_of,
     residual_record,
     sigmas_of,
 )
+from graphnav.estimation.solvers.recursion import STRETCH, move, smooth_rows
 
-_BLOCK = 32  # keyframes whose covariances stay in a processor's cache
+_LOST = 7e4  # times smaller than filtered: P - P N P is good to eps times the square of that, a millionth
 
 
 def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None = None) -> SmootherPass:
@@ -60,13 +63,10 @@ def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None
             if info:
                 raise _breakdown(problem, end)
             r[end], N[end] = inverse @ away, inverse @ (ahead - P[end]) @ inverse
-        _find_disturbances(forward, end, r, N, progress)
-        errors = forward.errors_predicted[:end] + (forward.P_predicted[:end] @ r[:end, :, None])[..., 0]
-        for k in range(0, end, _BLOCK):
-            some = slice(k, min(k + _BLOCK, end))
-            ahead = forward.P_predicted[some]
-            smoothed = ahead - ahead @ N[some] @ ahead
-            P[some] = 0.5 * (smoothed + np.swapaxes(smoothed, -1, -2))
+        errors = np.empty((end, D))
+        if forward.updates is not None:
+            _smooth_points(forward, forward.updates, r, N, errors, P, progress)
+            _restore_digits(forward, P, end)
         first = move_points(forward.about.first(end), errors)
         values[:end] = first.values
         states = [first.states, *states]
@@ -83,7 +83,7 @@ def _smooth_filtered(
     for k in range(K - 1, end - 1, -1):
         if k < K - 1:
             Pp, at, ahead = forward.P_predicted[k + 1], slice(k, k + 1), slice(k + 1, k + 2)
-            _, gain, info = dposv(Pp, forward.F[k] @ forward.P[k])
+            _, gain, info = dposv(Pp, move(forward.F[k], forward.decay[k], forward.P[k]))
             if info:
                 raise _breakdown(problem, k)
             C = gain.T
@@ -98,23 +98,43 @@ def _smooth_filtered(
     return States.stack(states[::-1])
 
 
-def _find_disturbances(forward: ForwardRecord, end: int, r: Array, N: Array, progress: Progress | None) -> None:
-    """r and N before keyframes 0 to `end`, that of `end` known if there is one."""
-    K, D = forward.P.shape[:2]
+def _smooth_points(
+    forward: ForwardRecord, one: Updates, r: Array, N: Array, errors: Array, P: Array, progress: Progress | None
+) -> None:
+    """Smoothed errors (end, D), covariances, r and N of the first keyframes; r and N behind them known if there are."""
+    end, D = errors.shape
     r_k, N_k = (r[end], N[end]) if end < len(r) else (np.zeros(D), np.zeros((D, D)))
-    I = np.eye(D)
-    for k in range(end - 1, -1, -1):
-        if k < K - 1:
-            F = forward.F[k]
-            r_k, N_k = r_k @ F, F.T @ N_k @ F
-        for gain, H, w, W in reversed(forward.gains[k]):
-            # I - K H as a whole: after a first fix it is what is left of a wide prior, of ten orders
-            M = I - gain @ H
-            r_k = r_k @ M + w @ H
-            N_k = M.T @ N_k @ M + H.T @ W
-        r[k], N[k] = r_k, 0.5 * (N_k + N_k.T)
-        if progress is not None and k % 256 == 0:
-            progress("smoother", 1.0 - k / K)
+    blocks = one.blocks
+    for hi in range(end, 0, -STRETCH):
+        lo = max(hi - STRETCH, 0)
+        smooth_rows(
+            lo, hi, r_k, N_k, forward.F, forward.decay, one.Kt, one.H, one.w, one.SH,
+            blocks.first, blocks.begin, blocks.end, one.taken,
+            forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, r, N, errors, P,
+        )  # fmt: skip
+        r_k, N_k = r[lo], N[lo]
+        if progress is not None:
+            progress("smoother", 1.0 - lo / len(forward.P))
+
+
+def _restore_digits(forward: ForwardRecord, P: Array, end: int) -> None:
+    """Covariances anew where P - P N P has lost its digits, as before a first fix, by steps that lose none.
+
+    With C and P^s of the next keyframe, in Joseph's form: (I - C F) P_k (I - C F)^T + C (P^s + Q) C^T.
+    """
+    after, before = (np.diagonal(x[:end], axis1=1, axis2=2) for x in (P, forward.P))
+    lost = np.flatnonzero(np.any(after * _LOST < before, axis=1))
+    I = np.eye(P.shape[1])
+    for k in lost[lost < len(P) - 1][::-1]:
+        F, Pp = move(forward.F[k], forward.decay[k], I), forward.P_predicted[k + 1]
+        FP = F @ forward.P[k]
+        _, gain, info = dposv(Pp, FP)
+        if info:
+            continue
+        C = gain.T
+        M = I - C @ F
+        smoothed = M @ forward.P[k] @ M.T + C @ (P[k + 1] + Pp - FP @ F.T) @ C.T
+        P[k] = 0.5 * (smoothed + smoothed.T)
 
 
 def _breakdown(problem: Problem, k: int) -> EstimationError:

@@ -21,6 +21,8 @@ from graphnav.core.rotation import Array, mv
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord
 
+NONE = 1e-12  # weight of a row that is not used beside others of its keyframe
+
 
 class Innovations:
     """One constraint's innovations, and what the filter has made of them."""
@@ -53,6 +55,7 @@ class RowBlock:
     """Rows of a keyframe that are taken in at once, numbers `begin` to `end` of those it has."""
 
     k: int
+    number: int  # of the block among all
     begin: int
     end: int
     parts: list[tuple[Constraint, int, int]]  # each with its rows lo..hi
@@ -64,6 +67,18 @@ class RowBlock:
         return self.k, slice(self.begin, self.end)
 
 
+@dataclass(frozen=True)
+class Blocks:
+    """Rows that are taken in at once: those of keyframe k are the blocks `first[k]` to `first[k+1]`."""
+
+    first: Array  # (K+1,)
+    begin: Array  # (B,) place in the keyframe of the first number, and behind the last
+    end: Array
+    alone: Array  # (B,) one kind, about which something is to be decided
+    used: Array  # (B,) rows of weight 0 are not
+    part: Array  # (B+1,) the first of the parts that each is made of
+
+
 class Stack:
     """The rows of the first K keyframes, at most M numbers each.
 
@@ -72,69 +87,78 @@ class Stack:
 
     def __init__(self, problem: Problem, K: int, alone: Collection[str] = ()) -> None:
         self.K, self._constraints = K, problem.constraints
-        self._alone = [c.name in alone for c in problem.constraints]
-        self._weights = [None if c.weight is None else c.weight.tolist() for c in self._constraints]
         self.records = {c.name: Innovations(c) for c in self._constraints}
         self.places: dict[str, tuple[Array, Array]] = {}  # per constraint: keyframe (n, 1) and place there (n, m)
-        self._first: list[list[int]] = []
-        filled, apart = np.zeros(K, dtype=int), np.zeros(K, dtype=bool)
-        for c, one in zip(self._constraints, self._alone, strict=True):
+        weights, filled = [], np.zeros(K, dtype=int)
+        parts = []  # of each kind at each keyframe: keyframe, kind, rows lo..hi, numbers begin..end, apart, used
+        for i, c in enumerate(self._constraints):
             first, m = np.searchsorted(c.keyframe, np.arange(K + 1)), len(c.axes)
-            self._first.append(first.tolist())
             k = c.keyframe[: first[-1]]
             begin = filled[k] + m * (np.arange(len(k)) - first[k])
             self.places[c.name] = k[:, None], begin[:, None] + np.arange(m)
+            here = np.flatnonzero(np.diff(first))
+            lo, hi = first[here], first[here + 1]
+            weight = np.ones(len(k)) if c.weight is None else c.weight[: len(k)]
+            used = np.maximum.reduceat(weight, lo) > 0.0 if len(lo) else np.ones(0, dtype=bool)
+            apart = np.minimum.reduceat(weight, lo) == 0.0 if len(lo) else used
+            numbers = filled[here], filled[here] + m * (hi - lo)
+            parts.append(np.stack([here, np.full(len(here), i), lo, hi, *numbers, apart | (c.name in alone), used]))
             filled += m * np.diff(first)
-            apart[k if one else k[c.weight[: len(k)] == 0.0] if c.weight is not None else k[:0]] = True
-        self.M = int(np.max(filled, initial=0))
-        self._filled, self._apart = filled.tolist(), apart.tolist()
-        self.root_weight = np.ones((K, self.M))
-        for c in self._constraints:
+            # what is not used beside others of its kind weighs next to nothing; alone it has an innovation only
+            weight = np.where(np.repeat(used, hi - lo), np.maximum(weight, NONE), 1.0)
+            weights.append(np.sqrt(weight)[:, None])
             if c.weight is not None:
-                n = len(self.places[c.name][0])
-                self.root_weight[self.places[c.name]] = np.sqrt(c.weight[:n, None])
-                self.records[c.name].weight[:n] = c.weight[:n]
-        self._root, self._solved = np.zeros((K, self.M, self.M)), np.zeros((K, self.M))
+                self.records[c.name].weight[: len(k)] = c.weight[: len(k)]
+        self.M = int(np.max(filled, initial=0))
+        self.root_weight = np.ones((K, self.M))
+        for place, weight in zip(self.places.values(), weights, strict=True):
+            self.root_weight[place] = weight
+        table = np.concatenate(parts, axis=1) if parts else np.empty((8, 0), dtype=int)
+        table = table[:, np.argsort(table[0], kind="stable")]
+        self._parts = table[:6].T.tolist()
+        self.single = self._blocks(table, np.ones(table.shape[1], dtype=bool))
+        k, apart = table[0], table[6].astype(bool)
+        self.joint = self._blocks(table, np.diff(k, prepend=-1).astype(bool) | apart | np.roll(apart, 1))
+        self.root, self.solved = np.zeros((K, self.M, self.M)), np.zeros((K, self.M))
+
+    def _blocks(self, table: Array, new: Array) -> Blocks:
+        """Parts (8, n) in blocks, where `new` (n,) each begins one."""
+        part = np.append(np.flatnonzero(new), table.shape[1])
+        head, last = part[:-1], part[1:] - 1
+        first = np.searchsorted(table[0, head], np.arange(self.K + 1))
+        apart, used = table[6, head].astype(bool), table[7, head].astype(bool)
+        return Blocks(first, table[4, head], table[5, last], apart, used, part)
 
     def together(self, k: int, one_by_one: bool = False) -> Iterator[RowBlock]:
         """All rows of a keyframe, in the order of the constraints; each kind by itself if wanted so."""
-        here = zip(self._constraints, self._first, range(len(self._first)), strict=True)
-        parts = [(c, first[k], first[k + 1], i) for c, first, i in here if first[k] < first[k + 1]]
-        if not one_by_one and not self._apart[k]:
-            if parts:
-                yield RowBlock(k, 0, self._filled[k], [part[:3] for part in parts], False)
-            return
-        some: RowBlock | None = None
-        end = 0
-        for c, lo, hi, i in parts:
-            begin, end = end, end + (hi - lo) * len(c.axes)
-            weights = self._weights[i]
-            apart = one_by_one or self._alone[i] or (weights is not None and 0.0 in weights[lo:hi])
-            if some is not None and not apart:
-                some.parts.append((c, lo, hi))
-                some.end = end
-                continue
-            if some is not None:
-                yield some
-            some = RowBlock(k, begin, end, [(c, lo, hi)], apart)
-            if apart:
-                yield some
-                some = None
-        if some is not None:
-            yield some
+        blocks = self.single if one_by_one else self.joint
+        for b in range(blocks.first[k], blocks.first[k + 1]):
+            yield self.block(b, blocks)
+
+    def block(self, b: int, blocks: Blocks | None = None) -> RowBlock:
+        """Block number b."""
+        blocks = blocks or self.joint
+        some = self._parts[blocks.part[b] : blocks.part[b + 1]]
+        parts = [(self._constraints[i], lo, hi) for _, i, lo, hi, _, _ in some]
+        alone = blocks is self.single or bool(blocks.alone[b])
+        return RowBlock(some[0][0], b, some[0][4], some[-1][5], parts, alone)
 
     def seen(self, rows: RowBlock, root: Array, solved: Array) -> None:
-        """Rows have had an innovation r: the upper root of its covariance S, below it anything, and S^-1 r."""
+        """Rows have had an innovation r: the lower root of its covariance S, and S^-1 r."""
         k, at = rows.at
-        self._root[k, at, at], self._solved[k, at] = root, solved
+        self.root[k, at, at], self.solved[k, at] = root, solved
 
     def finish(self) -> None:
         """Work out the innovations of each kind."""
         kind = np.full((self.K, self.M), -1)
-        for i, place in enumerate(self.places.values()):
+        weighs = np.zeros((self.K, self.M), dtype=bool)
+        for i, c in enumerate(self._constraints):
+            place = self.places[c.name]
             kind[place] = i
-        L = np.swapaxes(np.triu(self._root), -1, -2)
-        white = (self._solved[:, None] @ L)[:, 0]
+            weighs[place] = True if c.weight is None else c.weight[: len(place[0]), None] > 0.0
+        L = self.root
+        white = (self.solved[:, None] @ L)[:, 0]
+        spread = np.where(weighs, np.abs(np.diagonal(L, axis1=1, axis2=2)), 1.0)
         L *= kind[:, :, None] == kind[:, None]
         residual, sigma = mv(L, white), np.sqrt(np.einsum("kij,kij->ki", L, L))
         for c in self._constraints:
@@ -143,7 +167,5 @@ class Stack:
             record.residual[:n], record.sigma[:n] = residual[place], sigma[place]
             total = np.bincount(k, np.sum(white[place] ** 2, axis=1), self.K)
             record.nis[:n] = total[k] / np.bincount(k, minlength=self.K)[k]
-        used = (kind >= 0) & (self.root_weight > 0.0)
-        spread = np.where(used, np.abs(np.diagonal(self._root, axis1=1, axis2=2)), 1.0)
         self.log_likelihood = -np.sum(np.log(np.where(spread > 0.0, spread, 1.0)), axis=1)
-        self.log_likelihood -= 0.5 * np.sum(np.where(used, white, 0.0) ** 2, axis=1)
+        self.log_likelihood -= 0.5 * np.sum(np.where(weighs, white, 0.0) ** 2, axis=1)

@@ -30,6 +30,7 @@ from scipy.special import chdtri, gammaincinv
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import ExcludedSpan
+from graphnav.estimation.solvers.recursion import move
 
 _PATIENCE = 60.0  # s, after which fixes that are refused may be the ones that are right
 _CHANCE = 3  # fixes that agree after a fault, below which the next that does not says that they did by chance
@@ -185,9 +186,9 @@ class Bank(_Tests):
         other.X = self.X.copy()
         return other
 
-    def predicted(self, F: Array) -> None:
-        """The filter has gone on to the next keyframe."""
-        self.X = F @ self.X
+    def predicted(self, F: Array, decay: Array) -> None:
+        """The filter has gone on to the next keyframe, by a step as `graphnav.estimation.solvers.recursion` has it."""
+        self.X = move(F, decay, self.X)
 
     def signature(self, name: str, k: int, H: Array) -> Array:
         """(n m, C) mean of an innovation at keyframe k for unit errors since each onset; a fix itself is one."""

@@ -1,0 +1,31 @@
+"""Functions on arrays, compiled to machine code where Numba is installed.
+
+One text serves both: without Numba, or with the environment variable GRAPHNAV_COMPILE=0, the same functions run as
+they stand, several times more slowly. Machine code is kept on disk: in NUMBA_CACHE_DIR if that is set, beside the
+module, or where that folder cannot be written in the user's folder for caches.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def compiled(function: F) -> F:
+    """The function, compiled when it is called first.
+
+    Those that call each other stand in one module: what is kept on disk is as old as the module it is of.
+    """
+    if os.environ.get("GRAPHNAV_COMPILE") == "0":
+        return function
+    try:
+        import numba
+    except ImportError:
+        return function
+    try:
+        return cast(F, numba.njit(function, cache=True, nogil=True))
+    except RuntimeError:  # there is no folder to keep it in
+        return cast(F, numba.njit(function, nogil=True))

@@ -1,0 +1,255 @@
+"""The linear recursions of filter and smoother, on arrays alone: compiled where Numba is there.
+
+A step moves the D error states by a matrix of which F (15, w) are the rows of the fifteen states, which depend on
+themselves and on the scale errors of the IMU behind them; each parameter beyond shrinks by a factor of its own, `decay`
+(D-15). Rows of a keyframe stand one behind the other and are taken in block by block, block b from `begin[b]` to
+`end[b]`, those of keyframe k being `first[k]` to `first[k+1]`. Covariances are symmetric and C-contiguous.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.core.compiled import compiled
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM
+
+STRETCH = 256  # keyframes from one word of how far it has come to the next
+
+
+@compiled
+def move(F: Array, decay: Array, X: Array) -> Array:
+    """A step of columns X (D, n)."""
+    out = np.empty(X.shape)
+    np.dot(F, X[: F.shape[1]], out[:DIM])
+    np.multiply(decay.reshape(-1, 1), X[DIM:], out[DIM:])
+    return out
+
+
+@compiled
+def move_back(F: Array, decay: Array, X: Array) -> Array:
+    """X (n, D) times the matrix of a step."""
+    w = F.shape[1]
+    out = np.empty(X.shape)
+    top = np.dot(np.ascontiguousarray(X[:, :DIM]), F)
+    np.positive(top[:, :DIM], out[:, :DIM])
+    np.multiply(X[:, DIM:], decay, out[:, DIM:])
+    np.add(out[:, DIM:w], top[:, DIM:], out[:, DIM:w])
+    return out
+
+
+@compiled
+def predict(P: Array, F: Array, decay: Array, Q: Array, added: Array, out: Array) -> None:
+    """The covariance (D, D) after a step, in `out`: with Q (15, 15) of the states and `added` (D-15) of parameters."""
+    w = F.shape[1]
+    top = np.dot(F, P[:w])
+    np.add(np.dot(np.ascontiguousarray(top[:, :w]), F.T), Q, out[:DIM, :DIM])
+    np.multiply(top[:, DIM:], decay, out[:DIM, DIM:])
+    np.multiply(P[DIM:, DIM:] * decay, decay.reshape(-1, 1), out[DIM:, DIM:])
+    for i in range(len(added)):
+        out[DIM + i, DIM + i] += added[i]
+    np.positive(out[:DIM, DIM:].T, out[DIM:, :DIM])
+
+
+@compiled
+def solve(L: Array, X: Array) -> None:
+    """X (m, n) <- S^-1 X for S = L L^T."""
+    m, U = len(L), np.ascontiguousarray(L.T)
+    for i in range(m):
+        own = X[i]
+        if i:
+            own -= np.dot(L[i, :i], X[:i])
+        own /= L[i, i]
+    for i in range(m - 1, -1, -1):
+        own = X[i]
+        if i < m - 1:
+            own -= np.dot(U[i, i + 1 :], X[i + 1 :])
+        own /= L[i, i]
+
+
+@compiled
+def gain(HP: Array, HPHt: Array, variance: Array, r: Array) -> tuple[Array, Array, Array]:
+    """The lower root (m, m) of S = H P H^T + R, S^-1 r, and the gain transposed (m, D)."""
+    m, D = HP.shape
+    S = HPHt.copy()
+    for i in range(m):
+        S[i, i] += variance[i]
+    L = np.linalg.cholesky(S)
+    right = np.empty((m, D + 1))
+    np.positive(HP, right[:, :D])
+    np.positive(r, right[:, D])
+    solve(L, right)
+    return L, right[:, D].copy(), np.ascontiguousarray(right[:, :D])
+
+
+@compiled
+def update(P: Array, HP: Array, H: Array, Kt: Array, variance: Array) -> Array:
+    """The covariance after an update, by Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T."""
+    one = P - np.dot(Kt.T, HP)
+    left = np.dot(H, one.T) - variance.reshape(-1, 1) * Kt
+    two = one - np.dot(left.T, Kt)
+    # rounding's asymmetry would grow, past what a stop leaves between its place and the state
+    return 0.5 * (two + two.T)
+
+
+@compiled
+def filter_rows(
+    k0: int,
+    k1: int,
+    e: Array,
+    P: Array,
+    F: Array,
+    decay: Array,
+    gap: Array,
+    Q: Array,
+    added: Array,
+    r: Array,
+    H: Array,
+    variance: Array,
+    first: Array,
+    begin: Array,
+    end: Array,
+    used: Array,
+    errors_predicted: Array,
+    P_predicted: Array,
+    errors: Array,
+    P_filtered: Array,
+    root: Array,
+    solved: Array,
+    Kt: Array,
+    SH: Array,
+    at: Array,
+) -> None:
+    """Filter keyframes k0 to k1, linearised throughout, from errors e (D,) and P before them.
+
+    Parameters
+    ----------
+    gap : (n-1, D) where a step leads from a point, less the next point.
+    Q, added : (n-1, 15, 15) and (n-1, D-15) as for `predict`.
+    r, H, variance : (n, M), (n, M, D), (n, M) of the rows at the points.
+    used : (B,) whether a block is taken in; of one that is not there is an innovation only.
+    root, solved : (n, M, M), (n, M), filled with roots of S and S^-1 (r + H e).
+    Kt, SH : (n, M, D), filled with gains transposed and S^-1 H.
+    at : (1,), the block that is taken in.
+    """
+    for k in range(k0, k1):
+        if k:
+            e = gap[k - 1] + move(F[k - 1], decay[k - 1], e.reshape(-1, 1)).ravel()
+            predict(P, F[k - 1], decay[k - 1], Q[k - 1], added[k - 1], P_predicted[k])
+        else:
+            np.positive(P, P_predicted[k])
+        P = P_predicted[k]
+        np.positive(e, errors_predicted[k])
+        for b in range(first[k], first[k + 1]):
+            at[0] = b
+            lo, hi = begin[b], end[b]
+            own, R = H[k, lo:hi], variance[k, lo:hi]
+            HP = np.dot(own, P)
+            left = r[k, lo:hi] + np.dot(own, e)
+            L, w_b, Kt_b = gain(HP, np.dot(HP, own.T), R, left)
+            np.positive(w_b, solved[k, lo:hi])
+            np.positive(L, root[k, lo:hi, lo:hi])
+            if used[b]:
+                np.positive(Kt_b, Kt[k, lo:hi])
+                np.positive(own, SH[k, lo:hi])
+                solve(L, SH[k, lo:hi])
+                e = e - np.dot(left, Kt_b)
+                P = update(P, HP, own, Kt_b, R)
+        np.positive(e, errors[k])
+        np.positive(P, P_filtered[k])
+
+
+@compiled
+def smooth_point(e: Array, P: Array, r: Array, N: Array, smoothed: Array, P_smoothed: Array) -> None:
+    """Errors (D,) and covariance (D, D) of the smoother, from those of the filter and the disturbance behind them."""
+    np.add(e, np.dot(P, r), smoothed)
+    one = P - np.dot(np.dot(P, N), P)
+    np.multiply(0.5, one + one.T, P_smoothed)
+
+
+@compiled
+def smooth_rows(
+    k0: int,
+    k1: int,
+    r_k: Array,
+    N_k: Array,
+    F: Array,
+    decay: Array,
+    Kt: Array,
+    H: Array,
+    w: Array,
+    SH: Array,
+    first: Array,
+    begin: Array,
+    end: Array,
+    taken: Array,
+    errors_predicted: Array,
+    P_predicted: Array,
+    errors: Array,
+    P: Array,
+    r: Array,
+    N: Array,
+    smoothed: Array,
+    P_smoothed: Array,
+) -> None:
+    """r (n, D) and N (n, D, D) of keyframes k1 - 1 down to k0, from those of k1, zero where there is none.
+
+    And errors (n, D) and covariances of the smoother there: from the filtered ones, since those predicted, of a place
+    that only the first fix tells, are larger by ten orders than what is left of them.
+
+    Parameters
+    ----------
+    Kt, H, w, SH : of the updates: gains transposed, rows, S^-1 nu and S^-1 H.
+    taken : (B,) whether a block was taken in.
+    """
+    I = np.eye(len(r_k))
+    for k in range(k1 - 1, k0 - 1, -1):
+        if k < len(F):
+            r_k = move_back(F[k], decay[k], r_k.reshape(1, -1)).ravel()
+            N_k = move_back(F[k], decay[k], N_k)
+            N_k = move_back(F[k], decay[k], np.ascontiguousarray(N_k.T))
+            smooth_point(errors[k], P[k], r_k, N_k, smoothed[k], P_smoothed[k])
+        for b in range(first[k + 1] - 1, first[k] - 1, -1):
+            if taken[b]:
+                lo, hi = begin[b], end[b]
+                own = H[k, lo:hi]
+                # I - K H as a whole: after a first fix it is what is left of a wide prior, of ten orders
+                M = I - np.dot(Kt[k, lo:hi].T, own)
+                r_k = np.dot(r_k, M) + np.dot(w[k, lo:hi], own)
+                N_k = np.dot(M.T, np.dot(N_k, M)) + np.dot(own.T, SH[k, lo:hi])
+        N_k = 0.5 * (N_k + N_k.T)
+        np.positive(r_k, r[k])
+        np.positive(N_k, N[k])
+        if k == len(F):  # the last of all: its filtered covariance is of errors about the estimate already
+            smooth_point(errors_predicted[k], P_predicted[k], r_k, N_k, smoothed[k], P_smoothed[k])
+
+
+@compiled
+def lag_covariances(
+    k: Array, begin: int, end: int, P: Array, P_predicted: Array, F: Array, decay: Array, N: Array
+) -> Array:
+    """(n, end - begin) smoothed covariances of error states `begin` to `end` at keyframes k - 1 and k (n,).
+
+    Cov(x_k-1, x_k) = P_k-1 F^T P-_k^-1 P^s_k = P_k-1 F^T (I - N P-_k)
+    """
+    out = np.empty((len(k), end - begin))
+    for i in range(len(k)):
+        j = k[i]
+        rest = -np.dot(P_predicted[j, begin:end], N[j])
+        for c in range(end - begin):
+            rest[c, begin + c] += 1.0
+        rest = move_back(F[j - 1], decay[j - 1], rest)
+        for c in range(end - begin):
+            out[i, c] = np.dot(P[j - 1, begin + c], rest[c])
+    return out
+
+
+@compiled
+def row_variances(H: Array, P: Array, k: Array) -> Array:
+    """(n, m) diagonals of H P_k H^T of rows H (n, m, D) at keyframes k (n,)."""
+    out = np.empty(H.shape[:2])
+    for i in range(len(H)):
+        HP = np.dot(H[i], P[k[i]])
+        for j in range(H.shape[1]):
+            out[i, j] = np.dot(HP[j], H[i, j])
+    return out

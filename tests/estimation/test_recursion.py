@@ -1,0 +1,135 @@
+"""The compiled recursions: against the definitions written out, and against their own text without a compiler."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import oracle
+import pytest
+
+from graphnav import run
+from graphnav.config import settings_from
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM
+from graphnav.estimation.solvers import recursion
+
+SCALE, PARAMETERS, KEYFRAMES, ROWS = 6, 5, 7, 8  # D = 26
+D = DIM + SCALE + PARAMETERS
+
+
+class Drive:
+    """A linear drive with rows in blocks: two at each keyframe, one of three numbers and one of five."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(4)
+        n, w = KEYFRAMES, DIM + SCALE
+        self.F = np.zeros((n - 1, DIM, w))
+        self.F[:, :, :DIM] = np.eye(DIM)
+        self.F += 0.1 * rng.standard_normal(self.F.shape)
+        self.decay, self.added = np.ones((n - 1, D - DIM)), np.zeros((n - 1, D - DIM))
+        self.decay[::2, SCALE:], self.added[::2, SCALE:] = 0.8, 0.3
+        half = rng.standard_normal((n - 1, DIM, DIM))
+        self.Q = half @ np.swapaxes(half, 1, 2)
+        self.gap = rng.standard_normal((n - 1, D))
+        self.H, self.r = rng.standard_normal((n, ROWS, D)), rng.standard_normal((n, ROWS))
+        self.variance = rng.uniform(0.5, 2.0, (n, ROWS))
+        self.first, self.begin = 2 * np.arange(n + 1), np.tile([0, 3], n)
+        self.end = np.tile([3, ROWS], n)
+        self.used = np.arange(2 * n) != 4
+        self.e, self.P = rng.standard_normal(D), np.diag(rng.uniform(1.0, 4.0, D))
+
+    def whole(self, k: int) -> Array:
+        """(D, D) of the step to keyframe k."""
+        out = np.diag(np.concatenate([np.zeros(DIM), self.decay[k - 1]]))
+        out[:DIM, : DIM + SCALE] = self.F[k - 1]
+        return out
+
+    def solved(self) -> dict[str, Array]:
+        """Filter and smoother by the recursions."""
+        n = KEYFRAMES
+        out = {name: np.zeros((n, D)) for name in ("ahead", "errors", "r", "smoothed")}
+        out |= {name: np.zeros((n, D, D)) for name in ("P_ahead", "P", "N", "P_smoothed")}
+        out |= {"root": np.zeros((n, ROWS, ROWS)), "solved": np.zeros((n, ROWS))}
+        out |= {name: np.zeros((n, ROWS, D)) for name in ("Kt", "SH")}
+        recursion.filter_rows(
+            0, n, self.e, self.P, self.F, self.decay, self.gap, self.Q, self.added, self.r, self.H, self.variance,
+            self.first, self.begin, self.end, self.used, out["ahead"], out["P_ahead"], out["errors"], out["P"],
+            out["root"], out["solved"], out["Kt"], out["SH"], np.zeros(1, dtype=int),
+        )  # fmt: skip
+        recursion.smooth_rows(
+            0, n, np.zeros(D), np.zeros((D, D)), self.F, self.decay, out["Kt"], self.H, -out["solved"], out["SH"],
+            self.first, self.begin, self.end, self.used,
+            out["ahead"], out["P_ahead"], out["errors"], out["P"],
+            out["r"], out["N"], out["smoothed"], out["P_smoothed"],
+        )  # fmt: skip
+        k = np.arange(1, n)
+        out["lag"] = recursion.lag_covariances(k, 0, D, out["P"], out["P_ahead"], self.F, self.decay, out["N"])
+        return out
+
+
+def test_filter_and_smoother_are_one_update_of_the_whole_drive() -> None:
+    """All keyframes as one Gaussian vector, and all rows as one measurement of it."""
+    drive, n = Drive(), KEYFRAMES
+    mean, covariance = np.zeros((n, D)), np.zeros((n, D, n, D))
+    mean[0], covariance[0, :, 0] = drive.e, drive.P
+    for k in range(1, n):
+        step = drive.whole(k)
+        mean[k] = drive.gap[k - 1] + step @ mean[k - 1]
+        covariance[k, :, :k] = np.einsum("ij,jkl->ikl", step, covariance[k - 1, :, :k])
+        covariance[:k, :, k] = np.einsum("ikl->kli", covariance[k, :, :k])
+        covariance[k, :, k] = step @ covariance[k - 1, :, k - 1] @ step.T
+        covariance[k, :DIM, k, :DIM] += drive.Q[k - 1]
+        covariance[k, DIM:, k, DIM:] += np.diag(drive.added[k - 1])
+    taken = np.concatenate(
+        [np.arange(drive.begin[b], drive.end[b]) + ROWS * (b // 2) for b in np.flatnonzero(drive.used)]
+    )
+    H = np.zeros((n, ROWS, n, D))
+    for k in range(n):
+        H[k, :, k] = drive.H[k]
+    H = H.reshape(n * ROWS, n * D)[taken]
+    P = covariance.reshape(n * D, n * D)
+    K = np.linalg.solve(H @ P @ H.T + np.diag(drive.variance.ravel()[taken]), H @ P).T
+    mean = mean - (K @ (drive.r.ravel()[taken] + H @ mean.ravel())).reshape(n, D)
+    blocks = (P - K @ H @ P).reshape(n, D, n, D)
+    found = drive.solved()
+    np.testing.assert_allclose(found["smoothed"], mean, atol=1e-8)
+    np.testing.assert_allclose(found["errors"][-1], mean[-1], atol=1e-8)
+    for k in range(n):
+        np.testing.assert_allclose(found["P_smoothed"][k], blocks[k, :, k], atol=1e-8)
+    for k in range(1, n):
+        np.testing.assert_allclose(found["lag"][k - 1], np.diagonal(blocks[k - 1, :, k]), atol=1e-8)
+
+
+def test_a_covariance_that_is_none_is_found_out() -> None:
+    drive = Drive()
+    drive.P[3, 3] = -100.0
+    with pytest.raises(np.linalg.LinAlgError):
+        drive.solved()
+
+
+def test_without_a_compiler_the_numbers_are_the_same(tmp_path: Path) -> None:
+    file = tmp_path / "plain.npz"
+    code = (
+        "import sys, numpy as np; from test_recursion import Drive; "
+        "assert 'numba' not in sys.modules; np.savez(sys.argv[1], **Drive().solved())"
+    )
+    here = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    environment = {**os.environ, "GRAPHNAV_COMPILE": "0", "PYTHONPATH": here}
+    subprocess.run([sys.executable, "-c", code, str(file)], check=True, env=environment)
+    plain, found = np.load(file), Drive().solved()
+    assert set(plain) == set(found)
+    for name, value in found.items():
+        np.testing.assert_allclose(plain[name], value, rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+def test_smoothed_sigmas_before_the_first_fix_are_those_of_the_batch() -> None:
+    recording, _ = oracle.drive(oracle.vehicle_path(duration=60, seed=2), seed=3)
+    found = run(recording, settings_from({"noise": {"mode": "stated"}}), ("rts", "batch"))
+    assert recording.gnss is not None
+    assert found["rts"].t[0] < recording.gnss.t[recording.gnss.t >= found["rts"].t[0]][0]
+    variances = [np.diagonal(found[name].covariance, axis1=1, axis2=2)[:, :9] for name in ("rts", "batch")]
+    np.testing.assert_allclose(variances[0] / variances[1], 1.0, atol=0.05)  # a batch goes on linearising
