@@ -8,11 +8,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import oracle
 import pytest
 
-from graphnav import run
-from graphnav.config import settings_from
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.solvers import recursion
@@ -124,12 +121,3 @@ def test_without_a_compiler_the_numbers_are_the_same(tmp_path: Path) -> None:
     assert set(plain) == set(found)
     for name, value in found.items():
         np.testing.assert_allclose(plain[name], value, rtol=1e-9, atol=1e-12, err_msg=name)
-
-
-def test_smoothed_sigmas_before_the_first_fix_are_those_of_the_batch() -> None:
-    recording, _ = oracle.drive(oracle.vehicle_path(duration=60, seed=2), seed=3)
-    found = run(recording, settings_from({"noise": {"mode": "stated"}}), ("rts", "batch"))
-    assert recording.gnss is not None
-    assert found["rts"].t[0] < recording.gnss.t[recording.gnss.t >= found["rts"].t[0]][0]
-    variances = [np.diagonal(found[name].covariance, axis1=1, axis2=2)[:, :9] for name in ("rts", "batch")]
-    np.testing.assert_allclose(variances[0] / variances[1], 1.0, atol=0.05)  # a batch goes on linearising

@@ -438,3 +438,12 @@ def test_fixes_outside_the_imu_do_not_matter(lap: tuple[Recording, Trajectory]) 
     more = replace(part, gnss=Gnss(**{f: getattr(recording.gnss, f) for f in ("t", "llh", "sd", "lever_arm")}))
     a, b = (run(r, solvers=("batch",))["batch"] for r in (part, more))
     np.testing.assert_allclose(a.frame.to_llh(a.states.p), b.frame.to_llh(b.states.p), atol=1e-6)
+
+
+def test_smoothed_sigmas_before_the_first_fix_are_those_of_the_batch() -> None:
+    recording, _ = oracle.drive(oracle.vehicle_path(duration=120, seed=2), seed=3)
+    found = run(recording, settings_from({"noise": {"mode": "stated"}}), ("rts", "batch"))
+    assert recording.gnss is not None
+    assert found["rts"].t[0] < recording.gnss.t[recording.gnss.t >= found["rts"].t[0]][0]
+    variances = [np.diagonal(found[name].covariance, axis1=1, axis2=2)[:, :9] for name in ("rts", "batch")]
+    np.testing.assert_allclose(variances[0] / variances[1], 1.0, atol=0.05)  # a batch goes on linearising
