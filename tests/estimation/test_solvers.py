@@ -441,9 +441,7 @@ def test_fixes_outside_the_imu_do_not_matter(lap: tuple[Recording, Trajectory]) 
 
 
 def test_smoothed_sigmas_before_the_first_fix_are_those_of_the_batch() -> None:
-    recording, _ = oracle.drive(oracle.vehicle_path(duration=120, seed=2), seed=3)
+    recording = oracle.drive(oracle.vehicle_path(duration=120, seed=2), seed=3)[0].without("gnss", (-1.0, 3.5))
     found = run(recording, settings_from({"noise": {"mode": "stated"}}), ("rts", "batch"))
-    assert recording.gnss is not None
-    assert found["rts"].t[0] < recording.gnss.t[recording.gnss.t >= found["rts"].t[0]][0]
     variances = [np.diagonal(found[name].covariance, axis1=1, axis2=2)[:, :9] for name in ("rts", "batch")]
-    np.testing.assert_allclose(variances[0] / variances[1], 1.0, atol=0.05)  # a batch goes on linearising
+    np.testing.assert_allclose(variances[0] / variances[1], 1.0, atol=0.01)  # a batch goes on linearising
