@@ -132,8 +132,7 @@ def withheld_truth(
         )
     notes = [Note("truth.withheld_gnss", "the truth is the withheld GNSS itself")]
     if antenna.clock_offset:
-        moved = f"stamps of the withheld fixes: {1e3 * antenna.clock_offset:+.1f} ms, the receiver's clock as estimated"
-        notes.append(Note("truth.clock_offset", moved))
+        notes.append(Note("truth.clock_offset", "the stamps of the withheld fixes are moved as estimated"))
     truth = Trajectory(
         gnss.t[mask] + antenna.clock_offset, gnss.llh[mask], sd_p=gnss.sd[mask],
         v=None if gnss.v is None else gnss.v[mask],

@@ -157,7 +157,7 @@ class Cluster:
 def test_a_scheduler_is_told_of_a_few_drives_and_those_it_loses_are_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", SimpleNamespace(Client=Cluster, as_completed=Cluster.complete))
+    monkeypatch.setitem(sys.modules, "distributed", SimpleNamespace(Client=Cluster, as_completed=Cluster.completed))
     tasks = [Task(str(k), "kitti", str(tmp_path / str(k)), "ekf", {}) for k in range(30)]
     rows = {row["drive"]: row for row in solve_on_cluster(tasks, "tcp://a:1", Limits(1.0))}
     assert {name: row["status"] for name, row in rows.items()} == {

@@ -286,7 +286,7 @@ SIXTH = ["--windows", "3", "--length", "150", "--no-whole", "--share", "0.17", "
 # breaches that are there, by name; none may be worse by more than a tenth
 KNOWN = {
     ("worst", "tokyo_spp 326.7-476.7 +odometer ekf, h"): 3.53,
-    ("worst", "boulder 68-218 gnss ekf, h"): 2.64,
+    ("worst", "boulder 68-218 gnss ekf, h"): 2.99,
     ("confirmed", "tokyo_spp 326.7-476.7 +odometer ekf"): 0.032,
     ("confirmed", "tokyo_spp 326.7-476.7 +odometer rts"): 0.032,
     ("confirmed", "tokyo_spp 326.7-476.7 +odometer batch"): 0.032,
