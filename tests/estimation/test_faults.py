@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import oracle
@@ -26,6 +27,7 @@ from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.watch import Bank, Verdicts
 from graphnav.evaluation.scoring import errors
 from graphnav.recording import Recording
+from graphnav.recording.formats import read
 
 # nothing is looked for: everything is what it is stated to be
 OFF = settings_from({"gnss": {"faults": "off"}, "noise": {"mode": "stated"}})
@@ -339,3 +341,27 @@ def test_settings_of_earlier_versions(given: dict[str, object], is_now: tuple[ob
 def test_a_switch_that_is_none_of_its_words(key: str, value: object, says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         settings_from({"gnss": {key: value}})
+
+
+@pytest.mark.parametrize(("begin", "doppler"), [(60.0, True), (70.0, False)])
+def test_a_receiver_that_repeats_a_fix_is_left_out(begin: float, doppler: bool) -> None:
+    """Twelve seconds of one place: no error in common explains them, each has one of its own."""
+    recording = read(Path(__file__).resolve().parents[2] / "data" / "tokyo")
+    gnss, truth = recording.gnss, recording.truth
+    assert gnss is not None
+    assert truth is not None
+    t = gnss.t - recording.start
+    same = (t > begin) & (t < begin + 12.0)
+    llh = gnss.llh.copy()
+    llh[same] = llh[same][0]
+    some = replace(gnss, llh=llh, v=gnss.v if doppler else None, sd_v=gnss.sd_v if doppler else None)
+    found = run(replace(recording, gnss=some), None, ("batch",))["batch"]
+    off = errors(found.trajectory(), Trajectory(truth.t, truth.llh), lever_arm=gnss.lever_arm).horizontal
+    assert np.sqrt(np.nanmean(off**2)) < 0.1  # metres to tens of metres where it is believed
+    moving = same & (np.linalg.norm(LocalFrame(llh[same][0]).from_llh(gnss.llh)[:, :2], axis=1) > 10.0)
+    record = found.records["gnss_position"]
+    used = np.isin(np.round(record.t, 3), np.round(gnss.t[moving], 3))
+    assert used.sum() > 5
+    assert worth_nothing(found)[used].all()
+    right = ~same & ((t < begin - 5.0) | (t > begin + 17.0))
+    assert not left_out(found, recording)[right].any()

@@ -221,9 +221,13 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
         return replace(one, looks=one.looks + 2)
     without = NoiseModel(excluded=dict.fromkeys(FIXES, tuple(hidden)))
     other = estimate_noise(base, None, without, (found.points, with_noise(base, found.noise)))
-    two = decide(base, other, hidden)
-    best = two if two.log_evidence > one.log_evidence else one
-    return replace(best, passes=other.passes, looks=one.looks + two.looks + 2)
+    ways = [one, decide(base, other, hidden)]
+    # by figures that nothing wrong is in any more, a long span may shrink to what is wrong of it
+    shorter = find_spans(base, replace(other.noise, excluded={}), other)
+    if shorter and shorter != hidden:
+        ways.append(decide(base, other, shorter))
+    best = max(ways, key=lambda way: way.log_evidence)
+    return replace(best, passes=other.passes, looks=sum(way.looks for way in ways) + 3)
 
 
 def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[tuple[float, float]]:
@@ -250,7 +254,7 @@ def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]
     )
     known = values_of(with_noise(base, found.noise), found.points)
     about = points_of(used, found.points.states, known)
-    before, likelihood = evidence(used, about, spans, {INTERVALS: disturbed, ROWS: weighted})
+    before, likelihood, looks = evidence(used, about, spans, {INTERVALS: disturbed, ROWS: weighted})
     excluded: dict[str, tuple[tuple[float, float], ...]] = {}
     total = before + found.log_prior
     dropped: dict[tuple[str, ...], list[tuple[float, float]]] = {INTERVALS: [], ROWS: []}
@@ -272,7 +276,7 @@ def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]
     excluded = {name: some for name, some in excluded.items() if name in present}
     weights = {name: _outside(some, dropped[INTERVALS]) for name, some in of_imu.items()}
     weights |= {name: _outside(some, dropped[ROWS]) for name, some in of_rows.items()}
-    return Explained(replace(noise, weights=weights, excluded=excluded), total, 0, len(_WRONG))
+    return Explained(replace(noise, weights=weights, excluded=excluded), total, 0, looks)
 
 
 def _count(some: RowWeights) -> int:
@@ -303,8 +307,8 @@ def excluded_share(problem: Problem, noise: NoiseModel) -> float:
 
 def evidence(
     problem: Problem, about: Points, spans: list[tuple[float, float]], single: Mapping[tuple[str, ...], Problem]
-) -> tuple[float, Array]:
-    """Log-likelihood of the innovations before all spans, and (M, 7) from each span's beginning on, by `_WRONG`.
+) -> tuple[float, Array, int]:
+    """Log-likelihood of innovations before all spans, (M, 7) from each span's beginning on, by `_WRONG`, and passes.
 
     Parameters
     ----------
@@ -316,7 +320,7 @@ def evidence(
     edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
     known = values_of(problem, about)
     found: list[Array] = []
-    before = 0.0
+    before, passes = 0.0, 0
     present = {rows.name for rows in problem.constraints}
     for kinds in _WRONG:
         possible = present & set(kinds) if kinds == WHEELS else kinds in single or present.issuperset(kinds)
@@ -331,10 +335,11 @@ def evidence(
         each = []
         for one in ways:
             likelihood = refilter(one, points_of(one, about.states, known)).log_likelihood
+            passes += 1
             before = float(np.sum(likelihood[: edges[0]])) if not kinds else before
             each.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)])
         found.append(np.max(each, axis=0))
-    return before, np.array(found).T
+    return before, np.array(found).T, passes
 
 
 def join_spans(found: tuple[ExcludedSpan, ...]) -> list[tuple[float, float]]:
