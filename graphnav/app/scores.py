@@ -73,7 +73,7 @@ def score(
     with_truth = truth_of(recording)
     found = {}
     for name, solution in solutions.items():
-        antenna, compared = _calibrated(solution), with_truth
+        antenna, compared = _read_antenna(solution), with_truth
         if truth is None:
             compared = withheld_truth(recording, "gnss", [span for _, span in asked], antenna)
         reference, swings = np.empty(0), False
@@ -92,7 +92,7 @@ def score(
     return found, against, tuple(name for name, _ in spans)
 
 
-def _calibrated(solution: Solution) -> AntennaCalibration:
+def _read_antenna(solution: Solution) -> AntennaCalibration:
     """The last estimates of the antenna; as stated where none are, as in another program's trajectory."""
     from graphnav.evaluation.evaluate import AntennaCalibration
 

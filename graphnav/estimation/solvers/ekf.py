@@ -35,7 +35,7 @@ from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.decision import Decide, hold
-from graphnav.estimation.solvers.gain import breakdown, solve_innovation, solve_robust, weights_of
+from graphnav.estimation.solvers.gain import describe_breakdown, solve_innovation, solve_robust, weights_of
 from graphnav.estimation.solvers.linearise import Advance, Points, advance, scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
@@ -286,7 +286,7 @@ def _filter_points(
                 stack.root, stack.solved, updates.Kt, updates.SH, at,
             )  # fmt: skip
         except np.linalg.LinAlgError:
-            raise breakdown(stack.block(int(at[0]))) from None
+            raise describe_breakdown(stack.block(int(at[0]))) from None
         last = min(k + STRETCH, n) - 1
         e, P = errors[last], P_filtered[last]
         if progress is not None:

@@ -33,10 +33,10 @@ def solve_innovation(HP: Array, HPHt: Array, variance: Array, r: Array, some: Ro
     try:
         return gain(HP, HPHt, variance, r)
     except np.linalg.LinAlgError:
-        raise breakdown(some) from None
+        raise describe_breakdown(some) from None
 
 
-def breakdown(some: RowBlock) -> EstimationError:
+def describe_breakdown(some: RowBlock) -> EstimationError:
     """What is said where a filter's covariance cannot take in some rows."""
     at = ", ".join(f"'{rows.name}' row {lo}" for rows, lo, _ in some.parts)
     return EstimationError(

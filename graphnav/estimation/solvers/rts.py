@@ -41,7 +41,7 @@ from graphnav.estimation.solvers.passes import (
 )
 from graphnav.estimation.solvers.recursion import STRETCH, move, smooth_rows
 
-_LOST = 7e4  # times smaller than filtered: P - P N P is good to eps times the square of that, a millionth
+_CANCELLED = 7e4  # times smaller than filtered: P - P N P is good to eps times the square of that, a millionth
 
 
 def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None = None) -> SmootherPass:
@@ -123,7 +123,7 @@ def _restore_digits(forward: ForwardRecord, P: Array, end: int) -> None:
     With C and P^s of the next keyframe, in Joseph's form: (I - C F) P_k (I - C F)^T + C (P^s + Q) C^T.
     """
     after, before = (np.diagonal(x[:end], axis1=1, axis2=2) for x in (P, forward.P))
-    lost = np.flatnonzero(np.any(after * _LOST < before, axis=1))
+    lost = np.flatnonzero(np.any(after * _CANCELLED < before, axis=1))
     I = np.eye(P.shape[1])
     for k in lost[lost < len(P) - 1][::-1]:
         F, Pp = move(forward.F[k], forward.decay[k], I), forward.P_predicted[k + 1]
