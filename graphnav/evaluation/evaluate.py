@@ -186,16 +186,18 @@ def evaluate_recording(
         sigma = recording.truth.closed_loop_sigma
         note = Note("truth.closed_loop", f"the only truth is that the end is the start, to {sigma:g} m")
         return Metrics(trajectory.name, closure=closure(trajectory), notes=(*trajectory.notes, note))
-    start = recording.start
+    late = 0.0
     if found is None and gnss_spans and recording.gnss is not None:
         found = withheld_truth(recording, "gnss", gnss_spans, antenna)
-        start += antenna.clock_offset  # spans are on the fixes' clock
+        late = antenna.clock_offset
     if found is None:
         return None
     truth, lever_arm = found
     alone = recording.gnss is None
     found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, at=at, from_start=alone)
-    return measure(found_errors, trajectory.name, spans, start=start)
+    # spans are on the fixes' own clock, and so are the errors then
+    found_errors = replace(found_errors, t=found_errors.t - late)
+    return measure(found_errors, trajectory.name, spans, start=recording.start)
 
 
 def evaluate(
