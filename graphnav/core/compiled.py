@@ -9,9 +9,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import Any, TypeVar, cast
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+
+def can_compile() -> bool:
+    """Whether functions are compiled here."""
+    return os.environ.get("GRAPHNAV_COMPILE") != "0" and find_spec("numba") is not None
 
 
 def compiled(function: F) -> F:
@@ -19,12 +25,10 @@ def compiled(function: F) -> F:
 
     Those that call each other stand in one module: what is kept on disk is as old as the module it is of.
     """
-    if os.environ.get("GRAPHNAV_COMPILE") == "0":
+    if not can_compile():
         return function
-    try:
-        import numba
-    except ImportError:
-        return function
+    import numba
+
     try:
         return cast(F, numba.njit(function, cache=True, nogil=True))
     except RuntimeError:  # there is no folder to keep it in

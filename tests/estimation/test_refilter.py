@@ -77,13 +77,14 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed:
     given, own = AtPoints(posed, points, stack, steps, F), AtEstimate(posed, steps)
 
     def here(k: int, e: Array) -> Estimate:
-        return own.plus(Estimate(points.states[k : k + 1], points.values[k]), e)
+        return Estimate(points.states[k : k + 1].plus(e[None, :DIM]), points.values[k] + e[DIM:])
 
     for k in (3, 60, 150):
         linear = given.step(k, np.zeros(D))
 
         def ahead(e: Array, k: int = k) -> Array:
-            return own.minus(own.step(k, here(k - 1, e))[0], here(k, np.zeros(D)))
+            reached = own.step(k, here(k - 1, e))[0]
+            return np.concatenate([reached.state.minus(points.states[k : k + 1])[0], reached.values - points.values[k]])
 
         np.testing.assert_allclose(linear[0], ahead(np.zeros(D)), atol=1e-9)
         whole = move(linear[1], steps.decay[k - 1], np.eye(D))

@@ -62,15 +62,16 @@ class Trio:
 def nearly_linear(kind: str) -> Trio:
     """Setting off, with everything known so well that second-order terms are nothing.
 
-    The steepest second-order term is the specific force turned by half the squared attitude error, 5e-10 m/s^2,
-    against 1e-3 m/s of velocity noise.
+    The steepest second-order term of a state is the specific force turned by half the squared attitude error, 2e-11
+    m/s^2, against 1e-3 m/s of velocity noise; of a covariance it is the attitude error times what an update adds to the
+    velocity.
     """
     estimated = kind == "constants"
     noise = replace(
         oracle.MEMS,
-        gyro_noise_density=1e-6,
-        gyro_bias_walk=1e-8,
-        gyro_bias_sigma=1e-6,
+        gyro_noise_density=2e-7,
+        gyro_bias_walk=2e-9,
+        gyro_bias_sigma=2e-7,
         accel_bias_sigma=1e-3,
         gyro_scale_sigma=1e-5 * estimated,
         accel_scale_sigma=1e-4 * estimated,
@@ -82,7 +83,7 @@ def nearly_linear(kind: str) -> Trio:
     frame = LocalFrame(recording.gnss.llh[0])
     start = truth_states(truth, np.array([recording.start]), frame)
     start = replace(start, ba=np.zeros((1, 3)), bg=np.zeros((1, 3)))
-    sigma = np.repeat([1e-5, 0.05, 1e-3, 1e-3, 1e-6], 3)
+    sigma = np.repeat([2e-6, 0.05, 1e-3, 1e-3, 2e-7], 3)
     settings = settings_from({"gnss": gnss, "vehicle": NO_WHEELS})
     stops = np.array([[0.5, 2.0], [3.0, 4.5]]) if kind == "stops" else None
     problem = with_noise(

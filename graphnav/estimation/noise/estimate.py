@@ -27,6 +27,7 @@ from scipy.special import chdtrc, chdtri
 from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import TIMES
 from graphnav.core.rotation import Array
+from graphnav.estimation.faults import weigh_rows
 from graphnav.estimation.noise.apply import row_weights, with_noise
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import ImuMoments, imu_moments, lag_moments, process_moments, row_moments
@@ -181,7 +182,12 @@ def _begin(problem: Problem, start: NoiseModel | None) -> _Components:
 
 def _first_points(problem: Problem, figures: _Components, opening: float | None) -> Points:
     used = with_noise(problem, figures.model())
-    return backward(used, ekf(used, opening=opening))
+    about = backward(used, ekf(used, opening=opening))
+    # what is grossly wrong takes a filter that uses everything too far away to be linearised there
+    sound = weigh_rows(used, refilter(used, about, watch=True).weights)
+    if not any(rows.weight is not None and np.any(rows.weight == 0.0) for rows in sound.constraints):
+        return about
+    return backward(sound, ekf(sound, opening=opening))
 
 
 def _carry(points: Points, before: Problem, after: Problem) -> Points:

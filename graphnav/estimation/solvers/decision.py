@@ -36,5 +36,8 @@ def hold(one: Decision | None, x: Any, P: Array, where: Any) -> tuple[Any, Array
     K = np.linalg.solve(one.H @ PHt + R, PHt.T).T
     M = np.eye(len(P)) - K @ one.H
     P = M @ P @ M.T + K @ R @ K.T
-    d = -(K @ one.residual)
-    return (x + d if isinstance(x, np.ndarray) else where.plus(x, d)), 0.5 * (P + P.T)
+    P, d = 0.5 * (P + P.T), -(K @ one.residual)
+    if isinstance(x, np.ndarray):
+        return x + d, P
+    to = where.plus(x, d)
+    return to, where.carry(P, x, to)

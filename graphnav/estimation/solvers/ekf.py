@@ -11,12 +11,13 @@ and updates with the rows of every constraint there, nu = -r,
 
 (closed loop: the error state is moved into x at once; Joseph's form keeps P symmetric and positive).
 
-The opening, the part that the alignment has seen, is run through twice. Before a vehicle moves nothing tells its
+The opening is the part that the alignment has seen. Before a vehicle moves nothing tells its
 heading, the filter's wanders by degrees until the first motion puts it right, and Jacobians taken along the way
 contradict those taken afterwards: heading, tilt and accelerometer bias get correlations that were never measured.
-So the opening is filtered and smoothed, and filtered again from the same prior, linearised at the points that the first
-pass left (`graphnav.estimation.solvers.points`). So are the first steps of a walk, which tell tilt and accelerometer
-bias apart. Later keyframes are linearised where the filter is.
+So the opening is filtered and smoothed until attitudes stay, and filtered again from the same prior, linearised at the
+points that are left (`graphnav.estimation.solvers.points`). So are the first steps of a walk, which tell tilt and
+accelerometer bias apart. Later keyframes are linearised where the filter is, and their covariances move along with it
+(`graphnav.estimation.solvers.invariant`).
 
 Where only figures or weights have changed since the drive was filtered, `refilter` is linearised at given points
 throughout.
@@ -36,18 +37,21 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.decision import Decide, hold
 from graphnav.estimation.solvers.gain import describe_breakdown, solve_innovation, solve_robust, weights_of
+from graphnav.estimation.solvers.invariant import transport_covariance
 from graphnav.estimation.solvers.linearise import Advance, Points, advance, scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
     Progress,
+    SmootherPass,
     Updates,
     join_passes,
     move_points,
+    near_to,
     parameters_of,
     sigmas_of,
 )
-from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate, move_covariance
+from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate
 from graphnav.estimation.solvers.recursion import STRETCH, filter_rows, predict, solve, update
 from graphnav.estimation.solvers.retest import finds_fault
 from graphnav.estimation.solvers.rts import backward
@@ -55,6 +59,7 @@ from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
 from graphnav.estimation.solvers.watch import Bank, Verdicts
 from graphnav.imu.dynamics import SCALE
 
+_PASSES = 4  # over the opening
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
 
 
@@ -77,14 +82,14 @@ def ekf(
     began = time.perf_counter()
     K, about = len(problem.t), None
     if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
-        about = backward(problem, _forward(problem, n)) if known is None else known.first(n)
+        about = _smooth_opening(problem, n) if known is None else known.first(n)
     one = _forward(problem, K, about, progress, decide=decide)
     seconds = time.perf_counter() - began
     filtered, P = one.states, one.P[:, :DIM, :DIM]
     if about is not None:
         n = len(about.values) - 1
         P = P.copy()
-        P[:n] = move_covariance(P[:n], one.errors[:n])
+        P[:n] = transport_covariance(P[:n], about.states[:n], filtered[:n])
     solution = Solution(
         solver="ekf",
         frame=problem.frame,
@@ -101,6 +106,16 @@ def ekf(
         between=(dense(problem, filtered, P, scale_at(problem.columns, one.values), smooth=False),),
     )
     return FilterPass(**vars(one), solution=solution)
+
+
+def _smooth_opening(problem: Problem, n: int) -> SmootherPass:
+    """Where the first n keyframes are linearised: smoothed, again about that until attitudes stay (Bell 1994)."""
+    about = backward(problem, _forward(problem, n))
+    for _ in range(_PASSES):
+        before, about = about, backward(problem, _forward(problem, n, about))
+        if near_to(about, before):
+            break
+    return about
 
 
 def refilter(problem: Problem, about: Points, progress: Progress | None = None, watch: bool = False) -> ForwardRecord:
@@ -249,8 +264,10 @@ def _one(points: Points, k: int) -> Estimate:
 
 def _leave_points(about: Points, own: AtEstimate, all_P: Array, n: int, e: Array) -> tuple[Estimate, Array]:
     """The estimate after the last of n given points, and its covariance, also in its place, by the error e there."""
-    all_P[n - 1] = move_covariance(all_P[n - 1], e[:3])
-    return own.plus(_one(about, n - 1), e), all_P[n - 1]
+    at = _one(about, n - 1)
+    x = own.plus(at, e)
+    all_P[n - 1] = own.carry(all_P[n - 1], at, x)
+    return x, all_P[n - 1]
 
 
 def _points(about: Points | None, errors: Array, own: list[Estimate]) -> Points:
@@ -317,7 +334,7 @@ def _update(
                 root, solved, Kt = solve_innovation(HP, HPHt, sigma * sigma, r, some)
         d = -(r @ Kt) if e is None else e - r @ Kt
         if left:  # again about where this leads (Jazwinski 1970, theorem 8.2)
-            at = where.plus(at, d)
+            P, at = where.carry(P, at, ahead := where.plus(at, d)), ahead
             e = where.minus(x, at)
     if some.alone:
         refused = rows.gate is not None and nis > rows.gate**2
@@ -339,7 +356,8 @@ def _update(
         fault = tests.updated(rows.name, Kt.T, G, weighted, r, where.speed(some.k, x))
     elif bank is not None:
         bank.taken(Kt.T, H)
-    return where.plus(at, d), P, fault
+    to = where.plus(at, d)
+    return to, where.carry(P, at, to), fault
 
 
 def _here(about: Points | None, k: int, x: Any) -> Points:

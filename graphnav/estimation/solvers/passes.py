@@ -12,6 +12,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.estimation.solvers.invariant import plus_invariant
 from graphnav.estimation.solvers.linearise import Points, last_of, linearise, shift
 from graphnav.estimation.solvers.recursion import solve
 from graphnav.estimation.solvers.robust import weight_and_cost
@@ -105,7 +106,7 @@ class FilterPass(ForwardRecord):
 
 def move_points(points: Points, errors: Array) -> Points:
     """Points moved by error states (K, D)."""
-    return Points(points.states.plus(errors[:, :DIM]), points.values + errors[:, DIM:])
+    return Points(plus_invariant(points.states, errors[:, :DIM]), points.values + errors[:, DIM:])
 
 
 def join_passes(parts: list[Points]) -> Points:
@@ -143,7 +144,9 @@ def residual_record(problem: Problem, rows: Constraint, points: Points, robust: 
     if robust:
         weight = weight * weight_and_cost(rows.robust, np.sqrt(nis), rows.robust_scale)[0]
     t = problem.t[rows.keyframe]
-    return ConstraintRecord("residual", t, linear.residual, linear.stated, nis, weight, rows.axes, rows.unit)
+    return ConstraintRecord(
+        "residual", t, linear.residual, linear.stated, nis, weight, rows.axes, rows.unit, **rows.labels
+    )
 
 
 def integrate_again(problem: Problem, states: States, scale: Array | None, first: int = 0) -> tuple[Problem, int]:

@@ -20,6 +20,7 @@ from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.invariant import minus_invariant, plus_invariant, transport_covariance
 from graphnav.estimation.solvers.linearise import Advance, Points, linearise, shift
 from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.imu.dynamics import SCALE
@@ -72,12 +73,17 @@ class AtEstimate:
     @staticmethod
     def plus(at: Estimate, d: Array) -> Estimate:
         """`at` moved by an error state."""
-        return Estimate(at.state.plus(d[None, :DIM]), at.values + d[DIM:])
+        return Estimate(plus_invariant(at.state, d[None, :DIM]), at.values + d[DIM:])
 
     @staticmethod
     def minus(x: Estimate, at: Estimate) -> Array:
         """The error state (D,) that leads from `at` to x."""
-        return np.concatenate([x.state.minus(at.state)[0], x.values - at.values])
+        return np.concatenate([minus_invariant(x.state, at.state)[0], x.values - at.values])
+
+    @staticmethod
+    def carry(P: Array, x: Estimate, to: Estimate) -> Array:
+        """The covariance P (D, D) of errors about x as one of errors about an estimate that x has moved to."""
+        return transport_covariance(P[None], x.state, to.state)[0]
 
 
 class AtPoints:
@@ -139,6 +145,11 @@ class AtPoints:
     def plus(at: None, d: Array) -> Array:
         """The points moved by an error state."""
         return d
+
+    @staticmethod
+    def carry(P: Array, x: Array, to: Array) -> Array:
+        """The points stay."""
+        return P
 
     def speed(self, k: int, x: Array | None = None) -> float:
         """m/s."""

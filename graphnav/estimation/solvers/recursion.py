@@ -52,6 +52,17 @@ def predict(P: Array, F: Array, decay: Array, Q: Array, added: Array, out: Array
 
 
 @compiled
+def turn(P: Array, T: Array, out: Array) -> None:
+    """The covariance P (D, D) of errors of which the first m are now T (m, m) times what they were, in `out`."""
+    m = len(T)
+    top = np.dot(T, P[:m])
+    np.positive(P[m:, m:], out[m:, m:])
+    np.positive(np.dot(np.ascontiguousarray(top[:, :m]), T.T), out[:m, :m])
+    np.positive(top[:, m:], out[:m, m:])
+    np.positive(top[:, m:].T, out[m:, :m])
+
+
+@compiled
 def solve(L: Array, X: Array) -> None:
     """X (m, n) <- S^-1 X for S = L L^T."""
     m, U = len(L), np.ascontiguousarray(L.T)

@@ -46,7 +46,15 @@ class Innovations:
         kept = (self.weight > 0.0) & (self.used > 0.0)
         nis = self.nis * np.divide(self.weight, self.used, out=np.ones_like(self.nis), where=kept)
         return ConstraintRecord(
-            "innovation", t, self.residual, self.sigma, nis, self.weight, self.rows.axes, self.rows.unit
+            "innovation",
+            t,
+            self.residual,
+            self.sigma,
+            nis,
+            self.weight,
+            self.rows.axes,
+            self.rows.unit,
+            **self.rows.labels,
         )
 
 

@@ -1,0 +1,70 @@
+"""Errors of attitude and velocity that stay what they are wherever the filter's estimate moves to.
+
+Nothing but its motion tells a vehicle's heading: at rest, and for all that is said in the axes of the body, a state
+turned about the vertical is as good as before. As an error state added as in `graphnav.core.state.States.plus`, a turn
+by psi is theta = psi R_nb^T z and dv = psi z x v: another one at each estimate. So a filter that moves its estimate and
+keeps its covariance as it was takes what it does not know of the heading for something else, say a tilt; gravity tells
+it of that, and it ends sure of a heading that nothing has shown (Huang, Mourikis, Roumeliotis 2010,
+"Observability-based rules for designing consistent EKF SLAM estimators").
+
+With the errors of attitude and velocity in n, turned together (Barrau, Bonnabel 2017, "The invariant extended Kalman
+filter as a stable observer"),
+
+    phi = R_nb theta     nu = dv - phi x v
+
+a turn is phi = psi z and nu = 0 at every estimate, the velocity in the body is linear in nu, and a state moves to
+
+    R_nb <- Exp(phi) R_nb     v <- Exp(phi) (v + nu)     p <- p + dp
+
+The place is not turned: fixes tell it. To first order this is `States.plus`, so the Jacobians of rows and steps stay;
+only how states and covariances move is another.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.core import rotation
+from graphnav.core.rotation import Array, mv
+from graphnav.core.state import BLOCKS, States
+from graphnav.estimation.solvers.recursion import turn
+
+_THETA, _V = BLOCKS["theta"], BLOCKS["v"]
+_MOVING = _V.stop  # numbers of an error state that theta and dv are among
+_I9 = np.eye(_MOVING)
+
+
+def plus_invariant(states: States, e: Array) -> States:
+    """K states moved by error states (K, 15)."""
+    phi, dv = mv(states.R_nb, e[:, _THETA]), e[:, _V]
+    exp_phi = rotation.exp(phi)
+    return States(
+        exp_phi @ states.R_nb,
+        states.p + e[:, BLOCKS["p"]],
+        mv(exp_phi, states.v + dv - mv(rotation.skew(phi), states.v)),
+        states.ba + e[:, BLOCKS["ba"]],
+        states.bg + e[:, BLOCKS["bg"]],
+    )
+
+
+def minus_invariant(states: States, other: States) -> Array:
+    """The error states (K, 15) with ``plus_invariant(other, e) == states``."""
+    theta = rotation.log(np.swapaxes(other.R_nb, -1, -2) @ states.R_nb)
+    phi = mv(other.R_nb, theta)
+    dv = mv(rotation.exp(-phi), states.v) - other.v + mv(rotation.skew(phi), other.v)
+    return np.concatenate([theta, states.p - other.p, dv, states.ba - other.ba, states.bg - other.bg], axis=-1)
+
+
+def transport_covariance(P: Array, states: States, moved: States) -> Array:
+    """Covariances (K, D, D) of errors about K states turned into those about the states they have moved to.
+
+    phi and nu stay: theta' = R_nb'^T R_nb theta, dv' = dv + (R_nb theta) x (v' - v).
+    """
+    T = np.zeros((len(P), _MOVING, _MOVING))
+    T[:] = _I9
+    T[:, _THETA, _THETA] = np.swapaxes(moved.R_nb, -1, -2) @ states.R_nb
+    T[:, _V, _THETA] = rotation.skew(states.v - moved.v) @ states.R_nb
+    out = np.empty(P.shape)
+    for one, matrix, to in zip(P, T, out, strict=True):
+        turn(one, matrix, to)
+    return out
