@@ -102,6 +102,11 @@ class Constraint(ABC):
     def __len__(self) -> int:
         return len(self.keyframe)
 
+    @property
+    def labels(self) -> dict[str, Array]:
+        """What a record of rows of satellites has beside them: their names and elevations, (N,) each."""
+        return {}
+
     def noise_groups(self) -> tuple[tuple[str, ...], Array]:
         """Names of the variance components of the rows, and which of them each number (N, m) has; -1 for none."""
         names = tuple(dict.fromkeys(self.noise_axes))

@@ -37,7 +37,7 @@ from graphnav.gnss.atmosphere import obliquity
 from graphnav.gnss.ephemeris import rotate_earth
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import code_sigma, rate_sigma
-from graphnav.gnss.signals import L1, NAMES, C, signal_name
+from graphnav.gnss.signals import L1, NAMES, C, satellite_name, signal_name
 from graphnav.gnss.single_point import coefficients, look, signal_groups, stretch
 from graphnav.recording import Recording
 
@@ -165,6 +165,11 @@ class SatelliteConstraint(Constraint):
     satellite: Array = field(default_factory=lambda: np.empty(0, dtype=np.int16))  # (N,) graphnav.gnss.signals
     elevation: Array = field(default_factory=lambda: np.empty(0))  # (N,) rad
     level: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of _CLASSES
+
+    @property
+    def labels(self) -> dict[str, Array]:
+        known, which = np.unique(self.satellite, return_inverse=True)
+        return {"satellite": np.array([satellite_name(s) for s in known])[which], "elevation": self.elevation}
 
     def noise_groups(self) -> tuple[tuple[str, ...], Array]:
         there, which = np.unique(self.level, return_inverse=True)

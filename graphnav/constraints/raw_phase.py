@@ -47,10 +47,10 @@ class GnssPhase(RangeConstraint):
     slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) of the ionosphere's delay over that at the zenith
     wavelength: Array = field(default_factory=lambda: np.empty(0))  # (N,) m
     slot: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index of `slots`
-    arc: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) within the slot
+    begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the arc
+    whole: Array = field(default_factory=lambda: np.empty(0, dtype=bool))  # (N,) no half cycle is open in the arc
     slots: tuple[str, ...] = ()  # names of the ambiguities
     group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (slots,) system and signal; -1: no integers
-    whole: tuple[Array, ...] = ()  # (slots,) of (arcs,) bool: differences are integers, no half cycle is open
 
     def noise_groups(self) -> tuple[tuple[str, ...], Array]:
         return (), np.full((len(self), 1), -1)
@@ -83,7 +83,7 @@ class GnssPhase(RangeConstraint):
         place[there] = np.arange(len(there))
         group = arcs.satellite[there].astype(int) // 100 * 1000 + arcs.signal[there]
         group[arcs.satellite[there] // 100 == GLONASS] = -1  # each satellite has a frequency of its own
-        frame, raw, arc = scene.frame, raw.take(used), arcs.arc[used]
+        frame, raw = scene.frame, raw.take(used)
         geometry = look(raw, raw.antenna, coefficients(raw))
         common = common_fields(scene, found)
         if s.robust == "automatic":
@@ -105,10 +105,10 @@ class GnssPhase(RangeConstraint):
             wavelength=wavelength[used],
             sigma=carrier_difference_sigma(raw.cn0, geometry.elevation, wavelength[used])[:, None],
             slot=place[arcs.slot[used]],
-            arc=arc,
+            begin=arcs.begin[used],
+            whole=~raw.half,
             slots=tuple(ambiguity_name(arcs.names[k]) for k in there),
             group=group,
-            whole=tuple(~arcs.half[k] for k in there),
             **common,
         )
 

@@ -19,6 +19,7 @@ that an epoch is consistent without (data snooping: Baarda 1968) for half of the
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -37,9 +38,9 @@ from graphnav.gnss.integers import decorrelate, find_nearest
 
 _SUCCESS, _RATIO, _FEWEST = 0.999, 3.0, 4
 _ROUNDS = 4  # of the smoother: what one finds tells the next, and the last finds next to nothing
-_PLACE, _SPEED = 10.0, 1.0  # m, m/s, 1-sigma of what is known where integers were wrong: less than codes tell
+LOST_PLACE, LOST_SPEED = 10.0, 1.0  # m, m/s, 1-sigma of what is known where integers were wrong: less than codes tell
 _ALARM = 0.001  # of epochs with right integers that fail the test of consistency
-Arc = tuple[int, int]  # slot, number within it
+Arc = tuple[str, float]  # its ambiguity, and when it begins, s
 
 
 @dataclass
@@ -109,7 +110,7 @@ def fix(
     own = tuple(problem.parameters.get(p.name, p) for p in phase.parameters)
     phase = replace(phase, parameters=own)
     whole = replace(problem, constraints=tuple(sorted((*problem.constraints, phase), key=lambda c: c.name)))
-    epochs = _Epochs(whole, phase)
+    epochs = Epochs(phase, whole.columns, whole.t)
     search = whole.settings.raw_gnss.integers
     causal = _Causal(epochs)
     forward = ekf(whole, progress, opening, decide=causal if search else None)
@@ -133,7 +134,7 @@ def fix(
     )
 
 
-def _note(epochs: _Epochs, known: Known) -> str:
+def _note(epochs: Epochs, known: Known) -> str:
     every = {arc for arcs in epochs.active.values() for arc in arcs}
     return (
         f"gnss_phase: {len(known.of)} of {len(every)} arcs of carriers have integer ambiguities; "
@@ -141,20 +142,22 @@ def _note(epochs: _Epochs, known: Known) -> str:
     )
 
 
-class _Epochs:
+class Epochs:
     """Which arcs there are at each keyframe with carriers, and where their numbers stand."""
 
-    def __init__(self, problem: Problem, phase: GnssPhase) -> None:
-        self.phase, self._all_columns = phase, problem.columns
-        self.columns = [problem.columns[name].start for name in phase.slots]
+    def __init__(self, phase: GnssPhase, columns: dict[str, slice], t: Array) -> None:
+        self.phase, self._all_columns = phase, columns
+        self.columns = {name: columns[name].start for name in phase.slots}
         self.keyframes = np.unique(phase.keyframe).tolist()
-        self.t, self.time = problem.t[self.keyframes], problem.t
+        self.t, self.time = t[self.keyframes], t
         self.rows: dict[int, slice] = {}
         self.active: dict[int, list[Arc]] = {}
-        edges = np.searchsorted(phase.keyframe, [*self.keyframes, len(problem.t)])
+        arcs = [(phase.slots[slot], begin) for slot, begin in zip(phase.slot, phase.begin.tolist(), strict=True)]
+        self._group = dict(zip(phase.slots, phase.group.tolist(), strict=True))
+        self._whole = {arc for arc, whole in zip(arcs, phase.whole.tolist(), strict=True) if whole}
+        edges = np.searchsorted(phase.keyframe, [*self.keyframes, len(t)])
         for k, lo, hi in zip(self.keyframes, edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-            self.rows[k] = slice(lo, hi)
-            self.active[k] = list(zip(phase.slot[lo:hi].tolist(), phase.arc[lo:hi].tolist(), strict=True))
+            self.rows[k], self.active[k] = slice(lo, hi), arcs[lo:hi]
 
     def odd(self, k: int, here: Points, known: Known) -> list[Arc]:
         """Arcs with integers that an epoch is not consistent with, and is without them.
@@ -190,15 +193,14 @@ class _Epochs:
 
     def can(self, arc: Arc) -> bool:
         """Whether it has integers."""
-        slot, number = arc
-        return bool(self.phase.group[slot] >= 0 and self.phase.whole[slot][number])
+        return self._group[arc[0]] >= 0 and arc in self._whole
 
     def sets(self, k: int, known: Known) -> dict[int, list[list[Arc]]]:
         """By group, the arcs of an epoch, those together that hang together, the largest set first."""
         out: dict[int, dict[Arc, list[Arc]]] = {}
         for arc in self.active[k]:
             if self.can(arc) and arc not in known.let_go:
-                out.setdefault(int(self.phase.group[arc[0]]), {}).setdefault(known.find(arc)[0], []).append(arc)
+                out.setdefault(self._group[arc[0]], {}).setdefault(known.find(arc)[0], []).append(arc)
         return {group: sorted(sets.values(), key=len, reverse=True) for group, sets in out.items()}
 
     def differences(self, k: int, known: Known) -> int:
@@ -207,19 +209,19 @@ class _Epochs:
 
 
 def _decide(
-    sets: dict[int, list[list[Arc]]], at: list[int], values: Array, P: Array, known: Known, impose: bool
+    sets: dict[int, list[list[Arc]]], at: dict[str, int], values: Array, P: Array, known: Known, impose: bool
 ) -> list[tuple[Arc, Arc, int]]:
     """Differences that can be told at an epoch.
 
     Parameters
     ----------
-    at : column of each slot.
+    at : column of each ambiguity.
     values, P : parameters with as many zeros in front as there are states, and the joint covariance.
     impose : whether P is without what is known.
     """
     arcs = [arc for some in sets.values() for one in some for arc in one]
     place = {arc: i for i, arc in enumerate(arcs)}
-    columns = np.array([at[slot] for slot, _ in arcs], dtype=int)
+    columns = np.array([at[name] for name, _ in arcs], dtype=int)
     x, Q = values[columns], P[np.ix_(columns, columns)]
     given = sum(len(one) - 1 for some in sets.values() for one in some)
     if impose and given:
@@ -258,14 +260,51 @@ def _decide(
     return []
 
 
+@dataclass(frozen=True)
+class Held:
+    """What is held behind an epoch, and what was decided there; nothing of it changes."""
+
+    known: Known = field(default_factory=Known)
+    odd: bool = False  # the epoch is not consistent with what is known
+    found: tuple[tuple[Arc, Arc, int], ...] = ()  # differences that were found there
+    let_go: bool = False  # of all that was known
+    fixed: bool = False
+    epoch: bool = False  # there are carriers
+
+    def go_on(self) -> Held:
+        """The same behind a keyframe without carriers."""
+        return replace(self, found=(), let_go=False, epoch=False) if self.epoch else self
+
+
+def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Callable[[], Array]) -> Held:
+    """Find integers by what is known at a keyframe; let go of all where two epochs in a row contradict them."""
+    known = before.known
+    if odd := bool(epochs.odd(k, here, known)):
+        known = Known() if before.odd else known
+        fixed = epochs.differences(k, known) >= _FEWEST
+        return Held(known, True, let_go=before.odd, fixed=fixed, epoch=True)
+    sets, found = epochs.sets(k, known), []
+    if any(len(some) > 1 for some in sets.values()):
+        values = np.concatenate([np.zeros(DIM), here.values[0]])
+        found = _decide(sets, epochs.columns, values, covariance(), known, impose=False)
+    if found:
+        held = replace(known, of=known.of.copy())
+        for a, b, n in found:
+            held.join(a, b, n)
+        if epochs.odd(k, here, held):
+            found = []
+        else:
+            known = held
+    return Held(known, odd, tuple(found), fixed=epochs.differences(k, known) >= _FEWEST, epoch=True)
+
+
 class _Causal:
     """What the filter does at a keyframe: find integers, hold them, let go of those that do not hold."""
 
-    def __init__(self, epochs: _Epochs) -> None:
+    def __init__(self, epochs: Epochs) -> None:
         self._epochs, self._fixed = epochs, dict.fromkeys(epochs.keyframes, 0.0)
-        own = {p.name: float(np.max(p.sigma)) for p in epochs.phase.parameters}
-        self._unknown = [own[name] for name in epochs.phase.slots]
-        self.known, self._odd = Known(), False
+        self._unknown = {p.name: float(np.max(p.sigma)) for p in epochs.phase.parameters}
+        self._held = Held()
 
     @property
     def epochs(self) -> Array:
@@ -274,38 +313,25 @@ class _Causal:
 
     def __call__(self, k: int, here: Points, P: Array) -> Decision | None:
         """Integers to hold from a keyframe on, and ambiguities that are not known any more."""
-        epochs, known = self._epochs, self.known
+        epochs = self._epochs
         if k not in epochs.active:
             return None
-        added, found = np.zeros(len(P)), []
-        odd = bool(epochs.odd(k, here, known))
-        if odd and self._odd:
-            self.known = known = Known()
-            for slot, sigma in enumerate(self._unknown):
-                added[epochs.columns[slot]] = sigma**2
-            added[BLOCKS["p"]], added[BLOCKS["v"]] = _PLACE**2, _SPEED**2
-        elif not odd:
-            values = np.concatenate([np.zeros(DIM), here.values[0]])
-            found = _decide(epochs.sets(k, known), epochs.columns, values, P, known, impose=False)
-        self._odd = odd
-        if found:
-            held = replace(known, of=known.of.copy())
-            for a, b, n in found:
-                held.join(a, b, n)
-            if epochs.odd(k, here, held):
-                found = []
-            else:
-                self.known = known = held
-        self._fixed[k] = float(epochs.differences(k, known) >= _FEWEST)
-        H, r = np.zeros((len(found), len(P))), np.zeros(len(found))
-        for i, (a, b, n) in enumerate(found):
+        held = self._held = hold_on(self._held, epochs, k, here, lambda: P)
+        self._fixed[k] = float(held.fixed)
+        added, values = np.zeros(len(P)), here.values[0]
+        if held.let_go:
+            for name, at in epochs.columns.items():
+                added[at] = self._unknown[name] ** 2
+            added[BLOCKS["p"]], added[BLOCKS["v"]] = LOST_PLACE**2, LOST_SPEED**2
+        H, r = np.zeros((len(held.found), len(P))), np.zeros(len(held.found))
+        for i, (a, b, n) in enumerate(held.found):
             first, second = epochs.columns[a[0]], epochs.columns[b[0]]
             H[i, first], H[i, second] = 1.0, -1.0
-            r[i] = values[first] - values[second] - n
-        return Decision(H, r, np.full(len(found), EXACT), added) if found or added.any() else None
+            r[i] = values[first - DIM] - values[second - DIM] - n
+        return Decision(H, r, np.full(len(r), EXACT), added) if len(r) or held.let_go else None
 
 
-def _sweep(epochs: _Epochs, problem: Problem, smoothed: SmootherPass, known: Known) -> None:
+def _sweep(epochs: Epochs, problem: Problem, smoothed: SmootherPass, known: Known) -> None:
     """Look at all epochs, those with most arcs first."""
     tried: set[frozenset[frozenset[Arc]]] = set()
     values = np.concatenate([np.zeros((len(smoothed.values), DIM)), smoothed.values], axis=1)
@@ -326,9 +352,9 @@ def _one(points: Points, k: int) -> Points:
     return Points(points.states[k : k + 1], points.values[k : k + 1])
 
 
-def _holding(problem: Problem, phase: GnssPhase, epochs: _Epochs, known: Known) -> Problem:
+def _holding(problem: Problem, phase: GnssPhase, epochs: Epochs, known: Known) -> Problem:
     """A problem with rows for what is known: each arc is held to the first other where both are there at once."""
-    rows: list[tuple[int, int, int, int]] = []
+    rows: list[tuple[int, str, str, int]] = []
     held = Known()
     for k in epochs.keyframes:
         for sets in epochs.sets(k, known).values():
@@ -338,18 +364,24 @@ def _holding(problem: Problem, phase: GnssPhase, epochs: _Epochs, known: Known) 
                         n = known.find(arc)[1] - known.find(one[0])[1]
                         held.join(arc, one[0], n)
                         rows.append((k, arc[0], one[0][0], n))
-    if not rows:
+    return with_integers(problem, phase, rows)
+
+
+def with_integers(problem: Problem, phase: GnssPhase, found: Sequence[tuple[int, str, str, int]]) -> Problem:
+    """A problem with rows for differences: keyframe, in that order, two ambiguities, and cycles between them."""
+    if not found:
         return problem
-    table = np.array(rows)
-    names = set(phase.slots)
+    index = {name: i for i, name in enumerate(phase.slots)}
     whole = WholeCycles(
-        keyframe=table[:, 0], slots=phase.slots, pair=table[:, 1:3], cycles=table[:, 3].astype(float),
-        parameters=tuple(p for p in phase.parameters if p.name in names),
+        keyframe=np.array([k for k, *_ in found]), slots=phase.slots,
+        pair=np.array([[index[a], index[b]] for _, a, b, _ in found]),
+        cycles=np.array([float(n) for *_, n in found]),
+        parameters=tuple(p for p in phase.parameters if p.name in index),
     )  # fmt: skip
     return replace(problem, constraints=tuple(sorted((*problem.constraints, whole), key=lambda c: c.name)))
 
 
-def _let_go(epochs: _Epochs, problem: Problem, smoothed: SmootherPass, known: Known) -> bool:
+def _let_go(epochs: Epochs, problem: Problem, smoothed: SmootherPass, known: Known) -> bool:
     """Give up arcs that most of their epochs are not consistent with."""
     seen: Counter[Arc] = Counter()
     odd: Counter[Arc] = Counter()

@@ -125,7 +125,14 @@ def within(solution: Solution, share: Share) -> Solution:
     def record(r: ConstraintRecord) -> ConstraintRecord:
         some = inside(r.t)
         return replace(
-            r, t=r.t[some], residual=r.residual[some], sigma=r.sigma[some], nis=r.nis[some], weight=r.weight[some]
+            r,
+            t=r.t[some],
+            residual=r.residual[some],
+            sigma=r.sigma[some],
+            nis=r.nis[some],
+            weight=r.weight[some],
+            satellite=r.satellite[some[: len(r.satellite)]],
+            elevation=r.elevation[some[: len(r.elevation)]],
         )
 
     def detection(d: Detection) -> Detection:

@@ -12,7 +12,7 @@ from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM, States
+from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights
@@ -56,6 +56,8 @@ class ConstraintRecord:
     weight: Array  # (N,) robust weight, 1 = as a Gaussian, 0 = rejected
     axes: tuple[str, ...]  # names of the m components
     unit: str
+    satellite: Array = field(default_factory=lambda: np.empty(0, dtype=str))  # (N,) names, where rows are of satellites
+    elevation: Array = field(default_factory=lambda: np.empty(0))  # (N,) rad, of these
 
 
 @dataclass(frozen=True)
@@ -185,7 +187,7 @@ class Solution:
             times = piece.times(rate)
             for k in range(0, len(times), _ROWS):
                 t = times[k : k + _ROWS]
-                yield to_trajectory(self.solver, self.frame, t, *piece(t, _OUT))
+                yield to_trajectory(self.solver, self.frame, t, *piece(t, _OUT), joint=False)
 
     def at(self, t: Array) -> tuple[Array, States, Array]:
         """States between the keyframes.
@@ -213,17 +215,27 @@ class Solution:
         return np.concatenate(times), States.stack(list(states)), np.concatenate(covariances)
 
 
-def to_trajectory(name: str, frame: LocalFrame, t: Array, states: States, covariance: Array) -> Trajectory:
-    """States in the fixed navigation frame turned into the local ENU at each point."""
+def to_trajectory(
+    name: str, frame: LocalFrame, t: Array, states: States, covariance: Array, joint: bool = True
+) -> Trajectory:
+    """States in the fixed navigation frame turned into the local ENU at each point.
+
+    Without `joint` covariances are left out, of which sigmas need but a third.
+    """
     R_ln = frame.R_ln(states.p)
     rph = rotation.to_rph(R_ln @ states.R_nb)
-    # (p, v, rph) in local axes from (theta, p, v) in the error state
-    J = np.zeros((len(t), 9, 9))
-    J[:, 0:3, 3:6] = R_ln
-    J[:, 3:6, 6:9] = R_ln
-    J[:, 6:9, 0:3] = rotation.rph_jacobian(rph)
-    cov = J @ covariance[:, :_OUT, :_OUT] @ np.swapaxes(J, -1, -2)
-    sd = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
+    turns = {"p": R_ln, "v": R_ln, "theta": rotation.rph_jacobian(rph)}  # from the error state to local axes
+    cov = None
+    if joint:
+        J = np.zeros((len(t), 9, 9))
+        for k, (block, turn) in enumerate(turns.items()):
+            J[:, 3 * k : 3 * k + 3, BLOCKS[block]] = turn
+        cov = J @ covariance[:, :_OUT, :_OUT] @ np.swapaxes(J, -1, -2)
+    variance = [
+        np.einsum("kij,kij->ki", turn @ covariance[:, BLOCKS[block], BLOCKS[block]], turn)
+        for block, turn in turns.items()
+    ]
+    sd = np.sqrt(np.maximum(np.concatenate(variance, axis=1), 0.0))
     return Trajectory(
         t=t,
         llh=frame.to_llh(states.p),
@@ -248,7 +260,8 @@ def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Soluti
     def rows(name: str) -> ConstraintRecord:
         have = [part.records[name] for part in parts if name in part.records]
         arrays: dict[str, Any] = {
-            key: np.concatenate([getattr(r, key) for r in have]) for key in ("t", "residual", "sigma", "nis", "weight")
+            key: np.concatenate([getattr(r, key) for r in have])
+            for key in ("t", "residual", "sigma", "nis", "weight", "satellite", "elevation")
         }
         return replace(have[0], **arrays)
 

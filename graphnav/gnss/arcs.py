@@ -36,11 +36,21 @@ class Arcs:
     satellite: Ids  # (S,)
     signal: Ids  # (S,)
     begins: tuple[Array, ...]  # (S,) of (n,) s: first times of the arcs
-    half: tuple[NDArray[np.bool_], ...]  # (S,) of (n,): half a cycle is open throughout
     slips: int  # that no flag tells
 
+    @property
+    def begin(self) -> Array:
+        """(N,) s, of each row's arc; NaN where there is no carrier."""
+        out = np.full(len(self.arc), np.nan)
+        for slot, begins in enumerate(self.begins):
+            own = (self.slot == slot) & (self.arc >= 0)
+            out[own] = begins[self.arc[own]]
+        return out
 
-def find_arcs(raw: RawGnss, still: bool = False, base_arc: NDArray[np.intp] | None = None) -> Arcs:
+
+def find_arcs(
+    raw: RawGnss, still: bool = False, base_arc: NDArray[np.intp] | None = None, period: float | None = None
+) -> Arcs:
     """The arcs of a receiver's carriers.
 
     Parameters
@@ -48,11 +58,14 @@ def find_arcs(raw: RawGnss, still: bool = False, base_arc: NDArray[np.intp] | No
     raw : all epochs and signals that the receiver has, with nominal antennas; rows that are left out later keep theirs.
     still : the antenna stands at its nominal place, as that of a base station does.
     base_arc : (N,) a number that changes for a slot where the base station's arc does.
+    period : s between epochs, where the series is too short to tell.
     """
     key = raw.satellite.astype(np.int64) * 1000 + raw.signal
     slots, slot = np.unique(key, return_inverse=True)
+    if len(raw.arc_begin):
+        return _known_arcs(raw, slots, slot)
     epochs, epoch = raw.epochs
-    usual = float(np.median(np.diff(epochs))) if len(epochs) > 1 else np.inf
+    usual = period or (float(np.median(np.diff(epochs))) if len(epochs) > 1 else np.inf)
     there = np.isfinite(raw.carrier) & np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock)
     if base_arc is not None:
         there &= base_arc >= 0
@@ -75,12 +88,27 @@ def find_arcs(raw: RawGnss, still: bool = False, base_arc: NDArray[np.intp] | No
     base = count[np.minimum(first_of_slot, max(len(count) - 1, 0))] if len(count) else np.zeros(len(slots), dtype=int)
     arc[order] = count - base[slot[order]]
     firsts = [order[begins_here & (slot[order] == k)] for k in range(len(slots))]
-    ids = slots // 1000, slots % 1000
-    names = tuple(f"{satellite_name(s)}.{signal_name(g)}" for s, g in zip(*ids, strict=True))
-    return Arcs(
-        slot, arc, names, ids[0].astype(np.int16), ids[1].astype(np.int16), tuple(raw.t[k] for k in firsts),
-        tuple(raw.half[k] for k in firsts), int(slipped.sum()),
-    )  # fmt: skip
+    return Arcs(slot, arc, *_names(slots), tuple(raw.t[k] for k in firsts), int(slipped.sum()))
+
+
+def _known_arcs(raw: RawGnss, slots: NDArray[np.int64], slot: NDArray[np.intp]) -> Arcs:
+    """The arcs of a piece of a series, which were found as its epochs came."""
+    arc, begins = np.full(len(raw), -1), []
+    for k in range(len(slots)):
+        own = np.flatnonzero((slot == k) & np.isfinite(raw.arc_begin))
+        t, arc[own] = np.unique(raw.arc_begin[own], return_inverse=True)
+        begins.append(t)
+    return Arcs(slot, arc, *_names(slots), tuple(begins), 0)
+
+
+def _names(slots: NDArray[np.int64]) -> tuple[tuple[str, ...], Ids, Ids]:
+    """Names, satellites and signals of slots."""
+    satellites, signals = (slots // 1000).astype(np.int16), (slots % 1000).astype(np.int16)
+    return (
+        tuple(f"{satellite_name(s)}.{signal_name(g)}" for s, g in zip(satellites, signals, strict=True)),
+        satellites,
+        signals,
+    )
 
 
 def _find_slips(

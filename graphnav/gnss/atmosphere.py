@@ -111,12 +111,12 @@ def niell(llh: Array, elevation: Array, day: Array) -> tuple[Array, Array]:
     def at(table: Array) -> Array:
         return np.stack([np.interp(lat, _LATITUDES, row) for row in table])
 
-    dry = _continued_fraction(sin, at(_DRY_MEAN) - at(_DRY_SEASON) * season)
-    higher = (1.0 / sin - _continued_fraction(sin, _HEIGHT[:, None])) * llh[:, 2] / 1e3
-    return dry + higher, _continued_fraction(sin, at(_WET))
+    dry = _evaluate_fraction(sin, at(_DRY_MEAN) - at(_DRY_SEASON) * season)
+    higher = (1.0 / sin - _evaluate_fraction(sin, _HEIGHT[:, None])) * llh[:, 2] / 1e3
+    return dry + higher, _evaluate_fraction(sin, at(_WET))
 
 
-def _continued_fraction(sin: Array, coefficients: Array) -> Array:
+def _evaluate_fraction(sin: Array, coefficients: Array) -> Array:
     """Marini's continued fraction, 1 at the zenith."""
     a, b, c = coefficients
     return np.asarray((1.0 + a / (1.0 + b / (1.0 + c))) / (sin + a / (sin + b / (sin + c))))

@@ -1,8 +1,8 @@
 """Navigation messages as satellites send them, word by word: ephemerides out of bits.
 
-GPS and QZSS LNAV (IS-GPS-200N, 20.3.3), Galileo I/NAV and F/NAV (OS SIS ICD 2.1, 4.3 and 4.2), BeiDou D1
-(BDS-SIS-ICD-B1I 3.0, 5.2) and GLONASS (ICD GLONASS L1/L2 5.1, 4.4). A message is complete once its parts are of one
-issue.
+GPS and QZSS LNAV (IS-GPS-200N, 20.3.3), Galileo I/NAV and F/NAV (OS SIS ICD 2.1, 4.3 and 4.2), BeiDou D1 and, of
+geostationary satellites, D2 (BDS-SIS-ICD-B1I 3.0, 5.2 and 5.3) and GLONASS (ICD GLONASS L1/L2 5.1, 4.4). A message is
+complete once its parts are of one issue.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ class Decoder:
         elif system == GALILEO and len(words) >= 8:
             own = self._fnav if payload[2] == _E5A else self._inav
             own(satellite, Bits.of(words[:8], 32), gps)
-        elif system == BEIDOU and len(words) >= 10 and 5 < number < 59:
-            self._d1(satellite, Bits.of(words[:10], 30), gps)
+        elif system == BEIDOU and len(words) >= 10:
+            (self._d1 if 5 < number < 59 else self._d2)(satellite, Bits.of(words[:10], 30), gps)
         elif system == GLONASS and len(words) >= 4:
             self._channels[satellite] = payload[3] - 7
             self._string(satellite, Bits.of(words[:4], 32), gps)
@@ -212,6 +212,48 @@ class Decoder:
             omega_dot=three.s((131, 11), (150, 13)) * 2.0**-43 * _PI,
             idot=three.s((189, 13), (210, 1)) * 2.0**-43 * _PI, healthy=one.u((42, 1)) == 0,
             delay=(one.s((98, 10)) * 1e-10, one.s((108, 4), (120, 6)) * 1e-10),
+        )  # fmt: skip
+
+    def _d2(self, satellite: int, bits: Bits, gps: float) -> None:
+        page = bits.u((42, 4))
+        if bits.u((15, 3)) != 1 or not 1 <= page <= 10:
+            return
+        parts = self._parts.setdefault(satellite, {})
+        parts[page] = bits
+        sent = {k: x.u((18, 8), (30, 12)) for k, x in parts.items()}
+        for k in [k for k in parts if sent[k] - sent[page] != 3 * (k - page)]:
+            del parts[k]  # of another round
+        if len(parts) < 10:
+            return
+        whole = Bits(0, 0)
+        for k in range(1, 11):
+            whole = Bits(whole.value << 300 | parts[k].value, whole.size + 300)
+        parts.clear()
+
+        def at(page: int, *places: tuple[int, int]) -> list[tuple[int, int]]:
+            return [(300 * (page - 1) + first, many) for first, many in places]
+
+        u, s = whole.u, whole.s
+        toes, toc = u(*at(7, (80, 2), (90, 15))) * 8.0, u(*at(1, (77, 5), (90, 12))) * 8.0
+        self._add(
+            satellite, _near(toes + _BDT, gps), _near(toc + _BDT, gps), toes,
+            clock=(
+                s(*at(3, (100, 12), (120, 12))) * 2.0**-33,
+                s(*at(3, (132, 4)), *at(4, (46, 6), (60, 12))) * 2.0**-50, s(*at(4, (72, 10), (90, 1))) * 2.0**-66,
+            ),
+            iode=u(*at(4, (91, 5))), crs=s(*at(8, (91, 18))) * 2.0**-6, delta_n=s(*at(4, (96, 16))) * 2.0**-43 * _PI,
+            m0=s(*at(5, (50, 2), (60, 22), (90, 8))) * 2.0**-31 * _PI,
+            cuc=s(*at(4, (120, 14)), *at(5, (46, 4))) * 2.0**-31,
+            e=u(*at(5, (124, 10)), *at(6, (46, 6), (60, 16))) * 2.0**-33, cus=s(*at(5, (98, 14), (120, 4))) * 2.0**-31,
+            root_a=u(*at(6, (76, 6), (90, 22), (120, 4))) * 2.0**-19,
+            cic=s(*at(6, (124, 10)), *at(7, (46, 6), (60, 2))) * 2.0**-31,
+            omega0=s(*at(9, (51, 1), (60, 22), (90, 9))) * 2.0**-31 * _PI, cis=s(*at(7, (62, 18))) * 2.0**-31,
+            i0=s(*at(7, (105, 7), (120, 14)), *at(8, (46, 6), (60, 5))) * 2.0**-31 * _PI,
+            crc=s(*at(8, (65, 17), (90, 1))) * 2.0**-6,
+            omega=s(*at(9, (99, 13), (120, 14)), *at(10, (46, 5))) * 2.0**-31 * _PI,
+            omega_dot=s(*at(8, (109, 3), (120, 16)), *at(9, (46, 5))) * 2.0**-43 * _PI,
+            idot=s(*at(10, (51, 1), (60, 13))) * 2.0**-43 * _PI, healthy=u(*at(1, (46, 1))) == 0,
+            delay=(s(*at(1, (102, 10))) * 1e-10, s(*at(1, (120, 10))) * 1e-10),
         )  # fmt: skip
 
     def _string(self, satellite: int, bits: Bits, gps: float) -> None:

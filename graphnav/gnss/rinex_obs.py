@@ -8,7 +8,7 @@ are given names of version 3 as RTKLIB 2.4.3 does (rinex.c, convcode).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.files import Lines, calendar_days, find_moved_points, numbers, read_bytes
+from graphnav.gnss.rinex_header import Header, read_header
 from graphnav.gnss.series import Observations, note_cut, once
 from graphnav.gnss.signals import BEIDOU, GLONASS, GPS, QZSS, SYSTEMS, Ids, is_known_signal, satellite_id, signal_id
 
@@ -27,21 +28,7 @@ _SYSTEM_OF = np.full(256, -1)
 for _k, _letter in enumerate(SYSTEMS):
     _SYSTEM_OF[ord(_letter)] = _k
 _KINDS = "CLDS"
-_MOST_TYPES = 200  # of a system; RINEX 4.01 has some 80
 _WIDTH = 16  # of a field: value F14.3, loss of lock I1, strength I1
-
-
-@dataclass
-class Header:
-    """What the header of an observation file says."""
-
-    version: float = 0.0
-    system: str = "G"
-    types: dict[int, list[str]] = field(default_factory=dict)  # by system, in the file's order: "C1C"
-    scale: str = "GPS"  # of time
-    marker: Array | None = None
-    channels: dict[int, int] = field(default_factory=dict)
-    end: int = 0  # number of lines
 
 
 @dataclass
@@ -71,7 +58,7 @@ def read_observations(path: Path) -> Observations:
 def parse_observations(data: bytes, path: Path) -> Observations:
     """The observations of a RINEX file's content; `path` is only for what is said of it."""
     lines = Lines(data)
-    header = _header(lines, path)
+    header = read_header(lines, path)
     remarks: list[str] = []
     stamp, zero, flag, rows, cells = (_version_2 if header.version < 3.0 else _version_3)(lines, header, path, remarks)
     if not len(rows.line):
@@ -126,68 +113,6 @@ def parse_observations(data: bytes, path: Path) -> Observations:
             header.channels, header.marker, (str(path),), tuple(remarks),
         )
     )  # fmt: skip
-
-
-def _header(lines: Lines, path: Path) -> Header:
-    """Read up to END OF HEADER."""
-    out, system, many = Header(), -1, 0
-    for k in range(len(lines)):
-        text = lines.text(k)
-        label, body = text[60:].strip(), text[:60]
-        try:
-            if label == "RINEX VERSION / TYPE":
-                out.version = float(body[:9])
-                if body[20:21] != "O":
-                    raise RecordingError(
-                        f"{path}: a RINEX file of type '{body[20:40].strip()}', not of observations", key="file.kind"
-                    )
-                out.system = body[40:41].strip() or "G"
-            elif label == "SYS / # / OBS TYPES":
-                if body[0] != " ":
-                    system, many = SYSTEMS.find(body[0]), int(body[3:6])
-                    out.types[system] = []
-                out.types.setdefault(system, []).extend(body[6:].split())
-            elif label == "# / TYPES OF OBSERV":
-                many = int(body[:6]) if body[:6].strip() else many
-                out.types.setdefault(-2, []).extend(body[6:].split())
-            elif label == "APPROX POSITION XYZ":
-                place = np.array(body.split(), dtype=float)
-                out.marker = place if len(place) == 3 and 6e6 < np.linalg.norm(place) < 7e6 else None
-            elif label == "TIME OF FIRST OBS":
-                out.scale = body[48:51].strip() or ("GLO" if out.system == "R" else "GPS")
-            elif label == "GLONASS SLOT / FRQ #":
-                words = body[3:].split()
-                out.channels |= {
-                    100 * GLONASS + int(name[1:]): int(number)
-                    for name, number in zip(words[::2], words[1::2], strict=False)
-                    if name[:1] == "R"
-                }
-            elif label == "END OF HEADER":
-                out.end = k + 1
-                break
-        except (ValueError, IndexError):
-            raise RecordingError(
-                f"{path}, line {k + 1}: the header's '{label}' cannot be read", key="rinex.header"
-            ) from None
-        if k == 0 and not out.version:
-            break
-    if not out.version:
-        raise RecordingError(f"{path}: not a RINEX file; its first line says no version", key="file.kind")
-    if not out.end:
-        raise RecordingError(f"{path}: the header has no END OF HEADER; the file is cut off", key="rinex.cut")
-    if not 2.0 <= out.version < 5.0:
-        raise RecordingError(f"{path}: RINEX version {out.version:g}; 2.11, 3 and 4 are read", key="rinex.version")
-    if out.version < 3.0:
-        both = out.types.pop(-2, [])
-        out.types = dict.fromkeys(range(len(SYSTEMS)), both)
-    out.types.pop(-1, None)
-    if not any(out.types.values()):
-        raise RecordingError(f"{path}: the header names no types of observations", key="rinex.no_types")
-    if (most := max(map(len, out.types.values()))) > _MOST_TYPES:
-        raise RecordingError(
-            f"{path}: the header names {most} types of observations of a system, more than there are", key="rinex.types"
-        )
-    return out
 
 
 def _translate_name(name: str, system: int, version: float) -> str:

@@ -15,17 +15,19 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.standstill import PLACE
 from graphnav.core.rotation import Array
-from graphnav.core.state import Parameter
+from graphnav.core.state import BLOCKS, Parameter
+from graphnav.estimation.fixing import LOST_PLACE, LOST_SPEED, Epochs, Held, hold_on, split, with_integers
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.noise.model import INTERVALS, STATED, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.linearise import Step
+from graphnav.estimation.solvers.linearise import Points, Step
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.tree_window import TreeWindow
 from graphnav.estimation.solvers.watch import Verdicts, Watch
 from graphnav.estimation.solvers.window import Message, SettledStates, Window
+from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.online.looks import Stops
 from graphnav.online.sensors import Sensors
@@ -67,6 +69,9 @@ class Chain:
         self._standing = Stops()
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
+        self._held: list[Held] = []  # per stage, integers of ambiguities
+        self._head_held = Held()
+        self.epochs = self.fixed = 0  # with carriers, that have settled, and those of them that are fixed
         self._parameters: dict[str, Parameter] = {}
         self._turned = False  # whether something has moved so far that it may have to be linearised again
 
@@ -129,7 +134,19 @@ class Chain:
                 if not (weight == 1.0).all():
                     c = replace(c, weight=weight if c.weight is None else c.weight * weight)
             rows.append(c)
-        return replace(problem, constraints=tuple(rows))
+        return self._hold(replace(problem, constraints=tuple(rows)))
+
+    def _hold(self, problem: Problem) -> Problem:
+        """The problem with the integers that were decided on at its keyframes, and let go of."""
+        if not self.settings.raw_gnss.integers or split(problem)[1] is None:
+            return problem
+        begin, end = np.searchsorted(self.window.t, problem.t[[0, -1]] + [-SAME_TIME, SAME_TIME])
+        decided = {
+            float(self.window.stages[i].place.t): held
+            for i, held in enumerate(self._held[begin:end], begin)
+            if held.found or held.let_go
+        }
+        return _with_decisions(problem, decided) if decided else problem
 
     def _add(
         self, posed: Problem, first: int, ahead: Predicted | None = None, begin: int = 0, end: int | None = None
@@ -161,8 +178,37 @@ class Chain:
     def _push(self, problem: Problem, k: int, ahead: Predicted | None) -> float:
         place, nodes = self._place(problem, k)
         turn = self.window.push(place, ahead if ahead is not None and ahead.before is self.window.newest else None)
+        held = self._decide(problem, k)
+        if held.found or held.let_go:
+            self.window.truncate(len(self.window) - 1)
+            place = replace(place, problem=_with_decisions(problem, {place.t: held}))
+            if held.let_go:
+                place = replace(place, steps=(*place.steps, *self._begin_ambiguities(problem, place.steps)))
+            turn = max(turn, self.window.push(place))
         self._nodes.append(nodes)
+        self._held.append(held)
         return turn
+
+    def _decide(self, problem: Problem, k: int) -> Held:
+        """Integers that can be told behind keyframe `k` of a problem, the newest."""
+        held = (self._held[-1] if self._held else self._head_held).go_on()
+        phase, newest = split(problem)[1], self.window.newest
+        if phase is None or not self.settings.raw_gnss.integers or k not in phase.keyframe:
+            return held
+        if any(name not in newest.columns for name in phase.slots):
+            return held
+        here = Points(newest.state, newest.values[None])
+        return hold_on(held, Epochs(phase, newest.columns, problem.t), k, here, lambda: newest.covariance)
+
+    def _begin_ambiguities(self, problem: Problem, steps: tuple[Step, ...]) -> tuple[Step, ...]:
+        """Ambiguities, but those that begin anyway, begin anew about what they are thought to be."""
+        phase, newest, begun = split(problem)[1], self.window.newest, {step.name for step in steps}
+        assert phase is not None
+        return tuple(
+            Step(p.name, newest.value(p.name), p.sigma[0])
+            for p in phase.parameters
+            if p.name in phase.slots and p.name in newest.columns and p.name not in begun
+        )
 
     def _place(self, problem: Problem, k: int) -> tuple[Place, dict[str, float]]:
         """Keyframe `k` of a problem as the next one, and when each parameter's node began there."""
@@ -202,14 +248,16 @@ class Chain:
 
     def _keep(self, count: int) -> None:
         self.window.truncate(count)
-        del self._nodes[count:]
+        del self._nodes[count:], self._held[count:]
 
     def _leave(self, count: int) -> SettledStates:
         """Let the first keyframes settle."""
-        self._head_nodes = self._nodes[count - 1]
+        self.epochs += sum(held.epoch for held in self._held[:count])
+        self.fixed += sum(held.epoch and held.fixed for held in self._held[:count])
+        self._head_nodes, self._head_held = self._nodes[count - 1], self._held[count - 1].go_on()
         self.head, self.opened = float(self.window.t[count - 1]), True
         settled = self.window.settle(count)
-        del self._nodes[:count]
+        del self._nodes[:count], self._held[:count]
         return settled
 
     def _forget(self) -> None:
@@ -219,3 +267,25 @@ class Chain:
             if stages[k].place.problem is None:
                 break  # nor do those before it
             stages[k] = replace(stages[k], place=replace(stages[k].place, problem=None))
+
+
+def _with_decisions(problem: Problem, decided: dict[float, Held]) -> Problem:
+    """A problem with what was decided at some of its keyframes, by time."""
+    phase = split(problem)[1]
+    if phase is None:
+        return problem
+    rows, lost = [], np.zeros(len(problem.t), dtype=bool)
+    for k, t in enumerate(problem.t.tolist()):
+        held = decided.get(t)
+        if held is not None:
+            rows += [(k, a, b, n) for (a, _), (b, _), n in held.found]
+            lost[k] = held.let_go
+    problem = with_integers(problem, phase, rows)
+    if not lost[1:].any():
+        return problem
+    covariance = problem.intervals.covariance.copy()
+    for block, sigma in (("p", LOST_PLACE), ("v", LOST_SPEED)):
+        at = np.arange(15)[BLOCKS[block]]
+        covariance[np.ix_(lost[1:], at, at)] += sigma**2 * np.eye(3)
+    intervals = replace(problem.intervals, covariance=covariance)
+    return replace(problem, intervals=intervals, motion=ImuFactors(intervals, problem.frame))

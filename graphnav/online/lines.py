@@ -4,6 +4,7 @@ graphnav-online/1 {"platform": "vehicle", "imu": {"noise": {...}}, "gnss": {"lev
 I,t,gx,gy,gz,ax,ay,az
 G,t,lat,lon,h,sd_e,sd_n,sd_u[,ve,vn,vu,sd_ve,sd_vn,sd_vu]
 O,t,speed
+R,t,place and clock;satellite,signal,...;...   raw observations, an epoch a line (`graphnav.online.raw`)
 S,name,t,...                  another sensor (`graphnav.sensors`): its columns, in the units that are usual in files
 E
 """
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any, Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 from graphnav.core.complaints import complaint, nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_json, parse_number
+from graphnav.online.raw import RAW, LiveRaw, live_raw, text_of, values_of
 from graphnav.online.replay import rows_of
 from graphnav.online.sensors import Row
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
@@ -60,6 +62,7 @@ class _Setup(_Part):
     imu: _Imu = _Imu()
     gnss: _Gnss | None = None
     odometer: _Odometer | None = None
+    raw_gnss: LiveRaw | None = None
 
 
 def setup_of(line: str) -> Recording:
@@ -88,7 +91,8 @@ def setup_of(line: str) -> Recording:
     stated = found.imu.noise.model_dump(exclude_none=True)  # type: ignore[attr-defined]
     gnss = odometer = None
     if found.gnss is not None:
-        gnss = Gnss(_NONE, _ROWS, _ROWS, lever_arm=np.array(found.gnss.lever_arm))
+        derived = found.raw_gnss is not None  # fixes serve the start
+        gnss = Gnss(_NONE, _ROWS, _ROWS, lever_arm=np.array(found.gnss.lever_arm), derived=derived)
     if (o := found.odometer) is not None:
         odometer = Odometer(
             _NONE, _NONE, np.array(o.lever_arm), o.scale_sigma,
@@ -100,7 +104,8 @@ def setup_of(line: str) -> Recording:
         for name, sensor in known.items()
         if (figures := getattr(found, name)) is not None
     }
-    return Recording(found.name, found.platform, imu, gnss, odometer, sensors=sensors)
+    raw = None if found.raw_gnss is None else found.raw_gnss.setup()
+    return Recording(found.name, found.platform, imu, gnss, odometer, sensors=sensors, raw_gnss=raw)
 
 
 def row_of(line: str) -> Row | None:
@@ -117,6 +122,9 @@ def row_of(line: str) -> Row | None:
     kind, *cells = line.split(",")
     if kind == "S":
         return _series_row(cells)
+    if kind == "R":
+        t, _, text = line[2:].partition(",")
+        return RAW, parse_number(t), values_of(text)
     try:
         numbers = [parse_number(cell) if cell.strip() else float("nan") for cell in cells]
     except ValueError:
@@ -164,6 +172,8 @@ def head_of(recording: Recording) -> str:
             "lever_arm": o.lever_arm.tolist(), "scale_sigma": o.scale_sigma, "signed": o.signed,
             "speed_sigma": o.speed_sigma, "delay_sigma": o.delay_sigma,
         }  # fmt: skip
+    if recording.raw_gnss is not None:
+        setup["raw_gnss"] = live_raw(recording.raw_gnss)
     setup |= {name: series.figures.model_dump() for name, series in recording.sensors.items()}
     return f"{HEAD} {json.dumps(setup)}"
 
@@ -175,6 +185,8 @@ def line_of(row: Row) -> str:
         return f"I,{t!r}," + ",".join(map(repr, values))
     if sensor == "odometer":
         return f"O,{t!r},{values[0]!r}"
+    if sensor == RAW:
+        return f"R,{t!r},{text_of(values)}"
     if sensor != "gnss":
         columns = list_sensors()[sensor].columns
         numbers = [x / _usual(column) for x, column in zip(values, columns, strict=True)]
@@ -187,7 +199,7 @@ def line_of(row: Row) -> str:
 def lines_of(recording: Recording) -> Iterator[tuple[float, str]]:
     """A recording as a live source would send it: time and line, the first line and the end included."""
     yield recording.start, head_of(recording)
-    for row in rows_of(replace(recording, raw_gnss=None))[1]:  # of which there are no lines
+    for row in rows_of(recording)[1]:
         yield row[1], line_of(row)
     yield recording.end, END
 

@@ -100,6 +100,9 @@ class Sensors:
             return self._add_other(sensor, t, values, released)
         if sensor == RAW:
             return self._add_epoch(t, values, released)
+        if sensor != "imu" and getattr(self.setup, sensor) is None:
+            self.counts[f"{sensor}: not in the setup"] += 1
+            return False
         known = values[: 6 if sensor != "odometer" else 1]
         if not math.isfinite(sum(known)) or not abs(t) <= LATEST or (sensor == "gnss" and min(values[3:6]) <= 0.0):
             self.counts[f"{sensor}: not a number"] += 1
@@ -186,6 +189,7 @@ class Sensors:
             return False
         elif not self.raw.wanted(t):
             why = "closer than they are used"
+            self.raw.add(t, values, used=False)
         else:
             self.raw.add(t, values)
         self.counts[RAW if why is None else f"{RAW}: {why}"] += 1

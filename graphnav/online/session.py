@@ -121,7 +121,11 @@ class Session:
         """Counts of rows, and what was noted."""
         assert self.online is not None
         online = self.online
-        return {
+        more: dict[str, object] = {}
+        if online.tracker is not None and online.tracker.epochs:  # of the last piece
+            tracker = online.tracker
+            more["ambiguities"] = {"epochs": tracker.epochs, "fixed": tracker.fixed}
+        return more | {
             "source": "online",
             "settled": self.rows_settled,
             "rows": dict(online.sensors.counts),

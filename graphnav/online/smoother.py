@@ -29,7 +29,7 @@ from graphnav.estimation.solvers.window import first_message
 from graphnav.online.ahead import Live
 from graphnav.online.judging import CatchUp, Judgement
 from graphnav.online.looks import CONTEXT, SURE
-from graphnav.online.raw import settings_online
+from graphnav.online.raw import codes_alone, settings_online
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import Tracker
 from graphnav.online.walker import Walker
@@ -98,16 +98,17 @@ class Smoother:
         sensors = self.sensors
         before = sensors.imu.newest
         if sensor == "imu" and sensors.add_next(t, values, before):  # as all but a few do
-            if t >= self._awake:
-                self._look()
+            self._look_if_due(t)
             return
         previous = sensors.newest(sensor)
         if not sensors.add(sensor, t, values, released):
             return
-        if sensor == "imu":
-            newest = sensors.imu.newest
+        if sensor == "imu" and (newest := sensors.imu.newest) > before:
+            # a row before this one that was left out leaves no trace: what is done at which row stays the same
             if newest - before > self.settings.keyframes.bridge and len(sensors.imu) > 1 and np.isfinite(before):
                 self._restart(before, f"the IMU was silent from {before:.3f} to {newest:.3f} s")
+            self._look_if_due(newest)
+            return
         tracker = self.tracker
         if tracker is not None:
             self._awake = -np.inf
@@ -129,6 +130,10 @@ class Smoother:
             elif sensor == "odometer" and previous < tracker.newest - SAME_TIME:
                 self._dirty = min(self._dirty, previous + 2.0 * SAME_TIME)
         if sensors.imu.newest >= self._due:
+            self._look()
+
+    def _look_if_due(self, now: float) -> None:
+        if now >= self._awake:
             self._look()
 
     def _look(self) -> None:
@@ -208,7 +213,7 @@ class Smoother:
             self.frame = LocalFrame(origin(recording))
         frame = self.frame
         try:
-            found = align(recording, self.settings, frame, lambda problem, start: batch(
+            found = align(recording, codes_alone(self.settings), frame, lambda problem, start: batch(
                 problem, start, wanted=(0,), reintegrate=False), stationary)  # fmt: skip
         except EstimationError as error:
             if last:
@@ -267,7 +272,8 @@ class Smoother:
         until = tracker.newest + AFTER
         recording, every = (self.sensors.recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
         due = tracker.newest + min(_THINKING * self.settings.solver.lag, _LONGEST_THOUGHT)
-        self._judgement = Judgement(recording, every, self.settings, self.frame, found, times, self.sensors.unit(), due)
+        settings = codes_alone(self.settings)
+        self._judgement = Judgement(recording, every, settings, self.frame, found, times, self.sensors.unit(), due)
 
     def _use(self, judgement: Judgement, tracker: Tracker) -> None:
         """Begin to go through what has not settled with what the sensors were judged to be."""

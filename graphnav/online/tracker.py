@@ -283,7 +283,7 @@ class Tracker(Chain):
         other, head = copy.copy(self), self.window.head
         other.noise, other._parameters, other.verdicts = noise, {}, copy.deepcopy(self.verdicts)
         other.window = type(self.window)(head.moved(head.estimate), _turn(setup, noise))
-        other._nodes, other._motions, other.settled, other._ahead = [], {}, [], None
+        other._nodes, other._held, other._motions, other.settled, other._ahead = [], [], {}, [], None
         other._settling = False
         other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)
         other._readings.revised = False

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import refused
+from helpers import assert_told, refused
 
 from graphnav.core import earth
 from graphnav.core.errors import RecordingError
@@ -315,7 +315,7 @@ def test_fields_flags_and_blanks():
     assert obs.half.tolist() == [False, False, False, True]
     assert obs.doppler[[0, 2]].tolist() == [-1000.5, -1000.5]
     assert np.isnan(obs.doppler[1])
-    assert any("E D9C" in remark for remark in obs.remarks)  # a band that Galileo has not
+    assert_told(obs.remarks, "raw.unknown_signals", "E D9C")  # a band that Galileo has not
 
 
 def test_what_is_cut_or_twice_costs_only_itself():
@@ -366,19 +366,19 @@ def changed(tmp_path):
 
 
 def test_mistakes_in_the_table_are_told(changed, tmp_path):
-    for old, new, named in (
-        ('nav = "nav.gz"', "", "nav or sp3"),
-        ('nav = "nav.gz"', 'nav = "none.gz"', "none.gz"),
-        ('nav = "nav.gz"', 'nav = "base.obs.gz"', "base.obs.gz"),
-        ('nav = "nav.gz"', 'nav = "nav.gz"\nclk = "nav.gz"', "clk"),
-        ('clock = "2020-11-05T05:14:42Z"', "", "clock"),
-        ('clock = "2020-11-05T05:14:42Z"', 'clock = "2020-11-15T05:14:42Z"', "10.0 days"),
-        ('code = "pr_corrected_m"', 'codes = "pr_corrected_m"', "codes"),
-        ('stamps = "nominal"', 'stamps = "rough"', "stamps"),
+    for old, new, key, named in (
+        ('nav = "nav.gz"', "", "raw.no_ephemerides", "nav"),
+        ('nav = "nav.gz"', 'nav = "none.gz"', "file.unreadable", "none.gz"),
+        ('nav = "nav.gz"', 'nav = "base.obs.gz"', "file.kind", "base.obs.gz"),
+        ('nav = "nav.gz"', 'nav = "nav.gz"\nclk = "nav.gz"', "key.value", "clk"),
+        ('clock = "2020-11-05T05:14:42Z"', "", "clock.unknown", "clock"),
+        ('clock = "2020-11-05T05:14:42Z"', 'clock = "2020-11-15T05:14:42Z"', "raw.ephemeris_day", "10.0"),
+        ('code = "pr_corrected_m"', 'codes = "pr_corrected_m"', "key.value", "codes"),
+        ('stamps = "nominal"', 'stamps = "rough"', "key.value", "stamps"),
         ('nav = "nav.gz"', 'nav = "nav.gz"\nbase = "base.obs.gz"\nbase_position = [-3961905.0, 3348993.0, 3648211.0]',
-         "base_position"),
+         "raw.base_position", "base_position"),
     ):  # fmt: skip
-        with pytest.raises(RecordingError, match=named):
+        with refused(key, RecordingError, named):
             changed(old, new)
 
 

@@ -29,6 +29,7 @@ from graphnav.gnss.integers import decorrelate, find_nearest
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import L1, C
 from graphnav.recording.formats import read
+from graphnav.report.tables import satellite_tables
 
 STATED = settings_from({"noise": {"mode": "stated"}})
 WAVELENGTH = C / L1
@@ -318,7 +319,7 @@ def test_every_solver_is_fixed_and_right(drive):
 def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
     """One number of the first vector that the filter finds is wrong, and nothing is noticed for some epochs."""
     recording, truth = drive
-    found, noticed = [], fixing._Epochs.odd
+    found, noticed = [], fixing.Epochs.odd
 
     def wrong(a, decorrelated):
         found.append(find_nearest(a, decorrelated))
@@ -329,7 +330,7 @@ def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
     begin = recording.raw_gnss.t[0]
     until = begin + 13.0
     monkeypatch.setattr(
-        fixing._Epochs, "odd", lambda self, k, *rest: [] if self.time[k] < until else noticed(self, k, *rest)
+        fixing.Epochs, "odd", lambda self, k, *rest: [] if self.time[k] < until else noticed(self, k, *rest)
     )
     one = run(recording, STATED, ("ekf",))["ekf"]
     off, fixed = off_by(one, truth)
@@ -339,3 +340,18 @@ def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
     assert not fixed[t > until].all()
     assert fixed[-1]
     assert off[late & fixed].max() < 0.05
+
+
+def test_records_name_satellites_and_the_report_sums_them_up(drive):
+    recording, _ = drive
+    one = run(recording, STATED, ("rts",))["rts"]
+    record = one.records["gnss_phase"]
+    assert set(record.satellite) <= set(raw_drive.SATELLITES)
+    assert len(record.satellite) == len(record.elevation) == len(record.t)
+    assert record.elevation.min() > np.radians(9.9)
+    tables = satellite_tables(one)
+    for name in set(record.satellite):
+        own = (record.satellite == name) & (record.weight >= 0.5)
+        assert f"{np.sqrt(np.mean(record.nis[own])):.3g}"[:4] in tables[0]
+        assert name in tables[0]
+    assert not satellite_tables(replace(one, records={}))

@@ -66,6 +66,25 @@ def test_a_step_is_spread_over_rows_and_nothing_else_changes(
     same(joined([*parts, *online.settled()]), walked(walk, rows))
 
 
+def test_rows_that_are_left_out_leave_no_trace(walk: Recording, rows: list[Row]) -> None:
+    """Not even of which row does what: linearised again at others, a window whose heading is open ends elsewhere."""
+    spoilt: list[Row] = []
+    for k, row in enumerate(rows):
+        t = row[1]
+        spoilt.append(row)
+        if k % 7 == 3:
+            spoilt.append(row)
+        elif k % 50 == 20:
+            spoilt.append(("imu", t + 0.003, (0.0, 0.0, (1e6, 1e300, -80.0)[k // 50 % 3], 0.0, 0.0, 9.8)))
+        elif k % 50 == 45:
+            spoilt.append(("imu", t + 1e6, (0.0,) * 6))
+        elif k % 50 == 5:
+            spoilt.append(("odometer", t, ((1e300, 1.5)[k // 50 % 2], *(float("nan"),) * 5)))  # of none that it has
+    one, other = walked(walk, spoilt), walked(walk, rows)
+    for name in ("t", "llh", "v", "rph", "sd_p"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
 def test_what_is_over_is_not_searched_for_slides_and_the_rest_is_as_it_was(walk: Recording) -> None:
     spans = detect(walk).stationary
     since = walk.start + 10.0

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import numpy as np
 import oracle
 import pytest
 import raw_drive
+from test_raw_rtk import with_carriers
 
 from graphnav.config import Settings, settings_from
+from graphnav.constraints.raw_phase import WholeCycles
 from graphnav.core.notes import key_of
 from graphnav.core.trajectory import Trajectory
+from graphnav.estimation import fixing
 from graphnav.estimation.pipeline import run
+from graphnav.gnss.arcs import find_arcs
+from graphnav.gnss.integers import find_nearest
 from graphnav.online import Online, Row, rows_of, without_rows
+from graphnav.online.lines import head_of, line_of, row_of, setup_of
+from graphnav.online.raw import RawEpochs, epochs_of, without_epochs
 from graphnav.recording import Recording
 
 CODES = {"differences": False, "carrier": False}
@@ -126,3 +134,134 @@ def test_loose_coupling_uses_the_fixes(recording: Recording, rows: list[Row]) ->
     assert online.tracker is not None
     online.finish()
     assert not online.failures
+
+
+# ------------------------------------------------------------------------------------------- carriers against a base
+@pytest.fixture(scope="module")
+def rtk() -> Recording:
+    path = oracle.vehicle_path(130.0, 50.0)
+    made, _ = oracle.drive(path, seed=3, gnss_velocity_sd=(0.1, 0.1, 0.1))
+    made = raw_drive.with_observations(made, path, noise=0.3, seed=2).crop(0.0, 50.0)
+    return with_carriers(made, path, 0.003)[0]
+
+
+def test_arcs_are_those_of_the_series_however_its_epochs_come(rtk: Recording) -> None:
+    """Flags, gaps, open half cycles, slips that no flag tells, arcs of the base, and epochs that are not used."""
+    raw, rng = rtk.raw_gnss, np.random.default_rng(4)
+    raw = replace(raw, lock=np.full(len(raw), np.nan))
+    n = len(raw)
+    raw.slip[rng.integers(0, n, 20)] = True
+    raw.half[(raw.satellite == raw.satellite[0]) & (raw.t > 20.0) & (raw.t < 30.0)] = True
+    raw.base_arc[(raw.satellite == raw.satellite[1]) & (raw.t > 40.0)] += 1
+    raw.carrier[(raw.satellite == raw.satellite[2]) & (raw.t > 25.0)] += 3.0
+    raw = raw.take(rng.random(n) > 0.03)
+    raw = raw.take(np.abs(raw.t - 15.0) > 2.5)
+    whole = find_arcs(raw, base_arc=raw.base_arc)
+    assert whole.slips >= 1
+    assert sum(map(len, whole.begins)) > 3 * len(whole.names)
+    settings = settings_from({"raw_gnss": {"period": 3.0}}).raw_gnss
+    epochs = epochs_of(raw)
+    shuffled = [epochs[k] for k in np.argsort(np.arange(len(epochs)) + rng.normal(0.0, 1.0, len(epochs)))]
+    for order in (epochs, shuffled):
+        buffer = RawEpochs(without_epochs(raw), settings)
+        for t, values in order:
+            buffer.add(t, values, used=buffer.wanted(t))
+        assert len(buffer) < 0.6 * len(epochs)
+        part = buffer.between(-np.inf, np.inf)
+        own = np.isin(raw.t, part.t)
+        np.testing.assert_array_equal(part.arc_begin, whole.begin[own])
+
+
+@pytest.mark.parametrize("engine", ["window", "isam2"])
+def test_integers_online_are_those_of_the_recording(rtk: Recording, engine: str) -> None:
+    online, track = played(without_rows(rtk), rows_of(rtk)[1], settings_from(LONG), engine)
+    tracker = online.tracker
+    assert tracker is not None
+    offline = run(rtk, settings_from({"noise": {"mode": "stated"}}), ("ekf", "rts"))
+    whole, filtered = offline["rts"], offline["ekf"].fixed
+    assert (tracker.epochs, tracker.fixed) == (len(filtered), np.sum(filtered[:, 1]))
+    at = np.argmin(np.abs(whole.t - track.t[:, None]), axis=1)
+    same = np.abs(whole.t[at] - track.t) < 1e-6
+    assert same.sum() > 40
+    apart = whole.frame.from_llh(track.llh[same]) - whole.states.p[at[same]]
+    assert np.abs(apart).max() < 2e-3  # m, as between the solvers of a recording
+    sigma = np.sqrt(np.diagonal(whole.covariance[at[same], 3:6, 3:6], axis1=1, axis2=2))
+    share = track.sd_p[same] / sigma  # a smoother fixes arcs that had ended before a filter could
+    assert np.median(share) == pytest.approx(1.0, abs=0.01)
+    assert share.min() > 0.99
+
+
+def test_integers_are_rows_and_go_on_from_a_checkpoint_and_from_lines(rtk: Recording) -> None:
+    how = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
+    rows = rows_of(rtk)[1]
+    _, plain = played(without_rows(rtk), rows, how)
+    online, parts, seen = Online(setup_of(head_of(rtk)), how), [], 0
+    for k, row in enumerate(rows):
+        online.add(row_of(line_of(row)) if row[0] != "gnss" else row)  # degrees round
+        parts += online.settled()
+        if k % 100 == 99 and online.tracker is not None:
+            online = pickle.loads(pickle.dumps(online))
+            stages, held = online.tracker.window.stages, online.tracker._held
+            counts = [sum(len(m.b) for m in stage.measured if m.name == WholeCycles.name) for stage in stages]
+            assert counts == [len(one.found) for one in held]
+            assert held[-1].fixed
+            seen += 1
+    online.finish()
+    parts += online.settled()
+    assert seen
+    np.testing.assert_array_equal(np.concatenate([part.llh for part in parts]), plain.llh)
+
+
+def test_wrong_integers_are_let_go_of(rtk: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every other number of the first vector that is found is wrong, and nothing is noticed for some epochs."""
+    found, noticed, until = [], fixing.Epochs.odd, 25.0
+
+    def wrong(a, decorrelated):
+        found.append(find_nearest(a, decorrelated))
+        spoiled = (np.arange(len(a)) % 2 == 0) & (len(found) == 1)
+        return replace(found[-1], best=found[-1].best + spoiled)
+
+    monkeypatch.setattr(fixing, "find_nearest", wrong)
+    monkeypatch.setattr(
+        fixing.Epochs, "odd", lambda self, k, *rest: [] if self.time[k] < until else noticed(self, k, *rest)
+    )
+    how = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 5.0}})
+    online, track = played(without_rows(rtk), rows_of(rtk)[1], how, "isam2")
+    tracker, truth = online.tracker, rtk.truth
+    assert tracker is not None
+    at = np.array([np.argmin(np.abs(truth.t - t)) for t in track.t])
+    h = np.hypot(*((track.llh - truth.llh[at])[:, :2] * 6.37e6 * [1.0, np.cos(truth.llh[0, 0])]).T)
+    assert h[(track.t > 15.0) & (track.t < until - 1.0)].max() > 0.05
+    assert h[track.t > until + 10.0].max() < 0.05
+    assert tracker._head_held.fixed
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda line: line.replace(",1C,", ",1,", 1),
+        lambda line: line.replace(";", ",", 1),
+        lambda line: line.replace("G0", "Q0", 1),
+        lambda line: line[: len(line) // 2],
+        lambda line: line.replace(".", "x", 1),
+        lambda line: "R,",
+    ],
+)
+def test_lines_that_are_no_epochs_are_told(rtk: Recording, spoil: Callable[[str], str]) -> None:
+    line = line_of(("raw_gnss", *epochs_of(rtk.raw_gnss)[0]))
+    with pytest.raises(ValueError, match=r"\w"):
+        row_of(spoil(line))
+
+
+def test_a_satellite_that_cannot_be_costs_only_itself(rtk: Recording) -> None:
+    t, values = epochs_of(rtk.raw_gnss)[0]
+    rows, setup = np.reshape(values, (-1, 26)), without_epochs(rtk.raw_gnss)
+    for column, value in ((2, 1e300), (9, np.nan), (9, 1e300), (4, -1e9), (8, 0.0), (12, 1e9), (3, np.inf)):
+        spoilt = rows.copy()
+        spoilt[1, column] = value
+        buffer = RawEpochs(setup, settings_from({}).raw_gnss)
+        assert buffer.odds(tuple(spoilt.ravel())) is None
+        buffer.add(t, tuple(spoilt.ravel()))
+        left = buffer.between(t, t)
+        np.testing.assert_array_equal(left.satellite, np.delete(rows[:, 0], 1).astype(int))
+        assert np.isfinite(left.antenna).all()
