@@ -29,22 +29,14 @@ Table = dict[str, Array]  # the columns of a CSV file by name
 HEAD = """\
 # What can go wrong
 
-Common mistakes, made by the tests on `data/tokyo`, and the end of what graphnav says of each. Run `graphnav info` first
+Mistakes that the tests make on `data/tokyo`, and the [key](keys.md) of what graphnav finds. Run `graphnav info` first
 and read from the top: the first finding may be the cause of the others.
 
-| severity of a finding | means |
-| --- | --- |
-| note | nothing changes |
-| warning | the result suffers |
-| untrusted | the result may be wrong whatever its sigmas say |
-| refused | nothing is solved |
-
-Findings have a [key](keys.md) that stays the same whatever their words. Lines without one are errors, exit code 2,
-which begin with file, line and column.
+A note changes nothing; with a warning the result suffers; an untrusted one may be wrong whatever its sigmas say; what
+is refused is not solved. An error is exit code 2 and a line that names file, line and column, and what to do.
+`graphnav init` makes CSV files of tables with other separators, decimal commas, lines of units, dates and times of day.
 """
-_WHOLE = 10  # words of a line that is shown whole
-_PLACE = re.compile(r"^(?:(?:drive|settings)\S*|'tokyo'|--?\w+ \S+)(?:, line \d+)?(?:, column '\w+')?: ")
-_ASIDE = re.compile(r" \((?:[^()]|\([^()]*\))*\)")
+_AND = "; "
 
 
 @dataclass(frozen=True)
@@ -178,24 +170,22 @@ def said(mistake: Mistake, lines: list[str]) -> list[str]:
     return [line for line in lines if all(want in line for want in mistake.wants)]
 
 
-def row(mistake: Mistake, lines: list[str]) -> str:
-    """The mistake's line of the page."""
+def finding(mistake: Mistake, lines: list[str]) -> str:
+    """Severity and key of what is said, as the page has it."""
     (line, *_) = said(mistake, lines) or lines or [""]
-    severity, key = line.split(": ")[0], key_of(line)
-    if key and severity == "note":
-        return f"| {mistake.what} | {severity} `{key}` |"
-    text = line.removeprefix(f"{severity}: ") if key else _PLACE.sub("", line.removeprefix("graphnav: "))
-    if len(text.split()) > _WHOLE:
-        text = re.split("[;:] ", _ASIDE.sub("", text))[-1]
-    if len(words := text.split()) > _WHOLE + 2:
-        text = " ".join(["...", *words[-_WHOLE:]])
-    text = text.replace("|", "\\|").replace("<", "&lt;")
-    return f"| {mistake.what} | {severity} `{key}`: {text} |" if key else f"| {mistake.what} | {text} |"
+    return f"{line.split(': ')[0]} `{key}`" if (key := key_of(line)) else "error"
 
 
-def page(rows: dict[str, list[str]]) -> str:
-    """docs/mistakes.md."""
+def page(rows: dict[str, dict[str, list[str]]]) -> str:
+    """docs/mistakes.md, of the mistakes by section and finding."""
     text = HEAD
     for head, some in rows.items():
-        text += "\n".join([f"\n## {head}\n", "| what was done | what graphnav says |", "| --- | --- |", *some]) + "\n"
+        lines = [f"- {found}: {_AND.join(every)}" for found, every in some.items()]
+        text += "\n".join([f"\n## {head}\n", *lines]) + "\n"
     return text
+
+
+def listed(text: str) -> dict[str, str]:
+    """The finding of each mistake on the page."""
+    rows = re.findall(r"^- (error|\w+ `[\w.]+`): (.*)$", text.removeprefix(HEAD), re.MULTILINE)
+    return {what: found for found, every in rows for what in every.split(_AND)}

@@ -16,10 +16,10 @@ from mistakes import (
     Table,
     both,
     change,
+    finding,
     made,
     nothing,
     page,
-    row,
     scaled,
     settings,
     swapped,
@@ -235,7 +235,7 @@ MISTAKES: dict[str, list[Mistake]] = {
             "the IMU in local time, nine hours ahead", _later("imu", 32400.0), ("GNSS", "do not overlap", "local time")
         ),
         Mistake(
-            "the same, and smoothed all the same",
+            "the IMU in local time, smoothed all the same",
             _later("imu", 32400.0),
             ("GNSS", "do not overlap", "local time"),
             SMOOTH,
@@ -384,12 +384,12 @@ MISTAKES: dict[str, list[Mistake]] = {
             error=True,
         ),
         Mistake(
-            "the same where both are below 90 deg",
+            "the two exchanged where both are below 90 deg",
             change("gnss", _exchanged),
             ("refused", "latitude and longitude are exchanged"),
         ),
         Mistake(
-            "the same without velocities",
+            "the two exchanged, without velocities",
             both(change("gnss", _exchanged), toml(', ve = "ve_mps", vn = "vn_mps", vu = "vu_mps"', "")),
             ("refused", "latitude and longitude are exchanged"),
         ),
@@ -404,7 +404,7 @@ MISTAKES: dict[str, list[Mistake]] = {
             ("refused", "the latitudes have the wrong sign"),
         ),
         Mistake(
-            "either lost, without velocities",
+            "a sign lost, without velocities",
             both(scaled("gnss", "lat_deg", -1.0), toml(', ve = "ve_mps", vn = "vn_mps", vu = "vu_mps"', "")),
             ("refused", "latitudes or longitudes have the wrong sign"),
         ),
@@ -606,8 +606,8 @@ MISTAKES: dict[str, list[Mistake]] = {
 if __name__ == "__main__":
     rows = {}
     for head, some in MISTAKES.items():
-        rows[head] = []
+        rows[head] = {}
         for one in some:
             with tempfile.TemporaryDirectory() as scratch:
-                rows[head].append(row(one, made(one, Path(scratch))[1]))
+                rows[head].setdefault(finding(one, made(one, Path(scratch))[1]), []).append(one.what)
     (ROOT / "docs" / "mistakes.md").write_text(page(rows), encoding="utf-8")

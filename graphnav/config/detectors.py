@@ -95,7 +95,7 @@ class DetectorSettings(Section):
 
     @field_validator("fire")
     @classmethod
-    def _fused_alone(cls, fire: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_fused_is_alone(cls, fire: tuple[str, ...]) -> tuple[str, ...]:
         if FUSED in fire and len(fire) > 1:
             raise ValueError("'fused' is all detectors together: name it alone, or name detectors")
         return tuple(dict.fromkeys(fire))

@@ -121,7 +121,7 @@ class Settings(Section):
 
     @field_validator("sensors")
     @classmethod
-    def _known_sensors(cls, sensors: dict[str, SensorSettings]) -> dict[str, SensorSettings]:
+    def _check_sensors(cls, sensors: dict[str, SensorSettings]) -> dict[str, SensorSettings]:
         for name in sensors:
             if name not in list_sensors():
                 raise ValueError(f"no sensor '{name}' is known; {nearest(name, tuple(list_sensors()))}")

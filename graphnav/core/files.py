@@ -10,6 +10,7 @@ What a file names in its turn is read only from its own folder and those in it, 
 from __future__ import annotations
 
 import gzip
+import hashlib
 import io
 import json
 import math
@@ -291,3 +292,9 @@ class _Bounded(io.RawIOBase):
             self._source.close()
             self._plain.close()
         super().close()
+
+
+def sha256(path: Path) -> str:
+    """Of a file, in hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -114,7 +114,7 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
     if not len(spans):
         return NONE, certain, ()
     certain = _certain_motion(b, spans, speeds, certain)
-    known = np.array([_known_speed(speeds, span) for span in spans])
+    known = np.array([_find_speed(speeds, span) for span in spans])
     moves = np.array([_leads_to_speed(b, span, speeds, scene.settings.fusion) for span in spans]) & np.isnan(known)
     rest = np.flatnonzero(~moves)  # one that moves may brake steadily: the force over it counts, not its mean
     moves[rest] = moving_by_chain([link(b, *pair) for pair in pairwise(spans[rest])], known[rest])
@@ -216,7 +216,7 @@ def _count(n: int) -> str:
     return "1 stretch is" if n == 1 else f"{n} stretches are"
 
 
-def _known_speed(speeds: list[Speeds], span: Array) -> float:
+def _find_speed(speeds: list[Speeds], span: Array) -> float:
     """Speed in a span in which nothing changes, by the sensor that sees most; NaN if none looked."""
     found = [s.over(span) for s in speeds]
     return float(np.nanmax(found)) if not np.isnan(found).all() else float("nan")

@@ -91,11 +91,7 @@ class ImuFactors:
         coast[:, :3, 3:] = h * (_I3 + h * h / 6.0 * gradient)
         coast[:, 3:, :3] = W
         coast[:, 3:, 3:] = _I3 + 0.5 * h * h * gradient
-        self.coast = self.post @ coast
-        # and what gravity at the start changes with its position
-        coast[:, :3, :3] += 0.5 * h * h * (gradient + self.W2)
-        coast[:, 3:, :3] += h * (gradient + self.W2)
-        self.inner = self.post @ coast
+        self._coast, self.coast = coast, self.post @ coast
         self.pushed = self.post @ np.concatenate([gamma2 * h * h, gamma1 * h], axis=1)  # by G: iint E, int E
         # d(theta, dP, dV) / d(ba, bg), (n, 9, 6)
         self.bias = np.zeros((n, 9, 6))
@@ -107,8 +103,17 @@ class ImuFactors:
 
     def prepare(self) -> ImuFactors:
         """The same, with all that is made when it is asked for first made already."""
-        _ = self.whitener
+        _ = self.whitener, self.inner
         return self
+
+    @cached_property
+    def inner(self) -> Array:
+        """(n, 6, 6) `coast`, and what gravity at the start changes with its position."""
+        h, by_place = self.intervals.T[:, None, None], self.frame.gravity_gradient + self.W2
+        coast = self._coast.copy()
+        coast[:, :3, :3] += 0.5 * h * h * by_place
+        coast[:, 3:, :3] += h * by_place
+        return np.asarray(self.post @ coast)
 
     @cached_property
     def whitener(self) -> Array:

@@ -45,6 +45,11 @@ class Imu:
     R_bs: Array = field(default_factory=lambda: np.eye(3))  # body (RFU) from the file's axes
     noise_assumed: bool = False  # True when the recording states no noise figures
 
+    @property
+    def period(self) -> float:
+        """Usual time between rows at the beginning, s."""
+        return float(np.median(np.diff(self.t[:1000])))
+
 
 # Types of fixes by RTKLIB's quality numbers (SOLQ_FIX to SOLQ_PPP of rtklib.h); 0 where a fix says nothing
 FIX_TYPES = {0: "unknown", 1: "fixed", 2: "float", 3: "sbas", 4: "differential", 5: "single", 6: "ppp"}
@@ -157,8 +162,7 @@ class Recording:
     @cached_property
     def start(self) -> float:
         """Start of the first IMU period: where the recording's own clock reads 0, s."""
-        t = self.imu.t
-        return float(t[0] - np.median(np.diff(t[:1000])))
+        return float(self.imu.t[0] - self.imu.period)
 
     @property
     def end(self) -> float:

@@ -80,7 +80,7 @@ class SensorTable(TomlTable):
 
     @field_validator("columns")
     @classmethod
-    def _known_columns(cls, columns: dict[str, str]) -> dict[str, str]:
+    def _check_columns(cls, columns: dict[str, str]) -> dict[str, str]:
         known = (*cls.required, *cls.optional)
         for name in columns:
             if name not in known:

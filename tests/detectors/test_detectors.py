@@ -6,10 +6,12 @@ import csv
 import functools
 import gzip
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers import refuse_command
 from road import MG, made, with_gnss
 
 from graphnav.app import cli
@@ -341,7 +343,7 @@ def test_nothing_makes_it_fail(rate, rows, what):
     found = detect(recording)
     if recording.duration < 3.0:
         assert len(found.stationary) == 0
-        assert "shorter than" in found.notes[0]
+        assert key_of(found.notes[0]) == "detectors.too_short"
     for d in found.all:
         assert len(d.t) == len(d.statistic) == len(d.mask)
         assert d.intervals.shape == (len(d.intervals), 2)
@@ -406,8 +408,8 @@ def test_the_command_writes_what_it_promises(tmp_path, capsys):
     write_folder(recording, tmp_path / "drive", ["made"])
     assert cli.run(["detect", str(tmp_path / "drive"), "-o", str(out), "--end", "75"]) == 0
     said = capsys.readouterr().out
-    assert "idle line at 12.5" in said
-    assert "2 stops" in said
+    assert re.search(r"\b12\.5", said)  # Hz, the idle line
+    assert re.search(r"\b2 ", said)
     with (out / "detections.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["start", "end", "detector", "fired", "rows"]
@@ -425,32 +427,29 @@ def test_the_command_writes_what_it_promises(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "reason"),
+    ("arguments", "key", "name"),
     [
-        (["detect", "nowhere", "-o", "out"], "nowhere"),
-        (["detect", "kitti", "-o", "out", "--start", "9000"], "--start 9000: lies outside"),
-        (["detect", "kitti", "-o", "out", "--start", "50", "--end", "40"], "--end 40"),
-        (["detect", "kitti", "-o", "out", "--without", "odometer"], "has none"),
-        (["detect", "kitti"], "-o"),
-        (["detect", "kitti", "-o", "out", "--detectors", "fft,sway"], "no detector 'sway'"),
-        (["detect", "kitti", "-o", "out", "--detectors", "fft,fused"], "name it alone"),
-        (["smooth", "kitti", "-o", "out", "--detectors", ""], "names no detector"),
+        (["detect", "nowhere", "-o", "out"], "file.missing", "nowhere"),
+        (["detect", "kitti", "-o", "out", "--start", "9000"], "option.span_outside", "--start 9000"),
+        (["detect", "kitti", "-o", "out", "--start", "50", "--end", "40"], "option.value", "--end 40"),
+        (["detect", "kitti", "-o", "out", "--without", "odometer"], "withhold.none", "'odometer'"),
+        (["detect", "kitti"], "", "-o"),
+        (["detect", "kitti", "-o", "out", "--detectors", "fft,sway"], "option.unknown_name", "'sway'"),
+        (["detect", "kitti", "-o", "out", "--detectors", "fft,fused"], "detectors.fused_alone", "fft,fused"),
+        (["smooth", "kitti", "-o", "out", "--detectors", ""], "option.no_name", "--detectors"),
     ],
 )
-def test_bad_input_is_one_line(arguments, reason, tmp_path, monkeypatch, capsys):
+def test_bad_input_is_one_line(arguments, key, name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert cli.run(arguments) == 2
-    error = capsys.readouterr().err
-    assert reason in error
-    assert error.count("\n") == 1
+    assert name in refuse_command(capsys, key, *arguments)
     assert not (tmp_path / "out").exists()
 
 
 def test_an_unknown_setting_is_named(tmp_path, capsys):
     config = tmp_path / "settings.toml"
     config.write_text("[detectors.fft]\nwindows = 3.0\n")
-    assert cli.run(["detect", "kitti", "-o", str(tmp_path / "out"), "--config", str(config)]) == 2
-    assert "did you mean 'window'" in capsys.readouterr().err
+    out = tmp_path / "out"
+    assert "'window'" in refuse_command(capsys, "key.unknown", "detect", "kitti", "-o", out, "--config", config)
 
 
 # ---- while the drive happens

@@ -32,8 +32,8 @@ def test_the_error_of_a_lag_is_as_large_as_stated(misfit_lasts: float) -> None:
         x = lasting(rng, len(moved), 16.0)
         y = np.interp(t + late, moved, x) + 0.7 * lasting(rng, n, misfit_lasts)
 
-        def x_at(rows: np.ndarray, lag: float, moved: np.ndarray = moved, x: np.ndarray = x) -> np.ndarray:
-            return np.interp(t[rows] + lag, moved, x)[:, None]
+        def x_at(rows: np.ndarray, lag: lags.Lags, moved: np.ndarray = moved, x: np.ndarray = x) -> np.ndarray:
+            return np.interp(np.add.outer(lag, t[rows]), moved, x)[..., None]
 
         lag, spread = lags.refine_lag(t, y, x_at, lambda lag: np.ones(n, dtype=bool), np.arange(n), 0.0, 20)
         off.append(lag - late)
@@ -47,8 +47,8 @@ def test_nothing_is_known_of_a_lag_where_nothing_changes() -> None:
     t = 0.2 * np.arange(300)
     y = np.random.default_rng(1).normal(size=300)
 
-    def x_at(rows: np.ndarray, lag: float) -> np.ndarray:
-        return (t[rows, None] + lag) * 1e-3
+    def x_at(rows: np.ndarray, lag: lags.Lags) -> np.ndarray:
+        return np.add.outer(lag, t[rows])[..., None] * 1e-3
 
     _, sigma = lags.refine_lag(t, y, x_at, lambda lag: np.ones(300, dtype=bool), np.arange(300), 0.0, 20)
     assert sigma > 1.0

@@ -12,7 +12,7 @@ import numpy as np
 import pymap3d
 import pynmeagps
 import pytest
-from helpers import refused
+from helpers import refuse_command, refused
 from test_exporters import DEG, made
 
 from graphnav.app import cli, convert
@@ -175,12 +175,9 @@ def test_convert_writes_a_trajectory_for_other_programs(run, tmp_path, capsys) -
     source = str(run / "trajectory.csv")
     track = read_trajectory(source)
     assert cli.run(["convert", source, "-o", str(tmp_path / "a.gpx"), "--point", "antenna"]) == 0
-    assert "is not known" in capsys.readouterr().out
     assert len(gpxpy.parse((tmp_path / "a.gpx").read_text()).tracks[0].segments[0].points) == len(track)
-    assert (
-        cli.run(["convert", source, "-o", str(tmp_path / "out"), "--export", "nav,tum,kml", "--rate", "10"]) == 0
-        or True
-    )
+    assert cli.run(["convert", source, "-o", str(tmp_path / "out"), "--export", "nav,tum,kml", "--rate", "10"]) == 0
+    assert {p.name for p in (tmp_path / "out").iterdir()} >= {f"trajectory.{kind}" for kind in ("nav", "tum", "kml")}
     assert (
         cli.run(["convert", source, "-o", str(tmp_path / "out"), "--format", "nmea", "--clock", "gps week 2200"]) == 0
     )
@@ -188,28 +185,25 @@ def test_convert_writes_a_trajectory_for_other_programs(run, tmp_path, capsys) -
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    ("arguments", "key", "name"),
     [
-        (["--format", "gpz", "-o", "OUT"], "--format gpz: no such format; did you mean 'gpx'?"),
-        (["-o", "OUT.gpx", "--export", "nav"], "--export nav: but OUT.gpx is to be written"),
-        (["-o", "OUT.gpx", "--point", "roof"], "--point roof: write imu, antenna, or x,y,z"),
-        (["-o", "OUT.gpx", "--rate", "0"], "--rate 0: must be above 0"),
-        (["-o", "OUT.gpx", "--clock", "noon"], "--clock noon: must be"),
-        (["-o", "OUT.nmea"], "NMEA needs the time of day"),
+        (["--format", "gpz", "-o", "OUT"], "log.format_unknown", "'gpx'"),
+        (["-o", "OUT.gpx", "--export", "nav"], "option.not_here", "--export nav"),
+        (["-o", "OUT.gpx", "--point", "roof"], "option.point", "--point roof"),
+        (["-o", "OUT.gpx", "--rate", "0"], "option.value", "--rate 0"),
+        (["-o", "OUT.gpx", "--clock", "noon"], "option.clock", "--clock noon"),
+        (["-o", "OUT.nmea"], "export.time_of_day", "NMEA"),
     ],
 )
-def test_bad_exports_are_one_line_and_exit_code_2(run, tmp_path, capsys, arguments, sentence, monkeypatch) -> None:
+def test_bad_exports_are_one_line_and_exit_code_2(run, tmp_path, capsys, arguments, key, name, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert cli.run(["convert", str(run / "trajectory.csv"), *arguments]) == 2
-    error = capsys.readouterr().err
-    assert sentence in error
-    assert error.count("\n") == 1
+    assert name in refuse_command(capsys, key, "convert", run / "trajectory.csv", *arguments)
 
 
 def test_a_csv_trajectory_without_a_summary_has_no_antenna(tmp_path, capsys) -> None:
     write_as("csv", made(), tmp_path / "a.csv")
-    assert cli.run(["convert", str(tmp_path / "a.csv"), "-o", str(tmp_path / "a.gpx"), "--point", "antenna"]) == 2
-    assert "no summary.json beside a.csv" in capsys.readouterr().err
+    asked = ["convert", tmp_path / "a.csv", "-o", tmp_path / "a.gpx", "--point", "antenna"]
+    assert "a.csv" in refuse_command(capsys, "option.point", *asked)
 
 
 @pytest.mark.parametrize("name", ["csv", "tum", "kml", "gpx", "nav", "nmea"])

@@ -8,7 +8,7 @@ from dataclasses import replace
 import logs
 import numpy as np
 import pytest
-from helpers import refused, same_recording
+from helpers import assert_told, refused, same_recording
 
 from graphnav.app import convert
 from graphnav.core.errors import ConfigError, RecordingError
@@ -72,7 +72,7 @@ def test_kf_gins_increments_become_rates_with_its_noise_lever_arm_and_truth(kf_g
     assert found.truth.rph == pytest.approx(TRUTH.rph, abs=1e-9)
     assert found.truth.v == pytest.approx(TRUTH.v, abs=1e-9)
     assert found.gps_zero == logs.WEEK * 604800.0  # the truth's first column
-    assert any("starttime" in remark for remark in found.remarks)
+    assert_told(found.remarks, "log.span_not_used", "starttime")
 
 
 def test_kf_gins_folder_finds_its_configuration_and_binary_rows_are_the_same(kf_gins):
@@ -90,7 +90,7 @@ def test_kf_gins_files_without_a_configuration(kf_gins):
     found = read(kf_gins)
     assert found.imu.noise_assumed
     assert not found.gnss.lever_arm.any()
-    assert any("lever arm" in remark for remark in found.remarks)
+    assert_told(found.remarks, "log.no_configuration")
     alone = load(kf_gins / "gnss.txt")
     assert alone.imu is None
     with refused("log.no_imu", RecordingError, "gnss.txt", "graphnav init"):
@@ -108,7 +108,7 @@ def test_ob_gins_names_its_keys_otherwise_and_has_a_wheel(tmp_path):
     assert found.odometer.speed == pytest.approx(RECORDING.odometer.speed, abs=1e-9)
     assert found.odometer.lever_arm == pytest.approx([-0.628, -0.64, -2.122])
     assert found.imu.noise.gyro_noise_density == pytest.approx(2.90888e-5, rel=1e-5)
-    assert any("bodyangle" in remark for remark in found.remarks)
+    assert_told(found.remarks, "log.body_angle_not_used", "bodyangle")
 
 
 def test_kf_gins_increments_after_a_gap_are_those_of_one_period(kf_gins):
@@ -116,7 +116,7 @@ def test_kf_gins_increments_after_a_gap_are_those_of_one_period(kf_gins):
     (kf_gins / "imu.txt").write_text("\n".join(lines[:100] + lines[150:]) + "\n")
     found = read(kf_gins)
     assert found.imu.accel[100] == pytest.approx(RECORDING.imu.accel[150], abs=1e-7)
-    assert any("1 gaps" in remark for remark in found.remarks)
+    assert_told(found.remarks, "imu.increments_after_gap", "1")
 
 
 @pytest.mark.parametrize(
@@ -214,13 +214,13 @@ def test_nmea_without_gst_or_date_says_what_is_assumed(tmp_path):
     path = logs.write_nmea(tmp_path / "a.nmea", RECORDING, gst=False)
     log = load(path)
     assert log.gnss.sd[:, 0] == pytest.approx(0.02 * 0.8)  # fixed, HDOP 0.8
-    assert any("have no GST" in remark for remark in log.remarks)
+    assert_told(log.remarks, "gnss.sigma_of_hdop")
     path.write_text("".join(line for line in path.read_text().splitlines(True) if "RMC" not in line))
     log = load(path)
     assert log.gps_zero is None
     assert log.gnss.v is None
     assert log.gnss.t == pytest.approx(86382.0 + RECORDING.gnss.t, abs=1e-6)
-    assert any("no RMC or ZDA" in remark for remark in log.remarks)
+    assert_told(log.remarks, "log.clock_unknown")
 
 
 def test_broken_nmea_lines_are_skipped_and_named(tmp_path):
@@ -231,7 +231,7 @@ def test_broken_nmea_lines_are_skipped_and_named(tmp_path):
     path.write_text("".join(lines))
     log = load(path)
     assert len(log.gnss.t) == len(RECORDING.gnss.t) - 1
-    assert any("line 2: not a sound sentence" in remark for remark in log.remarks)
+    assert_told(log.remarks, "log.broken_lines", "line 2")
     path.write_text("".join(line.replace("*", "*0") for line in lines))
     with refused("log.no_positions", RecordingError, "a.nmea, line 1", "GGA"):
         load(path)

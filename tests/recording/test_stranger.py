@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import logs
 import numpy as np
 import pytest
 import stranger
+from helpers import refuse_command
 from test_formats_binary import write_bag, write_ubx
 
 from graphnav.app import cli
@@ -137,8 +139,8 @@ def test_words_with_dates_do_not_stop_a_draft_and_what_is_no_table_is_named(toky
     (folder / "notes.csv").write_text("time,text\n2025-07-08T16:00:00Z,a turn\n2025-07-08T16:00:09Z,left, then right\n")
     run("init", folder, "-o", folder, "--quiet")
     (folder / "imu.csv").write_bytes((folder / "imu.csv").read_text("utf-8").encode("utf-16"))
-    assert cli.run(["init", str(folder), "-o", str(folder), "--force", "--quiet"]) == 2
-    assert "imu.csv: is UTF-16" in capsys.readouterr().err
+    said = refuse_command(capsys, "draft.no_imu", "init", folder, "-o", folder, "--force", "--quiet")
+    assert "imu.csv" in said
 
 
 def test_a_table_of_numbers_is_left_as_it_is(tmp_path):
@@ -164,8 +166,7 @@ def test_a_bag_with_two_imus(tokyo, tmp_path, capsys):
     noise = read(tmp_path / "converted").imu.noise
     for stated, x in ((noise.gyro_noise_density, by_flag.imu.gyro), (noise.accel_noise_density, by_flag.imu.accel)):
         assert stated == pytest.approx(noise_density(by_flag.imu.t, x), rel=0.05)
-    assert cli.run(["info", str(bag), "--topic", "/imu/dat"]) == 2
-    assert "/imu/data" in capsys.readouterr().err
+    assert "/imu/data" in refuse_command(capsys, "log.topic_unknown", "info", bag, "--topic", "/imu/dat")
 
 
 # ---- every kind of log
@@ -218,13 +219,13 @@ def test_every_kind_of_log_is_solved(tmp_path, make):
 
 def test_a_topic_of_what_is_no_bag_is_one_line(tmp_path, capsys):
     path = logs.write_rtklib(tmp_path / "a.pos", RECORDING)
-    assert cli.run(["convert", str(path), "-o", str(tmp_path / "out"), "--topic", "/a"]) == 2
-    assert "--topic /a" in capsys.readouterr().err
+    assert "--topic /a" in refuse_command(
+        capsys, "option.not_here", "convert", path, "-o", tmp_path / "out", "--topic", "/a"
+    )
     logs.write_kf_gins(tmp_path, RECORDING, TRUTH)
     text = 'format = "graphnav-recording/1"\nplatform = "vehicle"\n[imu]\nfile = "imu.txt"\ntopic = "/a"\n'
     (tmp_path / "recording.toml").write_text(text)
-    assert cli.run(["info", str(tmp_path)]) == 2
-    assert "imu.topic" in capsys.readouterr().err
+    assert "imu.topic" in refuse_command(capsys, "key.not_here", "info", tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -251,3 +252,63 @@ def test_advice_is_for_the_log_at_hand(tmp_path):
     found = inspect(replace(read(bag), imu=replace(RECORDING.imu, t=read(bag).imu.t, accel=-RECORDING.imu.accel)))
     assert "recording.log" in [f.key for f in found.findings]
     assert not any("type = " in f.sentence for f in found.findings)  # a key of recording.toml
+
+
+# ---- tables as loggers write them
+
+ROWS = ["16:00:00.5", "16:00:00.7", "16:00:01.0"]
+NOON, UNIX_DAY = 57600.5, 1751932800.0
+
+
+@pytest.mark.parametrize(
+    ("text", "t"),
+    [
+        ("time  x\n" + "\n".join(f"{row}   1.5" for row in ROWS), NOON),
+        ("# time x\n" + "\n".join(f"{row} 1.5" for row in ROWS), NOON),
+        ("time\tx\n" + "\n".join(f"{row}\t1.5".replace(".", ",") for row in ROWS), NOON),
+        ("time;x;\n" + "\n".join(f"{row};1,5;" for row in ROWS), NOON),
+        ("time;x\n" + "\n".join(f"{row};1,5;" for row in ROWS), NOON),
+        ("time;x\ns;m\n" + "\n".join(f"{row};1,5" for row in ROWS), NOON),
+        ("time,x\n" + "\n".join(f'"{row}","1,5"' for row in ROWS), NOON),
+        ("time,x\n" + "\n".join(f"0{row[1:].replace('6', '4', 1)} PM, 1.5" for row in ROWS), NOON),
+        ("time,x\n" + "\n".join(f"{row.replace('.', ':')}00,1.5" for row in ROWS), NOON),
+        ("Logger 3\nDate: 08.07.2025\n\ntime;x\n" + "\n".join(f"{row};1,5" for row in ROWS), UNIX_DAY + NOON),
+        ("time x\n" + "\n".join(f"2025-07-08 {row} 1.5" for row in ROWS), UNIX_DAY + NOON),
+        ("date|time|x\n" + "\n".join(f"2025/7/8|{row}|1.5" for row in ROWS), UNIX_DAY + NOON),
+        ("time,x\n" + "\n".join(f"07/13/2025 {row},1.5" for row in ROWS), UNIX_DAY + 5 * 86400.0 + NOON),
+        ("time,x\n" + "\n".join(f"07/08/2025 {row},1.5" for row in ROWS), NOON),  # of which month nobody knows
+        ("zeit;größe\n" + "\n".join(f"{row};1,5" for row in ROWS), NOON),
+    ],
+)
+def test_tables_of_loggers_are_read(tmp_path, text, t):
+    (tmp_path / "a.txt").write_text(text + "\n", encoding="cp1252")
+    found = read_plain(tmp_path / "a.txt")
+    named = {name.partition(" ")[0]: x for name, x in found.columns.items()}
+    assert named.pop((found.dated or found.daily).partition(" ")[0]) == pytest.approx(
+        t + np.array([0.0, 0.2, 0.5]), abs=1e-6
+    )
+    assert [x.tolist() for name, x in named.items() if name not in ("", "time", "date")] == [[1.5] * 3]
+    assert (found.dated is None) == (t == NOON)
+
+
+def test_times_of_day_go_on_after_midnight_and_take_the_date_of_another_log(tokyo, tmp_path):
+    drive = tokyo[1]
+    late = drive.unix + 7.5 * 3600.0 + 1740.0  # midnight comes a minute later
+    imu, gnss = drive.recording.imu, drive.recording.gnss
+
+    def clock(x: float, form: str) -> str:
+        return f"{datetime.fromtimestamp(round(x, 3), UTC):{form}}"[:-3]
+
+    rows = [
+        " ".join([clock(x, "%H%M%S.%f"), *map(repr, [*w, *f])])
+        for x, w, f in zip(late, imu.gyro.tolist(), imu.accel.tolist(), strict=True)
+    ]
+    (tmp_path / "imu.txt").write_text("time gx gy gz ax ay az\n" + "\n".join(rows) + "\n")
+    at = gnss.t + late[0] - imu.t[0]
+    places = np.column_stack([np.degrees(gnss.llh[:, :2]), gnss.llh[:, 2]]).tolist()
+    rows = [";".join([clock(x, "%d.%m.%Y %H:%M:%S.%f"), *map(repr, row)]) for x, row in zip(at, places, strict=True)]
+    (tmp_path / "gps.txt").write_text("time;lat;lon;h\n" + "\n".join(rows) + "\n")
+    run("init", tmp_path, "-o", tmp_path, "--quiet")
+    recording = read(tmp_path)
+    assert recording.imu.t == pytest.approx(late, abs=2e-3)
+    assert recording.gnss.t == pytest.approx(at, abs=2e-3)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array, wrap
 from graphnav.recording import Gnss, Imu, Odometer
 from graphnav.recording.checks import lags as lags_of_clocks
+from graphnav.recording.checks.lags import Lags
 
 Index = NDArray[Any]  # of row numbers
 
@@ -87,19 +89,29 @@ def _mean(x: Array) -> Array:
     return np.asarray(np.full(len(x), 1.0 / len(x)) @ x)
 
 
-def _integral(t: Array, rate: Array) -> tuple[Array, Array]:
-    """Integral and its integral at the ends of the periods, of rows that are means over them."""
+def _integrate(t: Array, rate: Array, twice: bool) -> Array:
+    """Integral at the ends of the periods, of rows that are means over them, less their mean; or its own integral.
+
+    Axis by axis and in place: of a day each number more takes a hundred megabytes.
+    """
     dt = np.diff(t, prepend=2 * t[0] - t[1])
-    change = rate.T * dt  # axes first: the sums then run along contiguous numbers
-    first = np.cumsum(change, axis=1)
-    second = np.cumsum((first - 0.5 * change) * dt, axis=1)
-    return np.ascontiguousarray(first.T), np.ascontiguousarray(second.T)
+    out = np.empty(rate.shape)
+    for k, mean in enumerate(_mean(rate)):  # only changes matter; keeps the second integral small
+        change = rate[:, k] - mean
+        change *= dt
+        first = np.cumsum(change)
+        if twice:
+            change *= -0.5
+            change += first
+            change *= dt
+            np.cumsum(change, out=first)
+        out[:, k] = first
+    return out
 
 
 def _sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
     """mean(at, width) of the integral of `rate`; width 0 is the value there."""
-    rate = rate - _mean(rate)  # only changes matter; keeps the second integral small
-    first, second = _integral(t, rate)
+    integral = cache(lambda twice: _integrate(t, rate, twice))
     period = (t[-1] - t[0]) / (len(t) - 1)
 
     def columns(at: Array, values: Array) -> Array:
@@ -113,7 +125,8 @@ def _sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
 
     def mean(at: Array, width: Array) -> Array:
         if not width.any():
-            return columns(at, first)
+            return columns(at, integral(False))
+        second = integral(True)
         return (columns(at + width / 2, second) - columns(at - width / 2, second)) / width[:, None]
 
     return mean
@@ -135,6 +148,14 @@ def _regress(x: Array, y: Array) -> tuple[float, Array]:
     return (float(prediction @ y / scale) if scale > 0 else 0.0), b
 
 
+def _correlate_each(x: Array, y: Array) -> Array:
+    """The correlation of a regression of y (K,) on each of several sets of regressors (L, K, m)."""
+    x, y = x - x.mean(1, keepdims=True), y - y.mean()
+    prediction = (x @ lags_of_clocks.regress_each(x, y)[..., None])[..., 0]
+    scale = np.linalg.norm(prediction, axis=1) * np.linalg.norm(y)
+    return np.asarray(np.where(scale > 0.0, prediction @ y / np.where(scale > 0.0, scale, 1.0), 0.0))
+
+
 def _regress_inliers(x: Array, y: Array) -> tuple[float, Array]:
     """The same without what lies beyond 5 sigma (by the median), twice: spikes of a fix hide a good fit."""
     x, y = x - np.median(x, axis=0), y - np.median(y)
@@ -154,17 +175,16 @@ def _peak(lags: Array, c: Array) -> float:
     return float(lags[k])
 
 
-def _search(
-    t: Array, y: Array, x_at: Callable[[Index, float], Array], span: Array, valid: Callable[[float], Array]
-) -> Fit:
-    """The shift at which x explains y, of times t, best; `x_at(rows, lag)`, `valid(lag)` a mask of the rows."""
+def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, valid: Callable[[float], Array]) -> Fit:
+    """The shift at which x explains y, of times t, best; `x_at(rows, lags)`, `valid(lag)` a mask of the rows."""
     every = np.arange(len(y))
 
     def correlations(rows: Index, lags: Array) -> Array:
-        some = (rows[valid(lag)[rows]] for lag in lags)
-        return np.array(
-            [_regress(x_at(r, lag), y[r])[0] if len(r) >= MIN_PAIRS else 0.0 for r, lag in zip(some, lags, strict=True)]
-        )
+        found = []
+        for r, of in lags_of_clocks.share_rows(lags, rows, valid):
+            few = len(r) < MIN_PAIRS
+            found.append(np.zeros(len(of)) if few else _correlate_each(x_at(r, of), y[r]))
+        return np.concatenate(found)
 
     def correlation(lag: float, rows: Index) -> float:
         return float(correlations(rows, np.array([lag]))[0])
@@ -198,12 +218,13 @@ def _imu_fit(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) 
     mean = _sampler(imu.t, rate)
     ti, tj, wi, wj = track.t[i], track.t[j], track.width[i], track.width[j]
 
-    def x_at(rows: Index, lag: float) -> Array:
+    def x_at(rows: Index, lag: Lags) -> Array:
         used = np.zeros(len(track.t), dtype=bool)  # most ends of one pair begin another
         used[i[rows]] = used[j[rows]] = True
         place = np.cumsum(used) - 1
-        values = mean(track.t[used] + lag, track.width[used])
-        return np.asarray(values[place[j[rows]]] - values[place[i[rows]]])
+        at = np.add.outer(lag, track.t[used])
+        values = mean(at.ravel(), np.broadcast_to(track.width[used], at.shape).ravel()).reshape(*at.shape, -1)
+        return np.asarray(values[..., place[j[rows]], :] - values[..., place[i[rows]], :])
 
     def valid(lag: float) -> Array:
         return (ti + lag - wi / 2 > imu.t[0]) & (tj + lag + wj / 2 < imu.t[-1])
@@ -271,13 +292,13 @@ def velocity_fit(track: Track, places: Track) -> Fit | None:
     t, way = track.t, np.zeros((len(track.t), 2))
     way[1:] = np.cumsum(0.5 * (track.v[1:, :2] + track.v[:-1, :2]) * np.diff(t)[:, None], axis=0)
 
-    def speed(of: Index, lag: float) -> Array:
-        a, b = (places.t[of] + side * places.width[of] / 2 + lag for side in (-1.0, 1.0))
+    def speed(of: Index, lag: Lags) -> Array:
+        a, b = (np.add.outer(lag, places.t[of] + side * places.width[of] / 2) for side in (-1.0, 1.0))
         gone = [np.interp(b, t, axis) - np.interp(a, t, axis) for axis in way.T]
         return np.asarray(np.hypot(*gone) / places.width[of])
 
-    def x_at(rows: Index, lag: float) -> Array:
-        return (speed(j[rows], lag) - speed(i[rows], lag))[:, None]
+    def x_at(rows: Index, lag: Lags) -> Array:
+        return (speed(j[rows], lag) - speed(i[rows], lag))[..., None]
 
     def valid(lag: float) -> Array:
         first, last = places.t[i] - places.width[i] / 2 + lag, places.t[j] + places.width[j] / 2 + lag
@@ -294,9 +315,9 @@ def odometer_fit(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
     distance = np.r_[0.0, np.cumsum(0.5 * (odometer.speed[1:] + odometer.speed[:-1]) * np.diff(t))]
     width = np.maximum(track.width, 4.0 * float(np.median(np.diff(t))))
 
-    def x_at(rows: Index, lag: float) -> Array:
-        at, w = track.t[rows] + lag, width[rows]
-        return ((np.interp(at + w / 2, t, distance) - np.interp(at - w / 2, t, distance)) / w)[:, None]
+    def x_at(rows: Index, lag: Lags) -> Array:
+        at, w = np.add.outer(lag, track.t[rows]), width[rows]
+        return np.asarray((np.interp(at + w / 2, t, distance) - np.interp(at - w / 2, t, distance)) / w)[..., None]
 
     def valid(lag: float) -> Array:
         inside = (track.t + lag - width / 2 > t[0]) & (track.t + lag + width / 2 < t[-1])

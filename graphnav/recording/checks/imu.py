@@ -58,10 +58,10 @@ def check_repeats(imu: Imu) -> Iterator[Finding]:
 def check_saturation(imu: Imu) -> Iterator[Finding]:
     # in the file's axes: a tilted mount would spread a clipped axis over three
     for what, values, smallest, unit in (("gyro", imu.gyro, 0.5, "rad/s"), ("accelerometer", imu.accel, 5.0, "m/s2")):
-        x = imu.R_bs.T @ values.T
         for axis in range(3):
+            x = values @ imu.R_bs[:, axis]
             for sign in (1.0, -1.0):
-                signed = sign * x[axis]
+                signed = sign * x
                 top = signed.max()
                 if top < smallest or top < 3.0 * signed.std() or top == np.median(signed):
                     continue

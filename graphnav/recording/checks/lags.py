@@ -8,7 +8,7 @@ not of the curvature at the best one alone: where speed hardly changes, several 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from graphnav.core.rotation import Array
 
 Index = NDArray[Any]  # of row numbers
-Regressors = Callable[[Index, float], Array]  # (rows, lag) -> (K, m)
+Lags = Array | float  # s, (L,) or one
+Regressors = Callable[[Index, Lags], Array]  # (rows, lags) -> (L, K, m), of one lag (K, m)
 REACH = 5.0  # s on either side of the first guess, which is all that a sigma can come to
 _SLOW = 10.0  # s; what changes slower than this is the road (as in `graphnav.recording.draft.motion.band`)
 _STEP, _FINE, _FINEST = 0.1, 0.02, 0.005  # s, of the grids of lags
+_AT_ONCE = 1 << 16  # rows times lags, so that what is at work stays small
 _PARTS, _STUDENT = 4, 3.0  # parts, and the variance of Student's t with the degrees of freedom of their scatter
 _FAR = 5.0  # robust sigmas beyond which a row is an error of the fix
 
@@ -51,20 +53,29 @@ def refine_lag(
     ----------
     t : (N,) s, ascending, of the rows of y.
     y : (N,) what is observed.
-    x_at : regressors of some rows at a lag.
+    x_at : regressors of some rows at a lag, or at several.
     valid : mask (N,) of the rows that have regressors at a lag.
     rows : those of y that are used.
     fewest : rows that make a regression.
     """
 
+    def at_each(lags: Array, some: Index) -> list[_At | None]:
+        every: list[_At | None] = []
+        for kept, of in share_rows(lags, some, valid):
+            if len(kept) < fewest:
+                every += [None] * len(of)
+                continue
+            x = x_at(kept, of)
+            L, K, m = x.shape
+            both = quick(t[kept], np.column_stack([x.transpose(1, 0, 2).reshape(K, L * m), y[kept]]))
+            x, left = both[:, :-1].reshape(K, L, m).transpose(1, 0, 2), both[:, -1]
+            b = regress_each(x, left)
+            e = left - (x @ b[..., None])[..., 0]
+            every += [_At(kept, x[k], left, b[k], e[k]) for k in range(L)]
+        return every
+
     def at(lag: float, some: Index) -> _At | None:
-        kept = some[valid(lag)[some]]
-        if len(kept) < fewest:
-            return None
-        both = quick(t[kept], np.column_stack([x_at(kept, lag), y[kept]]))
-        x, of = both[:, :-1], both[:, -1]
-        b = np.linalg.lstsq(x, of, rcond=None)[0]
-        return _At(kept, x, of, b, of - x @ b)
+        return at_each(np.array([lag]), some)[0]
 
     for _ in range(2):  # spikes of a fix hide a good fit
         found = at(guess, rows)
@@ -74,8 +85,7 @@ def refine_lag(
         rows = found.rows[off <= _FAR * np.median(off) / 0.6745]
 
     def profile(lags: Array) -> Array:
-        every = (at(float(lag), rows) for lag in lags)
-        return np.array([np.nan if one is None else one.unexplained for one in every])
+        return np.array([np.nan if one is None else one.unexplained for one in at_each(lags, rows)])
 
     wide = guess + np.arange(-REACH, REACH + _STEP / 2, _STEP)
     seen = profile(wide)
@@ -100,6 +110,25 @@ def refine_lag(
     likelihood = np.exp(-0.5 * max(worth - 4.0, 1.0) * (depth - depth.min())) * np.gradient(lags)
     by_likelihood = np.sqrt(np.sum(likelihood * (lags - lag) ** 2) / likelihood.sum())
     return lag, float(max(spread, by_likelihood))
+
+
+def share_rows(lags: Array, rows: Index, valid: Callable[[float], Array]) -> Iterator[tuple[Index, Array]]:
+    """Successive lags at which the same rows are valid: these rows, and the lags; many rows at few lags at once."""
+    inside = np.array([valid(float(lag))[rows] for lag in lags])
+    begin = 0
+    for k in range(1, len(lags) + 1):
+        full = (k - begin) * len(rows) >= _AT_ONCE
+        if k == len(lags) or full or not np.array_equal(inside[k], inside[begin]):
+            yield rows[inside[begin]], lags[begin:k]
+            begin = k
+
+
+def regress_each(x: Array, y: Array) -> Array:
+    """Least-squares coefficients (L, m) of y (K,) on each of several sets of regressors (L, K, m)."""
+    if x.shape[2] == 1:
+        power = np.einsum("lki,lki->li", x, x)
+        return np.asarray(np.einsum("lki,k->li", x, y) / np.where(power > 0.0, power, 1.0))
+    return np.asarray(np.linalg.pinv(x, rcond=np.finfo(float).eps * x.shape[1]) @ y)
 
 
 def quick(t: Array, x: Array) -> Array:

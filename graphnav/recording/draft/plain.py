@@ -1,23 +1,31 @@
-"""Tables that are no CSV of numbers: fields apart by semicolons or tabs, decimal commas, dates in words."""
+"""Tables that are no CSV of numbers: other separators, decimal commas, lines above the header, dates, times of day."""
 
 from __future__ import annotations
 
+import csv
 import re
-from dataclasses import dataclass
-from datetime import UTC, date, datetime, time, timedelta
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, time, timedelta
 from pathlib import Path
 
 import numpy as np
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import open_file, parse_number
+from graphnav.core.files import open_file, parse_number, read_bytes
 from graphnav.core.rotation import Array
-from graphnav.recording.draft.columns import match
-from graphnav.recording.formats.text import text_lines
+from graphnav.recording.draft.columns import UNITS, match, split_unit
 
+DAY = 86400.0  # s
 _START = 1 << 16  # bytes, in which the header is
-_DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(.*)")  # 08.07.2025; with slashes nobody knows
-_OTHER_MARKS = re.compile(r"(\d{4})[/.](\d{1,2})[/.](\d{1,2})(.*)")  # 2025/07/08
+_MARKS = {"\t": "a tab", ";": "a semicolon", ",": "a comma", "|": "a bar", None: "blanks"}
+_COMMENT = re.compile(r"\s*(?:#|%|//)+\s?")
+_DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(.*)")  # 08.07.2025
+_YEAR_FIRST = re.compile(r"(\d{4})[-/.](\d{1,2})[-/.](\d{1,2})(.*)")  # 2025-07-08
+_SLASHES = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})(.*)")  # 07/08/2025, of which one number may tell the month
+_CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})(?:[.,:](\d{1,9}))?\s*([AaPp][Mm])?")
+
+Lines = list[tuple[int, str]]  # number in the file, from 1, and text
 
 
 @dataclass(frozen=True)
@@ -26,15 +34,27 @@ class Plain:
 
     columns: dict[str, Array]
     words: str
-    dated: str | None  # the column that was dates: Unix time, s
+    dated: str | None = None  # the column that was dates: Unix time, s
+    daily: str | None = None  # the column that was times of day: s since midnight before the first row
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How a table is written."""
+
+    mark: str | None  # between fields; None for blanks
+    names: list[str]
+    above: list[str]  # lines before the header
+    first: int  # where rows begin, among the lines
+    done: list[str] = field(default_factory=list)  # what a CSV file does not have
 
 
 def read_plain(path: Path) -> Plain | None:
-    """A table whose fields, numbers or dates are written in another way than a CSV file's; None if they are not.
+    """A table whose fields, numbers or times are written in another way than a CSV file's; None if they are not.
 
     Parameters
     ----------
-    path : a .csv file.
+    path : a file of text.
 
     Returns
     -------
@@ -51,65 +71,206 @@ def read_plain(path: Path) -> Plain | None:
         start = raw.read(_START)
     if path.suffix == ".gz" or b"\0" in start:
         return None
-    lines = _lines(start.decode("utf-8-sig", errors="replace").splitlines())
-    if len(lines) < 3:
+    # cut off amid a line, most likely
+    begin, _ = _decode(start.rpartition(b"\n")[0] if len(start) == _START else start)
+    layout = _lay_out(path, _lines(begin.splitlines()))
+    if layout is None:
         return None
-    mark = next((m for m in ("\t", ";") if m in lines[0][1]), ",")
-    header, first = ([cell.strip().strip('"') for cell in line.split(mark)] for _, line in lines[:2])
-    if mark == "," and not any(_date(cell) or _clock(cell) is not None for cell in first):
-        return None
-    lines = _lines(text_lines(path))
-    rows = [[cell.strip().strip('"') for cell in line.split(mark)] for _, line in lines[1:]]
-    wrong = next((k for k, row in enumerate(rows) if len(row) != len(header)), None)
-    if wrong is not None and match(header, path.stem).sensor is None:
+    text, encoding = _decode(read_bytes(path))
+    lines = _lines(text.splitlines())
+    rows = [_split(line, layout.mark) for _, line in lines[layout.first :]]
+    names, done = layout.names, [*layout.done, *encoding]
+    if len(rows[0]) == len(names) + 1 and not any(row[-1] for row in rows if len(row) > len(names)):
+        rows = [row[: len(names)] for row in rows]
+        done.append("an empty field at the end")
+    wrong = next((k for k, row in enumerate(rows) if len(row) != len(names)), None)
+    if wrong is not None and match(names, path.stem).sensor is None:
         return None  # notes, not numbers
     if wrong is not None:
         raise RecordingError(
-            f"{path}, line {lines[wrong + 1][0]}: has {len(rows[wrong])} fields where the header has {len(header)}",
+            f"{path}, line {lines[layout.first + wrong][0]}: has {len(rows[wrong])} fields where the header has "
+            f"{len(names)}",
             key="table.fields",
         )
-    cells = {name: [row[k] for row in rows] for k, name in enumerate(header)}
-    done = [f"fields apart by {'a semicolon' if mark == ';' else 'a tab'}"] if mark != "," else []
-    if mark != "," and any("," in cell for cell in first):
+    cells = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
+    if any("," in cell for cell in rows[0]):
         done.append("decimal commas")
-    columns = {name: x for name, some in cells.items() if (x := _numbers(some, mark != ",")) is not None}
-    dated, said = _dates(cells, columns)
-    return Plain(columns, ", ".join([*done, *said]), dated) if done or said else None
+    columns = {name: x for name, some in cells.items() if (x := _numbers(some)) is not None}
+    dated, daily, said = _times(cells, columns, layout.above)
+    return Plain(columns, ", ".join([*done, *said]), dated, daily) if done or said else None
 
 
-def _lines(text: list[str]) -> list[tuple[int, str]]:
-    """Numbers and text of the lines that hold something."""
-    return [(k, line) for k, line in enumerate(text, 1) if line.strip() and line.lstrip()[0] != "#"]
+def seconds_of_clock(t: Array) -> Array | None:
+    """Seconds since midnight of times of day written as one number, hhmmss.ss; None where these are none.
+
+    They are where no stamp has more than 59 minutes or seconds, and 40 s are missing between every two minutes.
+    """
+    hours, minutes, seconds = t // 10_000, t // 100 % 100, t % 100
+    if not ((t >= 0.0) & (t < 240_000.0) & (minutes < 60.0) & (seconds < 60.0)).all():
+        return None
+    over = np.flatnonzero(np.diff(minutes))
+    if not len(over) or np.abs(np.diff(t)[over]).min() < 40.0:
+        return None
+    out = np.asarray(3600.0 * hours + 60.0 * minutes + seconds)
+    return out + DAY * np.cumsum(np.diff(out, prepend=out[:1]) < -0.5 * DAY)
 
 
-def _numbers(cells: list[str], commas: bool) -> Array | None:
+def _decode(data: bytes) -> tuple[str, list[str]]:
+    """Text, and in words its encoding where it is not UTF-8."""
+    try:
+        return data.decode("utf-8-sig"), []
+    except UnicodeDecodeError:
+        return data.decode("cp1252", errors="replace"), ["text of Windows"]
+
+
+def _lines(text: Sequence[str]) -> Lines:
+    """Numbers and text of the lines that hold something; after the first row without comments."""
+    lines = [(k, line) for k, line in enumerate(text, 1) if line.strip()]
+    first = _first_row(lines)
+    return [(k, line) for i, (k, line) in enumerate(lines) if i <= (first or 0) or line.lstrip()[0] != "#"]
+
+
+def _split(line: str, mark: str | None) -> list[str]:
+    """The fields of a line."""
+    if mark is None:
+        return line.split()
+    cells = next(csv.reader([line], delimiter=mark)) if '"' in line else line.split(mark)
+    return [cell.strip() for cell in cells]
+
+
+def _values(line: str, mark: str | None) -> tuple[float, int]:
+    """Which share of the fields of a line are numbers, dates or times of day, and how many."""
+    cells = _split(line, mark)
+    count = sum(_is_value(cell) for cell in cells)
+    return count / max(sum(cell != "" for cell in cells), 1), count
+
+
+def _is_value(cell: str) -> bool:
+    return _numbers([cell]) is not None or _clock(cell) is not None or bool(_date(cell) or _SLASHES.fullmatch(cell))
+
+
+def _first_row(lines: Lines) -> int | None:
+    """Where two lines follow each other that are rows of one table."""
+    for k in range(len(lines) - 1):
+        if _mark_of([line for _, line in lines[k : k + 2]]) != "":
+            return k
+    return None
+
+
+def _mark_of(rows: Sequence[str]) -> str | None:
+    """What stands between the fields of rows; "" where they are none: two fields and half of them are values."""
+    found = []
+    for mark in _MARKS:
+        some = [_values(row, mark) for row in rows]
+        if (
+            all(share >= 0.5 and count >= 2 for share, count in some)
+            and len({len(_split(row, mark)) for row in rows}) == 1
+        ):
+            found.append((min(some), mark))
+    return max(found, key=lambda one: one[0])[1] if found else ""
+
+
+def _lay_out(path: Path, lines: Lines) -> _Layout | None:
+    """How a table is written; None where it is a CSV file or no table with a header."""
+    first = _first_row(lines)
+    if not first:  # none, or no line before it
+        return None
+    mark = _mark_of([line for _, line in lines[first : first + 2]])
+    row = _split(lines[first][1], mark)
+    head, units = first - 1, []
+    said = [_split(_COMMENT.sub("", line), mark) for _, line in lines[max(first - 2, 0) : first]]
+    if len(said) == 2 and len(said[0]) == len(said[1]) == len(row) and _are_units(said[1]):
+        head, units = first - 2, said[1]
+    names = _split(_COMMENT.sub("", lines[head][1]), mark)
+    if mark is None and len(names) > len(row):  # names of several words stand farther apart
+        names = re.split(r"\s{2,}", _COMMENT.sub("", lines[head][1]).strip())
+    commented = _COMMENT.match(lines[head][1])
+    if len(names) == len(row) - 1 and _date(row[0]) and _clock(row[1]) is not None:
+        names = ["date", *names]  # one name above a date and a time of day
+    if len(names) not in (len(row), len(row) - 1):
+        if commented or match(names, path.stem).sensor is None:
+            return None
+        raise RecordingError(
+            f"{path}, line {lines[head][0]}: names {len(names)} columns where the rows have {len(row)} fields apart by "
+            f"{_MARKS[mark]}",
+            key="table.fields",
+        )
+    if units:
+        bare = [unit.strip("[]()") for unit in units]
+        names = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, bare, strict=True)]
+    above = [line for _, line in lines[:head]]
+    done = [f"fields apart by {_MARKS[mark]}"] if mark != "," else []
+    done += ["a line of units"] if units else []
+    done += ["a header in a comment"] if commented else []
+    done += ["lines above the header"] if any(not _COMMENT.match(line) for line in above) else []
+    return _Layout(mark, names, above, first, done)
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    """Whether a line under the names holds units."""
+    spelt = [split_unit(f"x [{cell.strip('[]()')}]")[1] for cell in cells if cell.strip("[]()-")]
+    return sum(unit in UNITS for unit in spelt) > 0.5 * len(spelt)
+
+
+def _numbers(cells: Sequence[str]) -> Array | None:
     """A column as numbers, NaN where blank; None where it holds anything else."""
     try:
-        return np.array([parse_number(c.replace(",", ".") if commas else c) if c else np.nan for c in cells])
+        return np.array([parse_number(c.replace(",", ".")) if c else np.nan for c in cells])
     except ValueError:
         return None
 
 
-def _dates(cells: dict[str, list[str]], columns: dict[str, Array]) -> tuple[str | None, list[str]]:
-    """Turns the column of dates, or those of dates and times of day, into Unix time; its name, and words about it."""
-    for name, some in cells.items():
-        if name in columns or (begin := _date(some[0])) is None:
-            continue
-        own, days = name, some
-        if begin.time() == time() and ":" not in some[0]:  # dates alone: the times of day stand beside them
-            own = next((n for n, c in cells.items() if n not in columns and _clock(c[0]) is not None), "")
-            if not own:
-                continue
-            days = [f"{day} {clock}" for day, clock in zip(some, cells[own], strict=True)]
-        stamps = [_date(text) for text in days]
-        if any(x is None for x in stamps):
-            continue
-        zone = stamps[0] is not None and stamps[0].tzinfo is not None
-        utc = (x if x.tzinfo else x.replace(tzinfo=UTC) for x in stamps if x is not None)
-        columns[own] = np.array([x.timestamp() for x in utc])
-        why = "" if zone else "; CHECK: they state no zone and are taken as UTC"
-        return own, [f"dates of '{own}' as Unix time in s{why}"]
-    return None, []
+def _times(
+    cells: dict[str, list[str]], columns: dict[str, Array], above: Sequence[str]
+) -> tuple[str | None, str | None, list[str]]:
+    """Turns a column of dates, or one of times of day, into s; which is dated, which is daily, and words about it.
+
+    Dates alone stand in a column beside times of day, or in a line above the header.
+    """
+    words = {name: some for name, some in cells.items() if name not in columns and any(some)}
+    said = []
+    for name, some in words.items():
+        if any(_SLASHES.fullmatch(cell) for cell in some):
+            words[name], doubt = _ordered(some)
+            said += [doubt] if doubt else []
+    daily = next((name for name, some in words.items() if all(not c or _clock(c) is not None for c in some)), None)
+    days = next((some for name, some in words.items() if name != daily and _date(some[0]) is not None), None)
+    if days is not None and any(":" in cell for cell in days):
+        daily = next(name for name, some in words.items() if some is days)
+        clocks = days
+    elif daily is not None:
+        if days is None:
+            stated = [found for line in above for word in re.split(r"[\s,;|]+", line) if (found := _date(word))]
+            days = [f"{stated[0]:%Y-%m-%d}"] * len(words[daily]) if stated else None
+        seconds = np.array([x if (x := _clock(c)) is not None else np.nan for c in words[daily]])
+        seconds += DAY * np.cumsum(np.diff(seconds, prepend=seconds[:1]) < -0.5 * DAY)  # over midnight
+        if days is None or (begin := _date(days[0])) is None:
+            columns[daily] = seconds
+            return None, daily, [*said, f"times of day of '{daily}' as s since midnight"]
+        midnight = begin.replace(tzinfo=UTC).timestamp()
+        columns[daily] = midnight + seconds
+        return daily, None, [*said, f"dates and times of day of '{daily}' as Unix time in s; CHECK: taken as UTC"]
+    else:
+        return None, None, said
+    stamps = [_date(text) for text in clocks]
+    if any(x is None for x in stamps):
+        return None, None, said
+    zone = stamps[0] is not None and stamps[0].tzinfo is not None
+    columns[daily] = np.array([(x if x.tzinfo else x.replace(tzinfo=UTC)).timestamp() for x in stamps if x is not None])
+    why = "" if zone else "; CHECK: they state no zone and are taken as UTC"
+    return daily, None, [*said, f"dates of '{daily}' as Unix time in s{why}"]
+
+
+def _ordered(cells: list[str]) -> tuple[list[str], str]:
+    """Dates with slashes with the year first; where nothing tells the day from the month, their times of day."""
+    parts = [found.groups() for cell in cells if (found := _SLASHES.fullmatch(cell))]
+    day_first, month_first = (any(int(part[k]) > 12 for part in parts) for k in (0, 1))
+    if day_first != month_first:
+        a, b = (2, 1) if day_first else (1, 2)
+        return [_SLASHES.sub(rf"\3-\{a}-\{b}\4", cell) for cell in cells], ""
+    return [
+        _SLASHES.sub(r"\4", cell).strip(" T") for cell in cells
+    ], f"CHECK: {cells[0][:10]} may begin with the day or the month, so dates are left out"
 
 
 def _date(text: str) -> datetime | None:
@@ -118,27 +279,30 @@ def _date(text: str) -> datetime | None:
         return None
     if found := _DAY_FIRST.fullmatch(text):
         day, month, year, rest = found.groups()
-    elif found := _OTHER_MARKS.fullmatch(text):
+    elif found := _YEAR_FIRST.fullmatch(text):
         year, month, day, rest = found.groups()
-    elif text[4:5] == "-":
-        year, month, day, rest = text[:4], text[5:7], text[8:10], text[10:]
     else:
         return None
     try:
-        start = date(int(year), int(month), int(day))
-        if not rest.strip(" T"):
-            return datetime.combine(start, time())
-        return datetime.combine(start, time.fromisoformat(rest.strip(" T").replace(",", ".")))
+        start = datetime(int(year), int(month), int(day))
+        rest = rest.strip(" T").replace(",", ".")
+        if (seconds := _clock(rest) if rest else 0.0) is not None:
+            return start + timedelta(seconds=seconds)
+        return datetime.combine(start, time.fromisoformat(rest))
     except ValueError:
         return None
 
 
-def _clock(text: str) -> timedelta | None:
-    """A time of day; None if it is none."""
-    if text.count(":") != 2:
+def _clock(text: str) -> float | None:
+    """A time of day, s since midnight; None if it is none."""
+    found = _CLOCK.fullmatch(text)
+    if found is None:
         return None
-    try:
-        own = time.fromisoformat(text.replace(",", "."))
-    except ValueError:
+    hours, minutes, seconds = (int(part) for part in found.groups()[:3])
+    if half := found[5]:
+        if not 1 <= hours <= 12:
+            return None
+        hours = hours % 12 + 12 * (half.lower() == "pm")
+    if hours > 23 or minutes > 59 or seconds > 60:
         return None
-    return timedelta(hours=own.hour, minutes=own.minute, seconds=own.second)
+    return 3600.0 * hours + 60.0 * minutes + seconds + float(f"0.{found[4] or 0}")

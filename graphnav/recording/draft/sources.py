@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
+from graphnav.core.timescales import GPS_TO_UNIX
 from graphnav.recording import Gnss, Imu, Odometer
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.plain import Plain, read_plain
+from graphnav.recording.draft.plain import DAY, Plain, read_plain, seconds_of_clock
 from graphnav.recording.formats import formats
 from graphnav.recording.formats.folder import other_log
 from graphnav.recording.formats.registry import Log
@@ -49,6 +50,7 @@ _WANTED = {
     "odometer": ("t", "speed", *WHEELS),
     "gravity": ("t", "pull_x", "pull_y", "pull_z"),
 }
+_TABLES = (".csv", ".csv.gz", ".txt", ".tsv", ".dat", ".asc", ".log")  # of a folder these are looked at
 _PAUSES = 1000.0  # times as long as all of its rows together a log may last
 _NEEDED = {"gnss": 4, "odometer": 2}  # of those, how many must be there in a row
 
@@ -154,10 +156,31 @@ def sources(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one{unread}",
             key="draft.no_imu",
         )
+    _date_times_of_day(sensors)
     parts = [s.path.name for name in ("gyro", "accel", "gravity") for s in every.get(name, ())]
     if "imu" in every and parts:
         left.append(f"{', '.join(parts)}: {sensors['imu'].path.name} holds both")
     return LogsFound({name: sensors[name] for name in ("imu", "gnss", "odometer") if name in sensors}, left)
+
+
+def _date_times_of_day(sensors: dict[str, Source]) -> None:
+    """Times of day become those of the date of another log, if one has dates."""
+    dates = {s.path: unix for s in sensors.values() if (unix := _unix_start(s)) is not None}
+    for source in sensors.values():
+        if dates and source.plain is not None and source.plain.daily == source.columns.names["t"]:
+            path, begin = next(iter(dates.items()))
+            days = round((begin - float(source.t[0])) / DAY)
+            source.values["t"] = source.values["t"] + DAY * days
+            words = f"{source.plain.words}; CHECK: taken as UTC, of the date of {path.name}"
+            source.plain = replace(source.plain, words=words)
+
+
+def _unix_start(source: Source) -> float | None:
+    """Unix time of the first row of a log that knows its date, s."""
+    if source.log is None:
+        return float(source.t[0]) if guesses.is_date(source.t) else None
+    begin = next(sensor.t[0] for sensor in source._sensors)
+    return None if source.log.gps_zero is None else float(source.log.gps_zero + begin + GPS_TO_UNIX)
 
 
 def _files(path: Path) -> list[Path]:
@@ -168,7 +191,7 @@ def _files(path: Path) -> list[Path]:
     made = {JOINED, "recording.toml"}  # by an earlier draft
     made |= {plain_name(p, sensor) for p in every for sensor in _WANTED}
     inside = sorted(p for p in every if p.name not in made)
-    logs = [p for p in inside if p.name.endswith((".csv", ".csv.gz")) or _is_known(p)]
+    logs = [p for p in inside if p.name.lower().endswith(_TABLES) or _is_known(p)]
     if not logs:
         raise RecordingError(
             f"{path}: no log in this folder: no CSV file, and none of a kind that is known", key="draft.no_log"
@@ -279,7 +302,7 @@ def _look(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     log = other_log(path, topics)
     if log is not None:
         return {s: Source(path, log=log) for s in ("imu", "gnss", "odometer") if getattr(log, s) is not None}
-    plain = read_plain(path) if path.is_file() and path.name.endswith((".csv", ".txt", ".tsv")) else None
+    plain = read_plain(path) if path.is_file() else None
     try:
         header = read_header(path) if plain is None else list(plain.columns)
     except RecordingError as error:
@@ -294,9 +317,9 @@ def _look(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
         )
     if plain is None:
         columns = _with_clock(path, header, columns)
-    elif plain.dated is not None:
+    elif stamps := plain.dated or (plain.daily if columns.names["t"] == plain.daily else None):
         units = {ours: unit for ours, unit in columns.units.items() if ours != "t"}
-        columns = matching.Columns({**columns.names, "t": plain.dated}, units)
+        columns = matching.Columns({**columns.names, "t": stamps}, units)
     roles = [sensor]
     if sensor == "imu" and {"lat", "lon"} <= columns.names.keys():
         roles.append("gnss")
@@ -365,6 +388,9 @@ def _read(path: Path, columns: matching.Columns, role: str, plain: Plain | None)
             f"{path}: fewer than two rows hold all of {', '.join(names[n] for n in needed)}", key="table.few_rows"
         )
     values = {ours: table[ours][whole] for ours in names}
+    if (seconds := seconds_of_clock(values["t"])) is not None:
+        words = f"times of day of '{names['t']}', hhmmss, as s since midnight"
+        values["t"], plain = seconds, Plain({}, words, daily=names["t"])
     order = np.argsort(values["t"], kind="stable")
     order = order[np.concatenate([[True], np.diff(values["t"][order]) > 0])]
     values = {ours: v[order] for ours, v in values.items()}

@@ -9,27 +9,30 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from html import escape
 from pathlib import Path
-from xml.sax.saxutils import escape
 
 import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording.exporters import Add, require_geodetic
+from graphnav.recording.exporters.digits import rows_bytes
 
 _HEAD = """<?xml version="1.0" encoding="UTF-8"?>
 <gpx version="1.1" creator="graphnav" xmlns="http://www.topografix.com/GPX/1/1">
 <trk><name>{name}</name><desc>{about}</desc><trkseg>
 """
 _TAIL = "</trkseg></trk>\n</gpx>\n"
+_POINT = '<trkpt lat="%.10f" lon="%.10f"><ele>%.4f</ele></trkpt>'
+_STAMPED = _POINT.replace("</trkpt>", "<time>%sZ</time></trkpt>")
 
 
 @contextmanager
 def writing(path: Path, name: str = "") -> Iterator[Add]:
     """A file, with times where UTC is known."""
     begun = False
-    with path.open("w", encoding="utf-8") as file:
+    with path.open("wb") as file:
 
         def add(block: Trajectory, utc: Array | None = None) -> None:
             nonlocal begun
@@ -37,13 +40,13 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
             if not begun:
                 times = "" if utc is not None else "; no times: the clock is not known"
                 about = f"heights above the WGS-84 ellipsoid{times}"
-                file.write(_HEAD.format(name=escape(name or "trajectory"), about=about))
+                head = _HEAD.format(name=escape(name or "trajectory", quote=False), about=about)
+                file.write(head.encode())
                 begun = True
             degrees = np.rad2deg(block.llh[:, :2])
-            stamps = [""] * len(block) if utc is None else np.datetime_as_string(utc, unit="ms").tolist()
-            for (lat, lon), h, stamp in zip(degrees.tolist(), block.llh[:, 2].tolist(), stamps, strict=True):
-                time = f"<time>{stamp}Z</time>" if stamp else ""
-                file.write(f'<trkpt lat="{lat:.10f}" lon="{lon:.10f}"><ele>{h:.4f}</ele>{time}</trkpt>\n')
+            table = np.column_stack([degrees, block.llh[:, 2]])
+            stamps = None if utc is None else np.datetime_as_string(utc, unit="ms").astype("S")
+            file.write(rows_bytes(table, _POINT if utc is None else _STAMPED, stamps))
 
         yield add
-        file.write(_TAIL)
+        file.write(_TAIL.encode())

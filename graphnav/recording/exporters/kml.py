@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from html import escape
 from pathlib import Path
-from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -57,7 +57,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
             for name, k in (("start", 0), ("end", -1))
         )
         line = rows_text(degrees[:, [1, 0, 2]], "%.9f,%.9f,%.3f")
-        file.write(_DOCUMENT.format(name=escape(name or "trajectory"), line=line, ends=ends))
+        file.write(_DOCUMENT.format(name=escape(name or "trajectory", quote=False), line=line, ends=ends))
 
 
 class _Thinned:

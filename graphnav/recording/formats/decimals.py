@@ -18,6 +18,7 @@ from graphnav.core.files import parse_number
 from graphnav.core.rotation import Array
 
 _BLOCK = 1 << 18  # bytes handled at once: keeps the working arrays in the processor's cache
+_SLAB = 1 << 22  # rows of a column that are put together: 32 MB, which go back to the system when they are let go
 _COMMA, _MINUS, _POINT, _LINE = b",-.\n"
 _PAD = 16  # bytes before a block, for words that reach back beyond it
 _MOST = 16  # digits read on each side of the point
@@ -26,18 +27,36 @@ _TENS = 10 ** np.arange(19, dtype=_U)
 _LAST = np.array([2**64 - 2 ** (64 - 8 * k) for k in range(9)], _U)  # the last k bytes of a word
 
 
-def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> Array:
-    """The columns `use`, (len(use), N), of lines of `width` cells.
+def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array]:
+    """The columns `use`, (N,) each, of lines of `width` cells; held twice is one of them at a time.
 
     Raises
     ------
     ValueError
         If a line has another number of cells or a cell is not a number; a more patient reader may say which.
     """
-    blocks = [np.empty((len(use), 0))]
+    slabs: list[list[Array]] = [[np.empty(0)] for _ in use]
+    blocks: list[Array] = []
+    rows = 0
     while block := file.read(_BLOCK):
         blocks.append(_columns(block + file.readline(), width, list(use)))
-    return np.concatenate(blocks, axis=1)
+        rows += blocks[-1].shape[1]
+        if rows >= _SLAB:
+            _put_together(blocks, slabs)
+            rows = 0
+    _put_together(blocks, slabs)
+    columns = []
+    for column in slabs:
+        columns.append(np.concatenate(column))
+        column.clear()
+    return columns
+
+
+def _put_together(blocks: list[Array], slabs: list[list[Array]]) -> None:
+    """Move blocks (len(slabs), n) of rows to the end of their columns."""
+    for k, column in enumerate(slabs):
+        column.append(np.concatenate([block[k] for block in blocks] or [np.empty(0)]))
+    blocks.clear()
 
 
 def _columns(text: bytes, width: int, use: list[int]) -> Array:

@@ -37,6 +37,7 @@ from graphnav.recording.formats.trajectories import read_trajectory
 from graphnav.sensors import Sensor, Series, list_sensors
 from graphnav.sensors.tables import ANGLE
 
+_AT_ONCE = 1 << 16  # rows
 _RAW_FILES = ("rover", "nav", "sp3", "clk", "antex", "base")
 
 
@@ -150,8 +151,8 @@ def read_folder(source: str | Path) -> Recording:
 
 def _imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
     R_bs = d.R_bs
-    gyro = rows.stack("gx", "gy", "gz") * schema.RATE[d.units.gyro] @ R_bs.T
-    accel = rows.stack("ax", "ay", "az") * schema.FORCE[d.units.accel] @ R_bs.T
+    gyro = _turn(rows, ("gx", "gy", "gz"), schema.RATE[d.units.gyro], R_bs)
+    accel = _turn(rows, ("ax", "ay", "az"), schema.FORCE[d.units.accel], R_bs)
     stated = d.figures
     noise = replace(ImuNoise(), **stated)
     missing = [key for key in schema.NOISE_FIGURES if key not in stated]
@@ -167,6 +168,15 @@ def _imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
             f"accelerometer {noise.accel_noise_density:g} m/s2/sqrt(Hz))",
         )
     return Imu(rows["t"], gyro, accel, noise, R_bs, noise_assumed=len(missing) == len(schema.NOISE_FIGURES))
+
+
+def _turn(rows: Table, names: tuple[str, ...], unit: float, R_bs: Array) -> Array:
+    """(N, 3) columns in body axes; of a day of them nothing is held twice."""
+    out = np.empty((len(rows), 3))
+    for k in range(0, len(out), _AT_ONCE):
+        some = slice(k, k + _AT_ONCE)
+        np.matmul(np.stack([rows[name][some] for name in names], -1) * unit, R_bs.T, out=out[some])
+    return out
 
 
 def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:

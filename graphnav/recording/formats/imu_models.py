@@ -64,31 +64,31 @@ def _from_tuning(
     return ImuModel(name, noise | walks, source)
 
 
-_GINS = "tuned on drives by the i2Nav group, README of awesome-gins-datasets, section 1"
+_GINS = "README of awesome-gins-datasets, section 1: tuned on drives"
 _ALL: tuple[ImuModel, ...] = (
     _from_tuning("ICM20602", _GINS, ("0.2 deg/sqrt(h)", "0.2 m/s/sqrt(h)"), ("200 deg/h", "1000 mGal"), 1.0),
     _from_tuning("ADIS16460", _GINS, ("0.2 deg/sqrt(h)", "0.1 m/s/sqrt(h)"), ("20 deg/h", "100 mGal"), 1.0),
     _from_tuning("ADIS16465", _GINS, ("0.1 deg/sqrt(h)", "0.1 m/s/sqrt(h)"), ("25 deg/h", "200 mGal"), 1.0),
     _from_tuning("HGuide-i300", _GINS, ("0.2 deg/sqrt(h)", "0.2 m/s/sqrt(h)"), ("15 deg/h", "150 mGal"), 1.0),
-    _from_tuning("Leador-A15", "settings of KF-GINS for its own demonstration drive, dataset/kf-gins.yaml",
+    _from_tuning("Leador-A15", "KF-GINS, dataset/kf-gins.yaml",
            ("0.003 deg/sqrt(h)", "0.03 m/s/sqrt(h)"), ("0.027 deg/h", "15 mGal"), 4.0, ("300 ppm", "300 ppm")),
     ImuModel("ADIS16448",
              _figures({"noise_density": "1.6968e-4 rad/s/sqrt(Hz)", "bias_walk": "1.9393e-5 rad/s/sqrt(s)"},
                       {"noise_density": "2.0e-3 m/s2/sqrt(Hz)", "bias_walk": "3.0e-3 m/s2/sqrt(s)"}),
-             "Allan variance in imu0/sensor.yaml of the EuRoC data set (Burri et al., 2016)"),
-    _sheet("STIM300", "data sheet of Sensonor (10 g range), quoted with its source in the documentation of NavToolkit",
+             "EuRoC data set (Burri et al., 2016), imu0/sensor.yaml: Allan variance"),
+    _sheet("STIM300", "data sheet of Sensonor (10 g range), by the documentation of NavToolkit",
            ("0.15 deg/sqrt(h)", "0.06 m/s/sqrt(h)"), ("0.5 deg/h", "0.05 mg"), ("4 deg/h", "0.75 mg"),
            ("500 ppm", "300 ppm")),
-    _sheet("Ellipse2", "data sheet of SBG, quoted in a table of NAVIGATION (ion.org) beside the STIM300; turn-on "
-           "biases are that table's own", ("0.15 deg/sqrt(h)", "0.033 m/s/sqrt(h)"), ("7 deg/h", "0.014 mg"),
+    _sheet("Ellipse2", "data sheet of SBG, by a table of NAVIGATION (ion.org)",
+           ("0.15 deg/sqrt(h)", "0.033 m/s/sqrt(h)"), ("7 deg/h", "0.014 mg"),
            ("70 deg/h", "0.14 mg")),
-    _sheet("MTi-1", "data sheet of Xsens, quoted in Transactions on Aerospace Research 2023 (tar-2023-0022), table 2",
+    _sheet("MTi-1", "data sheet of Xsens, by Transactions on Aerospace Research, tar-2023-0022",
            ("0.007 deg/s/sqrt(Hz)", "120 ug/sqrt(Hz)"), ("10 deg/h", "0.03 mg")),
-    _sheet("ICM-42688-P", "data sheet of TDK InvenSense, features on its first page",
+    _sheet("ICM-42688-P", "data sheet of TDK InvenSense",
            ("2.8 mdps/sqrt(Hz)", "70 ug/sqrt(Hz)")),
-    _sheet("ICM-42605", "data sheet of TDK InvenSense DS-000292 1.5, features on its first page",
+    _sheet("ICM-42605", "data sheet of TDK InvenSense DS-000292 1.5",
            ("3.8 mdps/sqrt(Hz)", "70 ug/sqrt(Hz)")),
-    _sheet("LSM6DSV", "data sheet of STMicroelectronics, quoted in the documentation of Luxonis",
+    _sheet("LSM6DSV", "data sheet of STMicroelectronics, by the documentation of Luxonis",
            ("2.8 mdps/sqrt(Hz)", "60 ug/sqrt(Hz)")),
 )  # fmt: skip
 

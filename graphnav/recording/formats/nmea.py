@@ -181,7 +181,10 @@ def _note(epoch: _Epoch, kind: bytes, message: Any) -> None:
 def _number(value: Any) -> float:
     if value in ("", None):
         return float("nan")
-    return parse_number(value) if isinstance(value, str) else float(value)
+    try:
+        return parse_number(value) if isinstance(value, str) else float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        return float("nan")
 
 
 def _times(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Remarks) -> tuple[Array, float | None]:

@@ -75,7 +75,9 @@ def usable_rows(
             )
     rows = rows.with_column("t", rows["t"] * TIME[unit] + offset)
 
-    blank = np.isnan(np.stack([rows[name] for name in needed])).any(0)
+    blank = np.zeros(len(rows), dtype=bool)
+    for name in needed:
+        blank |= np.isnan(rows[name])
     if blank.all():
         raise RecordingError(
             f"{rows.path}: no row holds all of {', '.join(needed)} (all blank or NaN)", key="table.all_blank"

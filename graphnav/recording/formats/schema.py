@@ -123,7 +123,7 @@ class ImuTable(SensorTable):
 
     @field_validator("model")
     @classmethod
-    def _known_model(cls, model: str | None) -> str | None:
+    def _check_model(cls, model: str | None) -> str | None:
         if model is not None and find_model(model) is None:
             raise ValueError(f"no figures of an IMU called '{model}' are known; {nearest(model, tuple(MODELS))}")
         return model
@@ -200,7 +200,7 @@ class RawGnssTable(TomlTable):
 
     @field_validator("columns")
     @classmethod
-    def _known_columns(cls, columns: dict[str, str]) -> dict[str, str]:
+    def _check_columns(cls, columns: dict[str, str]) -> dict[str, str]:
         for name in columns:
             if name not in cls.columns_known:
                 raise ValueError(f"'{name}' is not one of graphnav's columns; {nearest(name, cls.columns_known)}")
@@ -289,7 +289,7 @@ class RecordingFile(TomlTable):
 
     @field_validator("clock")
     @classmethod
-    def _known_clock(cls, clock: str | None) -> str | None:
+    def _check_clock(cls, clock: str | None) -> str | None:
         if clock is not None:
             parse_clock(clock, 0.0)
         return clock

@@ -114,9 +114,9 @@ def read_table(
             )
     use = [header.index(theirs) for theirs in file_names.values()]
     values = _parse(path, skip, header, use)
-    if not values.shape[1]:
+    if not len(values[0]):
         raise RecordingError(f"{path}: holds a header and no rows", key="file.no_rows")
-    return Table(path, dict(zip(file_names, values, strict=True)), file_names, np.arange(values.shape[1]))
+    return Table(path, dict(zip(file_names, values, strict=True)), file_names, np.arange(len(values[0])))
 
 
 def _list_names(header: list[str]) -> str:
@@ -198,7 +198,7 @@ def _header(path: Path) -> tuple[int, list[str]]:
         if len(names) == 1 and mark is not None:
             raise RecordingError(
                 f"{path}, line {number}: fields are separated by {mark}; they must be by commas, numbers written with "
-                f"points{'' if mark == _MARKS[' '] else ' (graphnav init makes such a file of it)'}",
+                "points (graphnav init makes such a file of it)",
                 key="table.separator",
             )
         if all(_is_number(name) for name in names):
@@ -218,8 +218,8 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> Array:
-    """The wanted columns, (len(use), N): plain numbers, else as NumPy reads them, else cell by cell."""
+def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> list[Array]:
+    """The wanted columns, (N,) each: plain numbers, else as NumPy reads them, else cell by cell."""
     try:
         with _open_bytes(path) as raw:
             head = b"".join(raw.readline() for _ in range(skip))
@@ -233,7 +233,7 @@ def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> Array:
         values = _loadtxt(text, skip, header, use)
     except ValueError:
         values = _parse_cells(path, header, use)
-    return np.ascontiguousarray(values.T)
+    return list(np.ascontiguousarray(values.T))
 
 
 def _loadtxt(text: str, skip: int, header: list[str], use: list[int]) -> Array:
@@ -272,7 +272,7 @@ def _hint(cell: str, cells: list[str], header: list[str], use: list[int]) -> str
     if [one.strip('"') for one in cells] == header:
         return "; the header is there again: cut the file in two there, or take the line out"
     if re.fullmatch(r"(\d+-\d+-\d+[T ])?\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?Z?", cell):
-        return "; it is a time of day: write seconds"
+        return "; it is a time of day: write seconds, or let graphnav init do it"
     if not any(_is_number(cells[k].strip('"')) for k in use):
         return "; if the line holds units, take it out"
     return ""

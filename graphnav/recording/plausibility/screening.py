@@ -131,11 +131,6 @@ def screen(recording: Recording) -> Screened:
     return Screened(recording, tuple(findings), clock)
 
 
-def screen_again(recording: Recording) -> Recording:
-    """The recording as `screen` left it when it was solved, without looking for findings again."""
-    return recording if recording.screened else _without_the_impossible(recording)[0]
-
-
 def _without_the_impossible(recording: Recording) -> tuple[Recording, list[Finding], list[Finding], Track | None]:
     """The recording without what cannot be right, findings of the IMU and of the others, and the way by the fixes."""
     of_imu: list[Finding] = list(check_imu_scale(recording))
@@ -159,8 +154,10 @@ def _without_the_impossible(recording: Recording) -> tuple[Recording, list[Findi
 def check_imu_scale(recording: Recording) -> Iterator[Finding]:
     """A force at rest that is not gravity, and a turn rate that no sensor reads: units and scales."""
     imu = recording.imu
-    rate = np.abs(imu.gyro).max(axis=1)
-    beyond = float((~(rate <= GYRO_RANGE)).mean())
+    wild = np.zeros(len(imu.t), dtype=bool)
+    for x in imu.gyro.T:  # axis by axis, here and below: a day has a hundred megabytes of each
+        wild |= ~(np.abs(x) <= GYRO_RANGE)
+    beyond = float(wild.mean())
     if beyond > _ISOLATED:
         yield Finding(
             "refused",
@@ -169,7 +166,10 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
             "imu.gyro_unit",
         )
     with np.errstate(over="ignore", invalid="ignore"):
-        turn = np.linalg.norm(imu.gyro - np.median(imu.gyro, axis=0), axis=1)
+        turn = np.zeros(len(imu.t))
+        for x in imu.gyro.T:
+            turn += (x - np.median(x)) ** 2
+        np.sqrt(turn, out=turn)
         calm = turn <= np.percentile(turn, _QUIET)
         f = float(np.median(np.linalg.norm(imu.accel[calm], axis=1)))
     if (sentence := _scale(f)) is not None:
@@ -243,19 +243,17 @@ def check_dead_axes(recording: Recording) -> Iterator[Finding]:
     period = period_of(imu.t)
     whole = recording.duration
     for name, values in (("gyro", imu.gyro), ("accelerometer", imu.accel)):
-        x = values @ imu.R_bs  # the file's axes
-        size = np.abs(x).max(axis=0)
-        step = np.abs(np.diff(x, axis=0))
-        same = step <= 1e-12 * size  # turned into body axes and back, equal values differ by rounding
         for axis in range(3):
-            a, b = max(runs_of(same[:, axis]), key=lambda run: run[1] - run[0], default=(0, 0))
+            x, same = _repeats(values @ imu.R_bs[:, axis])
+            a, b = max(runs_of(same), key=lambda run: run[1] - run[0], default=(0, 0))
             lasts = float(imu.t[b] - imu.t[a])
             if lasts < min(_DEAD, 0.9 * whole) or b - a < _DEAD:
                 continue
             others = [k for k in range(3) if k != axis]
-            if not any(_moves(x[a : b + 1, k], same[a:b, k], _STIRS[name]) for k in others):
+            turned = (_repeats(values @ imu.R_bs[:, k]) for k in others)
+            if not any(_moves(y[a : b + 1], stays[a:b], _STIRS[name]) for y, stays in turned):
                 continue
-            value = x[a, axis]
+            value = x[a]
             when = (
                 "throughout"
                 if lasts > whole - 2.0 * period - 0.01 * whole
@@ -269,6 +267,12 @@ def check_dead_axes(recording: Recording) -> Iterator[Finding]:
                 + ("" if when == "throughout" else "; use what lies before or after (--start, --end)"),
                 "imu.dead_axis",
             )
+
+
+def _repeats(x: Array) -> tuple[Array, Array]:
+    """An axis (N,) of the file, and which values (N-1,) are that before: turned and back, these differ by rounding."""
+    step = np.diff(x)
+    return x, np.abs(step, out=step) <= 1e-12 * max(float(x.max()), -float(x.min()))
 
 
 def _moves(x: Array, same: Array, least: float) -> bool:
