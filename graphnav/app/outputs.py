@@ -13,7 +13,7 @@ import numpy as np
 
 from graphnav.app import stored
 from graphnav.app.scores import outages
-from graphnav.app.stored import attach_recording, write_outcome
+from graphnav.app.stored import write_outcome
 from graphnav.app.summary import comparison, gather_provenance, noise_rows, solver_summary
 from graphnav.app.workflow import Outcome
 from graphnav.core.errors import ConfigError, PartlyWrittenError
@@ -125,12 +125,11 @@ def draw_again(folder: Path, part: Path) -> list[Path]:
     Raises
     ------
     GraphnavError
-        If there is none, or its recording has changed.
+        If there is none.
     """
     from graphnav.report import documents as report
 
     outcome, provenance = stored.read_outcome(folder / stored.NAME)
-    outcome = attach_recording(outcome, provenance["inputs"])
     alone = not (folder / "comparison.csv").exists()
     detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
     files = []

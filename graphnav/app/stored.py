@@ -1,13 +1,12 @@
 """What came of a run, kept in a file beside its results, so that its pages can be drawn again without solving.
 
 `run.npz` holds the arrays, and as JSON how they hang together: nested dataclasses of this package by their names, and
-plain values. The recording is not in it; it is read again, and must be the same to the byte. What lies between the
-keyframes is not in it either: it is drawn straight.
+plain values. Of the IMU it holds the rows that are drawn. What lies between the keyframes is not in it: it is drawn
+straight.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import zlib
 from collections.abc import Mapping
@@ -19,23 +18,24 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
-from graphnav.app.workflow import Outcome, read_part
+from graphnav.app.workflow import Outcome
 from graphnav.config import Settings
 from graphnav.core import rotation
-from graphnav.core.errors import ConfigError, RecordingError
+from graphnav.core.errors import ConfigError
 from graphnav.core.files import check_regular, check_size, exists, parse_json
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import times_between
 from graphnav.estimation.solution import Solution
-from graphnav.recording import Recording
-from graphnav.recording.checks.stated import truth_apart
-from graphnav.recording.plausibility.screening import screen_again
+from graphnav.recording import Recording, rows_of
+from graphnav.report.plots.detections import drawn_rows
+from graphnav.report.plots.thinning import BINS
+from graphnav.sensors import Series, list_sensors
 
 NAME = "run.npz"
-_FORM = "graphnav-run/1"
-_ANEW = ("between", "graphs")  # of a solution: what only solving again gives
+_FORM = "graphnav-run/2"
+_ANEW = ("between", "graphs", "own")  # what only solving again gives, and classes of a script
 _PACKAGE = __name__.partition(".")[0]
 
 
@@ -73,8 +73,9 @@ class Straight:
 
 
 def write_outcome(outcome: Outcome, provenance: Mapping[str, Any], path: Path) -> None:
-    """Keep all of an outcome but its recording, with the provenance of the run."""
+    """Keep all of an outcome that its pages show, with the provenance of the run."""
     arrays: list[Array] = []
+    outcome = replace(outcome, recording=_thin_recording(outcome.recording))
     plain = json.dumps({"form": _FORM, "outcome": _pack(outcome, arrays), "provenance": _pack(provenance, arrays)})
     text = np.frombuffer(plain.encode(), dtype=np.uint8)
     named: dict[str, Any] = {f"a{k}": a for k, a in enumerate(arrays)}
@@ -82,7 +83,7 @@ def write_outcome(outcome: Outcome, provenance: Mapping[str, Any], path: Path) -
 
 
 def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
-    """An outcome without its recording (`attach_recording` reads that), and the provenance of its run.
+    """An outcome with what its pages show of the recording, and the provenance of its run.
 
     Raises
     ------
@@ -116,31 +117,13 @@ def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
         ) from None
 
 
-def attach_recording(outcome: Outcome, inputs: Mapping[str, str]) -> Outcome:
-    """An outcome of `read_outcome` with its recording; `inputs` are the sha256 of all files that it was read from.
-
-    Raises
-    ------
-    GraphnavError
-        If one of them has changed or is gone, naming it.
-    """
-    request = outcome.request
-    for name, digest in inputs.items():
-        if not Path(name).is_file():
-            raise RecordingError(
-                f"{name}: is not there any more; it was read for these results", key="results.input_gone"
-            )
-        if sha256(Path(name)) != digest:
-            raise RecordingError(f"{name}: has changed since; solve again", key="results.input_changed")
-    part = read_part(request.source, request.start, request.end, topics=request.topics)
-    recording = screen_again(part)
-    return replace(outcome, recording=replace(recording, truth=None) if truth_apart(recording) else recording)
-
-
-def sha256(path: Path) -> str:
-    """Of a file, in hexadecimal digits."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _thin_recording(recording: Recording) -> Recording:
+    """As much of a recording as the pages show."""
+    imu = recording.imu
+    shown = np.zeros(len(imu.t), dtype=bool)
+    shown[: 4 * BINS + 1] = True  # for the period, and more than is drawn without thinning
+    shown[drawn_rows(imu)] = True
+    return replace(recording, imu=rows_of(imu, shown), raw_gnss=None)
 
 
 def _pack(value: Any, arrays: list[Array]) -> Any:
@@ -160,8 +143,8 @@ def _pack(value: Any, arrays: list[Array]) -> Any:
         return {"settings": value.model_dump(mode="json")}
     if isinstance(value, Path):
         return {"path": str(value)}
-    if isinstance(value, Recording):
-        return None
+    if isinstance(value, Series):
+        return {"series": value.sensor.name, "rows": _pack([value.t, value.values], arrays)}
     if isinstance(value, Mapping):
         return {"map": [[_pack(k, arrays), _pack(v, arrays)] for k, v in value.items()]}
     if isinstance(value, tuple | list):
@@ -187,6 +170,10 @@ def _unpack(value: Any, arrays: list[Array]) -> Any:
         return Settings.model_validate(value["settings"])
     if "path" in value:
         return Path(value["path"])
+    if "series" in value:
+        sensor = list_sensors()[value["series"]]
+        t, rows = _unpack(value["rows"], arrays)
+        return Series(sensor, t, rows, sensor.figures.model_construct())
     if "map" in value:
         return {_unpack(k, arrays): _unpack(v, arrays) for k, v in value["map"]}
     if "tuple" in value:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import graphnav
-from graphnav.app.stored import sha256
 from graphnav.app.workflow import Outcome
+from graphnav.core.files import sha256
 from graphnav.core.findings import Finding
 from graphnav.core.jsonable import peak_memory_mb
 from graphnav.core.notes import key_of
@@ -104,14 +104,7 @@ def noise_rows(outcome: Outcome, solution: Solution) -> tuple[FigureRow, ...]:
     for source, span in outcome.used_withheld:
         if source in recording.aiding:
             recording = recording.without(source, span)
-    imu = None
-    if recording.platform == "foot" and any(group.startswith("imu.") for group in solution.noise.figures):
-        # factors of a walk are relative to the densities of its rests
-        from graphnav.estimation.noise.imu_floor import with_measured_floor
-        from graphnav.imu.onboard_offset import without_onboard_offset
-
-        imu = with_measured_floor(without_onboard_offset(recording, settings)[0], settings)[0].imu.noise
-    return figure_rows(solution.noise, recording, settings.gnss.slow_times, imu)
+    return figure_rows(solution.noise, recording, settings.gnss.slow_times, outcome.densities)
 
 
 def noise_summary(outcome: Outcome, solution: Solution) -> dict[str, Any]:

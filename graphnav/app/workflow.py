@@ -26,7 +26,7 @@ from graphnav.core.progress import Progress, listening, tell
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import Against, read_against
-from graphnav.recording import Recording, sources
+from graphnav.recording import ImuNoise, Recording, sources
 from graphnav.recording.exporters import check_names
 
 if TYPE_CHECKING:
@@ -79,6 +79,7 @@ class Outcome:
     warnings: tuple[str, ...]  # those of the findings that results suffer from
     timings: dict[str, float]  # s by stage, of what all solvers share
     checks: tuple[Finding, ...] = ()  # what the checks of the recording found, with keys and severities
+    densities: ImuNoise | None = None  # what the noise factors of the IMU are relative to, if not to what it states
 
     @property
     def used_withheld(self) -> tuple[Withheld, ...]:
@@ -204,10 +205,23 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
 
         checks = (*find_reversed_arms(used), *checks)
         findings = [*(f.sentence for f in checks), *findings]
+    densities = _find_densities(used, request.settings, solutions)
     return Outcome(
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
-        tuple(f.sentence for f in checks if f.severity != "note"), timings | spent, checks,
+        tuple(f.sentence for f in checks if f.severity != "note"), timings | spent, checks, densities,
     )  # fmt: skip
+
+
+def _find_densities(recording: Recording, settings: Settings, solutions: Mapping[str, Solution]) -> ImuNoise | None:
+    """Those of the rests, which factors of a walk are relative to; None where they are to what is stated."""
+    if recording.platform != "foot":
+        return None
+    if not any(group.startswith("imu.") for solution in solutions.values() for group in solution.noise.figures):
+        return None
+    from graphnav.estimation.noise.imu_floor import with_measured_floor
+    from graphnav.imu.onboard_offset import without_onboard_offset
+
+    return with_measured_floor(without_onboard_offset(recording, settings)[0], settings)[0].imu.noise
 
 
 def _beside(request: Request, recording: Recording, solutions: Mapping[str, Solution]) -> dict[str, Solution]:

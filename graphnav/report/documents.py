@@ -64,7 +64,7 @@ def write_report(
     spans = _shades(solution, start, withheld, outages)
     if detectors is None:
         detectors = detector_pictures(recording, solution)
-    if recording.gnss is None and recording.raw_gnss is None:  # what comes after knows no place of its own
+    if not pictures.has_place(solution):  # nor does what comes after
         solution = replace(solution, separation=None)
     own, others = ({k: p for k, p in solution.parameters.items() if has_names(k) == of_it} for of_it in (True, False))
     sections: Sections = [
@@ -113,6 +113,7 @@ def write_report(
             [
                 *_gallery(pictures.timeline_picture(solution, recording, spans)),
                 *tables.constraint_table(solution),
+                *tables.satellite_tables(solution),
                 *tables.ambiguity_table(solution),
                 *tables.rejected_table(solution, start),
                 *_fold("Residuals of each", _gallery(pictures.record_pictures(solution, start, end, spans))),

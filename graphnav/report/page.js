@@ -1,15 +1,80 @@
 // Unpacks plotly, draws each figure when it comes into sight and all of them before printing, keeps the time axes of
 // all figures together, and draws again in the colours of a dark or light page.
-(async () => {
+(() => {
+  // RFC 1951 in zlib's envelope, all at once: browsers unpack streams only later, when a page may be printed already
+  const inflate = (data, size) => {
+    const out = new Uint8Array(size);
+    let at = 2, to = 0, held = 0, have = 0, last;
+    const need = n => { for (; have < n; have += 8) held |= data[at++] << have; };
+    const drop = n => { held >>>= n; have -= n; };
+    const bits = n => { need(n); const value = held & ((1 << n) - 1); drop(n); return value; };
+    const codes = lengths => {  // by the bits that come next: symbol and length of its code
+      const table = new Uint16Array(1 << Math.max(...lengths));
+      for (let n = 1, code = 0; 1 << n <= table.length; n++, code <<= 1) lengths.forEach((length, symbol) => {
+        if (length !== n) return;
+        let k = 0;
+        for (let bit = 0; bit < n; bit++) k |= (code >> bit & 1) << n - 1 - bit;
+        for (; k < table.length; k += 1 << n) table[k] = symbol << 4 | n;
+        code++;
+      });
+      return table;
+    };
+    const next = table => { need(15); const found = table[held & table.length - 1]; drop(found & 15); return found >> 4; };
+    const same = (count, length) => Array(count).fill(length);
+    const steps = (first, few, each) => {  // where the lengths, or distances, of each symbol begin; their bits
+      const begins = [first], more = [];
+      for (let k = 0; k < 30; k++) begins.push(begins[k] + (1 << (more[k] = k < few ? 0 : (k - few) / each + 1 | 0)));
+      return [begins, more];
+    };
+    const [lengthOf, lengthBits] = steps(3, 8, 4), [distanceOf, distanceBits] = steps(1, 4, 2);
+    lengthOf[28] = 258;
+    lengthBits[28] = 0;
+    do {
+      last = bits(1);
+      const kind = bits(2);
+      if (kind === 0) {
+        at -= have >> 3;
+        held = have = 0;
+        const count = data[at] | data[at + 1] << 8;
+        out.set(data.subarray(at += 4, at += count), to);
+        to += count;
+        continue;
+      }
+      let literals = [...same(144, 8), ...same(112, 9), ...same(24, 7), ...same(8, 8)], distances = same(30, 5);
+      if (kind === 2) {
+        const many = bits(5) + 257, far = bits(5) + 1, count = bits(4) + 4, own = same(19, 0), all = [];
+        [16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15].slice(0, count).forEach(k => own[k] = bits(3));
+        const table = codes(own);
+        while (all.length < many + far) {
+          const one = next(table);
+          if (one < 16) all.push(one);
+          else if (one === 16) all.push(...same(bits(2) + 3, all.at(-1)));
+          else all.push(...same(one === 17 ? bits(3) + 3 : bits(7) + 11, 0));
+        }
+        literals = all.slice(0, many);
+        distances = all.slice(many);
+      }
+      const literal = codes(literals), distance = codes(distances);
+      for (let one; (one = next(literal)) !== 256;) {
+        if (one < 256) {
+          out[to++] = one;
+          continue;
+        }
+        const end = to + lengthOf[one -= 257] + bits(lengthBits[one]), k = next(distance);
+        for (let from = to - distanceOf[k] - bits(distanceBits[k]); to < end;) out[to++] = out[from++];
+      }
+    } while (!last);
+    return out;
+  };
   const unpacked = element => {
     const packed = Uint8Array.from(atob(element.textContent), c => c.charCodeAt(0));
-    return new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"))).text();
+    return new TextDecoder().decode(inflate(packed, Number(element.dataset.size)));
   };
   const library = document.createElement("script");
-  library.textContent = await unpacked(document.getElementById("plotly-library"));
+  library.textContent = unpacked(document.getElementById("plotly-library"));
   document.head.append(library);
   const places = [...document.querySelectorAll(".plot")];
-  const texts = await Promise.all(places.map(place => unpacked(place.nextElementSibling)));
+  const texts = places.map(place => unpacked(place.nextElementSibling));
   const touch = matchMedia("(pointer: coarse)").matches;
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const config = {responsive: true, displaylogo: false, displayModeBar: touch ? true : "hover",

@@ -160,7 +160,7 @@ def picture(figure: Figure, title: str, note: str = "", kind: str = "") -> Raw:
     parts = [
         f"<figcaption>{text(title)}</figcaption>",
         f'<div class="plot" role="img" aria-label="{escape(title)}"{time} style="height:{figure.height}px"></div>',
-        f'<script type="{_PACKED}">{_deflate(data)}</script>',
+        _packed(data),
         f'<p class="note">{text(note)}</p>' if note else "",
     ]
     mark = f' class="{kind}"' if kind else ""
@@ -228,7 +228,7 @@ def page(
     )
     script = ""
     if "<figure" in body:
-        script = f'<script type="{_PACKED}" id="plotly-library">{_library()}</script>'
+        script = _library()
         script += f"<script>{(_HERE / 'page.js').read_text(encoding='utf-8')}</script>"
         body = f'<noscript><p class="soft">The figures need scripts, which are off.</p></noscript>{body}'
     style = css_colours() + (_HERE / "page.css").read_text(encoding="utf-8")
@@ -245,8 +245,11 @@ def _library() -> str:
     found = importlib.util.find_spec("plotly")
     if found is None or found.origin is None:
         raise ModuleNotFoundError("plotly is not installed")
-    return _deflate((Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes())
+    return _packed((Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes(), "plotly-library")
 
 
-def _deflate(content: bytes) -> str:
-    return base64.b64encode(zlib.compress(content, _LEVEL)).decode("ascii")
+def _packed(content: bytes, key: str = "") -> str:
+    """An element that holds something deflated, for `page.js` to unpack."""
+    mark = f' id="{key}"' if key else ""
+    packed = base64.b64encode(zlib.compress(content, _LEVEL)).decode("ascii")
+    return f'<script type="{_PACKED}"{mark} data-size="{len(content)}">{packed}</script>'

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from graphnav.core.earth import LocalFrame
 from graphnav.core.interpolation import fit_yaw, yaw_matrix
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
@@ -46,7 +47,7 @@ def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], 
     )
     lat, lon = np.degrees(first.frame.origin[:2])
     where = f"North is up; the origin is latitude {lat:.6f}, longitude {lon:.6f} deg."
-    if recording.gnss is None:
+    if not has_place(first):
         where = "Nothing says where on the Earth this is: place and heading count from the start."
     return page.picture(figure, "Plan view", where, kind="large")
 
@@ -61,7 +62,7 @@ def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> 
 
     lines, points = {}, {}
     truth, fixes = _truth(recording, solutions), fixes_of(recording, first)
-    base = 0.0 if recording.gnss is None else float(first.frame.origin[2])
+    base = float(first.frame.origin[2]) if has_place(first) else 0.0
     if truth is not None and truth[1].shape[1] > 2:
         lines["truth"] = over_way(truth[0], base + truth[1][:, 2])
     lines |= {name: over_way(s.t, base + s.states.p[:, 2]) for name, s in solutions.items()}
@@ -70,14 +71,14 @@ def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> 
             rows = of_it & ~fixes.excluded
             points[kind] = over_way(fixes.t[rows] + start, base + fixes.enu[rows, 2])
     note = "Heights above the ellipsoid; fixes are of the antenna."
-    if recording.gnss is None:
+    if not has_place(first):
         note = "Heights count from the start."
     return page.picture(plots.profile(lines, points), "Height profile", note, kind="large")
 
 
 def fixes_of(recording: Recording, solution: Solution) -> plots.Fixes | None:
     """The fixes in metres, of what kind each is, and which the solver did not use though nobody withheld them."""
-    if recording.gnss is None:
+    if recording.gnss is None or not has_place(solution):
         return None
     gnss, t = recording.gnss, recording.gnss.t
     out = np.zeros(len(t), dtype=bool)
@@ -106,20 +107,30 @@ def fixes_of(recording: Recording, solution: Solution) -> plots.Fixes | None:
 def _truth(recording: Recording, solutions: Mapping[str, Solution]) -> tuple[Array, Array] | None:
     """Times (M,) and places (M, 2 or 3) of the truth, in metres like the first solution's."""
     truth, first = recording.truth, next(iter(solutions.values()))
-    if truth is not None and truth.llh is not None:
+    if truth is None or (truth.llh is None and truth.xyz is None):
+        return None
+    if truth.llh is not None and has_place(first):
         return truth.t, first.frame.from_llh(truth.llh)
-    if truth is not None and truth.xyz is not None:
-        return truth.t, _lay_on(truth.t, truth.xyz, list(own_solutions(solutions).values())[-1])
-    return None
+    own = truth.xyz if truth.llh is None else LocalFrame(truth.llh[0]).from_llh(truth.llh)
+    assert own is not None
+    return _lay_on(truth.t, own, list(own_solutions(solutions).values())[-1])
 
 
-def _lay_on(t: Array, xyz: Array, solution: Solution) -> Array:
-    """A truth (M, 2 or 3) in a frame of its own, turned and moved onto a solution, (N, 2)."""
+def has_place(solution: Solution) -> bool:
+    """Whether a solution knows where on the Earth it is; else its place and heading count from the start."""
+    return any(kind.startswith("gnss") for kind in solution.records)
+
+
+def _lay_on(t: Array, xyz: Array, solution: Solution) -> tuple[Array, Array] | None:
+    """A truth (M, 2 or 3) in another frame, turned and moved onto a solution: times (N,) and places (N, 2 or 3)."""
     shared = (t >= solution.t[0]) & (t <= solution.t[-1]) & np.isfinite(xyz).all(axis=1)
-    p = solution.at(t[shared])[1].p
-    flat = np.column_stack([xyz[shared, :2], np.zeros(len(p))])
-    yaw, offset = fit_yaw(flat, p)
-    return np.asarray((flat @ yaw_matrix(yaw).T + offset)[:, :2])
+    if shared.sum() < 2:
+        return None
+    p = np.column_stack([np.interp(t[shared], solution.t, x) for x in solution.states.p.T])
+    own = np.zeros_like(p)
+    own[:, : xyz.shape[1]] = xyz[shared]
+    yaw, offset = fit_yaw(own, p)
+    return t[shared], np.asarray((own @ yaw_matrix(yaw).T + offset)[:, : xyz.shape[1]])
 
 
 def error_series(errors: Errors, start: float) -> dict[str, Series]:
@@ -194,7 +205,7 @@ def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spa
     first = next(iter(solutions.values()))
     tracks = {name: s.trajectory() for name, s in solutions.items()}
     fixes, gnss = fixes_of(recording, first), recording.gnss
-    base = np.array([0.0, 0.0, 0.0 if gnss is None else float(first.frame.origin[2])])
+    base = np.array([0.0, 0.0, float(first.frame.origin[2]) if has_place(first) else 0.0])
 
     def draw_measured(panel: plots.Panel, k: int) -> None:
         if fixes is not None:

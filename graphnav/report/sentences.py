@@ -14,9 +14,10 @@ from graphnav.evaluation.against import own_solutions
 from graphnav.evaluation.segments import rms
 from graphnav.recording import Recording
 from graphnav.report import page
+from graphnav.report.consistency import consistency
 from graphnav.report.page import Raw
 from graphnav.report.plots import Spans
-from graphnav.report.tables import Withheld, consistency
+from graphnav.report.tables import Withheld
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
@@ -74,8 +75,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
     for source, span in withheld:
         if source in used.aiding:
             used = used.without(source, span)
-    rate = 1.0 / float(np.median(np.diff(used.imu.t)))
-    sources = [f"{len(used.imu.t)} IMU rows at {rate:.4g} Hz"]
+    sources = [f"an IMU at {1.0 / used.imu.period:.4g} Hz"]
     if used.gnss is not None:
         sources.append(f"{len(used.gnss.t)} GNSS fixes")
     if used.odometer is not None:

@@ -13,9 +13,10 @@ from graphnav.estimation.solution import Solution
 from graphnav.evaluation.segments import relative_errors, rms
 from graphnav.recording import Recording
 from graphnav.report import page
+from graphnav.report.consistency import consistency
 from graphnav.report.page import Raw
 from graphnav.report.pictures import ENU, fixes_of
-from graphnav.report.tables import Withheld, consistency
+from graphnav.report.tables import Withheld
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from graphnav.evaluation.against import own_solutions
 from graphnav.evaluation.segments import rms
 from graphnav.recording import Recording
 from graphnav.report import page
+from graphnav.report.consistency import CONSISTENCY_HEAD, consistency, consistency_row, mean_or_nan
 from graphnav.report.names import components
 from graphnav.report.page import Raw
 from graphnav.report.plots import Spans
@@ -27,66 +28,6 @@ if TYPE_CHECKING:
 _LISTED = 40  # rejected measurements, stops
 _SHOWN = 10  # excluded spans, stops; the others open on demand
 Withheld = Sequence[tuple[str, tuple[float, float] | None]]
-
-
-@dataclass(frozen=True)
-class Consistency:
-    """How one constraint's residuals compare with their sigma."""
-
-    count: int
-    rejected: int
-    reduced: int
-    mean_nis: float  # of what was not rejected
-    dof: int
-    outside: float  # share of components beyond 3 sigma, of what was not rejected
-    kind: str
-
-    @property
-    def verdict(self) -> str:
-        """One sentence on the consistency of sigma."""
-        if self.count - self.rejected < 10 or not np.isfinite(self.mean_nis):
-            return "too few to judge"
-        ratio = self.mean_nis / self.dof
-        if self.kind == "residual":
-            # a fit takes up part of the noise, so a smoother's residuals are below their sigma, never above
-            if ratio > 1.3:
-                return "residuals larger than sigma allows: sigma is too small, or something is unmodelled"
-            return "residuals within their sigma"
-        if ratio > 1.5:
-            return "innovations larger than predicted: the filter is overconfident"
-        if ratio < 0.5:
-            return "innovations smaller than predicted: sigma is wider than it need be"
-        return "innovations as large as predicted: sigma is consistent"
-
-
-def consistency(record: ConstraintRecord) -> Consistency:
-    """Summarise a record.
-
-    A residual of weight w counts with the sigma that it was used with, larger by 1 / sqrt(w); of an innovation
-    the normalised square is of that already.
-    """
-    used = record.weight > 1e-9
-    weight = record.weight[used] if record.kind == "residual" else np.ones(int(used.sum()))
-    white = np.abs(record.residual[used] / record.sigma[used]) * np.sqrt(weight)[:, None]
-    white = white[np.isfinite(white)]
-    return Consistency(
-        count=len(record.t),
-        rejected=int(np.sum(~used)),
-        reduced=int(np.sum(used & (record.weight < 0.5))),
-        mean_nis=_mean(weight * record.nis[used]),
-        dof=record.residual.shape[1],
-        outside=_mean((white > 3.0).astype(float)),
-        kind=record.kind,
-    )
-
-
-CONSISTENCY_HEAD = ("used", "rejected", "weight < 0.5", "mean NIS", "components", "outside 3 sigma", "what it says")
-
-
-def consistency_row(c: Consistency) -> list[Any]:
-    """The cells under `CONSISTENCY_HEAD`."""
-    outside = f"{100 * c.outside:.2f} %" if np.isfinite(c.outside) else "-"
-    return [c.count - c.rejected, c.rejected, c.reduced, float(c.mean_nis), c.dof, Raw(outside), c.verdict]
 
 
 def constraint_table(solution: Solution) -> list[Raw]:
@@ -108,6 +49,46 @@ def constraint_table(solution: Solution) -> list[Raw]:
     return out
 
 
+_ELEVATIONS = (0.0, 15.0, 30.0, 45.0, 60.0, 90.0)  # deg
+
+
+def satellite_tables(solution: Solution) -> list[Raw]:
+    """Residuals of rows of satellites, in sigmas as weighted, by satellite and by elevation."""
+    records = {kind: r for kind, r in solution.records.items() if len(r.satellite) == len(r.t) > 0}
+    if not records:
+        return []
+    names = sorted({name for r in records.values() for name in r.satellite.tolist()})
+    which = {kind: np.searchsorted(names, r.satellite) for kind, r in records.items()}
+    by_satellite = [
+        [name, *(cell for kind, r in records.items() for cell in _residual_cells(r, which[kind] == k))]
+        for k, name in enumerate(names)
+    ]
+    by_elevation = [
+        [
+            f"{low:.0f} to {high:.0f} deg",
+            *(
+                cell
+                for r in records.values()
+                for cell in _residual_cells(r, (np.degrees(r.elevation) >= low) & (np.degrees(r.elevation) < high))
+            ),
+        ]
+        for low, high in itertools.pairwise(_ELEVATIONS)
+    ]
+    head = [cell for kind in records for cell in (f"{kind} rows", "refused", "RMS / sigma")]
+    return [page.table(["satellite", *head], by_satellite), page.table(["elevation", *head], by_elevation)]
+
+
+def _residual_cells(record: ConstraintRecord, some: Array) -> list[Any]:
+    """How many rows there are, the share that has less than half of its weight, and the RMS of the others in sigmas."""
+    count = int(np.count_nonzero(some))
+    if not count:
+        return ["-", "-", "-"]
+    used = some & (record.weight >= 0.5)
+    nis = record.nis[used] / record.residual.shape[1]
+    share = 1.0 - np.count_nonzero(used) / count
+    return [count, Raw(f"{100.0 * share:.1f} %"), float(np.sqrt(np.mean(nis))) if len(nis) else "-"]
+
+
 def ambiguity_table(solution: Solution) -> list[Raw]:
     """How many epochs with carriers against a base station have integer ambiguities."""
     epochs = getattr(solution, "fixed", np.empty((0, 2)))
@@ -122,11 +103,6 @@ def ambiguity_table(solution: Solution) -> list[Raw]:
 def _largest(x: Array) -> float:
     x = np.abs(x[np.isfinite(x)])
     return float(x.max()) if x.size else float("nan")
-
-
-def _mean(x: Array) -> float:
-    x = x[np.isfinite(x)]
-    return float(np.mean(x)) if x.size else float("nan")
 
 
 COMPARED_SPAN = ("horizontal RMS [m]", "largest [m]", "at the end [m]", "largest, % of way", "up largest [m]",
@@ -145,7 +121,7 @@ def accuracy_row(errors: Errors) -> list[float]:
         rms(np.linalg.norm(errors.v, axis=1)),
         rms(rph[:, :2]),
         rms(rph[:, 2]),
-        float(np.sqrt(_mean(errors.nees_axis))),
+        float(np.sqrt(mean_or_nan(errors.nees_axis))),
     ]
 
 
@@ -165,7 +141,7 @@ def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[fl
         100.0 * _largest(h) / way if way >= 1.0 else float("nan"),
         _largest(errors.p[rows, 2]),
         float(np.degrees(_largest(errors.rph[rows, 2]))),
-        float(np.sqrt(_mean(errors.nees_axis[rows]))),
+        float(np.sqrt(mean_or_nan(errors.nees_axis[rows]))),
     ]
 
 

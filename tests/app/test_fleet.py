@@ -16,6 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from helpers import refused
 
 from graphnav import load
 from graphnav.app import cli
@@ -165,7 +166,7 @@ def test_a_scheduler_is_told_of_a_few_drives_and_those_it_loses_are_said(
     }
     assert "worker lost" in rows["3"]["error"]
     assert Cluster.most <= 10
-    with pytest.raises(ConfigError, match="tcp://nobody:1"):
+    with refused("fleet.no_cluster", ConfigError, "tcp://nobody:1"):
         next(solve_on_cluster(tasks, "tcp://nobody:1", Limits(1.0)))
 
 

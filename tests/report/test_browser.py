@@ -49,7 +49,7 @@ def checked(tab, width):
 @pytest.mark.parametrize("page", PAGES)
 def test_every_picture_comes_alive_in_both_colours(tab, pages, page, size):
     tab.open(pages / page, size)
-    tab.wait("!!window.Plotly")
+    tab.wait("document.documentElement.dataset.ready !== undefined")
     tab.read()
     shown = "[...document.querySelectorAll('.plot')].filter(p => !p.closest('details'))"
     tab.wait(f"{shown}.every(p => p.classList.contains('js-plotly-plot'))")
@@ -69,6 +69,14 @@ def test_without_scripts_a_page_says_what_is_missing(tab, pages):
     assert tab.run("document.querySelector('main noscript').innerText").strip()
     assert tab.run("document.querySelectorAll('table').length") > 5
     assert tab.trouble == []
+
+
+def test_a_page_that_is_just_loaded_can_be_printed(tab, pages):
+    """As `chromium --print-to-pdf` does: all is unpacked when the page says that it is loaded."""
+    tab.open(pages / "batch/report.html")
+    assert tab.run("document.documentElement.dataset.ready !== undefined && !!window.Plotly")
+    library = "new TextEncoder().encode(document.head.querySelector('script').textContent).length"
+    assert tab.run(library) == tab.run("Number(document.getElementById('plotly-library').dataset.size)")
 
 
 def test_printing_draws_every_figure_that_is_not_folded(tab, pages):

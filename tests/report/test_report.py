@@ -31,12 +31,13 @@ from graphnav.imu.dynamics import SCALE
 from graphnav.recording import Gnss, Imu, Recording, Truth
 from graphnav.report import page
 from graphnav.report import pictures as report_pictures
+from graphnav.report.consistency import consistency
 from graphnav.report.documents import write_comparison, write_report
 from graphnav.report.names import components, has_names
 from graphnav.report.provenance import command, toml_text
 from graphnav.report.sentences import doubts
 from graphnav.report.summary import fix_table, left_out, sigma_table, verdicts
-from graphnav.report.tables import accuracy_row, consistency, excluded_table, span_row
+from graphnav.report.tables import accuracy_row, excluded_table, span_row
 
 START, COUNT = 1000.0, 600
 NAME = "drive <script>alert('x')</script> & \"co\""
@@ -156,7 +157,7 @@ def unpacked(text):
 def figures_of(path):
     """Title -> the figure that plotly is given, of everything on a page."""
     found = re.findall(
-        r'<figcaption>([^<]*)</figcaption><div class="plot"[^>]*></div><script type="[\w/-]*">([^<]*)<',
+        r'<figcaption>([^<]*)</figcaption><div class="plot"[^>]*></div><script type="[\w/-]*" data-size="\d+">([^<]*)<',
         path.read_text(encoding="utf-8"),
     )
     return {title: json.loads(unpacked(packed)) for title, packed in found}
@@ -170,11 +171,11 @@ def checked(path):
     assert parser.references
     assert all(r[1:] in parser.ids for r in parser.references if r.startswith("#"))
     assert all(r.startswith(("#", "data:", "trajectory.")) for r in parser.references)
-    own = re.sub(r'id="plotly-library">[^<]*<', "<", html)
+    own = re.sub(r'id="plotly-library" data-size="\d+">[^<]*<', "<", html)
     assert not re.search(r"url\(|@import", own)
     drawn = figures_of(path)
     assert len(drawn) == len(parser.figures)
-    assert "Plotly" in unpacked(re.search(r'id="plotly-library">([^<]*)<', html)[1])
+    assert "Plotly" in unpacked(re.search(r'id="plotly-library" data-size="\d+">([^<]*)<', html)[1])
     # two elements of the library and its use, and the data of every figure
     assert parser.tags.count("script") == len(parser.figures) + 2
     said = json.dumps(list(drawn.values()))
@@ -202,7 +203,7 @@ def test_report_holds_what_it_was_given(tmp_path, recording):
         "539 GNSS fixes", "gnss 99.5 to 160.5 s", "all of odometer",
         "101.23", "0.04", "599 gnss_position", "0.321", "1.821", "1237",
         "the IMU clock drifts by 12 ppm", "3 rows < NaN were left out", "9.8.7", "deadbeef", "[gnss]",
-        "robust_scale = 3.25", "0.8765", "6000 IMU rows at 10 Hz", "Spans without", "99.5 to 160.5 s",
+        "robust_scale = 3.25", "0.8765", "an IMU at 10 Hz", "Spans without", "99.5 to 160.5 s",
     ):  # fmt: skip
         assert words in text, words
 
@@ -623,3 +624,15 @@ def test_separation_satellites_and_stated_accuracy_are_shown(tmp_path, recording
     assert re.search(
         r">17<.*>17<", (tmp_path / "r.html").read_text().partition("Fixes</h3>")[2].partition("</table>")[0]
     )
+
+
+def test_a_truth_on_the_earth_is_laid_onto_a_walk_that_counts_from_its_start(recording):
+    """The solution's frame stands anywhere and is turned; the truth lies elsewhere on the Earth."""
+    turned, far = solution(offset=0.0), LocalFrame(np.array([0.9, 1.4, 300.0]))
+    p = turned.states.p @ rotation.exp(np.array([0.0, 0.0, 0.7])).T + [50.0, -20.0, 4.0]
+    states = replace(turned.states, p=p)
+    walk = replace(turned, states=states, records={"stance": record()})
+    walked = replace(recording, gnss=None, truth=replace(recording.truth, llh=far.to_llh(way(turned.t - START))))
+    t, laid = report_pictures._truth(walked, {"ekf": walk})
+    assert t == pytest.approx(turned.t)
+    assert laid == pytest.approx(p, abs=0.05)  # the Earth is round

@@ -18,12 +18,11 @@ import numpy as np
 import graphnav
 from graphnav.app import outputs
 from graphnav.app.fleet.manifest import Task
-from graphnav.app.stored import sha256
 from graphnav.app.summary import median_sigmas, solver_summary
 from graphnav.app.workflow import Outcome, Request, parse_noise, parse_withheld, read_part, run_request
 from graphnav.config.files import settings_from
 from graphnav.core.errors import GraphnavError
-from graphnav.core.files import check_regular, parse_json, permit_outside, read_text
+from graphnav.core.files import check_regular, parse_json, permit_outside, read_text, sha256
 from graphnav.core.jsonable import peak_memory_mb, write_json
 from graphnav.core.staging import stage_results
 from graphnav.estimation.noise.apply import row_weights
@@ -183,7 +182,7 @@ def _figures(outcome: Outcome) -> Row:
         "spans": len(ends),
         "span_end_h_median_m": _short(float(np.median(ends))) if ends else None,
         "span_end_h_max_m": max(ends, default=None),
-        "left_out": _left_out(solution),
+        "left_out": _measure_left_out(solution),
         "warnings": len(outcome.warnings),
         **{
             f"noise.{group}": _short(figure.get("variance_factor"))
@@ -208,7 +207,7 @@ MEASURED = (
 )
 
 
-def _left_out(solution: Solution) -> float | None:
+def _measure_left_out(solution: Solution) -> float | None:
     """The share of the fixes' information that is left out."""
     fixes = solution.records.get("gnss_position")
     if fixes is None or not len(fixes.t):

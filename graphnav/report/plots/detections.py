@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import Detection
-from graphnav.recording import Recording
+from graphnav.recording import Imu, Recording
 from graphnav.report.plots.figure import Figure, Panel, limits
-from graphnav.report.plots.thinning import BINS
+from graphnav.report.plots.thinning import BINS, thin
 
 _DYNAMIC = 2.5  # decades of amplitude in the spectrogram
 _FLOOR = 1e-6  # of a statistic, on its logarithmic axis
@@ -34,8 +35,9 @@ def detections(recording: Recording, found: Sequence[Detection]) -> Figure:
             by_name.setdefault(d.name, []).append(d)
     if len(by_name) > _MOST:
         by_name = {name: every for name, every in by_name.items() if name in _SHOWN}
-    t = imu.t - t0
-    force, rate = np.linalg.norm(imu.accel, axis=1), np.degrees(np.linalg.norm(imu.gyro, axis=1))
+    shown = drawn_rows(imu)
+    t = imu.t[shown] - t0
+    force, rate = (size[shown] for size in _sizes(imu))
     speeds = _speeds(recording)
     rows: list[tuple[str, str, tuple[float, float], bool]] = [
         ("size of the specific force [m/s²]", "m/s²", limits([force]), False),
@@ -70,6 +72,16 @@ def detections(recording: Recording, found: Sequence[Detection]) -> Figure:
     if pictured:
         _spectrogram(next(panels), pictured, t0)
     return figure
+
+
+def drawn_rows(imu: Imu) -> NDArray[np.intp]:
+    """Those of an IMU's rows that the figure shows; of these and any others the same."""
+    return np.union1d(*(thin(imu.t, size) for size in _sizes(imu)))
+
+
+def _sizes(imu: Imu) -> tuple[Array, Array]:
+    """Of force (m/s^2) and rate (deg/s)."""
+    return np.linalg.norm(imu.accel, axis=1), np.degrees(np.linalg.norm(imu.gyro, axis=1))
 
 
 def _speeds(recording: Recording) -> list[tuple[str, Array, Array, str]]:

@@ -34,7 +34,10 @@ def thin(t: Array, y: Array, bins: int = BINS) -> np.ndarray:
     extremes = [np.flatnonzero(y == np.repeat(f.reduceat(y, starts), lengths)) for f in (np.fmin, np.fmax)]
     extremes = [rows[np.diff(np.searchsorted(starts, rows, side="right"), prepend=0) > 0] for rows in extremes]
     breaks = np.flatnonzero(~finite & np.concatenate([[True], finite[:-1]]))
-    return np.unique(np.concatenate([starts, starts + lengths - 1, *extremes, breaks]))
+    kept = np.zeros(n, dtype=bool)
+    for rows in (starts, starts + lengths - 1, *extremes, breaks):
+        kept[rows] = True
+    return np.flatnonzero(kept)
 
 
 def with_breaks(t: Array, rows: np.ndarray, *columns: Array) -> Any:

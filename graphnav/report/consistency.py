@@ -1,0 +1,77 @@
+"""How a constraint's residuals or innovations compare with their sigma, in numbers and one sentence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.estimation.solution import ConstraintRecord
+from graphnav.report.page import Raw
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """How one constraint's residuals compare with their sigma."""
+
+    count: int
+    rejected: int
+    reduced: int
+    mean_nis: float  # of what was not rejected
+    dof: int
+    outside: float  # share of components beyond 3 sigma, of what was not rejected
+    kind: str
+
+    @property
+    def verdict(self) -> str:
+        """One sentence on the consistency of sigma."""
+        if self.count - self.rejected < 10 or not np.isfinite(self.mean_nis):
+            return "too few to judge"
+        ratio = self.mean_nis / self.dof
+        if self.kind == "residual":
+            # a fit takes up part of the noise, so a smoother's residuals are below their sigma, never above
+            if ratio > 1.3:
+                return "residuals larger than sigma allows: sigma is too small, or something is unmodelled"
+            return "residuals within their sigma"
+        if ratio > 1.5:
+            return "innovations larger than predicted: the filter is overconfident"
+        if ratio < 0.5:
+            return "innovations smaller than predicted: sigma is wider than it need be"
+        return "innovations as large as predicted: sigma is consistent"
+
+
+def consistency(record: ConstraintRecord) -> Consistency:
+    """Summarise a record.
+
+    A residual of weight w counts with the sigma that it was used with, larger by 1 / sqrt(w); of an innovation
+    the normalised square is of that already.
+    """
+    used = record.weight > 1e-9
+    weight = record.weight[used] if record.kind == "residual" else np.ones(int(used.sum()))
+    white = np.abs(record.residual[used] / record.sigma[used]) * np.sqrt(weight)[:, None]
+    white = white[np.isfinite(white)]
+    return Consistency(
+        count=len(record.t),
+        rejected=int(np.sum(~used)),
+        reduced=int(np.sum(used & (record.weight < 0.5))),
+        mean_nis=mean_or_nan(weight * record.nis[used]),
+        dof=record.residual.shape[1],
+        outside=mean_or_nan((white > 3.0).astype(float)),
+        kind=record.kind,
+    )
+
+
+CONSISTENCY_HEAD = ("used", "rejected", "weight < 0.5", "mean NIS", "components", "outside 3 sigma", "what it says")
+
+
+def consistency_row(c: Consistency) -> list[Any]:
+    """The cells under `CONSISTENCY_HEAD`."""
+    outside = f"{100 * c.outside:.2f} %" if np.isfinite(c.outside) else "-"
+    return [c.count - c.rejected, c.rejected, c.reduced, float(c.mean_nis), c.dof, Raw(outside), c.verdict]
+
+
+def mean_or_nan(x: Array) -> float:
+    x = x[np.isfinite(x)]
+    return float(np.mean(x)) if x.size else float("nan")
