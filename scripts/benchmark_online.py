@@ -155,12 +155,21 @@ def filter_seconds(recording: Recording, settings: Settings) -> float:
     return (time.process_time() - began) / len(problem.t)
 
 
-def posed(recording: Recording, settings: Settings) -> Problem:
-    """A recording aligned and posed with its noise model, as for any solver."""
-    frame, stationary = LocalFrame(origin(recording)), detect(recording, settings).stationary
+def posed(recording: Recording, settings: Settings, known_from: float = np.inf) -> Problem:
+    """A recording aligned and posed with its noise model, as for any solver.
+
+    `known_from` are the first seconds of it from which the noise model is estimated.
+    """
+    frame = LocalFrame(origin(recording))
     found = align(recording, settings, frame, lambda p, x: batch(p, x, wanted=(0,), reintegrate=False))
-    base = build_problem(recording, settings, frame, found.state, found.sigma, stationary, parts_of_noise=True)
-    return with_noise(base, estimate_noise(base, found.until).noise)
+
+    def build(part: Recording) -> Problem:
+        still = detect(part, settings).stationary
+        return build_problem(part, settings, frame, found.state, found.sigma, still, parts_of_noise=True)
+
+    base = build(recording)
+    first = build(recording.crop(0.0, known_from)) if known_from < recording.end - recording.start else base
+    return with_noise(base, estimate_noise(first, found.until).noise)
 
 
 def report(hour: int, found: np.ndarray, filtered: float, errors: np.ndarray, cpu: float, rows: int) -> None:

@@ -43,12 +43,13 @@ def main() -> int:
             found = cases.play(options.only, Path(folder), options.target)
             print(f"{found.target}: {found.kind} in {found.seconds:.2f} s\n{found.said}")
         return 0
+    cases.prepare()  # which each worker has then
     table: dict[str, Counter[str]] = {}
     slowest, peak, next_case, last = 0.0, 0, options.first, options.first + options.cases
     began = time.monotonic()
     while next_case < last:
         here, there = multiprocessing.Pipe(duplex=False)
-        worker = multiprocessing.Process(target=work, args=(there, next_case, last, options.target))
+        worker = multiprocessing.get_context("fork").Process(target=work, args=(there, next_case, last, options.target))
         worker.start()
         there.close()
         while next_case < last:

@@ -5,8 +5,8 @@
 
 Both sessions have the same drop-outs and the same steps of the clock. One has besides an absurd row every minute, rows
 that are late and rows that come twice, and is killed (SIGKILL) five times and resumed, the sender beginning again a
-little before where it was cut off. Each is `graphnav online` fed through a pipe. Told are the distance of what has
-settled at the same times, what was counted, and the memory of the process as it goes on.
+little before where it was cut off. Each is `graphnav online` fed through a pipe, both side by side. Told are the
+distance of what has settled at the same times, what was counted, and the memory of the process as it goes on.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import random
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -54,10 +55,12 @@ def main() -> int:
     head = head_of(recording)
     print(f"{options.who}: {len(plain)} rows, {len(hostile)} with those that are absurd or come twice", flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        session(head, plain, Path(folder) / "plain", [], options.lag)
+        beside = threading.Thread(target=session, args=(head, plain, Path(folder) / "plain", [], options.lag))
+        beside.start()
         step = len(hostile) / (KILLS + 1)
         kills = sorted(int(step * (k - 1 + rng.uniform(0.7, 1.3))) for k in range(1, KILLS + 1))
         session(head, hostile, Path(folder) / "hostile", kills, options.lag)
+        beside.join()
         return compare(Path(folder) / "plain", Path(folder) / "hostile")
 
 

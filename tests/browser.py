@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
-DESKTOP, PHONE = (1280, 900), (390, 844)
+DESKTOP, PHONE = (1400, 900), (390, 844)
 _PATIENCE = 60.0  # s
 
 
@@ -99,10 +99,15 @@ class Browser:
             time.sleep(0.05)
 
     def read(self) -> None:
-        """Scroll through the page, so that everything that waits to be seen is drawn."""
+        """Scroll through the page, so that everything that waits to be seen is drawn.
+
+        Two frames at each place: what is seen is told between frames, and a busy machine draws few of them.
+        """
         self.run(
-            "(async () => { for (let y = 0; y < document.body.scrollHeight; y += innerHeight / 2) {"
-            "scrollTo(0, y); await new Promise(go => setTimeout(go, 60)); } scrollTo(0, 0); })()"
+            "(async () => { const frame = () => new Promise(requestAnimationFrame);"
+            "for (let y = 0; y < document.body.scrollHeight; y += innerHeight / 2) {"
+            "scrollTo({top: y, behavior: 'instant'}); await frame(); await frame(); }"
+            "scrollTo(0, 0); })()"
         )
 
     def shot(self, path: Path) -> None:

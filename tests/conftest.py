@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+# programs that tests start keep their bytecode: without it each takes three times as long until it runs
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:

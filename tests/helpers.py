@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from graphnav.app import cli
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import GraphnavError
+from graphnav.core.notes import key_of
 from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.problem import Problem
@@ -35,6 +39,36 @@ def refused(key: str, kind: type[GraphnavError], *names: str) -> Iterator[pytest
     assert caught.value.key == key, f"{caught.value.key!r}: {sentence}"
     assert "\n" not in sentence
     assert [name for name in names if name not in sentence] == [], sentence
+
+
+def refuse_command(capsys: pytest.CaptureFixture[str], key: str, *arguments: str | Path) -> str:
+    """The one line on stderr of a command that ends with exit code 2 for an error of this key; "" is wrong usage."""
+    keys: list[str] = []
+    app = cli.app
+
+    def watched(*words: Any, **how: Any) -> Any:
+        try:
+            return app(*words, **how)
+        except GraphnavError as error:
+            keys.append(error.key)
+            raise
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "app", watched)
+        assert cli.run([str(a) for a in arguments]) == 2
+    out, said = capsys.readouterr()
+    assert out == ""
+    assert said.startswith("graphnav: ")
+    assert keys == [key] * bool(key), said
+    assert said.count("\n") == 1
+    return said
+
+
+def assert_told(notes: Iterable[str], key: str, *names: str) -> None:
+    """Some note has this key and names files, lines and values; its other words are free."""
+    notes = list(notes)
+    found = [note for note in notes if key_of(note) == key and all(name in note for name in names)]
+    assert found, [(key_of(note), str(note)) for note in notes]
 
 
 def difference(f: Callable[[Array], Array], steps: Array, width: int | None = None) -> Array:

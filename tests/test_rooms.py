@@ -27,8 +27,8 @@ ROOMS = {
     "evaluation": ["core", "recording", "estimation"],
     "report": ["core", "recording", "detectors", "constraints", "estimation", "evaluation"],
     "app": [
-        "core", "config", "recording", "imu", "detectors", "simulation", "constraints", "estimation", "online",
-        "evaluation", "report",
+        "core", "sensors", "config", "recording", "imu", "detectors", "simulation", "constraints", "estimation",
+        "online", "evaluation", "report",
     ],
     "__main__": ["app"],
 }  # fmt: skip

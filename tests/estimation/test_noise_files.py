@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers import refused
 
 from graphnav.app import cli
 from graphnav.app.workflow import list_unused_noise
 from graphnav.config import Settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError
+from graphnav.core.notes import key_of
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.estimation.noise.files import list_groups, noise_values, read_noise, read_noise_and_mode, write_noise
@@ -80,58 +83,90 @@ def changed(key: str, value: Any) -> dict[str, Any]:
 
 FIGURE = "noise/figures/imu.gyro_noise_density"
 BAD = {
-    "no noise model": ({"settings": {}}, ("holds no table 'noise'",)),
-    "a list": ([1, 2], ("holds no table 'noise'",)),
-    "unknown part": (changed("noise/weight", {}), ("noise.weight", "did you mean 'weights'")),
-    "unknown mode": (changed("noise/mode", "guessed"), ("noise.mode", "guessed")),
-    "unknown group": (changed("noise/figures/imu.gyro_noise", {"log_factor": 0.0}), ("imu.gyro_noise", "did you mean")),
-    "unknown key of a figure": (changed(f"{FIGURE}/sigmas", 1.0), ("sigmas", "did you mean 'sigma'")),
-    "no figure": (changed(FIGURE, {"sigma": 1.0}), ("neither", "log_factor")),
-    "a figure is a number": (changed(FIGURE, 2.0), ("must be a table",)),
-    "words": (changed(f"{FIGURE}/log_factor", "1"), ("log_factor", "number")),
-    "true": (changed(f"{FIGURE}/log_factor", True), ("log_factor", "number")),
-    "null": (changed(f"{FIGURE}/sigma", None), ("sigma", "null", "number")),
-    "infinite": (changed(f"{FIGURE}/log_factor", float("inf")), ("log_factor", "number")),
-    "nothing left of a variance": (changed(FIGURE, {"variance_factor": 0.0}), ("variance_factor", "between")),
-    "two figures": (changed(f"{FIGURE}/variance_factor", 4.0), ("disagree",)),
-    "negative sigma": (changed(f"{FIGURE}/sigma", -1.0), ("sigma", "between")),
-    "figures in a list": (changed("noise/figures", []), ("noise.figures", "table")),
-    "time of no process": (changed("noise/correlation_times/nhc", 2.0), ("correlation_times.nhc", "nhc_error")),
-    "no time": (changed("noise/correlation_times/nhc_error", 0.0), ("nhc_error", "between")),
-    "weights of nothing": (changed("noise/weights/gnss", {"t": [], "weight": []}), ("weights.gnss", "gnss_code")),
-    "weights without times": (changed("noise/weights/nhc", {"weight": [0.5]}), ("weights.nhc", "t and weight")),
-    "too few weights": (changed("noise/weights/nhc", {"t": [1.0, 2.0], "weight": [0.5]}), ("2 times and 1 weights",)),
-    "weight above one": (changed("noise/weights/nhc", {"t": [1.0], "weight": [1.5]}), ("weight", "between 0 and 1")),
-    "times not sorted": (changed("noise/weights/nhc", {"t": [2.0, 1.0], "weight": [0.5, 0.5]}), ("ascending",)),
-    "weights are a number": (changed("noise/weights/nhc", {"t": 1.0, "weight": [0.5]}), ("must be a list",)),
-    "half a span": (changed("noise/excluded/nhc", [[1.0]]), ("excluded.nhc", "[begin, end]")),
-    "backward span": (changed("noise/excluded/nhc", [[2.0, 1.0]]), ("excluded.nhc", "ends before it begins")),
+    "no noise model": ({"settings": {}}, "noise.no_model", ()),
+    "a list": ([1, 2], "noise.no_model", ()),
+    "unknown part": (changed("noise/weight", {}), "key.unknown", ("'noise.weight'", "'weights'")),
+    "unknown mode": (changed("noise/mode", "guessed"), "key.value", ("'noise.mode'", "guessed")),
+    "unknown group": (
+        changed("noise/figures/imu.gyro_noise", {"log_factor": 0.0}),
+        "key.unknown",
+        ("imu.gyro_noise'", "'imu.gyro_noise_density'"),
+    ),
+    "unknown key of a figure": (changed(f"{FIGURE}/sigmas", 1.0), "key.unknown", ("sigmas'", "'sigma'")),
+    "no figure": (changed(FIGURE, {"sigma": 1.0}), "key.missing", ("log_factor",)),
+    "a figure is a number": (changed(FIGURE, 2.0), "key.value", ("= 2.0",)),
+    "words": (changed(f"{FIGURE}/log_factor", "1"), "key.value", ("log_factor", '"1"')),
+    "true": (changed(f"{FIGURE}/log_factor", True), "key.value", ("log_factor", "true")),
+    "null": (changed(f"{FIGURE}/sigma", None), "key.value", ("sigma'", "null")),
+    "infinite": (changed(f"{FIGURE}/log_factor", float("inf")), "key.value", ("log_factor", "Infinity")),
+    "nothing left of a variance": (
+        changed(FIGURE, {"variance_factor": 0.0}),
+        "key.value",
+        ("variance_factor", "= 0.0"),
+    ),
+    "two figures": (changed(f"{FIGURE}/variance_factor", 4.0), "noise.disagree", ("gyro_noise_density",)),
+    "negative sigma": (changed(f"{FIGURE}/sigma", -1.0), "key.value", ("sigma'", "= -1.0")),
+    "figures in a list": (changed("noise/figures", []), "key.value", ("'noise.figures'", "= []")),
+    "time of no process": (
+        changed("noise/correlation_times/nhc", 2.0),
+        "key.unknown",
+        ("correlation_times.nhc'", "'nhc_error'"),
+    ),
+    "no time": (changed("noise/correlation_times/nhc_error", 0.0), "key.value", ("nhc_error'", "= 0.0")),
+    "weights of nothing": (
+        changed("noise/weights/gnss", {"t": [], "weight": []}),
+        "key.unknown",
+        ("weights.gnss'", "'gnss_code'"),
+    ),
+    "weights without times": (changed("noise/weights/nhc", {"weight": [0.5]}), "key.value", ("weights.nhc'",)),
+    "too few weights": (changed("noise/weights/nhc", {"t": [1.0, 2.0], "weight": [0.5]}), "noise.lengths", ("2", "1")),
+    "weight above one": (
+        changed("noise/weights/nhc", {"t": [1.0], "weight": [1.5]}),
+        "key.value",
+        ("weight'", "= 1.5"),
+    ),
+    "times not sorted": (
+        changed("noise/weights/nhc", {"t": [2.0, 1.0], "weight": [0.5, 0.5]}),
+        "noise.not_ascending",
+        ("weights.nhc.t'",),
+    ),
+    "weights are a number": (
+        changed("noise/weights/nhc", {"t": 1.0, "weight": [0.5]}),
+        "key.value",
+        ("weights.nhc.t'", "= 1.0"),
+    ),
+    "half a span": (changed("noise/excluded/nhc", [[1.0]]), "key.value", ("excluded.nhc'", "[1.0]")),
+    "backward span": (changed("noise/excluded/nhc", [[2.0, 1.0]]), "key.value", ("excluded.nhc'", "[2.0, 1.0]")),
 }
 
 
-@pytest.mark.parametrize(("values", "words"), BAD.values(), ids=BAD)
-def test_what_is_no_noise_model_is_refused_in_one_sentence(values: Any, words: tuple[str, ...], tmp_path: Path) -> None:
+@pytest.mark.parametrize(("values", "key", "names"), BAD.values(), ids=BAD)
+def test_what_is_no_noise_model_is_refused_in_one_sentence(
+    values: Any, key: str, names: tuple[str, ...], tmp_path: Path
+) -> None:
     path = tmp_path / "noise.json"
     path.write_text(json.dumps(values), encoding="utf-8")
-    with pytest.raises(ConfigError) as found:
+    with refused(key, ConfigError, str(path), *names):
         read_noise(path)
-    said = str(found.value)
-    assert str(path) in said
-    assert "\n" not in said
-    for word in words:
-        assert word in said
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
-    [(None, "cannot be read"), (b'{\n"noise": ', "line 2"), (b"\xff\xfe\x00", "UTF-8"), (b"", "line 1")],
+    ("content", "key", "name"),
+    [
+        (None, "file.unreadable", "noise.json"),
+        (b'{\n"noise": ', "json.syntax", "line 2"),
+        (b"\xff\xfe\x00", "file.text", "UTF-8"),
+        (b"", "json.syntax", "line 1"),
+    ],
     ids=["missing", "cut off", "not text", "empty"],
 )
-def test_a_file_that_is_no_json_is_refused(content: bytes | None, words: str, tmp_path: Path, capsys: Any) -> None:
+def test_a_file_that_is_no_json_is_refused(
+    content: bytes | None, key: str, name: str, tmp_path: Path, capsys: Any
+) -> None:
     path = tmp_path / "noise.json"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(ConfigError, match=words):
+    with refused(key, ConfigError, name):
         read_noise(path)
     assert cli.run(["smooth", "kitti", "--noise", str(path), "-o", str(tmp_path / "o")]) == 2
     printed = capsys.readouterr()
@@ -181,8 +216,7 @@ def test_what_a_noise_model_says_of_nothing_is_told() -> None:
         excluded={"gnss_position": ((2.0, 3.0), (20.0, 30.0))},
     )
     said = list_unused_noise(noise, solution)
-    assert len(said) == 3
+    assert [key_of(one) for one in said] == [f"noise.file.{what}" for what in ("unused", "rows", "spans")]
     assert "odometer" in said[0]
-    assert "1 of the 2 rows" in said[1]
-    assert "1 of the 2 spans" in said[2]
+    assert [re.findall(r"\d+", one) for one in said[1:]] == [["1", "2"]] * 2
     assert list_unused_noise(NoiseModel({"gnss_position.up": VarianceComponent(0.0)}), solution) == []

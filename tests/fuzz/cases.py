@@ -485,12 +485,18 @@ def target_of(number: int) -> str:
     return every[number % len(every)]
 
 
+def prepare() -> None:
+    """Make the seeds, which is no work of the case that happens to be the first."""
+    raw_cases.write_seeds(seeds() / "raw-gnss")
+
+
 def play(number: int, folder: Path, target: str | None = None) -> Result:
     """Run one case in a folder of its own, which is taken away again."""
     target = target or target_of(number)
     at = folder / f"case-{number}"
     at.mkdir()
     chance = random.Random(f"{target} {number}")
+    prepare()
     before = [signal.signal(what, _stop) for what in (signal.SIGPROF, signal.SIGALRM)]
     signal.setitimer(signal.ITIMER_PROF, SECONDS)  # of work, which other programs do not lengthen
     signal.setitimer(signal.ITIMER_REAL, 10.0 * SECONDS)  # of waiting for what never comes
