@@ -157,7 +157,7 @@ def _draw_comparison(outcome: Outcome, folder: Path, provenance: Mapping[str, An
         errors={name: m.errors for name, m in outcome.metrics.items() if m.errors is not None},
         withheld=outcome.used_withheld,
         outages=outages(outcome.recording),
-        findings=_odd(outcome),
+        findings=_list_findings(outcome),
         provenance=provenance,
         noise=noise_rows(outcome, next(iter(outcome.solutions.values()))),
     )
@@ -214,7 +214,7 @@ def _draw_solver(
         errors=None if metrics is None else metrics.errors,
         withheld=outcome.used_withheld,
         outages=outages(outcome.recording),
-        findings=_odd(outcome),
+        findings=_list_findings(outcome),
         provenance=provenance,
         detectors=detectors,
         noise=noise_rows(outcome, solution),
@@ -265,7 +265,7 @@ def _calibration(p: ParameterEstimate) -> dict[str, Any]:
     }
 
 
-def _odd(outcome: Outcome) -> list[str]:
+def _list_findings(outcome: Outcome) -> list[str]:
     """What the report lists as odd."""
     lines = list(outcome.findings)
     if outcome.zero:

@@ -80,7 +80,7 @@ def score(
         if compared is not None:
             reference, arm = compared[0].t, compared[1]
             swings = compared[0].v is not None and arm is not None and bool(np.any(arm))
-        at = _epochs(solution, reference)
+        at = _choose_epochs(solution, reference)
         wanted = np.union1d(np.union1d(solution.t, at), _thin(reference, solution, _MOST_TURNING)) if swings else at
         track = _score_at(solution, wanted, placed=used.gnss is not None)
         epochs = at if len(at) else None
@@ -100,7 +100,7 @@ def _read_antenna(solution: Solution) -> AntennaCalibration:
     return AntennaCalibration(float(offset.value[-1, 0]) if offset else 0.0, lever.value[-1] if lever else None)
 
 
-def _epochs(solution: Solution, truth: Array) -> Array:
+def _choose_epochs(solution: Solution, truth: Array) -> Array:
     """Epochs to compare at: the keyframes where the truth has them and they are many, else (some of) the truth's.
 
     Never others: interpolated between keyframes, a filter would seem to know in an outage what the fix after it

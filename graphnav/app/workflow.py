@@ -191,7 +191,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     solutions = {
         name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
     }
-    solutions |= _beside(request, recording, solutions)
+    solutions |= _read_others(request, recording, solutions)
     spent: dict[str, float] = {}
     with _measure_time(spent, "evaluation"):
         metrics, against, names = score(recording, used, solutions, moved)
@@ -224,7 +224,7 @@ def _find_densities(recording: Recording, settings: Settings, solutions: Mapping
     return with_measured_floor(without_onboard_offset(recording, settings)[0], settings)[0].imu.noise
 
 
-def _beside(request: Request, recording: Recording, solutions: Mapping[str, Solution]) -> dict[str, Solution]:
+def _read_others(request: Request, recording: Recording, solutions: Mapping[str, Solution]) -> dict[str, Solution]:
     """The trajectories of other programs, by the names of their files."""
     reference = list(solutions.values())[-1]
     out: dict[str, Solution] = {}

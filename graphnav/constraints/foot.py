@@ -103,7 +103,7 @@ class Stance(Constraint):
             keyframe=rows + 1,
             past=past,
             phase=landed - leaves,
-            share=_shares(landed - leaves) * _rolls(t, span, scene, s.correlation)[:, None],
+            share=_interpolate_phase(landed - leaves) * _mark_rolling(t, span, scene, s.correlation)[:, None],
             sigma=np.repeat(sigma[:, None], 3, axis=1),
             parameters=(
                 *scale_parameter(scene.recording),
@@ -130,12 +130,12 @@ class Stance(Constraint):
         return Linearized(u, J, self.sigma[rows])
 
 
-def _shares(phase: Array) -> Array:
+def _interpolate_phase(phase: Array) -> Array:
     """(N, 5) weights of the nodes for linear interpolation at phases (N,)."""
     return np.maximum(0.0, 1.0 - np.abs(phase[:, None] - _NODES) / (_NODES[1] - _NODES[0]))
 
 
-def _rolls(t: Array, span: Array, scene: BuildContext, lasts: float) -> Array:
+def _mark_rolling(t: Array, span: Array, scene: BuildContext, lasts: float) -> Array:
     """(N,) 1 at times t (N,) for so long after landing and before leaving in their stances (N, 2), else 0.
 
     A recording neither begins with a landing nor ends with a leaving.

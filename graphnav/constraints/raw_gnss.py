@@ -180,7 +180,7 @@ class SatelliteConstraint(Constraint):
         lever = parameters.get(LEVER_ARM, self.lever_arm)
         return states.p + rotation.mv(states.R_nb, lever), lever
 
-    def _lasting(
+    def _sum_lasting_errors(
         self, parameters: dict[str, Array], names: tuple[str, ...], rows: slice | Array, e: Array
     ) -> tuple[Array | float, dict[str, Array]]:
         """What errors that all have in common, shifts in east, north, up, do to the rows (n,), and by how much."""
@@ -309,7 +309,7 @@ class GnssCode(RangeConstraint):
             if name in parameters:
                 own, J[name] = select_columns(parameters[name], which)
                 residual = residual + own
-        shift, more = self._lasting(parameters, CODE_ERRORS, rows, e)
+        shift, more = self._sum_lasting_errors(parameters, CODE_ERRORS, rows, e)
         return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])
 
 
@@ -376,5 +376,5 @@ class GnssDoppler(SatelliteConstraint):
         J[CLOCK] = np.broadcast_to(np.array([[0.0, 1.0]]), (len(e), 1, 2))
         if LEVER_ARM in parameters:
             J[LEVER_ARM] = J[LEVER_ARM] + by_place @ states.R_nb
-        shift, more = self._lasting(parameters, (RATE_ERROR,), rows, e)
+        shift, more = self._sum_lasting_errors(parameters, (RATE_ERROR,), rows, e)
         return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])

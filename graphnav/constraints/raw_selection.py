@@ -22,7 +22,7 @@ def select_observations(recording: Recording, settings: Settings) -> RawGnss | N
         return None
     used = (raw.t >= recording.start - SAME_TIME) & (raw.t <= recording.end + SAME_TIME) & usable(raw, s)
     if s.period > 0.0 and used.any():
-        used &= np.isin(raw.t, _apart(np.unique(raw.t[used]), s.period))
+        used &= np.isin(raw.t, _keep_apart(np.unique(raw.t[used]), s.period))
     raw = raw.take(used)
     raw = raw.take(primary(raw))
     return raw if len(raw) else None
@@ -34,7 +34,7 @@ def usable(raw: RawGnss, settings: RawGnssSettings) -> NDArray[np.bool_]:
     return used & np.isfinite(raw.difference) if raw.differenced else used
 
 
-def _apart(t: Array, least: float) -> Array:
+def _keep_apart(t: Array, least: float) -> Array:
     """Those of some times that are so far apart at least."""
     out = [float(t[0])]
     for x in t.tolist():

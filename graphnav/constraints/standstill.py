@@ -73,7 +73,7 @@ def _find_standing(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array
     return rows[keep], run[keep]
 
 
-def _swaying(rate: Array, T: Array, run: Array) -> Array:
+def _estimate_swaying(rate: Array, T: Array, run: Array) -> Array:
     """1-sigma (N, 3), rad/s, of the mean rates (N, 3) of intervals in which a foot stands, from how its angle wanders.
 
     A standing body sways slowly: where its rate passes zero it is not still, and what it does in one interval it does
@@ -167,7 +167,7 @@ class ZeroRate(_Standing):
         _, rate = unrest(scene, rows, stop)
         own = scene.recording.imu.noise.gyro_noise_density / np.sqrt(scene.intervals.T[rows])
         if scene.recording.platform == "foot":
-            rate = np.hypot(rate, _swaying(scene.intervals.rate[rows], scene.intervals.T[rows], stop))
+            rate = np.hypot(rate, _estimate_swaying(scene.intervals.rate[rows], scene.intervals.T[rows], stop))
         return cls(
             keyframe=rows + 1,
             rate=scene.intervals.rate[rows] + scene.intervals.bg[rows],
@@ -206,7 +206,7 @@ class HeldPosition(_Standing):
         return cls(
             keyframe=keyframe[order],
             sigma=np.repeat(np.concatenate([sigma[first], sigma])[order], 3, axis=1),
-            parameters=(_places(scene, np.unique(stop)),),
+            parameters=(_guess_places(scene, np.unique(stop)),),
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -214,7 +214,7 @@ class HeldPosition(_Standing):
         return Linearized(states.p - parameters[PLACE], {"p": one, PLACE: -one}, self.sigma[rows])
 
 
-def _places(scene: BuildContext, stops: Array) -> Parameter:
+def _guess_places(scene: BuildContext, stops: Array) -> Parameter:
     """One unknown place per stop: about where the fixes around it say, as far off as a vehicle can go meanwhile."""
     begins = scene.stationary[stops, 0]
     gnss = scene.recording.gnss

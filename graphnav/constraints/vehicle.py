@@ -292,7 +292,7 @@ class NonHolonomic(Wheels):
         return Linearized(residual - parameters[BODY] * effect, jacobians | lasting, self.sigma[rows])
 
 
-def _speed_of(odometer: Odometer, imu: Imu) -> MeanSpeed:
+def _average_speed(odometer: Odometer, imu: Imu) -> MeanSpeed:
     figures = ReadingStatistics.of(odometer)
     return MeanSpeed.of(odometer, faults(odometer, imu, figures).spans, figures)
 
@@ -318,7 +318,7 @@ class OdometerSpeed(Wheels):
         s, odometer = scene.settings.vehicle, scene.recording.odometer
         if scene.recording.platform != "vehicle" or odometer is None or not s.odometer:
             return None
-        speed = scene.speed or _speed_of(odometer, scene.recording.imu)
+        speed = scene.speed or _average_speed(odometer, scene.recording.imu)
         rows, past = scene.share(moving_rows), scene.share(interval_motion)
         begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
         reach = REACH * odometer.delay_sigma

@@ -164,7 +164,7 @@ def check_size(path: Path, count: int, error: Kind = RecordingError) -> None:
         Of the kind given.
     """
     if count > (most := _limit(MAX_FILE, 10**6)):
-        raise error(_too_large(path, most, packed=True), key="file.large")
+        raise error(_refuse_size(path, most, packed=True), key="file.large")
 
 
 def read_text(path: Path, error: Kind = RecordingError) -> str:
@@ -184,7 +184,7 @@ def read_text(path: Path, error: Kind = RecordingError) -> str:
 def parse_json(text: str) -> Any:
     """JSON, with everything that is wrong with it as a ValueError in a few words."""
     try:
-        values = json.loads(text, parse_int=_whole)
+        values = json.loads(text, parse_int=_parse_whole)
     except RecursionError:
         raise ValueError("nested too deep") from None
     return values
@@ -203,7 +203,7 @@ def parse_number(text: str) -> float:
     return float(text)
 
 
-def _whole(digits: str) -> int:
+def _parse_whole(digits: str) -> int:
     if len(digits) > 20:
         raise ValueError(f"a number of {len(digits)} digits")
     return int(digits)
@@ -223,7 +223,7 @@ def _limit(name: str, unit: int) -> int:
     return int(value * unit)
 
 
-def _too_large(path: Path, most: int, packed: bool) -> str:
+def _refuse_size(path: Path, most: int, packed: bool) -> str:
     return f"{path}: holds more than {most / 1e6:g} MB{' unpacked' if packed else ''}; if that is right, set {MAX_FILE}"
 
 
@@ -265,7 +265,7 @@ class _Bounded(io.RawIOBase):
             raise self.error(f"{self.path}: cannot be read ({cause.strerror})", key="file.unreadable") from None
         self._count += len(chunk)
         if self._count > self._most:
-            raise self.error(_too_large(self.path, self._most, self._packed), key="file.large")
+            raise self.error(_refuse_size(self.path, self._most, self._packed), key="file.large")
         if self._packed and self._count > _SMALL and self._count > _RATIO * self._size and not os.environ.get(MAX_FILE):
             raise self.error(
                 f"{self.path}: unpacks to more than {_RATIO} times its size, which no log does; if that is right, "

@@ -113,7 +113,7 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
     spans = merge_spans(longer_than(spans, 3.0 * b.period))
     if not len(spans):
         return NONE, certain, ()
-    certain = _certain_motion(b, spans, speeds, certain)
+    certain = _screen_motion(b, spans, speeds, certain)
     known = np.array([_find_speed(speeds, span) for span in spans])
     moves = np.array([_leads_to_speed(b, span, speeds, scene.settings.fusion) for span in spans]) & np.isnan(known)
     rest = np.flatnonzero(~moves)  # one that moves may brake steadily: the force over it counts, not its mean
@@ -151,7 +151,7 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
     return spans, certain, tuple(notes)
 
 
-def _certain_motion(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array) -> Array:
+def _screen_motion(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array) -> Array:
     """Spans of certain motion without those in the midst of a still stretch whose speed the force does not lead to.
 
     They begin and end where nothing changes: it is the fixes, or the wheels, that are wrong.
@@ -230,14 +230,14 @@ def bridge_disturbances(b: Blocks, spans: Array, certain: Array, settings: Fusio
         moved = bool(((certain[:, 0] < span[0]) & (certain[:, 1] > before[1])).any())
         near = span[0] - before[1] <= settings.bridge
         one = link(b, before, span) if near and not moved else None
-        if one is not None and _shaken_only(one, settings):
+        if one is not None and _is_only_shaken(one, settings):
             out[-1] = np.array([before[0], span[1]])
         else:
             out.append(span)
     return np.array(out) if out else NONE
 
 
-def _shaken_only(one: Link, settings: FusionSettings) -> bool:
+def _is_only_shaken(one: Link, settings: FusionSettings) -> bool:
     """Whether what lies between two stops shook the vehicle without moving it: to and fro, but not away."""
     away = one.mean > _AWAY * settings.bridge_speed
     return one.peak < settings.bridge_speed and not away and abs(one.change) < one.tolerance

@@ -152,7 +152,7 @@ class _Windowed(Detector):
             return Detection(name, none, none, least, none > 0, NONE, (f"{name}: shorter than a window",))
         per_row = 1.0 / np.sqrt(scene.blocks.row_period)
         sigma_a, sigma_w = noise.accel_noise_density * per_row, noise.gyro_noise_density * per_row
-        reference = _quietest(m) if labels is None else within(m.t, labels.still, m.half)
+        reference = _find_quietest(m) if labels is None else within(m.t, labels.still, m.half)
         at_rest = bool(reference.any())
         means, g = _centre(m.rows, reference if at_rest else np.ones(len(m.t), dtype=bool), scene.gravity, at_rest)
         values = np.where(m.whole, STATISTICS[name](means, sigma_a, sigma_w, g), np.nan)
@@ -161,7 +161,7 @@ class _Windowed(Detector):
         if name == "glrt" and settings.threshold is not None:
             threshold = settings.threshold
         elif labels is None:
-            most = least + float(STATISTICS[name](_idling(scene, g), sigma_a, sigma_w, g)[0])
+            most = least + float(STATISTICS[name](_average_idling(scene, g), sigma_a, sigma_w, g)[0])
             threshold, notes = own_threshold(scene, name, m.t, m.half, values, least, most)
         elif at_rest:
             in_motion = within(m.t, labels.moving, m.half)
@@ -203,7 +203,7 @@ def _centre(rows: Array, reference: Array, g: float, at_rest: bool) -> tuple[Arr
     return means, measured if at_rest and abs(measured / g - 1.0) < _SCALE else g
 
 
-def _quietest(m: Means) -> Array:
+def _find_quietest(m: Means) -> Array:
     """(W,) bool, the second of windows in which force and rate scatter least: whatever moves, it is the likeliest rest.
 
     Each against its own typical scatter, so that neither unit decides.
@@ -216,7 +216,7 @@ def _quietest(m: Means) -> Array:
     return np.asarray(scatter <= np.partition(scatter, few)[few])
 
 
-def _idling(scene: Scene, g: float) -> Array:
+def _average_idling(scene: Scene, g: float) -> Array:
     """(1, 9) means of a window with an engine that idles at the limits of Li 2024: Peak-1 and Peak-2 of every axis.
 
     A line of amplitude A has the mean square A^2 / 2, so every axis has the mean square A^2.

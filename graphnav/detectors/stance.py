@@ -61,12 +61,12 @@ def detect_stances(
         return Detections(
             NONE, (), (Note("detectors.too_short", "no detection: the recording is shorter than a window"),)
         )
-    bias, g = _quietest(imu, period)
+    bias, g = _average_quietest(imu, period)
     found: list[Detection] = []
     kept, notes = [], []
     for name in which:
         e = np.sqrt(glrt_statistic(imu.accel, imu.gyro - bias, window, settings.force_per_rate, 1.0, g, name))
-        found.append(_below(name, e, imu, period, window, settings))
+        found.append(_find_below(name, e, imu, period, window, settings))
         one = found[-1]
         deep = one.intervals[_as_deep_as_others(one.intervals, one.t, one.statistic, settings.threshold)]
         if len(deep) < len(one.intervals):
@@ -89,7 +89,7 @@ def detect_stances(
     return Detections(spans, tuple(found), tuple(notes))
 
 
-def _below(name: str, e: Array, imu: Imu, period: float, window: int, settings: StanceSettings) -> Detection:
+def _find_below(name: str, e: Array, imu: Imu, period: float, window: int, settings: StanceSettings) -> Detection:
     """Spans in which e is below its threshold."""
     t = 0.5 * (imu.t[: len(e)] + imu.t[window - 1 :]) - 0.5 * period  # a row speaks for the period before it
     whole = unbroken(np.r_[True, np.diff(imu.t) < period + settings.bridge], window)
@@ -105,7 +105,7 @@ def _below(name: str, e: Array, imu: Imu, period: float, window: int, settings: 
     return Detection(name, t, e, settings.threshold, below, spans)
 
 
-def _quietest(imu: Imu, period: float) -> tuple[Array, float]:
+def _average_quietest(imu: Imu, period: float) -> tuple[Array, float]:
     """Mean rate (3,) and size of the mean force of the second in which both scatter least."""
     n = min(len(imu.t), max(2, round(_QUIET / period)))
     rows = np.column_stack([imu.gyro, imu.accel])

@@ -94,7 +94,7 @@ def find_reversed_arms(recording: Recording) -> list[Finding]:
     second = np.floor(gnss.t)
     thin = rows_of(gnss, np.concatenate([[True], np.diff(second) > 0.0]))
     try:
-        antenna, axle = _estimate(_most_turning(replace(recording, gnss=thin)))
+        antenna, axle = _estimate(_find_turning(replace(recording, gnss=thin)))
     except EstimationError:
         return []
     out = []
@@ -117,7 +117,7 @@ def find_reversed_arms(recording: Recording) -> list[Finding]:
     return out
 
 
-def _most_turning(recording: Recording) -> Recording:
+def _find_turning(recording: Recording) -> Recording:
     """The part of a drive, `_PART` s long at most, in which it turns most where there are fixes."""
     imu, gnss = recording.imu, recording.gnss
     assert gnss is not None

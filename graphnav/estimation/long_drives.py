@@ -45,7 +45,7 @@ class Share:
 def shares(recording: Recording, settings: Settings) -> list[Share]:
     """The recording in one part, or in parts of equal length that overlap."""
     begin, length = recording.start, recording.end - recording.start
-    if length <= _longest(recording, settings):
+    if length <= _limit_length(recording, settings):
         return [Share(recording, -np.inf, np.inf)]
     edges = np.linspace(0.0, length, int(np.ceil(length / PART)) + 1)
     edges = np.array([0.0, *(edge for edge in edges[1:-1] if _is_told(recording, begin + edge)), length])
@@ -61,7 +61,7 @@ def shares(recording: Recording, settings: Settings) -> list[Share]:
     return out
 
 
-def _longest(recording: Recording, settings: Settings) -> float:
+def _limit_length(recording: Recording, settings: Settings) -> float:
     """s, at most solved at once: memory goes by the square of the error states, of which satellites have their own."""
     raw, chosen = recording.raw_gnss, settings.raw_gnss
     if raw is None or not recording.tight(chosen.coupling):

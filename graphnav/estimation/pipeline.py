@@ -122,7 +122,7 @@ def _run(
     if unknown:
         raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}", key="solver.unknown")
     frame = LocalFrame(origin(recording))
-    pieces, notes = _pieces(recording, settings)
+    pieces, notes = _split_pieces(recording, settings)
     notes = [*fitting(recording, settings), *notes]
     found: list[dict[str, Solution]] = []
     parts = [share for piece in pieces for share in shares(piece, settings)]
@@ -242,7 +242,7 @@ def _solve(
             detections=found.detections.all,
             excluded=wrong,
             noise=found.noise,
-            graphs=(_graph_of(problem, out[name]),),
+            graphs=(_bind_graph(problem, out[name]),),
             passes=dict(passes),
             separation=apart,
             fixed=found.fixed.get(name, found.fixed.get("", out[name].fixed)),
@@ -252,7 +252,7 @@ def _solve(
     }
 
 
-def _graph_of(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, Any]]:
+def _bind_graph(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, Any]]:
     """What makes the problem GTSAM's, with a solution's values of parameters."""
 
     def export() -> tuple[Any, Any]:
@@ -299,7 +299,7 @@ def origin(recording: Recording) -> np.ndarray:
     return np.array([np.pi / 4, 0.0, 0.0])
 
 
-def _pieces(recording: Recording, settings: Settings) -> tuple[list[Recording], list[str]]:
+def _split_pieces(recording: Recording, settings: Settings) -> tuple[list[Recording], list[str]]:
     """The recording cut at IMU gaps too long to bridge, and a sentence for each cut."""
     t = recording.imu.t
     cuts = np.flatnonzero(np.diff(t) > settings.keyframes.bridge)

@@ -165,7 +165,7 @@ def prepare(
         if excluded_share(base, best.noise) > _MOST:
             # most fixes contradict what came of the start: it is looked for in what follows
             try:
-                later = align_with(_after(recording, aligned), detections.stationary)
+                later = align_with(_cut_aligned(recording, aligned), detections.stationary)
                 other = build(later, detections, parts=True)
                 again = _estimate(other, later, settings, progress, passes)
                 if excluded_share(other, again.noise) < excluded_share(base, best.noise):
@@ -182,7 +182,7 @@ def prepare(
         noise, known = best.noise, best.points
         passes.update(filter=1)
         plain = NoiseModel(excluded=noise.excluded)
-        if _explains_more(base, plain, best):
+        if _is_likelier(base, plain, best):
             noise, known = plain, None
         noise = replace(noise, spacing=spacing)
         # of what the estimation has left only its points are wanted any more: the rest is half of all memory
@@ -238,7 +238,7 @@ def start_sigma(start: Alignment) -> Array:
     return sigma
 
 
-def _explains_more(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:
+def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:
     """Whether the figures as stated make the innovations likelier than the estimate, with its prior, does.
 
     Both without what is left out: likelihoods are compared of the same measurements.
@@ -315,7 +315,7 @@ def _smooth(problem: Problem, start: States) -> Solution:
     return batch(split(problem)[0], start, wanted=(0,), reintegrate=False)
 
 
-def _after(recording: Recording, aligned: Alignment) -> Recording:
+def _cut_aligned(recording: Recording, aligned: Alignment) -> Recording:
     """Without the fixes that an alignment has seen."""
     assert recording.gnss is not None
     assert aligned.until is not None

@@ -84,10 +84,10 @@ def parse_requirement(text: str, solvers: Sequence[str] = ()) -> Requirement:
         limit = float(number)
     except ValueError:
         raise ConfigError(f"--require {text}: '{number}' is not a number; {usage}", key="option.requirement") from None
-    return Requirement(text, _full(name, text), sign, limit, solver)
+    return Requirement(text, _complete_name(name, text), sign, limit, solver)
 
 
-def _full(name: str, text: str) -> str:
+def _complete_name(name: str, text: str) -> str:
     """The name with its unit, and the number of its span where it has one."""
     every = names()
     short = {full.removesuffix(unit): full for unit in _UNITS for full in every if full.endswith(unit)}

@@ -16,15 +16,15 @@ _LONGEST = 1e7  # of the components of a vector: m, from the Earth's centre at m
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 
 
-def _usable(value: float) -> float:
+def _is_number(value: float) -> float:
     if value and not _SMALLEST <= abs(value) <= _LARGEST:
         raise ValueError(f"{value:g} must lie between {_SMALLEST:g} and {_LARGEST:g}")
     return value
 
 
-Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0), AfterValidator(_usable)]
+Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0), AfterValidator(_is_number)]
 
-NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0), AfterValidator(_usable)]
+NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0), AfterValidator(_is_number)]
 
 
 def three_numbers(value: Any) -> Any:

@@ -62,7 +62,7 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Simulated:
             raise ConfigError(
                 f"scenario '{name}' has no option '{key}'; {nearest(key, list(known))}", key="simulation.option"
             )
-        if not _alike(value, known[key]):
+        if not _fits_default(value, known[key]):
             raise ConfigError(
                 f"scenario '{name}': {key} = {value!r} is not of the kind of its default {known[key]!r}",
                 key="simulation.value",
@@ -77,7 +77,7 @@ def defaults(one: Scenario) -> dict[str, Any]:
     return {p.name: p.default for p in inspect.signature(one.run).parameters.values() if p.name != "seed"}
 
 
-def _alike(value: Any, default: Any) -> bool:
+def _fits_default(value: Any, default: Any) -> bool:
     """Whether a value may stand for a default: numbers for numbers, of which True is none."""
     if isinstance(default, bool) or isinstance(value, bool):
         return isinstance(default, bool) and isinstance(value, bool)

@@ -67,7 +67,7 @@ def carry_back(
                 ),
             )
             sd_bg = np.full(3, noise.gyro_noise_density / np.sqrt(stood) + noise.gyro_bias_walk * np.sqrt(stood))
-        p, sd_p, v, sd_v = _by_first_fixes(recording, solution.frame, R, (p, sd_p, v, sd_v))
+        p, sd_p, v, sd_v = _refine_by_fixes(recording, solution.frame, R, (p, sd_p, v, sd_v))
         wide = np.hypot(wide, settings.alignment.prior_inflation * drift)
         own = np.hypot(own, np.abs(rotation.rph_jacobian(rotation.to_rph(R))) @ drift)
     sigma = np.concatenate(
@@ -101,7 +101,7 @@ def _range(x: Array) -> Array:
     return np.maximum.accumulate(x, axis=0) - np.minimum.accumulate(x, axis=0)
 
 
-def _by_first_fixes(
+def _refine_by_fixes(
     recording: Recording, frame: LocalFrame, R: Array, found: tuple[Array, Array, Array, Array]
 ) -> tuple[Array, Array, Array, Array]:
     """Position and velocity at the start, each with its sigma: as found, or by the first fixes where these know more.

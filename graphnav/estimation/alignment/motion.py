@@ -71,7 +71,7 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
         return None
     t, p = gnss.t, LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
     if recording.platform == "vehicle":
-        yaw, still = integrate_yaw(recording.imu, t, _usual_rate(recording.imu)), inside(t, stationary)
+        yaw, still = integrate_yaw(recording.imu, t, _estimate_rate(recording.imu)), inside(t, stationary)
     else:  # a foot turns about every axis
         yaw, still = np.zeros(len(t)), np.zeros(len(t), dtype=bool)
     sd = across(gnss.sd)
@@ -101,7 +101,7 @@ def in_motion(
         recording.crop(begin - recording.start, end - recording.start),
         gnss=_thin(gnss, begin, end),
     )
-    bias = _usual_rate(imu)
+    bias = _estimate_rate(imu)
     rp = level(recording, begin)
     heading = _heading_of_accelerations(part, frame, rp, bias)
     tried = _try_headings(part, settings, frame, smooth, rp, heading, bias)
@@ -153,7 +153,7 @@ def _heading_of_accelerations(part: Recording, frame: LocalFrame, rp: Array, bia
     return float(-np.angle(z))
 
 
-def _usual_rate(imu: Imu) -> Array:
+def _estimate_rate(imu: Imu) -> Array:
     """Median turn rate, kept within what the sensor's turn-on bias can be, rad/s."""
     limit = 3.0 * imu.noise.gyro_bias_sigma
     return np.clip(np.median(imu.gyro, axis=0), -limit, limit)

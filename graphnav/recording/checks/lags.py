@@ -93,7 +93,7 @@ def refine_lag(
         return guess, REACH
     near = wide[int(np.nanargmin(seen))] + np.arange(-_STEP, _STEP + _FINE / 2, _FINE)
     close = profile(near)
-    lag = _lowest(near, close)
+    lag = _find_lowest(near, close)
     best = at(lag, rows)
     scores = None if best is None else _scores(t, x_at, valid, best, lag)
     if best is None or scores is None:
@@ -168,7 +168,7 @@ def _scores(
     return max(lasting, scatter, 1e-300), information
 
 
-def _lowest(lags: Array, values: Array) -> float:
+def _find_lowest(lags: Array, values: Array) -> float:
     """Where evenly spaced values are lowest, by the parabola through the lowest and its neighbours."""
     k = int(np.nanargmin(values))
     if 0 < k < len(lags) - 1 and np.isfinite(values[k - 1 : k + 2]).all():

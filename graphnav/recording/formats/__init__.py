@@ -54,7 +54,7 @@ def read(source: str | Path, topics: Sequence[str] = (), allow_outside: bool = F
         if candidate.recognises(source):
             with permit_outside(allow_outside):
                 return _choose(candidate, source, topics).recording(source) if topics else candidate.read(source)
-    raise _unknown(source, known)
+    raise _explain_unknown(source, known)
 
 
 def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()) -> Log:
@@ -85,7 +85,7 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
     exists(Path(source))
     chosen = known[name] if name else next((f for f in known.values() if f.recognises(source)), None)
     if chosen is None:
-        raise _unknown(source, known)
+        raise _explain_unknown(source, known)
     if topics:
         return _choose(chosen, source, topics)
     if chosen.load is not None:
@@ -107,7 +107,7 @@ def _choose(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:
     return chosen.choose(source, topics)
 
 
-def _unknown(source: str | Path, known: dict[str, Format]) -> RecordingError:
+def _explain_unknown(source: str | Path, known: dict[str, Format]) -> RecordingError:
     """Why nothing can read a source."""
     builtin = ", ".join(name for name, f in known.items() if f.builtin)
     path = Path(source)

@@ -43,7 +43,7 @@ def sound(log: Log, path: Path) -> Log:
         if not check_rows("IMU", good, "are no numbers or at no time"):
             imu = rows_of(imu, good)
     if gnss is not None:
-        gnss = _sound_gnss(gnss, check_rows)
+        gnss = _clean_gnss(gnss, check_rows)
     if odometer is not None:
         good = np.isfinite(odometer.speed) & (np.abs(odometer.t) <= LATEST)
         if not check_rows("odometer", good, "are no numbers or at no time"):
@@ -55,7 +55,7 @@ def sound(log: Log, path: Path) -> Log:
     return replace(log, imu=imu, gnss=gnss, odometer=odometer, truth=truth, remarks=tuple(remarks))
 
 
-def _sound_gnss(gnss: Gnss, check_rows: Callable[[str, NDArray[np.bool_], str], bool]) -> Gnss:
+def _clean_gnss(gnss: Gnss, check_rows: Callable[[str, NDArray[np.bool_], str], bool]) -> Gnss:
     """The fixes that are somewhere, and as sure of it as any receiver is that has a fix."""
     there: NDArray[np.bool_] = np.asarray(on_earth(*gnss.llh.T) & (np.abs(gnss.t) <= LATEST))
     first = gnss.llh[~there][:1]

@@ -53,7 +53,7 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
     p = _positions(gnss)
     off = out_of_reach(gnss.t, p)
     if off.any():
-        findings.append(_unreachable(gnss, p, off, recording.start))
+        findings.append(_drop_unreachable(gnss, p, off, recording.start))
         gnss = rows_of(gnss, ~off)
         p = _positions(gnss)
     for a, b in frozen_heights(gnss, p):
@@ -118,7 +118,7 @@ def out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
     return lost
 
 
-def _unreachable(gnss: Gnss, p: Array, off: NDArray[np.bool_], start: float) -> Finding:
+def _drop_unreachable(gnss: Gnss, p: Array, off: NDArray[np.bool_], start: float) -> Finding:
     k = int(np.flatnonzero(off)[0])
     kept = np.flatnonzero(~off & np.isfinite(p).all(axis=1))
     near = kept[np.argmin(np.abs(gnss.t[kept] - gnss.t[k]))]

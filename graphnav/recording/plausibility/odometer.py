@@ -26,7 +26,7 @@ _RATE = 10.0  # Hz that changes of speed need
 def screen(recording: Recording, way: Track | None) -> tuple[Recording, list[Finding]]:
     """The recording without readings that cannot be right, and what was found; `way` is what GNSS says."""
     findings: list[Finding] = []
-    for one in (_beyond, _clock_jump, _other_scale):
+    for one in (_find_beyond, _clock_jump, _other_scale):
         odometer = recording.odometer
         if odometer is None or len(odometer.t) < 2:
             break
@@ -51,7 +51,7 @@ def track(odometer: Odometer) -> Track | None:
 _Found = tuple[NDArray[np.bool_], Finding | None]
 
 
-def _beyond(odometer: Odometer, way: Track | None, start: float) -> _Found:
+def _find_beyond(odometer: Odometer, way: Track | None, start: float) -> _Found:
     """Readings that no vehicle reaches."""
     bad = ~(np.abs(odometer.speed) <= FASTEST)
     if not bad.any():

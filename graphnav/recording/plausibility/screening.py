@@ -244,14 +244,14 @@ def check_dead_axes(recording: Recording) -> Iterator[Finding]:
     whole = recording.duration
     for name, values in (("gyro", imu.gyro), ("accelerometer", imu.accel)):
         for axis in range(3):
-            x, same = _repeats(values @ imu.R_bs[:, axis])
+            x, same = _compare_repeats(values @ imu.R_bs[:, axis])
             a, b = max(runs_of(same), key=lambda run: run[1] - run[0], default=(0, 0))
             lasts = float(imu.t[b] - imu.t[a])
             if lasts < min(_DEAD, 0.9 * whole) or b - a < _DEAD:
                 continue
             others = [k for k in range(3) if k != axis]
-            turned = (_repeats(values @ imu.R_bs[:, k]) for k in others)
-            if not any(_moves(y[a : b + 1], stays[a:b], _STIRS[name]) for y, stays in turned):
+            turned = (_compare_repeats(values @ imu.R_bs[:, k]) for k in others)
+            if not any(_is_moving(y[a : b + 1], stays[a:b], _STIRS[name]) for y, stays in turned):
                 continue
             value = x[a]
             when = (
@@ -269,13 +269,13 @@ def check_dead_axes(recording: Recording) -> Iterator[Finding]:
             )
 
 
-def _repeats(x: Array) -> tuple[Array, Array]:
+def _compare_repeats(x: Array) -> tuple[Array, Array]:
     """An axis (N,) of the file, and which values (N-1,) are that before: turned and back, these differ by rounding."""
     step = np.diff(x)
     return x, np.abs(step, out=step) <= 1e-12 * max(float(x.max()), -float(x.min()))
 
 
-def _moves(x: Array, same: Array, least: float) -> bool:
+def _is_moving(x: Array, same: Array, least: float) -> bool:
     """Whether an axis moves by many steps of its resolution, not only now and then, and with a sensor's noise.
 
     Its standard deviation is then above `least`.
