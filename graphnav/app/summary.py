@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 def solver_summary(
     outcome: Outcome, name: str, spent: Mapping[str, float], provenance: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What summary.json holds; `spent` are the seconds of writing, which only the writer knows."""
+    """What summary.json holds; `spent` are the seconds that writing took."""
     from graphnav.evaluation.metrics import summary
     from graphnav.report.sentences import doubts
 

@@ -53,7 +53,7 @@ def bar(quiet: bool, *work: str) -> Iterator[Progress | None]:
 
 
 def say(text: str, flush: bool = True) -> None:
-    """Print to stdout; whoever reads may stop early."""
+    """Print to stdout; the reader may close it early."""
     try:
         print(_strip_controls(text), flush=flush)
     except BrokenPipeError:

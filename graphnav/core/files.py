@@ -1,8 +1,8 @@
 """Files from anywhere, opened within limits: regular files only, of so many bytes unpacked, in lines so long.
 
 Whatever goes wrong with a file, be it that it is a pipe or a device, that its compression is damaged, or that it
-unpacks to more than anybody meant, is one sentence in the caller's own kind of error. The limits are
-`GRAPHNAV_MAX_FILE_MB` and `GRAPHNAV_MAX_LINE_KB` of the environment; SECURITY.md has their defaults.
+unpacks to far more, is one sentence in the caller's own kind of error. The limits are `GRAPHNAV_MAX_FILE_MB` and
+`GRAPHNAV_MAX_LINE_KB` of the environment; SECURITY.md has their defaults.
 
 What a file names in its turn is read only from its own folder and those in it, unless `permit_outside`.
 """

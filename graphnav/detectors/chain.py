@@ -198,6 +198,6 @@ def moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
                 nearest = int(np.argmin(apart))
                 out[group[m]] = abs(known[group[of[nearest]]] + speed[nearest]) > max(apart[nearest], _SIGMAS * _LEAST)
             else:
-                # nobody knows a speed: whoever is faster than another one in the chain moves
+                # no speed is known: a stretch faster than another one in the chain moves
                 out[group[m]] = bool((speed > np.maximum(apart, _SIGMAS * _LEAST)).any())
     return out

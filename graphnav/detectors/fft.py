@@ -122,7 +122,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
 
 
 def _weigh_idling(w: Windows, settings: FftSettings) -> Array:
-    """(W,) below 1 where the engine may idle, for a detector that nobody tells what stands.
+    """(W,) below 1 where the engine may idle, for a detector without labels of still windows.
 
     Below the lowest idle line no peak may rise above the paper's limits, nor, where windows fall into two populations
     by what they have there, above the lower one.

@@ -1,8 +1,8 @@
-"""From the detectors' answers to stationary intervals: candidates, vetoes, bridges and honest edges.
+"""From the detectors' answers to stationary intervals: candidates, vetoes, bridges and their ends.
 
 1. Stretches that a detector calls still are candidates: in the fusion the low-band GLRT, a likelihood ratio test, else
-   whoever decides alone. Their ends are moved to where the low-passed force and rate leave what they are inside (never
-   outwards past a disturbance).
+   the one that decides alone. Their ends are moved to where the low-passed force and rate leave what they are inside
+   (never outwards past a disturbance).
 2. Nothing changed in a candidate, so neither did its speed: if the speeds known inside say motion, all of it moves,
    and so does what the force links to it (`graphnav.detectors.chain`). Where no sensor looked, the speed measured last
    before it, and first after it, must be one that the force leads to from rest.

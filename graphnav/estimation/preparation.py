@@ -53,7 +53,7 @@ from graphnav.estimation.solvers.passes import (
 from graphnav.estimation.solvers.rts import backward
 from graphnav.recording import Recording
 
-_FAR = 0.5  # rad between the stated and the found start attitude, beyond which a filter is astray for a while
+_FAR = 0.5  # rad between the stated and the found start attitude, beyond which a filter diverges for a while
 _FAR_AWAY = 100.0  # m, by which single fixes in a city may be wrong
 _LOST = 0.1  # rad by which a filter may be off for a smoother to rest on it
 _MOST = 0.5  # share of the fixes that can be wrong; beyond it, it is the start that is
@@ -78,7 +78,7 @@ class Prepared:
 
     @property
     def diverged(self) -> bool:
-        """Whether the stated start is so far from the one found that a filter from there is astray for a while."""
+        """Whether the stated start is so far from the one found that a filter from there diverges for a while."""
         return _has_diverged(self.aligned, self.start)
 
 
@@ -250,7 +250,7 @@ def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool
 
 
 def _start(found: Alignment, stated: Alignment) -> Alignment:
-    """Where estimation sets out: the stated start, unless a filter from there would be astray."""
+    """Where estimation starts: the stated start, unless a filter from there would diverge."""
     return found if _has_diverged(found, stated) else stated
 
 

@@ -119,7 +119,7 @@ def judge(requirements: Sequence[Requirement], rows: Sequence[Mapping[str, Any]]
 
 
 def text(verdicts: Sequence[Verdict]) -> str:
-    """Lines for people, to follow others; nothing for no verdicts."""
+    """Lines of text that follow others; "" without verdicts."""
     lines = [f"  {'met' if verdict.met else 'not met'}: {verdict.sentence}" for verdict in verdicts]
     return "\n".join(["\n", "required", *lines]) if lines else ""
 

@@ -234,6 +234,6 @@ def _ring(t: Array, strikes: Array, style: Style, rng: np.random.Generator) -> A
 
 
 def _sway(count: int, rng: np.random.Generator, columns: int) -> Array:
-    """(count, columns) of unit size: the swaying of somebody who stands."""
+    """(count, columns) of unit size: the sway of a standing person."""
     x = gaussian_filter1d(rng.standard_normal((count, columns)), 0.3 / STEP, axis=0)
     return x / np.sqrt(np.mean(x**2, axis=0))

@@ -62,7 +62,7 @@ def ready(recording: Recording, settings: Settings, stationary: Array | None = N
 
     Parameters
     ----------
-    stationary : as for `align`; None where nobody has looked for stops yet, which only a quiet IMU stands for then.
+    stationary : as for `align`; None where stops have not been detected yet; a quiet IMU alone stands for them then.
     """
     span = motion(plausible(recording), settings, NONE if stationary is None else stationary)
     if span is None:

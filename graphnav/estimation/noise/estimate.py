@@ -8,7 +8,7 @@ the points that the pass before left, every factor f with redundancy B and the s
     -(B x + A e^-x) / 2 - (ln f + x - m)^2 / (2 s^2)
 
 the likelihood of A / f as a chi-square variable of B degrees of freedom, and the prior. Without a prior that is the
-fixed point f <- f A / B of Foerstner (1979), Koch (1999, section 3.6) and MacKay (1992); no sensor is judged before
+fixed point f <- f A / B of Foerstner (1979), Koch (1999, section 3.6) and MacKay (1992); no sensor is estimated before
 another, so none is believed for having come first. What few rows say is bounded: squares that chance would leave once
 in a thousand times have no more say than that (`CHANCE`), and a row, or what is wrong with wheels for seconds, has a
 weight by which it would be that large.

@@ -16,7 +16,7 @@ from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.crosschecks import Track
 
 _LONG = 15.0  # m; no lever arm on a road vehicle is that long
-_RUN = 8.0  # m/s, that nobody walks
+_RUN = 8.0  # m/s, above any walking speed
 # SI figures that no IMU has (a phone's are a tenth or less), and the unit of a data sheet that may have been meant
 _IMPOSSIBLE = {
     "gyro_noise_density": (0.02, "rad/s/sqrt(Hz)", "deg/sqrt(h)"),

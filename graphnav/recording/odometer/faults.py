@@ -195,7 +195,7 @@ def _find_wrong(
     if motion is not None and imu is not None:
         bad += _find_moving_zeros(odometer, imu, motion.lag, stays)
     bad += _find_islands(t, v, motion, breaks, stays, _ISLAND)
-    bad += [(k + 1, max(m, k + 2), WILD) for k, m in breaks]  # nobody knows which side is right
+    bad += [(k + 1, max(m, k + 2), WILD) for k, m in breaks]  # which side is right is unknown
     return _merge(t, bad)
 
 
