@@ -372,17 +372,17 @@ def test_lines_read_back_as_they_were(drive: tuple[Recording, Trajectory], rows:
 
 
 @pytest.mark.parametrize(
-    ("line", "reason"),
+    ("line", "named"),
     [
-        ("I,1,2,3", "'I' needs 7 numbers, not 3"),
-        ("G,1,2,3,4", "'G' needs 7 or 13 numbers"),
-        ("X,1", "no rows of kind 'X'"),
-        ("O,1,fast", "holds something that is no number"),
-        ("\x00\xff", "no rows of kind"),
+        ("I,1,2,3", "'I'.* 7 .* 3$"),
+        ("G,1,2,3,4", "'G'.* 7 .* 13 .* 4$"),
+        ("X,1", "'X'"),
+        ("O,1,fast", "'O,1,fast'"),
+        ("\x00\xff", "'\x00\xff'"),
     ],
 )
-def test_bad_lines_say_why(line: str, reason: str) -> None:
-    with pytest.raises(ValueError, match=reason):
+def test_bad_lines_are_named_with_what_they_lack(line: str, named: str) -> None:
+    with pytest.raises(ValueError, match=named):
         row_of(line)
 
 
