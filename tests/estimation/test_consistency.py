@@ -111,9 +111,6 @@ def test_with_positions(positions: dict[str, Score], solver: str) -> None:
     assert_consistent(positions[solver])
 
 
-@pytest.mark.xfail(
-    run=False, reason="position 0.13 to 0.4 per axis: what lasts for hours adds its prior to white fixes"
-)
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_with_estimated_noise(estimated: dict[str, Score], solver: str) -> None:
     assert_consistent(estimated[solver])
