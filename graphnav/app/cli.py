@@ -31,9 +31,9 @@ from graphnav.app.cli_options import (
     Start,
     Topic,
     Without,
-    firing,
-    only,
-    withheld_of,
+    choose_detectors,
+    collect_withheld,
+    pick_one,
 )
 from graphnav.app.talk import (
     BAD_INPUT,
@@ -101,7 +101,7 @@ def info(
 
     with bar(quiet, "ekf" if antenna else "info"):
         tell("reading")
-        whole = read(only(context, recording), topic or (), allow_outside)
+        whole = read(pick_one(context, recording), topic or (), allow_outside)
         tell("checks")
         found = inspect(whole)
         from graphnav.estimation.antenna import find_antenna, find_wrong_arms
@@ -134,13 +134,13 @@ def detect(
     from graphnav.recording.plausibility.screening import screen_recording
     from graphnav.report import detections as detection_report
 
-    withheld = withheld_of(without, start, end)
-    settings = firing(read_settings(config), detectors)
+    withheld = collect_withheld(without, start, end)
+    settings = choose_detectors(read_settings(config), detectors)
     folder = outputs.output_folder(out)
     with bar(quiet, "detect"), permit_outside(allow_outside):
         tell("reading")
         used, said = screen_recording(
-            workflow.read_part(only(context, recording), start, end, withheld, tuple(topic or ()))
+            workflow.read_part(pick_one(context, recording), start, end, withheld, tuple(topic or ()))
         )
         tell("detection")
         found = detected(used, settings)

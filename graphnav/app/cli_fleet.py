@@ -93,7 +93,7 @@ def fleet(
         drives = manifest.read_drives(source.resolve(), asked)
     known: dict[Any, Any] = {}
     tasks = [
-        manifest.task_of(
+        manifest.build_task(
             drive, folder, known, withhold=withhold, rate=rate, pages=pages, again=again, outside=allow_outside
         )
         for drive in drives

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from graphnav.app.cli_options import AllowOutside, Config, Fire, Profile, Quiet, Topic, firing
+from graphnav.app.cli_options import AllowOutside, Config, Fire, Profile, Quiet, Topic, choose_detectors
 from graphnav.app.talk import Interrupted, say
 from graphnav.core.errors import ConfigError
 
@@ -69,7 +69,7 @@ def online(
     if send:
         _send(source, topic or [], allow_outside, speed)
         return
-    settings = firing(_override(read_settings(config, profile), lag, engine), detectors)
+    settings = choose_detectors(_override(read_settings(config, profile), lag, engine), detectors)
     if resume and out is None:
         raise ConfigError("--resume: say which folder to go on in: -o OUT", key="option.missing")
     folder = None if out is None else output_folder(out)

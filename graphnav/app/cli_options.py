@@ -78,7 +78,7 @@ AllowOutside = Annotated[
 ]
 
 
-def only(context: typer.Context, recording: str) -> str:
+def pick_one(context: typer.Context, recording: str) -> str:
     """The one recording that is asked for.
 
     Raises
@@ -95,7 +95,7 @@ def only(context: typer.Context, recording: str) -> str:
     return recording
 
 
-def withheld_of(without: list[str] | None, start: float | None, end: float | None) -> tuple[Any, ...]:
+def collect_withheld(without: list[str] | None, start: float | None, end: float | None) -> tuple[Any, ...]:
     """What is withheld; the span asked for must not be empty."""
     from graphnav.app import workflow
 
@@ -104,7 +104,7 @@ def withheld_of(without: list[str] | None, start: float | None, end: float | Non
     return tuple(workflow.parse_withheld(one) for one in without or ())
 
 
-def firing(settings: Settings, names: str | None) -> Settings:
+def choose_detectors(settings: Settings, names: str | None) -> Settings:
     """The settings with the detectors of --detectors; as they are without.
 
     Raises

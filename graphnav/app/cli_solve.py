@@ -29,9 +29,9 @@ from graphnav.app.cli_options import (
     Start,
     Topic,
     Without,
-    firing,
-    only,
-    withheld_of,
+    choose_detectors,
+    collect_withheld,
+    pick_one,
 )
 from graphnav.app.talk import bar, insist, show
 from graphnav.core.errors import ConfigError
@@ -68,7 +68,7 @@ def smooth(
 ) -> None:
     """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
     asked = _Options(
-        only(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
+        pick_one(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
         quiet, json, pages,
     )  # fmt: skip
     with permit_outside(allow_outside):
@@ -124,7 +124,7 @@ def compare(
 ) -> None:
     """Put the same recording through several solvers and compare them, against the truth where there is one."""
     asked = _Options(
-        only(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
+        pick_one(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
         quiet, json, pages,
     )  # fmt: skip
     beside = _Beside(against or [], against_point or [], against_shift or [])
@@ -205,7 +205,7 @@ def _solve(
     from graphnav.evaluation import gates
     from graphnav.recording.exporters import NAMES
 
-    withheld = withheld_of(asked.without, asked.start, asked.end)
+    withheld = collect_withheld(asked.without, asked.start, asked.end)
     convert.check_rate(asked.rate)
     chosen, alone = split_names(solvers, pipeline.KNOWN, option, "solver"), option == "--solver"
     if alone and len(chosen) > 1:
@@ -229,7 +229,7 @@ def _solve(
             raise ConfigError(f"--against {file}: no such file", key="file.missing")
         of = convert.parse_point(beside.points[k] if beside.points else None, "--against-point")
         against.append(workflow.Against(file, of, beside.shifts[k] if beside.shifts else None))
-    settings = firing(read_settings(asked.config, asked.profile), asked.detectors)
+    settings = choose_detectors(read_settings(asked.config, asked.profile), asked.detectors)
     settings, noise = workflow.parse_noise(asked.noise, settings)
     request = workflow.Request(
         asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.app.workflow import Outcome
-from graphnav.core.complaints import nearest, split_names
+from graphnav.core.complaints import split_names, suggest_nearest
 from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.files import parse_json, read_text
 from graphnav.core.interpolation import interpolate
@@ -70,7 +70,7 @@ def convert_log(source: str, out: Path, name: str | None, topics: Sequence[str] 
     """
     if name is not None and name not in formats():
         raise ConfigError(
-            f"--format {name}: no such format; {nearest(name, [*formats(), *NAMES])}", key="log.format_unknown"
+            f"--format {name}: no such format; {suggest_nearest(name, [*formats(), *NAMES])}", key="log.format_unknown"
         )
     log = _with_measured_noise(load(source, name, topics))
     if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):

@@ -18,7 +18,7 @@ import numpy as np
 from graphnav.app.scores import Withheld, score
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
-from graphnav.core.complaints import nearest
+from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.findings import Finding
 from graphnav.core.notes import Note
@@ -105,7 +105,7 @@ def parse_withheld(text: str) -> Withheld:
     source, first, last = found.groups()
     if source not in sources():
         raise ConfigError(
-            f"--without {text}: no source '{source}' can be withheld; {nearest(source, sources())}",
+            f"--without {text}: no source '{source}' can be withheld; {suggest_nearest(source, sources())}",
             key="option.withheld",
         )
     if first is None:

@@ -41,7 +41,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
-from graphnav.constraints.standstill import standing_intervals
+from graphnav.constraints.standstill import find_standing
 from graphnav.constraints.vehicle import IntervalMotion
 from graphnav.core import rotation
 from graphnav.core.rotation import Array, mv
@@ -90,7 +90,7 @@ class Stance(Constraint):
     @classmethod
     def build(cls, scene: BuildContext) -> Stance | None:
         s, iv = scene.settings.foot, scene.intervals
-        rows, stop = standing_intervals(scene)
+        rows, stop = find_standing(scene)
         if scene.recording.platform != "foot" or not len(rows) or not s.stance:
             return None
         span, t = scene.stationary[stop], 0.5 * (iv.t0 + iv.t1)[rows]
@@ -167,7 +167,7 @@ class FootLateral(Constraint):
         if scene.recording.platform != "foot" or not len(scene.stationary) or not s.lateral:
             return None
         moving = iv.T > _SHORTEST
-        moving[standing_intervals(scene)[0]] = False
+        moving[find_standing(scene)[0]] = False
         rows = np.flatnonzero(moving)
         past = IntervalMotion.of(iv, rows, scene.frame)
         # a swing lies between two stances; the heading changes in it by the integral of the turn rate about the

@@ -161,8 +161,8 @@ class GnssPosition(Constraint):
             usual_error=np.median(sd if scene.typical_sigmas is None else scene.typical_sigmas, axis=0),
             type=kinds,
             lever_arm=gnss.lever_arm,
-            gyro=around(imu, imu.gyro, gnss.t[used]),
-            accel=around(imu, imu.accel, gnss.t[used]),
+            gyro=average_around(imu, imu.gyro, gnss.t[used]),
+            accel=average_around(imu, imu.accel, gnss.t[used]),
             g_n=scene.frame.gravity_n(p_n),
             omega_n=scene.frame.omega_n,
             processes=(*processes, *_stamp_error(scene.settings, gnss.t[used])),
@@ -268,8 +268,8 @@ class GnssVelocity(Constraint):
             v_l=gnss.v[used],
             R_ln=earth.enu_axes(gnss.llh[used]) @ scene.frame.R_ne.T,
             sigma=gnss.sd_v[used],
-            gyro=around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
-            accel=around(scene.recording.imu, scene.recording.imu.accel, gnss.t[used]),
+            gyro=average_around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
+            accel=average_around(scene.recording.imu, scene.recording.imu.accel, gnss.t[used]),
             g_n=scene.frame.gravity_n(scene.frame.from_llh(gnss.llh[used])),
             omega_n=scene.frame.omega_n,
             lever_arm=gnss.lever_arm,
@@ -353,7 +353,7 @@ def acceleration(states: States, accel: Array, g_n: Array) -> tuple[Array, dict[
     return mv(R, force) + g_n, {"theta": -R @ rotation.skew(force), "ba": -R}
 
 
-def around(imu: Imu, x: Array, t: Array) -> Array:
+def average_around(imu: Imu, x: Array, t: Array) -> Array:
     """(N, 3) mean of an IMU signal around times t: one sample's vibration would be noise times lever arm."""
     lo = np.searchsorted(imu.t, t - _WINDOW)
     hi = np.maximum(np.searchsorted(imu.t, t + _WINDOW), lo + 1)

@@ -27,7 +27,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.constraints.base import BuildContext, Constraint, Linearized
-from graphnav.constraints.gnss import LEVER_ARM, TIMES, antenna_velocity, around, node_spacing, period
+from graphnav.constraints.gnss import LEVER_ARM, TIMES, antenna_velocity, average_around, node_spacing, period
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import earth, rotation
 from graphnav.core.notes import Note
@@ -352,7 +352,7 @@ class GnssDoppler(SatelliteConstraint):
             offset=-(raw.range_rate + raw.drift)[some],
             v_n=found.v_n[some],
             stretch=found.stretch[some],
-            gyro=around(imu, imu.gyro, raw.t[some]),
+            gyro=average_around(imu, imu.gyro, raw.t[some]),
             omega_n=scene.frame.omega_n,
             sigma=rate_sigma(raw.cn0, found.elevation)[some, None],
             processes=(lasting,),

@@ -40,7 +40,7 @@ _STANDING = 0.6  # s; in a walk no stance is that quiet for so long
 _I3 = np.eye(3)
 
 
-def standing_intervals(scene: BuildContext) -> tuple[Array, Array]:
+def find_standing(scene: BuildContext) -> tuple[Array, Array]:
     """Indices of the intervals inside stationary spans, and of the span each lies in."""
     iv, spans = scene.intervals, scene.stationary
     if not len(spans):
@@ -132,7 +132,7 @@ class ZeroVelocity(_Standing):
 
     @classmethod
     def build(cls, scene: BuildContext) -> ZeroVelocity | None:
-        rows, stop = standing_intervals(scene)
+        rows, stop = find_standing(scene)
         if not len(rows) or not scene.settings.standstill.zero_velocity or scene.recording.platform == "foot":
             return None
         force, _ = unrest(scene, rows, stop)
@@ -159,7 +159,7 @@ class ZeroRate(_Standing):
 
     @classmethod
     def build(cls, scene: BuildContext) -> ZeroRate | None:
-        rows, stop = standing_intervals(scene)
+        rows, stop = find_standing(scene)
         if scene.recording.platform == "foot":
             rows, stop = _find_standing(scene, rows, stop)
         if not len(rows) or not scene.settings.standstill.zero_rate:
@@ -194,7 +194,7 @@ class HeldPosition(_Standing):
 
     @classmethod
     def build(cls, scene: BuildContext) -> HeldPosition | None:
-        rows, stop = standing_intervals(scene)
+        rows, stop = find_standing(scene)
         if not len(rows) or not scene.settings.standstill.held_position or scene.recording.platform == "foot":
             return None
         force, _ = unrest(scene, rows, stop)

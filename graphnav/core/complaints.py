@@ -93,7 +93,7 @@ def shorten(value: Any) -> str:
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
-def nearest(name: str, known: Sequence[str]) -> str:
+def suggest_nearest(name: str, known: Sequence[str]) -> str:
     """What may have been meant: the nearest of the names there are, else all of them."""
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     if close:

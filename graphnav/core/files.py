@@ -46,7 +46,7 @@ def permit_outside(allowed: bool = True) -> Iterator[None]:
         _outside.reset(before)
 
 
-def beside(source: Path, name: str, key: str, error: Kind = RecordingError) -> Path:
+def resolve_beside(source: Path, name: str, key: str, error: Kind = RecordingError) -> Path:
     """The path of a file that the file `source` names under a key.
 
     Raises
@@ -55,7 +55,7 @@ def beside(source: Path, name: str, key: str, error: Kind = RecordingError) -> P
         Of the kind given, if it lies outside the folder of `source`, symbolic links followed, or is no path at all.
     """
     path = source.parent / name
-    if not inside(path, source.parent, error):
+    if not is_inside(path, source.parent, error):
         raise error(
             f"{source}: '{key}' names a file outside the folder that it lies in; move it there, or say --allow-outside "
             "if you trust who wrote this",
@@ -65,7 +65,7 @@ def beside(source: Path, name: str, key: str, error: Kind = RecordingError) -> P
     return path
 
 
-def inside(path: Path, folder: Path, error: Kind = RecordingError) -> bool:
+def is_inside(path: Path, folder: Path, error: Kind = RecordingError) -> bool:
     """Whether a path may be read because of what a file in `folder` says."""
     try:
         return _outside.get() or path.resolve().is_relative_to(folder.resolve())
@@ -83,7 +83,7 @@ def check_inside(files: Iterable[Path], source: Path, error: Kind = RecordingErr
     """
     folder = source if source.is_dir() else source.parent
     for file in files:
-        if file.is_symlink() and not inside(file, folder, error):
+        if file.is_symlink() and not is_inside(file, folder, error):
             raise error(
                 f"{file}: is a link to outside of {folder}; say --allow-outside if you trust who made it",
                 key="file.outside",

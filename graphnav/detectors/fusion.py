@@ -23,9 +23,9 @@ from graphnav.config.detectors import FusionSettings
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, longer_than, merge_spans, spans_of, subtract_spans, union, within
-from graphnav.detectors.chain import LONGEST, Link, Outwards, at_rest_until, link, moving_by_chain, speed_beside
+from graphnav.detectors.chain import LONGEST, Link, Outwards, at_rest_until, find_speed_beside, link, moving_by_chain
 from graphnav.detectors.low_band import Scale, low_band
-from graphnav.detectors.motion import Speeds, of_three
+from graphnav.detectors.motion import Speeds, take_median
 from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.windows import Blocks, kernel, share_of, smooth
 
@@ -185,11 +185,11 @@ def _leads_to_speed(b: Blocks, span: Array, speeds: list[Speeds], settings: Fusi
             at = at[np.argsort(np.abs(s.t[at] - edge), kind="stable")[:3]]
             if len(at) < 3 or np.abs(s.t[at] - edge).max() > LONGEST:
                 continue
-            beside = beside or speed_beside(b, span, way)
+            beside = beside or find_speed_beside(b, span, way)
             if beside is None:
                 break
             excess = [_excess(beside, s, k, max(s.late, settings.odometer_delay)) for k in at.tolist()]
-            if of_three(*np.array(excess)) > 0.0:
+            if take_median(*np.array(excess)) > 0.0:
                 return True
     return False
 

@@ -22,8 +22,8 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, spans_of, within
 from graphnav.detectors.scene import MG, Detector, Labels, Scene
-from graphnav.detectors.thresholds import fewest_errors, own_threshold
-from graphnav.detectors.windows import Blocks, running, unbroken, window_times
+from graphnav.detectors.thresholds import find_fewest_errors, own_threshold
+from graphnav.detectors.windows import Blocks, find_unbroken, sum_running, window_times
 
 _TINY = 1e-300
 _STEP = 0.1  # s between windows
@@ -89,7 +89,7 @@ def glrt_statistic(
     """
     if len(accel) < window:
         return np.zeros(0)
-    return STATISTICS[name](running(rows_for(accel, gyro)).means(window), sigma_a, sigma_w, g)
+    return STATISTICS[name](sum_running(rows_for(accel, gyro)).means(window), sigma_a, sigma_w, g)
 
 
 def stance_mask(statistic: Array, threshold: float, window: int) -> np.ndarray:
@@ -123,7 +123,10 @@ def window_means(b: Blocks, length: float) -> Means | None:
     if count < window:
         return None
     return Means(
-        window_times(middle, window), 0.5 * length, running(rows).means(window), unbroken(whole, window, first=0)
+        window_times(middle, window),
+        0.5 * length,
+        sum_running(rows).means(window),
+        find_unbroken(whole, window, first=0),
     )
 
 
@@ -165,7 +168,7 @@ class _Windowed(Detector):
             threshold, notes = own_threshold(scene, name, m.t, m.half, values, least, most)
         elif at_rest:
             in_motion = within(m.t, labels.moving, m.half)
-            threshold, _ = fewest_errors(values[reference & m.whole], values[in_motion & m.whole], least)
+            threshold, _ = find_fewest_errors(values[reference & m.whole], values[in_motion & m.whole], least)
         mask = values < threshold
         return Detection(name, m.t, values, threshold, mask, spans_of(mask, m.t, m.half), notes)
 

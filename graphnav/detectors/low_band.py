@@ -23,7 +23,7 @@ from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, longer_than, spans_of, within
 from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.thresholds import FEWEST, MISLABELLED, MISTAKEN, log_statistic, valley
-from graphnav.detectors.windows import LowPassed, running, unbroken, window_times
+from graphnav.detectors.windows import LowPassed, find_unbroken, sum_running, window_times
 from graphnav.recording import ImuNoise
 
 NAME = "low_band_glrt"
@@ -60,13 +60,13 @@ class Scale:
     overstated: bool = False  # the recording knows windows far below that
 
 
-def spreads(low: LowPassed, window: int) -> Array:
+def measure_spreads(low: LowPassed, window: int) -> Array:
     """Variance per axis of force and of rate in every window of low-passed rows, (W, 2); NaN where a gap lies in it."""
     rows = low.rows - low.rows.mean(axis=0)
-    sums = running(np.concatenate([rows, rows**2], axis=1)).means(window)
+    sums = sum_running(np.concatenate([rows, rows**2], axis=1)).means(window)
     spread = np.maximum(sums[:, 6:] - sums[:, :6] ** 2, 0.0)
     each = np.stack([spread[:, :3].mean(axis=1), spread[:, 3:].mean(axis=1)], -1)
-    return np.where(unbroken(low.whole, window)[:, None], each, np.nan)
+    return np.where(find_unbroken(low.whole, window)[:, None], each, np.nan)
 
 
 def scale(low: LowPassed, noise: ImuNoise, settings: LowBandSettings, spread: Array) -> Scale:
@@ -107,7 +107,7 @@ def detect_low_band(
         nothing = Detection(NAME, empty, empty, settings.threshold, empty > 0, NONE)
         return nothing, scale(low, noise, settings, np.zeros((0, 2)))
     t = window_times(low.t, window)
-    spread = spreads(low, window)
+    spread = measure_spreads(low, window)
     s = scale(low, noise, settings, spread)
     found = statistic(spread, s)
     threshold, notes = _threshold(t, found, settings, moving, low.period, s)

@@ -34,7 +34,7 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, merge_spans, spans_of, union
 from graphnav.detectors.glrt import glrt_statistic
-from graphnav.detectors.windows import running, unbroken
+from graphnav.detectors.windows import find_unbroken, sum_running
 from graphnav.recording import Imu
 
 _QUIET = 1.0  # s; the quietest of the recording says what bias and gravity are
@@ -92,7 +92,7 @@ def detect_stances(
 def _find_below(name: str, e: Array, imu: Imu, period: float, window: int, settings: StanceSettings) -> Detection:
     """Spans in which e is below its threshold."""
     t = 0.5 * (imu.t[: len(e)] + imu.t[window - 1 :]) - 0.5 * period  # a row speaks for the period before it
-    whole = unbroken(np.r_[True, np.diff(imu.t) < period + settings.bridge], window)
+    whole = find_unbroken(np.r_[True, np.diff(imu.t) < period + settings.bridge], window)
     e = np.where(whole, e, np.nan)
     below = e < settings.threshold
     spans = longer_than(merge_spans(spans_of(below, t, 0.5 * period), settings.bridge), settings.shortest)
@@ -109,7 +109,7 @@ def _average_quietest(imu: Imu, period: float) -> tuple[Array, float]:
     """Mean rate (3,) and size of the mean force of the second in which both scatter least."""
     n = min(len(imu.t), max(2, round(_QUIET / period)))
     rows = np.column_stack([imu.gyro, imu.accel])
-    means, squares = running(rows).means(n), running(rows**2).means(n)
+    means, squares = sum_running(rows).means(n), sum_running(rows**2).means(n)
     scatter = squares - means**2
     # each against its own typical scatter, so that neither unit decides
     total = np.sum(scatter / np.maximum(np.median(scatter, axis=0), 1e-12), axis=1)
@@ -144,7 +144,7 @@ def _without_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fa
     """
     out = spans.copy()
     window = len(imu.t) - len(t) + 1
-    force = running(imu.accel).means(window)
+    force = sum_running(imu.accel).means(window)
     T = np.diff(imu.t, prepend=2.0 * imu.t[0] - imu.t[1])
     ways = []  # from a quiet moment outward: which span, which end of it, the window, the first row and how many
     for side, way in ((0, -1), (1, 1)):

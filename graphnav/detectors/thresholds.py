@@ -89,7 +89,7 @@ def own_threshold(
         return max(least, float(10.0**split)), ()
     rests = ~within(t, scene.certain, -half) & np.isfinite(x)  # no part of them is certain to move
     if moves.any() and rests.any():
-        found, wrong = fewest_errors(values[rests], values[moves], least)
+        found, wrong = find_fewest_errors(values[rests], values[moves], least)
         if wrong < _TELLS:
             return min(found, most), ()
     if moves.any():
@@ -104,7 +104,7 @@ def own_threshold(
     )
 
 
-def fewest_errors(still: Array, moving: Array, least: float) -> tuple[float, float]:
+def find_fewest_errors(still: Array, moving: Array, least: float) -> tuple[float, float]:
     """Threshold that calls the smallest share of still windows moving plus of moving windows still, at least `least`.
 
     Of several that do equally well, the middle one by their logarithm. The second number is that sum of shares.

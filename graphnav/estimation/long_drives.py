@@ -108,7 +108,7 @@ class _Span:
         return self.whole(t, size)
 
 
-def within(solution: Solution, share: Share) -> Solution:
+def crop_solution(solution: Solution, share: Share) -> Solution:
     """What a solution of a part says of the part's own span."""
     start, end = share.start, share.end
     if np.isneginf(start) and np.isposinf(end):

@@ -24,7 +24,7 @@ from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation import faults
-from graphnav.estimation.long_drives import OVERLAP, shares, within
+from graphnav.estimation.long_drives import OVERLAP, crop_solution, shares
 from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe_far
@@ -123,7 +123,7 @@ def _run(
         raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}", key="solver.unknown")
     frame = LocalFrame(origin(recording))
     pieces, notes = _split_pieces(recording, settings)
-    notes = [*fitting(recording, settings), *notes]
+    notes = [*check_profile(recording, settings), *notes]
     found: list[dict[str, Solution]] = []
     parts = [share for piece in pieces for share in shares(piece, settings)]
     if len(parts) > len(pieces):
@@ -134,7 +134,7 @@ def _run(
             # matrices here have thirty rows: threads for them cost more than the work, twenty times on a busy machine
             with threadpool_limits(limits=1, user_api="blas"):
                 solved = _solve_with_retry(part.recording, settings, frame, solvers, progress, noise)
-            found.append({name: within(one, part) for name, one in solved.items()})
+            found.append({name: crop_solution(one, part) for name, one in solved.items()})
         except EstimationError as error:
             if len(parts) == 1:
                 raise
@@ -264,7 +264,7 @@ def _bind_graph(problem: Problem, solution: Solution) -> Callable[[], tuple[Any,
     return export
 
 
-def fitting(recording: Recording, settings: Settings) -> list[str]:
+def check_profile(recording: Recording, settings: Settings) -> list[str]:
     """What the settings' profile asks for and the recording lacks, in sentences.
 
     Raises

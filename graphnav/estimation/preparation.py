@@ -24,7 +24,7 @@ from graphnav.core.state import BLOCKS, States
 from graphnav.detectors import Detections, detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment, align, with_known_heading
-from graphnav.estimation.alignment.first import some
+from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.fixing import fix, split
 from graphnav.estimation.noise.apply import with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
@@ -319,4 +319,4 @@ def _cut_aligned(recording: Recording, aligned: Alignment) -> Recording:
     """Without the fixes that an alignment has seen."""
     assert recording.gnss is not None
     assert aligned.until is not None
-    return replace(recording, gnss=some(recording.gnss, recording.gnss.t > aligned.until))
+    return replace(recording, gnss=pick_fixes(recording.gnss, recording.gnss.t > aligned.until))

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict
 from graphnav.config import Settings
 from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.constraints.gnss import period
-from graphnav.constraints.raw_selection import EARLY, usable
+from graphnav.constraints.raw_selection import EARLY, select_usable
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
 from graphnav.core.notes import Note
@@ -164,7 +164,9 @@ class RawEpochs:
         if not np.isin(rows[:, 0], self.setup.catalogue.satellites).all():
             return "of satellites that the setup does not name"
         rows = _sane(rows)
-        return None if usable(self._series([0.0], [rows]), self.settings).any() else "no satellite that is of use"
+        return (
+            None if select_usable(self._series([0.0], [rows]), self.settings).any() else "no satellite that is of use"
+        )
 
     def wanted(self, t: float) -> bool:
         """Whether no epoch is there that is so near to a time that one of the two suffices."""

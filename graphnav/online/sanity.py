@@ -15,7 +15,7 @@ import numpy as np
 
 from graphnav.core.earth import llh_to_ecef
 from graphnav.core.rotation import Array
-from graphnav.recording.formats.repair import VAGUEST, VAGUEST_V, on_earth
+from graphnav.recording.formats.repair import VAGUEST, VAGUEST_V, is_on_earth
 from graphnav.recording.plausibility.fixes import FASTEST, MISLED
 from graphnav.recording.plausibility.screening import ACCEL_RANGE, GYRO_RANGE
 
@@ -56,7 +56,7 @@ def odometer_reads(values: tuple[float, ...]) -> bool:
 def fix_odds(values: tuple[float, ...]) -> str | None:
     """What is wrong with a fix by itself, as it is counted; None if nothing is."""
     lat, lon, h = (np.array([x]) for x in values[:3])
-    if not on_earth(lat, lon, h)[0]:
+    if not is_on_earth(lat, lon, h)[0]:
         return "nowhere on Earth"
     if not all(_SUREST <= sd <= VAGUEST for sd in values[3:6]):
         return "a sigma that says nothing"

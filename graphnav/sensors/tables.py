@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator
 from pydantic.types import Strict
 
-from graphnav.core.complaints import nearest
+from graphnav.core.complaints import suggest_nearest
 
 _SMALLEST, _LARGEST = 1e-15, 1e9  # of a figure: squares of it are numbers
 _LONGEST = 1e7  # of the components of a vector: m, from the Earth's centre at most, or of a direction
@@ -84,5 +84,5 @@ class SensorTable(TomlTable):
         known = (*cls.required, *cls.optional)
         for name in columns:
             if name not in known:
-                raise ValueError(f"'{name}' is not one of graphnav's columns; {nearest(name, known)}")
+                raise ValueError(f"'{name}' is not one of graphnav's columns; {suggest_nearest(name, known)}")
         return columns

@@ -15,7 +15,7 @@ from graphnav.core import rotation as ro
 from graphnav.core.notes import key_of
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
-from graphnav.estimation.noise.imu_floor import quietest_density, with_measured_floor
+from graphnav.estimation.noise.imu_floor import bound_density, with_measured_floor
 from graphnav.imu.clipping import find_cut_peaks, with_whole_peaks
 from graphnav.imu.onboard_offset import evidence, offset_learnt, without_onboard_offset
 from graphnav.imu.preintegration import preintegrate
@@ -67,15 +67,15 @@ def test_a_bound_on_white_noise_from_the_quietest_stretch() -> None:
         t = 0.005 * np.arange(1, 4001)
         x = 1e-3 / np.sqrt(0.005) * rng.standard_normal((4000, 3)) + 0.02 * np.sin(0.5 * t)[:, None]
         x[2000:] += rng.standard_normal((2000, 3))  # and then it walks
-        found.append(quietest_density(t, x) / 1e-3)
+        found.append(bound_density(t, x) / 1e-3)
     assert np.mean(np.array(found) < 1.0) <= 0.05  # the least of some ten stretches of which each is below in 0.1 %
     assert max(found) < 1.7
 
 
 def test_what_is_too_short_for_a_bound_has_none() -> None:
     t = 0.005 * np.arange(1, 101)
-    assert quietest_density(t, np.zeros((100, 3))) == np.inf
-    assert quietest_density(t[:1], np.zeros((1, 3))) == np.inf
+    assert bound_density(t, np.zeros((100, 3))) == np.inf
+    assert bound_density(t[:1], np.zeros((1, 3))) == np.inf
 
 
 def test_figures_stated_too_large_are_lowered_for_a_walk_and_for_nothing_else() -> None:

@@ -47,7 +47,7 @@ def solve_drive(task: Task) -> Row:
     _forget_peak()
     try:
         with permit_outside(task.outside):
-            key = key_of(task)
+            key = hash_task(task)
             if not task.again and (there := read_row(folder, key)) is not None:
                 return {**there, "drive": task.name, "source": task.source, "skipped": True}
             outcome = run_request(_request(task))
@@ -95,7 +95,7 @@ def read_row(folder: Path, key: str | None = None) -> Row | None:
         return None
 
 
-def key_of(task: Task) -> str:
+def hash_task(task: Task) -> str:
     """What a result depends on: this version, all that is asked, and every byte of input."""
     asked = {k: v for k, v in asdict(task).items() if k not in ("name", "source", "folder", "again")}
     asked |= {"graphnav": graphnav.__version__, "noise": task.noise and sha256(Path(task.noise))}

@@ -16,9 +16,9 @@ from typing import Any
 from graphnav.app.workflow import parse_noise, parse_withheld
 from graphnav.config import read_settings
 from graphnav.config.files import settings_from
-from graphnav.core.complaints import nearest, read_toml
+from graphnav.core.complaints import read_toml, suggest_nearest
 from graphnav.core.errors import ConfigError
-from graphnav.core.files import exists, inside, read_text
+from graphnav.core.files import exists, is_inside, read_text
 from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.pipeline import KNOWN
 from graphnav.recording.formats import formats
@@ -98,7 +98,7 @@ def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, Drive
     return _number_clones(drives)
 
 
-def task_of(
+def build_task(
     drive: tuple[str, str, DriveOptions, str], out: Path, known: dict[Any, dict[str, Any]], **common: Any
 ) -> Task:
     """A drive with its settings read and checked; `known` keeps those that many share.
@@ -110,7 +110,9 @@ def task_of(
     """
     name, source, asked, where = drive
     if asked.solver not in KNOWN:
-        raise ConfigError(f"{where}: no solver '{asked.solver}'; {nearest(asked.solver, KNOWN)}", key="manifest.solver")
+        raise ConfigError(
+            f"{where}: no solver '{asked.solver}'; {suggest_nearest(asked.solver, KNOWN)}", key="manifest.solver"
+        )
     try:
         without = tuple((asked.without or "").split())
         for one in without:
@@ -214,7 +216,8 @@ def _check_columns(names: Iterable[str], where: str) -> None:
     unknown = [name for name in names if name not in _COLUMNS]
     if unknown:
         raise ConfigError(
-            f"{where}: no such column '{unknown[0]}'; {nearest(unknown[0], _COLUMNS)}", key="table.column_unknown"
+            f"{where}: no such column '{unknown[0]}'; {suggest_nearest(unknown[0], _COLUMNS)}",
+            key="table.column_unknown",
         )
     if "recording" not in names:
         raise ConfigError(f"{where}: 'recording' is missing", key="manifest.no_recording")
@@ -261,7 +264,7 @@ def _drive(source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions
 def _find_beside(source: Path, name: str, where: str, key: str) -> Path:
     """What a manifest names; as elsewhere, that lies in its folder or below unless the command says otherwise."""
     path = source.parent / name
-    if not inside(path, source.parent, ConfigError):
+    if not is_inside(path, source.parent, ConfigError):
         raise ConfigError(
             f"{where}, '{key}': {name} lies outside its folder; say --allow-outside if you trust who wrote it",
             key="file.outside",

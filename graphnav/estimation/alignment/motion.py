@@ -18,8 +18,8 @@ from graphnav.core.state import States
 from graphnav.detectors.base import NONE, inside
 from graphnav.estimation.alignment.back import carry_back
 from graphnav.estimation.alignment.course import COURSE_SIGMA, with_course
-from graphnav.estimation.alignment.first import Alignment, level, some
-from graphnav.estimation.alignment.travel import across, integrate_yaw, travel
+from graphnav.estimation.alignment.first import Alignment, level, pick_fixes
+from graphnav.estimation.alignment.travel import average_across, integrate_yaw, travel
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.imu.preintegration import prefix
@@ -39,18 +39,18 @@ _UNLIKELY = 14.0  # by which a log-likelihood is less where one in a million is 
 Smoother = Callable[[Problem, States], Solution]
 
 
-def plausible(recording: Recording) -> Recording:
+def drop_implausible(recording: Recording) -> Recording:
     """Without the fixes that lie far off the running median of five: they would be taken for motion."""
     gnss = recording.gnss
     if gnss is not None and not np.isfinite(gnss.llh).all():
-        gnss = some(gnss, np.flatnonzero(np.isfinite(gnss.llh).all(axis=1)))
+        gnss = pick_fixes(gnss, np.flatnonzero(np.isfinite(gnss.llh).all(axis=1)))
         recording = replace(recording, gnss=gnss)
     if gnss is None or len(gnss.t) < 5:
         return recording
     p = LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
     off = np.linalg.norm(p - median_filter(p, size=(5, 1), mode="nearest"), axis=1)
     usual = np.maximum(np.median(off), np.linalg.norm(gnss.sd[:, :2], axis=1))
-    return replace(recording, gnss=some(gnss, off <= _JUMP * usual))
+    return replace(recording, gnss=pick_fixes(gnss, off <= _JUMP * usual))
 
 
 def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:
@@ -74,7 +74,7 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
         yaw, still = integrate_yaw(recording.imu, t, _estimate_rate(recording.imu)), inside(t, stationary)
     else:  # a foot turns about every axis
         yaw, still = np.zeros(len(t)), np.zeros(len(t), dtype=bool)
-    sd = across(gnss.sd)
+    sd = average_across(gnss.sd)
     way = travel(p, sd, yaw, still)
     away = np.maximum(way.times_sigma, travel(p, sd, np.zeros(len(t)), still).times_sigma) > _MOVES
     if not away.any():
@@ -90,7 +90,7 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
     return float(max(t[0], np.round(begin, 3))), float(t[last])  # what rounding did to D shall not show
 
 
-def in_motion(
+def align_in_motion(
     recording: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, span: tuple[float, float]
 ) -> Alignment:
     """The first state from the short problem over `span` (s), carried back to the first sample."""
@@ -167,7 +167,7 @@ def _thin(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
         if gnss.t[i] - last >= spacing:
             keep.append(i)
             last = gnss.t[i]
-    return some(gnss, np.array(keep))
+    return pick_fixes(gnss, np.array(keep))
 
 
 def _try_headings(

@@ -23,7 +23,7 @@ from graphnav.recording.checks.aiding import (
     check_imu_axes,
     check_mirroring,
     check_yaw_scale,
-    mirrored_places,
+    find_mirrored,
     odometer_findings,
     overlap_s,
 )
@@ -160,7 +160,7 @@ def inspect(recording: Recording) -> Inspection:
         findings += check_gnss_coverage(recording)
         findings += check_rounding(recording.gnss)
         findings += check_fix_types(recording.gnss)
-        wrong = mirrored_places(recording, list(velocities(recording.gnss)))
+        wrong = find_mirrored(recording, list(velocities(recording.gnss)))
         if overlap or not wrong:
             # against wrong velocities, or on another clock, every position jumps
             findings += wrong or (check_gnss_jumps(recording, track) if overlap else ())

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import inside
+from graphnav.core.files import is_inside
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import NEAR, Epochs, between_clocks
 from graphnav.recording import Gnss, Odometer
@@ -262,7 +262,7 @@ class _Writer:
             if topics[0] in self.asked:
                 others = "as was asked"
             self._key("topic", quote(topics[0]), others if len(topics) > 1 else "the only one")
-        if source.joined_from is None and source.plain is None and not inside(source.path, self.folder):
+        if source.joined_from is None and source.plain is None and not is_inside(source.path, self.folder):
             self.decisions.append(f"{relative}: lies outside the folder of this file; say --allow-outside to read it")
         names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
         if names:

@@ -10,7 +10,7 @@ import pkgutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from graphnav.core.complaints import nearest
+from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import exists, permit_outside
 from graphnav.recording import Recording
@@ -81,7 +81,9 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
     """
     known = formats()
     if name is not None and name not in known:
-        raise RecordingError(f"--format {name}: no such format; {nearest(name, list(known))}", key="log.format_unknown")
+        raise RecordingError(
+            f"--format {name}: no such format; {suggest_nearest(name, list(known))}", key="log.format_unknown"
+        )
     exists(Path(source))
     chosen = known[name] if name else next((f for f in known.values() if f.recognises(source)), None)
     if chosen is None:

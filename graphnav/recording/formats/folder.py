@@ -12,7 +12,7 @@ import numpy as np
 
 from graphnav.core.earth import ecef_to_llh, enu_axes
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import beside
+from graphnav.core.files import resolve_beside
 from graphnav.core.timescales import parse_clock
 from graphnav.gnss.series import RawGnss
 from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth
@@ -57,7 +57,7 @@ def read_folder(source: str | Path) -> Recording:
 
     def table(name: str) -> Table:
         section = getattr(d, name)
-        file = beside(path, section.file, f"{name}.file")
+        file = resolve_beside(path, section.file, f"{name}.file")
         files.append(file)
         required, optional, keep = section.required, section.optional, section.keep
         if name == "truth":
@@ -78,7 +78,9 @@ def read_folder(source: str | Path) -> Recording:
         if section is None:
             return None
         if section.file not in logs:
-            logs[section.file] = other_log(beside(path, section.file, f"{name}.file"), topics.get(section.file, ()))
+            logs[section.file] = other_log(
+                resolve_beside(path, section.file, f"{name}.file"), topics.get(section.file, ())
+            )
         log = logs[section.file]
         if section.topic and not (log and log.topics):
             raise RecordingError(
@@ -121,7 +123,7 @@ def read_folder(source: str | Path) -> Recording:
     if d.truth and d.truth.closed_loop_sigma:
         truth = Truth(imu.t[[0, -1]], of=d.truth.of, closed_loop_sigma=d.truth.closed_loop_sigma)
     elif d.truth and d.truth.file and Path(d.truth.file).suffix in (".nav", ".pos", ".tum"):
-        files.append(beside(path, d.truth.file, "truth.file"))
+        files.append(resolve_beside(path, d.truth.file, "truth.file"))
         truth = _read_truth(d.truth, files[-1], remarks)
     elif d.truth:
         truth = build_truth(d.truth, table("truth"), remarks)
@@ -156,7 +158,8 @@ def _load_raw(
     from graphnav.gnss.placing import Corrected
 
     some = {
-        name: tuple(beside(path, file, f"raw_gnss.{name}") for file in getattr(d, name) or ()) for name in _RAW_FILES
+        name: tuple(resolve_beside(path, file, f"raw_gnss.{name}") for file in getattr(d, name) or ())
+        for name in _RAW_FILES
     }
     corrected = Corrected(clock="clock" in d.corrected, troposphere="troposphere" in d.corrected)
     sources = Sources(

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.core.complaints import nearest
+from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import unix_to_gps
@@ -67,7 +67,7 @@ def load(path: Path, wanted: Sequence[str] = ()) -> Log:
     for name in wanted:
         if name not in (known := [t.name for t in topics]):
             raise RecordingError(
-                f"{path}: no topic '{name}' that can be used; {nearest(name, known)}", key="log.topic_unknown"
+                f"{path}: no topic '{name}' that can be used; {suggest_nearest(name, known)}", key="log.topic_unknown"
             )
     chosen: dict[str, _Topic] = {}
     ranked: dict[str, list[_Topic]] = {}

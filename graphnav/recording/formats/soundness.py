@@ -13,7 +13,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note
 from graphnav.recording import Gnss, rows_of
 from graphnav.recording.formats.registry import Log
-from graphnav.recording.formats.repair import LATEST, VAGUEST, VAGUEST_V, on_earth
+from graphnav.recording.formats.repair import LATEST, VAGUEST, VAGUEST_V, is_on_earth
 
 
 def sound(log: Log, path: Path) -> Log:
@@ -49,7 +49,7 @@ def sound(log: Log, path: Path) -> Log:
         if not check_rows("odometer", good, "are no numbers or at no time"):
             odometer = rows_of(odometer, good)
     if truth is not None and truth.llh is not None:
-        good = on_earth(*truth.llh.T) & (np.abs(truth.t) <= LATEST)
+        good = is_on_earth(*truth.llh.T) & (np.abs(truth.t) <= LATEST)
         if not check_rows("truth", good, "are nowhere on Earth or at no time"):
             truth = rows_of(truth, good)
     return replace(log, imu=imu, gnss=gnss, odometer=odometer, truth=truth, remarks=tuple(remarks))
@@ -57,7 +57,7 @@ def sound(log: Log, path: Path) -> Log:
 
 def _clean_gnss(gnss: Gnss, check_rows: Callable[[str, NDArray[np.bool_], str], bool]) -> Gnss:
     """The fixes that are somewhere, and as sure of it as any receiver is that has a fix."""
-    there: NDArray[np.bool_] = np.asarray(on_earth(*gnss.llh.T) & (np.abs(gnss.t) <= LATEST))
+    there: NDArray[np.bool_] = np.asarray(is_on_earth(*gnss.llh.T) & (np.abs(gnss.t) <= LATEST))
     first = gnss.llh[~there][:1]
     at = "".join(f" (the first at {np.degrees(p[0]):.7g}, {np.degrees(p[1]):.7g} deg, {p[2]:.7g} m)" for p in first)
     if not check_rows("GNSS", there, f"are nowhere on Earth or at no time{at}"):

@@ -51,12 +51,12 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
         )
         gnss = rows_of(gnss, np.arange(len(gnss.t)) >= cached)
     p = _positions(gnss)
-    off = out_of_reach(gnss.t, p)
+    off = find_out_of_reach(gnss.t, p)
     if off.any():
         findings.append(_drop_unreachable(gnss, p, off, recording.start))
         gnss = rows_of(gnss, ~off)
         p = _positions(gnss)
-    for a, b in frozen_heights(gnss, p):
+    for a, b in find_frozen_heights(gnss, p):
         driven = float(np.hypot(*np.diff(p[a:b, :2], axis=0).T).sum())
         sd = gnss.sd.copy()
         sd[a:b, 2] = np.maximum(sd[a:b, 2], _SLOPE * driven)
@@ -89,7 +89,7 @@ def _positions(gnss: Gnss) -> Array:
     return LocalFrame(middle if np.isfinite(middle).all() else np.zeros(3)).from_llh(gnss.llh)
 
 
-def out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
+def find_out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
     """Fixes at p (M, 3) m, t (M,) s, that cannot be reached from the most that can be reached from each other."""
     lost = np.zeros(len(t), dtype=bool)
     there = np.flatnonzero(np.isfinite(p).all(axis=1))
@@ -134,7 +134,7 @@ def _drop_unreachable(gnss: Gnss, p: Array, off: NDArray[np.bool_], start: float
     )
 
 
-def frozen_heights(gnss: Gnss, p: Array) -> list[tuple[int, int]]:
+def find_frozen_heights(gnss: Gnss, p: Array) -> list[tuple[int, int]]:
     """[first, end) of the fixes whose height stays the same to the last digit while the vehicle drives."""
     same = np.diff(gnss.llh[:, 2]) == 0.0
     way = np.r_[0.0, np.cumsum(np.nan_to_num(np.hypot(*np.diff(p[:, :2], axis=0).T)))]

@@ -296,7 +296,7 @@ _SURE = 0.7  # of a correlation, and of a unit vector's component
 
 def check_forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iterator[Finding]:
     """The forward force falls when the speed rises: one axis of the accelerometer is reversed, or all of the IMU."""
-    up = crosschecks.up_of(imu)
+    up = crosschecks.find_up(imu)
     if way is None or forward is None or forward.correlation < _SURE or up[2] < 0.8:
         return
     ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
