@@ -33,6 +33,8 @@ def find() -> str | None:
 class Browser:
     """One tab. `trouble` is everything logged as an error or thrown, `asked` every address asked for."""
 
+    density = 1  # pixels per CSS pixel; drawn by software, a page of twice as many takes four times as long to paint
+
     def __init__(self, program: str, profile: str) -> None:
         # the browser reads from 3 and writes to 4: keep our own ends away from those numbers
         ours_in, theirs_out = (fcntl.fcntl(fd, fcntl.F_DUPFD, 10) for fd in os.pipe())
@@ -65,7 +67,13 @@ class Browser:
         """Go to a file, in a window of this size, as a reader with light or dark taste."""
         width, height = size
         phone = width < 600
-        self._call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=2, mobile=phone)
+        self._call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=self.density,
+            mobile=phone,
+        )
         self._call("Emulation.setTouchEmulationEnabled", enabled=phone)
         self._call("Emulation.setScriptExecutionDisabled", value=not scripts)
         self.colours(dark)
@@ -180,6 +188,7 @@ def main() -> None:
     page, folder = Path(sys.argv[1]), Path(sys.argv[2])
     folder.mkdir(parents=True, exist_ok=True)
     with browser() as one:
+        one.density = 2
         for device, size in (("desktop", DESKTOP), ("phone", PHONE)):
             for dark in (False, True):
                 one.open(page, size, dark)

@@ -77,14 +77,17 @@ def velocity_errors(solution: Solution, truth: Trajectory) -> tuple[Array, Array
 
 
 @pytest.fixture(scope="module")
-def positions(shared_data: Path) -> dict[str, Score]:
-    drives = [oracle.oracle_drive(shared_data, seed, odometer=False, rate=RATE) for seed in range(SEEDS)]
+def drives(shared_data: Path) -> list[tuple[Recording, Trajectory]]:
+    return [oracle.oracle_drive(shared_data, seed, odometer=False, rate=RATE) for seed in range(SEEDS)]
+
+
+@pytest.fixture(scope="module")
+def positions(drives: list[tuple[Recording, Trajectory]]) -> dict[str, Score]:
     return scored(drives, STATED)
 
 
 @pytest.fixture(scope="module")
-def estimated(shared_data: Path) -> dict[str, Score]:
-    drives = [oracle.oracle_drive(shared_data, seed, odometer=False, rate=RATE) for seed in range(SEEDS)]
+def estimated(drives: list[tuple[Recording, Trajectory]]) -> dict[str, Score]:
     return scored(drives, INERTIAL)
 
 
