@@ -368,5 +368,5 @@ def test_a_receiver_that_repeats_a_fix_is_left_out(begin: float, doppler: bool) 
     assert used.sum() > 5
     assert worth_nothing(found)[used].all()
     # of right ones beside it no more than it is long itself
-    right = ~same & ((t < begin - 12.0) | (t > begin + 24.0))
+    right = ~same & ((t < begin - 5.0) | (t > begin + 17.0))
     assert not left_out(found, recording)[right].any()
