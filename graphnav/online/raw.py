@@ -50,12 +50,12 @@ def without_epochs(raw: RawGnss) -> RawGnss:
     satellites, _ = placed.satellites
     groups, _ = signal_groups(placed.take(primary(placed)))
     catalogue = Catalogue(tuple(satellites.tolist()), groups, raw.differenced, period(raw.epochs[0]))
-    return replace(_empty(_filled(raw)), catalogue=catalogue)
+    return replace(_make_empty(_fill_columns(raw)), catalogue=catalogue)
 
 
 def epochs_of(raw: RawGnss) -> list[tuple[float, tuple[float, ...]]]:
     """Times (s) and numbers of the epochs of a series, those of its satellites that are placed."""
-    raw = _filled(raw.take(np.isfinite(raw.p[:, 0])))
+    raw = _fill_columns(raw.take(np.isfinite(raw.p[:, 0])))
     columns = np.column_stack([np.asarray(getattr(raw, name), dtype=float) for name in _NUMBERS])
     t, first = np.unique(raw.t, return_index=True)
     return [
@@ -287,7 +287,7 @@ def codes_alone(settings: Settings) -> Settings:
     return settings.model_copy(update={RAW: less})
 
 
-def _filled(raw: RawGnss) -> RawGnss:
+def _fill_columns(raw: RawGnss) -> RawGnss:
     """A series with all columns, with nothing in those that it lacks."""
     n, none = len(raw), np.full(len(raw), np.nan)
     return replace(
@@ -298,7 +298,7 @@ def _filled(raw: RawGnss) -> RawGnss:
     )
 
 
-def _empty(raw: RawGnss) -> RawGnss:
+def _make_empty(raw: RawGnss) -> RawGnss:
     """A series without rows."""
     none = {
         f.name: getattr(raw, f.name)[:0]

@@ -86,13 +86,13 @@ class Reach:
     def take(self, t: float, values: tuple[float, ...]) -> list[Row] | None:
         """Whether a fix is taken: [] if so, None if not, and the others in its place if they outnumber all before."""
         p = llh_to_ecef(np.array(values[:3]))
-        if self._p is None or _near(t - self._t, p - self._p):
+        if self._p is None or _is_near(t - self._t, p - self._p):
             if t > self._t:
                 self._t, self._p = t, p
             self._count = min(self._count + 1, _MOST)
             self._others.clear()
             return []
-        if self._last is None or not self._others or not _near(t - self._last[0], p - self._last[1]):
+        if self._last is None or not self._others or not _is_near(t - self._last[0], p - self._last[1]):
             self._others.clear()
         self._others.append(("gnss", t, values))
         self._last = t, p
@@ -103,7 +103,7 @@ class Reach:
         return rows
 
 
-def _near(dt: float, dp: Array) -> bool:
+def _is_near(dt: float, dp: Array) -> bool:
     return float(np.linalg.norm(dp)) <= FASTEST * abs(dt) + MISLED
 
 

@@ -139,7 +139,7 @@ def write_report(
         ("Provenance", provenance_tables(settings, provenance)),
     ]
     lead = [
-        *_doubts(only, every),
+        *_list_doubts(only, every),
         page.paragraph(words.describe_run(recording, only, withheld, outages)),
         summary.verdicts(solution, errors),
         *words.closure_note(name, metrics),
@@ -208,7 +208,7 @@ def write_comparison(
         ("Provenance", provenance_tables(settings, provenance)),
     ]
     lead = [
-        *_doubts(solutions, every),
+        *_list_doubts(solutions, every),
         page.paragraph(words.describe_run(recording, solutions, withheld, outages)),
         *_verdicts(solutions, every),
         *(note for name, values in metrics_of.items() for note in words.closure_note(name, values)),
@@ -239,7 +239,7 @@ def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans
     return {"withheld": gone, "no GNSS": list(outages), "excluded": excluded}
 
 
-def _doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[page.Raw]:
+def _list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[page.Raw]:
     """Why the result cannot be trusted, where it cannot."""
     return [page.paragraph(said, "verdict bad") for said in words.doubts(solutions, errors)]
 

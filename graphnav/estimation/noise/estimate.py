@@ -232,7 +232,7 @@ def _improve(
         if chain.parameter.noise_groups:
             driven[chain.parameter.name] = process_moments(problem, chain, smoothed, end)
             _improve_process(figures, chain, driven[chain.parameter.name])
-            told = _told(figures, chain)
+            told = _is_observed(figures, chain)
             if chain.parameter.correlation_time is not None and told.any():
                 _improve_time(figures, chain, told, lag_moments(problem, chain, forward, smoothed, end))
     for rows in problem.constraints:
@@ -272,7 +272,7 @@ def _improve_process(figures: _Components, chain: ParameterChain, moments: tuple
         figures.update(group, *_cap(A[:, own], B[:, own], 1, _USUAL))
 
 
-def _told(figures: _Components, chain: ParameterChain) -> Array:
+def _is_observed(figures: _Components, chain: ParameterChain) -> Array:
     """(k,) whether the data say anything of each number of a process."""
     return np.array([figures.freedom.get(group, 0.0) > 1.0 for group in chain.parameter.noise_groups])
 

@@ -226,7 +226,7 @@ class _Writer:
             lag = _odometer_lag(source.t, source.values["speed"] * SPEED[str(speed.value)], felt)
             if lag is not None and lag.correlation > FAIR and abs(lag.seconds) > _SMALL:
                 sure = "" if lag.correlation > CLEAR else "CHECK: "
-                self._key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_agree(lag)}")
+                self._key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_describe_agreement(lag)}")
                 self._key("delay_sigma", "0.05", "s, what is left of it; it is estimated")
         self._lever_arm(source.log.odometer if source.log else None, "from the IMU to the middle of the rear axle")
 
@@ -301,7 +301,7 @@ def _first(source: Source, sensor: str) -> float:
     return float((source.t if source.log is None else getattr(source.log, sensor).t)[0])
 
 
-def _agree(lag: motion.Lag) -> str:
+def _describe_agreement(lag: motion.Lag) -> str:
     return f"the accelerations agree best with the IMU's so (coherence {lag.correlation:.2f})"
 
 
