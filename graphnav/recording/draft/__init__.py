@@ -17,7 +17,8 @@ from graphnav.recording import Gnss, Odometer
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.agreement import CLEAR, FAIR, Agreement, compare
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.sources import JOINED, Source, fix_speed_unit, fixes, plain_name, sources
+from graphnav.recording.draft.logs import Source
+from graphnav.recording.draft.sources import JOINED, find_logs, fix_speed_unit, fixes, plain_name
 from graphnav.recording.formats.schema import FORCE, RATE, SPEED
 from graphnav.recording.formats.writer import quote
 
@@ -48,7 +49,7 @@ def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: 
     RecordingError
         If a file cannot be read, holds nothing that is known, or there is no IMU among them.
     """
-    found = sources(paths, topics)
+    found = find_logs(paths, topics)
     writer = _Writer(folder, topics)
     writer.decisions += [f"left out: {said}" for said in found.left_out]
     text = writer.text(found.sensors, name or folder.resolve().name or "drive")
@@ -63,7 +64,7 @@ def imu_of(path: Path) -> tuple[Array, Array, Array]:
     RecordingError
         As `draft`.
     """
-    source = sources([path]).sensors["imu"]
+    source = find_logs([path]).sensors["imu"]
     gyro, accel = source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
     force = guesses.accel_unit(path, accel, source.find_unit("ax", "accel"))
     rate = guesses.gyro_unit(gyro, source.find_unit("gx", "gyro"), None, vehicle=False)
