@@ -38,7 +38,7 @@ from graphnav.gnss.ephemeris import rotate_earth
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import code_sigma, rate_sigma
 from graphnav.gnss.signals import L1, NAMES, C, satellite_name, signal_name
-from graphnav.gnss.single_point import coefficients, look, signal_groups, stretch
+from graphnav.gnss.single_point import choose_coefficients, look, signal_groups, stretch
 from graphnav.recording import Recording
 
 CLOCK = "receiver_clock"
@@ -87,12 +87,12 @@ def prepare_rows(scene: BuildContext) -> PreparedRows | None:
     if raw is None:
         return None
     keyframe = scene.keyframe_at(raw.t)
-    geometry = look(raw, raw.antenna, coefficients(raw))
+    geometry = look(raw, raw.antenna, choose_coefficients(raw))
     used = (keyframe >= 0) & (geometry.elevation >= np.radians(scene.settings.raw_gnss.elevation))
     if not used.any():
         return None
     raw, keyframe = raw.take(used), keyframe[used]
-    geometry = look(raw, raw.antenna, coefficients(raw))
+    geometry = look(raw, raw.antenna, choose_coefficients(raw))
     frame = scene.frame
     epochs, first = np.unique(raw.t, return_index=True)
     return PreparedRows(

@@ -23,7 +23,7 @@ import numpy as np
 from graphnav.config.detectors import FftSettings
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, Mask, spans_of, within
+from graphnav.detectors.base import NONE, Detection, Mask, mask_within, spans_of
 from graphnav.detectors.motion import Speeds
 from graphnav.detectors.scene import MG, Detector, Labels, Scene
 from graphnav.detectors.spectrum import FEWEST_WINDOWS, LOWEST, IdleLine, Windows, idle_line, peaks
@@ -77,7 +77,9 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     whole = t_last - t_first < (1.0 + _STRETCH) * length * period
     half = 0.5 * length * period
     calm = _weigh_idling(w, settings) if labels is None and settings.find_line else np.zeros(w.count)
-    inner = whole & (within(t, labels.still, half) if labels else (calm < 1.0) & ~within(t, scene.certain, half))
+    inner = whole & (
+        mask_within(t, labels.still, half) if labels else (calm < 1.0) & ~mask_within(t, scene.certain, half)
+    )
     line = idle_line(w, np.flatnonzero(inner)) if settings.find_line else None
     notes: list[str] = []
     if settings.find_line and line is None:

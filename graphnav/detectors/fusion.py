@@ -22,12 +22,21 @@ import numpy as np
 from graphnav.config.detectors import FusionSettings
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, longer_than, merge_spans, spans_of, subtract_spans, union, within
+from graphnav.detectors.base import (
+    NONE,
+    Detection,
+    longer_than,
+    mask_within,
+    merge_spans,
+    spans_of,
+    subtract_spans,
+    union,
+)
 from graphnav.detectors.chain import LONGEST, Link, Outwards, at_rest_until, find_speed_beside, link, moving_by_chain
 from graphnav.detectors.low_band import Scale, low_band
 from graphnav.detectors.motion import Speeds, take_median
 from graphnav.detectors.scene import Detector, Labels, Scene
-from graphnav.detectors.windows import Blocks, kernel, share_of, smooth
+from graphnav.detectors.windows import Blocks, kernel, share_of, smooth_rows
 
 LOW_BAND, FFT = "low_band_glrt", "fft"
 _LOOK = 3.0  # s about an end in which the edge is sought
@@ -65,7 +74,7 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
     i, j = max(i - len(h), 0), min(j + len(h), len(b.t))
     if j - i <= len(h) + 2:
         return middle
-    rows = smooth(b.mean[i:j, :6], h) * white
+    rows = smooth_rows(b.mean[i:j, :6], h) * white
     t = 0.5 * (b.t[i : j - len(h) + 1] + b.t[i + len(h) - 1 : j])
     rows, t = (rows, t) if way > 0 else (rows[::-1], t[::-1])
     normal = way * (t - end) < -0.5
@@ -168,7 +177,7 @@ def _screen_motion(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array
 def _still_in_motion(found: Detection, certain: Array) -> float:
     """Share of the windows in certain motion that look still; 0 where there are too few to tell."""
     step = float(found.t[1] - found.t[0]) if len(found.t) > 1 else 0.0
-    moving = within(found.t, certain, _INNER) & np.isfinite(found.statistic)
+    moving = mask_within(found.t, certain, _INNER) & np.isfinite(found.statistic)
     return float(found.mask[moving].mean()) if moving.sum() * step > _ENOUGH else 0.0
 
 

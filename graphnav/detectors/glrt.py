@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, spans_of, within
+from graphnav.detectors.base import NONE, Detection, mask_within, spans_of
 from graphnav.detectors.scene import MG, Detector, Labels, Scene
 from graphnav.detectors.thresholds import find_fewest_errors, own_threshold
 from graphnav.detectors.windows import Blocks, find_unbroken, sum_running, window_times
@@ -155,7 +155,7 @@ class _Windowed(Detector):
             return Detection(name, none, none, least, none > 0, NONE, (f"{name}: shorter than a window",))
         per_row = 1.0 / np.sqrt(scene.blocks.row_period)
         sigma_a, sigma_w = noise.accel_noise_density * per_row, noise.gyro_noise_density * per_row
-        reference = _find_quietest(m) if labels is None else within(m.t, labels.still, m.half)
+        reference = _find_quietest(m) if labels is None else mask_within(m.t, labels.still, m.half)
         at_rest = bool(reference.any())
         means, g = _centre(m.rows, reference if at_rest else np.ones(len(m.t), dtype=bool), scene.gravity, at_rest)
         values = np.where(m.whole, STATISTICS[name](means, sigma_a, sigma_w, g), np.nan)
@@ -167,7 +167,7 @@ class _Windowed(Detector):
             most = least + float(STATISTICS[name](_average_idling(scene, g), sigma_a, sigma_w, g)[0])
             threshold, notes = own_threshold(scene, name, m.t, m.half, values, least, most)
         elif at_rest:
-            in_motion = within(m.t, labels.moving, m.half)
+            in_motion = mask_within(m.t, labels.moving, m.half)
             threshold, _ = find_fewest_errors(values[reference & m.whole], values[in_motion & m.whole], least)
         mask = values < threshold
         return Detection(name, m.t, values, threshold, mask, spans_of(mask, m.t, m.half), notes)

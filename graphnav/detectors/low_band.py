@@ -20,7 +20,7 @@ import numpy as np
 from graphnav.config.detectors import LowBandSettings
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, longer_than, spans_of, within
+from graphnav.detectors.base import NONE, Detection, longer_than, mask_within, spans_of
 from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.thresholds import FEWEST, MISLABELLED, MISTAKEN, log_statistic, valley
 from graphnav.detectors.windows import LowPassed, find_unbroken, sum_running, window_times
@@ -87,7 +87,7 @@ def scale(low: LowPassed, noise: ImuNoise, settings: LowBandSettings, spread: Ar
     return Scale(float(force), float(rate), expected, bool((stated > _OVERSTATED * np.hypot(floor, sway)).any()))
 
 
-def statistic(spread: Array, s: Scale) -> Array:
+def compute_statistic(spread: Array, s: Scale) -> Array:
     """S of windows with these variances per axis, (W,)."""
     return np.asarray(0.5 * (spread[:, 0] / s.force**2 + spread[:, 1] / s.rate**2))
 
@@ -109,7 +109,7 @@ def detect_low_band(
     t = window_times(low.t, window)
     spread = measure_spreads(low, window)
     s = scale(low, noise, settings, spread)
-    found = statistic(spread, s)
+    found = compute_statistic(spread, s)
     threshold, notes = _threshold(t, found, settings, moving, low.period, s)
     mask = found < threshold
     # a window says nothing of where in it motion began: only what all windows over it call still is
@@ -124,7 +124,7 @@ def _threshold(
         return settings.threshold, ()
     x, start = log_statistic(found), float(np.log10(settings.threshold))
     swaying = 0.5 * ((settings.force / s.force) ** 2 + (settings.rate / s.rate) ** 2)
-    label = within(t, moving, settings.window) & np.isfinite(x)
+    label = mask_within(t, moving, settings.window) & np.isfinite(x)
     split = valley(x, start - _DOWN, start + _UP + float(np.log10(s.stated)), round(FEWEST / period))
     if split is not None and not (label.any() and np.mean(x[label] < split) > MISLABELLED):
         return float(10.0**split), ()

@@ -32,7 +32,7 @@ from graphnav.config.detectors import FUSED, StanceSettings
 from graphnav.core import rotation
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, merge_spans, spans_of, union
+from graphnav.detectors.base import NONE, Detection, Detections, longer_than, mask_inside, merge_spans, spans_of, union
 from graphnav.detectors.glrt import glrt_statistic
 from graphnav.detectors.windows import find_unbroken, sum_running
 from graphnav.recording import Imu
@@ -84,7 +84,7 @@ def detect_stances(
         return Detections(NONE, (), ())
     spans = union(kept) if len(kept) > 1 else kept[0]
     first = found[0]
-    mask = inside(first.t, spans)
+    mask = mask_inside(first.t, spans)
     found.append(Detection(FUSED, first.t, first.statistic, settings.threshold, mask, spans, tuple(notes)))
     return Detections(spans, tuple(found), tuple(notes))
 

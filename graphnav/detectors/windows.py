@@ -141,6 +141,6 @@ def share_of(x: Array, share: float) -> Array:
     return np.asarray(x[k] + (at - k) * (x[min(k + 1, len(x) - 1)] - x[k]))
 
 
-def smooth(rows: Array, h: Array) -> Array:
+def smooth_rows(rows: Array, h: Array) -> Array:
     """Every row low-passed by h, (K - len(h) + 1, c): for a short stretch."""
     return np.asarray(sliding_window_view(rows, len(h), axis=0) @ h)

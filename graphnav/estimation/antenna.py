@@ -25,7 +25,7 @@ from graphnav.estimation.pipeline import origin
 from graphnav.estimation.problem import build_problem
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import backward, rts
-from graphnav.recording import Recording, rows_of
+from graphnav.recording import Recording, take_rows
 
 _UNKNOWN = 2.0  # m, 1-sigma before the drive
 _FINE = 0.3  # m, 1-sigma of fixes that tell
@@ -90,7 +90,7 @@ def find_wrong_arms(recording: Recording) -> list[Finding]:
     if np.median(gnss.sd[:, :2]) > _FINE:
         return []
     second = np.floor(gnss.t)
-    thin = rows_of(gnss, np.concatenate([[True], np.diff(second) > 0.0]))
+    thin = take_rows(gnss, np.concatenate([[True], np.diff(second) > 0.0]))
     try:
         antenna, axle = _estimate(_find_turning(replace(recording, gnss=thin)))
     except EstimationError:

@@ -84,7 +84,7 @@ class Fixed:
     notes: tuple[str, ...] = ()
 
 
-def split(problem: Problem) -> tuple[Problem, GnssPhase | None]:
+def split_carriers(problem: Problem) -> tuple[Problem, GnssPhase | None]:
     """A problem without its carriers, and these."""
     phase = next((c for c in problem.constraints if isinstance(c, GnssPhase)), None)
     if phase is None:

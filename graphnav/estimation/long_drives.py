@@ -21,7 +21,7 @@ from graphnav.core.state import DIM, States
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import NoiseModel, RowWeights
 from graphnav.estimation.solution import Between, ConstraintRecord, ParameterEstimate, Solution
-from graphnav.recording import Recording, rows_of
+from graphnav.recording import Recording, take_rows
 
 STRAIGHT, _STATES = 10_800.0, 44  # s, at most solved at once: 3 GB at a keyframe a second and 44 error states
 PART = 3_600.0  # s, at most, of a part: the estimation of noise has enough keyframes by a factor of two
@@ -55,7 +55,7 @@ def shares(recording: Recording, settings: Settings) -> list[Share]:
         part = recording.crop(first - 1e-9, last + 1e-9)
         lo_row, hi_row = np.searchsorted(recording.imu.t, part.imu.t[[0, -1]])
         own = slice(int(lo_row), int(hi_row) + 1)
-        part = replace(part, imu=rows_of(recording.imu, own))  # no copy of what is by far the largest
+        part = replace(part, imu=take_rows(recording.imu, own))  # no copy of what is by far the largest
         start = -np.inf if k == 0 else begin + lo
         out.append(Share(part, start, np.inf if k == len(edges) - 2 else begin + hi))
     return out

@@ -25,7 +25,7 @@ from graphnav.detectors import Detections, detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment, align, with_known_heading
 from graphnav.estimation.alignment.first import pick_fixes
-from graphnav.estimation.fixing import fix, split
+from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.noise.apply import with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import (
@@ -129,7 +129,7 @@ def prepare(
             used, settings, frame, start.state, start_sigma(start), found.stationary, parts_of_noise=parts
         )
         book("preintegration", since)
-        problem, carriers[0] = split(problem)  # the noise model rests on the codes
+        problem, carriers[0] = split_carriers(problem)  # the noise model rests on the codes
         return problem
 
     def without_wrong(noise: NoiseModel) -> tuple[Alignment, Detections, bool]:
@@ -312,7 +312,7 @@ def _differ(a: Array, b: Array) -> bool:
 def _smooth(problem: Problem, start: States) -> Solution:
     from graphnav.estimation.solvers.batch import batch
 
-    return batch(split(problem)[0], start, wanted=(0,), reintegrate=False)
+    return batch(split_carriers(problem)[0], start, wanted=(0,), reintegrate=False)
 
 
 def _cut_aligned(recording: Recording, aligned: Alignment) -> Recording:

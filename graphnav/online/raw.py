@@ -23,7 +23,7 @@ from graphnav.core.rotation import Array
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.series import Catalogue, RawGnss, primary
 from graphnav.gnss.signals import SYSTEMS, satellite_id, satellite_name, signal_id, signal_name
-from graphnav.gnss.single_point import coefficients, look, signal_groups, solve
+from graphnav.gnss.single_point import choose_coefficients, look, signal_groups, solve
 from graphnav.recording import Recording
 from graphnav.sensors.tables import NotNegative, Positive, Vector
 
@@ -236,7 +236,7 @@ class RawEpochs:
             return rows
         k = bisect_left(self._every, t)
         place = self._rows[self._every[k - 1]][0, -5:-2] if k else np.array(self.setup.place)
-        geometry = look(series, np.broadcast_to(place, (len(rows), 3)), coefficients(series))
+        geometry = look(series, np.broadcast_to(place, (len(rows), 3)), choose_coefficients(series))
         clock = np.nanmedian(series.code + series.clock - geometry.distance - geometry.troposphere)
         rows[:, -5:] = [*place, clock, 0.0]
         return rows

@@ -26,7 +26,7 @@ from graphnav.simulation import simulate
 
 
 def covered(t, spans):
-    return base.inside(t, spans)
+    return base.mask_inside(t, spans)
 
 
 def rates(spans, stops, start, end):

@@ -15,7 +15,7 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
-from graphnav.detectors.base import NONE, inside
+from graphnav.detectors.base import NONE, mask_inside
 from graphnav.estimation.alignment.back import carry_back
 from graphnav.estimation.alignment.course import COURSE_SIGMA, with_course
 from graphnav.estimation.alignment.first import Alignment, level, pick_fixes
@@ -71,7 +71,7 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
         return None
     t, p = gnss.t, LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
     if recording.platform == "vehicle":
-        yaw, still = integrate_yaw(recording.imu, t, _estimate_rate(recording.imu)), inside(t, stationary)
+        yaw, still = integrate_yaw(recording.imu, t, _estimate_rate(recording.imu)), mask_inside(t, stationary)
     else:  # a foot turns about every axis
         yaw, still = np.zeros(len(t)), np.zeros(len(t), dtype=bool)
     sd = average_across(gnss.sd)
@@ -161,9 +161,9 @@ def _estimate_rate(imu: Imu) -> Array:
 
 def _thin(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
     """Fixes of a span at most about one a second: enough to align, and quick."""
-    inside = np.flatnonzero((gnss.t >= begin) & (gnss.t <= end))
+    there = np.flatnonzero((gnss.t >= begin) & (gnss.t <= end))
     keep, last = [], -np.inf
-    for i in inside:
+    for i in there:
         if gnss.t[i] - last >= spacing:
             keep.append(i)
             last = gnss.t[i]

@@ -12,10 +12,10 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import is_inside
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import NEAR, Epochs, between_clocks
+from graphnav.core.timescales import NEAR, ClockOffset, between_clocks
 from graphnav.recording import Gnss, Odometer
 from graphnav.recording.draft import guesses, motion
-from graphnav.recording.draft.agreement import CLEAR, FAIR, Agreement, compare
+from graphnav.recording.draft.agreement import CLEAR, FAIR, Agreement, compare_with_fixes
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.logs import Source
 from graphnav.recording.draft.sources import JOINED, find_logs, fix_speed_unit, fixes, plain_name
@@ -77,7 +77,7 @@ class _Writer:
     def __init__(self, folder: Path, asked: Sequence[str]) -> None:
         self.folder = folder
         self.asked = asked  # topics
-        self.epochs: Epochs | None = None  # of the clocks of IMU and fixes
+        self.epochs: ClockOffset | None = None  # of the clocks of IMU and fixes
         self.lines: list[str] = []
         self.decisions: list[str] = []
         self.made: dict[str, dict[str, Array]] = {}
@@ -119,7 +119,7 @@ class _Writer:
         agreement = Agreement()
         if gnss is not None:
             self.epochs = _epochs(source, gnss)
-            agreement = compare(t, gyro, accel, up, fixes(gnss), self.epochs.offset if self.epochs else 0.0)
+            agreement = compare_with_fixes(t, gyro, accel, up, fixes(gnss), self.epochs.offset if self.epochs else 0.0)
         if source.log is None:
             rate = guesses.gyro_unit(gyro, source.find_unit("gx", "gyro"), agreement.turn, vehicle)
             gyro = gyro * RATE[str(rate.value)]
@@ -290,7 +290,7 @@ def _odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> motion.L
     return motion.lag(grid, motion.band(forward[:, 0]), even, motion.band(pull))
 
 
-def _epochs(imu: Source, gnss: Source) -> Epochs | None:
+def _epochs(imu: Source, gnss: Source) -> ClockOffset | None:
     """What lies between the clocks of two logs, where both are known."""
     first = [_first(source, sensor) for source, sensor in ((imu, "imu"), (gnss, "gnss"))]
     zeros = [None if source.log is None else source.log.gps_zero for source in (imu, gnss)]

@@ -30,8 +30,8 @@ from graphnav.recording.formats.kfgins_configuration import (
     find_file,
     mention_unused,
     read_configuration,
+    read_imu_noise,
     read_lever_arm,
-    read_noise,
 )
 from graphnav.recording.formats.registry import Log, first_bytes, log_format
 from graphnav.recording.formats.repair import Remarks, is_on_earth
@@ -82,7 +82,7 @@ def load(path: Path) -> Log:
     if imu_file is not None:
         imu, speed = _read_imu(imu_file, remarks)
         if config:
-            imu = replace(imu, noise=read_noise(where, config, remarks), noise_assumed=False)
+            imu = replace(imu, noise=read_imu_noise(where, config, remarks), noise_assumed=False)
         if speed is not None:
             odometer = Odometer(imu.t, speed, read_lever_arm(where, config, "odolever"))
             remarks.add(

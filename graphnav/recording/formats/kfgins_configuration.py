@@ -105,7 +105,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
-def read_noise(where: Path, config: dict[str, Any], remarks: Remarks) -> ImuNoise:
+def read_imu_noise(where: Path, config: dict[str, Any], remarks: Remarks) -> ImuNoise:
     """The noise figures of the IMU."""
     section = config.get("imunoise", config.get("imumodel"))
     if not isinstance(section, dict):

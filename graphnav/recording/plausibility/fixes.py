@@ -12,7 +12,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from graphnav.core.earth import LocalFrame
 from graphnav.core.findings import Finding, runs_of
 from graphnav.core.rotation import Array
-from graphnav.recording import Gnss, Recording, rows_of
+from graphnav.recording import Gnss, Recording, take_rows
 
 FASTEST = 150.0  # m/s; the fastest cars that can be bought reach 490 km/h, 136 m/s
 # A receiver cannot follow a reflection that comes more than one and a half code chips late (GPS C/A: 293 m a chip).
@@ -49,12 +49,12 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
                 "gnss.cached",
             )
         )
-        gnss = rows_of(gnss, np.arange(len(gnss.t)) >= cached)
+        gnss = take_rows(gnss, np.arange(len(gnss.t)) >= cached)
     p = _positions(gnss)
     off = find_out_of_reach(gnss.t, p)
     if off.any():
         findings.append(_drop_unreachable(gnss, p, off, recording.start))
-        gnss = rows_of(gnss, ~off)
+        gnss = take_rows(gnss, ~off)
         p = _positions(gnss)
     for a, b in find_frozen_heights(gnss, p):
         driven = float(np.hypot(*np.diff(p[a:b, :2], axis=0).T).sum())
@@ -196,7 +196,7 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     there: NDArray[np.bool_] = np.asarray(np.isfinite(p).all(axis=1))
     if there.sum() < 2 * _WINDOW:
         return
-    gnss, p = rows_of(gnss, there), p[there, :2]
+    gnss, p = take_rows(gnss, there), p[there, :2]
     dt, period, _ = _steps(gnss)
     jump = _jumps(p, dt)
     sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from graphnav.core.findings import Finding, period_of, runs_of
-from graphnav.recording import Odometer, Recording, rows_of
+from graphnav.recording import Odometer, Recording, take_rows
 from graphnav.recording.checks.crosschecks import MIN_PAIRS, Track
 from graphnav.recording.plausibility.fixes import FASTEST
 
@@ -34,11 +34,11 @@ def screen(recording: Recording, way: Track | None) -> tuple[Recording, list[Fin
         if finding is None:
             continue
         findings.append(finding)
-        recording = replace(recording, odometer=None if bad.all() else rows_of(odometer, ~bad))
+        recording = replace(recording, odometer=None if bad.all() else take_rows(odometer, ~bad))
     return recording, findings
 
 
-def track(odometer: Odometer) -> Track | None:
+def build_odometer_track(odometer: Odometer) -> Track | None:
     """The odometer's speed as if it were GNSS's, for where there is none."""
     every = max(1, round(1.0 / (_RATE * period_of(odometer.t)))) if len(odometer.t) > 1 else 1
     t, speed = odometer.t[::every], odometer.speed[::every]

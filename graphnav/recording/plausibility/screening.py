@@ -18,7 +18,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.findings import Finding, period_of, runs_of
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.recording import Imu, Recording, rows_of
+from graphnav.recording import Imu, Recording, take_rows
 from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.aiding import check_imu_axes, check_imu_clock, overlap_s
 from graphnav.recording.checks.clock import ClockOffsets, clock_of
@@ -116,7 +116,7 @@ def screen(recording: Recording) -> Screened:
     if recording.platform == "vehicle" and not dead and not wrong_unit:
         way = track
         if way is None and recording.odometer is not None:
-            way = plausibility_odometer.track(recording.odometer)
+            way = plausibility_odometer.build_odometer_track(recording.odometer)
         # stamps that are late by now this, now that have no clock
         if track is not None and not any(f.key == "gnss.stamped_on_arrival" for f in findings):
             assert recording.gnss is not None
@@ -234,7 +234,7 @@ def without_spikes(imu: Imu, start: float, wrong_unit: bool = False) -> tuple[Im
     )
     if bad.mean() > _ISOLATED:
         return imu, [Finding("refused", f"{sentence}: more than can be bridged; look at the log", "imu.spike")]
-    return rows_of(imu, ~bad), [Finding("warning", f"{sentence}: left out, as a gap", "imu.spike")]
+    return take_rows(imu, ~bad), [Finding("warning", f"{sentence}: left out, as a gap", "imu.spike")]
 
 
 def check_dead_axes(recording: Recording) -> Iterator[Finding]:
