@@ -55,9 +55,9 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
 
 
 def _list_doubts(outcome: Outcome) -> tuple[str, ...]:
-    from graphnav.report.sentences import doubts
+    from graphnav.report.sentences import list_doubts
 
-    return doubts(outcome.solutions, {k: m.errors for k, m in outcome.metrics.items() if m.errors is not None})
+    return list_doubts(outcome.solutions, {k: m.errors for k, m in outcome.metrics.items() if m.errors is not None})
 
 
 def _describe_noise(outcome: Outcome) -> list[str]:

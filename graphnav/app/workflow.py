@@ -182,7 +182,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
         recording = replace(recording, truth=None)
 
     from graphnav.estimation.pipeline import run
-    from graphnav.report.sentences import doubts
+    from graphnav.report.sentences import list_doubts
 
     given = request.noise
     solutions = run(used, request.settings, request.solvers, progress, None if given is None else given.model)
@@ -200,7 +200,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
             findings += [note for note in found.notes if note not in findings]
     errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
     checks = inspection.findings
-    if doubts(solutions, errors):  # which costs too much to be asked where nothing is wrong
+    if list_doubts(solutions, errors):  # which costs too much to be asked where nothing is wrong
         from graphnav.estimation.antenna import find_wrong_arms
 
         checks = (*find_wrong_arms(used), *checks)

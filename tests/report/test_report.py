@@ -35,7 +35,7 @@ from graphnav.report.consistency import consistency
 from graphnav.report.documents import write_comparison, write_report
 from graphnav.report.names import components, has_names
 from graphnav.report.provenance import command, toml_text
-from graphnav.report.sentences import doubts
+from graphnav.report.sentences import list_doubts
 from graphnav.report.summary import fix_table, left_out, sigma_table, verdicts
 from graphnav.report.tables import accuracy_row, excluded_table, span_row
 
@@ -431,8 +431,8 @@ def test_what_cannot_be_trusted_says_so_first(tmp_path, recording):
     assert "cannot be trusted" not in first_words(replace(solution(), noise=partly))
     larger = replace(solution(), records={"gnss_position": record(2.0)})
     assert "sigma cannot be trusted" in first_words(larger)
-    assert doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.02)})
-    assert not doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.3)})
+    assert list_doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.02)})
+    assert not list_doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.3)})
 
 
 def test_the_noise_model_is_a_table(tmp_path, recording):
@@ -603,7 +603,7 @@ def test_an_outlier_that_has_little_weight_says_nothing_against_sigma():
     found = {}
     for name, some in (("weighted", rows), ("as good as the others", replace(rows, weight=np.ones(COUNT)))):
         one = replace(solution("rts"), records={"gnss_position": some})
-        found[name] = [key_of(doubt) for doubt in doubts({"rts": one}, {})]
+        found[name] = [key_of(doubt) for doubt in list_doubts({"rts": one}, {})]
     assert found == {"weighted": [], "as good as the others": ["doubt.sigma"]}
 
 
