@@ -217,23 +217,21 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
     one = decide(base, found, spans)
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
     hidden = find_spans(base, NoiseModel(medians), found)
+    without = NoiseModel(excluded=dict.fromkeys(FIXES, tuple(hidden)))
     if all(any(a <= begin and end <= b for a, b in spans) for begin, end in hidden):
         return replace(one, looks=one.looks + 2)
-    ways, passes, other, spans = [one], 0, found, hidden
-    before: list[tuple[float, float]] = []
-    # by figures that nothing wrong is in, spans come to what is wrong of them
-    while spans and spans != before and (len(ways) < 3 or ways[-1].log_evidence > ways[-2].log_evidence):
-        without = NoiseModel(excluded=dict.fromkeys(FIXES, tuple(spans)))
+    other, spans, passes = found, hidden, 0
+    for _ in range(2):  # by figures that nothing wrong is in, spans come to what is wrong of them
         other = estimate_noise(base, None, without, (other.points, with_noise(base, other.noise)))
-        passes += other.passes
-        posed = with_noise(base, other.noise)
-        before = trim_spans(posed, other.points, spans)
-        if not before:
+        posed, passes = with_noise(base, other.noise), passes + other.passes
+        spans = trim_spans(posed, other.points, spans)
+        refined = trim_spans(posed, other.points, find_spans(base, replace(other.noise, excluded={}), other))
+        if not refined or refined == spans:
             break
-        ways.append(decide(base, other, before))
-        spans = trim_spans(posed, other.points, find_spans(base, replace(other.noise, excluded={}), other))
+        spans, without = refined, replace(without, excluded=dict.fromkeys(FIXES, tuple(refined)))
+    ways = [one, *([decide(base, other, spans)] if spans else [])]
     best = max(ways, key=lambda way: way.log_evidence)
-    return replace(best, passes=passes, looks=sum(way.looks + 1 for way in ways) + 1)
+    return replace(best, passes=passes, looks=sum(way.looks for way in ways) + 4)
 
 
 def trim_spans(problem: Problem, smoothed: SmootherPass, spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
