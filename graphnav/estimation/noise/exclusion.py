@@ -201,7 +201,7 @@ def _log_evidence(base: Problem, found: NoiseEstimate) -> float:
     """Of all measurements, those that are left out too; each outlier among the others has its cost."""
     spans = _join(span for some in found.noise.excluded.values() for span in some)
     whole = decide(base, found, spans).log_evidence if spans else found.log_posterior
-    outliers = sum(_count(_keep_outside(some, spans)) for some in found.noise.weights.values())
+    outliers = sum(_count(_outside(some, spans)) for some in found.noise.weights.values())
     return whole - _OUTLIER * outliers
 
 
@@ -266,7 +266,7 @@ def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]
         return Explained(found.noise, found.log_posterior, 0, 0)
     noise = replace(found.noise, excluded={})
     reach = _with_next_fix(base, spans)
-    outside = {name: _keep_outside(some, reach if name in INTERVALS else spans) for name, some in noise.weights.items()}
+    outside = {name: _outside(some, reach if name in INTERVALS else spans) for name, some in noise.weights.items()}
     of_imu = {name: some for name, some in noise.weights.items() if name in INTERVALS}
     of_rows = {name: some for name, some in noise.weights.items() if name not in INTERVALS}
     used, disturbed, weighted = (
@@ -281,7 +281,7 @@ def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]
     for k, span in enumerate(spans):
         cost = np.array([0.0 if not kinds else _ODDS for kinds in _WRONG])
         for kinds, some, within in ((INTERVALS, of_imu, reach[k]), (ROWS, of_rows, span)):
-            outliers = sum(_count(one) - _count(_keep_outside(one, [within])) for one in some.values())
+            outliers = sum(_count(one) - _count(_outside(one, [within])) for one in some.values())
             cost[_WRONG.index(kinds)] = _OUTLIER * outliers if outliers else np.inf
         one = likelihood[k] - cost
         best = int(np.argmax(one))
@@ -294,8 +294,8 @@ def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]
             excluded |= {name: (*excluded.get(name, ()), span) for name in _WRONG[best]}
     present = {rows.name for rows in base.constraints}
     excluded = {name: some for name, some in excluded.items() if name in present}
-    weights = {name: _keep_outside(some, dropped[INTERVALS]) for name, some in of_imu.items()}
-    weights |= {name: _keep_outside(some, dropped[ROWS]) for name, some in of_rows.items()}
+    weights = {name: _outside(some, dropped[INTERVALS]) for name, some in of_imu.items()}
+    weights |= {name: _outside(some, dropped[ROWS]) for name, some in of_rows.items()}
     return Explained(replace(noise, weights=weights, excluded=excluded), total, 0, looks)
 
 
@@ -311,7 +311,7 @@ def _with_next_fix(problem: Problem, spans: list[tuple[float, float]]) -> list[t
     return [(a, max(b, float(t[min(int(np.searchsorted(t, b + SAME_TIME)), len(t) - 1)]))) for a, b in spans]
 
 
-def _keep_outside(some: RowWeights, spans: list[tuple[float, float]]) -> RowWeights:
+def _outside(some: RowWeights, spans: list[tuple[float, float]]) -> RowWeights:
     """The weights of rows outside spans."""
     keep = np.ones(len(some.t), dtype=bool)
     for begin, end in spans:
