@@ -22,7 +22,7 @@ from graphnav.estimation.solvers.window import SettledStates, turn_limit
 
 _SKIP = 10  # keyframes between two looks at what has moved, as GTSAM's relinearizeSkip, at least
 _GROWN = 8  # what a look takes goes with the keyframes there: it comes when there are this part more of them
-_PORTION = 96  # variables eliminated at one keyframe for the covariances of those that are to settle
+_SHARE = 4  # covariances of keyframes are eliminated for in a fourth of the time until the next are to settle
 _ROUNDS = 30
 
 
@@ -42,13 +42,14 @@ class TreeSmoother:
         self._problem = problem
         self._look = _SKIP  # the keyframe at which to look next at what has moved
         self._leaving: Leaving | None = None  # of what is to settle
+        self._portion = 0  # variables that are eliminated for that at a keyframe
 
     def add(self, place: Place) -> tuple[Message, Array]:
         """As of `Engine`."""
         tree = self.tree
         turn = tree.add(replace(place, problem=self._problem))
         look = turn > tree.turn or (place.k >= self._look and self._leaving is None)
-        if self._leaving is not None and (self._leaving.step(_PORTION) or look):
+        if self._leaving is not None and (self._leaving.step(self._portion) or look):
             self.settled.append(self._leaving.settled())
             tree.marginalise(self._leaving.count)
             self._leaving = None
@@ -60,6 +61,7 @@ class TreeSmoother:
             self._problem, _ = tree.integrate_again(self._problem)
             count = int(np.searchsorted(self._problem.t[: place.k], place.t - self.lag)) - oldest.k
             self._leaving = Leaving(tree, count)
+            self._portion = 1 + _SHARE * self._leaving.left // count
         return tree.newest, newest_covariance(tree)
 
     def finish(self, problem: Problem) -> tuple[Problem, int]:

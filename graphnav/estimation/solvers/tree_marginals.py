@@ -34,7 +34,7 @@ def newest_covariance(tree: Tree) -> Array:
         found = tree.isam.marginalCovariance(x.key)
     except RuntimeError:
         raise _undetermined(last.place.t) from None
-    return move_covariance(np.asarray(x.unit[:, None] * found * x.unit), x.delta)
+    return move_covariance((x.unit[:, None] * found * x.unit)[None], x.delta[None])[0]
 
 
 def newest_root(tree: Tree, columns: Columns) -> Array:
@@ -82,8 +82,14 @@ class Leaving:
         variables = tree.variables.values()
         self._left = sorted((x for x in variables if x.first >= behind), key=lambda x: x.first)
         self._own = sorted((x for x in variables if x.first < behind), key=lambda x: x.last)
+        self._net: gtsam.GaussianBayesNet | None = None
         self._graph = tree.isam.getFactorsUnsafe().linearize(tree.isam.getLinearizationPoint())
         self.read()
+
+    @property
+    def left(self) -> int:
+        """Variables that are behind."""
+        return len(self._left)
 
     def read(self) -> None:
         """Take the estimates as they are now."""
@@ -92,14 +98,18 @@ class Leaving:
         self._states, self._values = states_of(self._keyframes), tuple(k.values for k in self._keyframes)
 
     def step(self, most: int) -> bool:
-        """Eliminate at most so many variables of the keyframes behind; True once none is left."""
+        """Eliminate at most so many variables of the keyframes behind, and at last those that leave; True once done."""
         if self._tree.changed <= self._newest:
             self._begin()
         if self._left:
             last, self._left = self._left[-most:], self._left[:-most]
             order = _ordering(reversed(last))
             self._graph = self._graph.eliminatePartialSequential(order, gtsam.EliminateQR)[1]
-        return not self._left
+        elif self._net is None:
+            self._net = self._graph.eliminateSequential(_ordering(self._own), gtsam.EliminateQR)
+        else:
+            return True
+        return False
 
     def settled(self) -> SettledStates:
         """States, parameters and covariances, all at once of what is left to be done."""
@@ -124,10 +134,10 @@ class Leaving:
         try:
             while not self.step(_AT_ONCE):
                 pass
-            net = self._graph.eliminateSequential(_ordering(self._own), gtsam.EliminateQR)
         except RuntimeError:  # GTSAM's for a variable that nothing determines
             raise _undetermined(self._keyframes[0].place.t) from None
-        found = Eliminated(net).covariances()
+        assert self._net is not None
+        found = Eliminated(self._net).covariances()
         return {x.key: x.unit[:, None] * found[x.key] * x.unit for x in self._own}
 
 
