@@ -20,6 +20,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import gtsam
 import numpy as np
 
 from graphnav.core.rotation import Array
@@ -45,10 +46,10 @@ from graphnav.estimation.solvers.tree_nodes import (
     Made,
     Variable,
     factor,
+    fill_keys,
     fresh_isam,
     interval_factor,
     is_constant,
-    key_list,
     limit_of,
     read_estimates,
     read_factors,
@@ -370,7 +371,7 @@ class Tree:
         """Let the first keyframes go, and the parameters' nodes that only they touch."""
         first = self.keyframes[count].number
         gone = [x for x in self.variables.values() if x.last < first]
-        left = set(self.isam.marginalizeLeavesWithIndices(key_list(gone))[1])
+        left = set(self.isam.marginalizeLeavesWithIndices(fill_keys(gtsam.KeyList(), gone))[1])
         for x in gone:
             del self.variables[x.key]
         del self.keyframes[:count]

@@ -7,8 +7,6 @@ eliminating the tree's factors from the other end, the newest first: what is lef
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import gtsam
 import numpy as np
 
@@ -20,7 +18,7 @@ from graphnav.estimation.solvers.graph import Eliminated
 from graphnav.estimation.solvers.linearise import Columns, shift
 from graphnav.estimation.solvers.points import move_covariance
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_nodes import Variable, states_of
+from graphnav.estimation.solvers.tree_nodes import fill_keys, states_of
 from graphnav.estimation.solvers.window import SettledStates
 
 _AT_ONCE = 45  # variables: GTSAM's bookkeeping of one elimination grows faster than what it eliminates
@@ -103,10 +101,10 @@ class Leaving:
             self._begin()
         if self._left:
             last, self._left = self._left[-most:], self._left[:-most]
-            order = _ordering(reversed(last))
+            order = fill_keys(gtsam.Ordering(), reversed(last))
             self._graph = self._graph.eliminatePartialSequential(order, gtsam.EliminateQR)[1]
         elif self._net is None:
-            self._net = self._graph.eliminateSequential(_ordering(self._own), gtsam.EliminateQR)
+            self._net = self._graph.eliminateSequential(fill_keys(gtsam.Ordering(), self._own), gtsam.EliminateQR)
         else:
             return True
         return False
@@ -139,13 +137,6 @@ class Leaving:
         assert self._net is not None
         found = Eliminated(self._net).covariances()
         return {x.key: x.unit[:, None] * found[x.key] * x.unit for x in self._own}
-
-
-def _ordering(variables: Iterable[Variable]) -> gtsam.Ordering:
-    out = gtsam.Ordering()
-    for x in variables:
-        out.push_back(x.key)
-    return out
 
 
 def _undetermined(t: float) -> EstimationError:

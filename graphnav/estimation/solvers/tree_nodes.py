@@ -123,7 +123,9 @@ def update_isam(
         for variable, group in order:
             groups.insert2(variable.key, group)
     try:
-        result = isam.update(graph, new, list(gone), groups, None, None if anew is None else key_list(anew))
+        result = isam.update(
+            graph, new, list(gone), groups, None, None if anew is None else fill_keys(gtsam.KeyList(), anew)
+        )
     except RuntimeError as error:  # GTSAM's for a variable that nothing determines
         raise EstimationError(
             f"the smoother's information broke down at {t:.3f} s: check sigmas and units", key="solver.breakdown"
@@ -143,9 +145,8 @@ def read_estimates(isam: gtsam.ISAM2, variables: Collection[Variable]) -> None:
         begin = end
 
 
-def key_list(variables: Iterable[Variable]) -> gtsam.KeyList:
-    """The keys of variables."""
-    out = gtsam.KeyList()
+def fill_keys(out: Any, variables: Iterable[Variable]) -> Any:
+    """The keys of variables in a list of GTSAM's."""
     for x in variables:
         out.push_back(x.key)
     return out
