@@ -4,8 +4,9 @@
 
 All settings are the defaults; the noise model is estimated once for each recording. A state that has settled with two
 minutes of the future knows less than batch does of the whole drive: a third line has what that makes of it. The last
-line is beside batch of what had come when each state settled: every measurement after that has no weight, and the
-intervals of both are integrated about the same biases and scale errors, those of batch, with --as-posed about those that they come to.
+line is beside batch of what had come when each state settled: every measurement after that has no weight. Within a lag
+all have their intervals integrated about the biases and scale errors that batch comes to, with --as-posed about those
+that each comes to by itself.
 """
 
 from __future__ import annotations
