@@ -39,9 +39,8 @@ from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.ekf import ekf, refilter
+from graphnav.estimation.solvers.ekf import ekf, near, refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.near import near
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     SmootherPass,
