@@ -111,9 +111,11 @@ class Smoother:
             return
         tracker = self.tracker
         if tracker is not None:
-            self._awake = -np.inf
             if isinstance(tracker, Walker):
+                if sensor == "imu" and not tracker.note_missed_row(t):
+                    return  # as if it had come in its turn
                 tracker.finish_entering(sensors)
+            self._awake = -np.inf
             if sensor != "gnss" and t < previous:
                 tracker.note_late_row(sensor, t)
             if sensors.left:
@@ -195,10 +197,12 @@ class Smoother:
         if len(sensors.imu) < 2:
             return
         first, now = float(sensors.imu.t[0]), sensors.imu.newest
-        self._due = now + _TRY
+        if not last:  # at full times, so that a row which is missing there changes nothing
+            now = _TRY * float(np.floor(now / _TRY))
+            self._due = now + _TRY
         if now - first < _LEVEL:
             return
-        recording = sensors.recording()
+        recording = sensors.recording(-np.inf, now)
         if recording.gnss is None and sensors.setup.gnss is not None and not last:
             self._wait(now)
             return
@@ -330,7 +334,6 @@ class Smoother:
             for row in rows:
                 sensors.aiding[name].add(*row)
         sensors.space(0.0)  # all of them, until there is a start again
-        self._due = self._awake = sensors.imu.newest + _TRY
 
     def _begin_anew(self, oldest: float) -> None:
         """Forget all rows and what was made of them; those up to a time (s) come too late from now on."""
@@ -340,7 +343,7 @@ class Smoother:
         self.sensors.space(0.0)
         self.sensors.oldest = oldest
         self._fixes, self._dirty = [], np.inf
-        self._due = self._awake = oldest + _TRY
+        self._due = self._awake = -np.inf
 
     # --------------------------------------------------------------------------------------------------- running
     def _advance(self, tracker: Tracker, last: bool = False) -> None:
@@ -352,10 +355,11 @@ class Smoother:
         if not last and now - odometer < _SILENT:
             limit = min(limit, max(odometer, now - _ODOMETER))
         if isinstance(tracker, Walker):
-            newest = tracker.take_steps(sensors, now if last else now - SURE, last, self._fixes, self._dirty)
+            at = _STEP * float(np.floor(now / _STEP))
+            newest = tracker.take_steps(sensors, now if last else at - SURE, last, self._fixes, self._dirty)
             if newest > -np.inf:
                 self._dirty, self._fixes = np.inf, [t for t in self._fixes if t > newest + SAME_TIME]
-            self._due = now + _STEP
+            self._due = at + _STEP
             return
         T = tracker.newest
         begun = bool(len(tracker.window)) or tracker.opened
