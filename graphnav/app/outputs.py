@@ -133,7 +133,7 @@ def draw_again(folder: Path, part: Path) -> list[Path]:
         return _draw_pages(outcome, provenance, part, alone)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise ConfigError(
-            f"{folder / stored.NAME}: what is in it does not fit together ({type(error).__name__}: {error}); solve again",
+            f"{folder / stored.NAME}: its parts do not fit together ({type(error).__name__}: {error}); solve again",
             key="results.unfit",
         ) from error
 
