@@ -60,9 +60,9 @@ class _Slots:
     The first m of them are of the part of an error that stays, the others of what it grows by in a minute.
     """
 
-    def __init__(self, columns: slice, L: int, rows: Constraint) -> None:
+    def __init__(self, columns: slice, L: int, rows: Constraint, drifts: bool) -> None:
         m = len(rows.axes)
-        self.columns, self.L, self.m = columns, L, m
+        self.columns, self.L, self.m, self.drifts = columns, L, m, drifts
         self.threshold = float(chdtri(2 * m, FALSE_ALARM))
         self.rows = rows
         self.first = np.full(L, np.nan)  # when each slot began, NaN before
@@ -89,8 +89,9 @@ class _Slots:
         slot = min((self.seen & -self.seen).bit_length() - 1, self.L - 1)
         self.first[slot], self.score[slot], self.info[slot] = t, 0.0, self.prior
         self.inputs[:, slot, 0] = self.one
-        minutes = np.where(np.isnan(self.first), 0.0, (t - self.first) / MINUTE)
-        self.inputs[:, :, 1] = minutes[:, None] * self.one[:, None]
+        if self.drifts:
+            minutes = np.where(np.isnan(self.first), 0.0, (t - self.first) / MINUTE)
+            self.inputs[:, :, 1] = minutes[:, None] * self.one[:, None]
         begin = self.columns.start + 2 * self.m * slot
         return slice(begin, begin + 2 * self.m)
 
@@ -118,7 +119,7 @@ class _Slots:
         return float(np.max(self.first[T.max() - _ONSET / self.threshold <= T]))
 
 
-def _slots(constraints: Iterable[Constraint], t: Array | None, period: float) -> dict[str, _Slots]:
+def _slots(constraints: Iterable[Constraint], t: Array | None, period: float, drifts: bool = True) -> dict[str, _Slots]:
     """Slots of each constraint, their columns behind each other; t (K,) of the keyframes, s, tells the period."""
     out: dict[str, _Slots] = {}
     end = 0
@@ -127,7 +128,7 @@ def _slots(constraints: Iterable[Constraint], t: Array | None, period: float) ->
             period = float(np.median(np.diff(t[rows.keyframe])))
         L = 1 + int(np.clip(np.log2(LONGEST / max(period, 1e-3)), 0, 12))
         columns = slice(end, end + 2 * L * len(rows.axes))
-        out[rows.name] = _Slots(columns, L, rows)
+        out[rows.name] = _Slots(columns, L, rows, drifts)
         end = columns.stop
     return out
 
@@ -197,10 +198,11 @@ class Bank(_Tests):
     constraints : those whose rows are tested.
     t : (K,) times of the keyframes, s.
     width : of the error state.
+    drifts : whether errors may grow, too.
     """
 
-    def __init__(self, constraints: Iterable[Constraint], t: Array, width: int) -> None:
-        self._slots, self._t = _slots(constraints, t, LONGEST), t
+    def __init__(self, constraints: Iterable[Constraint], t: Array, width: int, drifts: bool = True) -> None:
+        self._slots, self._t = _slots(constraints, t, LONGEST, drifts), t
         self.X = np.zeros((width, _width(self._slots)))
 
     def copy(self) -> Bank:
