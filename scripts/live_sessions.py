@@ -5,7 +5,7 @@
 
 Both sessions have the same drop-outs and the same steps of the clock. One has besides an absurd row every minute, rows
 that are late and rows that come twice, and is killed (SIGKILL) five times and resumed, the sender beginning again a
-little before where it was cut off. Each is `graphnav online` fed through a pipe, both side by side. Told are the
+little before where it was cut off. Each is `graphnav online` fed through a pipe, one after the other. Told are the
 distance of what has settled at the same times, what was counted, and the memory of the process as it goes on.
 """
 
@@ -16,7 +16,6 @@ import random
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 
@@ -46,6 +45,7 @@ def main() -> int:
     parser.add_argument("--hours", type=float, default=2.0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--lag", type=float, default=120.0, help="s (%(default)s)")
+    parser.add_argument("-o", "--out", type=Path, help="folder to keep both sessions in")
     options = parser.parse_args()
     rng = random.Random(options.seed)
     recording = made(options.who, 3600.0 * options.hours)
@@ -55,13 +55,12 @@ def main() -> int:
     head = head_of(recording)
     print(f"{options.who}: {len(plain)} rows, {len(hostile)} with those that are absurd or come twice", flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        beside = threading.Thread(target=session, args=(head, plain, Path(folder) / "plain", [], options.lag))
-        beside.start()
+        out = options.out or Path(folder)
+        session(head, plain, out / "plain", [], options.lag)
         step = len(hostile) / (KILLS + 1)
         kills = sorted(int(step * (k - 1 + rng.uniform(0.7, 1.3))) for k in range(1, KILLS + 1))
-        session(head, hostile, Path(folder) / "hostile", kills, options.lag)
-        beside.join()
-        return compare(Path(folder) / "plain", Path(folder) / "hostile")
+        session(head, hostile, out / "hostile", kills, options.lag)
+        return compare(out / "plain", out / "hostile")
 
 
 def made(who: str, seconds: float) -> Recording:
@@ -92,8 +91,9 @@ def spoilt(rows: list[Row], rng: random.Random) -> list[Row]:
     """An absurd row every minute, a row that is late every 20 s, and one that comes twice every ten."""
     out: list[Row] = []
     late: list[tuple[int, Row]] = []
-    minute = twenty = ten = 0.0
+    minute, twenty, ten = 0.0, 20.0, 0.0  # what comes late before there is any other row is lost
     fix = next((values for sensor, _, values in rows if sensor == "gnss"), None)
+    slow = "imu" if fix is None else "gnss"  # whose rows are late
     blank, since, before = (float("nan"),) * 6, 0.0, rows[0][1]
     for k, row in enumerate(rows):
         sensor, t, _ = row
@@ -110,7 +110,7 @@ def spoilt(rows: list[Row], rng: random.Random) -> list[Row]:
             out.append(rng.choice(wild))
         while late and late[0][0] <= k:
             out.append(late.pop(0)[1])
-        if since >= twenty and sensor == "gnss":
+        if since >= twenty and sensor == slow:
             twenty = since + 20.0
             late.append((k + 60, row))
             continue

@@ -127,10 +127,20 @@ def draw_again(folder: Path, part: Path) -> list[Path]:
     GraphnavError
         If there is none.
     """
-    from graphnav.report import documents as report
-
     outcome, provenance = stored.read_outcome(folder / stored.NAME)
     alone = not (folder / "comparison.csv").exists()
+    try:
+        return _draw_pages(outcome, provenance, part, alone)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"{folder / stored.NAME}: its parts do not fit together ({type(error).__name__}: {error}); solve again",
+            key="results.unfit",
+        ) from error
+
+
+def _draw_pages(outcome: Outcome, provenance: Mapping[str, Any], part: Path, alone: bool) -> list[Path]:
+    from graphnav.report import documents as report
+
     detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
     files = []
     for name in own_solutions(outcome.solutions):

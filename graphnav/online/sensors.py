@@ -286,10 +286,10 @@ class Sensors:
 
     def _add_imu(self, t: float, values: tuple[float, ...]) -> bool:
         if t <= self.oldest or (t < self.imu.newest - SAME and not self._clock.fits(t, self.imu.t)):
-            repeated = t > self.oldest and bool(np.any(np.abs(self.imu.t - t) <= SAME))
-            self.counts["imu: repeated" if repeated else "imu: too late"] += 1
+            self.counts[self._passed(t)] += 1
             if self._clock.hold(("imu", t, values)):
-                self.set_back = self._clock.set_back()
+                self.set_back = self._clock.set_back()  # which count when they are taken in
+                self.counts -= Counter(self._passed(when) for sensor, when, _ in self.set_back if sensor == "imu")
                 for name, width in _TOLD.items():
                     rows = getattr(self, name).rows[:, : width + 1].tolist()
                     self._before = {one for one in self._before if one[0] != name} | {(name, *row) for row in rows}
@@ -310,7 +310,8 @@ class Sensors:
             # the next row tells whether this stamp was wrong or the IMU away
             before, self._suspect = self._suspect, (t, values)
             if before is None or not 0.0 < t - before[0] < self.longest_gap:
-                self.counts["imu: stamp in the future"] += before is not None
+                if before is not None:
+                    self.counts["imu: stamp in the future"] += 1
                 return False
             self.imu.add(*before)
             self.counts["imu"] += 1
@@ -326,6 +327,11 @@ class Sensors:
             return False
         self.counts["imu"] += 1
         return True
+
+    def _passed(self, t: float) -> str:
+        """What an IMU row at a time that has passed is counted as."""
+        repeated = t > self.oldest and bool(np.any(np.abs(self.imu.t - t) <= SAME))
+        return "imu: repeated" if repeated else "imu: too late"
 
     def drop_before(self, t: float) -> None:
         """Forget rows before a time."""

@@ -128,7 +128,7 @@ class Session:
         return more | {
             "source": "online",
             "settled": self.rows_settled,
-            "rows": dict(online.sensors.counts),
+            "rows": dict(+online.sensors.counts),
             "late_and_used": dict(online.late),
             "bad_lines": self.bad,
             "clocks": online.clocks,

@@ -39,6 +39,7 @@ AFTER = 0.05  # s of IMU after a keyframe that a fix may look at
 _ODOMETER = 0.3  # s that a keyframe waits for the odometer
 _SILENT = 2.0  # s after which an odometer is not waited for
 _STEP = 0.5  # s between looks at a walk
+_MISSING = 5  # rows of the IMU in a row, whose work the next one does
 _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that level a vehicle without GNSS
 _JUDGED = 120.0  # s of rows by which the sensors are judged again
@@ -77,6 +78,7 @@ class Smoother:
         self._began = -np.inf  # s, of what is being smoothed
         self._due = -np.inf  # s, of IMU time at which the next keyframes can be made
         self._awake = -np.inf  # s, at which there is anything to do
+        self._spacing = 0.0  # s, between the newest two rows of the IMU
         self._dirty = np.inf
         self._settled: list[Trajectory] = []
         self._last_settled = -np.inf
@@ -98,7 +100,7 @@ class Smoother:
         sensors = self.sensors
         before = sensors.imu.newest
         if sensor == "imu" and sensors.add_next(t, values, before):  # as all but a few do
-            self._look_if_due(t)
+            self._look_if_due(t, before)
             return
         previous = sensors.newest(sensor)
         if not sensors.add(sensor, t, values, released):
@@ -107,13 +109,15 @@ class Smoother:
             # a row before this one that was left out leaves no trace: what is done at which row stays the same
             if newest - before > self.settings.keyframes.bridge and len(sensors.imu) > 1 and np.isfinite(before):
                 self._restart(before, f"the IMU was silent from {before:.3f} to {newest:.3f} s")
-            self._look_if_due(newest)
+            self._look_if_due(newest, before)
             return
         tracker = self.tracker
         if tracker is not None:
-            self._awake = -np.inf
             if isinstance(tracker, Walker):
+                if sensor == "imu" and not tracker.note_missed_row(t):
+                    return  # as if it had come in its turn
                 tracker.finish_entering(sensors)
+            self._awake = -np.inf
             if sensor != "gnss" and t < previous:
                 tracker.note_late_row(sensor, t)
             if sensors.left:
@@ -130,22 +134,29 @@ class Smoother:
             elif sensor == "odometer" and previous < tracker.newest - SAME_TIME:
                 self._dirty = min(self._dirty, previous + 2.0 * SAME_TIME)
         if sensors.imu.newest >= self._due:
-            self._look()
+            self._look(sensors.imu.newest)
 
-    def _look_if_due(self, now: float) -> None:
-        if now >= self._awake:
-            self._look()
+    def _look_if_due(self, now: float, before: float) -> None:
+        spacing, self._spacing = self._spacing, now - before
+        if now < self._awake:
+            return
+        if self._spacing > 1.5 * spacing > 0.0 and isinstance(self.tracker, Walker):
+            # what is done at which row stays the same where some are missing, which may yet come
+            for k in range(1, min(round(self._spacing / spacing), _MISSING + 1)):
+                if before + k * spacing >= self._awake - SAME_TIME:
+                    self._look(before + k * spacing)
+        self._look(now)
 
-    def _look(self) -> None:
+    def _look(self, now: float) -> None:
         """Do what there is to do; without keyframes to make one thing at a row, so that none waits for long."""
-        now, tracker = self.sensors.imu.newest, self.tracker
+        tracker = self.tracker
         if tracker is None:
             self._align()
             self._awake = self._due if self.tracker is None else now
         elif isinstance(tracker, Walker) and tracker.busy:
             tracker.go_on(self.sensors)
             self._awake = now
-        elif now >= self._due:
+        elif now >= self._due - SAME_TIME:
             self._advance(tracker)
             self._awake = now
         elif self._again is not None:
@@ -195,10 +206,12 @@ class Smoother:
         if len(sensors.imu) < 2:
             return
         first, now = float(sensors.imu.t[0]), sensors.imu.newest
-        self._due = now + _TRY
+        if not last:  # at full times, so that a row which is missing there changes nothing
+            now = _TRY * float(np.floor(now / _TRY))
+            self._due = now + _TRY
         if now - first < _LEVEL:
             return
-        recording = sensors.recording()
+        recording = sensors.recording(-np.inf, now)
         if recording.gnss is None and sensors.setup.gnss is not None and not last:
             self._wait(now)
             return
@@ -330,7 +343,6 @@ class Smoother:
             for row in rows:
                 sensors.aiding[name].add(*row)
         sensors.space(0.0)  # all of them, until there is a start again
-        self._due = self._awake = sensors.imu.newest + _TRY
 
     def _begin_anew(self, oldest: float) -> None:
         """Forget all rows and what was made of them; those up to a time (s) come too late from now on."""
@@ -340,7 +352,7 @@ class Smoother:
         self.sensors.space(0.0)
         self.sensors.oldest = oldest
         self._fixes, self._dirty = [], np.inf
-        self._due = self._awake = oldest + _TRY
+        self._due = self._awake = -np.inf
 
     # --------------------------------------------------------------------------------------------------- running
     def _advance(self, tracker: Tracker, last: bool = False) -> None:
@@ -352,10 +364,11 @@ class Smoother:
         if not last and now - odometer < _SILENT:
             limit = min(limit, max(odometer, now - _ODOMETER))
         if isinstance(tracker, Walker):
-            newest = tracker.take_steps(sensors, now if last else now - SURE, last, self._fixes, self._dirty)
+            at = _STEP * float(np.floor((now + SAME_TIME) / _STEP))
+            newest = tracker.take_steps(sensors, now if last else at - SURE, last, self._fixes, self._dirty)
             if newest > -np.inf:
                 self._dirty, self._fixes = np.inf, [t for t in self._fixes if t > newest + SAME_TIME]
-            self._due = now + _STEP
+            self._due = at + _STEP
             return
         T = tracker.newest
         begun = bool(len(tracker.window)) or tracker.opened

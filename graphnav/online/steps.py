@@ -65,6 +65,10 @@ class StepCutter:
         epochs = [cls.epochs(part, settings, around) for cls in kinds_for(part)]
         return keyframe_times(T, limit, np.concatenate([*epochs, none]), settings.keyframes.rate)
 
+    def read_again(self, t: float) -> None:
+        """A row came late, at a time (s): what it reads counts, too."""
+        self._seen = min(self._seen, float(np.nextafter(t, -np.inf)))
+
     def changed(self, sensors: Sensors, head: float) -> float:
         """From when on intervals after `head` would be integrated otherwise by now, s.
 

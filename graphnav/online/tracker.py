@@ -43,6 +43,7 @@ from graphnav.online.steps import StepCutter
 from graphnav.recording import Recording
 from graphnav.recording.odometer import MeanSpeed
 
+ROWS_AFTER = 0.1  # s of rows after the last of some keyframes that these look at
 _ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints look at where the IMU has no gap; else `CONTEXT`
 _BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
@@ -235,7 +236,7 @@ class Tracker(Chain):
         """What was prepared for a new keyframe with its fix, if it was."""
         if ahead is None or len(times) > 1 or len(ahead.problem.t) != len(before) + 1:
             return None
-        recording = sensors.recording(float(ahead.problem.t[0]) - _ROWS_BEFORE, float(times[-1]) + 0.1)
+        recording = sensors.recording(float(ahead.problem.t[0]) - _ROWS_BEFORE, float(times[-1]) + ROWS_AFTER)
         problem = ahead.problem.complete(recording, self._scale_errors(sensors, recording))
         known = {c.name for c in ahead.problem.constraints}
         late = replace(problem, constraints=tuple(c for c in problem.constraints if c.name not in known))
@@ -335,7 +336,9 @@ class Tracker(Chain):
             stops = stops if self.foot else stops[stops[:, 1] > begin]
             here = stops[(stops[:, 0] < begin) & (stops[:, 1] > begin)]
             begin = min([begin, *here[:, 0].tolist()])
-        recording = self._cut_around(sensors, begin, max(float(times[-1]) + 0.1, sensors.imu_until(float(times[-1]))))
+        recording = self._cut_around(
+            sensors, begin, max(float(times[-1]) + ROWS_AFTER, sensors.imu_until(float(times[-1])))
+        )
         start, speed = self.window.newest.state, None
         if recording.odometer is not None:
             speed = MeanSpeed.of(recording.odometer, self._readings.wrong, self._readings.figures)

@@ -21,7 +21,7 @@ from graphnav.online.ahead import Live, live, since
 from graphnav.online.chain import Posed
 from graphnav.online.looks import CONTEXT
 from graphnav.online.sensors import Sensors
-from graphnav.online.tracker import Tracker
+from graphnav.online.tracker import ROWS_AFTER, Tracker
 from graphnav.recording import Recording
 
 _ENTERING = 4  # keyframes that enter at a row: half of the 4 ms that pass to the next of an IMU at 250 Hz
@@ -124,6 +124,14 @@ class Walker(Tracker):
         """All that is left to do, at once."""
         while self._work is not None:
             self.go_on(sensors)
+
+    def note_missed_row(self, t: float) -> bool:
+        """A row of the IMU came late, at a time (s): whether keyframes were made that would have looked at it."""
+        self._steps.read_again(t)
+        work, newest = self._work, self.newest
+        if work is not None and work.posed is not None:
+            newest = max(newest, float(work.posed.times[-1]))
+        return t <= newest + ROWS_AFTER
 
     def note_late_row(self, sensor: str, t: float) -> None:
         super().note_late_row(sensor, t)

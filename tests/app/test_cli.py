@@ -193,6 +193,10 @@ def test_the_pages_are_drawn_again_without_solving(compared, tmp_path, capsys):
         said = capsys.readouterr().err
         assert "run.npz" in said
     assert "../../ekf" in said
+    empty = {k: np.atleast_1d(v)[:0] for k, v in arrays.items()}
+    np.savez(out / "run.npz", text=np.frombuffer(kept.encode(), dtype=np.uint8), **empty)  # which do not fit together
+    assert cli.run(["report", str(out)]) == 2
+    assert "run.npz" in capsys.readouterr().err
     for data in (b"PK", bytes(damaged)):
         (out / "run.npz").write_bytes(data)
         assert cli.run(["report", str(out)]) == 2

@@ -113,6 +113,7 @@ def seeds() -> Path:
     write_as("nav", track, folder / "t.nav", None)
     write_noise(folder / "noise.json", run(recording, settings_from({}), ("ekf",))["ekf"].noise)
     (folder / "settings.toml").write_text(settings_text(read_settings()))
+    commanded("smooth", folder / "own", "--solver", "ekf", "--noise", "stated", "-o", folder / "out", "--no-report")
     return folder
 
 
@@ -422,6 +423,14 @@ def of_stream(folder: Path, chance: random.Random) -> None:
         insist(float(np.abs(error).max()) < 5.0, f"{np.abs(error).max():.1f} m off")
 
 
+def of_results(folder: Path, chance: random.Random) -> None:
+    """What a run left, spoilt: its pages are drawn again from it, or it is refused."""
+    (folder / "out").mkdir()
+    path = Path(shutil.copy(seeds() / "out" / "run.npz", folder / "out"))
+    path.write_bytes(mutators.results(path.read_bytes(), chance))
+    commanded("report", folder / "out", "--quiet")
+
+
 def of_usage(folder: Path, chance: random.Random) -> None:
     """Options that make no sense."""
     command = chance.choice(
@@ -475,7 +484,7 @@ TARGETS: dict[str, tuple[Callable[[Path, random.Random], None], int]] = {
     "nmea": (of_nmea, 16), "ubx": (of_ubx, 16), "ubx sensors": (of_ubx_sensors, 1), "kitti-raw": (of_kitti, 8),
     "trajectory": (of_trajectory, 24), "evaluation": (of_evaluation, 8), "export": (of_export, 8),
     "draft": (of_draft, 2), "usage": (of_usage, 10), "solution": (of_solution, 1), "stream": (of_stream, 1),
-    "raw gnss": (of_raw_gnss, 16),
+    "raw gnss": (of_raw_gnss, 16), "results": (of_results, 8),
 }  # fmt: skip
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import gzip
+import io
 import random
 import re
 import struct
 from collections.abc import Callable, Sequence
 
 import logs
+import numpy as np
 from logs import frame
 
 NUMBERS = (
@@ -247,6 +249,48 @@ def packed(data: bytes, chance: Chance) -> bytes:
 
 
 # ------------------------------------------------------------------------------------- files of fixed columns
+def results(data: bytes, chance: Chance) -> bytes:
+    """Arrays and JSON in an archive: its bytes, or what is in it, packed again as it should be."""
+    if chance.random() < 0.2:
+        return chance.choice(BINARY)(data, chance)
+    with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    if chance.random() < 0.5:
+        text = arrays["text"].tobytes()
+        text = number(text, chance) if chance.random() < 0.5 else chance.choice(BINARY)(text, chance)
+        arrays["text"] = np.frombuffer(text, dtype=np.uint8)
+    else:
+        name = chance.choice([name for name in arrays if name != "text"])
+        arrays[name] = _array(arrays[name], chance)
+    out = io.BytesIO()
+    np.savez(out, **arrays)
+    return out.getvalue()
+
+
+def number(data: bytes, chance: Chance) -> bytes:
+    """Another number, or a word, in the place of one."""
+    text = data.decode()
+    found = chance.choice(list(_NUMBER.finditer(text)))
+    return (text[: found.start()] + nasty(chance) + text[found.end() :]).encode("utf-8", "surrogatepass")
+
+
+def _array(x: np.ndarray, chance: Chance) -> np.ndarray:
+    """An array of other length, shape or kind, or with other values in it."""
+    how = chance.randrange(6)
+    if how == 0:
+        return x[: len(x) // 2] if x.ndim else np.zeros(3)
+    if how == 1:
+        return x.reshape(-1)
+    if how == 2:
+        return x.astype(chance.choice(("U8", "f2", "c16", "i8")))
+    if how == 3:
+        return np.repeat(np.atleast_1d(x), 2, axis=0)
+    out = np.array(x, dtype=float) if x.dtype.kind in "biuf" else np.zeros(x.shape)
+    where = slice(None) if how == 4 or not out.size else chance.randrange(out.size)
+    out.reshape(-1)[where] = chance.choice((np.nan, np.inf, 1e300, -1e300, 1e9, -1.0, 0.0, 5e-324))
+    return out
+
+
 def field(data: bytes, chance: Chance) -> bytes:
     """Numbers become something else that is as wide."""
     text = data.decode("latin-1")

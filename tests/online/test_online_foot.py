@@ -85,6 +85,24 @@ def test_rows_that_are_left_out_leave_no_trace(walk: Recording, rows: list[Row])
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
+@pytest.mark.parametrize("by", [3, 60, 90])
+def test_rows_of_the_imu_that_come_late_leave_no_trace(
+    walk: Recording, rows: list[Row], by: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The very first, too, and those at which a look is due, as long as none of the keyframes needed them.
+
+    There is work to do at every row, and which is done at which does not change.
+    """
+    monkeypatch.setattr(Walker, "at_a_row", 1)
+    late = list(range(0 if by == 3 else 700, len(rows) - by, 97 if by == 3 else 151))
+    late += [k for k, row in enumerate(rows) if round(row[1], 6) in (10.0, 12.5)]
+    order = sorted(range(len(rows)), key=lambda k: k + by + 0.5 if k in late else k)
+    assert order != sorted(order)
+    one, other = walked(walk, [rows[k] for k in order]), walked(walk, rows)
+    for name in ("t", "llh", "v", "rph", "sd_p"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
 def test_what_is_over_is_not_searched_for_slides_and_the_rest_is_as_it_was(walk: Recording) -> None:
     spans = detect(walk).stationary
     since = walk.start + 10.0

@@ -111,6 +111,26 @@ def test_nmea_fields_that_are_no_numbers(tmp_path: Path, field: int) -> None:
     assert np.abs(np.degrees(log.gnss.llh[:, 0])).max() <= 90.0
 
 
+def test_nmea_counts_of_satellites_that_are_none(tmp_path: Path) -> None:
+    """More digits than a number has leave the count open and keep the fix; what is no number is no sentence."""
+    path = logs.write_nmea(tmp_path / "a.nmea", logs.simulated(20.0)[0])
+    whole = load(path).gnss
+    lines = path.read_text().splitlines(keepends=True)
+    damages = ("9" * 400, "1" * 5000, "1_0", "\uff11", "x")
+    for k, damage in enumerate(damages):
+        body = lines[3 * k][1:].split("*")[0].split(",")
+        assert body[0].endswith("GGA")
+        body[7] = damage
+        lines[3 * k] = logs.sentence(",".join(body))
+    path.write_text("".join(lines), encoding="utf-8")
+    log = load(path)
+    left_out = np.setdiff1d(whole.t, log.gnss.t)
+    assert left_out == pytest.approx(whole.t[1:5])  # 5,000 digits are refused by the parser itself
+    assert np.isnan(log.gnss.satellites[0])
+    np.testing.assert_array_equal(log.gnss.satellites[1:], whole.satellites[5:])
+    np.testing.assert_array_equal(log.gnss.llh, np.delete(whole.llh, range(1, 5), axis=0))
+
+
 @pytest.mark.parametrize("kind", ["GGA", "GST", "RMC", "VTG", "ZDA"])
 def test_nmea_sentences_that_end_early(tmp_path: Path, kind: str) -> None:
     path = logs.write_nmea(tmp_path / "a.nmea", logs.simulated(5.0)[0])

@@ -133,6 +133,9 @@ def _epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
         kind = raw[start + 3 : start + 6]
         if kind not in (b"GGA", b"GST", b"RMC", b"VTG", b"ZDA"):
             continue
+        if b"_" in raw[start:] or not raw[start:].isascii():  # which int and float of Python take for digits
+            broken.append(number)
+            continue
         try:
             message = pynmeagps.NMEAReader.parse(raw[start:].strip() + b"\r\n")
         except Exception:  # the parser's own errors and whatever a cut line makes it stumble over
