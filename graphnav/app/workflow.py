@@ -56,6 +56,7 @@ class Request:
     noise: GivenNoise | None = None  # to be used as it is; else what the settings say
     against: tuple[Against, ...] = ()  # trajectories of other programs to put beside the solutions
     topics: tuple[str, ...] = ()  # of a ROS bag, as `graphnav.recording.formats.read` takes them
+    format: str | None = None  # of a log, likewise
     exported: tuple[str, ...] = ()  # formats that are to be written as well, of
     point: str | None = None  # "antenna", "imu" or a lever arm
 
@@ -165,7 +166,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
 
     timings: dict[str, float] = {}
     with _measure_time(timings, "reading"):
-        whole = read(request.source, request.topics)
+        whole = read(request.source, request.topics, name=request.format)
     check_names(request.exported, whole.gps_zero)
     if request.point == "antenna" and whole.gnss is None:
         raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
@@ -274,8 +275,11 @@ def read_part(
     end: float | None = None,
     withheld: tuple[Withheld, ...] = (),
     topics: tuple[str, ...] = (),
+    name: str | None = None,
 ) -> Recording:
     """The part asked for of a recording, without what is withheld; times in s from the recording's start.
+
+    `topics` and `name` are those of `graphnav.recording.formats.read`.
 
     Raises
     ------
@@ -284,7 +288,7 @@ def read_part(
     """
     from graphnav.recording.formats import read
 
-    whole = read(source, topics)
+    whole = read(source, topics, name=name)
     part = _crop(whole, Request(source, (), start=start, end=end))
     zero = part.start - whole.start if part is not whole else 0.0
     return _withhold(part, _move(withheld, zero), zero)[0]

@@ -403,6 +403,13 @@ BAD = {
         "option.not_here",
         "--format nav",
     ),
+    "no trajectory yet": (
+        ["convert", "kitti", "-o", "o", "--export", "gpx"],
+        "trajectory.none",
+        "graphnav smooth kitti",
+    ),
+    "what is written": (["smooth", "kitti", "-o", "o", "--format", "gpx"], "log.format_unknown", "--export gpx"),
+    "another's name": (["info", "file", "--format", "kitti"], "log.format_unknown", "file"),
     "not a trajectory": (["evaluate", "file", "file"], "file.no_rows", "file"),
 }
 
