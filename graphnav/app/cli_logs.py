@@ -92,9 +92,10 @@ def allan(
     from graphnav.app.outputs import output_folder
     from graphnav.core.errors import RecordingError
     from graphnav.core.staging import final_path, stage_results
-    from graphnav.recording.allan import allan_of, files
+    from graphnav.recording.allan import allan_of
     from graphnav.recording.draft import imu_of
     from graphnav.recording.formats import load
+    from graphnav.report import allan as pages
 
     folder = output_folder(out)
     with bar(quiet, "allan"), permit_outside(allow_outside):
@@ -120,7 +121,7 @@ def allan(
             raise RecordingError(f"{log}: {error}", key=error.key) from None
         tell("writing")
         with stage_results(folder) as part:
-            written = files.write(result, part)
+            written = pages.write(result, part)
     written = final_path(written, part, folder)
     lines = [f"{result.duration:.0f} s at rest, {result.rate:.4g} Hz", "", "[imu.noise]", *result.lines(), ""]
     show(

@@ -147,7 +147,7 @@ def report(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Draw the pages of a run again, without solving: after another version of graphnav, or with plotly there."""
+    """Draw the pages of a run again, without solving: after another version of graphnav, or after --no-report."""
     from graphnav.app import outputs
     from graphnav.core.staging import final_path, stage_results
 
@@ -218,7 +218,8 @@ def _solve(
     given: dict[str, Any] = {
         "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
         "config": asked.config and str(asked.config), "noise": asked.noise, "detectors": asked.detectors,
-        "without": asked.without, "rate": asked.rate, "start": asked.start, "end": asked.end, "format": asked.format, "topic": asked.topic,
+        "without": asked.without, "rate": asked.rate, "start": asked.start, "end": asked.end, "format": asked.format,
+        "topic": asked.topic,
         "against": (beside and [str(file) for file in beside.files]) or None,
     }  # fmt: skip
     folder = outputs.output_folder(asked.out, outputs.FILES, () if alone else chosen)

@@ -176,7 +176,7 @@ def _trajectory_file(source: str) -> Path:
         return path / _TRAJECTORY
     if any(known.builtin and known.recognises(source) for known in formats().values()) or path.is_dir():
         raise ConfigError(
-            f"{source}: is no trajectory; name a file of one, or solve it: graphnav smooth {source} --export ... -o OUT",
+            f"{source}: is no trajectory; name a file of one, or solve: graphnav smooth {source} --export ... -o OUT",
             key="trajectory.none",
         )
     return path
