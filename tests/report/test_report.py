@@ -643,7 +643,7 @@ def test_a_truth_on_the_earth_is_laid_onto_a_walk_that_counts_from_its_start(rec
 def test_the_page_of_an_allan_variance_draws_the_deviations_and_their_fit(tmp_path):
     rng, rate = np.random.default_rng(3), 50.0
     t = np.arange(1, 6001) / rate
-    gyro, accel = rng.normal(0.0, 1e-3, (len(t), 3)), rng.normal(0.0, 1e-2, (len(t), 3)) + [0.0, 0.0, 9.8]
+    gyro, accel = rng.normal(0.0, 1e-3, (len(t), 3)), rng.normal([0.0, 0.0, 9.8], 1e-2, (len(t), 3))
     result = allan_of(t, gyro, accel)
     path, _, _ = allan_page.write(result, tmp_path)
     for title, deviation, sigma in (("Gyro", result.gyro, 1e-3), ("Accelerometer", result.accel, 1e-2)):
