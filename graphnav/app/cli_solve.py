@@ -240,6 +240,7 @@ def _solve(
         asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
         {k: v for k, v in given.items() if v is not None}, noise, exported=exported, point=point,
         topics=tuple(asked.topic or ()), format=asked.format, against=tuple(against),
+        judge_arms=not alone,
     )  # fmt: skip
     with bar(asked.quiet, *chosen) as progress:
         outcome = workflow.run_request(request, progress)

@@ -59,6 +59,7 @@ class Request:
     format: str | None = None  # of a log, likewise
     exported: tuple[str, ...] = ()  # formats that are to be written as well, of
     point: str | None = None  # "antenna", "imu" or a lever arm
+    judge_arms: bool = False  # ask the drive for the signs of lever arms even where nothing is in doubt
 
 
 @dataclass(frozen=True)
@@ -201,7 +202,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
             findings += [note for note in found.notes if note not in findings]
     errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
     checks = inspection.findings
-    if doubts(solutions, errors):  # which costs too much to be asked where nothing is wrong
+    if request.judge_arms or doubts(solutions, errors):  # which takes a second
         from graphnav.estimation.antenna import find_reversed_arms
 
         checks = (*find_reversed_arms(used), *checks)
