@@ -232,7 +232,9 @@ def run(arguments: list[str]) -> int:
         return fail(str(error), BAD_INPUT, debug)
     except Interrupted as error:
         return fail(str(error), INTERRUPTED, False)
-    except (KeyboardInterrupt, typer.Abort):
+    except (KeyboardInterrupt, typer.Abort) as error:
+        if isinstance(error.__cause__, EOFError):  # of which typer thinks that somebody has typed it
+            return fail(_internal(error.__cause__), INTERNAL, debug)
         code = INTERRUPTED
     except MemoryError:
         return fail("out of memory; use a shorter part (--start, --end)", INTERNAL, debug)

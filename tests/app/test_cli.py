@@ -433,6 +433,7 @@ def test_exit_code_and_sentence_of_the_installed_program():
     ("error", "code", "words"),
     [
         (KeyboardInterrupt(), 130, "interrupted"),
+        (EOFError("cut short"), 1, "internal error: EOFError: cut short in cli_solve.py:"),
         (TypeError("what\nis this"), 1, "internal error: TypeError: what is this in cli_solve.py:"),
         (MemoryError(), 1, "out of memory"),
         (OSError(28, "No space left on device", "o/summary.json"), 2, "o/summary.json: No space left on device"),
