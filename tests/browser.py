@@ -98,17 +98,15 @@ class Browser:
             assert time.monotonic() < end, f"never true: {expression}"
             time.sleep(0.05)
 
-    def read(self) -> None:
-        """Scroll through the page, so that everything that waits to be seen is drawn.
+    def read(self, pictures: str, drawn: str) -> None:
+        """Scroll to one picture after the other until it is drawn, `drawn` of it, as they wait to be seen.
 
-        Two frames at each place: what is seen is told between frames, and a busy machine draws few of them.
+        None is passed before it is: a busy machine draws few frames, and what is passed between two is never seen.
         """
-        self.run(
-            "(async () => { const frame = () => new Promise(requestAnimationFrame);"
-            "for (let y = 0; y < document.body.scrollHeight; y += innerHeight / 2) {"
-            "scrollTo({top: y, behavior: 'instant'}); await frame(); await frame(); }"
-            "scrollTo(0, 0); })()"
-        )
+        for k in range(self.run(f"[...{pictures}].length")):
+            self.run(f"[...{pictures}][{k}].scrollIntoView({{block: 'center', behavior: 'instant'}})")
+            self.wait(f"[...{pictures}][{k}].matches('{drawn}')")
+        self.run("scrollTo(0, 0)")
 
     def shot(self, path: Path) -> None:
         """A picture of the whole page."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import resource
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -235,3 +237,12 @@ def same_recording(a: Recording, b: Recording, angle: float = 0.0) -> None:
                 np.testing.assert_allclose(getattr(one, key), value, 0.0, tolerance, err_msg=f"{sensor}.{key}")
             else:
                 assert getattr(one, key) == value, f"{sensor}.{key}"
+
+
+def full_disk() -> dict[str, Any]:
+    """Arguments with which `subprocess` starts a program that finds the disk full after 20 kB: a limit of the system.
+
+    It keeps no bytecode: cut short there, it would end every program after it.
+    """
+    limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # noqa: E731
+    return {"preexec_fn": limit, "env": {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}}

@@ -7,7 +7,6 @@ import gzip
 import io
 import json
 import re
-import resource
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,6 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from helpers import full_disk
 
 from graphnav.app import cli
 from graphnav.core.notes import Note, key_of
@@ -29,10 +29,10 @@ Table = dict[str, Array]  # the columns of a CSV file by name
 HEAD = """\
 # What can go wrong
 
-Mistakes that the tests make on `data/tokyo`, and the [key](keys.md) of what `graphnav info` finds; the first finding may be
-the cause of the others. A note changes nothing; with a warning the result suffers; an untrusted one may be wrong whatever
-its sigmas say; what is refused is not solved. What cannot be read, or is no key, setting or command, is an error: exit code
-2 and a line that names file, line and column, and what to do.
+Mistakes that the tests make on `data/tokyo`, and the [key](keys.md) of what `graphnav info` finds; the first finding may
+be the cause of the others. A note changes nothing; with a warning the result suffers; an untrusted one may be wrong
+whatever its sigmas say; what is refused is not solved. What cannot be read, or is no key, setting or command, is an
+error: exit code 2 and a line that names file, line and column, and what to do.
 """
 _AND, _ERROR = "; ", "error"
 
@@ -152,10 +152,9 @@ def made(mistake: Mistake, room: Path) -> tuple[int, list[str]]:
 
 def run(command: tuple[str, ...], room: Path, full: bool = False) -> tuple[int, str, str]:
     """Exit code, stdout and stderr of the program in a folder, on a disk that is `full` after 20 kB."""
-    if full:  # a limit of the system's stands for the disk
+    if full:
         program = [sys.executable, "-m", "graphnav", *command]
-        limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # noqa: E731
-        done = subprocess.run(program, cwd=room, preexec_fn=limit, capture_output=True, text=True, timeout=300)
+        done = subprocess.run(program, cwd=room, **full_disk(), capture_output=True, text=True, timeout=300)
         return done.returncode, done.stdout, done.stderr
     out, err = io.StringIO(), io.StringIO()
     with contextlib.chdir(room), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

@@ -415,6 +415,12 @@ MISTAKES: dict[str, list[Mistake]] = {
             ("info", "drive"),
         ),
         Mistake(
+            "the antenna half a metre from where it is",
+            toml("[0.0, 0.0, 0.6]", "[0.0, 0.6, 0.6]"),
+            ("antenna: the drive finds it at", "as stated"),
+            ("info", "drive"),
+        ),
+        Mistake(
             "the rear axle before the IMU, not behind",
             toml("[0.0, -1.8, 0.0]", "[0.0, 1.8, 0.0]"),
             ("forward part of lever_arm in [odometer]", "wrong sign"),

@@ -6,7 +6,6 @@ import json
 import os
 import pty
 import re
-import resource
 import signal
 import subprocess
 import sys
@@ -14,7 +13,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from helpers import refuse_command, refused
+from helpers import full_disk, refuse_command, refused
 
 from graphnav.app import cli
 from graphnav.app.terminal import Pace
@@ -250,14 +249,11 @@ def test_ctrl_c_waits_for_what_must_not_be_cut():
 
 
 def test_a_full_disk_leaves_the_older_results_as_they_were(tmp_path):
-    """A limit on the size of files stands for the disk."""
-
     smooth = ["smooth", str(TOKYO), "--solver", "ekf", "--noise", "stated", "-o", str(tmp_path)]
     assert cli.run([*smooth, "--end", "50", "--quiet"]) == 0
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
-    cap = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # noqa: E731
     command = [PROGRAM, *smooth, "--end", "60"]
-    run = subprocess.run(command, preexec_fn=cap, capture_output=True, text=True, timeout=300)
+    run = subprocess.run(command, **full_disk(), capture_output=True, text=True, timeout=300)
     assert run.returncode == 2
     assert re.fullmatch(r"graphnav: -o .*: cannot be written \(File too large\); .*\n", run.stderr)
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before

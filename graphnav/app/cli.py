@@ -106,9 +106,9 @@ def info(
         whole = read(only(context, recording), topic or (), allow_outside, format)
         tell("checks")
         found = inspect(whole)
-        from graphnav.estimation.antenna import find_antenna, find_reversed_arms
+        from graphnav.estimation.antenna import find_antenna, find_wrong_arms
 
-        more = find_reversed_arms(found.recording) if found.trusted and not quick else []
+        more = find_wrong_arms(found.recording) if found.trusted and not quick else []
         found = replace(found, findings=(*more, *found.findings, *([find_antenna(whole).finding] if antenna else [])))
     show(found.text, found.values, quiet, json)
 

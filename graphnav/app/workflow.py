@@ -203,9 +203,9 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
     checks = inspection.findings
     if request.judge_arms or doubts(solutions, errors):  # which takes a second
-        from graphnav.estimation.antenna import find_reversed_arms
+        from graphnav.estimation.antenna import find_wrong_arms
 
-        checks = (*find_reversed_arms(used), *checks)
+        checks = (*find_wrong_arms(used), *checks)
         findings = [*(f.sentence for f in checks), *findings]
     densities = _find_densities(used, request.settings, solutions)
     return Outcome(

@@ -29,7 +29,7 @@ from graphnav.recording import Recording, rows_of
 
 _UNKNOWN = 2.0  # m, 1-sigma before the drive
 _FINE = 0.3  # m, 1-sigma of fixes that tell
-_LONG = 0.25  # m, of the part of an arm whose sign matters
+_LONG = 0.25  # m, of a part of an arm whose sign matters, or of an error of one: tapes do better
 _OPPOSITE = 0.5  # of how far it is found from where it is stated, it may be from where the other sign puts it
 _PART = 240.0  # s
 _FEWEST = 30  # fixes
@@ -79,17 +79,15 @@ def find_antenna(recording: Recording) -> Antenna:
     return _estimate(recording)[0]
 
 
-def find_reversed_arms(recording: Recording) -> list[Finding]:
-    """Parts of lever arms whose sign the drive denies: it finds them where the opposite sign would put them.
+def find_wrong_arms(recording: Recording) -> list[Finding]:
+    """Lever arms that the drive denies: parts that it finds where the opposite sign would put them; else the antenna.
 
     Of a vehicle with fixes that are precise enough to tell, by the part of the drive that turns most; else nothing.
     """
-    gnss, odometer = recording.gnss, recording.odometer
+    gnss = recording.gnss
     if recording.platform != "vehicle" or gnss is None or len(gnss.t) < _FEWEST:
         return []
-    told = np.abs(gnss.lever_arm) > _LONG
-    wheel = odometer is not None and abs(odometer.lever_arm[1]) > _LONG
-    if np.median(gnss.sd[:, :2]) > _FINE or not (told.any() or wheel):
+    if np.median(gnss.sd[:, :2]) > _FINE:
         return []
     second = np.floor(gnss.t)
     thin = rows_of(gnss, np.concatenate([[True], np.diff(second) > 0.0]))
@@ -114,6 +112,8 @@ def find_reversed_arms(recording: Recording) -> list[Finding]:
                     f"{name}.lever_arm_sign",
                 )
             )
+    if not out and not antenna.agrees and np.abs(antenna.found - antenna.stated).max() > _LONG:
+        out.append(antenna.finding)
     return out
 
 

@@ -438,7 +438,7 @@ def test_exit_code_and_sentence_of_the_installed_program():
         (MemoryError(), 1, "out of memory"),
         (OSError(28, "No space left on device", "o/summary.json"), 2, "o/summary.json: No space left on device"),
     ],
-    ids=["ctrl-c", "internal", "memory", "disk full"],
+    ids=["ctrl-c", "end of file", "internal", "memory", "disk full"],
 )
 def test_no_traceback_reaches_a_user(error, code, words, tmp_path, monkeypatch, capsys):
     def failing(*_):

@@ -16,7 +16,7 @@ import oracle
 import pytest
 
 from graphnav.app import cli
-from graphnav.estimation.antenna import find_reversed_arms
+from graphnav.estimation.antenna import find_wrong_arms
 from graphnav.recording import Recording
 from graphnav.recording.checks.overview import Inspection, inspect
 from graphnav.recording.formats import read
@@ -302,7 +302,7 @@ def test_axes_are_denied_only_by_better_ones() -> None:
 
 def test_right_lever_arms_are_not_denied() -> None:
     recording, _ = oracle.drive(oracle.vehicle_path(120.0, 50.0), seed=5, lever_arm=(0.4, -0.5, 1.2))
-    assert find_reversed_arms(recording) == []
+    assert find_wrong_arms(recording) == []
 
 
 def test_fixes_of_before_the_drive_are_left_out(drive: Callable[[str], Recording]) -> None:

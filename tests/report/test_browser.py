@@ -50,9 +50,7 @@ def checked(tab, width):
 def test_every_picture_comes_alive_in_both_colours(tab, pages, page, size):
     tab.open(pages / page, size)
     tab.wait("document.documentElement.dataset.ready !== undefined")
-    tab.read()
-    shown = "[...document.querySelectorAll('.plot')].filter(p => !p.closest('details'))"
-    tab.wait(f"{shown}.every(p => p.classList.contains('js-plotly-plot'))")
+    tab.read("[...document.querySelectorAll('.plot')].filter(p => !p.closest('details'))", ".js-plotly-plot")
     checked(tab, size[0])
     ink = "getComputedStyle(document.querySelector('.js-plotly-plot .xtick text')).fill"
     wanted = "(p => (p.style.color = 'var(--soft)', getComputedStyle(p).color))(document.querySelector('nav'))"
