@@ -433,12 +433,11 @@ def test_exit_code_and_sentence_of_the_installed_program():
     ("error", "code", "words"),
     [
         (KeyboardInterrupt(), 130, "interrupted"),
-        (EOFError("cut short"), 1, "internal error: EOFError: cut short in cli_solve.py:"),
         (TypeError("what\nis this"), 1, "internal error: TypeError: what is this in cli_solve.py:"),
         (MemoryError(), 1, "out of memory"),
         (OSError(28, "No space left on device", "o/summary.json"), 2, "o/summary.json: No space left on device"),
     ],
-    ids=["ctrl-c", "end of file", "internal", "memory", "disk full"],
+    ids=["ctrl-c", "internal", "memory", "disk full"],
 )
 def test_no_traceback_reaches_a_user(error, code, words, tmp_path, monkeypatch, capsys):
     def failing(*_):
@@ -455,6 +454,15 @@ def test_no_traceback_reaches_a_user(error, code, words, tmp_path, monkeypatch, 
     assert cli.run(["smooth", "kitti", "-o", str(tmp_path / "o")]) == code
     shown = "Traceback" in capsys.readouterr().err
     assert shown == (code != 130)
+
+
+def test_an_end_of_a_file_is_not_taken_for_ctrl_c(tmp_path, monkeypatch, capsys):
+    def failing(*_):
+        raise EOFError("cut short")
+
+    monkeypatch.setattr(workflow, "run_request", failing)
+    assert cli.run(["smooth", "kitti", "-o", str(tmp_path / "o")]) == 1
+    assert "internal error: EOFError: cut short in cli_solve.py:" in capsys.readouterr().err
 
 
 def test_a_reader_that_stops_early_is_no_error():
