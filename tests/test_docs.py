@@ -39,9 +39,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "data").rglob("*.md"))]
 # a fence may be indented, as in a list
 FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
-
-
-EXAMPLE = re.compile(r'^--8<-- "(docs/examples/\w+\.py)"\n', re.MULTILINE)
+EXAMPLE = re.compile(r"^--8<--\n(docs/examples/\w+\.py)\n--8<--\n", re.MULTILINE)
 
 
 def text_without(indent, text):

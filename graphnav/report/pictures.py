@@ -302,7 +302,8 @@ def parameter_pictures(
             series = {solver: Series(p.t - start, scale * p.value, scale * p.sigma)}
             titles = [one.words for one in shown]
             figure = plots.bands(series, titles, shown[0].unit, end, spans=spans, about_zero=False)
-            out.append(page.picture(figure, f"{name.replace('_', ' ')} and 3 sigma"))
+            words = name.replace("_", " ")
+            out.append(page.picture(figure, f"{words[:1].upper()}{words[1:]} and 3 sigma"))
     return out
 
 
