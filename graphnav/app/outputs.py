@@ -6,6 +6,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,7 +88,7 @@ def write_run(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
     (name,) = own_solutions(outcome.solutions)
     provenance = gather_provenance(outcome)
     failed = write_solver(outcome, name, folder, provenance, pages=pages)
-    write_outcome(outcome, provenance, folder / stored.NAME)
+    write_outcome(replace(outcome, alone=True), provenance, folder / stored.NAME)
     _insist(failed)
     return [*([folder / "report.html"] if pages else []), folder / "trajectory.csv", folder / "summary.json"]
 
@@ -130,7 +131,7 @@ def draw_again(folder: Path, part: Path) -> list[Path]:
     from graphnav.report import documents as report
 
     outcome, provenance = stored.read_outcome(folder / stored.NAME)
-    alone = not (folder / "comparison.csv").exists()
+    alone = outcome.alone  # the folder may hold a comparison of before
     detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
     files = []
     for name in own_solutions(outcome.solutions):

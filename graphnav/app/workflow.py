@@ -82,6 +82,7 @@ class Outcome:
     timings: dict[str, float]  # s by stage, of what all solvers share
     checks: tuple[Finding, ...] = ()  # what the checks of the recording found, with keys and severities
     densities: ImuNoise | None = None  # what the noise factors of the IMU are relative to, if not to what it states
+    alone: bool = False  # whether its files lie straight in the folder, as those of one solver
 
     @property
     def used_withheld(self) -> tuple[Withheld, ...]:

@@ -171,6 +171,27 @@ def test_comparison_csv_has_a_row_per_solver_with_the_numbers_of_the_summaries(c
         assert float(row["run_time_s"]) > 0
 
 
+def test_of_a_run_over_a_comparison_its_own_page_is_drawn_again(tmp_path):
+    part = [
+        str(Path(__file__).parents[2] / "data" / "tokyo"),
+        "-o",
+        str(tmp_path),
+        "--solver",
+        "ekf",
+        "--noise",
+        "stated",
+        "--end",
+        "60",
+        "--quiet",
+    ]
+    assert cli.run(["compare", *part]) == 0
+    assert cli.run(["smooth", *part]) == 0
+    before = (tmp_path / "report.html").read_bytes()
+    (tmp_path / "report.html").unlink()
+    assert cli.run(["report", str(tmp_path), "--quiet"]) == 0
+    assert (tmp_path / "report.html").read_bytes() == before
+
+
 def test_the_pages_are_drawn_again_without_solving(compared, tmp_path, capsys):
     out = tmp_path / "again"
     shutil.copytree(compared[0], out)
