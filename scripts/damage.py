@@ -47,6 +47,12 @@ def bursts(recording: Recording, gnss: Gnss, rng: np.random.Generator) -> Gnss:
     return moved(gnss, by)
 
 
+def drifting(recording: Recording, gnss: Gnss, rng: np.random.Generator) -> Gnss:
+    """East by 0.3 m/s for a minute from two fifths of the drive on, then right again."""
+    since = gnss.t - recording.start - 0.4 * recording.duration
+    return moved(gnss, np.outer(np.where((since >= 0.0) & (since < 60.0), 0.3 * since, 0.0), [1.0, 0.0, 0.0]))
+
+
 def frozen(recording: Recording, gnss: Gnss, rng: np.random.Generator) -> Gnss:
     """Twelve seconds of one place, where the drive goes furthest in them."""
     p = LocalFrame(gnss.llh[0]).from_llh(gnss.llh)
@@ -70,6 +76,7 @@ DAMAGES: dict[str, Damage] = {
     "one in ten off by 20 m": outliers,
     "bursts": bursts,
     "frozen": frozen,
+    "drifting": drifting,
 }
 
 

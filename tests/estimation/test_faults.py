@@ -25,7 +25,7 @@ from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
 from graphnav.estimation.solvers.rts import backward
-from graphnav.estimation.solvers.watch import Bank, Verdicts
+from graphnav.estimation.solvers.watch import MINUTE, Bank, Verdicts
 from graphnav.evaluation.scoring import errors
 from graphnav.recording import Recording
 from graphnav.recording.formats import read
@@ -89,14 +89,14 @@ def left_out(solution: Solution, recording: Recording) -> Array:
 
 
 def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    """G of an error since row 63, against two filters whose fixes differ by it."""
+    """G of an error since row 63 that stays, or grows, against two filters whose fixes differ by it."""
     seen: dict[int, Array] = {}
     updated = Bank.updated
 
     def spy(self: Bank, name: str, K: Array, G: Array, weighted: Array, r: Array, speed: float) -> int | None:
         row = self._slots[name].seen - 1 if name == "gnss_position" else -1
         if 63 <= row < 160:
-            seen[row] = G[:, 6 * 3 : 6 * 3 + 3].copy()  # slot 6 begins at its 64th fix
+            seen[row] = G[:, 6 * 6 : 6 * 6 + 6].copy()  # slot 6 begins at its 64th fix
         updated(self, name, K, G, weighted, r, speed)
         return None
 
@@ -105,16 +105,18 @@ def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypa
     about = ekf(posed)
     plain = refilter(posed, about, watch=True).records[rows.name].residual
     delta = 1e-3
-    for axis in range(3):
+    minutes = (posed.t[rows.keyframe[63:]] - posed.t[rows.keyframe[63]]) / MINUTE
+    for column in range(6):
+        axis, size = column % 3, np.ones_like(minutes) if column < 3 else minutes
         p = rows.p_n.copy()
-        p[63:, axis] += delta
+        p[63:, axis] += delta * size
         shifted = replace(rows, p_n=p)
         other = replace(posed, constraints=tuple(shifted if c is rows else c for c in posed.constraints))
         change = (refilter(other, about).records[rows.name].residual - plain) / delta
         # innovations are the negative of residuals, in axes of the fix
-        C = rows.R_ln[63:160]
-        expected = -np.einsum("nij,nj->ni", np.stack([seen[k] for k in range(63, 160)]) @ C, np.eye(3)[[axis] * 97])
-        assert np.allclose(change[63:160], expected, atol=0.02), axis
+        kind = slice(0, 3) if column < 3 else slice(3, 6)
+        G = np.stack([seen[k][:, kind] for k in range(63, 160)]) @ rows.R_ln[63:160]
+        assert np.allclose(change[63:160], -G[:, :, axis], atol=0.02), column
 
 
 def test_filter_and_its_tests_are_the_filter_where_nothing_is_wrong(posed: Problem) -> None:
@@ -164,20 +166,21 @@ def test_gross_outliers_and_a_burst() -> None:
         assert mine < 1.2 * theirs, (name, mine, theirs)
 
 
-def test_error_that_grows(short: tuple[Recording, Trajectory]) -> None:
-    """0.2 m/s for a minute and a half: no single fix stands out until it ends."""
+@pytest.mark.parametrize("rate", [0.2, 0.05])
+def test_error_that_grows(short: tuple[Recording, Trajectory], rate: float) -> None:
+    """For a minute and a half, in m/s: no single fix stands out until it ends."""
     recording, truth = short
     assert recording.gnss is not None
     t = recording.gnss.t - recording.start
     bad = (t >= 110.0) & (t < 200.0)
-    grown = 0.2 * (t[bad] - 110.0)
+    grown = rate * (t[bad] - 110.0)
     wrong = moved(recording, bad, np.stack([0.6 * grown, 0.8 * grown, 0.0 * grown], -1))
     found, by_hand = run(wrong), run(recording.without("gnss", (109.9, 199.9)), OFF, ("rts", "batch"))
     plain = run(wrong, OFF, ("batch",))
     worst = {name: horizontal(s, truth).max() for name, s in found.items()}
     for name in ("rts", "batch"):
         assert worst[name] < 2.0 * horizontal(by_hand[name], truth).max(), (name, worst)
-    assert horizontal(plain["batch"], truth).max() > 5.0
+    assert horizontal(plain["batch"], truth).max() > 25.0 * rate
     given_up = left_out(found["ekf"], wrong)
     assert np.mean(given_up[bad]) > 0.8
     assert np.sum(given_up & ~bad) <= 5
@@ -365,5 +368,5 @@ def test_a_receiver_that_repeats_a_fix_is_left_out(begin: float, doppler: bool) 
     assert used.sum() > 5
     assert worth_nothing(found)[used].all()
     # of right ones beside it no more than it is long itself
-    right = ~same & ((t < begin - 12.0) | (t > begin + 24.0))
+    right = ~same & ((t < begin - 5.0) | (t > begin + 17.0))
     assert not left_out(found, recording)[right].any()

@@ -36,7 +36,7 @@ def live(drive: tuple[Recording, Trajectory]) -> tuple[Recording, Trajectory]:
 def likelihoods(slots: watch._Slots) -> Array:
     """(L,) T of every onset."""
     b = np.linalg.solve(slots.info, slots.score[..., None])[..., 0]
-    return np.where(slots.first < 0.0, np.nan, np.sum(slots.score * b, axis=1))
+    return np.where(np.isnan(slots.first), np.nan, np.sum(slots.score * b, axis=1))
 
 
 def test_tests_beside_a_message_are_those_of_the_filter(posed: Problem, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -183,8 +183,9 @@ def _begin(problem: Problem, start: NoiseModel | None) -> _Components:
 def _first_points(problem: Problem, figures: _Components, opening: float | None) -> Points:
     used = with_noise(problem, figures.model())
     about = backward(used, ekf(used, opening=opening))
-    # what is grossly wrong takes a filter that uses everything too far away to be linearised there
-    sound = weigh_rows(used, refilter(used, about, watch=True).weights)
+    # what is grossly wrong takes a filter that uses everything too far away to be linearised there; what seems to drift
+    # may as well be the filter, whose heading is not known yet
+    sound = weigh_rows(used, refilter(used, about, watch=True, drifts=False).weights)
     if not any(rows.weight is not None and np.any(rows.weight == 0.0) for rows in sound.constraints):
         return about
     return backward(sound, ekf(sound, opening=opening))

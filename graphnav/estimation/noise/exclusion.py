@@ -12,7 +12,7 @@ next one:
     IMU         the intervals there that the smoother needs more noise of have it
     rows        single rows there have the weights that were found
 
-An unknown error has a Gaussian prior about zero, as wide as such errors get (`_WIDE`), and so has its growth; what that
+An unknown error has a Gaussian prior about zero, as wide as such errors get (`WIDE`), and so has its growth; what that
 width costs in likelihood is the cost of the explanation (MacKay 1992, "Bayesian interpolation": the Occam factor). A
 fault is also as rare beforehand as the tests take it to be, an outlier among intervals or rows as rare as `CHANCE`. The
 best model decides what is left out.
@@ -30,6 +30,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
@@ -39,23 +40,22 @@ from graphnav.estimation import faults
 from graphnav.estimation.noise.apply import row_weights, with_noise
 from graphnav.estimation.noise.estimate import CHANCE, NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
+from graphnav.estimation.noise.moments import row_moments
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import points_of, values_of
-from graphnav.estimation.solvers.watch import FALSE_ALARM
+from graphnav.estimation.solvers.passes import SmootherPass, points_of, values_of
+from graphnav.estimation.solvers.watch import FALSE_ALARM, MINUTE, WIDE
 from graphnav.recording import Recording
 
 FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
 ROWS = ("rows",)
 _WRONG: tuple[tuple[str, ...], ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS, ROWS)
 _SINGLE = INTERVALS, ROWS  # outliers: nothing is left out for them
-_WIDE = {"m": 100.0, "m/s": 10.0}  # reflections in a city are off by up to a hundred metres; wheels by their speed
 _ODDS = -float(np.log(FALSE_ALARM))  # by which a fault is less likely beforehand than none
 _NONE = 1e-9  # sigma of an error that is not there
 _OUTLIER = -float(np.log(CHANCE))  # the same of one row, and of one interval of the IMU
-_MINUTE = 60.0  # s
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class _Shifted(Constraint):
         unknown = parameters[self.error]  # (n, 2 m), at the beginning of the span and growth in a minute
         linear = self.inner.linearize(states, {k: v for k, v in parameters.items() if k != self.error}, rows)
         n, m = linear.residual.shape
-        minutes = (self.since[rows] / _MINUTE)[:, None]
+        minutes = (self.since[rows] / MINUTE)[:, None]
         J = np.concatenate([np.broadcast_to(np.eye(m), (n, m, m)), minutes[..., None] * np.eye(m)], axis=-1)
         residual = linear.residual + unknown[:, :m] + minutes * unknown[:, m:]
         return Linearized(residual, linear.jacobians | {self.error: J}, linear.sigma)
@@ -103,7 +103,7 @@ def with_common_errors(problem: Problem, spans: list[tuple[float, float]], kinds
         if rows.name not in kinds:
             return rows
         name, m = f"{rows.name}_fault", len(rows.axes)
-        sigma = np.maximum(np.outer(wide, np.full(2 * m, _WIDE[rows.unit])), _NONE)
+        sigma = np.maximum(np.outer(wide, np.full(2 * m, WIDE[rows.unit])), _NONE)
         own = Parameter(name, np.zeros(sigma.shape), sigma, rows.unit, begins=np.array(begins))
         t = problem.t[rows.keyframe]
         return _Shifted(
@@ -128,7 +128,7 @@ def with_own_errors(problem: Problem, spans: list[tuple[float, float]], kinds: t
         within = np.any([(t >= a - SAME_TIME) & (t <= b + SAME_TIME) for a, b in spans], axis=0)
         sigma: Array = rows.sigma  # type: ignore[attr-defined]
         weight = np.ones(len(rows)) if rows.weight is None else rows.weight
-        wide = np.min(sigma / np.hypot(sigma, _WIDE[rows.unit]), axis=1) ** 2
+        wide = np.min(sigma / np.hypot(sigma, WIDE[rows.unit]), axis=1) ** 2
         return replace(rows, weight=np.where(within, np.minimum(weight, wide), weight))
 
     return replace(problem, constraints=tuple(loose(rows) for rows in problem.constraints))
@@ -217,17 +217,37 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
     one = decide(base, found, spans)
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
     hidden = find_spans(base, NoiseModel(medians), found)
+    without = NoiseModel(excluded=dict.fromkeys(FIXES, tuple(hidden)))
     if all(any(a <= begin and end <= b for a, b in spans) for begin, end in hidden):
         return replace(one, looks=one.looks + 2)
-    without = NoiseModel(excluded=dict.fromkeys(FIXES, tuple(hidden)))
-    other = estimate_noise(base, None, without, (found.points, with_noise(base, found.noise)))
-    ways = [one, decide(base, other, hidden)]
-    # by figures that nothing wrong is in any more, a long span may shrink to what is wrong of it
-    shorter = find_spans(base, replace(other.noise, excluded={}), other)
-    if shorter and shorter != hidden:
-        ways.append(decide(base, other, shorter))
+    other, spans, passes = found, hidden, 0
+    for _ in range(2):  # by figures that nothing wrong is in, spans come to what is wrong of them
+        other = estimate_noise(base, None, without, (other.points, with_noise(base, other.noise)))
+        posed, passes = with_noise(base, other.noise), passes + other.passes
+        spans = trim_spans(posed, other.points, spans)
+        refined = trim_spans(posed, other.points, find_spans(base, replace(other.noise, excluded={}), other))
+        if not refined or refined == spans:
+            break
+        spans, without = refined, replace(without, excluded=dict.fromkeys(FIXES, tuple(refined)))
+    ways = [one, *([decide(base, other, spans)] if spans else [])]
     best = max(ways, key=lambda way: way.log_evidence)
-    return replace(best, passes=other.passes, looks=sum(way.looks for way in ways) + 3)
+    return replace(best, passes=passes, looks=sum(way.looks for way in ways) + 4)
+
+
+def trim_spans(problem: Problem, smoothed: SmootherPass, spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Spans (s) without what is right at their ends: fixes where a smoother that does not use them has them.
+
+    Tests that go forward in time leave out too much: they date a fault from one of a few onsets, and what comes after
+    it is met by a filter that has been led astray.
+    """
+    off: list[Array] = []
+    for rows in problem.constraints:
+        if rows.name in FIXES:
+            squared = row_moments(problem, rows, smoothed, len(rows)).left_out.sum(axis=1)
+            off.append(problem.t[rows.keyframe[squared > chdtri(len(rows.axes), CHANCE)]])
+    t = np.unique(np.concatenate(off))
+    within = [t[np.searchsorted(t, a - SAME_TIME) : np.searchsorted(t, b + SAME_TIME)] for a, b in spans]
+    return [(float(some[0]), float(some[-1])) for some in within if len(some)]
 
 
 def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[tuple[float, float]]:

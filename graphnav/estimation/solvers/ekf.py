@@ -118,15 +118,18 @@ def _smooth_opening(problem: Problem, n: int) -> SmootherPass:
     return about
 
 
-def refilter(problem: Problem, about: Points, progress: Progress | None = None, watch: bool = False) -> ForwardRecord:
+def refilter(
+    problem: Problem, about: Points, progress: Progress | None = None, watch: bool = False, drifts: bool = True
+) -> ForwardRecord:
     """Run the filter over the first keyframes, linearised at given points; several times as fast as `ekf`.
 
     Parameters
     ----------
     about : of these keyframes, near enough for what is left to be linear: an earlier pass.
     watch : look for errors that last in the rows that are to be watched, and go back to before them.
+    drifts : of such errors those that grow as well.
     """
-    return _forward(problem, len(about.values), about, progress, watch)
+    return _forward(problem, len(about.values), about, progress, watch, drifts)
 
 
 def _forward(
@@ -135,6 +138,7 @@ def _forward(
     about: Points | None = None,
     progress: Progress | None = None,
     watch: bool = False,
+    drifts: bool = True,
     decide: Decide | None = None,
 ) -> ForwardRecord:
     """Filter the first K keyframes, of which the first n are linearised at given points."""
@@ -158,7 +162,7 @@ def _forward(
     P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
     records = stack.records
     watched = [c for c in fixes if c.watched]
-    bank = Bank(watched, problem.t, D) if watched else None
+    bank = Bank(watched, problem.t, D, drifts) if watched else None
     banks: dict[int, Bank] = {}  # as they were before the latest keyframes with fixes
     met = {int(k) for c in watched for k in c.keyframe}
     verdicts = Verdicts(
@@ -173,7 +177,7 @@ def _forward(
     if about is not None and given and updates and untested and not decided and decide is None:
         errors, errors_ahead = np.empty((n, D)), np.empty((n, D))
         _filter_points(given, steps, stack, updates, x, P, errors_ahead, all_Pp, errors, all_P, progress)
-        if not watched or not finds_fault(Bank(watched, problem.t, D), given, steps.decay, stack, updates):
+        if bank is None or not finds_fault(Bank(watched, problem.t, D, drifts), given, steps.decay, stack, updates):
             found[:n], ahead[:n] = errors, errors_ahead
             k = n
             x, P = _leave_points(about, own, all_P, k, errors[k - 1])

@@ -1,19 +1,21 @@
 """Watches a filter's fixes for errors that last: a bank of generalised likelihood ratio tests.
 
 A fault that grows slowly passes every test of one fix: the filter follows it. What it cannot do is follow without
-having been pushed in the same direction again and again. If the fixes have had a common error b since fix s, the
-innovations have the mean G b, where G is what a unit error does to them through the filter (Willsky and Jones 1976,
-"A generalized likelihood ratio approach to the detection and estimation of jumps in linear systems"),
+having been pushed in the same direction again and again. If the fixes have had an error U b since fix s, of which b are
+a part that stays and one that grows, U = [I, I (t - s)], the innovations have the mean G b, where G is what that does
+to them through the filter (Willsky and Jones 1976, "A generalized likelihood ratio approach to the detection and
+estimation of jumps in linear systems"; Willsky 1976, "A survey of design methods for failure detection", of ramps),
 
     X <- F X                       its effect on the predicted state
-    G = I - H X    X <- X + K G    at a fix since s (without I at other measurements)
+    G = U - H X    X <- X + K G    at a fix since s (without U at other measurements)
 
 and with nu ~ N(0, S) white but for that, the error most likely and how much more likely it makes the innovations are
 
-    score = sum G^T S^-1 nu    info = sum G^T S^-1 G    b = info^-1 score    T = score^T info^-1 score
+    score = sum G^T S^-1 nu    info = W^-2 + sum G^T S^-1 G    b = info^-1 score    T = score^T info^-1 score
 
-Without a fault T is chi-square with as many degrees of freedom as a fix has components. Onsets are 1, 2, 4 ... fixes
-old, more or less: slot l of the bank begins anew at every odd multiple of 2^l.
+with W, how large such errors get, for what one fix cannot tell. Without a fault T is chi-square with twice as many
+degrees of freedom as a fix has components, or less. Onsets are 1, 2, 4 ... fixes old, more or less: slot l of the bank
+begins anew at every odd multiple of 2^l.
 """
 
 from __future__ import annotations
@@ -38,22 +40,35 @@ _EVERY = 8  # fixes between two looks at what is usual
 LARGE = 3.0  # sigmas that are stated or that clocks can be off: less is no fault, however certain
 _CLOCKS = 0.05  # s, by which the stamps of IMU and receiver may disagree
 _BRAKING = 3.0  # m/s^2, of a usual manoeuvre
+_ONSET = float(chdtri(1, 0.05))  # of T, by which an onset may be less likely than the likeliest: 95 %
 FALSE_ALARM = 1e-7  # per test: one drive in a hundred of an hour, if errors were Gaussian
+WIDE = {"m": 100.0, "m/s": 10.0}  # reflections in a city are off by up to a hundred metres; wheels by their speed
+MINUTE = 60.0  # s, in which an error may grow by as much as it can be
 LONGEST = 600.0  # s, about, of the oldest onset: what inertial sensors knew ten minutes ago says little
 
 
-class _Slots:
-    """The tests of one constraint: slot l has columns 3 l to 3 l + 2 of those it has in the bank."""
+def matters(rows: Constraint, error: Array, speed: Array | float) -> Array:
+    """(...) whether errors (..., m) of fixes at speeds (...), m/s, are large enough to be faults, however certain."""
+    # a position is off by what the vehicle moves while clocks are
+    clocks = _CLOCKS * np.asarray(speed) if rows.fix_of == "p" else np.asarray(_CLOCKS * _BRAKING)
+    return np.asarray(np.sum(error**2 / (rows.typical_error() ** 2 + clocks[..., None] ** 2), axis=-1) > LARGE**2)
 
-    def __init__(self, columns: slice, L: int, m: int, stated: Array, moves: bool) -> None:
-        self.columns, self.L, self.m = columns, L, m
-        self.threshold = float(chdtri(m, FALSE_ALARM))
-        self.moves = moves  # a position, which is off by what the vehicle moves while clocks are
-        self.stated = stated  # (m,) typical sigma of a whole error
-        self.first = np.full(L, -1.0)  # when each slot began, -1 before
-        self.inputs = np.zeros((m, L * m))  # what a unit error is to each column: the identity since its slot began
-        self.one = np.eye(m)
-        self.score, self.info = np.zeros((L, m)), np.tile(self.one, (L, 1, 1))
+
+class _Slots:
+    """The tests of one constraint: slot l has columns 2 m l to 2 m (l + 1) of those it has in the bank.
+
+    The first m of them are of the part of an error that stays, the others of what it grows by in a minute.
+    """
+
+    def __init__(self, columns: slice, L: int, rows: Constraint, drifts: bool) -> None:
+        m = len(rows.axes)
+        self.columns, self.L, self.m, self.drifts = columns, L, m, drifts
+        self.threshold = float(chdtri(2 * m, FALSE_ALARM))
+        self.rows = rows
+        self.first = np.full(L, np.nan)  # when each slot began, NaN before
+        self.inputs = np.zeros((m, L, 2, m))  # U of each slot
+        self.one, self.prior = np.eye(m), np.eye(2 * m) / WIDE[rows.unit] ** 2
+        self.score, self.info = np.zeros((L, 2 * m)), np.tile(self.prior, (L, 1, 1))
         self.seen = 0
         self.typical_sigmas = _InnovationLevel(m)
 
@@ -66,52 +81,61 @@ class _Slots:
 
     def forget(self) -> None:
         """Begin none again until its turn."""
-        self.first[:], self.score[:], self.info[:], self.inputs[:] = -1.0, 0.0, self.one, 0.0
+        self.first[:], self.score[:], self.info[:], self.inputs[:] = np.nan, 0.0, self.prior, 0.0
 
     def begin(self, t: float) -> slice:
-        """Begin the slot whose turn it is; its columns in the bank."""
+        """Begin the slot whose turn it is at a fix, and let the others grow; its columns in the bank."""
         self.seen += 1
         slot = min((self.seen & -self.seen).bit_length() - 1, self.L - 1)
-        own = slice(slot * self.m, (slot + 1) * self.m)
-        self.first[slot], self.score[slot], self.info[slot] = t, 0.0, 0.0
-        self.inputs[:, own] = self.one
-        return slice(self.columns.start + own.start, self.columns.start + own.stop)
+        self.first[slot], self.score[slot], self.info[slot] = t, 0.0, self.prior
+        self.inputs[:, slot, 0] = self.one
+        if self.drifts:
+            minutes = np.where(np.isnan(self.first), 0.0, (t - self.first) / MINUTE)
+            self.inputs[:, :, 1] = minutes[:, None] * self.one[:, None]
+        begin = self.columns.start + 2 * self.m * slot
+        return slice(begin, begin + 2 * self.m)
 
     def found(self, score: Array, G: Array, weighted: Array, speed: float) -> float | None:
         """When a fault began that a fix adds enough to be sure of, or None.
 
         Parameters
         ----------
-        score : (L m,) G^T S^-1 nu.
-        G : (n m, L m) signature, and `weighted` S^-1 G.
+        score : (2 L m,) G^T S^-1 nu.
+        G : (n m, 2 L m) signature, and `weighted` S^-1 G.
         """
         L, m = self.L, self.m
-        self.score += score.reshape(L, m)
-        G3, S3 = (x.reshape(-1, L, m).swapaxes(0, 1) for x in (G, weighted))
+        self.score += score.reshape(L, 2 * m)
+        G3, S3 = (x.reshape(-1, L, 2 * m).swapaxes(0, 1) for x in (G, weighted))
         self.info += G3.swapaxes(1, 2) @ S3
         b = np.linalg.solve(self.info, self.score[..., None])[..., 0]
         T = np.einsum("lm,lm->l", self.score, b) / self.threshold
         if T.max() <= self.typical_sigmas.factor:
             return None
-        allowed = self.stated**2 + (_CLOCKS * speed if self.moves else _CLOCKS * _BRAKING) ** 2
-        T = np.where(np.sum(b**2 / allowed, axis=1) > LARGE**2, T, 0.0)
-        worst = int(np.argmax(T))
-        return float(self.first[worst]) if T[worst] > self.typical_sigmas.factor else None
+        now = np.einsum("mlk,lk->lm", self.inputs.reshape(m, L, 2 * m), b)
+        T = np.where(matters(self.rows, now, speed), T, 0.0)
+        if T.max() <= self.typical_sigmas.factor:
+            return None
+        # of the onsets that are about as likely the latest: it takes least
+        return float(np.max(self.first[T.max() - _ONSET / self.threshold <= T]))
 
 
-def _slots(constraints: Iterable[Constraint], t: Array | None, period: float) -> dict[str, _Slots]:
+def _slots(constraints: Iterable[Constraint], t: Array | None, period: float, drifts: bool = True) -> dict[str, _Slots]:
     """Slots of each constraint, their columns behind each other; t (K,) of the keyframes, s, tells the period."""
     out: dict[str, _Slots] = {}
     end = 0
     for rows in constraints:
-        m = len(rows.axes)
         if t is not None and len(rows) > 1:
             period = float(np.median(np.diff(t[rows.keyframe])))
         L = 1 + int(np.clip(np.log2(LONGEST / max(period, 1e-3)), 0, 12))
-        columns = slice(end, end + L * m)
-        out[rows.name] = _Slots(columns, L, m, rows.typical_error(), rows.fix_of == "p")
-        end += L * m
+        columns = slice(end, end + 2 * L * len(rows.axes))
+        out[rows.name] = _Slots(columns, L, rows, drifts)
+        end = columns.stop
     return out
+
+
+def _width(some: Mapping[str, _Slots]) -> int:
+    """How many columns a bank has."""
+    return sum(2 * slots.L * slots.m for slots in some.values())
 
 
 class _InnovationLevel:
@@ -174,11 +198,12 @@ class Bank(_Tests):
     constraints : those whose rows are tested.
     t : (K,) times of the keyframes, s.
     width : of the error state.
+    drifts : whether errors may grow, too.
     """
 
-    def __init__(self, constraints: Iterable[Constraint], t: Array, width: int) -> None:
-        self._slots, self._t = _slots(constraints, t, LONGEST), t
-        self.X = np.zeros((width, sum(s.L * s.m for s in self._slots.values())))
+    def __init__(self, constraints: Iterable[Constraint], t: Array, width: int, drifts: bool = True) -> None:
+        self._slots, self._t = _slots(constraints, t, LONGEST, drifts), t
+        self.X = np.zeros((width, _width(self._slots)))
 
     def copy(self) -> Bank:
         """The same, on its own."""
@@ -191,16 +216,16 @@ class Bank(_Tests):
         self.X = move(F, decay, self.X)
 
     def signature(self, name: str, k: int, H: Array) -> Array:
-        """(n m, C) mean of an innovation at keyframe k for unit errors since each onset; a fix itself is one."""
+        """(n m, C) mean of an innovation at keyframe k for unit errors since each onset; a fix itself has them."""
         slots = self._slots[name]
         self.X[:, slots.begin(float(self._t[k]))] = 0.0
         G = -(H @ self.X)
-        own = G[:, slots.columns].reshape(-1, slots.m, slots.inputs.shape[1])
+        own = G[:, slots.columns].reshape(-1, *slots.inputs.shape)
         G[:, slots.columns] = (own + slots.inputs).reshape(len(G), -1)
         return G
 
     def own(self, name: str, G: Array) -> Array:
-        """(n m, L m) what a signature says of errors of the fixes themselves."""
+        """(n m, 2 L m) what a signature says of errors of the fixes themselves."""
         return G[:, self._slots[name].columns]
 
     def seen(self, name: str, k: int, nis: float, used: bool) -> None:
@@ -229,7 +254,7 @@ class Bank(_Tests):
 class Watch(_Tests):
     """The same tests beside a square-root message R y = z, which is then R y = z - R X b for errors b since each onset.
 
-    With columns B = 1 / sigma for them at a fix, the QR that takes in its rows leaves behind, below those of the
+    With columns B = U / sigma for them at a fix, the QR that takes in its rows leaves behind, below those of the
     message, rho - Gamma b ~ N(0, 1): rho^T rho is its NIS, and Gamma^T rho and Gamma^T Gamma add to score and info.
 
     Parameters
@@ -241,7 +266,7 @@ class Watch(_Tests):
 
     def __init__(self, constraints: Iterable[Constraint], period: float, width: int) -> None:
         self._slots = _slots(constraints, None, period)
-        self._X: Array | None = np.zeros((width, sum(s.L * s.m for s in self._slots.values())))
+        self._X: Array | None = np.zeros((width, _width(self._slots)))
         self._stands: tuple[Array, Array] | None = None  # R and R X
 
     @property
@@ -261,13 +286,14 @@ class Watch(_Tests):
         self._X, self._stands = None, (R, Z)
 
     def begin(self, name: str, t: float, sigma: Array) -> tuple[slice, slice, Array]:
-        """Begin an onset with fixes of these sigmas (n, m): its columns, those of the kind, and B (n m, L m) there."""
+        """Begin an onset with fixes of these sigmas (n, m): its columns, those of the kind, and B (n m, 2 L m)."""
         slots = self._slots[name]
         own = slots.begin(t)
-        return own, slots.columns, (slots.inputs / sigma[..., None]).reshape(sigma.size, -1)
+        inputs = slots.inputs.reshape(slots.m, -1)
+        return own, slots.columns, (inputs / sigma[..., None]).reshape(sigma.size, -1)
 
     def found(self, name: str, t: float, rho: Array, Gamma: Array, speed: float) -> float | None:
-        """When a fault began, or None, by what a fix has left behind: rho (n m,) and Gamma (n m, L m) of its kind."""
+        """When a fault began, or None, by what a fix has left behind: rho (n m,) and Gamma (n m, 2 L m) of its kind."""
         slots = self._slots[name]
         slots.typical_sigmas.add(t, float(rho @ rho))
         return slots.found(rho @ Gamma, Gamma, Gamma, speed)
