@@ -229,7 +229,7 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
         if not refined or refined == spans:
             break
         spans, without = refined, replace(without, excluded=dict.fromkeys(FIXES, tuple(refined)))
-    ways = [one, *([decide(base, other, spans)] if spans else [])]
+    ways = [one, *([decide(base, weigh_left_out(posed, other, spans), spans)] if spans else [])]
     best = max(ways, key=lambda way: way.log_evidence)
     return replace(best, passes=passes, looks=sum(way.looks for way in ways) + 4)
 
@@ -240,14 +240,33 @@ def trim_spans(problem: Problem, smoothed: SmootherPass, spans: list[tuple[float
     Tests that go forward in time leave out too much: they date a fault from one of a few onsets, and what comes after
     it is met by a filter that has been led astray.
     """
-    off: list[Array] = []
+    t = np.unique(np.concatenate([t[weight < 1.0] for t, weight in _weigh_alone(problem, smoothed).values()]))
+    within = [t[np.searchsorted(t, a - SAME_TIME) : np.searchsorted(t, b + SAME_TIME)] for a, b in spans]
+    return [(float(some[0]), float(some[-1])) for some in within if len(some)]
+
+
+def weigh_left_out(problem: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]) -> NoiseEstimate:
+    """The estimate with weights for fixes in spans that it leaves out, so that each may be an outlier by itself."""
+    weights = dict(found.noise.weights)
+    for name, (t, weight) in _weigh_alone(problem, found.points).items():
+        kept = _outside(weights.get(name, RowWeights(np.empty(0), np.empty(0))), spans)
+        inside = np.any([(t >= a - SAME_TIME) & (t <= b + SAME_TIME) for a, b in spans], axis=0)
+        inside &= np.isin(t, t[weight < 1.0])  # with all rows of their times
+        both, of_both = np.concatenate([kept.t, t[inside]]), np.concatenate([kept.weight, weight[inside]])
+        order = np.argsort(both, kind="stable")
+        weights[name] = RowWeights(both[order], of_both[order])
+    return replace(found, noise=replace(found.noise, weights=weights))
+
+
+def _weigh_alone(problem: Problem, smoothed: SmootherPass) -> dict[str, tuple[Array, Array]]:
+    """Times (N,) s of fixes, and weights (N,) by which each is as likely as chance allows where it is not used."""
+    out = {}
     for rows in problem.constraints:
         if rows.name in FIXES:
             squared = row_moments(problem, rows, smoothed, len(rows)).left_out.sum(axis=1)
-            off.append(problem.t[rows.keyframe[squared > chdtri(len(rows.axes), CHANCE)]])
-    t = np.unique(np.concatenate(off))
-    within = [t[np.searchsorted(t, a - SAME_TIME) : np.searchsorted(t, b + SAME_TIME)] for a, b in spans]
-    return [(float(some[0]), float(some[-1])) for some in within if len(some)]
+            most = chdtri(len(rows.axes), CHANCE)
+            out[rows.name] = problem.t[rows.keyframe], np.minimum(1.0, most / np.maximum(squared, 1e-30))
+    return out
 
 
 def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[tuple[float, float]]:
