@@ -32,7 +32,7 @@ docs: $(VENV)/installed-dev
 $(VENV)/installed: pyproject.toml
 	@echo "installing graphnav and what it needs into $(VENV), once: about 800 MB, a minute or two"
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet -e '.[fast]'
+	$(BIN)/pip install --quiet -e '.[fast,plots]'
 	@echo "compiling the filter and the smoother, once"
 	@$(BIN)/python -c "from graphnav import load, run; run(load('data/tokyo').crop(0.0, 60.0))"
 	@touch $@

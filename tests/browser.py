@@ -22,6 +22,8 @@ from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 DESKTOP, PHONE = (1400, 900), (390, 844)
+PLOTS = "[...document.querySelectorAll('.plot')].filter(p => !p.closest('details'))"
+DRAWN = ".js-plotly-plot"
 _PATIENCE = 60.0  # s
 
 
@@ -106,7 +108,7 @@ class Browser:
             assert time.monotonic() < end, f"never true: {expression}"
             time.sleep(0.05)
 
-    def read(self, pictures: str, drawn: str) -> None:
+    def read(self, pictures: str = PLOTS, drawn: str = DRAWN) -> None:
         """Scroll to one picture after the other until it is drawn, `drawn` of it, as they wait to be seen.
 
         None is passed before it is: a busy machine draws few frames, and what is passed between two is never seen.
@@ -192,6 +194,7 @@ def main() -> None:
         for device, size in (("desktop", DESKTOP), ("phone", PHONE)):
             for dark in (False, True):
                 one.open(page, size, dark)
+                one.wait("document.documentElement.dataset.ready !== undefined")
                 one.read()
                 time.sleep(0.5)
                 one.shot(folder / f"{page.stem}-{device}-{'dark' if dark else 'light'}.png")

@@ -16,6 +16,9 @@ Source = Annotated[
     str, typer.Argument(metavar="RECORDING", help="A folder, a .toml, a known log, or a built-in name such as kitti.")
 ]
 SEVERAL = {"allow_extra_args": True}  # of which `only` has more to say than the parser
+Format = Annotated[
+    str | None, typer.Option("--format", metavar="NAME", help="Which known log it is, where that is not seen.")
+]
 Export = Annotated[
     str | None,
     typer.Option("--export", metavar="NAMES", help="Formats to write: some of gpx,nav,nmea,csv,tum,kml,parquet."),

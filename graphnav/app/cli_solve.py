@@ -16,6 +16,7 @@ from graphnav.app.cli_options import (
     End,
     Export,
     Fire,
+    Format,
     Json,
     Noise,
     Out,
@@ -61,6 +62,7 @@ def smooth(
     point: Point = None,
     pages: Pages = True,
     require: Require = None,
+    format: Format = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -68,8 +70,8 @@ def smooth(
 ) -> None:
     """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
     asked = _Options(
-        pick_one(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
-        quiet, json, pages,
+        pick_one(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require,
+        format, topic, quiet, json, pages,
     )  # fmt: skip
     with permit_outside(allow_outside):
         _solve(asked, solver, "--solver", export, point)
@@ -117,6 +119,7 @@ def compare(
     point: Point = None,
     pages: Pages = True,
     require: Require = None,
+    format: Format = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -124,8 +127,8 @@ def compare(
 ) -> None:
     """Put the same recording through several solvers and compare them, against the truth where there is one."""
     asked = _Options(
-        pick_one(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
-        quiet, json, pages,
+        pick_one(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require,
+        format, topic, quiet, json, pages,
     )  # fmt: skip
     beside = _Beside(against or [], against_point or [], against_shift or [])
     for option, values in (("--against-point", beside.points), ("--against-shift", beside.shifts)):
@@ -144,7 +147,7 @@ def report(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Draw the pages of a run again, without solving: after another version of graphnav, or with plotly there."""
+    """Draw the pages of a run again, without solving: after another version of graphnav, or after --no-report."""
     from graphnav.app import outputs
     from graphnav.core.staging import final_path, stage_results
 
@@ -173,6 +176,7 @@ class _Options:
     start: float | None
     end: float | None
     require: list[str] | None
+    format: str | None
     topic: list[str] | None
     quiet: bool
     json: bool
@@ -214,7 +218,8 @@ def _solve(
     given: dict[str, Any] = {
         "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
         "config": asked.config and str(asked.config), "noise": asked.noise, "detectors": asked.detectors,
-        "without": asked.without, "rate": asked.rate, "start": asked.start, "end": asked.end, "topic": asked.topic,
+        "without": asked.without, "rate": asked.rate, "start": asked.start, "end": asked.end, "format": asked.format,
+        "topic": asked.topic,
         "against": (beside and [str(file) for file in beside.files]) or None,
     }  # fmt: skip
     folder = outputs.output_folder(asked.out, outputs.FILES, () if alone else chosen)
@@ -234,7 +239,8 @@ def _solve(
     request = workflow.Request(
         asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
         {k: v for k, v in given.items() if v is not None}, noise, exported=exported, point=point,
-        topics=tuple(asked.topic or ()), against=tuple(against),
+        topics=tuple(asked.topic or ()), format=asked.format, against=tuple(against),
+        judge_arms=not alone,
     )  # fmt: skip
     with bar(asked.quiet, *chosen) as progress:
         outcome = workflow.run_request(request, progress)

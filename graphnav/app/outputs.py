@@ -6,6 +6,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,7 +88,7 @@ def write_run(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
     (name,) = own_solutions(outcome.solutions)
     provenance = gather_provenance(outcome)
     failed = write_solver(outcome, name, folder, provenance, pages=pages)
-    write_outcome(outcome, provenance, folder / stored.NAME)
+    write_outcome(replace(outcome, alone=True), provenance, folder / stored.NAME)
     _insist(failed)
     return [*([folder / "report.html"] if pages else []), folder / "trajectory.csv", folder / "summary.json"]
 
@@ -128,9 +129,8 @@ def draw_again(folder: Path, part: Path) -> list[Path]:
         If there is none.
     """
     outcome, provenance = stored.read_outcome(folder / stored.NAME)
-    alone = not (folder / "comparison.csv").exists()
     try:
-        return _draw_pages(outcome, provenance, part, alone)
+        return _draw_pages(outcome, provenance, part, outcome.alone)  # the folder may hold a comparison of before
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise ConfigError(
             f"{folder / stored.NAME}: its parts do not fit together ({type(error).__name__}: {error}); solve again",

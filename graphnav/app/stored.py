@@ -34,7 +34,7 @@ from graphnav.report.plots.thinning import BINS
 from graphnav.sensors import Series, list_sensors
 
 NAME = "run.npz"
-_FORM = "graphnav-run/2"
+_FORM = "graphnav-run/3"
 _ANEW = ("between", "graphs", "own")  # what only solving again gives, and classes of a script
 _PACKAGE = __name__.partition(".")[0]
 

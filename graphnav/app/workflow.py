@@ -56,8 +56,10 @@ class Request:
     noise: GivenNoise | None = None  # to be used as it is; else what the settings say
     against: tuple[Against, ...] = ()  # trajectories of other programs to put beside the solutions
     topics: tuple[str, ...] = ()  # of a ROS bag, as `graphnav.recording.formats.read` takes them
+    format: str | None = None  # of a log, likewise
     exported: tuple[str, ...] = ()  # formats that are to be written as well, of
     point: str | None = None  # "antenna", "imu" or a lever arm
+    judge_arms: bool = False  # ask the drive for the signs of lever arms even where nothing is in doubt
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,7 @@ class Outcome:
     timings: dict[str, float]  # s by stage, of what all solvers share
     checks: tuple[Finding, ...] = ()  # what the checks of the recording found, with keys and severities
     densities: ImuNoise | None = None  # what the noise factors of the IMU are relative to, if not to what it states
+    alone: bool = False  # whether its files lie straight in the folder, as those of one solver
 
     @property
     def used_withheld(self) -> tuple[Withheld, ...]:
@@ -165,7 +168,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
 
     timings: dict[str, float] = {}
     with _measure_time(timings, "reading"):
-        whole = read(request.source, request.topics)
+        whole = read(request.source, request.topics, name=request.format)
     check_names(request.exported, whole.gps_zero)
     if request.point == "antenna" and whole.gnss is None:
         raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
@@ -200,7 +203,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
             findings += [note for note in found.notes if note not in findings]
     errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
     checks = inspection.findings
-    if list_doubts(solutions, errors):  # which costs too much to be asked where nothing is wrong
+    if request.judge_arms or list_doubts(solutions, errors):  # which takes a second
         from graphnav.estimation.antenna import find_wrong_arms
 
         checks = (*find_wrong_arms(used), *checks)
@@ -274,8 +277,11 @@ def read_part(
     end: float | None = None,
     withheld: tuple[Withheld, ...] = (),
     topics: tuple[str, ...] = (),
+    name: str | None = None,
 ) -> Recording:
     """The part asked for of a recording, without what is withheld; times in s from the recording's start.
+
+    `topics` and `name` are those of `graphnav.recording.formats.read`.
 
     Raises
     ------
@@ -284,7 +290,7 @@ def read_part(
     """
     from graphnav.recording.formats import read
 
-    whole = read(source, topics)
+    whole = read(source, topics, name=name)
     part = _crop(whole, Request(source, (), start=start, end=end))
     zero = part.start - whole.start if part is not whole else 0.0
     return _withhold(part, _move(withheld, zero), zero)[0]

@@ -2,6 +2,18 @@
 
 An epoch is one row: the numbers of its satellites one after the other, each placed by the ephemerides that were known
 when the source began. Which satellites and signals there may be, and what all epochs have in common, says the setup.
+
+In the line protocol (`graphnav.online.lines`) each satellite and signal of an epoch is, with commas between:
+
+    satellite, signal              as G05, 1C
+    code, carrier, range rate      m, cycles, m/s; blank where absent, as is
+    C/N0                           dB-Hz
+    slip, half                     1 after a loss of lock; 1 where half a cycle is open
+    frequency                      Hz
+    x, y, z, vx, vy, vz            of the satellite in the Earth-fixed frame of the transmission, m, m/s
+    clock, drift                   of the satellite, group delay taken off, m, m/s
+    code and carrier of the base   m to add to those of the rover; blank without a base
+    arc of the base, lock          a number that changes with the base's arc, -1 without; s in lock, blank if unknown
 """
 
 from __future__ import annotations

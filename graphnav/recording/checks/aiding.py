@@ -124,7 +124,7 @@ def check_gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Find
         yield Finding(
             "warning",
             f"{count} in GNSS position that the motion and the sigmas do not explain, the largest {size[worst]:.1f} m "
-            f"at {at:.1f} s from the start; a robust kernel or a gate is advisable",
+            f"at {at:.1f} s from the start; an estimated noise model weighs such down, else a robust kernel does",
             "gnss.jump",
         )
 

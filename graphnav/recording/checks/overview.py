@@ -167,7 +167,8 @@ def inspect(recording: Recording) -> Inspection:
     if recording.raw_gnss is not None and len(recording.raw_gnss):
         facts["raw_gnss"] = raw_facts(recording.raw_gnss)
         findings += raw_findings(recording.raw_gnss)
-    turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis"}
+    # of axes that are wrong already, or of forces without gravity, nothing is told by gravity
+    turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis", "imu.force_scale"}
     if vehicle and overlap and track is not None and recording.gnss is not None:
         clock = whole.clock or clock_of(recording.imu, recording.gnss)
         yaw = crosschecks.yaw_fit(recording.imu, track)

@@ -13,6 +13,7 @@ import numpy as np
 from graphnav.core.earth import ecef_to_llh, enu_axes
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import resolve_beside
+from graphnav.core.notes import key_of
 from graphnav.core.timescales import parse_clock
 from graphnav.gnss.series import RawGnss
 from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth
@@ -31,6 +32,11 @@ from graphnav.recording.formats.table import Table, read_table
 from graphnav.recording.formats.trajectories import read_trajectory
 from graphnav.sensors import list_sensors
 
+_SETTLED = {  # what a log's reader assumes, and the keys that say it
+    "axes_assumed": {"axes", "forward", "up"},
+    "lever_arm_unknown": {"lever_arm"},
+    "sigma_assumed": {"sd"},
+}
 _RAW_FILES = ("rover", "nav", "sp3", "clk", "antex", "base")
 
 
@@ -51,9 +57,12 @@ def read_folder(source: str | Path) -> Recording:
     zeros: list[float] = []  # of their clocks
     topics: dict[str, tuple[str, ...]] = {}  # asked for of each file
     known = list_sensors()
-    for section in (d.imu, d.gnss, d.odometer, *(getattr(d, name) for name in known)):
+    settled: set[str] = set()  # what logs assume and the .toml states
+    for name in ("imu", "gnss", "odometer", *known):
+        section = getattr(d, name)
         if section is not None:
             topics[section.file] = (*topics.get(section.file, ()), *section.topic)
+            settled |= {f"{name}.{said}" for said, keys in _SETTLED.items() if keys & section.model_fields_set}
 
     def table(name: str) -> Table:
         section = getattr(d, name)
@@ -97,7 +106,7 @@ def read_folder(source: str | Path) -> Recording:
                 raise RecordingError(
                     f"{path}: '{name}.{key}' is only for CSV files, and {section.file} is none", key="key.not_here"
                 )
-        remarks.extend(r for r in log.remarks if r not in remarks)
+        remarks.extend(r for r in log.remarks if r not in remarks and key_of(r) not in settled)
         if log.gps_zero is not None:
             zeros.append(log.gps_zero - section.time_offset)
         return of_log(section, held)

@@ -170,14 +170,14 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
         yield Finding(
             "warning",
             f"neighbouring fixes scatter by {scatter:.2g} m where their 1-sigma is {sd:.2g} m: look at the unit of the "
-            "sigmas",
+            "sigmas, or at sd in [gnss]",
             "gnss.sigma_small",
         )
     elif scatter < _SMOOTH * sd and np.ptp(p[:, :2]) > 0.0:
         yield Finding(
             "warning",
             f"neighbouring fixes scatter by {scatter:.2g} m only where their 1-sigma is {sd:.2g} m: look at the unit "
-            "of the sigmas",
+            "of the sigmas, or at sd in [gnss]",
             "gnss.sigma_large",
         )
     if gnss.type is not None and (fixed := gnss.type == 1).sum() >= 10:

@@ -128,17 +128,18 @@ def _draw_stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) 
 
 
 def _mark_ends(panel: Panel, en: Array, scale: float) -> None:
-    """Where the track starts and ends, the words on the side where the track is not."""
+    """Where the track starts and ends, the words on the side where the track is not, but inside the map."""
+    west, east = panel.xlim
+    edge = 0.12 * (east - west)  # the room that words take on a phone
     together = bool(np.linalg.norm(en[-1] - en[0]) < 16.0 * scale)
     few = max(1, len(en) // 30)
     for row, inner, marker, words in ((0, few, "^", "start"), (-1, max(-1 - few, -len(en)), "s", "end")):
         panel.dots(en[[row], 0], en[[row], 1], "truth", "", 10.0, marker)
-        left = en[row, 0] < en[min(inner, len(en) - 1), 0]
+        x = en[row, 0]
+        left = bool(x > east - edge or (x < en[min(inner, len(en) - 1), 0] and x > west + edge))
         if not (together and row == 0):
             words = "start and end" if together else words
-            panel.words(
-                float(en[row, 0]), float(en[row, 1]), words, "right" if left else "left", (-8 if left else 8, 0)
-            )
+            panel.words(float(x), float(en[row, 1]), words, "right" if left else "left", (-8 if left else 8, 0))
 
 
 def _scale_bar(figure: Figure, panel: Panel) -> None:
