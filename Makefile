@@ -8,16 +8,21 @@ BIN := $(VENV)/bin
 # the matrices are small: threads would only wait for each other
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test docs clean
+.PHONY: demo test check suite docs clean
 
 demo: $(VENV)/installed
 	$(BIN)/graphnav compare kitti --without gnss:400-460 -o out/demo
 
-test: $(VENV)/installed-dev
+# with `make -j2` side by side: mypy has the core that the suite's last tests leave idle
+test: check suite
+
+suite: $(VENV)/installed-dev
+	$(BIN)/pytest -n $(JOBS) --dist worksteal
+
+check: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/pytest -n $(JOBS) --dist worksteal
 
 docs: $(VENV)/installed-dev
 	$(BIN)/mkdocs build
@@ -27,7 +32,7 @@ docs: $(VENV)/installed-dev
 $(VENV)/installed: pyproject.toml
 	@echo "installing graphnav and what it needs into $(VENV), once: about 800 MB, a minute or two"
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet -e '.[fast]'
+	$(BIN)/pip install --quiet -e '.[fast,plots]'
 	@echo "compiling the filter and the smoother, once"
 	@$(BIN)/python -c "from graphnav import load, run; run(load('data/tokyo').crop(0.0, 60.0))"
 	@touch $@

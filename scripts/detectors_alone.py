@@ -23,7 +23,7 @@ from graphnav import load
 from graphnav.app.scores import Withheld, score
 from graphnav.config import Settings, settings_from
 from graphnav.detectors import detect, list_detectors
-from graphnav.detectors.base import inside, longer_than, spans_of
+from graphnav.detectors.base import longer_than, mask_inside, spans_of
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.pipeline import SOLVERS, run
 from graphnav.recording import Recording
@@ -80,7 +80,7 @@ def found_by(drive: Drive, recording: Recording, fire: str) -> list[str]:
         return ["-"] * 5
     found = detect(recording, settings_of(fire)).stationary
     t = np.arange(*drive.known, 0.02)
-    still, called = inside(t, drive.stops), inside(t, found)
+    still, called = mask_inside(t, drive.stops), mask_inside(t, found)
     late = []
     for begin, end in drive.stops:
         own = found[(found[:, 1] > begin) & (found[:, 0] < end)]

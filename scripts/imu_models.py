@@ -1,4 +1,4 @@
-"""The table of docs/imu-models.md, read off the code: python scripts/imu_models.py writes it anew."""
+"""The table of docs/experiments/imu-models.md, read off the code: python scripts/imu_models.py writes it anew."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.recording.formats.imu_models import MODELS
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "imu-models.md"
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "experiments" / "imu-models.md"
 TABLE = re.compile(r"(?<=\| --- \| ---: \| ---: \| ---: \| ---: \| --- \|\n)(\|.*\n)+")
 
 

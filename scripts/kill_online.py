@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 ENGINE: list[str] = []
+MORE: list[str] = []
 
 
 def main() -> None:
@@ -30,8 +31,10 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--engine", choices=["window", "isam2"], default="window")
+    parser.add_argument("--lag", type=float, help="s; a short one has rows settle on the way")
     options = parser.parse_args()
     ENGINE.append(options.engine)
+    MORE.extend([] if options.lag is None else ["--lag", str(options.lag)])
     rng = random.Random(options.seed)
     with tempfile.TemporaryDirectory() as folder:
         began = time.monotonic()
@@ -81,7 +84,20 @@ def alike(text: bytes, whole: bytes) -> bool:
 def start(recording: str, out: Path, resumed: bool) -> subprocess.Popen[bytes]:
     more = ["--resume"] if resumed else []
     return subprocess.Popen(
-        [sys.executable, "-m", "graphnav", "online", recording, "-o", str(out), "--quiet", "--engine", *ENGINE, *more]
+        [
+            sys.executable,
+            "-m",
+            "graphnav",
+            "online",
+            recording,
+            "-o",
+            str(out),
+            "--quiet",
+            "--engine",
+            *ENGINE,
+            *MORE,
+            *more,
+        ]
     )
 
 

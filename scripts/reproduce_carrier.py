@@ -40,7 +40,7 @@ from graphnav.gnss.load import Sources, load_raw
 from graphnav.gnss.series import RawGnss, primary
 from graphnav.gnss.sigmas import carrier_sigma
 from graphnav.gnss.signals import C
-from graphnav.gnss.single_point import SinglePoint, coefficients, look
+from graphnav.gnss.single_point import SinglePoint, choose_coefficients, look
 from graphnav.recording import Gnss, Imu, ImuNoise, Recording, Truth
 
 Array = np.ndarray
@@ -68,10 +68,10 @@ def increments(data: Path) -> None:
     raw = raw.take(primary(raw) & np.isfinite(raw.p[:, 0]) & ~(raw.cn0 < 30.0))
     epochs, of = raw.epochs
     true = truth[np.clip(np.round(epochs).astype(int), 0, len(truth) - 1)]
-    geometry = look(raw, true[of], coefficients(raw))
+    geometry = look(raw, true[of], choose_coefficients(raw))
     high = geometry.elevation > np.radians(10.0)
     raw, of = raw.take(high), of[high]
-    geometry = look(raw, true[of], coefficients(raw))
+    geometry = look(raw, true[of], choose_coefficients(raw))
     before, after = consecutive(raw, whole)
     level = geometry.distance - geometry.ionosphere + geometry.troposphere - raw.clock
     level -= raw.carrier * C / raw.frequency

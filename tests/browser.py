@@ -22,6 +22,8 @@ from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 DESKTOP, PHONE = (1400, 900), (390, 844)
+PLOTS = "[...document.querySelectorAll('.plot')].filter(p => !p.closest('details'))"
+DRAWN = ".js-plotly-plot"
 _PATIENCE = 60.0  # s
 
 
@@ -32,6 +34,8 @@ def find() -> str | None:
 
 class Browser:
     """One tab. `trouble` is everything logged as an error or thrown, `asked` every address asked for."""
+
+    density = 1  # pixels per CSS pixel; drawn by software, a page of twice as many takes four times as long to paint
 
     def __init__(self, program: str, profile: str) -> None:
         # the browser reads from 3 and writes to 4: keep our own ends away from those numbers
@@ -65,7 +69,13 @@ class Browser:
         """Go to a file, in a window of this size, as a reader with light or dark taste."""
         width, height = size
         phone = width < 600
-        self._call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=2, mobile=phone)
+        self._call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=self.density,
+            mobile=phone,
+        )
         self._call("Emulation.setTouchEmulationEnabled", enabled=phone)
         self._call("Emulation.setScriptExecutionDisabled", value=not scripts)
         self.colours(dark)
@@ -98,7 +108,7 @@ class Browser:
             assert time.monotonic() < end, f"never true: {expression}"
             time.sleep(0.05)
 
-    def read(self, pictures: str, drawn: str) -> None:
+    def read(self, pictures: str = PLOTS, drawn: str = DRAWN) -> None:
         """Scroll to one picture after the other until it is drawn, `drawn` of it, as they wait to be seen.
 
         None is passed before it is: a busy machine draws few frames, and what is passed between two is never seen.
@@ -180,9 +190,11 @@ def main() -> None:
     page, folder = Path(sys.argv[1]), Path(sys.argv[2])
     folder.mkdir(parents=True, exist_ok=True)
     with browser() as one:
+        one.density = 2
         for device, size in (("desktop", DESKTOP), ("phone", PHONE)):
             for dark in (False, True):
                 one.open(page, size, dark)
+                one.wait("document.documentElement.dataset.ready !== undefined")
                 one.read()
                 time.sleep(0.5)
                 one.shot(folder / f"{page.stem}-{device}-{'dark' if dark else 'light'}.png")

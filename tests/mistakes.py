@@ -29,14 +29,12 @@ Table = dict[str, Array]  # the columns of a CSV file by name
 HEAD = """\
 # What can go wrong
 
-Mistakes that the tests make on `data/tokyo`, and the [key](keys.md) of what graphnav finds. Run `graphnav info` first
-and read from the top: the first finding may be the cause of the others.
-
-A note changes nothing; with a warning the result suffers; an untrusted one may be wrong whatever its sigmas say; what
-is refused is not solved. An error is exit code 2 and a line that names file, line and column, and what to do.
-`graphnav init` makes CSV files of tables with other separators, decimal commas, lines of units, dates and times of day.
+Mistakes that the tests make on `data/tokyo`, and the [key](keys.md) of what `graphnav info` finds; the first finding
+may be the cause of the others. A note changes nothing; with a warning the result suffers; an untrusted one may be wrong
+whatever its sigmas say; what is refused is not solved. What cannot be read, or is no key, setting or command, is an
+error: exit code 2 and a line that names file, line and column, and what to do.
 """
-_AND = "; "
+_AND, _ERROR = "; ", "error"
 
 
 @dataclass(frozen=True)
@@ -172,19 +170,22 @@ def said(mistake: Mistake, lines: list[str]) -> list[str]:
 def finding(mistake: Mistake, lines: list[str]) -> str:
     """Severity and key of what is said, as the page has it."""
     (line, *_) = said(mistake, lines) or lines or [""]
-    return f"{line.split(': ')[0]} `{key}`" if (key := key_of(line)) else "error"
+    return f"{line.split(': ')[0]} `{key}`" if (key := key_of(line)) else _ERROR
 
 
 def page(rows: dict[str, dict[str, list[str]]]) -> str:
     """docs/mistakes.md, of the mistakes by section and finding."""
     text = HEAD
     for head, some in rows.items():
+        some = {found: every for found, every in some.items() if found != _ERROR}
+        if not some:
+            continue
         lines = [f"- {found}: {_AND.join(every)}" for found, every in some.items()]
         text += "\n".join([f"\n## {head}\n", *lines]) + "\n"
     return text
 
 
 def listed(text: str) -> dict[str, str]:
-    """The finding of each mistake on the page."""
-    rows = re.findall(r"^- (error|\w+ `[\w.]+`): (.*)$", text.removeprefix(HEAD), re.MULTILINE)
+    """The finding of each mistake on the page, which leaves out errors: they say themselves what to do."""
+    rows = re.findall(r"^- (\w+ `[\w.]+`): (.*)$", text.removeprefix(HEAD), re.MULTILINE)
     return {what: found for found, every in rows for what in every.split(_AND)}

@@ -39,12 +39,18 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "data").rglob("*.md"))]
 # a fence may be indented, as in a list
 FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
+EXAMPLE = re.compile(r"^--8<--\n(docs/examples/\w+\.py)\n--8<--\n", re.MULTILINE)
+
+
+def text_without(indent, text):
+    """Lines without what they are indented by."""
+    return re.sub(rf"^{indent}", "", text, flags=re.MULTILINE)
 
 
 def blocks(kind):
-    """(page, text) of every fenced block of a kind."""
+    """(page, text) of every fenced block of a kind, with the examples that it names in their places."""
     return [
-        (page, re.sub(rf"^{indent}", "", text, flags=re.MULTILINE))
+        (page, EXAMPLE.sub(lambda found: (ROOT / found[1]).read_text(encoding="utf-8"), text_without(indent, text)))
         for page in PAGES
         for indent, found, text in FENCE.findall(page.read_text(encoding="utf-8"))
         if found == kind

@@ -22,6 +22,7 @@ from graphnav.app.cli_options import (
     Config,
     End,
     Fire,
+    Format,
     Json,
     Out,
     Profile,
@@ -31,9 +32,9 @@ from graphnav.app.cli_options import (
     Start,
     Topic,
     Without,
-    firing,
-    only,
-    withheld_of,
+    choose_detectors,
+    collect_withheld,
+    pick_one,
 )
 from graphnav.app.talk import (
     BAD_INPUT,
@@ -90,6 +91,7 @@ def info(
     quick: Annotated[
         bool, typer.Option("--quick", help="Leave out what takes solving: the signs of lever arms.")
     ] = False,
+    format: Format = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -101,7 +103,7 @@ def info(
 
     with bar(quiet, "ekf" if antenna else "info"):
         tell("reading")
-        whole = read(only(context, recording), topic or (), allow_outside)
+        whole = read(pick_one(context, recording), topic or (), allow_outside, format)
         tell("checks")
         found = inspect(whole)
         from graphnav.estimation.antenna import find_antenna, find_wrong_arms
@@ -121,6 +123,7 @@ def detect(
     without: Without = None,
     start: Start = None,
     end: End = None,
+    format: Format = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -134,13 +137,13 @@ def detect(
     from graphnav.recording.plausibility.screening import screen_recording
     from graphnav.report import detections as detection_report
 
-    withheld = withheld_of(without, start, end)
-    settings = firing(read_settings(config), detectors)
+    withheld = collect_withheld(without, start, end)
+    settings = choose_detectors(read_settings(config), detectors)
     folder = outputs.output_folder(out)
     with bar(quiet, "detect"), permit_outside(allow_outside):
         tell("reading")
         used, said = screen_recording(
-            workflow.read_part(only(context, recording), start, end, withheld, tuple(topic or ()))
+            workflow.read_part(pick_one(context, recording), start, end, withheld, tuple(topic or ()), format)
         )
         tell("detection")
         found = detected(used, settings)
@@ -229,7 +232,9 @@ def run(arguments: list[str]) -> int:
         return fail(str(error), BAD_INPUT, debug)
     except Interrupted as error:
         return fail(str(error), INTERRUPTED, False)
-    except (KeyboardInterrupt, typer.Abort):
+    except (KeyboardInterrupt, typer.Abort) as error:
+        if isinstance(error.__cause__, EOFError):  # of which typer thinks that somebody has typed it
+            return fail(_internal(error.__cause__), INTERNAL, debug)
         code = INTERRUPTED
     except MemoryError:
         return fail("out of memory; use a shorter part (--start, --end)", INTERNAL, debug)

@@ -83,7 +83,7 @@ def fleet(
         profile,
         None if config is None else str(config),
         None,
-        noise and _full(noise),
+        noise and _resolve_noise(noise),
         " ".join(without or ()) or None,
         start,
         end,
@@ -93,7 +93,7 @@ def fleet(
         drives = manifest.read_drives(source.resolve(), asked)
     known: dict[Any, Any] = {}
     tasks = [
-        manifest.task_of(
+        manifest.build_task(
             drive, folder, known, withhold=withhold, rate=rate, pages=pages, again=again, outside=allow_outside
         )
         for drive in drives
@@ -101,7 +101,7 @@ def fleet(
     if scheduler is not None:
         found = workers.solve_on_cluster(tasks, scheduler, workers.Limits(limit, memory))
     else:
-        count = processes or _processors()
+        count = processes or _count_processors()
         found = workers.solve_here(tasks, count, workers.Limits(limit, memory or workers.share_of_memory(count)))
     done: dict[str, Row] = {}
     try:
@@ -138,12 +138,12 @@ def fleet(
         )
 
 
-def _processors() -> int:
+def _count_processors() -> int:
     """Those that this process may use, where the system says so."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _full(noise: str) -> str:
+def _resolve_noise(noise: str) -> str:
     return str(Path(noise).resolve()) if Path(noise).is_file() else noise
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from graphnav.app.cli_options import AllowOutside, Export, Json, Point, Quiet, Topic
+from graphnav.app.cli_options import AllowOutside, Export, Format, Json, Point, Quiet, Topic
 from graphnav.app.talk import bar, say, show
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import permit_outside
@@ -24,9 +24,7 @@ commands = typer.Typer()
 def convert(
     source: Annotated[str, typer.Argument(metavar="SOURCE", help="Another program's log, or a trajectory file.")],
     out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder; for a trajectory, a file will do.")],
-    format: Annotated[
-        str | None, typer.Option("--format", metavar="NAME", help="What the log is, where that is not seen.")
-    ] = None,
+    format: Format = None,
     export: Export = None,
     point: Point = None,
     rate: Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Trajectory: interpolate to.")] = None,
@@ -48,13 +46,13 @@ def convert(
         raise ConfigError(
             f"--format {format}: is for logs; what a trajectory is, is seen from its content", key="option.not_here"
         )
-    if export is not None or conversion.is_export(Path(source), out, format):
+    if export is not None or conversion.is_export(Path(source), out):
         conversion.check_rate(rate)
         alone = bool(out.suffix) and not out.is_dir()
         folder = output_folder(out.parent if alone else out)
         with bar(quiet, "convert"), stage_results(folder) as part:
             target = part / out.name if alone else part
-            _, files, notes = conversion.export_file(Path(source), target, export or format, point, rate, clock)
+            _, files, notes = conversion.export_file(source, target, export, point, rate, clock)
         files = final_path(files, part, folder)
         show(
             lambda: "\n".join([*(f"note: {note}" for note in notes), *(f"wrote {file}" for file in files)]),
@@ -84,6 +82,7 @@ def allan(
     out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into.")],
     start: Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from its start.")] = None,
     end: Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from its start.")] = None,
+    format: Format = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -93,17 +92,18 @@ def allan(
     from graphnav.app.outputs import output_folder
     from graphnav.core.errors import RecordingError
     from graphnav.core.staging import final_path, stage_results
-    from graphnav.recording.allan import allan_of, files
+    from graphnav.recording.allan import allan_of
     from graphnav.recording.draft import imu_of
     from graphnav.recording.formats import load
+    from graphnav.report import allan as pages
 
     folder = output_folder(out)
     with bar(quiet, "allan"), permit_outside(allow_outside):
         tell("reading")
-        if log.endswith((".csv", ".csv.gz")):
+        if format is None and log.endswith((".csv", ".csv.gz")):
             t, gyro, accel = imu_of(Path(log))
         else:
-            imu = load(log, topics=topic or ()).imu
+            imu = load(log, format, topic or ()).imu
             if imu is None:
                 raise RecordingError(f"{log}: holds no IMU", key="log.no_imu")
             t, gyro, accel = imu.t, imu.gyro, imu.accel
@@ -121,7 +121,7 @@ def allan(
             raise RecordingError(f"{log}: {error}", key=error.key) from None
         tell("writing")
         with stage_results(folder) as part:
-            written = files.write(result, part)
+            written = pages.write(result, part)
     written = final_path(written, part, folder)
     lines = [f"{result.duration:.0f} s at rest, {result.rate:.4g} Hz", "", "[imu.noise]", *result.lines(), ""]
     show(

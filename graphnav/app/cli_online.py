@@ -18,13 +18,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from graphnav.app.cli_options import AllowOutside, Config, Fire, Profile, Quiet, Topic, firing
+from graphnav.app.cli_options import AllowOutside, Config, Fire, Format, Profile, Quiet, Topic, choose_detectors
 from graphnav.app.talk import Interrupted, say
 from graphnav.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from graphnav.config import Settings
     from graphnav.online.session import Session
+    from graphnav.recording import Recording
 
 LONGEST = 1 << 20  # bytes of a line
 TICK = 0.5  # s between views, and of waiting for a source
@@ -56,6 +57,7 @@ def online(
     send: Annotated[bool, typer.Option("--send", help="Print the recording as lines instead of smoothing it.")] = False,
     profile: Profile = None,
     config: Config = None,
+    format: Format = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -67,14 +69,14 @@ def online(
     from graphnav.recording.formats import read
 
     if send:
-        _send(source, topic or [], allow_outside, speed)
+        _send(read(source, topic or (), allow_outside, format), speed)
         return
-    settings = firing(_override(read_settings(config, profile), lag, engine), detectors)
+    settings = choose_detectors(_override(read_settings(config, profile), lag, engine), detectors)
     if resume and out is None:
         raise ConfigError("--resume: say which folder to go on in: -o OUT", key="option.missing")
     folder = None if out is None else output_folder(out)
     live = source == "-" or source.startswith("tcp:")
-    recording = None if live else read(source, topic or (), allow_outside)
+    recording = None if live else read(source, topic or (), allow_outside, format)
     session = Session(settings, source, folder, resume, recording)
     shown = Shown(session, quiet)
     with StopRequest() as asked:
@@ -107,13 +109,12 @@ def _override(settings: Settings, lag: float | None, engine: str | None) -> Sett
     return settings_from(settings.model_dump() | {"solver": settings.solver.model_dump() | typed})
 
 
-def _send(source: str, topics: list[str], allow_outside: bool, speed: float) -> None:
+def _send(recording: Recording, speed: float) -> None:
     """Print a recording's lines, as its sensors would have sent them."""
     from graphnav.online.lines import END, lines_of
-    from graphnav.recording.formats import read
 
     pace = Pace(speed)
-    for t, line in lines_of(read(source, topics, allow_outside)):
+    for t, line in lines_of(recording):
         pace.wait(t)
         say(line, flush=speed > 0 or line == END)
 

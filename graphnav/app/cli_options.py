@@ -16,6 +16,9 @@ Source = Annotated[
     str, typer.Argument(metavar="RECORDING", help="A folder, a .toml, a known log, or a built-in name such as kitti.")
 ]
 SEVERAL = {"allow_extra_args": True}  # of which `only` has more to say than the parser
+Format = Annotated[
+    str | None, typer.Option("--format", metavar="NAME", help="Which known log it is, where that is not seen.")
+]
 Export = Annotated[
     str | None,
     typer.Option("--export", metavar="NAMES", help="Formats to write: some of gpx,nav,nmea,csv,tum,kml,parquet."),
@@ -78,7 +81,7 @@ AllowOutside = Annotated[
 ]
 
 
-def only(context: typer.Context, recording: str) -> str:
+def pick_one(context: typer.Context, recording: str) -> str:
     """The one recording that is asked for.
 
     Raises
@@ -95,7 +98,7 @@ def only(context: typer.Context, recording: str) -> str:
     return recording
 
 
-def withheld_of(without: list[str] | None, start: float | None, end: float | None) -> tuple[Any, ...]:
+def collect_withheld(without: list[str] | None, start: float | None, end: float | None) -> tuple[Any, ...]:
     """What is withheld; the span asked for must not be empty."""
     from graphnav.app import workflow
 
@@ -104,7 +107,7 @@ def withheld_of(without: list[str] | None, start: float | None, end: float | Non
     return tuple(workflow.parse_withheld(one) for one in without or ())
 
 
-def firing(settings: Settings, names: str | None) -> Settings:
+def choose_detectors(settings: Settings, names: str | None) -> Settings:
     """The settings with the detectors of --detectors; as they are without.
 
     Raises

@@ -16,6 +16,7 @@ from graphnav.app.cli_options import (
     End,
     Export,
     Fire,
+    Format,
     Json,
     Noise,
     Out,
@@ -29,9 +30,9 @@ from graphnav.app.cli_options import (
     Start,
     Topic,
     Without,
-    firing,
-    only,
-    withheld_of,
+    choose_detectors,
+    collect_withheld,
+    pick_one,
 )
 from graphnav.app.talk import bar, insist, show
 from graphnav.core.errors import ConfigError
@@ -61,6 +62,7 @@ def smooth(
     point: Point = None,
     pages: Pages = True,
     require: Require = None,
+    format: Format = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -68,8 +70,8 @@ def smooth(
 ) -> None:
     """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
     asked = _Options(
-        only(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
-        quiet, json, pages,
+        pick_one(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require,
+        format, topic, quiet, json, pages,
     )  # fmt: skip
     with permit_outside(allow_outside):
         _solve(asked, solver, "--solver", export, point)
@@ -117,6 +119,7 @@ def compare(
     point: Point = None,
     pages: Pages = True,
     require: Require = None,
+    format: Format = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -124,8 +127,8 @@ def compare(
 ) -> None:
     """Put the same recording through several solvers and compare them, against the truth where there is one."""
     asked = _Options(
-        only(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require, topic,
-        quiet, json, pages,
+        pick_one(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require,
+        format, topic, quiet, json, pages,
     )  # fmt: skip
     beside = _Beside(against or [], against_point or [], against_shift or [])
     for option, values in (("--against-point", beside.points), ("--against-shift", beside.shifts)):
@@ -144,7 +147,7 @@ def report(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Draw the pages of a run again, without solving: after another version of graphnav, or with plotly there."""
+    """Draw the pages of a run again, without solving: after another version of graphnav, or after --no-report."""
     from graphnav.app import outputs
     from graphnav.core.staging import final_path, stage_results
 
@@ -173,6 +176,7 @@ class _Options:
     start: float | None
     end: float | None
     require: list[str] | None
+    format: str | None
     topic: list[str] | None
     quiet: bool
     json: bool
@@ -205,7 +209,7 @@ def _solve(
     from graphnav.evaluation import gates
     from graphnav.recording.exporters import NAMES
 
-    withheld = withheld_of(asked.without, asked.start, asked.end)
+    withheld = collect_withheld(asked.without, asked.start, asked.end)
     convert.check_rate(asked.rate)
     chosen, alone = split_names(solvers, pipeline.KNOWN, option, "solver"), option == "--solver"
     if alone and len(chosen) > 1:
@@ -214,7 +218,8 @@ def _solve(
     given: dict[str, Any] = {
         "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
         "config": asked.config and str(asked.config), "noise": asked.noise, "detectors": asked.detectors,
-        "without": asked.without, "rate": asked.rate, "start": asked.start, "end": asked.end, "topic": asked.topic,
+        "without": asked.without, "rate": asked.rate, "start": asked.start, "end": asked.end, "format": asked.format,
+        "topic": asked.topic,
         "against": (beside and [str(file) for file in beside.files]) or None,
     }  # fmt: skip
     folder = outputs.output_folder(asked.out, outputs.FILES, () if alone else chosen)
@@ -229,12 +234,13 @@ def _solve(
             raise ConfigError(f"--against {file}: no such file", key="file.missing")
         of = convert.parse_point(beside.points[k] if beside.points else None, "--against-point")
         against.append(workflow.Against(file, of, beside.shifts[k] if beside.shifts else None))
-    settings = firing(read_settings(asked.config, asked.profile), asked.detectors)
+    settings = choose_detectors(read_settings(asked.config, asked.profile), asked.detectors)
     settings, noise = workflow.parse_noise(asked.noise, settings)
     request = workflow.Request(
         asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
         {k: v for k, v in given.items() if v is not None}, noise, exported=exported, point=point,
-        topics=tuple(asked.topic or ()), against=tuple(against),
+        topics=tuple(asked.topic or ()), format=asked.format, against=tuple(against),
+        judge_arms=not alone,
     )  # fmt: skip
     with bar(asked.quiet, *chosen) as progress:
         outcome = workflow.run_request(request, progress)

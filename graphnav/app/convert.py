@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.app.workflow import Outcome
-from graphnav.core.complaints import nearest, split_names
+from graphnav.core.complaints import split_names
 from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.files import parse_json, read_text
 from graphnav.core.interpolation import interpolate
@@ -27,6 +27,7 @@ from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.trajectories import read_trajectory
 from graphnav.recording.formats.writer import write_recording
 
+_TRAJECTORY = "trajectory.csv"
 SUMMARY = "summary.json"  # of the run that wrote a trajectory: its clock and its points
 _DENSE = 20.0  # Hz
 _ROWS = 4096  # of these, handled at once
@@ -34,16 +35,9 @@ _MOST_ROWS = 2e7
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
 
 
-def is_export(source: Path, out: Path, name: str | None) -> bool:
+def is_export(source: Path, out: Path) -> bool:
     """Whether a trajectory is to be written for another program, rather than a log to be read."""
-    if source.is_dir():
-        return False
-    if out.suffix[1:] in NAMES and not out.is_dir():
-        return True
-    if name is None or not {part.strip() for part in name.split(",")} <= set(NAMES):
-        return False
-    known = formats()
-    return name not in known or not known[name].recognises(source)
+    return out.suffix[1:] in NAMES and not out.is_dir() and not source.is_dir()
 
 
 def check_rate(rate: float | None) -> None:
@@ -68,10 +62,6 @@ def convert_log(source: str, out: Path, name: str | None, topics: Sequence[str] 
     ConfigError
         If it would be written over itself.
     """
-    if name is not None and name not in formats():
-        raise ConfigError(
-            f"--format {name}: no such format; {nearest(name, [*formats(), *NAMES])}", key="log.format_unknown"
-        )
     log = _with_measured_noise(load(source, name, topics))
     if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
         raise ConfigError(f"-o {out}: the recording is read from there; name another folder", key="output.is_input")
@@ -126,9 +116,11 @@ def parse_point(text: str | None, option: str = "--point") -> str | Array:
 
 
 def export_file(
-    source: Path, out: Path, name: str | None, point: str | None, rate: float | None, clock: str | None
+    source: str, out: Path, name: str | None, point: str | None, rate: float | None, clock: str | None
 ) -> tuple[Trajectory, list[Path], list[str]]:
-    """Write a trajectory file for other programs: into the file `out`, or into the folder `out` under its own name.
+    """Write a trajectory for other programs: into the file `out`, or into the folder `out` under its own name.
+
+    It is a file, or the folder of a run.
 
     Returns
     -------
@@ -142,21 +134,22 @@ def export_file(
     ConfigError
         For options that cannot be used.
     """
-    trajectory = read_trajectory(source)
+    file = _trajectory_file(source)
+    trajectory = read_trajectory(file)
     if out.suffix[1:] in NAMES and not out.is_dir():
         if name is not None and name != out.suffix[1:]:
             raise ConfigError(f"--export {name}: but {out.name} is to be written", key="option.not_here")
         targets = {out.suffix[1:]: out}
     else:
         assert name is not None
-        targets = {one: out / f"{source.stem}.{one}" for one in split_names(name, NAMES, "--export", "format to write")}
-    run = _run(source)
+        targets = {one: out / f"{file.stem}.{one}" for one in split_names(name, NAMES, "--export", "format to write")}
+    run = _run(file)
     arm = parse_point(point)
     if isinstance(arm, str) and arm == "antenna":
         stated = run.get("antenna_lever_arm")
         if stated is None:
             raise ConfigError(
-                f"--point antenna: no {SUMMARY} beside {source.name} says where it is; say x,y,z", key="option.point"
+                f"--point antenna: no {SUMMARY} beside {file.name} says where it is; say x,y,z", key="option.point"
             )
         arm = np.array(stated, dtype=float)
     gps_zero = run.get("gps_zero")
@@ -174,6 +167,19 @@ def export_file(
     moved = at_point(trajectory, None if isinstance(arm, str) else arm, rate)
     files = write_formats(moved, targets, gps_zero)
     return moved, files, notes
+
+
+def _trajectory_file(source: str) -> Path:
+    """The trajectory that is meant: the file itself, or that of a run's folder."""
+    path = Path(source)
+    if (path / _TRAJECTORY).is_file():
+        return path / _TRAJECTORY
+    if any(known.builtin and known.recognises(source) for known in formats().values()) or path.is_dir():
+        raise ConfigError(
+            f"{source}: is no trajectory; name a file of one, or solve: graphnav smooth {source} --export ... -o OUT",
+            key="trajectory.none",
+        )
+    return path
 
 
 def at_point(trajectory: Trajectory, arm: Array | None, rate: float | None = None) -> Trajectory:

@@ -6,6 +6,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,7 +88,7 @@ def write_run(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
     (name,) = own_solutions(outcome.solutions)
     provenance = gather_provenance(outcome)
     failed = write_solver(outcome, name, folder, provenance, pages=pages)
-    write_outcome(outcome, provenance, folder / stored.NAME)
+    write_outcome(replace(outcome, alone=True), provenance, folder / stored.NAME)
     _insist(failed)
     return [*([folder / "report.html"] if pages else []), folder / "trajectory.csv", folder / "summary.json"]
 
@@ -128,9 +129,8 @@ def draw_again(folder: Path, part: Path) -> list[Path]:
         If there is none.
     """
     outcome, provenance = stored.read_outcome(folder / stored.NAME)
-    alone = not (folder / "comparison.csv").exists()
     try:
-        return _draw_pages(outcome, provenance, part, alone)
+        return _draw_pages(outcome, provenance, part, outcome.alone)  # the folder may hold a comparison of before
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise ConfigError(
             f"{folder / stored.NAME}: its parts do not fit together ({type(error).__name__}: {error}); solve again",
@@ -167,7 +167,7 @@ def _draw_comparison(outcome: Outcome, folder: Path, provenance: Mapping[str, An
         errors={name: m.errors for name, m in outcome.metrics.items() if m.errors is not None},
         withheld=outcome.used_withheld,
         outages=outages(outcome.recording),
-        findings=_odd(outcome),
+        findings=_list_findings(outcome),
         provenance=provenance,
         noise=noise_rows(outcome, next(iter(outcome.solutions.values()))),
     )
@@ -224,7 +224,7 @@ def _draw_solver(
         errors=None if metrics is None else metrics.errors,
         withheld=outcome.used_withheld,
         outages=outages(outcome.recording),
-        findings=_odd(outcome),
+        findings=_list_findings(outcome),
         provenance=provenance,
         detectors=detectors,
         noise=noise_rows(outcome, solution),
@@ -275,7 +275,7 @@ def _calibration(p: ParameterEstimate) -> dict[str, Any]:
     }
 
 
-def _odd(outcome: Outcome) -> list[str]:
+def _list_findings(outcome: Outcome) -> list[str]:
     """What the report lists as odd."""
     lines = list(outcome.findings)
     if outcome.zero:

@@ -80,7 +80,7 @@ def score(
         if compared is not None:
             reference, arm = compared[0].t, compared[1]
             swings = compared[0].v is not None and arm is not None and bool(np.any(arm))
-        at = _epochs(solution, reference)
+        at = _choose_epochs(solution, reference)
         wanted = np.union1d(np.union1d(solution.t, at), _thin(reference, solution, _MOST_TURNING)) if swings else at
         track = _score_at(solution, wanted, placed=used.gnss is not None)
         epochs = at if len(at) else None
@@ -100,19 +100,21 @@ def _read_antenna(solution: Solution) -> AntennaCalibration:
     return AntennaCalibration(float(offset.value[-1, 0]) if offset else 0.0, lever.value[-1] if lever else None)
 
 
-def _epochs(solution: Solution, truth: Array) -> Array:
+def _choose_epochs(solution: Solution, truth: Array) -> Array:
     """Epochs to compare at: the keyframes where the truth has them and they are many, else (some of) the truth's.
 
     Never others: interpolated between keyframes, a filter would seem to know in an outage what the fix after it
-    will tell.
+    will tell. So would another program's, between its rows: they are compared where the truth has them, few or many.
     """
     truth = truth[np.isfinite(truth)]
     if len(truth) > 1:
-        t = solution.t[(solution.t >= truth[0] - _SAME) & (solution.t <= truth[-1] + _SAME)]
+        own = solution.track.t if isinstance(solution, Foreign) else solution.t
+        t = own[(own >= truth[0] - _SAME) & (own <= truth[-1] + _SAME)]
         k = np.clip(np.searchsorted(truth, t), 1, len(truth) - 1)
         before, after = t - truth[k - 1], truth[k] - t
         there = (np.minimum(np.abs(before), np.abs(after)) <= _SAME) | (before + after <= _BETWEEN_ROWS)
-        if there.sum() >= max(_ENOUGH, 0.8 * len(t)):
+        enough = max(0.8 * min(len(t), len(truth)), 2) if isinstance(solution, Foreign) else max(_ENOUGH, 0.8 * len(t))
+        if there.sum() >= enough:
             return np.asarray(t[there])
     return _thin(truth, solution, _MOST)
 

@@ -28,13 +28,13 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import times_between
 from graphnav.estimation.solution import Solution
-from graphnav.recording import Recording, rows_of
+from graphnav.recording import Recording, take_rows
 from graphnav.report.plots.detections import drawn_rows
 from graphnav.report.plots.thinning import BINS
 from graphnav.sensors import Series, list_sensors
 
 NAME = "run.npz"
-_FORM = "graphnav-run/2"
+_FORM = "graphnav-run/3"
 _ANEW = ("between", "graphs", "own")  # what only solving again gives, and classes of a script
 _PACKAGE = __name__.partition(".")[0]
 
@@ -123,7 +123,7 @@ def _thin_recording(recording: Recording) -> Recording:
     shown = np.zeros(len(imu.t), dtype=bool)
     shown[: 4 * BINS + 1] = True  # for the period, and more than is drawn without thinning
     shown[drawn_rows(imu)] = True
-    return replace(recording, imu=rows_of(imu, shown), raw_gnss=None)
+    return replace(recording, imu=take_rows(imu, shown), raw_gnss=None)
 
 
 def _pack(value: Any, arrays: list[Array]) -> Any:

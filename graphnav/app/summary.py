@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 def solver_summary(
     outcome: Outcome, name: str, spent: Mapping[str, float], provenance: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What summary.json holds; `spent` are the seconds of writing, which only the writer knows."""
+    """What summary.json holds; `spent` are the seconds that writing took."""
     from graphnav.evaluation.metrics import summary
-    from graphnav.report.sentences import doubts
+    from graphnav.report.sentences import list_doubts
 
     solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
     errors = None if metrics is None else summary(metrics)
@@ -39,7 +39,7 @@ def solver_summary(
     if errors is not None:
         nees = {key: value for key, value in errors.items() if key.startswith("nees_")}
         errors = {key: value for key, value in errors.items() if key not in nees}
-    doubted = doubts({name: solution}, {} if metrics is None or metrics.errors is None else {name: metrics.errors})
+    doubted = list_doubts({name: solution}, {} if metrics is None or metrics.errors is None else {name: metrics.errors})
     timings = {**solution.timings, "evaluation": outcome.timings["evaluation"], **spent}
     said = [Finding("untrusted", doubt, key_of(doubt)) for doubt in doubted]
     messages = dict.fromkeys([*said, *outcome.checks, *(Finding("note", note, key_of(note)) for note in notes)])

@@ -53,9 +53,9 @@ def bar(quiet: bool, *work: str) -> Iterator[Progress | None]:
 
 
 def say(text: str, flush: bool = True) -> None:
-    """Print to stdout; whoever reads may stop early."""
+    """Print to stdout; the reader may close it early."""
     try:
-        print(_plain(text), flush=flush)
+        print(_strip_controls(text), flush=flush)
     except BrokenPipeError:
         # what is still in the buffer would fail again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -66,11 +66,11 @@ def fail(reason: str, code: int, debug: bool) -> int:
     """Print the one line that says why; returns the exit code."""
     if debug:
         traceback.print_exc()
-    line = _plain(" ".join(reason.split()))
+    line = _strip_controls(" ".join(reason.split()))
     print(f"graphnav: {line if len(line) <= _LONGEST else line[:_LONGEST] + '...'}", file=sys.stderr)
     return code
 
 
-def _plain(text: str) -> str:
+def _strip_controls(text: str) -> str:
     """The text without characters that steer a terminal: words of a file may hold any."""
     return "".join(c if c in "\n\t" or c.isprintable() else "\ufffd" for c in text) if not text.isprintable() else text

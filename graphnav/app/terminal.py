@@ -36,31 +36,31 @@ _WIDEST = 1000  # characters of a table
 
 def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     """What was read, what is worth knowing, how good it is, and where to look."""
-    lines = [f"warning: {said[0].lower()}{said[1:]}" for said in _doubts(outcome)]
-    lines.append(_read(outcome))
+    lines = [f"warning: {said[0].lower()}{said[1:]}" for said in _list_doubts(outcome)]
+    lines.append(_describe_recording(outcome))
     lines += [f"  {source} withheld{'' if span is None else f' {span[0]:g}-{span[1]:g} s'}"
               for source, span in outcome.request.withheld]  # fmt: skip
     notes = [note for s in outcome.solutions.values() for note in s.notes]
-    lines += [f"  {said}" for said in _noise(outcome)]
+    lines += [f"  {said}" for said in _describe_noise(outcome)]
     severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
         if key_of(note) in ("noise.imu", "noise.rows"):
             continue  # the report has the table
         lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
-    lines += _whole(outcome)
-    lines += _spans(outcome)
-    lines += ["", _stops(outcome), "", "look at"]
+    lines += _tabulate_errors(outcome)
+    lines += _tabulate_spans(outcome)
+    lines += ["", _describe_stops(outcome), "", "look at"]
     return "\n".join([*lines, *(f"  {file}" for file in files)])
 
 
-def _doubts(outcome: Outcome) -> tuple[str, ...]:
-    from graphnav.report.sentences import doubts
+def _list_doubts(outcome: Outcome) -> tuple[str, ...]:
+    from graphnav.report.sentences import list_doubts
 
-    return doubts(outcome.solutions, {k: m.errors for k, m in outcome.metrics.items() if m.errors is not None})
+    return list_doubts(outcome.solutions, {k: m.errors for k, m in outcome.metrics.items() if m.errors is not None})
 
 
-def _noise(outcome: Outcome) -> list[str]:
+def _describe_noise(outcome: Outcome) -> list[str]:
     """The noise model in a line: what differs from what is stated."""
     from graphnav.estimation.noise.table import whole_ratio
 
@@ -81,7 +81,7 @@ def _noise(outcome: Outcome) -> list[str]:
     return [f"noise {how}, in stated sigmas: {', '.join(parts)}"]
 
 
-def _stops(outcome: Outcome) -> str:
+def _describe_stops(outcome: Outcome) -> str:
     spans = next(iter(outcome.solutions.values())).stationary
     if not len(spans):
         return "stands nowhere"
@@ -89,7 +89,7 @@ def _stops(outcome: Outcome) -> str:
     return f"{many}, {np.diff(spans).sum():.1f} s in all: detections.csv"
 
 
-def _read(outcome: Outcome) -> str:
+def _describe_recording(outcome: Outcome) -> str:
     recording = outcome.recording
     rate = 1.0 / float(np.median(np.diff(recording.imu.t)))
     parts = [f"{recording.duration:.1f} s", f"IMU {len(recording.imu.t)} rows at {rate:.4g} Hz"]
@@ -103,12 +103,13 @@ def _read(outcome: Outcome) -> str:
     return f"{recording.name} ({recording.platform}): {', '.join(parts)}"
 
 
-def _whole(outcome: Outcome) -> list[str]:
+def _tabulate_errors(outcome: Outcome) -> list[str]:
     """A row per solver: its errors, or the sigmas it states where there is nothing to compare with."""
     if not outcome.metrics:
         head = ["solver", "keyframes", "sd hor. (m)", "sd up (m)", "sd head. (deg)", "seconds"]
         rows = [
-            [name, str(len(s.t)), *(short(x) for x in _sigmas(s)), _seconds(s)] for name, s in outcome.solutions.items()
+            [name, str(len(s.t)), *(short(x) for x in _list_sigmas(s)), _format_seconds(s)]
+            for name, s in outcome.solutions.items()
         ]
         return ["no truth to compare with; medians of the sigmas stated:", *table(head, rows)]
     if all(m.closure is not None for m in outcome.metrics.values()):
@@ -124,21 +125,21 @@ def _whole(outcome: Outcome) -> list[str]:
     for name, m in outcome.metrics.items():
         row = [short(getattr(m.components[key], what)) if key in m.components else "-" for _, key, what, _ in shown]
         nees = short(m.nees["p"].mean) if "p" in m.nees else "-"
-        rows.append([name, *row, nees, _seconds(outcome.solutions[name])])
+        rows.append([name, *row, nees, _format_seconds(outcome.solutions[name])])
     return [f"errors against {outcome.against}:", *table(head, rows)]
 
 
-def _sigmas(solution: Solution) -> list[float]:
+def _list_sigmas(solution: Solution) -> list[float]:
     """Those that `summary.median_sigmas` gives, NaN where there are none."""
     found = median_sigmas(solution)
     return [found.get(key, float("nan")) for key in ("sd_h_median_m", "sd_u_median_m", "sd_heading_median_deg")]
 
 
-def _seconds(solution: Solution) -> str:
+def _format_seconds(solution: Solution) -> str:
     return f"{sum(solution.timings.values()):.2f}" if solution.timings else "-"
 
 
-def _spans(outcome: Outcome) -> list[str]:
+def _tabulate_spans(outcome: Outcome) -> list[str]:
     """For every span without a source, a row per solver."""
     lines: list[str] = []
     for k, missing in enumerate(outcome.span_names):

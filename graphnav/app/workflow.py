@@ -18,7 +18,7 @@ import numpy as np
 from graphnav.app.scores import Withheld, score
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
-from graphnav.core.complaints import nearest
+from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.findings import Finding
 from graphnav.core.notes import Note
@@ -56,8 +56,10 @@ class Request:
     noise: GivenNoise | None = None  # to be used as it is; else what the settings say
     against: tuple[Against, ...] = ()  # trajectories of other programs to put beside the solutions
     topics: tuple[str, ...] = ()  # of a ROS bag, as `graphnav.recording.formats.read` takes them
+    format: str | None = None  # of a log, likewise
     exported: tuple[str, ...] = ()  # formats that are to be written as well, of
     point: str | None = None  # "antenna", "imu" or a lever arm
+    judge_arms: bool = False  # ask the drive for the signs of lever arms even where nothing is in doubt
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,7 @@ class Outcome:
     timings: dict[str, float]  # s by stage, of what all solvers share
     checks: tuple[Finding, ...] = ()  # what the checks of the recording found, with keys and severities
     densities: ImuNoise | None = None  # what the noise factors of the IMU are relative to, if not to what it states
+    alone: bool = False  # whether its files lie straight in the folder, as those of one solver
 
     @property
     def used_withheld(self) -> tuple[Withheld, ...]:
@@ -105,7 +108,7 @@ def parse_withheld(text: str) -> Withheld:
     source, first, last = found.groups()
     if source not in sources():
         raise ConfigError(
-            f"--without {text}: no source '{source}' can be withheld; {nearest(source, sources())}",
+            f"--without {text}: no source '{source}' can be withheld; {suggest_nearest(source, sources())}",
             key="option.withheld",
         )
     if first is None:
@@ -165,7 +168,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
 
     timings: dict[str, float] = {}
     with _measure_time(timings, "reading"):
-        whole = read(request.source, request.topics)
+        whole = read(request.source, request.topics, name=request.format)
     check_names(request.exported, whole.gps_zero)
     if request.point == "antenna" and whole.gnss is None:
         raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
@@ -182,7 +185,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
         recording = replace(recording, truth=None)
 
     from graphnav.estimation.pipeline import run
-    from graphnav.report.sentences import doubts
+    from graphnav.report.sentences import list_doubts
 
     given = request.noise
     solutions = run(used, request.settings, request.solvers, progress, None if given is None else given.model)
@@ -191,7 +194,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     solutions = {
         name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
     }
-    solutions |= _beside(request, recording, solutions)
+    solutions |= _read_others(request, recording, solutions)
     spent: dict[str, float] = {}
     with _measure_time(spent, "evaluation"):
         metrics, against, names = score(recording, used, solutions, moved)
@@ -200,7 +203,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
             findings += [note for note in found.notes if note not in findings]
     errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
     checks = inspection.findings
-    if doubts(solutions, errors):  # which costs too much to be asked where nothing is wrong
+    if request.judge_arms or list_doubts(solutions, errors):  # which takes a second
         from graphnav.estimation.antenna import find_wrong_arms
 
         checks = (*find_wrong_arms(used), *checks)
@@ -224,7 +227,7 @@ def _find_densities(recording: Recording, settings: Settings, solutions: Mapping
     return with_measured_floor(without_onboard_offset(recording, settings)[0], settings)[0].imu.noise
 
 
-def _beside(request: Request, recording: Recording, solutions: Mapping[str, Solution]) -> dict[str, Solution]:
+def _read_others(request: Request, recording: Recording, solutions: Mapping[str, Solution]) -> dict[str, Solution]:
     """The trajectories of other programs, by the names of their files."""
     reference = list(solutions.values())[-1]
     out: dict[str, Solution] = {}
@@ -274,8 +277,11 @@ def read_part(
     end: float | None = None,
     withheld: tuple[Withheld, ...] = (),
     topics: tuple[str, ...] = (),
+    name: str | None = None,
 ) -> Recording:
     """The part asked for of a recording, without what is withheld; times in s from the recording's start.
+
+    `topics` and `name` are those of `graphnav.recording.formats.read`.
 
     Raises
     ------
@@ -284,7 +290,7 @@ def read_part(
     """
     from graphnav.recording.formats import read
 
-    whole = read(source, topics)
+    whole = read(source, topics, name=name)
     part = _crop(whole, Request(source, (), start=start, end=end))
     zero = part.start - whole.start if part is not whole else 0.0
     return _withhold(part, _move(withheld, zero), zero)[0]

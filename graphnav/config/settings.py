@@ -13,7 +13,7 @@ from graphnav.config.motion import FootSettings, StandstillSettings, VehicleSett
 from graphnav.config.outliers import Outliers
 from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.config.section import Section
-from graphnav.core.complaints import nearest
+from graphnav.core.complaints import suggest_nearest
 from graphnav.sensors import list_sensors
 
 Profile = Literal["car", "car+odometer", "foot"]
@@ -124,7 +124,7 @@ class Settings(Section):
     def _check_sensors(cls, sensors: dict[str, SensorSettings]) -> dict[str, SensorSettings]:
         for name in sensors:
             if name not in list_sensors():
-                raise ValueError(f"no sensor '{name}' is known; {nearest(name, tuple(list_sensors()))}")
+                raise ValueError(f"no sensor '{name}' is known; {suggest_nearest(name, tuple(list_sensors()))}")
         usual = SensorSettings()  # which need not be kept
         return {name: one for name, one in sensors.items() if one != usual}
 

@@ -97,7 +97,7 @@ class Constraint(ABC):
     watched: bool = False  # for errors that last
     unscaled: Array | None = None  # (N, m) part of the sigmas that no variance factor scales: known geometry
     weight: Array | None = None  # (N,) of each row's information, 0 = not used; all 1 when None
-    notes: tuple[str, ...] = ()  # sentences that whoever reads the result must know
+    notes: tuple[str, ...] = ()  # sentences that belong with the result
 
     def __len__(self) -> int:
         return len(self.keyframe)

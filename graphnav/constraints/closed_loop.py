@@ -1,4 +1,4 @@
-"""The end is the start, where somebody says so: p_K - p_0, with p_0 where the frame begins.
+"""The end is the start, where the recording states it: p_K - p_0, with p_0 where the frame begins.
 
 Only for recordings whose positions count from their start (no GNSS), and never where the closure itself is what is
 to be judged.

@@ -60,7 +60,7 @@ class Baseline(Constraint):
         if not used.any():
             return None
         figures = series.figures
-        wrong = Parameter(cls._wrong(), np.zeros(1), np.full(1, np.radians(figures.baseline_sigma)), "rad")
+        wrong = Parameter(cls._name_error(), np.zeros(1), np.full(1, np.radians(figures.baseline_sigma)), "rad")
         return cls(
             keyframe=keyframe[used],
             measured=series[cls.column][used, None],
@@ -72,7 +72,7 @@ class Baseline(Constraint):
         )
 
     @classmethod
-    def _wrong(cls) -> str:
+    def _name_error(cls) -> str:
         """Name of what the baseline's direction is wrong by."""
         return f"{SENSOR.name}_{cls.column}_offset"
 
@@ -83,9 +83,9 @@ class Baseline(Constraint):
         angle, by_d = self.angle(d)
         residual = angle - self.measured[rows]
         jacobians: dict[str, Any] = {"theta": -by_d[:, None, :] @ C @ rotation.skew(self.baseline)}
-        if self._wrong() in parameters:
-            residual = residual + parameters[self._wrong()]
-            jacobians[self._wrong()] = np.ones((len(residual), 1, 1))
+        if self._name_error() in parameters:
+            residual = residual + parameters[self._name_error()]
+            jacobians[self._name_error()] = np.ones((len(residual), 1, 1))
         return Linearized((residual + np.pi) % (2.0 * np.pi) - np.pi, jacobians, self.sigma[rows])
 
     @abstractmethod

@@ -41,7 +41,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
-from graphnav.constraints.standstill import standing_intervals
+from graphnav.constraints.standstill import find_standing
 from graphnav.constraints.vehicle import IntervalMotion
 from graphnav.core import rotation
 from graphnav.core.rotation import Array, mv
@@ -90,7 +90,7 @@ class Stance(Constraint):
     @classmethod
     def build(cls, scene: BuildContext) -> Stance | None:
         s, iv = scene.settings.foot, scene.intervals
-        rows, stop = standing_intervals(scene)
+        rows, stop = find_standing(scene)
         if scene.recording.platform != "foot" or not len(rows) or not s.stance:
             return None
         span, t = scene.stationary[stop], 0.5 * (iv.t0 + iv.t1)[rows]
@@ -103,7 +103,7 @@ class Stance(Constraint):
             keyframe=rows + 1,
             past=past,
             phase=landed - leaves,
-            share=_shares(landed - leaves) * _rolls(t, span, scene, s.correlation)[:, None],
+            share=_interpolate_phase(landed - leaves) * _mark_rolling(t, span, scene, s.correlation)[:, None],
             sigma=np.repeat(sigma[:, None], 3, axis=1),
             parameters=(
                 *scale_parameter(scene.recording),
@@ -130,12 +130,12 @@ class Stance(Constraint):
         return Linearized(u, J, self.sigma[rows])
 
 
-def _shares(phase: Array) -> Array:
+def _interpolate_phase(phase: Array) -> Array:
     """(N, 5) weights of the nodes for linear interpolation at phases (N,)."""
     return np.maximum(0.0, 1.0 - np.abs(phase[:, None] - _NODES) / (_NODES[1] - _NODES[0]))
 
 
-def _rolls(t: Array, span: Array, scene: BuildContext, lasts: float) -> Array:
+def _mark_rolling(t: Array, span: Array, scene: BuildContext, lasts: float) -> Array:
     """(N,) 1 at times t (N,) for so long after landing and before leaving in their stances (N, 2), else 0.
 
     A recording neither begins with a landing nor ends with a leaving.
@@ -167,7 +167,7 @@ class FootLateral(Constraint):
         if scene.recording.platform != "foot" or not len(scene.stationary) or not s.lateral:
             return None
         moving = iv.T > _SHORTEST
-        moving[standing_intervals(scene)[0]] = False
+        moving[find_standing(scene)[0]] = False
         rows = np.flatnonzero(moving)
         past = IntervalMotion.of(iv, rows, scene.frame)
         # a swing lies between two stances; the heading changes in it by the integral of the turn rate about the

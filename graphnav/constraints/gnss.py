@@ -49,18 +49,18 @@ _WHITE = 1e-3  # s, a correlation time that leaves nothing from one fix to the n
 _WINDOW = 0.05  # s each side over which turn rate and force at a fix are averaged
 
 
-def _empty(*shape: int) -> Array:
+def _make_empty(*shape: int) -> Array:
     return np.empty(shape)
 
 
-def _usable(recording: Recording) -> Array:
+def _mask_covered(recording: Recording) -> Array:
     """Mask of the fixes the IMU covers."""
     assert recording.gnss is not None
     t = recording.gnss.t
     return (t >= recording.start - SAME_TIME) & (t <= recording.end + SAME_TIME)
 
 
-def _common(scene: BuildContext, offset: str) -> dict[str, Any]:
+def _build_common(scene: BuildContext, offset: str) -> dict[str, Any]:
     """Parameters and what the solvers want to know, from the settings."""
     settings, gnss = scene.settings.gnss, scene.recording.gnss
     assert gnss is not None
@@ -102,15 +102,17 @@ class GnssPosition(Constraint):
     unit: ClassVar[str] = "m"
     fix_of: ClassVar[str] = "p"
 
-    p_n: Array = field(default_factory=lambda: _empty(0, 3))  # fixes in the navigation frame
-    R_ln: Array = field(default_factory=lambda: _empty(0, 3, 3))
-    sigma: Array = field(default_factory=lambda: _empty(0, 3))
+    p_n: Array = field(default_factory=lambda: _make_empty(0, 3))  # fixes in the navigation frame
+    R_ln: Array = field(default_factory=lambda: _make_empty(0, 3, 3))
+    sigma: Array = field(default_factory=lambda: _make_empty(0, 3))
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
-    gyro: Array = field(default_factory=lambda: _empty(0, 3))  # measured rate at the fix
-    accel: Array = field(default_factory=lambda: _empty(0, 3))  # measured force at the fix
-    g_n: Array = field(default_factory=lambda: _empty(0, 3))  # gravity there
+    gyro: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured rate at the fix
+    accel: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured force at the fix
+    g_n: Array = field(default_factory=lambda: _make_empty(0, 3))  # gravity there
     omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
-    unit_error: Array = field(default_factory=lambda: _empty(0, 3))  # the same, smoothed: the unit of lasting errors
+    unit_error: Array = field(
+        default_factory=lambda: _make_empty(0, 3)
+    )  # the same, smoothed: the unit of lasting errors
     usual_error: Array = field(
         default_factory=lambda: np.zeros(3)
     )  # median of these: the unit of what lasts for minutes and hours
@@ -119,8 +121,8 @@ class GnssPosition(Constraint):
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
         if recording.gnss is None or not settings.gnss.position or recording.tight(settings.raw_gnss.coupling):
-            return _empty(0)
-        return recording.gnss.t[_usable(recording)]
+            return _make_empty(0)
+        return recording.gnss.t[_mask_covered(recording)]
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssPosition | None:
@@ -135,7 +137,7 @@ class GnssPosition(Constraint):
         llh, sd, imu = gnss.llh[used], gnss.sd[used], scene.recording.imu
         p_n = scene.frame.from_llh(llh)
         kinds = None if gnss.type is None or len(np.unique(gnss.type)) < 2 else gnss.type[used]
-        common = _common(scene, TIME_OFFSET)
+        common = _build_common(scene, TIME_OFFSET)
         names = [""] if kinds is None else [f".{FIX_TYPES[int(kind)]}" for kind in np.unique(kinds)]
         processes: tuple[Parameter, ...] = ()
         spacing = node_spacing(scene.settings.gnss.slow_times, period(gnss.t[used]))
@@ -159,8 +161,8 @@ class GnssPosition(Constraint):
             usual_error=np.median(sd if scene.typical_sigmas is None else scene.typical_sigmas, axis=0),
             type=kinds,
             lever_arm=gnss.lever_arm,
-            gyro=around(imu, imu.gyro, gnss.t[used]),
-            accel=around(imu, imu.accel, gnss.t[used]),
+            gyro=average_around(imu, imu.gyro, gnss.t[used]),
+            accel=average_around(imu, imu.accel, gnss.t[used]),
             g_n=scene.frame.gravity_n(p_n),
             omega_n=scene.frame.omega_n,
             processes=(*processes, *_stamp_error(scene.settings, gnss.t[used])),
@@ -226,16 +228,16 @@ class GnssVelocity(Constraint):
     unit: ClassVar[str] = "m/s"
     fix_of: ClassVar[str] = "v"
 
-    v_l: Array = field(default_factory=lambda: _empty(0, 3))
-    R_ln: Array = field(default_factory=lambda: _empty(0, 3, 3))
-    sigma: Array = field(default_factory=lambda: _empty(0, 3))
-    gyro: Array = field(default_factory=lambda: _empty(0, 3))  # measured rate at the fix
-    accel: Array = field(default_factory=lambda: _empty(0, 3))  # measured force at the fix
-    g_n: Array = field(default_factory=lambda: _empty(0, 3))  # gravity there
+    v_l: Array = field(default_factory=lambda: _make_empty(0, 3))
+    R_ln: Array = field(default_factory=lambda: _make_empty(0, 3, 3))
+    sigma: Array = field(default_factory=lambda: _make_empty(0, 3))
+    gyro: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured rate at the fix
+    accel: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured force at the fix
+    g_n: Array = field(default_factory=lambda: _make_empty(0, 3))  # gravity there
     omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
     unit_error: Array = field(
-        default_factory=lambda: _empty(0, 3)
+        default_factory=lambda: _make_empty(0, 3)
     )  # stated sigma, smoothed: the unit of lasting errors
 
     @classmethod
@@ -243,8 +245,8 @@ class GnssVelocity(Constraint):
         gnss = recording.gnss
         tight = recording.tight(settings.raw_gnss.coupling)
         if gnss is None or gnss.v is None or not settings.gnss.velocity or tight:
-            return _empty(0)
-        return gnss.t[_usable(recording) & np.isfinite(gnss.v).all(axis=1)]
+            return _make_empty(0)
+        return gnss.t[_mask_covered(recording) & np.isfinite(gnss.v).all(axis=1)]
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssVelocity | None:
@@ -266,14 +268,14 @@ class GnssVelocity(Constraint):
             v_l=gnss.v[used],
             R_ln=earth.enu_axes(gnss.llh[used]) @ scene.frame.R_ne.T,
             sigma=gnss.sd_v[used],
-            gyro=around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
-            accel=around(scene.recording.imu, scene.recording.imu.accel, gnss.t[used]),
+            gyro=average_around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
+            accel=average_around(scene.recording.imu, scene.recording.imu.accel, gnss.t[used]),
             g_n=scene.frame.gravity_n(scene.frame.from_llh(gnss.llh[used])),
             omega_n=scene.frame.omega_n,
             lever_arm=gnss.lever_arm,
             unit_error=_running_median(gnss.t[used], gnss.sd_v[used]),
             processes=(lasting, *_stamp_error(scene.settings, gnss.t[used])),
-            **_common(scene, VELOCITY_TIME_OFFSET),
+            **_build_common(scene, VELOCITY_TIME_OFFSET),
         )
 
     def typical_error(self) -> Array:
@@ -351,7 +353,7 @@ def acceleration(states: States, accel: Array, g_n: Array) -> tuple[Array, dict[
     return mv(R, force) + g_n, {"theta": -R @ rotation.skew(force), "ba": -R}
 
 
-def around(imu: Imu, x: Array, t: Array) -> Array:
+def average_around(imu: Imu, x: Array, t: Array) -> Array:
     """(N, 3) mean of an IMU signal around times t: one sample's vibration would be noise times lever arm."""
     lo = np.searchsorted(imu.t, t - _WINDOW)
     hi = np.maximum(np.searchsorted(imu.t, t + _WINDOW), lo + 1)

@@ -95,7 +95,7 @@ def _use_differences(recording: Recording, settings: Settings) -> bool:
     return not (s.carrier and s.code and np.isfinite(raw.carrier_difference).any())
 
 
-def _pairs(scene: BuildContext) -> tuple[PreparedRows, _Pairs] | None:
+def _pair_rows(scene: BuildContext) -> tuple[PreparedRows, _Pairs] | None:
     if not _use_differences(scene.recording, scene.settings):
         return None
     found, whole = scene.share(prepare_rows), scene.recording.raw_gnss
@@ -114,7 +114,7 @@ def _pairs(scene: BuildContext) -> tuple[PreparedRows, _Pairs] | None:
     return found, _Pairs(before, after, of[after], epochs, first, change, clock)
 
 
-def _clones(found: PreparedRows, pairs: _Pairs) -> tuple[Parameter, ...]:
+def _clone_antennas(found: PreparedRows, pairs: _Pairs) -> tuple[Parameter, ...]:
     return tuple(
         Parameter(
             name, found.nominal[pairs.first[k::2]], np.full((len(pairs.epochs[k::2]), 3), _ANYWHERE), "m",
@@ -141,7 +141,7 @@ class GnssAntennaClone(Constraint):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssAntennaClone | None:
-        both = scene.share(_pairs)
+        both = scene.share(_pair_rows)
         if both is None:
             return None
         found, pairs = both
@@ -151,7 +151,7 @@ class GnssAntennaClone(Constraint):
             keyframe=found.keyframe[pairs.first[own]],
             lever_arm=found.raw.lever_arm,
             odd=own % 2,
-            parameters=(*parameters, *_clones(found, pairs)),
+            parameters=(*parameters, *_clone_antennas(found, pairs)),
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -193,7 +193,7 @@ class GnssCarrier(SatelliteConstraint):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssCarrier | None:
-        both = scene.share(_pairs)
+        both = scene.share(_pair_rows)
         if both is None:
             return None
         found, pairs = both
@@ -213,7 +213,7 @@ class GnssCarrier(SatelliteConstraint):
                 RATES, np.zeros(many), np.full(many, ONE / hours), "m/s", correlation_time=hours, spacing=found.spacing
             ),
             ionosphere_parameter(raw, found.spacing),
-            *_clones(found, pairs),
+            *_clone_antennas(found, pairs),
         )
         # of a phase the delay is negative; against a base the parameter is what lies between the two receivers
         delay = -obliquity(found.elevation) * (0.0 if raw.differenced else (L1 / raw.frequency) ** 2)
@@ -257,7 +257,7 @@ class GnssCarrier(SatelliteConstraint):
             J[LEVER_ARM] = -e[:, None] @ states.R_nb
         time = self.time[rows]
         own, chosen = select_columns(parameters[RATES], self.which[rows])
-        shift, more = self._lasting(parameters, (DRIFT,), rows, e)
+        shift, more = self._sum_lasting_errors(parameters, (DRIFT,), rows, e)
         residual = residual + self.slant[rows] * parameters[IONOSPHERE][:, 0] + (own + shift) * time
         J |= {IONOSPHERE: self.slant[rows, None, None], RATES: chosen * time[:, None, None]}
         J |= {name: by * time[:, None, None] for name, by in more.items()}

@@ -27,7 +27,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.constraints.base import BuildContext, Constraint, Linearized
-from graphnav.constraints.gnss import LEVER_ARM, TIMES, antenna_velocity, around, node_spacing, period
+from graphnav.constraints.gnss import LEVER_ARM, TIMES, antenna_velocity, average_around, node_spacing, period
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import earth, rotation
 from graphnav.core.notes import Note
@@ -38,7 +38,7 @@ from graphnav.gnss.ephemeris import rotate_earth
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import code_sigma, rate_sigma
 from graphnav.gnss.signals import L1, NAMES, C, satellite_name, signal_name
-from graphnav.gnss.single_point import coefficients, look, signal_groups, stretch
+from graphnav.gnss.single_point import choose_coefficients, look, signal_groups, stretch
 from graphnav.recording import Recording
 
 CLOCK = "receiver_clock"
@@ -87,12 +87,12 @@ def prepare_rows(scene: BuildContext) -> PreparedRows | None:
     if raw is None:
         return None
     keyframe = scene.keyframe_at(raw.t)
-    geometry = look(raw, raw.antenna, coefficients(raw))
+    geometry = look(raw, raw.antenna, choose_coefficients(raw))
     used = (keyframe >= 0) & (geometry.elevation >= np.radians(scene.settings.raw_gnss.elevation))
     if not used.any():
         return None
     raw, keyframe = raw.take(used), keyframe[used]
-    geometry = look(raw, raw.antenna, coefficients(raw))
+    geometry = look(raw, raw.antenna, choose_coefficients(raw))
     frame = scene.frame
     epochs, first = np.unique(raw.t, return_index=True)
     return PreparedRows(
@@ -180,7 +180,7 @@ class SatelliteConstraint(Constraint):
         lever = parameters.get(LEVER_ARM, self.lever_arm)
         return states.p + rotation.mv(states.R_nb, lever), lever
 
-    def _lasting(
+    def _sum_lasting_errors(
         self, parameters: dict[str, Array], names: tuple[str, ...], rows: slice | Array, e: Array
     ) -> tuple[Array | float, dict[str, Array]]:
         """What errors that all have in common, shifts in east, north, up, do to the rows (n,), and by how much."""
@@ -309,7 +309,7 @@ class GnssCode(RangeConstraint):
             if name in parameters:
                 own, J[name] = select_columns(parameters[name], which)
                 residual = residual + own
-        shift, more = self._lasting(parameters, CODE_ERRORS, rows, e)
+        shift, more = self._sum_lasting_errors(parameters, CODE_ERRORS, rows, e)
         return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])
 
 
@@ -352,7 +352,7 @@ class GnssDoppler(SatelliteConstraint):
             offset=-(raw.range_rate + raw.drift)[some],
             v_n=found.v_n[some],
             stretch=found.stretch[some],
-            gyro=around(imu, imu.gyro, raw.t[some]),
+            gyro=average_around(imu, imu.gyro, raw.t[some]),
             omega_n=scene.frame.omega_n,
             sigma=rate_sigma(raw.cn0, found.elevation)[some, None],
             processes=(lasting,),
@@ -376,5 +376,5 @@ class GnssDoppler(SatelliteConstraint):
         J[CLOCK] = np.broadcast_to(np.array([[0.0, 1.0]]), (len(e), 1, 2))
         if LEVER_ARM in parameters:
             J[LEVER_ARM] = J[LEVER_ARM] + by_place @ states.R_nb
-        shift, more = self._lasting(parameters, (RATE_ERROR,), rows, e)
+        shift, more = self._sum_lasting_errors(parameters, (RATE_ERROR,), rows, e)
         return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])

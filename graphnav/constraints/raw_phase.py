@@ -30,7 +30,7 @@ from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.atmosphere import obliquity
 from graphnav.gnss.sigmas import carrier_difference_sigma
 from graphnav.gnss.signals import GLONASS, L1, C
-from graphnav.gnss.single_point import coefficients, look
+from graphnav.gnss.single_point import choose_coefficients, look
 from graphnav.recording import Recording
 
 EXACT = 1e-3  # cycles, 1-sigma of a difference that is known as an integer: a tenth of a carrier's noise
@@ -70,7 +70,7 @@ class GnssPhase(RangeConstraint):
         # the epochs of the codes, whose clocks these are; all signals of a satellite
         used = (arcs.arc >= 0) & ~(raw.cn0 < s.cn0) & np.isin(keyframe, found.keyframe)
         used &= (raw.t >= scene.t[0] - SAME_TIME) & (raw.t <= scene.t[-1] + SAME_TIME)
-        geometry = look(raw, raw.antenna, coefficients(raw))
+        geometry = look(raw, raw.antenna, choose_coefficients(raw))
         used &= geometry.elevation >= np.radians(s.elevation)
         if not used.any():
             return None
@@ -84,7 +84,7 @@ class GnssPhase(RangeConstraint):
         group = arcs.satellite[there].astype(int) // 100 * 1000 + arcs.signal[there]
         group[arcs.satellite[there] // 100 == GLONASS] = -1  # each satellite has a frequency of its own
         frame, raw = scene.frame, raw.take(used)
-        geometry = look(raw, raw.antenna, coefficients(raw))
+        geometry = look(raw, raw.antenna, choose_coefficients(raw))
         common = common_fields(scene, found)
         if s.robust == "automatic":
             common["robust"] = "cauchy"  # for slips that nothing has told of

@@ -62,7 +62,7 @@ class _Free:
     groups: int
 
 
-def _free(scene: BuildContext) -> _Free | None:
+def _combine_free(scene: BuildContext) -> _Free | None:
     if not scene.settings.raw_gnss.ppp:
         return None
     found, whole = scene.share(prepare_rows), scene.recording.raw_gnss
@@ -142,7 +142,7 @@ class GnssPppCode(_Ppp):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssPppCode | None:
-        free = scene.share(_free)
+        free = scene.share(_combine_free)
         if free is None:
             return None
         rows, raw = free.rows, free.found.raw.take(free.rows.which)
@@ -178,7 +178,7 @@ class GnssPppCarrier(_Ppp):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssPppCarrier | None:
-        free = scene.share(_free)
+        free = scene.share(_combine_free)
         if free is None:
             return None
         rows = free.rows

@@ -20,21 +20,21 @@ def select_observations(recording: Recording, settings: Settings) -> RawGnss | N
     s, raw = settings.raw_gnss, recording.raw_gnss
     if raw is None or not recording.tight(s.coupling) or not len(raw):
         return None
-    used = (raw.t >= recording.start - SAME_TIME) & (raw.t <= recording.end + SAME_TIME) & usable(raw, s)
+    used = (raw.t >= recording.start - SAME_TIME) & (raw.t <= recording.end + SAME_TIME) & select_usable(raw, s)
     if s.period > 0.0 and used.any():
-        used &= np.isin(raw.t, _apart(np.unique(raw.t[used]), s.period))
+        used &= np.isin(raw.t, _keep_apart(np.unique(raw.t[used]), s.period))
     raw = raw.take(used)
     raw = raw.take(primary(raw))
     return raw if len(raw) else None
 
 
-def usable(raw: RawGnss, settings: RawGnssSettings) -> NDArray[np.bool_]:
+def select_usable(raw: RawGnss, settings: RawGnssSettings) -> NDArray[np.bool_]:
     """(N,) which rows are placed, strong enough and, with a base station, seen by it."""
     used = np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock) & ~(raw.cn0 < settings.cn0)
     return used & np.isfinite(raw.difference) if raw.differenced else used
 
 
-def _apart(t: Array, least: float) -> Array:
+def _keep_apart(t: Array, least: float) -> Array:
     """Those of some times that are so far apart at least."""
     out = [float(t[0])]
     for x in t.tolist():

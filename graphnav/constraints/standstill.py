@@ -40,7 +40,7 @@ _STANDING = 0.6  # s; in a walk no stance is that quiet for so long
 _I3 = np.eye(3)
 
 
-def standing_intervals(scene: BuildContext) -> tuple[Array, Array]:
+def find_standing(scene: BuildContext) -> tuple[Array, Array]:
     """Indices of the intervals inside stationary spans, and of the span each lies in."""
     iv, spans = scene.intervals, scene.stationary
     if not len(spans):
@@ -73,7 +73,7 @@ def _find_standing(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array
     return rows[keep], run[keep]
 
 
-def _swaying(rate: Array, T: Array, run: Array) -> Array:
+def _estimate_swaying(rate: Array, T: Array, run: Array) -> Array:
     """1-sigma (N, 3), rad/s, of the mean rates (N, 3) of intervals in which a foot stands, from how its angle wanders.
 
     A standing body sways slowly: where its rate passes zero it is not still, and what it does in one interval it does
@@ -132,7 +132,7 @@ class ZeroVelocity(_Standing):
 
     @classmethod
     def build(cls, scene: BuildContext) -> ZeroVelocity | None:
-        rows, stop = standing_intervals(scene)
+        rows, stop = find_standing(scene)
         if not len(rows) or not scene.settings.standstill.zero_velocity or scene.recording.platform == "foot":
             return None
         force, _ = unrest(scene, rows, stop)
@@ -159,7 +159,7 @@ class ZeroRate(_Standing):
 
     @classmethod
     def build(cls, scene: BuildContext) -> ZeroRate | None:
-        rows, stop = standing_intervals(scene)
+        rows, stop = find_standing(scene)
         if scene.recording.platform == "foot":
             rows, stop = _find_standing(scene, rows, stop)
         if not len(rows) or not scene.settings.standstill.zero_rate:
@@ -167,7 +167,7 @@ class ZeroRate(_Standing):
         _, rate = unrest(scene, rows, stop)
         own = scene.recording.imu.noise.gyro_noise_density / np.sqrt(scene.intervals.T[rows])
         if scene.recording.platform == "foot":
-            rate = np.hypot(rate, _swaying(scene.intervals.rate[rows], scene.intervals.T[rows], stop))
+            rate = np.hypot(rate, _estimate_swaying(scene.intervals.rate[rows], scene.intervals.T[rows], stop))
         return cls(
             keyframe=rows + 1,
             rate=scene.intervals.rate[rows] + scene.intervals.bg[rows],
@@ -194,7 +194,7 @@ class HeldPosition(_Standing):
 
     @classmethod
     def build(cls, scene: BuildContext) -> HeldPosition | None:
-        rows, stop = standing_intervals(scene)
+        rows, stop = find_standing(scene)
         if not len(rows) or not scene.settings.standstill.held_position or scene.recording.platform == "foot":
             return None
         force, _ = unrest(scene, rows, stop)
@@ -206,7 +206,7 @@ class HeldPosition(_Standing):
         return cls(
             keyframe=keyframe[order],
             sigma=np.repeat(np.concatenate([sigma[first], sigma])[order], 3, axis=1),
-            parameters=(_places(scene, np.unique(stop)),),
+            parameters=(_guess_places(scene, np.unique(stop)),),
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -214,7 +214,7 @@ class HeldPosition(_Standing):
         return Linearized(states.p - parameters[PLACE], {"p": one, PLACE: -one}, self.sigma[rows])
 
 
-def _places(scene: BuildContext, stops: Array) -> Parameter:
+def _guess_places(scene: BuildContext, stops: Array) -> Parameter:
     """One unknown place per stop: about where the fixes around it say, as far off as a vehicle can go meanwhile."""
     begins = scene.stationary[stops, 0]
     gnss = scene.recording.gnss

@@ -185,7 +185,7 @@ class _Velocity:
         return out
 
 
-def moving_rows(scene: BuildContext) -> Array:
+def find_moving_rows(scene: BuildContext) -> Array:
     """Indices of the intervals in which the vehicle does not stand, long enough to mean something."""
     t0, t1 = scene.intervals.t0, scene.intervals.t1
     usable = t1 - t0 >= _SHORTEST
@@ -196,7 +196,7 @@ def moving_rows(scene: BuildContext) -> Array:
 
 def interval_motion(scene: BuildContext) -> IntervalMotion:
     """Of the intervals `moving_rows`."""
-    return IntervalMotion.of(scene.intervals, scene.share(moving_rows), scene.frame)
+    return IntervalMotion.of(scene.intervals, scene.share(find_moving_rows), scene.frame)
 
 
 def wheel_parameters(scene: BuildContext) -> tuple[Array, list[Parameter]]:
@@ -244,7 +244,7 @@ class NonHolonomic(Wheels):
         s = scene.settings.vehicle
         if scene.recording.platform != "vehicle" or not s.nhc:
             return None
-        rows, past = scene.share(moving_rows), scene.share(interval_motion)
+        rows, past = scene.share(find_moving_rows), scene.share(interval_motion)
         lever_arm, parameters = wheel_parameters(scene)
         if s.body_sigma > 0:
             parameters.append(
@@ -292,7 +292,7 @@ class NonHolonomic(Wheels):
         return Linearized(residual - parameters[BODY] * effect, jacobians | lasting, self.sigma[rows])
 
 
-def _speed_of(odometer: Odometer, imu: Imu) -> MeanSpeed:
+def _average_speed(odometer: Odometer, imu: Imu) -> MeanSpeed:
     figures = ReadingStatistics.of(odometer)
     return MeanSpeed.of(odometer, faults(odometer, imu, figures).spans, figures)
 
@@ -318,8 +318,8 @@ class OdometerSpeed(Wheels):
         s, odometer = scene.settings.vehicle, scene.recording.odometer
         if scene.recording.platform != "vehicle" or odometer is None or not s.odometer:
             return None
-        speed = scene.speed or _speed_of(odometer, scene.recording.imu)
-        rows, past = scene.share(moving_rows), scene.share(interval_motion)
+        speed = scene.speed or _average_speed(odometer, scene.recording.imu)
+        rows, past = scene.share(find_moving_rows), scene.share(interval_motion)
         begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
         reach = REACH * odometer.delay_sigma
         good = np.all([np.isfinite(speed(begin, end, d)[0]) for d in {-reach, 0.0, reach}], axis=0)

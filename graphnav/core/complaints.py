@@ -80,10 +80,10 @@ def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
         return Note("key.missing", f"'{key}' is missing")
     if first["type"] == "value_error":  # our own sentence
         what = str(first["ctx"]["error"])
-        return Note("key.value", f"'{key}': {what}{_meaning(loc, model)}" if key else what)
+        return Note("key.value", f"'{key}': {what}{_describe_key(loc, model)}" if key else what)
     if first["type"] in ("model_type", "model_attributes_type"):
         return Note("key.table", f"'{key}' must be a table: [{key}]")
-    what = f"{first['msg'][0].lower()}{first['msg'][1:]}{_meaning(loc, model)}"
+    what = f"{first['msg'][0].lower()}{first['msg'][1:]}{_describe_key(loc, model)}"
     return Note("key.value", f"'{key}' = {shorten(first['input'])}: {what}")
 
 
@@ -93,7 +93,7 @@ def shorten(value: Any) -> str:
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
-def nearest(name: str, known: Sequence[str]) -> str:
+def suggest_nearest(name: str, known: Sequence[str]) -> str:
     """What may have been meant: the nearest of the names there are, else all of them."""
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     if close:
@@ -150,7 +150,7 @@ def _suggestion(loc: tuple[str, ...], model: type[BaseModel]) -> str:
     return f"; known keys: {', '.join(known)}"
 
 
-def _meaning(loc: tuple[str, ...], model: type[BaseModel]) -> str:
+def _describe_key(loc: tuple[str, ...], model: type[BaseModel]) -> str:
     """The unit and the sentence of a key, in brackets."""
     tables = dict(_tables(model))
     for n in range(len(loc), 0, -1):  # an entry of a tuple has the key of the tuple

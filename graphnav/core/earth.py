@@ -125,7 +125,7 @@ class LocalFrame:
 
     @cached_property
     def gravity_gradient(self) -> Array:
-        """Newton's, -(g/r)(I - 3 u u^T), 1/s^2: small, but it is what makes long outages honest."""
+        """Newton's, -(g/r)(I - 3 u u^T), 1/s^2: small, but without it long outages drift."""
         g = self.gravity_n(np.zeros(3))
         size = float(np.linalg.norm(g))
         up = -g / size

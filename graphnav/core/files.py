@@ -1,8 +1,8 @@
 """Files from anywhere, opened within limits: regular files only, of so many bytes unpacked, in lines so long.
 
 Whatever goes wrong with a file, be it that it is a pipe or a device, that its compression is damaged, or that it
-unpacks to more than anybody meant, is one sentence in the caller's own kind of error. The limits are
-`GRAPHNAV_MAX_FILE_MB` and `GRAPHNAV_MAX_LINE_KB` of the environment; SECURITY.md has their defaults.
+unpacks to far more, is one sentence in the caller's own kind of error. The limits are `GRAPHNAV_MAX_FILE_MB` and
+`GRAPHNAV_MAX_LINE_KB` of the environment; SECURITY.md has their defaults.
 
 What a file names in its turn is read only from its own folder and those in it, unless `permit_outside`.
 """
@@ -46,7 +46,7 @@ def permit_outside(allowed: bool = True) -> Iterator[None]:
         _outside.reset(before)
 
 
-def beside(source: Path, name: str, key: str, error: Kind = RecordingError) -> Path:
+def resolve_beside(source: Path, name: str, key: str, error: Kind = RecordingError) -> Path:
     """The path of a file that the file `source` names under a key.
 
     Raises
@@ -55,7 +55,7 @@ def beside(source: Path, name: str, key: str, error: Kind = RecordingError) -> P
         Of the kind given, if it lies outside the folder of `source`, symbolic links followed, or is no path at all.
     """
     path = source.parent / name
-    if not inside(path, source.parent, error):
+    if not is_inside(path, source.parent, error):
         raise error(
             f"{source}: '{key}' names a file outside the folder that it lies in; move it there, or say --allow-outside "
             "if you trust who wrote this",
@@ -65,7 +65,7 @@ def beside(source: Path, name: str, key: str, error: Kind = RecordingError) -> P
     return path
 
 
-def inside(path: Path, folder: Path, error: Kind = RecordingError) -> bool:
+def is_inside(path: Path, folder: Path, error: Kind = RecordingError) -> bool:
     """Whether a path may be read because of what a file in `folder` says."""
     try:
         return _outside.get() or path.resolve().is_relative_to(folder.resolve())
@@ -83,7 +83,7 @@ def check_inside(files: Iterable[Path], source: Path, error: Kind = RecordingErr
     """
     folder = source if source.is_dir() else source.parent
     for file in files:
-        if file.is_symlink() and not inside(file, folder, error):
+        if file.is_symlink() and not is_inside(file, folder, error):
             raise error(
                 f"{file}: is a link to outside of {folder}; say --allow-outside if you trust who made it",
                 key="file.outside",
@@ -164,7 +164,7 @@ def check_size(path: Path, count: int, error: Kind = RecordingError) -> None:
         Of the kind given.
     """
     if count > (most := _limit(MAX_FILE, 10**6)):
-        raise error(_too_large(path, most, packed=True), key="file.large")
+        raise error(_refuse_size(path, most, packed=True), key="file.large")
 
 
 def read_text(path: Path, error: Kind = RecordingError) -> str:
@@ -184,7 +184,7 @@ def read_text(path: Path, error: Kind = RecordingError) -> str:
 def parse_json(text: str) -> Any:
     """JSON, with everything that is wrong with it as a ValueError in a few words."""
     try:
-        values = json.loads(text, parse_int=_whole)
+        values = json.loads(text, parse_int=_parse_whole)
     except RecursionError:
         raise ValueError("nested too deep") from None
     return values
@@ -203,7 +203,7 @@ def parse_number(text: str) -> float:
     return float(text)
 
 
-def _whole(digits: str) -> int:
+def _parse_whole(digits: str) -> int:
     if len(digits) > 20:
         raise ValueError(f"a number of {len(digits)} digits")
     return int(digits)
@@ -223,7 +223,7 @@ def _limit(name: str, unit: int) -> int:
     return int(value * unit)
 
 
-def _too_large(path: Path, most: int, packed: bool) -> str:
+def _refuse_size(path: Path, most: int, packed: bool) -> str:
     return f"{path}: holds more than {most / 1e6:g} MB{' unpacked' if packed else ''}; if that is right, set {MAX_FILE}"
 
 
@@ -265,7 +265,7 @@ class _Bounded(io.RawIOBase):
             raise self.error(f"{self.path}: cannot be read ({cause.strerror})", key="file.unreadable") from None
         self._count += len(chunk)
         if self._count > self._most:
-            raise self.error(_too_large(self.path, self._most, self._packed), key="file.large")
+            raise self.error(_refuse_size(self.path, self._most, self._packed), key="file.large")
         if self._packed and self._count > _SMALL and self._count > _RATIO * self._size and not os.environ.get(MAX_FILE):
             raise self.error(
                 f"{self.path}: unpacks to more than {_RATIO} times its size, which no log does; if that is right, "

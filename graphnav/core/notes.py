@@ -6,7 +6,7 @@ from __future__ import annotations
 class Note(str):
     """A sentence and its stable key: where it comes from, and what it is about, such as "noise.outliers".
 
-    It is a string, so whoever only shows it need not know of keys; scripts and tests read `key`.
+    It is a string, so code that only shows it needs no keys; scripts and tests read `key`.
     """
 
     __slots__ = ("key",)

@@ -1,4 +1,4 @@
-"""How far long work is. Whoever wants to know listens; work that takes long tells, from wherever it is."""
+"""Progress of long work: a stage reports its share done, and a listener set by the caller shows it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def listening(listener: Progress | None) -> Iterator[None]:
 
 
 def tell(stage: str, share: float = 0.0) -> None:
-    """Say that a stage has come to a share of its work; nothing happens where nobody listens."""
+    """Report the share of its work that a stage has done; without a listener nothing happens."""
     listener = _LISTENER.get()
     if listener is not None:
         listener(stage, share)

@@ -28,7 +28,7 @@ def stage_results(folder: Path) -> Iterator[Path]:
     ConfigError
         If it cannot be written, as when the disk is full.
     """
-    made = _missing(folder)
+    made = _list_missing(folder)
     folder.mkdir(parents=True, exist_ok=True)
     try:
         part = Path(tempfile.mkdtemp(prefix=".graphnav-", dir=folder))
@@ -76,7 +76,7 @@ def defer_interrupts() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-def _missing(folder: Path) -> list[Path]:
+def _list_missing(folder: Path) -> list[Path]:
     """The folders on the way to `folder` that are not there, innermost first."""
     return [path for path in (folder, *folder.parents) if not path.exists()]
 

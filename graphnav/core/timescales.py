@@ -84,14 +84,14 @@ def parse_clock(text: str, t: float) -> float:
 
 
 @dataclass(frozen=True)
-class Epochs:
+class ClockOffset:
     """What lies between two clocks that are known: to be added to the second's stamps, s, and in words why."""
 
     offset: float
     words: str
 
 
-def between_clocks(t: float, zero: float | None, u: float, other: float | None) -> Epochs | None:
+def between_clocks(t: float, zero: float | None, u: float, other: float | None) -> ClockOffset | None:
     """From a clock that reads `u` to one that reads `t`, both s, whose zeros (s since the GPS epoch) may be known.
 
     Stamps above 1e9 are Unix time; those below a week are seconds of the GPS week of the others, where these are known.
@@ -109,10 +109,10 @@ def between_clocks(t: float, zero: float | None, u: float, other: float | None) 
     offset = second - first
     week = second if unix[0] else first
     if unix[0] == unix[1] or week % WEEK:
-        return Epochs(offset, f"the clocks count from {clock_words(first)} and {clock_words(second)}")
+        return ClockOffset(offset, f"the clocks count from {clock_words(first)} and {clock_words(second)}")
     leap = float(leap_seconds(gps_to_utc(np.array([week])))[0])
     begins = week + GPS_TO_UNIX - leap
-    return Epochs(
+    return ClockOffset(
         offset,
         f"GPS week {round(week / WEEK)} begins at Unix time {begins:.0f} ({GPS_TO_UNIX:.0f} + {round(week / WEEK)} x "
         f"{WEEK:.0f} - {leap:.0f} leap seconds)",

@@ -19,7 +19,7 @@ from graphnav.config.detectors import FUSED
 from graphnav.core.errors import ConfigError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, subtract_spans
+from graphnav.detectors.base import NONE, Detection, Detections, longer_than, mask_inside, subtract_spans
 from graphnav.detectors.fusion import Decision, decide, decide_fused, merge_decisions
 from graphnav.detectors.glrt import STATISTICS, glrt_statistic
 from graphnav.detectors.scene import Detector, Scene
@@ -85,7 +85,7 @@ def detect(recording: Recording, settings: Settings | None = None, since: float 
         )
     found = _decide(scene)
     reference = found.found[0]
-    mask = inside(reference.t, found.spans)
+    mask = mask_inside(reference.t, found.spans)
     answer = Detection(
         FUSED, reference.t, reference.statistic, reference.threshold, mask, found.spans, found.notes,
         {"disturbed": found.disturbed},

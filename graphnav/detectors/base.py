@@ -94,7 +94,7 @@ def longer_than(spans: Array, shortest: float) -> Array:
     return spans[spans[:, 1] - spans[:, 0] >= shortest] if len(spans) else NONE
 
 
-def inside(t: Array, spans: Array) -> Mask:
+def mask_inside(t: Array, spans: Array) -> Mask:
     """Which times lie in one of the spans (in order, without overlap); ends belong to them."""
     if not len(spans):
         return np.zeros(len(t), dtype=bool)
@@ -102,7 +102,7 @@ def inside(t: Array, spans: Array) -> Mask:
     return np.asarray((k >= 0) & (t <= spans[np.maximum(k, 0), 1]))
 
 
-def within(t: Array, spans: Array, half: float) -> Mask:
+def mask_within(t: Array, spans: Array, half: float) -> Mask:
     """Which windows of `half` s on either side of t lie wholly in one of the spans."""
     if not len(spans):
         return np.zeros(len(t), dtype=bool)

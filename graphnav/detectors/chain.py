@@ -93,7 +93,7 @@ class Outwards:
         return there if there.any() and self.way * (self.t[-1] - outer) >= 0.0 else None
 
 
-def speed_beside(b: Blocks, span: Array, way: int) -> Outwards | None:
+def find_speed_beside(b: Blocks, span: Array, way: int) -> Outwards | None:
     """Speeds beside a still span (2,) s, were it a stop, up to a gap or a turn; None where there are too few rows.
 
     What rate and force are at rest is their mean over the span, as sure as they scatter in it.
@@ -198,6 +198,6 @@ def moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
                 nearest = int(np.argmin(apart))
                 out[group[m]] = abs(known[group[of[nearest]]] + speed[nearest]) > max(apart[nearest], _SIGMAS * _LEAST)
             else:
-                # nobody knows a speed: whoever is faster than another one in the chain moves
+                # no speed is known: a stretch faster than another one in the chain moves
                 out[group[m]] = bool((speed > np.maximum(apart, _SIGMAS * _LEAST)).any())
     return out

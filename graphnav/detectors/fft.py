@@ -23,7 +23,7 @@ import numpy as np
 from graphnav.config.detectors import FftSettings
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, Mask, spans_of, within
+from graphnav.detectors.base import NONE, Detection, Mask, mask_within, spans_of
 from graphnav.detectors.motion import Speeds
 from graphnav.detectors.scene import MG, Detector, Labels, Scene
 from graphnav.detectors.spectrum import FEWEST_WINDOWS, LOWEST, IdleLine, Windows, idle_line, peaks
@@ -76,8 +76,10 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
         )
     whole = t_last - t_first < (1.0 + _STRETCH) * length * period
     half = 0.5 * length * period
-    calm = _calm(w, settings) if labels is None and settings.find_line else np.zeros(w.count)
-    inner = whole & (within(t, labels.still, half) if labels else (calm < 1.0) & ~within(t, scene.certain, half))
+    calm = _weigh_idling(w, settings) if labels is None and settings.find_line else np.zeros(w.count)
+    inner = whole & (
+        mask_within(t, labels.still, half) if labels else (calm < 1.0) & ~mask_within(t, scene.certain, half)
+    )
     line = idle_line(w, np.flatnonzero(inner)) if settings.find_line else None
     notes: list[str] = []
     if settings.find_line and line is None:
@@ -93,7 +95,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     asked: Mask = np.asarray(np.isfinite(quotient).any(axis=0))
     if line is not None:
         notes.append(Note("detectors.fft.line", _describe(line)))
-        idling = inner & _shows(height, where, line)
+        idling = inner & _detect_line(height, where, line)
         met = np.asarray((quotient[idling] < 1.0).mean(axis=0) >= _MET) if idling.any() else asked
         if labels is None:
             met = met | np.isin(CONDITIONS, _ALWAYS)
@@ -112,7 +114,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     found = np.full(w.count, np.nan)
     if usable:
         found = np.where(whole, np.nanmax(np.where(asked, quotient, np.nan), axis=1), np.nan)
-        found = np.maximum(np.maximum(found, calm), _speed_quotient(t, settings, scene.known))
+        found = np.maximum(np.maximum(found, calm), _divide_speed(t, settings, scene.known))
     mask = found < 1.0
     details = {"peak_frequency": where, "peak_amplitude": height, "bands": np.array(bands), **picture}
     if line is not None:
@@ -121,8 +123,8 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     return Detection("fft", t, found, 1.0, mask, spans, tuple(notes), details)
 
 
-def _calm(w: Windows, settings: FftSettings) -> Array:
-    """(W,) below 1 where the engine may idle, for a detector that nobody tells what stands.
+def _weigh_idling(w: Windows, settings: FftSettings) -> Array:
+    """(W,) below 1 where the engine may idle, for a detector without labels of still windows.
 
     Below the lowest idle line no peak may rise above the paper's limits, nor, where windows fall into two populations
     by what they have there, above the lower one.
@@ -133,7 +135,7 @@ def _calm(w: Windows, settings: FftSettings) -> Array:
     return np.asarray(10.0 ** (x - (0.0 if split is None else split)))
 
 
-def _shows(height: Array, where: Array, line: IdleLine) -> Mask:
+def _detect_line(height: Array, where: Array, line: IdleLine) -> Mask:
     """Windows in which the line rules the band of Peak-1 or Peak-2 of one channel at least."""
     near = np.zeros(len(height), dtype=bool)
     for k in (1, 2):
@@ -198,7 +200,7 @@ def _limits(settings: FftSettings) -> Array:
     return np.array([settings.force_limit * MG, settings.force_limit * MG, np.radians(settings.rate_limit)])
 
 
-def _speed_quotient(t: Array, settings: FftSettings, speeds: Sequence[Speeds]) -> Array:
+def _divide_speed(t: Array, settings: FftSettings, speeds: Sequence[Speeds]) -> Array:
     """Speed over the limit, the largest of all sensors; 0 where none is known."""
     out = np.zeros(len(t))
     half = 0.5 * settings.window

@@ -1,8 +1,8 @@
-"""From the detectors' answers to stationary intervals: candidates, vetoes, bridges and honest edges.
+"""From the detectors' answers to stationary intervals: candidates, vetoes, bridges and their ends.
 
 1. Stretches that a detector calls still are candidates: in the fusion the low-band GLRT, a likelihood ratio test, else
-   whoever decides alone. Their ends are moved to where the low-passed force and rate leave what they are inside (never
-   outwards past a disturbance).
+   the one that decides alone. Their ends are moved to where the low-passed force and rate leave what they are inside
+   (never outwards past a disturbance).
 2. Nothing changed in a candidate, so neither did its speed: if the speeds known inside say motion, all of it moves,
    and so does what the force links to it (`graphnav.detectors.chain`). Where no sensor looked, the speed measured last
    before it, and first after it, must be one that the force leads to from rest.
@@ -22,12 +22,21 @@ import numpy as np
 from graphnav.config.detectors import FusionSettings
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, longer_than, merge_spans, spans_of, subtract_spans, union, within
-from graphnav.detectors.chain import LONGEST, Link, Outwards, at_rest_until, link, moving_by_chain, speed_beside
+from graphnav.detectors.base import (
+    NONE,
+    Detection,
+    longer_than,
+    mask_within,
+    merge_spans,
+    spans_of,
+    subtract_spans,
+    union,
+)
+from graphnav.detectors.chain import LONGEST, Link, Outwards, at_rest_until, find_speed_beside, link, moving_by_chain
 from graphnav.detectors.low_band import Scale, low_band
-from graphnav.detectors.motion import Speeds, of_three
+from graphnav.detectors.motion import Speeds, take_median
 from graphnav.detectors.scene import Detector, Labels, Scene
-from graphnav.detectors.windows import Blocks, kernel, share_of, smooth
+from graphnav.detectors.windows import Blocks, kernel, share_of, smooth_rows
 
 LOW_BAND, FFT = "low_band_glrt", "fft"
 _LOOK = 3.0  # s about an end in which the edge is sought
@@ -65,7 +74,7 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
     i, j = max(i - len(h), 0), min(j + len(h), len(b.t))
     if j - i <= len(h) + 2:
         return middle
-    rows = smooth(b.mean[i:j, :6], h) * white
+    rows = smooth_rows(b.mean[i:j, :6], h) * white
     t = 0.5 * (b.t[i : j - len(h) + 1] + b.t[i + len(h) - 1 : j])
     rows, t = (rows, t) if way > 0 else (rows[::-1], t[::-1])
     normal = way * (t - end) < -0.5
@@ -113,7 +122,7 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
     spans = merge_spans(longer_than(spans, 3.0 * b.period))
     if not len(spans):
         return NONE, certain, ()
-    certain = _certain_motion(b, spans, speeds, certain)
+    certain = _screen_motion(b, spans, speeds, certain)
     known = np.array([_find_speed(speeds, span) for span in spans])
     moves = np.array([_leads_to_speed(b, span, speeds, scene.settings.fusion) for span in spans]) & np.isnan(known)
     rest = np.flatnonzero(~moves)  # one that moves may brake steadily: the force over it counts, not its mean
@@ -151,7 +160,7 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
     return spans, certain, tuple(notes)
 
 
-def _certain_motion(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array) -> Array:
+def _screen_motion(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array) -> Array:
     """Spans of certain motion without those in the midst of a still stretch whose speed the force does not lead to.
 
     They begin and end where nothing changes: it is the fixes, or the wheels, that are wrong.
@@ -168,7 +177,7 @@ def _certain_motion(b: Blocks, spans: Array, speeds: list[Speeds], certain: Arra
 def _still_in_motion(found: Detection, certain: Array) -> float:
     """Share of the windows in certain motion that look still; 0 where there are too few to tell."""
     step = float(found.t[1] - found.t[0]) if len(found.t) > 1 else 0.0
-    moving = within(found.t, certain, _INNER) & np.isfinite(found.statistic)
+    moving = mask_within(found.t, certain, _INNER) & np.isfinite(found.statistic)
     return float(found.mask[moving].mean()) if moving.sum() * step > _ENOUGH else 0.0
 
 
@@ -185,11 +194,11 @@ def _leads_to_speed(b: Blocks, span: Array, speeds: list[Speeds], settings: Fusi
             at = at[np.argsort(np.abs(s.t[at] - edge), kind="stable")[:3]]
             if len(at) < 3 or np.abs(s.t[at] - edge).max() > LONGEST:
                 continue
-            beside = beside or speed_beside(b, span, way)
+            beside = beside or find_speed_beside(b, span, way)
             if beside is None:
                 break
             excess = [_excess(beside, s, k, max(s.late, settings.odometer_delay)) for k in at.tolist()]
-            if of_three(*np.array(excess)) > 0.0:
+            if take_median(*np.array(excess)) > 0.0:
                 return True
     return False
 
@@ -230,14 +239,14 @@ def bridge_disturbances(b: Blocks, spans: Array, certain: Array, settings: Fusio
         moved = bool(((certain[:, 0] < span[0]) & (certain[:, 1] > before[1])).any())
         near = span[0] - before[1] <= settings.bridge
         one = link(b, before, span) if near and not moved else None
-        if one is not None and _shaken_only(one, settings):
+        if one is not None and _is_only_shaken(one, settings):
             out[-1] = np.array([before[0], span[1]])
         else:
             out.append(span)
     return np.array(out) if out else NONE
 
 
-def _shaken_only(one: Link, settings: FusionSettings) -> bool:
+def _is_only_shaken(one: Link, settings: FusionSettings) -> bool:
     """Whether what lies between two stops shook the vehicle without moving it: to and fro, but not away."""
     away = one.mean > _AWAY * settings.bridge_speed
     return one.peak < settings.bridge_speed and not away and abs(one.change) < one.tolerance

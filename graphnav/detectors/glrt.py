@@ -20,10 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, spans_of, within
+from graphnav.detectors.base import NONE, Detection, mask_within, spans_of
 from graphnav.detectors.scene import MG, Detector, Labels, Scene
-from graphnav.detectors.thresholds import fewest_errors, own_threshold
-from graphnav.detectors.windows import Blocks, running, unbroken, window_times
+from graphnav.detectors.thresholds import find_fewest_errors, own_threshold
+from graphnav.detectors.windows import Blocks, find_unbroken, sum_running, window_times
 
 _TINY = 1e-300
 _STEP = 0.1  # s between windows
@@ -89,7 +89,7 @@ def glrt_statistic(
     """
     if len(accel) < window:
         return np.zeros(0)
-    return STATISTICS[name](running(rows_for(accel, gyro)).means(window), sigma_a, sigma_w, g)
+    return STATISTICS[name](sum_running(rows_for(accel, gyro)).means(window), sigma_a, sigma_w, g)
 
 
 def stance_mask(statistic: Array, threshold: float, window: int) -> np.ndarray:
@@ -123,7 +123,10 @@ def window_means(b: Blocks, length: float) -> Means | None:
     if count < window:
         return None
     return Means(
-        window_times(middle, window), 0.5 * length, running(rows).means(window), unbroken(whole, window, first=0)
+        window_times(middle, window),
+        0.5 * length,
+        sum_running(rows).means(window),
+        find_unbroken(whole, window, first=0),
     )
 
 
@@ -152,7 +155,7 @@ class _Windowed(Detector):
             return Detection(name, none, none, least, none > 0, NONE, (f"{name}: shorter than a window",))
         per_row = 1.0 / np.sqrt(scene.blocks.row_period)
         sigma_a, sigma_w = noise.accel_noise_density * per_row, noise.gyro_noise_density * per_row
-        reference = _quietest(m) if labels is None else within(m.t, labels.still, m.half)
+        reference = _find_quietest(m) if labels is None else mask_within(m.t, labels.still, m.half)
         at_rest = bool(reference.any())
         means, g = _centre(m.rows, reference if at_rest else np.ones(len(m.t), dtype=bool), scene.gravity, at_rest)
         values = np.where(m.whole, STATISTICS[name](means, sigma_a, sigma_w, g), np.nan)
@@ -161,11 +164,11 @@ class _Windowed(Detector):
         if name == "glrt" and settings.threshold is not None:
             threshold = settings.threshold
         elif labels is None:
-            most = least + float(STATISTICS[name](_idling(scene, g), sigma_a, sigma_w, g)[0])
+            most = least + float(STATISTICS[name](_average_idling(scene, g), sigma_a, sigma_w, g)[0])
             threshold, notes = own_threshold(scene, name, m.t, m.half, values, least, most)
         elif at_rest:
-            in_motion = within(m.t, labels.moving, m.half)
-            threshold, _ = fewest_errors(values[reference & m.whole], values[in_motion & m.whole], least)
+            in_motion = mask_within(m.t, labels.moving, m.half)
+            threshold, _ = find_fewest_errors(values[reference & m.whole], values[in_motion & m.whole], least)
         mask = values < threshold
         return Detection(name, m.t, values, threshold, mask, spans_of(mask, m.t, m.half), notes)
 
@@ -203,7 +206,7 @@ def _centre(rows: Array, reference: Array, g: float, at_rest: bool) -> tuple[Arr
     return means, measured if at_rest and abs(measured / g - 1.0) < _SCALE else g
 
 
-def _quietest(m: Means) -> Array:
+def _find_quietest(m: Means) -> Array:
     """(W,) bool, the second of windows in which force and rate scatter least: whatever moves, it is the likeliest rest.
 
     Each against its own typical scatter, so that neither unit decides.
@@ -216,7 +219,7 @@ def _quietest(m: Means) -> Array:
     return np.asarray(scatter <= np.partition(scatter, few)[few])
 
 
-def _idling(scene: Scene, g: float) -> Array:
+def _average_idling(scene: Scene, g: float) -> Array:
     """(1, 9) means of a window with an engine that idles at the limits of Li 2024: Peak-1 and Peak-2 of every axis.
 
     A line of amplitude A has the mean square A^2 / 2, so every axis has the mean square A^2.

@@ -20,10 +20,10 @@ import numpy as np
 from graphnav.config.detectors import LowBandSettings
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, longer_than, spans_of, within
+from graphnav.detectors.base import NONE, Detection, longer_than, mask_within, spans_of
 from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.thresholds import FEWEST, MISLABELLED, MISTAKEN, log_statistic, valley
-from graphnav.detectors.windows import LowPassed, running, unbroken, window_times
+from graphnav.detectors.windows import LowPassed, find_unbroken, sum_running, window_times
 from graphnav.recording import ImuNoise
 
 NAME = "low_band_glrt"
@@ -60,13 +60,13 @@ class Scale:
     overstated: bool = False  # the recording knows windows far below that
 
 
-def spreads(low: LowPassed, window: int) -> Array:
+def measure_spreads(low: LowPassed, window: int) -> Array:
     """Variance per axis of force and of rate in every window of low-passed rows, (W, 2); NaN where a gap lies in it."""
     rows = low.rows - low.rows.mean(axis=0)
-    sums = running(np.concatenate([rows, rows**2], axis=1)).means(window)
+    sums = sum_running(np.concatenate([rows, rows**2], axis=1)).means(window)
     spread = np.maximum(sums[:, 6:] - sums[:, :6] ** 2, 0.0)
     each = np.stack([spread[:, :3].mean(axis=1), spread[:, 3:].mean(axis=1)], -1)
-    return np.where(unbroken(low.whole, window)[:, None], each, np.nan)
+    return np.where(find_unbroken(low.whole, window)[:, None], each, np.nan)
 
 
 def scale(low: LowPassed, noise: ImuNoise, settings: LowBandSettings, spread: Array) -> Scale:
@@ -87,7 +87,7 @@ def scale(low: LowPassed, noise: ImuNoise, settings: LowBandSettings, spread: Ar
     return Scale(float(force), float(rate), expected, bool((stated > _OVERSTATED * np.hypot(floor, sway)).any()))
 
 
-def statistic(spread: Array, s: Scale) -> Array:
+def compute_statistic(spread: Array, s: Scale) -> Array:
     """S of windows with these variances per axis, (W,)."""
     return np.asarray(0.5 * (spread[:, 0] / s.force**2 + spread[:, 1] / s.rate**2))
 
@@ -107,9 +107,9 @@ def detect_low_band(
         nothing = Detection(NAME, empty, empty, settings.threshold, empty > 0, NONE)
         return nothing, scale(low, noise, settings, np.zeros((0, 2)))
     t = window_times(low.t, window)
-    spread = spreads(low, window)
+    spread = measure_spreads(low, window)
     s = scale(low, noise, settings, spread)
-    found = statistic(spread, s)
+    found = compute_statistic(spread, s)
     threshold, notes = _threshold(t, found, settings, moving, low.period, s)
     mask = found < threshold
     # a window says nothing of where in it motion began: only what all windows over it call still is
@@ -124,7 +124,7 @@ def _threshold(
         return settings.threshold, ()
     x, start = log_statistic(found), float(np.log10(settings.threshold))
     swaying = 0.5 * ((settings.force / s.force) ** 2 + (settings.rate / s.rate) ** 2)
-    label = within(t, moving, settings.window) & np.isfinite(x)
+    label = mask_within(t, moving, settings.window) & np.isfinite(x)
     split = valley(x, start - _DOWN, start + _UP + float(np.log10(s.stated)), round(FEWEST / period))
     if split is not None and not (label.any() and np.mean(x[label] < split) > MISLABELLED):
         return float(10.0**split), ()

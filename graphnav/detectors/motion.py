@@ -71,13 +71,13 @@ def speeds(recording: Recording, settings: FusionSettings) -> list[Speeds]:
     return [s for s in found if len(s.t) >= _MEDIAN]
 
 
-def moving(found: list[Speeds]) -> Array:
+def find_moving(found: list[Speeds]) -> Array:
     """(M, 2) s, spans of certain motion: less at the ends by what the stamps may be late and the speeds are blurred."""
     parts = []
     for s in found:
         excess = s.speed - s.limit
         k = np.arange(len(excess))
-        fast = of_three(excess[np.maximum(k - 1, 0)], excess, excess[np.minimum(k + 1, len(k) - 1)]) > 0.0
+        fast = take_median(excess[np.maximum(k - 1, 0)], excess, excess[np.minimum(k + 1, len(k) - 1)]) > 0.0
         breaks = np.diff(s.t) > _LONGEST
         spans = [spans_of(fast[a:b], s.t[a:b]) for a, b in _pieces(breaks)]
         one = union([p for p in spans if len(p)]) if any(len(p) for p in spans) else NONE
@@ -87,7 +87,7 @@ def moving(found: list[Speeds]) -> Array:
     return merge_spans(np.concatenate(parts)) if parts else NONE
 
 
-def of_three(a: Array, b: Array, c: Array) -> Array:
+def take_median(a: Array, b: Array, c: Array) -> Array:
     """Median of three, element by element."""
     return np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
 
@@ -98,7 +98,7 @@ def _pieces(breaks: np.ndarray) -> list[tuple[int, int]]:
     return list(zip([0, *ends], [*ends, len(breaks) + 1], strict=True))
 
 
-def smallest_step(values: Array) -> float:
+def find_smallest_step(values: Array) -> float:
     """Smallest step between the values of a quantised sensor; tiny where it is none."""
     steps = np.diff(np.unique(np.abs(values)))
     steps = steps[steps > 1e-6]
@@ -107,7 +107,7 @@ def smallest_step(values: Array) -> float:
 
 def _odometer(o: Odometer, settings: FusionSettings) -> Speeds:
     # one pulse in a period may be the jitter of a wheel that stands on a tooth
-    limit = max(settings.max_speed, 1.5 * smallest_step(o.speed))
+    limit = max(settings.max_speed, 1.5 * find_smallest_step(o.speed))
     return Speeds(o.t, o.speed[:, None], np.full(len(o.t), limit), settings.odometer_delay)
 
 

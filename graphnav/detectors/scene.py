@@ -15,7 +15,7 @@ from graphnav.core.findings import period_of
 from graphnav.core.rotation import Array
 from graphnav.core.shared import Shared
 from graphnav.detectors.base import Detection
-from graphnav.detectors.motion import Speeds, moving, speeds
+from graphnav.detectors.motion import Speeds, find_moving, speeds
 from graphnav.detectors.windows import Blocks, LowPassed, blocks, low_pass
 from graphnav.recording import Recording
 
@@ -53,7 +53,7 @@ class Scene(Shared):
     @cached_property
     def certain(self) -> Array:
         """(M, 2) s, spans in which odometer or GNSS are certain of motion."""
-        return moving(self.known)
+        return find_moving(self.known)
 
     @cached_property
     def gravity(self) -> float:

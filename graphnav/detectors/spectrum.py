@@ -128,7 +128,7 @@ def idle_line(windows: Windows, still: Array) -> IdleLine | None:
     reach = max(2, round(_FLOOR / f[1]))
     spectra = np.concatenate([a for _, a in windows.amplitudes(some)])
     power = 2.0 * np.log(np.maximum(spectra, 1e-12))
-    clear = np.asarray((power - _around(power, reach)).max(axis=1))  # (w, F), the clearest channel
+    clear = np.asarray((power - _take_local_median(power, reach)).max(axis=1))  # (w, F), the clearest channel
     quarter = max(1, len(some) // 4)
     line = np.sort(clear, axis=0)[-quarter:].mean(axis=0)
     # noise alone reaches something too; a line lies above what half the bins do
@@ -147,13 +147,13 @@ def idle_line(windows: Windows, still: Array) -> IdleLine | None:
     shown = clear[:, best - 1 : best + 2].max(axis=1) > _CLEAR
     shown = shown if shown.any() else np.ones(len(some), dtype=bool)
     # of the channel in which it stands out most
-    floor = np.exp(0.5 * _around(power, reach)[..., best])
+    floor = np.exp(0.5 * _take_local_median(power, reach)[..., best])
     strongest = int(np.median(height[shown] / floor[shown], axis=0).argmax())
     low, middle, high = np.quantile(where[shown, strongest], [0.05, 0.5, 0.95])
     return IdleLine(float(middle), float(low), float(high), float(line[best]), second(best), float(shown.mean()))
 
 
-def _around(power: Array, reach: int) -> Array:
+def _take_local_median(power: Array, reach: int) -> Array:
     """Median of the spectrum around each bin, by blocks of `reach` bins."""
     n = power.shape[-1] // reach
     if n < 2:

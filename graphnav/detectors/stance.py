@@ -32,9 +32,9 @@ from graphnav.config.detectors import FUSED, StanceSettings
 from graphnav.core import rotation
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, Detections, inside, longer_than, merge_spans, spans_of, union
+from graphnav.detectors.base import NONE, Detection, Detections, longer_than, mask_inside, merge_spans, spans_of, union
 from graphnav.detectors.glrt import glrt_statistic
-from graphnav.detectors.windows import running, unbroken
+from graphnav.detectors.windows import find_unbroken, sum_running
 from graphnav.recording import Imu
 
 _QUIET = 1.0  # s; the quietest of the recording says what bias and gravity are
@@ -61,12 +61,12 @@ def detect_stances(
         return Detections(
             NONE, (), (Note("detectors.too_short", "no detection: the recording is shorter than a window"),)
         )
-    bias, g = _quietest(imu, period)
+    bias, g = _average_quietest(imu, period)
     found: list[Detection] = []
     kept, notes = [], []
     for name in which:
         e = np.sqrt(glrt_statistic(imu.accel, imu.gyro - bias, window, settings.force_per_rate, 1.0, g, name))
-        found.append(_below(name, e, imu, period, window, settings))
+        found.append(_find_below(name, e, imu, period, window, settings))
         one = found[-1]
         deep = one.intervals[_as_deep_as_others(one.intervals, one.t, one.statistic, settings.threshold)]
         if len(deep) < len(one.intervals):
@@ -84,15 +84,15 @@ def detect_stances(
         return Detections(NONE, (), ())
     spans = union(kept) if len(kept) > 1 else kept[0]
     first = found[0]
-    mask = inside(first.t, spans)
+    mask = mask_inside(first.t, spans)
     found.append(Detection(FUSED, first.t, first.statistic, settings.threshold, mask, spans, tuple(notes)))
     return Detections(spans, tuple(found), tuple(notes))
 
 
-def _below(name: str, e: Array, imu: Imu, period: float, window: int, settings: StanceSettings) -> Detection:
+def _find_below(name: str, e: Array, imu: Imu, period: float, window: int, settings: StanceSettings) -> Detection:
     """Spans in which e is below its threshold."""
     t = 0.5 * (imu.t[: len(e)] + imu.t[window - 1 :]) - 0.5 * period  # a row speaks for the period before it
-    whole = unbroken(np.r_[True, np.diff(imu.t) < period + settings.bridge], window)
+    whole = find_unbroken(np.r_[True, np.diff(imu.t) < period + settings.bridge], window)
     e = np.where(whole, e, np.nan)
     below = e < settings.threshold
     spans = longer_than(merge_spans(spans_of(below, t, 0.5 * period), settings.bridge), settings.shortest)
@@ -105,11 +105,11 @@ def _below(name: str, e: Array, imu: Imu, period: float, window: int, settings: 
     return Detection(name, t, e, settings.threshold, below, spans)
 
 
-def _quietest(imu: Imu, period: float) -> tuple[Array, float]:
+def _average_quietest(imu: Imu, period: float) -> tuple[Array, float]:
     """Mean rate (3,) and size of the mean force of the second in which both scatter least."""
     n = min(len(imu.t), max(2, round(_QUIET / period)))
     rows = np.column_stack([imu.gyro, imu.accel])
-    means, squares = running(rows).means(n), running(rows**2).means(n)
+    means, squares = sum_running(rows).means(n), sum_running(rows**2).means(n)
     scatter = squares - means**2
     # each against its own typical scatter, so that neither unit decides
     total = np.sum(scatter / np.maximum(np.median(scatter, axis=0), 1e-12), axis=1)
@@ -144,7 +144,7 @@ def _without_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fa
     """
     out = spans.copy()
     window = len(imu.t) - len(t) + 1
-    force = running(imu.accel).means(window)
+    force = sum_running(imu.accel).means(window)
     T = np.diff(imu.t, prepend=2.0 * imu.t[0] - imu.t[1])
     ways = []  # from a quiet moment outward: which span, which end of it, the window, the first row and how many
     for side, way in ((0, -1), (1, 1)):

@@ -12,7 +12,7 @@ import numpy as np
 
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import within
+from graphnav.detectors.base import mask_within
 from graphnav.detectors.scene import Scene
 
 _TINY = 1e-300
@@ -83,13 +83,13 @@ def own_threshold(
     """
     x = log_statistic(values)
     step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
-    moves = within(t, scene.certain, half) & np.isfinite(x)
+    moves = mask_within(t, scene.certain, half) & np.isfinite(x)
     split = valley(x, float(np.log10(least)), float(np.log10(most)), max(2, round(FEWEST / step)))
     if split is not None and not (moves.any() and np.mean(x[moves] < split) > MISLABELLED):
         return max(least, float(10.0**split)), ()
-    rests = ~within(t, scene.certain, -half) & np.isfinite(x)  # no part of them is certain to move
+    rests = ~mask_within(t, scene.certain, -half) & np.isfinite(x)  # no part of them is certain to move
     if moves.any() and rests.any():
-        found, wrong = fewest_errors(values[rests], values[moves], least)
+        found, wrong = find_fewest_errors(values[rests], values[moves], least)
         if wrong < _TELLS:
             return min(found, most), ()
     if moves.any():
@@ -104,7 +104,7 @@ def own_threshold(
     )
 
 
-def fewest_errors(still: Array, moving: Array, least: float) -> tuple[float, float]:
+def find_fewest_errors(still: Array, moving: Array, least: float) -> tuple[float, float]:
     """Threshold that calls the smallest share of still windows moving plus of moving windows still, at least `least`.
 
     Of several that do equally well, the middle one by their logarithm. The second number is that sum of shares.

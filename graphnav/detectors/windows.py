@@ -75,7 +75,7 @@ class Sums:
         return np.asarray((last - self.total[: -length or None : step][: len(last)]) / length + self.offset)
 
 
-def running(rows: Array) -> Sums:
+def sum_running(rows: Array) -> Sums:
     """Running sums down the rows, (K, c)."""
     offset = rows.mean(axis=0) if len(rows) else np.zeros(rows.shape[1])
     total = np.zeros((len(rows) + 1, rows.shape[1]))
@@ -89,7 +89,7 @@ def window_times(t: Array, length: int, step: int = 1) -> Array:
     return np.asarray(0.5 * (first + t[length - 1 :: step]))
 
 
-def unbroken(whole: Array, length: int, step: int = 1, first: int = 1) -> Array:
+def find_unbroken(whole: Array, length: int, step: int = 1, first: int = 1) -> Array:
     """Which of those windows no gap crosses; `whole` as in `Blocks`.
 
     A gap before the first row of a window does not matter to it; with `first` 0 it does, where rows are means in which
@@ -129,7 +129,7 @@ def low_pass(b: Blocks) -> LowPassed:
         rows += weight * b.mean[i : i + stop : step, :6]
     gain = float(np.sqrt((h**2).sum() / b.period))
     t = window_times(b.t, len(h), step)[:count] if count else np.zeros(0)
-    whole = unbroken(b.whole, len(h), step)[:count] if count else np.zeros(0, dtype=bool)
+    whole = find_unbroken(b.whole, len(h), step)[:count] if count else np.zeros(0, dtype=bool)
     return LowPassed(t, rows, gain, step * b.period, whole)
 
 
@@ -141,6 +141,6 @@ def share_of(x: Array, share: float) -> Array:
     return np.asarray(x[k] + (at - k) * (x[min(k + 1, len(x) - 1)] - x[k]))
 
 
-def smooth(rows: Array, h: Array) -> Array:
+def smooth_rows(rows: Array, h: Array) -> Array:
     """Every row low-passed by h, (K - len(h) + 1, c): for a short stretch."""
     return np.asarray(sliding_window_view(rows, len(h), axis=0) @ h)

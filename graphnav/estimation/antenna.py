@@ -25,7 +25,7 @@ from graphnav.estimation.pipeline import origin
 from graphnav.estimation.problem import build_problem
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import backward, rts
-from graphnav.recording import Recording, rows_of
+from graphnav.recording import Recording, take_rows
 
 _UNKNOWN = 2.0  # m, 1-sigma before the drive
 _FINE = 0.3  # m, 1-sigma of fixes that tell
@@ -90,9 +90,9 @@ def find_wrong_arms(recording: Recording) -> list[Finding]:
     if np.median(gnss.sd[:, :2]) > _FINE:
         return []
     second = np.floor(gnss.t)
-    thin = rows_of(gnss, np.concatenate([[True], np.diff(second) > 0.0]))
+    thin = take_rows(gnss, np.concatenate([[True], np.diff(second) > 0.0]))
     try:
-        antenna, axle = _estimate(_most_turning(replace(recording, gnss=thin)))
+        antenna, axle = _estimate(_find_turning(replace(recording, gnss=thin)))
     except EstimationError:
         return []
     out = []
@@ -117,7 +117,7 @@ def find_wrong_arms(recording: Recording) -> list[Finding]:
     return out
 
 
-def _most_turning(recording: Recording) -> Recording:
+def _find_turning(recording: Recording) -> Recording:
     """The part of a drive, `_PART` s long at most, in which it turns most where there are fixes."""
     imu, gnss = recording.imu, recording.gnss
     assert gnss is not None

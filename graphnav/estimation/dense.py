@@ -86,7 +86,7 @@ class Dense:
         k = np.searchsorted(self.t, t, side="left") - 1
         if not len(t):
             return self.states[k]
-        # of the intervals touched alone: whoever asks for a few times pays for a few
+        # of the intervals touched alone, so that few times cost little
         first, last = int(k[0]), int(k[-1]) + 1
         samples, used = self.samples.between(self.t[first], self.t[last]), slice(first, last)
         dR, dV, dP = within(samples, self.t[first : last + 1], t, self.ba[used], self.bg[used])

@@ -84,7 +84,7 @@ class Fixed:
     notes: tuple[str, ...] = ()
 
 
-def split(problem: Problem) -> tuple[Problem, GnssPhase | None]:
+def split_carriers(problem: Problem) -> tuple[Problem, GnssPhase | None]:
     """A problem without its carriers, and these."""
     phase = next((c for c in problem.constraints if isinstance(c, GnssPhase)), None)
     if phase is None:
@@ -122,10 +122,10 @@ def fix(
         _sweep(epochs, whole, smoothed, known)
         if known.of == before:
             break
-        found = _holding(whole, phase, epochs, known)
+        found = _hold_arcs(whole, phase, epochs, known)
         smoothed = backward(found, refilter(found, smoothed, progress), progress)
         if _let_go(epochs, found, smoothed, known):
-            found = _holding(whole, phase, epochs, known)
+            found = _hold_arcs(whole, phase, epochs, known)
             smoothed = backward(found, refilter(found, smoothed, progress), progress)
     filtered = causal.epochs if search else np.stack([epochs.t, np.zeros(len(epochs.t))], -1)
     fixed = np.array([epochs.differences(k, known) >= _FEWEST for k in epochs.keyframes], dtype=float)
@@ -352,7 +352,7 @@ def _one(points: Points, k: int) -> Points:
     return Points(points.states[k : k + 1], points.values[k : k + 1])
 
 
-def _holding(problem: Problem, phase: GnssPhase, epochs: Epochs, known: Known) -> Problem:
+def _hold_arcs(problem: Problem, phase: GnssPhase, epochs: Epochs, known: Known) -> Problem:
     """A problem with rows for what is known: each arc is held to the first other where both are there at once."""
     rows: list[tuple[int, str, str, int]] = []
     held = Known()

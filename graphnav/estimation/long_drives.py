@@ -21,7 +21,7 @@ from graphnav.core.state import DIM, States
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import NoiseModel, RowWeights
 from graphnav.estimation.solution import Between, ConstraintRecord, ParameterEstimate, Solution
-from graphnav.recording import Recording, rows_of
+from graphnav.recording import Recording, take_rows
 
 STRAIGHT, _STATES = 10_800.0, 44  # s, at most solved at once: 3 GB at a keyframe a second and 44 error states
 PART = 3_600.0  # s, at most, of a part: the estimation of noise has enough keyframes by a factor of two
@@ -45,7 +45,7 @@ class Share:
 def shares(recording: Recording, settings: Settings) -> list[Share]:
     """The recording in one part, or in parts of equal length that overlap."""
     begin, length = recording.start, recording.end - recording.start
-    if length <= _longest(recording, settings):
+    if length <= _limit_length(recording, settings):
         return [Share(recording, -np.inf, np.inf)]
     edges = np.linspace(0.0, length, int(np.ceil(length / PART)) + 1)
     edges = np.array([0.0, *(edge for edge in edges[1:-1] if _is_told(recording, begin + edge)), length])
@@ -55,13 +55,13 @@ def shares(recording: Recording, settings: Settings) -> list[Share]:
         part = recording.crop(first - 1e-9, last + 1e-9)
         lo_row, hi_row = np.searchsorted(recording.imu.t, part.imu.t[[0, -1]])
         own = slice(int(lo_row), int(hi_row) + 1)
-        part = replace(part, imu=rows_of(recording.imu, own))  # no copy of what is by far the largest
+        part = replace(part, imu=take_rows(recording.imu, own))  # no copy of what is by far the largest
         start = -np.inf if k == 0 else begin + lo
         out.append(Share(part, start, np.inf if k == len(edges) - 2 else begin + hi))
     return out
 
 
-def _longest(recording: Recording, settings: Settings) -> float:
+def _limit_length(recording: Recording, settings: Settings) -> float:
     """s, at most solved at once: memory goes by the square of the error states, of which satellites have their own."""
     raw, chosen = recording.raw_gnss, settings.raw_gnss
     if raw is None or not recording.tight(chosen.coupling):
@@ -108,7 +108,7 @@ class _Span:
         return self.whole(t, size)
 
 
-def within(solution: Solution, share: Share) -> Solution:
+def crop_solution(solution: Solution, share: Share) -> Solution:
     """What a solution of a part says of the part's own span."""
     start, end = share.start, share.end
     if np.isneginf(start) and np.isposinf(end):

@@ -1,4 +1,4 @@
-"""A solved problem as GTSAM's own: a `NonlinearFactorGraph` and `Values`, for whoever goes on with GTSAM.
+"""A solved problem as GTSAM's own: a `NonlinearFactorGraph` and `Values`, to go on with in GTSAM.
 
 Variables, with k the number of the keyframe and j that of a node:
 

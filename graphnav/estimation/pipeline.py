@@ -24,7 +24,7 @@ from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation import faults
-from graphnav.estimation.long_drives import OVERLAP, shares, within
+from graphnav.estimation.long_drives import OVERLAP, crop_solution, shares
 from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe_far
@@ -122,8 +122,8 @@ def _run(
     if unknown:
         raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}", key="solver.unknown")
     frame = LocalFrame(origin(recording))
-    pieces, notes = _pieces(recording, settings)
-    notes = [*fitting(recording, settings), *notes]
+    pieces, notes = _split_pieces(recording, settings)
+    notes = [*check_profile(recording, settings), *notes]
     found: list[dict[str, Solution]] = []
     parts = [share for piece in pieces for share in shares(piece, settings)]
     if len(parts) > len(pieces):
@@ -134,7 +134,7 @@ def _run(
             # matrices here have thirty rows: threads for them cost more than the work, twenty times on a busy machine
             with threadpool_limits(limits=1, user_api="blas"):
                 solved = _solve_with_retry(part.recording, settings, frame, solvers, progress, noise)
-            found.append({name: within(one, part) for name, one in solved.items()})
+            found.append({name: crop_solution(one, part) for name, one in solved.items()})
         except EstimationError as error:
             if len(parts) == 1:
                 raise
@@ -242,7 +242,7 @@ def _solve(
             detections=found.detections.all,
             excluded=wrong,
             noise=found.noise,
-            graphs=(_graph_of(problem, out[name]),),
+            graphs=(_bind_graph(problem, out[name]),),
             passes=dict(passes),
             separation=apart,
             fixed=found.fixed.get(name, found.fixed.get("", out[name].fixed)),
@@ -252,7 +252,7 @@ def _solve(
     }
 
 
-def _graph_of(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, Any]]:
+def _bind_graph(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, Any]]:
     """What makes the problem GTSAM's, with a solution's values of parameters."""
 
     def export() -> tuple[Any, Any]:
@@ -264,7 +264,7 @@ def _graph_of(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, A
     return export
 
 
-def fitting(recording: Recording, settings: Settings) -> list[str]:
+def check_profile(recording: Recording, settings: Settings) -> list[str]:
     """What the settings' profile asks for and the recording lacks, in sentences.
 
     Raises
@@ -299,7 +299,7 @@ def origin(recording: Recording) -> np.ndarray:
     return np.array([np.pi / 4, 0.0, 0.0])
 
 
-def _pieces(recording: Recording, settings: Settings) -> tuple[list[Recording], list[str]]:
+def _split_pieces(recording: Recording, settings: Settings) -> tuple[list[Recording], list[str]]:
     """The recording cut at IMU gaps too long to bridge, and a sentence for each cut."""
     t = recording.imu.t
     cuts = np.flatnonzero(np.diff(t) > settings.keyframes.bridge)

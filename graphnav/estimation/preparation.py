@@ -24,8 +24,8 @@ from graphnav.core.state import BLOCKS, States
 from graphnav.detectors import Detections, detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment, align, with_known_heading
-from graphnav.estimation.alignment.first import some
-from graphnav.estimation.fixing import fix, split
+from graphnav.estimation.alignment.first import pick_fixes
+from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.noise.apply import with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import (
@@ -39,9 +39,8 @@ from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.ekf import ekf, refilter
+from graphnav.estimation.solvers.ekf import ekf, near, refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.near import near
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     SmootherPass,
@@ -53,7 +52,7 @@ from graphnav.estimation.solvers.passes import (
 from graphnav.estimation.solvers.rts import backward
 from graphnav.recording import Recording
 
-_FAR = 0.5  # rad between the stated and the found start attitude, beyond which a filter is astray for a while
+_FAR = 0.5  # rad between the stated and the found start attitude, beyond which a filter diverges for a while
 _FAR_AWAY = 100.0  # m, by which single fixes in a city may be wrong
 _LOST = 0.1  # rad by which a filter may be off for a smoother to rest on it
 _MOST = 0.5  # share of the fixes that can be wrong; beyond it, it is the start that is
@@ -78,7 +77,7 @@ class Prepared:
 
     @property
     def diverged(self) -> bool:
-        """Whether the stated start is so far from the one found that a filter from there is astray for a while."""
+        """Whether the stated start is so far from the one found that a filter from there diverges for a while."""
         return _has_diverged(self.aligned, self.start)
 
 
@@ -129,7 +128,7 @@ def prepare(
             used, settings, frame, start.state, start_sigma(start), found.stationary, parts_of_noise=parts
         )
         book("preintegration", since)
-        problem, carriers[0] = split(problem)  # the noise model rests on the codes
+        problem, carriers[0] = split_carriers(problem)  # the noise model rests on the codes
         return problem
 
     def without_wrong(noise: NoiseModel) -> tuple[Alignment, Detections, bool]:
@@ -165,7 +164,7 @@ def prepare(
         if excluded_share(base, best.noise) > _MOST:
             # most fixes contradict what came of the start: it is looked for in what follows
             try:
-                later = align_with(_after(recording, aligned), detections.stationary)
+                later = align_with(_cut_aligned(recording, aligned), detections.stationary)
                 other = build(later, detections, parts=True)
                 again = _estimate(other, later, settings, progress, passes)
                 if excluded_share(other, again.noise) < excluded_share(base, best.noise):
@@ -182,7 +181,7 @@ def prepare(
         noise, known = best.noise, best.points
         passes.update(filter=1)
         plain = NoiseModel(excluded=noise.excluded)
-        if _explains_more(base, plain, best):
+        if _is_likelier(base, plain, best):
             noise, known = plain, None
         noise = replace(noise, spacing=spacing)
         # of what the estimation has left only its points are wanted any more: the rest is half of all memory
@@ -238,7 +237,7 @@ def start_sigma(start: Alignment) -> Array:
     return sigma
 
 
-def _explains_more(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:
+def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:
     """Whether the figures as stated make the innovations likelier than the estimate, with its prior, does.
 
     Both without what is left out: likelihoods are compared of the same measurements.
@@ -250,7 +249,7 @@ def _explains_more(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bo
 
 
 def _start(found: Alignment, stated: Alignment) -> Alignment:
-    """Where estimation sets out: the stated start, unless a filter from there would be astray."""
+    """Where estimation starts: the stated start, unless a filter from there would diverge."""
     return found if _has_diverged(found, stated) else stated
 
 
@@ -312,11 +311,11 @@ def _differ(a: Array, b: Array) -> bool:
 def _smooth(problem: Problem, start: States) -> Solution:
     from graphnav.estimation.solvers.batch import batch
 
-    return batch(split(problem)[0], start, wanted=(0,), reintegrate=False)
+    return batch(split_carriers(problem)[0], start, wanted=(0,), reintegrate=False)
 
 
-def _after(recording: Recording, aligned: Alignment) -> Recording:
+def _cut_aligned(recording: Recording, aligned: Alignment) -> Recording:
     """Without the fixes that an alignment has seen."""
     assert recording.gnss is not None
     assert aligned.until is not None
-    return replace(recording, gnss=some(recording.gnss, recording.gnss.t > aligned.until))
+    return replace(recording, gnss=pick_fixes(recording.gnss, recording.gnss.t > aligned.until))

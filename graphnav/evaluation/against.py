@@ -64,7 +64,7 @@ class Foreign(Solution):
     def at(self, t: Array) -> tuple[Array, States, Array]:
         """Times, states (NaN where unknown) and covariances (NaN) at those of some times that it knows."""
         track = self.track_at(t)
-        return track.t, _states(self.frame, track), np.full((len(track), DIM, DIM), np.nan)
+        return track.t, _build_states(self.frame, track), np.full((len(track), DIM, DIM), np.nan)
 
 
 def own_solutions(solutions: Mapping[str, Solution]) -> dict[str, Solution]:
@@ -139,7 +139,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
     track = replace(track, name=name)
     _, known = interpolate(track, reference.t, max_gap=_MAX_GAP)
     t = reference.t[known]
-    states = _states(reference.frame, interpolate(track, t, max_gap=_MAX_GAP)[0])
+    states = _build_states(reference.frame, interpolate(track, t, max_gap=_MAX_GAP)[0])
     unknown = np.full((len(t), DIM, DIM), np.nan)
     return Foreign(name, reference.frame, t, states, unknown, notes=tuple(notes), track=track, borrowed=borrowed)
 
@@ -160,7 +160,7 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
         )
     else:
         return 0.0, []  # said by the caller
-    late = _late(replace(track, t=track.t + shift), reference)
+    late = _measure_delay(replace(track, t=track.t + shift), reference)
     if late is None or abs(late) < 0.02:
         return shift, notes
     if abs(late) < _APPLIED and shift != own_start:
@@ -177,7 +177,7 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
     ]
 
 
-def _late(track: Trajectory, reference: Solution) -> float | None:
+def _measure_delay(track: Trajectory, reference: Solution) -> float | None:
     """How much later the same speeds are in `reference`, s; None where that is not clear."""
     llh = track.llh if track.frame == "geodetic" else reference.frame.to_llh(np.nan_to_num(track.llh))
     places = crosschecks.track(Gnss(track.t, llh, np.ones((len(track), 3))))
@@ -205,7 +205,7 @@ def without_attitude(metrics: Metrics) -> Metrics:
     return replace(metrics, components=components, nees=nees, errors=errors)
 
 
-def _states(frame: LocalFrame, track: Trajectory) -> States:
+def _build_states(frame: LocalFrame, track: Trajectory) -> States:
     """A trajectory on the Earth as states in a navigation frame, NaN where it does not say."""
     p = frame.from_llh(track.llh)
     R_nl = np.swapaxes(frame.R_ln(p), -1, -2)

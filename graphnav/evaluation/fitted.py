@@ -52,7 +52,7 @@ def after_fit(cov: Array, p: Array, v: Array | None) -> tuple[Array, float]:
     B[:, :3, :3], B[:, :3, 3], B[:, 3:6, 3], B[:, _HEADING, 3] = np.eye(3), turned, turned_v, -1.0
     sign = np.array([1.0, 1.0, 1.0, -1.0])  # a yaw is anticlockwise, a heading clockwise
     stated = cov[:, _STATE][:, :, _STATE] * sign[:, None] * sign
-    X = _dead_reckon(stated, turned)
+    X = _propagate_dead_reckoning(stated, turned)
     cov = cov.copy()
     cov[np.ix_(range(n), _STATE, _STATE)] = X * sign[:, None] * sign
     # epochs from i on: those after it carry its error
@@ -60,8 +60,8 @@ def after_fit(cov: Array, p: Array, v: Array | None) -> tuple[Array, float]:
     moved = moved - np.einsum("ikl,il->ik", ahead, turned)
     K = ahead @ cov[:, :3] - moved[..., None] * cov[:, None, _HEADING]
     # epochs before i: it carries theirs
-    places, yaws = _before(G @ X[:, :3, :3]), _before(np.einsum("jkl,jl->jk", G, X[:, :3, 3]))
-    about = _before(np.einsum("jkl,jl,jm->jkm", G, X[:, :3, 3], turned))
+    places, yaws = _sum_before(G @ X[:, :3, :3]), _sum_before(np.einsum("jkl,jl->jk", G, X[:, :3, 3]))
+    about = _sum_before(np.einsum("jkl,jl,jm->jkm", G, X[:, :3, 3], turned))
     K[:, :, :3] += places + yaws[..., None] * turned[:, None] - about
     K[:, :, 3:6] += yaws[..., None] * turned_v[:, None]
     K[:, :, _HEADING] -= yaws
@@ -72,7 +72,7 @@ def after_fit(cov: Array, p: Array, v: Array | None) -> tuple[Array, float]:
     return rest, float(np.sqrt(horizontal[0] / horizontal[1])) if horizontal[1] > 0.0 else 1.0
 
 
-def _dead_reckon(X: Array, turned: Array) -> Array:
+def _propagate_dead_reckoning(X: Array, turned: Array) -> Array:
     """Covariances (N, 4, 4) of place and yaw that dead reckoning can have, nowhere below the stated ones."""
     out = X.copy()
     F = np.eye(4)
@@ -96,6 +96,6 @@ def _from(x: Array) -> Array:
     return np.asarray(np.cumsum(x[::-1], axis=0)[::-1])
 
 
-def _before(x: Array) -> Array:
+def _sum_before(x: Array) -> Array:
     """Sums of the rows before each."""
     return np.asarray(np.cumsum(x, axis=0) - x)

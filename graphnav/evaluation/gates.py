@@ -84,10 +84,10 @@ def parse_requirement(text: str, solvers: Sequence[str] = ()) -> Requirement:
         limit = float(number)
     except ValueError:
         raise ConfigError(f"--require {text}: '{number}' is not a number; {usage}", key="option.requirement") from None
-    return Requirement(text, _full(name, text), sign, limit, solver)
+    return Requirement(text, _complete_name(name, text), sign, limit, solver)
 
 
-def _full(name: str, text: str) -> str:
+def _complete_name(name: str, text: str) -> str:
     """The name with its unit, and the number of its span where it has one."""
     every = names()
     short = {full.removesuffix(unit): full for unit in _UNITS for full in every if full.endswith(unit)}
@@ -119,7 +119,7 @@ def judge(requirements: Sequence[Requirement], rows: Sequence[Mapping[str, Any]]
 
 
 def text(verdicts: Sequence[Verdict]) -> str:
-    """Lines for people, to follow others; nothing for no verdicts."""
+    """Lines of text that follow others; "" without verdicts."""
     lines = [f"  {'met' if verdict.met else 'not met'}: {verdict.sentence}" for verdict in verdicts]
     return "\n".join(["\n", "required", *lines]) if lines else ""
 

@@ -166,7 +166,7 @@ def measure(
         epochs=errors.epochs,
         duration=float(errors.t[-1] - errors.t[0]) if len(errors) else 0.0,
         distance=float(errors.distance[-1]) if len(errors) else 0.0,
-        components={key: found for key, x in series.items() if (found := statistic(x)) is not None},
+        components={key: found for key, x in series.items() if (found := compute_statistic(x)) is not None},
         nees={key: mean for key, (x, dof, z) in values.items() if (mean := average_nees(x, dof, z)) is not None},
         spans=tuple(_span(errors, a, b, start) for a, b in spans),
         notes=errors.notes,
@@ -174,7 +174,7 @@ def measure(
     )
 
 
-def statistic(x: Array) -> Statistic | None:
+def compute_statistic(x: Array) -> Statistic | None:
     """Of the finite values of `x` (N,); None where there are none. The 95 % point is interpolated linearly."""
     x = x[np.isfinite(x)]
     if not len(x):
@@ -296,23 +296,23 @@ def text(metrics: Metrics) -> str:
         lines.append(f"{'':<16}{'rms':>10}{'95 %':>10}{'max':>10}{'mean':>10}")
         for key, s in metrics.components.items():
             name, _, unit = COMPONENTS[key]
-            numbers = "".join(f"{_short(x):>10}" for x in (s.rms, s.p95, s.max, s.mean))
+            numbers = "".join(f"{_format_short(x):>10}" for x in (s.rms, s.p95, s.max, s.mean))
             lines.append(f"{name:<16}{numbers}  {unit}")
     if metrics.nees:
         lines.append(f"{'NEES per dof':<16}{'mean':>10}{'in 95 %':>10}   1 and 95 % where the sigmas are true")
         for key, nees in metrics.nees.items():
-            lines.append(f"{_NEES[key]:<16}{_short(nees.mean):>10}{100 * nees.inside:>9.1f}%")
+            lines.append(f"{_NEES[key]:<16}{_format_short(nees.mean):>10}{100 * nees.inside:>9.1f}%")
     if metrics.spans:
         titles = ("end hor.", "end 3-D", "max hor.", "max up", "m/s", "% dist.", "NEES")
         lines.append(f"{'span (s)':<16}" + "".join(f"{title:>10}" for title in titles))
         for span in metrics.spans:
             row = (span.end_h, span.end_3d, span.max_h, span.max_up, span.drift, span.drift_percent, span.nees)
-            lines.append(f"{f'{span.start:.1f}-{span.end:.1f}':<16}" + "".join(f"{_short(x):>10}" for x in row))
+            lines.append(f"{f'{span.start:.1f}-{span.end:.1f}':<16}" + "".join(f"{_format_short(x):>10}" for x in row))
     if metrics.closure is not None:
         c = metrics.closure
         lines.append(
-            f"closure: horizontal {_short(c.horizontal)} m, up {_short(c.vertical)} m, "
-            f"{_short(c.percent)} % of {c.distance:.1f} m"
+            f"closure: horizontal {_format_short(c.horizontal)} m, up {_format_short(c.vertical)} m, "
+            f"{_format_short(c.percent)} % of {c.distance:.1f} m"
         )
     lines += [f"note: {note}" for note in metrics.notes]
     return "\n".join(lines)
@@ -350,7 +350,7 @@ def _round(x: float) -> float | None:
     return float(f"{x:.5g}") if math.isfinite(x) else None
 
 
-def _short(x: float) -> str:
+def _format_short(x: float) -> str:
     """Four significant digits without an exponent in the range people meet."""
     if not math.isfinite(x):
         return "-"

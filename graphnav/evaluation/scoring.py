@@ -85,8 +85,8 @@ def errors(
     from_start = fitted and (trajectory.frame == "local" if from_start is None else from_start)
     if trajectory.frame == "local" or truth.frame == "local":
         trajectory, truth = _fit(trajectory, truth, lever_arm, max_gap, at, notes)
-    estimate, seen, travel, epochs = _pair(trajectory, truth, lever_arm, max_gap, at)
-    if _spacing(truth) < _spacing(trajectory) if at is None else _lie_apart(seen.t, truth.t):
+    estimate, seen, travel, epochs = _pair_epochs(trajectory, truth, lever_arm, max_gap, at)
+    if _measure_spacing(truth) < _measure_spacing(trajectory) if at is None else _are_between(seen.t, truth.t):
         notes.append(
             Note(
                 "truth.interpolated", "compared at the estimate's own epochs, to which the denser truth is interpolated"
@@ -108,7 +108,7 @@ def errors(
     cov = full_covariance(estimate)
     cov = np.full((len(seen), 9, 9), np.nan) if cov is None else cov
     if from_start:
-        cov = _of_the_rest(cov, estimate, notes)
+        cov = _subtract_fit(cov, estimate, notes)
     of_truth = full_covariance(replace(seen, covariance=None))
     if of_truth is not None:
         cov = cov + np.nan_to_num(of_truth)
@@ -182,7 +182,7 @@ def _fit(
     if trajectory.frame == truth.frame:
         # Neither knows where it is: anywhere will do, and lengths stay what they are.
         trajectory = place_on_earth(trajectory, LocalFrame(np.zeros(3)), 0.0, np.zeros(3))
-    estimate, seen, _, _ = _pair(trajectory, truth, lever_arm, max_gap, at)
+    estimate, seen, _, _ = _pair_epochs(trajectory, truth, lever_arm, max_gap, at)
     mine, theirs = estimate.llh, seen.llh
     frame = LocalFrame(mine[0] if trajectory.frame == "geodetic" else theirs[0])
     truth_is_local = truth.frame == "local"
@@ -211,7 +211,7 @@ def _fit(
     return place_on_earth(trajectory, frame, yaw, offset), truth
 
 
-def _of_the_rest(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
+def _subtract_fit(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
     """The covariance (N, 9, 9) of what a fit leaves of errors that count from the estimate's own start."""
     if not np.isfinite(cov).all():
         notes.append(
@@ -232,7 +232,7 @@ def _of_the_rest(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
     return rest
 
 
-def _pair(
+def _pair_epochs(
     trajectory: Trajectory, truth: Trajectory, lever_arm: Array | None, max_gap: float, at: Array | None
 ) -> tuple[Trajectory, Trajectory, Array, int]:
     """Estimate and truth at the epochs they share, the truth's horizontal velocity there (N, 2), and of how many."""
@@ -240,7 +240,7 @@ def _pair(
     if at is not None:
         seen, _ = interpolate(moving, at[np.isin(at, trajectory.t)], max_gap=max_gap)
         epochs = len(at)
-    elif _spacing(truth) < _spacing(trajectory):
+    elif _measure_spacing(truth) < _measure_spacing(trajectory):
         seen, _ = interpolate(moving, trajectory.t, max_gap=max_gap)
         epochs = len(trajectory)
     else:
@@ -253,12 +253,12 @@ def _pair(
     return estimate, seen if truth.v is not None else replace(seen, v=None), seen.v[:, :2], epochs
 
 
-def _spacing(trajectory: Trajectory) -> float:
+def _measure_spacing(trajectory: Trajectory) -> float:
     """Usual time between rows, s, to 0.1 ms so that rounding decides nothing; infinite for one row."""
     return float(np.round(np.median(np.diff(trajectory.t)), 4)) if len(trajectory) > 1 else np.inf
 
 
-def _lie_apart(t: Array, rows: Array) -> bool:
+def _are_between(t: Array, rows: Array) -> bool:
     """Whether some of the times are no row's, to 0.1 ms."""
     k = np.clip(np.searchsorted(rows, t), 1, len(rows) - 1) if len(rows) > 1 else np.zeros(len(t), dtype=int)
     return bool((np.minimum(np.abs(t - rows[k]), np.abs(t - rows[k - 1])) > 1e-4).any())

@@ -1,4 +1,4 @@
-"""How a walk without a place on the Earth is judged: by shape, strides, height and closure.
+"""Scores of a walk without a place on the Earth: shape, strides, height and closure.
 
 A solution's position and heading count from zero at its start, a truth in a local frame from anywhere. For the shape,
 yaw and offset are fitted over all epochs, as in `graphnav.evaluation.scoring`. For consistency that would be wrong: the

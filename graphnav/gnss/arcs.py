@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from graphnav.core.rotation import Array
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import C, Ids, satellite_name, signal_name
-from graphnav.gnss.single_point import coefficients, look
+from graphnav.gnss.single_point import choose_coefficients, look
 
 _ROUNDS = 20  # of reweighting towards the least sum of absolute residuals
 _SPARE = 2  # rows beyond the unknowns that have to agree before others are held against them
@@ -117,7 +117,7 @@ def _find_slips(
     """Which of the changes from rows `before` to rows `now` hold a slip."""
     if not len(now):
         return np.zeros(0, dtype=bool)
-    geometry = look(raw, raw.antenna, coefficients(raw))
+    geometry = look(raw, raw.antenna, choose_coefficients(raw))
     wavelength = C / raw.frequency
     known = geometry.distance + geometry.troposphere - geometry.ionosphere - raw.clock
     off = wavelength * raw.carrier - known

@@ -20,7 +20,7 @@ from graphnav.core.rotation import Array
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.series import RawGnss, median_of_epochs
 from graphnav.gnss.signals import C
-from graphnav.gnss.single_point import coefficients, look
+from graphnav.gnss.single_point import choose_coefficients, look
 
 _OLDEST = 15.0  # s between a base's epochs that a line is drawn through
 _SAME_EPOCH = 2e-3  # s: two receivers that keep their clocks within a millisecond of the nominal epoch
@@ -37,7 +37,7 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     """
     base = base.take(np.isfinite(base.code) & np.isfinite(base.clock) & np.isfinite(base.p[:, 0]))
     base = replace(base, klobuchar=rover.klobuchar, antenna=np.tile(position, (len(base), 1)))
-    geometry = look(base, base.antenna, coefficients(base))
+    geometry = look(base, base.antenna, choose_coefficients(base))
     arcs = find_arcs(base, still=True)
     high = geometry.elevation > _LEAST
     known = geometry.distance + geometry.troposphere - base.clock

@@ -172,7 +172,7 @@ class Ephemerides:
         out, which = Placed.unknown(len(t)), self.choose(satellite, t, zero)
         M = len(self.kepler["toe"])
         for own, number, solve in (
-            (np.flatnonzero((which >= 0) & (which < M)), which, self._orbit),
+            (np.flatnonzero((which >= 0) & (which < M)), which, self._compute_orbit),
             (np.flatnonzero(which >= M), which - M, self._integrate),
         ):
             if len(own):
@@ -203,14 +203,14 @@ class Ephemerides:
             out[own] = delay[own, k]
         return out
 
-    def _orbit(self, k: NDArray[np.intp], t: Array, zero: float) -> dict[str, Array]:
+    def _compute_orbit(self, k: NDArray[np.intp], t: Array, zero: float) -> dict[str, Array]:
         """At times of transmission by the satellite's clock, which is off by less than a millisecond."""
         eph = {name: value[k] for name, value in self.kepler.items()}
         system = system_of(eph["satellite"])
         mu, rate = (np.select([system == s for s in table], list(table.values())) for table in (_MU, _OMEGA))
         since = t - (eph["toc"] - zero)
         for _ in range(2):
-            since = t - (eph["toc"] - zero) - _polynomial(eph["clock"], since)
+            since = t - (eph["toc"] - zero) - _evaluate_clock(eph["clock"], since)
         tk = since + (eph["toc"] - eph["toe"])
         A, e = eph["root_a"] ** 2, eph["e"]
         n = np.sqrt(mu / A**3) + eph["delta_n"]
@@ -248,14 +248,14 @@ class Ephemerides:
         )
         if fixed.any():
             angle = rate * tk
-            turned, moving = _about_z(_about_x(p), angle), _about_z(_about_x(v), angle)
+            turned, moving = _turn_about_z(_turn_about_x(p), angle), _turn_about_z(_turn_about_x(v), angle)
             moving = moving + rate[:, None] * np.stack([turned[:, 1], -turned[:, 0], np.zeros(len(t))], -1)
             p, v = np.where(fixed[:, None], turned, p), np.where(fixed[:, None], moving, v)
         relative = -2.0 * np.sqrt(mu * A) * e / C**2
         return {
             "p": p,
             "v": v,
-            "clock": _polynomial(eph["clock"], since) + relative * sin_e,
+            "clock": _evaluate_clock(eph["clock"], since) + relative * sin_e,
             "drift": eph["clock"][:, 1] + 2.0 * eph["clock"][:, 2] * since + relative * cos_e * E_dot,
         }
 
@@ -269,7 +269,7 @@ class Ephemerides:
         for j in range(steps):
             h = np.clip(since - np.sign(since) * j * _STEP, -_STEP, _STEP)
             h = np.where(np.abs(since) > j * _STEP, h, 0.0)[:, None]
-            x = _runge_kutta(lambda state: _glonass_motion(state, eph["a"]), x, h)
+            x = _step_runge_kutta(lambda state: _glonass_motion(state, eph["a"]), x, h)
         return {
             "p": x[:, :3],
             "v": x[:, 3:],
@@ -287,17 +287,17 @@ def _columns(kind: type, some: list) -> dict[str, Array]:  # type: ignore[type-a
     return whole
 
 
-def _polynomial(clock: Array, t: Array) -> Array:
+def _evaluate_clock(clock: Array, t: Array) -> Array:
     return np.asarray(clock[:, 0] + t * (clock[:, 1] + t * clock[:, 2]))
 
 
-def _about_z(x: Array, angle: Array) -> Array:
+def _turn_about_z(x: Array, angle: Array) -> Array:
     """Coordinates (N, 3) in axes turned by angles (N,) about z."""
     s, c = np.sin(angle), np.cos(angle)
     return np.stack([c * x[:, 0] + s * x[:, 1], -s * x[:, 0] + c * x[:, 1], x[:, 2]], -1)
 
 
-def _about_x(x: Array) -> Array:
+def _turn_about_x(x: Array) -> Array:
     """Coordinates (N, 3) in axes turned by -5 deg about x."""
     s, c = np.sin(-_TILT), np.cos(-_TILT)
     return np.stack([x[:, 0], c * x[:, 1] + s * x[:, 2], -s * x[:, 1] + c * x[:, 2]], -1)
@@ -305,7 +305,7 @@ def _about_x(x: Array) -> Array:
 
 def rotate_earth(p: Array, seconds: Array) -> Array:
     """Earth-fixed coordinates (N, 3) of one time in the Earth-fixed frame so many seconds (N,) later."""
-    return _about_z(p, EARTH_RATE * seconds)
+    return _turn_about_z(p, EARTH_RATE * seconds)
 
 
 def _glonass_motion(x: Array, a: Array) -> Array:
@@ -323,7 +323,7 @@ def _glonass_motion(x: Array, a: Array) -> Array:
     return out
 
 
-def _runge_kutta(rate: Callable[[Array], Array], x: Array, h: Array) -> Array:
+def _step_runge_kutta(rate: Callable[[Array], Array], x: Array, h: Array) -> Array:
     """One step of fourth order, h (N, 1) s."""
     k1 = rate(x)
     k2 = rate(x + 0.5 * h * k1)

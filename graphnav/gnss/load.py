@@ -93,10 +93,10 @@ def load_raw(
         raise RecordingError(
             f"{sources.rover[0]}: holds no ephemerides; say nav or sp3 in [raw_gnss]", key="raw.no_ephemerides"
         )
-    _same_time(obs, nav, precise, sources)
+    _check_dates(obs, nav, precise, sources)
     if zero is not None:
         obs = obs.on_clock(zero)
-    rover, corrected = _rough_place(obs, nav, precise, sources.corrected), sources.corrected
+    rover, corrected = _locate_roughly(obs, nav, precise, sources.corrected), sources.corrected
     if sources.nominal_stamps:
         obs = with_own_stamps(obs, precise or nav, rover, corrected)  # type: ignore[arg-type]
     raw, remarks = place(obs, nav, precise, rover, corrected)
@@ -123,9 +123,9 @@ def load_raw(
                 "zenith)",
             )
         )
-    raw, fixes = _at_true_times(raw, fixes)
+    raw, fixes = _correct_times(raw, fixes)
     if sources.base:
-        raw, more = _difference(raw, sources, nav, precise)
+        raw, more = _difference_by_base(raw, sources, nav, precise)
         said += more
         one = primary(raw) & np.isfinite(raw.difference)
         if one.any():
@@ -134,7 +134,7 @@ def load_raw(
     return raw, fixes, tuple(said)
 
 
-def _difference(
+def _difference_by_base(
     raw: RawGnss, sources: Sources, nav: Ephemerides | None, precise: Orbits | None
 ) -> tuple[RawGnss, list[str]]:
     """The series with differences by the base station, and remarks."""
@@ -165,13 +165,13 @@ def _difference(
     if given is None:
         sentence = f"the base's position is that of its header, {off:.1f} m from its own single-point positions"
         said.append(Note("raw.base_position", sentence))
-    base, _ = _at_true_times(base, base_fixes)
+    base, _ = _correct_times(base, base_fixes)
     raw, more = with_differences(raw, base, position)
     said += [Note("raw.base", f"codes are differences against a base {away / 1e3:.1f} km away"), *more]
     return raw, said
 
 
-def _same_time(obs: Observations, nav: Ephemerides | None, precise: Orbits | None, sources: Sources) -> None:
+def _check_dates(obs: Observations, nav: Ephemerides | None, precise: Orbits | None, sources: Sources) -> None:
     """Whether observations and ephemerides are of the same days.
 
     Raises
@@ -196,7 +196,7 @@ def _same_time(obs: Observations, nav: Ephemerides | None, precise: Orbits | Non
             )
 
 
-def _rough_place(obs: Observations, nav: Ephemerides | None, precise: Orbits | None, corrected: Corrected) -> Array:
+def _locate_roughly(obs: Observations, nav: Ephemerides | None, precise: Orbits | None, corrected: Corrected) -> Array:
     """(3,) within kilometres of the rover: by the codes of a few epochs."""
     epochs = np.unique(obs.t)
     few = obs.take(np.isin(obs.t, epochs[:: max(1, len(epochs) // _FEW)]))
@@ -213,11 +213,13 @@ def _rough_place(obs: Observations, nav: Ephemerides | None, precise: Orbits | N
     return np.asarray(found)
 
 
-def _at_true_times(raw: RawGnss, fixes: SinglePoint) -> tuple[RawGnss, SinglePoint]:
+def _correct_times(raw: RawGnss, fixes: SinglePoint) -> tuple[RawGnss, SinglePoint]:
     """Both at the times at which the antenna was there: the receiver's stamps less its clock error."""
     epochs, of = raw.epochs
-    clock = _nearest(epochs, fixes.t, fixes.clock)  # not between two: a receiver's clock jumps by whole milliseconds
-    drift = _nearest(epochs, fixes.t, fixes.drift) if np.isfinite(fixes.drift).any() else np.zeros(len(epochs))
+    clock = _take_nearest(
+        epochs, fixes.t, fixes.clock
+    )  # not between two: a receiver's clock jumps by whole milliseconds
+    drift = _take_nearest(epochs, fixes.t, fixes.drift) if np.isfinite(fixes.drift).any() else np.zeros(len(epochs))
     true = epochs - clock / C
     fixes = replace(fixes, t=true[np.searchsorted(epochs, fixes.t)])
     good = np.isfinite(fixes.p[:, 0])
@@ -227,7 +229,7 @@ def _at_true_times(raw: RawGnss, fixes: SinglePoint) -> tuple[RawGnss, SinglePoi
     return raw.take(order), fixes
 
 
-def _nearest(t: Array, known: Array, value: Array) -> Array:
+def _take_nearest(t: Array, known: Array, value: Array) -> Array:
     """(N,) at times t what is known at the nearest time."""
     known, value = known[np.isfinite(value)], value[np.isfinite(value)]
     right = np.clip(np.searchsorted(known, t), 0, len(known) - 1)

@@ -110,7 +110,7 @@ class Decoder:
         health = one.u((64, 6))
         parts.clear()
         self._add(
-            satellite, _near(toes, gps), _near(toc, gps), toes,
+            satellite, _unroll_week(toes, gps), _unroll_week(toc, gps), toes,
             clock=(one.s((216, 22)) * 2.0**-31, one.s((200, 16)) * 2.0**-43, one.s((192, 8)) * 2.0**-55),
             iode=issue, crs=two.s((56, 16)) * 2.0**-5, delta_n=two.s((72, 16)) * 2.0**-43 * _PI,
             m0=two.s((88, 32)) * 2.0**-31 * _PI, cuc=two.s((120, 16)) * 2.0**-29, e=two.u((136, 32)) * 2.0**-33,
@@ -142,7 +142,7 @@ class Decoder:
         toes, toc = one.u((16, 14)) * 60.0, four.u((54, 14)) * 60.0
         parts.clear()
         self._add(
-            satellite, _near(toes, gps), _near(toc, gps), toes,
+            satellite, _unroll_week(toes, gps), _unroll_week(toc, gps), toes,
             clock=(four.s((68, 31)) * 2.0**-34, four.s((99, 21)) * 2.0**-46, four.s((120, 6)) * 2.0**-59),
             iode=issue, crs=three.s((104, 16)) * 2.0**-5, delta_n=three.s((40, 16)) * 2.0**-43 * _PI,
             m0=one.s((30, 32)) * 2.0**-31 * _PI, cuc=three.s((56, 16)) * 2.0**-29, e=one.u((62, 32)) * 2.0**-33,
@@ -169,7 +169,7 @@ class Decoder:
         toes, toc = three.u((160, 14)) * 60.0, one.u((22, 14)) * 60.0
         parts.clear()
         self._add(
-            satellite, _near(toes, gps), _near(toc, gps), toes,
+            satellite, _unroll_week(toes, gps), _unroll_week(toc, gps), toes,
             clock=(one.s((36, 31)) * 2.0**-34, one.s((67, 21)) * 2.0**-46, one.s((88, 6)) * 2.0**-59),
             iode=issue, crs=three.s((144, 16)) * 2.0**-5, delta_n=three.s((80, 16)) * 2.0**-43 * _PI,
             m0=two.s((16, 32)) * 2.0**-31 * _PI, cuc=three.s((96, 16)) * 2.0**-29, e=two.u((72, 32)) * 2.0**-33,
@@ -197,7 +197,7 @@ class Decoder:
         toc = one.u((73, 9), (90, 8)) * 8.0
         parts.clear()
         self._add(
-            satellite, _near(toes + _BDT, gps), _near(toc + _BDT, gps), toes,
+            satellite, _unroll_week(toes + _BDT, gps), _unroll_week(toc + _BDT, gps), toes,
             clock=(
                 one.s((225, 7), (240, 17)) * 2.0**-33, one.s((257, 5), (270, 17)) * 2.0**-50,
                 one.s((214, 11)) * 2.0**-66,
@@ -236,7 +236,7 @@ class Decoder:
         u, s = whole.u, whole.s
         toes, toc = u(*at(7, (80, 2), (90, 15))) * 8.0, u(*at(1, (77, 5), (90, 12))) * 8.0
         self._add(
-            satellite, _near(toes + _BDT, gps), _near(toc + _BDT, gps), toes,
+            satellite, _unroll_week(toes + _BDT, gps), _unroll_week(toc + _BDT, gps), toes,
             clock=(
                 s(*at(3, (100, 12), (120, 12))) * 2.0**-33,
                 s(*at(3, (132, 4)), *at(4, (46, 6), (60, 12))) * 2.0**-50, s(*at(4, (72, 10), (90, 1))) * 2.0**-66,
@@ -292,6 +292,6 @@ class Decoder:
             self._kepler.append(one)
 
 
-def _near(seconds: float, gps: float) -> float:
+def _unroll_week(seconds: float, gps: float) -> float:
     """Seconds of a week as s since the GPS epoch, in the week that brings them nearest to a time."""
     return float(seconds + WEEK * np.round((gps - seconds) / WEEK))

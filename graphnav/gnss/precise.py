@@ -46,8 +46,8 @@ class Orbits:
             true = t[own]
             for _ in range(2):
                 true = t[own] - np.nan_to_num(_interpolate_clocks(clocks, true, zero)[0])
-            p = _polynomial(nodes, true, zero)
-            ahead, behind = (_polynomial(nodes, true + h, zero) for h in (_HALF, -_HALF))
+            p = _interpolate_orbit(nodes, true, zero)
+            ahead, behind = (_interpolate_orbit(nodes, true + h, zero) for h in (_HALF, -_HALF))
             v = (ahead - behind) / (2.0 * _HALF)
             clock, drift = _interpolate_clocks(clocks, true, zero)
             out.p[own], out.v[own], out.drift[own] = p, v, drift
@@ -68,13 +68,15 @@ def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
     for one in np.unique(satellite):
         own = satellite == one
         whole = own & np.any(p != 0.0, axis=1)
-        orbit[int(one)] = _once(t[whole], p[whole])
+        orbit[int(one)] = _drop_repeated(t[whole], p[whole])
         told = own & (np.abs(clock) < _ABSENT)
         if told.any():
-            clocks[int(one)] = _once(t[told], clock[told])
+            clocks[int(one)] = _drop_repeated(t[told], clock[told])
     if clk:
         t, satellite, clock = (np.concatenate(x) for x in zip(*(_read_clk(path) for path in clk), strict=True))
-        clocks |= {int(one): _once(t[satellite == one], clock[satellite == one]) for one in np.unique(satellite)}
+        clocks |= {
+            int(one): _drop_repeated(t[satellite == one], clock[satellite == one]) for one in np.unique(satellite)
+        }
     few = sorted(one for one, (t, _) in orbit.items() if len(t) < _NODES)
     remarks = (
         (
@@ -89,7 +91,7 @@ def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
     return Orbits({k: x for k, x in orbit.items() if k not in few}, clocks, remarks)
 
 
-def _once(t: Array, x: Array) -> tuple[Array, Array]:
+def _drop_repeated(t: Array, x: Array) -> tuple[Array, Array]:
     t, first = np.unique(t, return_index=True)
     return t, x[first]
 
@@ -106,7 +108,7 @@ def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
     own = np.flatnonzero(first == ord("P"))
     if not len(epoch) or not len(own):
         raise RecordingError(f"{path}: holds no positions", key="raw.no_positions")
-    t = _stamps(lines, epoch, 3, scale, path)
+    t = _read_stamps(lines, epoch, 3, scale, path)
     if not lines.whole and own[-1] == len(lines) - 1:
         own = own[:-1]
     try:
@@ -145,7 +147,7 @@ def _read_clk(path: Path) -> tuple[Array, Ids, Array]:
     try:
         table = np.array([[*row[2:8], row[9]] for row in rows]).astype(float)
         ids = {name: _id_of(name) for name in set(names)}
-        t = _dates(table[:, :6], scale)
+        t = _read_dates(table[:, :6], scale)
         if not np.isfinite(table).all():
             raise ValueError
     except ValueError:
@@ -161,15 +163,15 @@ def _id_of(name: str) -> int:
     return satellite_id(name if name[0] != " " else "G" + name[1:])
 
 
-def _stamps(lines: Lines, which: NDArray[np.intp], begin: int, scale: str, path: Path) -> Array:
+def _read_stamps(lines: Lines, which: NDArray[np.intp], begin: int, scale: str, path: Path) -> Array:
     """(n,) s since the GPS epoch of lines that hold a date from a column on."""
     words = [lines.text(k)[begin:].split()[:6] for k in which]
     try:
-        return _dates(np.array(words, dtype=float), scale)
+        return _read_dates(np.array(words, dtype=float), scale)
     except ValueError:
         for k, some in zip(which, words, strict=True):
             try:
-                _dates(np.array([some], dtype=float), scale)
+                _read_dates(np.array([some], dtype=float), scale)
             except ValueError:
                 text = " ".join(some)[:40]
                 raise RecordingError(
@@ -178,7 +180,7 @@ def _stamps(lines: Lines, which: NDArray[np.intp], begin: int, scale: str, path:
         raise RecordingError(f"{path}: the date of an epoch cannot be read", key="table.date") from None
 
 
-def _dates(fields: Array, scale: str) -> Array:
+def _read_dates(fields: Array, scale: str) -> Array:
     """(n,) s since the GPS epoch of dates (n, 6); ValueError if one is none."""
     if fields.ndim != 2 or fields.shape[1] != 6:
         raise ValueError
@@ -192,7 +194,7 @@ def _dates(fields: Array, scale: str) -> Array:
     return np.asarray(since + fields[:, 3:] @ np.array([3600.0, 60.0, 1.0]) + ahead)
 
 
-def _polynomial(nodes: tuple[Array, Array], t: Array, zero: float) -> Array:
+def _interpolate_orbit(nodes: tuple[Array, Array], t: Array, zero: float) -> Array:
     """(N, 3) positions at times t (N,), s since `zero`, in the Earth-fixed frame of these; NaN outside the nodes."""
     at, p = nodes[0] - zero, nodes[1]
     first = np.clip(np.searchsorted(at, t) - (_NODES + 1) // 2, 0, len(at) - _NODES)

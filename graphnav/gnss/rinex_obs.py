@@ -172,7 +172,7 @@ def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
     own, of = own[keep], of[keep]
     _say_cut(lines, epoch, own, of, flag, count, path, remarks)
     if len(own) and own[-1] == len(lines) - 1 and not lines.whole:
-        own, of = own[:-1], of[:-1]  # whether its last field is whole nobody knows
+        own, of = own[:-1], of[:-1]  # its last field may be cut
     if not (flag <= 1).any():
         raise RecordingError(f"{path}: holds a header and no observations", key="file.no_rows")
     stamp, zero = _since_week(fields, header.scale, flag <= 1)

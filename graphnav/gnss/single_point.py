@@ -104,7 +104,7 @@ def stretch(raw: RawGnss, geometry: Geometry) -> Array:
     return np.asarray(1.0 + np.sum(geometry.e * moving, axis=1) / C)
 
 
-def coefficients(raw: RawGnss) -> Array:
+def choose_coefficients(raw: RawGnss) -> Array:
     """Klobuchar's coefficients: those broadcast, else those of the night."""
     return NIGHT if raw.klobuchar is None else np.array(raw.klobuchar)
 
@@ -138,7 +138,7 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True) -> 
     place = np.empty(len(raw), dtype=np.intp)
     place[order] = np.arange(len(raw)) - np.searchsorted(of[order], of[order])
     S = int(place.max(initial=0)) + 1
-    klobuchar_of = coefficients(raw)
+    klobuchar_of = choose_coefficients(raw)
     usable = np.isfinite(raw.p).all(axis=1) & np.isfinite(raw.code) & np.isfinite(raw.clock)
 
     pad = _padding(of, place, (E, S))

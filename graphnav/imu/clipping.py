@@ -1,4 +1,4 @@
-"""Peaks that a sensor cut off: found by their shape, put back as far as that tells, and doubted accordingly.
+"""Peaks that a sensor cut off: found by their shape, restored as far as it tells, with a larger variance there.
 
 A foot turns faster than the usual 300 deg/s range of inertial units, and not all of them end at a round number that
 repeats itself: after temperature compensation a cut peak is flat to a per cent only. But it is wider than it could be.

@@ -16,7 +16,7 @@ from graphnav.recording import Imu
 _WALK_POINTS = 6  # quadrature points for the effect of bias walk inside an interval
 
 
-def last_of(x: Array) -> Array:
+def take_last(x: Array) -> Array:
     """(n, ...) what (L, ..., n) holds at the end."""
     x = x[-1]
     return np.ascontiguousarray(x.transpose(x.ndim - 1, *range(x.ndim - 1)))
@@ -91,7 +91,7 @@ def walk_covariances(
     M = np.zeros((n, _WALK_POINTS, 15, 6))
     eye = np.eye(3)
     A_t, B_t, PA_t, PB_t = (x[at, :, :, row] for x in (A, B, PA, PB))
-    A_T, B_T, PA_T, PB_T = (last_of(x)[:, None] for x in (A, B, PA, PB))
+    A_T, B_T, PA_T, PB_T = (take_last(x)[:, None] for x in (A, B, PA, PB))
     turned = A_T - A_t
     M[..., 0:3, :3] = turned
     M[..., 3:6, :3] = PB_T - PB_t - B_t * s + rotation.skew(b[at, :, row]) @ A_t

@@ -44,7 +44,7 @@ def without_onboard_offset(recording: Recording, settings: Settings) -> tuple[Re
         return recording, ()
     imu = recording.imu
     offset = offset_learnt(imu)
-    if evidence(imu, offset) < 2.0 * np.log(_ODDS):
+    if compute_evidence(imu, offset) < 2.0 * np.log(_ODDS):
         return recording, ()
     most = 1e3 * float(np.abs(offset).max())
     said = Note(
@@ -62,7 +62,7 @@ def offset_learnt(imu: Imu) -> Array:
     return np.asarray(np.cumsum(imu.gyro * (_RATE * active * _periods(imu))[:, None], axis=0))
 
 
-def evidence(imu: Imu, offset: Array) -> float:
+def compute_evidence(imu: Imu, offset: Array) -> float:
     """Twice the logarithm of how much likelier the rows are if the unit took `offset` (N, 3) off than if it did not."""
     T = _periods(imu)[:, None]
     angle, bent = np.cumsum(imu.gyro * T, axis=0), np.cumsum(offset * T, axis=0)

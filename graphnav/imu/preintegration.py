@@ -36,7 +36,7 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
-from graphnav.imu.interval_noise import last_of, running_sum, walk_covariances, white_covariance, white_variances
+from graphnav.imu.interval_noise import running_sum, take_last, walk_covariances, white_covariance, white_variances
 from graphnav.imu.samples import MANY, Samples, chunks, pieces_of
 from graphnav.recording import Imu
 
@@ -285,7 +285,7 @@ def _integrate(
     of_gyro, of_accel = imu.noise.gyro_bias_walk**2 * walks[0], imu.noise.accel_bias_walk**2 * walks[1]
     Q = white_covariance(qg, qa, left, a_edge, b_edge) + of_gyro + of_accel
 
-    dR, v_ba, v_bg, p_ba, p_bg = (last_of(x) for x in (R, A, B, PA, PB))
+    dR, v_ba, v_bg, p_ba, p_bg = (take_last(x) for x in (R, A, B, PA, PB))
     turn = np.zeros((n, 15, 15))  # theta from the start frame to a right perturbation of dR
     turn[:, 3:, 3:] = np.eye(12)
     turn[:, :3, :3] = np.swapaxes(dR, -1, -2)
@@ -299,7 +299,7 @@ def _integrate(
     theta_bg = np.swapaxes(dR, -1, -2) @ v_ba
     mean_rate, mean_force = (np.sum(x * dt[:, None], axis=0).T / T[:, None] for x in (w, f))
     return Intervals(
-        t[rows], t[rows + 1], dR, last_of(V), last_of(P), theta_bg, v_ba, v_bg, p_ba, p_bg,
+        t[rows], t[rows + 1], dR, take_last(V), take_last(P), theta_bg, v_ba, v_bg, p_ba, p_bg,
         np.array(ba), np.array(bg), mean_rate, mean_force, Q, parts, *_mean_velocity_parts(edge, R, V, A),
     )  # fmt: skip
 
@@ -319,4 +319,4 @@ def _mean_velocity_parts(edge: Array, R: Array, V: Array, A: Array) -> tuple[Arr
         np.moveaxis(np.einsum("ln,lijn->ijn", w, x), -1, 0)
         for w, x in ((weight, back), (weight * (T - edge), back), (weight, left))
     )
-    return turned @ last_of(R), late @ last_of(R), left[..., 0], left[..., 1:]
+    return turned @ take_last(R), late @ take_last(R), left[..., 0], left[..., 1:]

@@ -16,7 +16,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.standstill import PLACE
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, Parameter
-from graphnav.estimation.fixing import LOST_PLACE, LOST_SPEED, Epochs, Held, hold_on, split, with_integers
+from graphnav.estimation.fixing import LOST_PLACE, LOST_SPEED, Epochs, Held, hold_on, split_carriers, with_integers
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.noise.model import INTERVALS, STATED, NoiseModel
 from graphnav.estimation.problem import Problem
@@ -138,7 +138,7 @@ class Chain:
 
     def _hold(self, problem: Problem) -> Problem:
         """The problem with the integers that were decided on at its keyframes, and let go of."""
-        if not self.settings.raw_gnss.integers or split(problem)[1] is None:
+        if not self.settings.raw_gnss.integers or split_carriers(problem)[1] is None:
             return problem
         begin, end = np.searchsorted(self.window.t, problem.t[[0, -1]] + [-SAME_TIME, SAME_TIME])
         decided = {
@@ -192,7 +192,7 @@ class Chain:
     def _decide(self, problem: Problem, k: int) -> Held:
         """Integers that can be told behind keyframe `k` of a problem, the newest."""
         held = (self._held[-1] if self._held else self._head_held).go_on()
-        phase, newest = split(problem)[1], self.window.newest
+        phase, newest = split_carriers(problem)[1], self.window.newest
         if phase is None or not self.settings.raw_gnss.integers or k not in phase.keyframe:
             return held
         if any(name not in newest.columns for name in phase.slots):
@@ -202,7 +202,7 @@ class Chain:
 
     def _begin_ambiguities(self, problem: Problem, steps: tuple[Step, ...]) -> tuple[Step, ...]:
         """Ambiguities, but those that begin anyway, begin anew about what they are thought to be."""
-        phase, newest, begun = split(problem)[1], self.window.newest, {step.name for step in steps}
+        phase, newest, begun = split_carriers(problem)[1], self.window.newest, {step.name for step in steps}
         assert phase is not None
         return tuple(
             Step(p.name, newest.value(p.name), p.sigma[0])
@@ -271,7 +271,7 @@ class Chain:
 
 def _with_decisions(problem: Problem, decided: dict[float, Held]) -> Problem:
     """A problem with what was decided at some of its keyframes, by time."""
-    phase = split(problem)[1]
+    phase = split_carriers(problem)[1]
     if phase is None:
         return problem
     rows, lost = [], np.zeros(len(problem.t), dtype=bool)

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
-from graphnav.core.complaints import complaint, nearest
+from graphnav.core.complaints import complaint, suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_json, parse_number
 from graphnav.online.raw import RAW, LiveRaw, live_raw, text_of, values_of
@@ -145,7 +145,7 @@ def row_of(line: str) -> Row | None:
 def _series_row(cells: list[str]) -> Row:
     name, sensor = cells[0] if cells else "", list_sensors().get(cells[0] if cells else "")
     if sensor is None:
-        raise ValueError(f"no sensor '{name[:20]}' is known; {nearest(name, tuple(list_sensors()))}")
+        raise ValueError(f"no sensor '{name[:20]}' is known; {suggest_nearest(name, tuple(list_sensors()))}")
     if len(cells) != 2 + len(sensor.names):
         raise ValueError(f"'S,{name}' needs {1 + len(sensor.names)} numbers, not {len(cells) - 1}")
     try:

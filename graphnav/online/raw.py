@@ -2,6 +2,18 @@
 
 An epoch is one row: the numbers of its satellites one after the other, each placed by the ephemerides that were known
 when the source began. Which satellites and signals there may be, and what all epochs have in common, says the setup.
+
+In the line protocol (`graphnav.online.lines`) each satellite and signal of an epoch is, with commas between:
+
+    satellite, signal              as G05, 1C
+    code, carrier, range rate      m, cycles, m/s; blank where absent, as is
+    C/N0                           dB-Hz
+    slip, half                     1 after a loss of lock; 1 where half a cycle is open
+    frequency                      Hz
+    x, y, z, vx, vy, vz            of the satellite in the Earth-fixed frame of the transmission, m, m/s
+    clock, drift                   of the satellite, group delay taken off, m, m/s
+    code and carrier of the base   m to add to those of the rover; blank without a base
+    arc of the base, lock          a number that changes with the base's arc, -1 without; s in lock, blank if unknown
 """
 
 from __future__ import annotations
@@ -15,7 +27,7 @@ from pydantic import BaseModel, ConfigDict
 from graphnav.config import Settings
 from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.constraints.gnss import period
-from graphnav.constraints.raw_selection import EARLY, usable
+from graphnav.constraints.raw_selection import EARLY, select_usable
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
 from graphnav.core.notes import Note
@@ -23,7 +35,7 @@ from graphnav.core.rotation import Array
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.series import Catalogue, RawGnss, primary
 from graphnav.gnss.signals import SYSTEMS, satellite_id, satellite_name, signal_id, signal_name
-from graphnav.gnss.single_point import coefficients, look, signal_groups, solve
+from graphnav.gnss.single_point import choose_coefficients, look, signal_groups, solve
 from graphnav.recording import Recording
 from graphnav.sensors.tables import NotNegative, Positive, Vector
 
@@ -50,12 +62,12 @@ def without_epochs(raw: RawGnss) -> RawGnss:
     satellites, _ = placed.satellites
     groups, _ = signal_groups(placed.take(primary(placed)))
     catalogue = Catalogue(tuple(satellites.tolist()), groups, raw.differenced, period(raw.epochs[0]))
-    return replace(_empty(_filled(raw)), catalogue=catalogue)
+    return replace(_make_empty(_fill_columns(raw)), catalogue=catalogue)
 
 
 def epochs_of(raw: RawGnss) -> list[tuple[float, tuple[float, ...]]]:
     """Times (s) and numbers of the epochs of a series, those of its satellites that are placed."""
-    raw = _filled(raw.take(np.isfinite(raw.p[:, 0])))
+    raw = _fill_columns(raw.take(np.isfinite(raw.p[:, 0])))
     columns = np.column_stack([np.asarray(getattr(raw, name), dtype=float) for name in _NUMBERS])
     t, first = np.unique(raw.t, return_index=True)
     return [
@@ -164,7 +176,9 @@ class RawEpochs:
         if not np.isin(rows[:, 0], self.setup.catalogue.satellites).all():
             return "of satellites that the setup does not name"
         rows = _sane(rows)
-        return None if usable(self._series([0.0], [rows]), self.settings).any() else "no satellite that is of use"
+        return (
+            None if select_usable(self._series([0.0], [rows]), self.settings).any() else "no satellite that is of use"
+        )
 
     def wanted(self, t: float) -> bool:
         """Whether no epoch is there that is so near to a time that one of the two suffices."""
@@ -234,7 +248,7 @@ class RawEpochs:
             return rows
         k = bisect_left(self._every, t)
         place = self._rows[self._every[k - 1]][0, -5:-2] if k else np.array(self.setup.place)
-        geometry = look(series, np.broadcast_to(place, (len(rows), 3)), coefficients(series))
+        geometry = look(series, np.broadcast_to(place, (len(rows), 3)), choose_coefficients(series))
         clock = np.nanmedian(series.code + series.clock - geometry.distance - geometry.troposphere)
         rows[:, -5:] = [*place, clock, 0.0]
         return rows
@@ -285,7 +299,7 @@ def codes_alone(settings: Settings) -> Settings:
     return settings.model_copy(update={RAW: less})
 
 
-def _filled(raw: RawGnss) -> RawGnss:
+def _fill_columns(raw: RawGnss) -> RawGnss:
     """A series with all columns, with nothing in those that it lacks."""
     n, none = len(raw), np.full(len(raw), np.nan)
     return replace(
@@ -296,7 +310,7 @@ def _filled(raw: RawGnss) -> RawGnss:
     )
 
 
-def _empty(raw: RawGnss) -> RawGnss:
+def _make_empty(raw: RawGnss) -> RawGnss:
     """A series without rows."""
     none = {
         f.name: getattr(raw, f.name)[:0]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.core.complaints import nearest
+from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.solution import to_trajectory
@@ -133,7 +133,7 @@ class Reading(_Row):
         for name in columns:
             if name not in sensor.names:
                 raise RecordingError(
-                    f"Reading of {sensor.name} at t = {t}: {nearest(name, sensor.names)}", key="row.name"
+                    f"Reading of {sensor.name} at t = {t}: {suggest_nearest(name, sensor.names)}", key="row.name"
                 )
         values = np.array([_number(cls, t, n, columns[n]) if n in columns else np.nan for n in sensor.names])
         if not sensor.usable(sensor.within_bounds(values)[None])[0]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from graphnav.core.earth import llh_to_ecef
 from graphnav.core.rotation import Array
-from graphnav.recording.formats.repair import VAGUEST, VAGUEST_V, on_earth
+from graphnav.recording.formats.repair import VAGUEST, VAGUEST_V, is_on_earth
 from graphnav.recording.plausibility.fixes import FASTEST, MISLED
 from graphnav.recording.plausibility.screening import ACCEL_RANGE, GYRO_RANGE
 
@@ -56,7 +56,7 @@ def odometer_reads(values: tuple[float, ...]) -> bool:
 def fix_odds(values: tuple[float, ...]) -> str | None:
     """What is wrong with a fix by itself, as it is counted; None if nothing is."""
     lat, lon, h = (np.array([x]) for x in values[:3])
-    if not on_earth(lat, lon, h)[0]:
+    if not is_on_earth(lat, lon, h)[0]:
         return "nowhere on Earth"
     if not all(_SUREST <= sd <= VAGUEST for sd in values[3:6]):
         return "a sigma that says nothing"
@@ -86,13 +86,13 @@ class Reach:
     def take(self, t: float, values: tuple[float, ...]) -> list[Row] | None:
         """Whether a fix is taken: [] if so, None if not, and the others in its place if they outnumber all before."""
         p = llh_to_ecef(np.array(values[:3]))
-        if self._p is None or _near(t - self._t, p - self._p):
+        if self._p is None or _is_near(t - self._t, p - self._p):
             if t > self._t:
                 self._t, self._p = t, p
             self._count = min(self._count + 1, _MOST)
             self._others.clear()
             return []
-        if self._last is None or not self._others or not _near(t - self._last[0], p - self._last[1]):
+        if self._last is None or not self._others or not _is_near(t - self._last[0], p - self._last[1]):
             self._others.clear()
         self._others.append(("gnss", t, values))
         self._last = t, p
@@ -103,7 +103,7 @@ class Reach:
         return rows
 
 
-def _near(dt: float, dp: Array) -> bool:
+def _is_near(dt: float, dp: Array) -> bool:
     return float(np.linalg.norm(dp)) <= FASTEST * abs(dt) + MISLED
 
 

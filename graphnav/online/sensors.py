@@ -107,13 +107,13 @@ class Sensors:
         if not math.isfinite(sum(known)) or not abs(t) <= LATEST or (sensor == "gnss" and min(values[3:6]) <= 0.0):
             self.counts[f"{sensor}: not a number"] += 1
             return False
-        if (odd := self._odd(sensor, values)) is not None:
+        if (odd := self._find_fault(sensor, values)) is not None:
             self.counts[f"{sensor}: {odd}"] += 1
             return False
         buffer: Buffer = getattr(self, sensor)
         if sensor == "imu":
             return self._add_imu(t, values)
-        if not self._in_time(sensor, t, values, (sensor, t, *values[: _TOLD[sensor]]), released):
+        if not self._is_in_time(sensor, t, values, (sensor, t, *values[: _TOLD[sensor]]), released):
             return False
         if sensor == "gnss":
             values, without = with_sane_velocity(values)
@@ -131,8 +131,8 @@ class Sensors:
                 return False
             values = (
                 *values,
-                *self._usually("position", t, values[3:6]),
-                *self._usually("velocity", t, values[9:12]),
+                *self._track_sigma("position", t, values[3:6]),
+                *self._track_sigma("velocity", t, values[9:12]),
                 1.0,
             )
         if not buffer.add(t, values):
@@ -143,7 +143,7 @@ class Sensors:
             return self._choose(t, *self._grid)
         return True
 
-    def _in_time(
+    def _is_in_time(
         self, sensor: str, t: float, values: tuple[float, ...], told: tuple[str | float, ...], released: bool
     ) -> bool:
         """Whether a row comes when it can be used; `told` is by what it is known again."""
@@ -171,7 +171,7 @@ class Sensors:
             why = "not a number"
         elif not sensor.usable(row := sensor.within_bounds(row))[0]:
             why = "beyond any sensor"
-        elif not self._in_time(name, t, values, _identify(name, t, values), released):
+        elif not self._is_in_time(name, t, values, _identify(name, t, values), released):
             return False
         elif not self.others[name].add(t, tuple(row[0].tolist())):
             why = "repeated"
@@ -185,7 +185,7 @@ class Sensors:
             why = "not a number"
         elif (why := self.raw.odds(values)) is not None:
             pass
-        elif not self._in_time(RAW, t, values, (RAW, t, len(values)), released):
+        elif not self._is_in_time(RAW, t, values, (RAW, t, len(values)), released):
             return False
         elif not self.raw.wanted(t):
             why = "closer than they are used"
@@ -246,7 +246,7 @@ class Sensors:
             self._unit = unit_of(self.gnss.rows[self.gnss.rows[:, _USED] > 0.0, 4:7])
         return self._unit
 
-    def _usually(self, kind: str, t: float, sd: tuple[float, ...]) -> tuple[float, ...]:
+    def _track_sigma(self, kind: str, t: float, sd: tuple[float, ...]) -> tuple[float, ...]:
         """A mean that looks back only, and so is the same whenever a fix is posed.
 
         The median of a minute that `graphnav.constraints.gnss` takes would change with every row that follows, and
@@ -277,7 +277,7 @@ class Sensors:
         """Another clock: what was noted of the times of rows holds no more."""
         self._means, self._suspect, self._reach = {}, None, Reach()
 
-    def _odd(self, sensor: str, values: tuple[float, ...]) -> str | None:
+    def _find_fault(self, sensor: str, values: tuple[float, ...]) -> str | None:
         """What is wrong with a row by itself, as it is counted."""
         if sensor == "gnss":
             return fix_odds(values)

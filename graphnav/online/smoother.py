@@ -163,7 +163,7 @@ class Smoother:
             self._go_through(self._again, tracker)
         elif self._judgement is not None and tracker.newest >= self._judgement.due:
             self._use(self._judgement, tracker)
-        elif tracker.work_ahead(self.sensors, expected := self._expected(tracker), not self._tentative):
+        elif tracker.work_ahead(self.sensors, expected := self._predict_keyframe(tracker), not self._tentative):
             self._collect(tracker)
         elif tracker.stale and not self._tentative:
             self._again = CatchUp(tracker.afresh(tracker.noise, self._setup))
@@ -172,7 +172,7 @@ class Smoother:
                 self._judge_again(self._found, tracker)
             self._awake = expected if now < expected else self._due
 
-    def _expected(self, tracker: Tracker) -> float:
+    def _predict_keyframe(self, tracker: Tracker) -> float:
         """When the next keyframe will stand, as far as is known, s."""
         T, period = tracker.newest, 1.0 / self.settings.keyframes.rate
         fix = min((t for t in self._fixes if t > T + SAME_TIME), default=np.inf)

@@ -124,7 +124,7 @@ class Tracker(Chain):
             return np.inf
         clock.append(time.thread_time())
         back = self._add(posed.problem, posed.first, posed.ahead)
-        self._done()
+        self._finish_keyframes()
         clock.append(time.thread_time())
         if len(new):
             self.seconds = dict(zip(("looking", "posing", "solving"), np.diff(clock).tolist(), strict=True))
@@ -140,18 +140,18 @@ class Tracker(Chain):
             times = np.unique(np.concatenate([again, new]))
             times = times[np.concatenate([[True], np.diff(times) > SAME_TIME])]
         keep = len(self.window) - len(again)
-        before = self._before(keep, float(times[0]))
+        before = self._list_before(keep, float(times[0]))
         self._keep(keep)
-        ahead, self._ahead = self._ahead if self._prepared(float(times[0])) else None, None
+        ahead, self._ahead = self._ahead if self._is_prepared(float(times[0])) else None, None
         problem = self._complete(ahead, sensors, before, times)
         if problem is None:
-            problem, ahead = self._noisy(self._pose(sensors, np.concatenate([before, times])), sensors), None
+            problem, ahead = self._apply_noise(self._pose(sensors, np.concatenate([before, times])), sensors), None
         self._parameters |= problem.parameters
         self._watch(problem, sensors)
         redone = again[0] if again else np.inf
         return Posed(problem, len(before), times, redone, None if ahead is None else ahead.keyframe)
 
-    def _done(self) -> None:
+    def _finish_keyframes(self) -> None:
         """Keyframes have entered."""
         self.in_force = {rows.name: len(rows.b) for rows in self.window.stages[-1].measured if rows.H.any()}
         self._forget()
@@ -194,7 +194,7 @@ class Tracker(Chain):
             self._standing.look(sensors, self.settings, expected, self.head)
         elif self._standing.news or self._dirty < np.inf:
             self.update(sensors, np.empty(0))
-        elif sensors.raw is None and not self._prepared(expected) and self._is_covered(sensors, expected):
+        elif sensors.raw is None and not self._is_prepared(expected) and self._is_covered(sensors, expected):
             self._prepare(sensors, expected)  # with raw observations a clock begins anew, which only the epoch tells
         else:
             return False
@@ -203,7 +203,7 @@ class Tracker(Chain):
     def _integrate(self, sensors: Sensors, expected: float) -> None:
         """The interval up to a keyframe that is expected."""
         T, start = self.newest, self.window.newest.state
-        imu = self._around(sensors, T, sensors.imu.newest).imu
+        imu = self._cut_around(sensors, T, sensors.imu.newest).imu
         ends = np.array([T, expected])
         interval = preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0], self._judged_imu)
         self._motions[expected] = ImuFactors(interval, self.frame).prepare()
@@ -215,13 +215,13 @@ class Tracker(Chain):
 
     def _prepare(self, sensors: Sensors, expected: float) -> None:
         """Pose and predict the keyframe that is expected, but for the fix."""
-        before = self._before(len(self.window), expected)
-        problem = self._noisy(self._pose(sensors, np.array([*before, expected]), complete=False), sensors)
+        before = self._list_before(len(self.window), expected)
+        problem = self._apply_noise(self._pose(sensors, np.array([*before, expected]), complete=False), sensors)
         self._parameters |= problem.parameters
         place, _ = self._place(self._weigh(problem), len(before))
         self._ahead = _Ahead(problem, self.window.expect(place), self.stops, self._readings.wrong)
 
-    def _prepared(self, t: float) -> bool:
+    def _is_prepared(self, t: float) -> bool:
         """Whether what was prepared for a keyframe still holds."""
         one = self._ahead
         return (
@@ -237,10 +237,10 @@ class Tracker(Chain):
         if ahead is None or len(times) > 1 or len(ahead.problem.t) != len(before) + 1:
             return None
         recording = sensors.recording(float(ahead.problem.t[0]) - _ROWS_BEFORE, float(times[-1]) + ROWS_AFTER)
-        problem = ahead.problem.complete(recording, self._usual(sensors, recording))
+        problem = ahead.problem.complete(recording, self._scale_errors(sensors, recording))
         known = {c.name for c in ahead.problem.constraints}
         late = replace(problem, constraints=tuple(c for c in problem.constraints if c.name not in known))
-        added = {c.name: c for c in self._noisy(late, sensors, self._noise_of_rows).constraints}
+        added = {c.name: c for c in self._apply_noise(late, sensors, self._noise_of_rows).constraints}
         problem = replace(problem, constraints=tuple(added.get(c.name, c) for c in problem.constraints))
         return problem if problem.parameters.keys() <= self._parameters.keys() else None
 
@@ -316,7 +316,7 @@ class Tracker(Chain):
         return since(self.window.newest, self.newest, self.frame, sensors, self.noise)
 
     # ------------------------------------------------------------------------------------------------- keyframes
-    def _before(self, keep: int, t: float) -> list[float]:
+    def _list_before(self, keep: int, t: float) -> list[float]:
         """Times of the keyframes that are posed again with those from t on, of the first `keep` in the window."""
         look = _BEFORE if len(self.stops) and self.stops[-1, 1] > t - _BEFORE else 1
         before = [stage.place.t for stage in self.window.stages[max(0, keep - look) : keep]]
@@ -324,7 +324,7 @@ class Tracker(Chain):
             before.insert(0, self.head)
         return before
 
-    def _usual(self, sensors: Sensors, recording: Recording) -> Array | None:
+    def _scale_errors(self, sensors: Sensors, recording: Recording) -> Array | None:
         """The unit of the slow errors of a recording's fixes, m."""
         if recording.gnss is None:
             return None
@@ -336,13 +336,13 @@ class Tracker(Chain):
             stops = stops if self.foot else stops[stops[:, 1] > begin]
             here = stops[(stops[:, 0] < begin) & (stops[:, 1] > begin)]
             begin = min([begin, *here[:, 0].tolist()])
-        recording = self._around(
+        recording = self._cut_around(
             sensors, begin, max(float(times[-1]) + ROWS_AFTER, sensors.imu_until(float(times[-1])))
         )
         start, speed = self.window.newest.state, None
         if recording.odometer is not None:
             speed = MeanSpeed.of(recording.odometer, self._readings.wrong, self._readings.figures)
-        usual = self._usual(sensors, recording)
+        usual = self._scale_errors(sensors, recording)
         found = ((t, self._motions.get(t)) for t in times[1:].tolist())
         known = {t: one for t, one in found if one is not None and not one.intervals.out_of_range(start.bg)[0]}
         problem = build_problem(
@@ -354,7 +354,7 @@ class Tracker(Chain):
                 self._motions[t] = ImuFactors(problem.intervals[k : k + 1], self.frame)
         return problem
 
-    def _noisy(self, problem: Problem, sensors: Sensors, noise: NoiseModel | None = None) -> Problem:
+    def _apply_noise(self, problem: Problem, sensors: Sensors, noise: NoiseModel | None = None) -> Problem:
         """A problem posed with stated noise as the noise model has it.
 
         A few keyframes do not tell how often fixes come, nor what they usually state.
@@ -370,7 +370,7 @@ class Tracker(Chain):
             rows.append(c)
         return with_noise(replace(problem, constraints=tuple(rows)), noise or self.noise)
 
-    def _around(self, sensors: Sensors, begin: float, end: float) -> Recording:
+    def _cut_around(self, sensors: Sensors, begin: float, end: float) -> Recording:
         """The rows that keyframes between two times look at.
 
         Only what gaps in the IMU hide is told by the signal of the last half minute.
@@ -391,7 +391,7 @@ class Tracker(Chain):
         for stop in self.stops if end < len(self.window) else ():
             if stop[0] < times[until - 1] < stop[1]:
                 until = int(np.searchsorted(times, stop[1] + SAME_TIME))
-        problem = self._weigh(self._noisy(self._pose(sensors, times[begin:until]), sensors))
+        problem = self._weigh(self._apply_noise(self._pose(sensors, times[begin:until]), sensors))
         return [
             replace(stage.place, problem=problem, k=first + skip - begin + i)
             for i, stage in enumerate(self.window.stages[first:end])

@@ -115,7 +115,7 @@ class Walker(Tracker):
         self._work = replace(work, entered=end)
         if back is not None or end == len(posed.problem.t):
             self._work = None
-            self._done()
+            self._finish_keyframes()
         if back is not None:
             self._renewal = _Renewal()
             self._go_back(sensors, posed, back)

@@ -218,7 +218,7 @@ class Recording:
         left = None
         if span is not None:
             t = sensor.t - self.start
-            left = rows_of(sensor, ~((t >= span[0]) & (t <= span[1])))
+            left = take_rows(sensor, ~((t >= span[0]) & (t <= span[1])))
         if source in self.sensors:
             rest = {name: series for name, series in self.sensors.items() if name != source}
             return replace(self, sensors=rest if left is None else {**self.sensors, source: left})
@@ -226,7 +226,7 @@ class Recording:
         if source == "gnss" and self.raw_gnss is not None:  # whose fixes they are
             raw = self.raw_gnss.t - self.start
             out = np.zeros(len(raw), dtype=bool) if span is None else (raw < span[0]) | (raw > span[1])
-            changed["raw_gnss"] = rows_of(self.raw_gnss, out) if out.any() else None
+            changed["raw_gnss"] = take_rows(self.raw_gnss, out) if out.any() else None
         return replace(self, **changed)
 
     def crop(self, start: float | None = None, end: float | None = None) -> Recording:
@@ -252,12 +252,12 @@ class Recording:
         lo = -np.inf if start is None else self.start + start
         hi = np.inf if end is None else self.start + end
         parts: dict[str, Any] = {
-            name: rows_of(sensor, (sensor.t >= lo) & (sensor.t <= hi))
+            name: take_rows(sensor, (sensor.t >= lo) & (sensor.t <= hi))
             for name in ("imu", "gnss", "odometer", "raw_gnss")
             if (sensor := getattr(self, name)) is not None
         }
         parts["sensors"] = {
-            name: rows_of(series, (series.t >= lo) & (series.t <= hi)) for name, series in self.sensors.items()
+            name: take_rows(series, (series.t >= lo) & (series.t <= hi)) for name, series in self.sensors.items()
         }
         if len(parts["imu"].t) < 2:
             raise RecordingError(
@@ -283,7 +283,7 @@ def sources() -> tuple[str, ...]:
     return ("gnss", "odometer", *list_sensors())
 
 
-def rows_of(sensor: Any, mask: NDArray[np.bool_] | slice) -> Any:
+def take_rows(sensor: Any, mask: NDArray[np.bool_] | slice) -> Any:
     """Some rows of a sensor.
 
     Parameters

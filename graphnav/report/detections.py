@@ -60,7 +60,7 @@ def statistics_text(found: Detections) -> str:
     t = max(detections, key=lambda d: len(d.t)).t
     head, columns = ["t"], [t]
     for d in detections:
-        k, near = _nearest(d.t, t)
+        k, near = _find_nearest(d.t, t)
         threshold = np.broadcast_to(d.threshold, d.t.shape)
         for values in (d.statistic, threshold, d.mask.astype(float)):
             columns.append(np.where(near, values[k], np.nan))
@@ -69,7 +69,7 @@ def statistics_text(found: Detections) -> str:
     return ",".join(head) + "\n" + rows_text(np.stack(columns, -1), form)
 
 
-def _nearest(of: Array, t: Array) -> tuple[np.ndarray, np.ndarray]:
+def _find_nearest(of: Array, t: Array) -> tuple[np.ndarray, np.ndarray]:
     """Row of `of` nearest to each time, and whether it is as near as its own spacing lets it be."""
     if len(of) == 1:
         return np.zeros(len(t), dtype=int), np.abs(t - of[0]) < 1.0

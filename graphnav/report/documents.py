@@ -139,11 +139,11 @@ def write_report(
         ("Provenance", provenance_tables(settings, provenance)),
     ]
     lead = [
-        *_doubts(only, every),
+        *_list_doubts(only, every),
         page.paragraph(words.describe_run(recording, only, withheld, outages)),
         summary.verdicts(solution, errors),
-        *words.closure_note(name, metrics),
-        words.tiles(recording, only, every),
+        *words.describe_closure(name, metrics),
+        words.list_tiles(recording, only, every),
         *summary.links(beside),
         *summary.fix_table(recording, solution, withheld),
         page.columns(["".join(summary.sigma_table(solution)), "".join(summary.separation_table(solution))]),
@@ -208,11 +208,11 @@ def write_comparison(
         ("Provenance", provenance_tables(settings, provenance)),
     ]
     lead = [
-        *_doubts(solutions, every),
+        *_list_doubts(solutions, every),
         page.paragraph(words.describe_run(recording, solutions, withheld, outages)),
         *_verdicts(solutions, every),
-        *(note for name, values in metrics_of.items() for note in words.closure_note(name, values)),
-        words.tiles(recording, solutions, every),
+        *(note for name, values in metrics_of.items() for note in words.describe_closure(name, values)),
+        words.list_tiles(recording, solutions, every),
     ]
     return _write(path, page.page(f"{recording.name}: comparison", lead, sections, _clocks(recording)))
 
@@ -239,9 +239,9 @@ def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans
     return {"withheld": gone, "no GNSS": list(outages), "excluded": excluded}
 
 
-def _doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[page.Raw]:
+def _list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[page.Raw]:
     """Why the result cannot be trusted, where it cannot."""
-    return [page.paragraph(said, "verdict bad") for said in words.doubts(solutions, errors)]
+    return [page.paragraph(said, "verdict bad") for said in words.list_doubts(solutions, errors)]
 
 
 def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[page.Raw]:

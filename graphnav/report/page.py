@@ -160,7 +160,7 @@ def picture(figure: Figure, title: str, note: str = "", kind: str = "") -> Raw:
     parts = [
         f"<figcaption>{text(title)}</figcaption>",
         f'<div class="plot" role="img" aria-label="{escape(title)}"{time} style="height:{figure.height}px"></div>',
-        _packed(data),
+        _pack(data),
         f'<p class="note">{text(note)}</p>' if note else "",
     ]
     mark = f' class="{kind}"' if kind else ""
@@ -245,10 +245,10 @@ def _library() -> str:
     found = importlib.util.find_spec("plotly")
     if found is None or found.origin is None:
         raise ModuleNotFoundError("plotly is not installed")
-    return _packed((Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes(), "plotly-library")
+    return _pack((Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes(), "plotly-library")
 
 
-def _packed(content: bytes, key: str = "") -> str:
+def _pack(content: bytes, key: str = "") -> str:
     """An element that holds something deflated, for `page.js` to unpack."""
     mark = f' id="{key}"' if key else ""
     packed = base64.b64encode(zlib.compress(content, _LEVEL)).decode("ascii")

@@ -70,7 +70,8 @@ def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> 
         for kind, of_it in fixes.kinds.items():
             rows = of_it & ~fixes.excluded
             points[kind] = over_way(fixes.t[rows] + start, base + fixes.enu[rows, 2])
-    note = "Heights above the ellipsoid; fixes are of the antenna."
+    antenna = "truth and fixes" if "truth" in lines and recording.truth and recording.truth.of == "gnss" else "fixes"
+    note = f"Heights above the ellipsoid; {antenna} are of the antenna."
     if not has_place(first):
         note = "Heights count from the start."
     return page.picture(plots.profile(lines, points), "Height profile", note, kind="large")
@@ -302,7 +303,8 @@ def parameter_pictures(
             series = {solver: Series(p.t - start, scale * p.value, scale * p.sigma)}
             titles = [one.words for one in shown]
             figure = plots.bands(series, titles, shown[0].unit, end, spans=spans, about_zero=False)
-            out.append(page.picture(figure, f"{name.replace('_', ' ')} and 3 sigma"))
+            words = name.replace("_", " ")
+            out.append(page.picture(figure, f"{words[:1].upper()}{words[1:]} and 3 sigma"))
     return out
 
 

@@ -28,7 +28,7 @@ _MOST = 0.5  # share of what the fixes say; beyond it most of what was measured 
 _TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduces residuals
 
 
-def doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> tuple[str, ...]:
+def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> tuple[str, ...]:
     """Sentences on why a result cannot be trusted, none where nothing speaks against it."""
     from graphnav.evaluation.sigmas import judge_sigmas
 
@@ -113,7 +113,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
     return words
 
 
-def tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> Raw:
+def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> Raw:
     """The few numbers to see first."""
     states = next(iter(solutions.values())).states
     way = float(np.linalg.norm(np.diff(states.p, axis=0), axis=1).sum())
@@ -204,7 +204,7 @@ def believe_without_truth(solution: Solution) -> Raw:
     return page.paragraph(said, "verdict")
 
 
-def closure_note(name: str, metrics: Mapping[str, Any] | None) -> list[Raw]:
+def describe_closure(name: str, metrics: Mapping[str, Any] | None) -> list[Raw]:
     """How far from the start a loop ended, where that is the truth."""
     if not metrics or metrics.get("closure_h_m") is None:
         return []

@@ -38,7 +38,7 @@ _SHOWS = {
 
 def verdicts(solution: Solution, errors: Errors | None) -> Raw:
     """Position, velocity and attitude: how good, and whether the stated sigma is consistent."""
-    judged = _by_records(solution) | ({} if errors is None else _by_truth(errors))
+    judged = _judge_by_records(solution) | ({} if errors is None else _judge_by_truth(errors))
     cells = []
     for block in ("position", "velocity", "attitude"):
         kind, words = judged.get(block, ("", "nothing is there to judge it by"))
@@ -46,7 +46,7 @@ def verdicts(solution: Solution, errors: Errors | None) -> Raw:
     return Raw(f'<div class="judged">{"".join(cells)}</div>')
 
 
-def _by_truth(errors: Errors) -> dict[str, tuple[str, str]]:
+def _judge_by_truth(errors: Errors) -> dict[str, tuple[str, str]]:
     from graphnav.evaluation.sigmas import judge_sigmas
 
     # a truth may have no heights
@@ -70,7 +70,7 @@ def _by_truth(errors: Errors) -> dict[str, tuple[str, str]]:
     return out
 
 
-def _by_records(solution: Solution) -> dict[str, tuple[str, str]]:
+def _judge_by_records(solution: Solution) -> dict[str, tuple[str, str]]:
     out = {}
     for block, kinds in _SHOWS.items():
         for kind in kinds:

@@ -100,7 +100,7 @@ def ambiguity_table(solution: Solution) -> list[Raw]:
     return [page.table(head, [[len(epochs), fixed, len(epochs) - fixed, share]])]
 
 
-def _largest(x: Array) -> float:
+def _find_largest(x: Array) -> float:
     x = np.abs(x[np.isfinite(x)])
     return float(x.max()) if x.size else float("nan")
 
@@ -116,7 +116,7 @@ def accuracy_row(errors: Errors) -> list[float]:
     rph = np.degrees(errors.rph)
     return [
         rms(errors.horizontal),
-        _largest(errors.horizontal),
+        _find_largest(errors.horizontal),
         rms(errors.p[:, 2]),
         rms(np.linalg.norm(errors.v, axis=1)),
         rms(rph[:, :2]),
@@ -136,11 +136,11 @@ def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[fl
     way = float(errors.distance[rows[-1]] - errors.distance[rows[0]])
     return [
         rms(h),
-        _largest(h),
+        _find_largest(h),
         float(h[-1]),
-        100.0 * _largest(h) / way if way >= 1.0 else float("nan"),
-        _largest(errors.p[rows, 2]),
-        float(np.degrees(_largest(errors.rph[rows, 2]))),
+        100.0 * _find_largest(h) / way if way >= 1.0 else float("nan"),
+        _find_largest(errors.p[rows, 2]),
+        float(np.degrees(_find_largest(errors.rph[rows, 2]))),
         float(np.sqrt(mean_or_nan(errors.nees_axis[rows]))),
     ]
 
@@ -161,16 +161,16 @@ def accuracy_tables(errors: Mapping[str, Errors], withheld: Withheld, start: flo
             *out,
             page.heading("Spans without a source"),
             page.table(["span", "what", *COMPARED_SPAN], rows),
-            *_notes(errors),
+            *_list_notes(errors),
         ]
     for what, (a, b) in spans:
         rows = [[page.solver(name), *span_row(e, (a, b), start)] for name, e in errors.items()]
         out.append(page.heading(f"{what} {a:g} to {b:g} s" if what == "Withheld" else f"{what} {a:.1f} to {b:.1f} s"))
         out.append(page.table(["solver", *COMPARED_SPAN], rows, best=range(1, 7)))
-    return [*out, *_notes(errors)]
+    return [*out, *_list_notes(errors)]
 
 
-def _notes(errors: Mapping[str, Errors]) -> list[Raw]:
+def _list_notes(errors: Mapping[str, Errors]) -> list[Raw]:
     notes = list(dict.fromkeys(note for e in errors.values() for note in e.notes))
     return [page.bullets(notes)] if notes else []
 
@@ -194,10 +194,10 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Raw]:
                 float("nan") if row.used is None else row.used,
                 row.unit or "-",
                 float(np.exp(0.5 * row.figure.log_factor)),
-                _range(row.figure.log_factor, row.figure.sigma),
+                _format_range(row.figure.log_factor, row.figure.sigma),
                 float("nan") if row.correlation_time is None else row.correlation_time,
                 Raw(f"{row.figure.freedom:.0f}"),
-                _range(row.figure.prior, row.figure.prior_sigma),
+                _format_range(row.figure.prior, row.figure.prior_sigma),
             ]
             for row in rows
         ]
@@ -226,7 +226,7 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Raw]:
     return [*out, page.bullets(less)] if less else out
 
 
-def _range(log_factor: float, sigma: float) -> Raw:
+def _format_range(log_factor: float, sigma: float) -> Raw:
     """1-sigma range of a factor on sigma, of the logarithm of that on the variance."""
     if sigma <= 0.0:
         return Raw("-")

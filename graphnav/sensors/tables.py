@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator
 from pydantic.types import Strict
 
-from graphnav.core.complaints import nearest
+from graphnav.core.complaints import suggest_nearest
 
 _SMALLEST, _LARGEST = 1e-15, 1e9  # of a figure: squares of it are numbers
 _LONGEST = 1e7  # of the components of a vector: m, from the Earth's centre at most, or of a direction
@@ -16,15 +16,15 @@ _LONGEST = 1e7  # of the components of a vector: m, from the Earth's centre at m
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 
 
-def _usable(value: float) -> float:
+def _is_number(value: float) -> float:
     if value and not _SMALLEST <= abs(value) <= _LARGEST:
         raise ValueError(f"{value:g} must lie between {_SMALLEST:g} and {_LARGEST:g}")
     return value
 
 
-Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0), AfterValidator(_usable)]
+Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0), AfterValidator(_is_number)]
 
-NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0), AfterValidator(_usable)]
+NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0), AfterValidator(_is_number)]
 
 
 def three_numbers(value: Any) -> Any:
@@ -84,5 +84,5 @@ class SensorTable(TomlTable):
         known = (*cls.required, *cls.optional)
         for name in columns:
             if name not in known:
-                raise ValueError(f"'{name}' is not one of graphnav's columns; {nearest(name, known)}")
+                raise ValueError(f"'{name}' is not one of graphnav's columns; {suggest_nearest(name, known)}")
         return columns

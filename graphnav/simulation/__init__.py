@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Sequence
 from typing import Any
 
-from graphnav.core.complaints import nearest
+from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError
 from graphnav.simulation.result import Simulated
 from graphnav.simulation.scenarios import Scenario, scenarios
@@ -29,7 +29,7 @@ def scenario(name: str) -> Scenario:
     """
     known = scenarios()
     if name not in known:
-        raise ConfigError(f"no scenario '{name}'; {nearest(name, list(known))}", key="simulation.unknown")
+        raise ConfigError(f"no scenario '{name}'; {suggest_nearest(name, list(known))}", key="simulation.unknown")
     return known[name]
 
 
@@ -60,9 +60,9 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Simulated:
     for key, value in options.items():
         if key not in known:
             raise ConfigError(
-                f"scenario '{name}' has no option '{key}'; {nearest(key, list(known))}", key="simulation.option"
+                f"scenario '{name}' has no option '{key}'; {suggest_nearest(key, list(known))}", key="simulation.option"
             )
-        if not _alike(value, known[key]):
+        if not _fits_default(value, known[key]):
             raise ConfigError(
                 f"scenario '{name}': {key} = {value!r} is not of the kind of its default {known[key]!r}",
                 key="simulation.value",
@@ -77,7 +77,7 @@ def defaults(one: Scenario) -> dict[str, Any]:
     return {p.name: p.default for p in inspect.signature(one.run).parameters.values() if p.name != "seed"}
 
 
-def _alike(value: Any, default: Any) -> bool:
+def _fits_default(value: Any, default: Any) -> bool:
     """Whether a value may stand for a default: numbers for numbers, of which True is none."""
     if isinstance(default, bool) or isinstance(value, bool):
         return isinstance(default, bool) and isinstance(value, bool)

@@ -117,7 +117,7 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     t = centres(0.0, end, STEP, DEGREE)
     strike, off = steps.strike, steps.off
     vary = 1.0 + style.jitter * rng.standard_normal((K, 11))
-    sway = np.deg2rad(0.03) * _slow(len(t), rng, 2)
+    sway = np.deg2rad(0.03) * _sway(len(t), rng, 2)
     # a first and a last stance begin and end as the others do
     usual = float(np.median(off[1:-1] - strike[1:-1]))
     begun = np.where(np.arange(K) == 0, off - usual, strike)
@@ -132,7 +132,7 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     took = strike[1:] - off[:-1]
     u = np.clip((t - off[k]) / took[k], 0.0, 1.0)
     ahead = np.diff(steps.place, axis=0)
-    share, slope = _slide(u), u**6 - u**5  # the latter: of unit slope at its end, else nothing at both
+    share, slope = _share_of_swing(u), u**6 - u**5  # the latter: of unit slope at its end, else nothing at both
     landing = style.landing[0] * vary[1:, 0] * took / np.maximum(np.linalg.norm(ahead, axis=1), 0.1)
     # the shoe gives way by millimetres, by which it takes the edge off what ends with the strike
     share = gaussian_filter1d(share + np.minimum(landing, 0.5)[k] * slope + k, style.give / STEP) - k
@@ -148,7 +148,7 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     up = h + air * (gaussian_filter1d(h, _SWING / STEP) - h) + gaussian_filter1d(clearance, style.give / STEP)
     east = base[:, 0] + along * np.sin(psi) + aside * np.cos(psi)
     north = base[:, 1] + along * np.cos(psi) - aside * np.sin(psi)
-    x = np.column_stack([east, north, up, roll, pitch, psi]) + _shaken(t, strike[1:], style, rng)
+    x = np.column_stack([east, north, up, roll, pitch, psi]) + _ring(t, strike[1:], style, rng)
     stances = np.column_stack([begun + _FLAT * (ended - begun), begun + _HEEL_OFF * (ended - begun)])
     stances[0, 0], stances[-1, 1] = 0.0, end
     return Foot(spline(0.0, STEP, x, DEGREE), 0.0, end, np.column_stack([strike, off]), stances)
@@ -209,13 +209,13 @@ def _roll(t: Array, steps: Footprints, begun: Array, style: Style, vary: Array) 
 _SPEED = np.array([0.0, 0.65, 1.05, 1.25, 1.45, 1.0, 0.0])
 
 
-def _slide(u: Array) -> Array:
+def _share_of_swing(u: Array) -> Array:
     """Share (n,) of the way between two footprints at shares u of the swing's time."""
     knots = np.repeat([0.0, 1.0], len(_SPEED))
     return BSpline(knots, _SPEED / _SPEED.mean(), len(_SPEED) - 1).antiderivative()(u)
 
 
-def _shaken(t: Array, strikes: Array, style: Style, rng: np.random.Generator) -> Array:
+def _ring(t: Array, strikes: Array, style: Style, rng: np.random.Generator) -> Array:
     """(J, 6) what is left of a strike: shoe, flesh and mounting ring and die out within some 0.15 s.
 
     Movements of `style.impact` and turns such as go with them at a foot's size.
@@ -233,7 +233,7 @@ def _shaken(t: Array, strikes: Array, style: Style, rng: np.random.Generator) ->
     return out
 
 
-def _slow(count: int, rng: np.random.Generator, columns: int) -> Array:
-    """(count, columns) of unit size: the swaying of somebody who stands."""
+def _sway(count: int, rng: np.random.Generator, columns: int) -> Array:
+    """(count, columns) of unit size: the sway of a standing person."""
     x = gaussian_filter1d(rng.standard_normal((count, columns)), 0.3 / STEP, axis=0)
     return x / np.sqrt(np.mean(x**2, axis=0))

@@ -19,7 +19,7 @@ _SINKS, _ROLLS, _PITCHES = 0.0075, 0.0070, 0.0022
 
 @dataclass(frozen=True)
 class Boarding:
-    """Somebody gets in (`weight` +1) or out (-1) by a door; 0 is a door opened and shut only."""
+    """A person gets in (`weight` +1) or out (-1) by a door; 0 is a door opened and shut only."""
 
     t: float  # s, when the door opens
     weight: float = 1.0
@@ -29,7 +29,7 @@ class Boarding:
 
 @dataclass(frozen=True)
 class Fidget:
-    """Somebody shifts on the seat."""
+    """A person shifts on the seat."""
 
     t: float
     size: float  # share of the weight that moves

@@ -43,7 +43,7 @@ class _FootMotion:
     omega: Array  # (n, 3) rad/s over the Earth, b
 
 
-def _foot_motion(foot: Foot, R_fb: Array, t: Array) -> _FootMotion:
+def _move_foot(foot: Foot, R_fb: Array, t: Array) -> _FootMotion:
     x, dx = foot.spline(t), foot.spline.derivative()(t)
     R_nf = rotation.from_rph(x[:, [ROLL, PITCH, HEADING]])
     roll = x[:, ROLL]
@@ -65,7 +65,7 @@ def move_foot(
     count = int(np.floor((foot.end - foot.start) * rate + 1e-6))
     dt = 1.0 / rate
     t = foot.start + np.arange(count + 1) * dt
-    ends = _foot_motion(foot, R_fb, t)
+    ends = _move_foot(foot, R_fb, t)
     parts = max(1, round(2.0 * dt / STEP))  # of a period: half a spline's step at most
     nodes = ((np.arange(parts)[:, None] + 0.5 + 0.5 * _NODES) * dt / parts).ravel()
     weights = np.tile(0.5 * _WEIGHTS / parts, parts)
@@ -74,7 +74,7 @@ def move_foot(
     for a in range(0, count, _CHUNK):
         rows = slice(a, min(a + _CHUNK, count))
         inside = (t[:-1][rows, None] + nodes).ravel()
-        felt = _foot_motion(foot, R_fb, inside)
+        felt = _move_foot(foot, R_fb, inside)
         to_body = np.swapaxes(felt.R_nb, -1, -2)
         coriolis = 2.0 * np.cross(frame.omega_n, felt.v)
         force = mv(to_body, acceleration(inside)[:, PLACE] + coriolis - frame.gravity_n(felt.p))
@@ -94,7 +94,7 @@ def move_foot(
 
     def point(times: Array, lever_arm_b: Array) -> tuple[Array, Array]:
         """(llh, velocity in local ENU) of a point fixed to the IMU, at times within the walk, (M, 3) each."""
-        felt = _foot_motion(foot, R_fb, np.clip(np.asarray(times, dtype=float), t[0], t[-1]))
+        felt = _move_foot(foot, R_fb, np.clip(np.asarray(times, dtype=float), t[0], t[-1]))
         arm = np.asarray(lever_arm_b, dtype=float)
         p = felt.p + felt.R_nb @ arm
         return frame.to_llh(p), mv(frame.R_ln(p), felt.v + mv(felt.R_nb, np.cross(felt.omega, arm)))

@@ -191,15 +191,15 @@ def road_noise(path: Path, rng: np.random.Generator, size: float = 1.0, modes: S
     swallows what is shorter than itself, which at 0.2 m/s is all of it.
     """
     v = np.abs(path.speed(shake_times(path)))
-    return sample_movement(path, _swing(modes, size * np.sqrt(v / 14.0) * v / (v + 2.0), rng))
+    return sample_movement(path, _excite_modes(modes, size * np.sqrt(v / 14.0) * v / (v + 2.0), rng))
 
 
 def idle_floor(path: Path, rng: np.random.Generator, size: float = 1.0, modes: Sequence[Mode] = FLOOR) -> Part:
     """The coloured floor below 10 Hz of a body with a running engine."""
-    return sample_movement(path, _swing(modes, np.full(len(shake_times(path)), size), rng))
+    return sample_movement(path, _excite_modes(modes, np.full(len(shake_times(path)), size), rng))
 
 
-def _swing(modes: Sequence[Mode], envelope: Array, rng: np.random.Generator) -> Array:
+def _excite_modes(modes: Sequence[Mode], envelope: Array, rng: np.random.Generator) -> Array:
     """(J, 5) what white noise of changing strength makes of the modes."""
     out = np.zeros((len(envelope), 5))
     for mode in modes:

@@ -171,6 +171,27 @@ def test_comparison_csv_has_a_row_per_solver_with_the_numbers_of_the_summaries(c
         assert float(row["run_time_s"]) > 0
 
 
+def test_of_a_run_over_a_comparison_its_own_page_is_drawn_again(tmp_path):
+    part = [
+        str(Path(__file__).parents[2] / "data" / "tokyo"),
+        "-o",
+        str(tmp_path),
+        "--solver",
+        "ekf",
+        "--noise",
+        "stated",
+        "--end",
+        "60",
+        "--quiet",
+    ]
+    assert cli.run(["compare", *part]) == 0
+    assert cli.run(["smooth", *part]) == 0
+    before = (tmp_path / "report.html").read_bytes()
+    (tmp_path / "report.html").unlink()
+    assert cli.run(["report", str(tmp_path), "--quiet"]) == 0
+    assert (tmp_path / "report.html").read_bytes() == before
+
+
 def test_the_pages_are_drawn_again_without_solving(compared, tmp_path, capsys):
     out = tmp_path / "again"
     shutil.copytree(compared[0], out)
@@ -407,6 +428,13 @@ BAD = {
         "option.not_here",
         "--format nav",
     ),
+    "no trajectory yet": (
+        ["convert", "kitti", "-o", "o", "--export", "gpx"],
+        "trajectory.none",
+        "graphnav smooth kitti",
+    ),
+    "what is written": (["smooth", "kitti", "-o", "o", "--format", "gpx"], "log.format_unknown", "--export gpx"),
+    "another's name": (["info", "file", "--format", "kitti"], "log.format_unknown", "file"),
     "not a trajectory": (["evaluate", "file", "file"], "file.no_rows", "file"),
 }
 
@@ -451,6 +479,15 @@ def test_no_traceback_reaches_a_user(error, code, words, tmp_path, monkeypatch, 
     assert cli.run(["smooth", "kitti", "-o", str(tmp_path / "o")]) == code
     shown = "Traceback" in capsys.readouterr().err
     assert shown == (code != 130)
+
+
+def test_an_end_of_a_file_is_not_taken_for_ctrl_c(tmp_path, monkeypatch, capsys):
+    def failing(*_):
+        raise EOFError("cut short")
+
+    monkeypatch.setattr(workflow, "run_request", failing)
+    assert cli.run(["smooth", "kitti", "-o", str(tmp_path / "o")]) == 1
+    assert "internal error: EOFError: cut short in cli_solve.py:" in capsys.readouterr().err
 
 
 def test_a_reader_that_stops_early_is_no_error():

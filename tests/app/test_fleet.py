@@ -21,8 +21,8 @@ from helpers import refused
 from graphnav import load
 from graphnav.app import cli
 from graphnav.app.fleet import page, tables
-from graphnav.app.fleet.drive import CRASHED, DONE, HUNG, REFUSED, key_of, read_row, spans
-from graphnav.app.fleet.manifest import DriveOptions, Task, read_drives, task_of
+from graphnav.app.fleet.drive import CRASHED, DONE, HUNG, REFUSED, hash_task, read_row, spans
+from graphnav.app.fleet.manifest import DriveOptions, Task, build_task, read_drives
 from graphnav.app.fleet.workers import Limits, Worker, solve_on_cluster
 from graphnav.config import Settings
 from graphnav.core.errors import ConfigError
@@ -177,14 +177,14 @@ def test_a_result_depends_on_input_settings_and_what_is_asked(tmp_path: Path) ->
     (folder / "a.csv").write_text("1")
     (folder / "b.csv").write_text("1")
     task = Task("a", str(folder), "x", "ekf", Settings().model_dump(mode="json"))
-    first = key_of(task)
-    assert key_of(replace(task, name="b", folder="y")) == first
-    assert key_of(replace(task, solver="rts")) != first
-    assert key_of(replace(task, settings={**task.settings, "profile": "car"})) != first
+    first = hash_task(task)
+    assert hash_task(replace(task, name="b", folder="y")) == first
+    assert hash_task(replace(task, solver="rts")) != first
+    assert hash_task(replace(task, settings={**task.settings, "profile": "car"})) != first
     (folder / "b.csv").write_text("2")
-    assert key_of(task) == first
+    assert hash_task(task) == first
     (folder / "a.csv").write_text("2")
-    assert key_of(task) != first
+    assert hash_task(task) != first
 
 
 def test_a_manifest_gives_each_drive_its_own_settings(tmp_path: Path) -> None:
@@ -201,7 +201,7 @@ def test_a_manifest_gives_each_drive_its_own_settings(tmp_path: Path) -> None:
     found = []
     for name in ("m.csv", "m.toml"):
         drives = read_drives(tmp_path / name, DriveOptions(solver="rts"))
-        tasks = [task_of(drive, tmp_path, {}) for drive in drives]
+        tasks = [build_task(drive, tmp_path, {}) for drive in drives]
         assert [task.name for task in tasks] == ["kitti", "kitti-2"]
         found.append(tasks)
     assert found[0] == found[1]
@@ -231,7 +231,7 @@ def test_a_manifest_that_cannot_be_is_refused_where_it_says_so(tmp_path: Path, t
     path = tmp_path / "m.csv"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
-        [task_of(drive, tmp_path, {}) for drive in read_drives(path, DriveOptions())]
+        [build_task(drive, tmp_path, {}) for drive in read_drives(path, DriveOptions())]
     assert "m.csv" in str(caught.value)
     for word in words:
         assert word in str(caught.value)

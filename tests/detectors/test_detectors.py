@@ -26,7 +26,7 @@ from graphnav.simulation import simulate
 
 
 def covered(t, spans):
-    return base.inside(t, spans)
+    return base.mask_inside(t, spans)
 
 
 def rates(spans, stops, start, end):
@@ -74,7 +74,7 @@ def test_a_stance_is_every_row_of_a_window_below_the_threshold():
 def test_running_sums_keep_their_digits_over_hours():
     rng = np.random.default_rng(2)
     rows = 96.0 + 1e-3 * rng.standard_normal((2_000_000, 1))
-    means = windows.running(rows).means(50)
+    means = windows.sum_running(rows).means(50)
     assert np.abs(means[-1] - rows[-50:].mean()) < 1e-9
     assert len(means) == len(rows) - 49
 
@@ -320,7 +320,7 @@ def test_what_wanders_as_much_as_it_says_is_no_motion():
     assert motion.Speeds(t, lies, limit).over(span) == 0.0
     assert abs(motion.Speeds(t, truth, limit).over(span) - np.hypot(8.0, 1.0)) < 0.05
     assert np.isnan(motion.Speeds(t, truth, limit).over(np.array([70.0, 80.0])))
-    assert len(motion.moving([motion.Speeds(t, truth, limit)])) == 1
+    assert len(motion.find_moving([motion.Speeds(t, truth, limit)])) == 1
 
 
 def test_a_gap_ends_a_stop():

@@ -41,7 +41,7 @@ def shares(found: np.ndarray, recording: Recording) -> tuple[float, float]:
     """Shares of the stops' seconds and of the other seconds that are called stationary."""
     t = np.arange(recording.start, recording.end, 0.02)
     far = np.abs(t[:, None] - STOPS.ravel()).min(axis=1) > FREE
-    still, called = base.inside(t, STOPS), base.inside(t, found)
+    still, called = base.mask_inside(t, STOPS), base.mask_inside(t, found)
     return float(called[still & far].mean()), float(called[~still & far].mean())
 
 
@@ -85,14 +85,14 @@ def test_a_window_while_the_drive_goes_on_says_what_the_recording_says(name: str
         since, until = look.end - 25.0, look.end - 1.0
         found = stops(look, settings, since, until, base.NONE, since)
         t = np.arange(since, until, 0.02)
-        there = base.inside(t, whole)
+        there = base.mask_inside(t, whole)
         if found is None:
             assert not there.any()
             continue
         # an end, of the recording's answer or of what the window can see, is where they may differ
         ends = np.append(np.clip(whole, since, until), [since, until])
         far = np.abs(t[:, None] - ends).min(axis=1) > edge
-        np.testing.assert_array_equal(base.inside(t, found)[far], there[far])
+        np.testing.assert_array_equal(base.mask_inside(t, found)[far], there[far])
         looked += bool(there.any())
     assert looked > 10
 

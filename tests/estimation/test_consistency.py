@@ -77,14 +77,17 @@ def velocity_errors(solution: Solution, truth: Trajectory) -> tuple[Array, Array
 
 
 @pytest.fixture(scope="module")
-def positions(shared_data: Path) -> dict[str, Score]:
-    drives = [oracle.oracle_drive(shared_data, seed, odometer=False, rate=RATE) for seed in range(SEEDS)]
+def drives(shared_data: Path) -> list[tuple[Recording, Trajectory]]:
+    return [oracle.oracle_drive(shared_data, seed, odometer=False, rate=RATE) for seed in range(SEEDS)]
+
+
+@pytest.fixture(scope="module")
+def positions(drives: list[tuple[Recording, Trajectory]]) -> dict[str, Score]:
     return scored(drives, STATED)
 
 
 @pytest.fixture(scope="module")
-def estimated(shared_data: Path) -> dict[str, Score]:
-    drives = [oracle.oracle_drive(shared_data, seed, odometer=False, rate=RATE) for seed in range(SEEDS)]
+def estimated(drives: list[tuple[Recording, Trajectory]]) -> dict[str, Score]:
     return scored(drives, INERTIAL)
 
 
@@ -111,9 +114,6 @@ def test_with_positions(positions: dict[str, Score], solver: str) -> None:
     assert_consistent(positions[solver])
 
 
-@pytest.mark.xfail(
-    run=False, reason="position 0.13 to 0.4 per axis: what lasts for hours adds its prior to white fixes"
-)
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_with_estimated_noise(estimated: dict[str, Score], solver: str) -> None:
     assert_consistent(estimated[solver])

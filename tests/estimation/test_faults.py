@@ -141,12 +141,12 @@ def test_clean_drive_keeps_every_fix() -> None:
 # ---------------------------------------------------------------------------------------------------------- whole runs
 
 
-def test_gross_outliers_and_a_burst() -> None:
+def test_gross_outliers_and_a_burst(short: tuple[Recording, Trajectory]) -> None:
     """Every tenth fix 5 to 200 m off, and 30 s that are 10 m off alike."""
-    recording, truth = oracle.drive(oracle.vehicle_path(duration=420, seed=11), seed=3)
+    recording, truth = short
     assert recording.gnss is not None
     rng, t = np.random.default_rng([7, 0]), recording.gnss.t - recording.start
-    bad, begin = rng.random(len(t)) < 0.1, rng.uniform(60, 350)
+    bad, begin = rng.random(len(t)) < 0.1, rng.uniform(60, 200)
     u = rng.standard_normal((len(t), 3))
     by = u / np.linalg.norm(u, axis=1, keepdims=True) * rng.uniform(5, 200, (len(t), 1))
     burst = (t >= begin) & (t < begin + 30)
@@ -247,10 +247,10 @@ def scattered(recording: Recording, bad: Array, times: float, seed: int) -> Reco
     return moved(recording, bad, rng.standard_normal((int(bad.sum()), 3)) * recording.gnss.sd[bad] * times)
 
 
-TOO_LATE = pytest.mark.xfail(run=False, reason="the filter is 1.54 times as far off as one that knows, wanted 1.5")
+LEFT_OUT = pytest.mark.xfail(strict=True, reason="38 % of such fixes are left out instead of weighed down, wanted 10 %")
 
 
-@pytest.mark.parametrize("times", [5.0, pytest.param(50.0, marks=TOO_LATE)])
+@pytest.mark.parametrize("times", [5.0, pytest.param(50.0, marks=LEFT_OUT)])
 def test_noise_is_weighed_down_and_not_left_out(short: tuple[Recording, Trajectory], times: float) -> None:
     """Fixes that for a while scatter more than they state: every solver gives them what they are worth."""
     recording, truth = short
@@ -261,13 +261,14 @@ def test_noise_is_weighed_down_and_not_left_out(short: tuple[Recording, Trajecto
     sd = np.where(bad[:, None], times * recording.gnss.sd, recording.gnss.sd)
     assert wrong.gnss is not None
     solvers = ("ekf", "rts", "incremental", "batch")
-    found, known = run(wrong, solvers=solvers), run(replace(wrong, gnss=replace(wrong.gnss, sd=sd)), OFF, solvers)
+    found = run(wrong, solvers=solvers)
+    assert np.mean(left_out(found["ekf"], wrong)) < 0.1
+    known = run(replace(wrong, gnss=replace(wrong.gnss, sd=sd)), OFF, solvers)
     left = run(recording.without("gnss", (109.9, 199.9)), OFF, ("ekf",))["ekf"]
     for name in solvers:
         weight = found[name].records["gnss_position"].weight
         assert np.array_equal(weight, found["ekf"].records["gnss_position"].weight), name
         assert np.median(weight[~bad]) == 1.0
-    assert np.mean(left_out(found["ekf"], wrong)) < 0.1
     assert horizontal(found["ekf"], truth).max() < horizontal(left, truth).max()
     for name in solvers:
         mine, best = (float(np.sqrt(np.mean(horizontal(s[name], truth) ** 2))) for s in (found, known))
@@ -294,22 +295,24 @@ def test_kernel_is_of_whole_measurements(posed: Problem) -> None:
         assert bool(np.abs(blocks[0][1][100]).max() == 0.0) is weighed
 
 
-def test_graduation_where_bursts_are_many(drive: tuple[Recording, Trajectory]) -> None:
-    """Thirty per cent of the fixes are off by 10 m, 20 s at a time and all alike, and nobody watches for faults."""
+ASTRAY = pytest.mark.xfail(strict=True, reason="10 m: batch does not find back from where the smoother ends")
+
+
+@pytest.mark.parametrize(
+    ("kernel", "low", "high"),
+    [("off", 5.0, np.inf), ("huber", 1.0, np.inf), pytest.param("gnc", 0.0, 0.15, marks=ASTRAY)],
+)
+def test_graduation_where_bursts_are_many(
+    drive: tuple[Recording, Trajectory], kernel: str, low: float, high: float
+) -> None:
+    """Thirty per cent of the fixes are off by 10 m, 20 s at a time and all alike, and faults are not looked for."""
     recording, truth = drive[0].crop(0.0, 240.0), drive[1]
     assert recording.gnss is not None
     t = recording.gnss.t - recording.start
     bad = (t > 60.0) & ((t - 60.0) % 60.0 < 20.0)
     wrong = moved(recording, bad, np.array([8.0, -6.0, 0.0]))
-    worst = {}
-    for kernel in ("off", "huber", "gnc"):
-        settings = settings_from({"gnss": {"faults": "off", "robust": kernel}, "noise": {"mode": "stated"}})
-        worst[kernel] = horizontal(run(wrong, settings, ("batch",))["batch"], truth).max()
-    assert worst["off"] > 5.0
-    assert worst["huber"] > 1.0
-    if worst["gnc"] > 5.0:
-        pytest.xfail(f"{worst['gnc']:.0f} m: the smoother's states are a start that batch does not find back from")
-    assert worst["gnc"] < 0.15
+    settings = settings_from({"gnss": {"faults": "off", "robust": kernel}, "noise": {"mode": "stated"}})
+    assert low < horizontal(run(wrong, settings, ("batch",))["batch"], truth).max() < high
 
 
 def test_what_a_gate_refuses_no_solver_uses(drive: tuple[Recording, Trajectory]) -> None:

@@ -14,7 +14,7 @@ from graphnav.app.workflow import Request, run_request
 from graphnav.config import Settings, settings_from
 from graphnav.constraints.base import BuildContext
 from graphnav.constraints.foot import FOOT_AXIS, PATTERN, PIVOT, TRAVEL, FootLateral, Stance
-from graphnav.constraints.standstill import ZeroRate, _swaying
+from graphnav.constraints.standstill import ZeroRate, _estimate_swaying
 from graphnav.core import rotation as ro
 from graphnav.core.earth import LocalFrame
 from graphnav.core.interpolation import interpolate
@@ -292,7 +292,7 @@ def test_a_swaying_body_in_units_of_white_rate() -> None:
     rng = np.random.default_rng(2)
     q, T, n, runs = 3e-6, 0.05, 60, 400
     rate = np.sqrt(q / T) * rng.standard_normal((runs * n, 3))
-    sigma = _swaying(rate, np.full(runs * n, T), np.repeat(np.arange(runs), n))
+    sigma = _estimate_swaying(rate, np.full(runs * n, T), np.repeat(np.arange(runs), n))
     assert np.mean(sigma**2) * T == pytest.approx(q, rel=0.08)
 
 

@@ -22,10 +22,11 @@ from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.incremental import incremental
 from graphnav.estimation.solvers.isam import isam2
 from graphnav.estimation.solvers.linearise import node_steps
+from graphnav.estimation.solvers.points import move_covariance
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import newest_covariance, smooth_keyframes
+from graphnav.estimation.solvers.tree_marginals import Leaving, newest_covariance
 from graphnav.estimation.solvers.window import first_message, turn_limit
 from graphnav.recording import Recording
 
@@ -173,7 +174,7 @@ def test_keyframes_come_again_after_others_were_taken_back(drive: Drive) -> None
     for one in (tree, never):
         while one.relinearise(0.02):
             pass
-    a, b = smooth_keyframes(tree, len(tree)), smooth_keyframes(never, len(never))
+    a, b = Leaving(tree, len(tree)).settled(), Leaving(never, len(never)).settled()
     assert np.abs(a.states.minus(b.states) / np.sqrt(np.diagonal(b.covariance, axis1=1, axis2=2))).max() < 0.01
     np.testing.assert_allclose(a.covariance[:, range(15), range(15)], b.covariance[:, range(15), range(15)], rtol=0.01)
 
@@ -189,7 +190,29 @@ def test_a_tree_made_again_from_its_rows_goes_on_as_before(posed: Problem) -> No
         for one in (tree, again):
             one.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=True))
             one.relinearise()
-    a, b = smooth_keyframes(tree, len(tree)), smooth_keyframes(again, len(again))
+    a, b = Leaving(tree, len(tree)).settled(), Leaving(again, len(again)).settled()
     np.testing.assert_allclose(a.states.p, b.states.p, atol=1e-6)
     np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-4, atol=1e-14)
     assert isinstance(a.states, States)
+
+
+def test_covariances_from_the_other_end_are_the_marginals_of_the_tree(posed: Problem) -> None:
+    """Of keyframes that are to leave a lag, in portions with others coming meanwhile, and after a relinearisation."""
+    tree, _ = _played(posed, 60, lag=40.0)
+    steps = node_steps(posed)
+    for again in (False, True):
+        leaving, count = Leaving(tree, 6), 6
+        leaving.step(20)
+        if again:
+            tree.linearise_again(range(3, len(tree)))
+        expected = [tree.isam.marginalCovariance(k.state.key) for k in tree.keyframes[:count]]
+        unit = tree.keyframes[0].state.unit
+        if not again:
+            k = tree.keyframes[-1].place.k + 1
+            tree.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=True))
+        found = leaving.settled()
+        delta = leaving._delta
+        own = move_covariance(unit[:, None] * np.array(expected) * unit, delta)
+        for a, b in zip(found.covariance, own, strict=True):
+            sd = np.sqrt(np.diag(b))
+            np.testing.assert_allclose(a / sd / sd[:, None], b / sd / sd[:, None], atol=1e-8)

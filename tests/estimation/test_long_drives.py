@@ -14,7 +14,7 @@ from graphnav.config import Settings
 from graphnav.core.notes import key_of
 from graphnav.estimation import long_drives
 from graphnav.estimation.pipeline import run
-from graphnav.recording import rows_of
+from graphnav.recording import take_rows
 
 DEMO = Path(__file__).resolve().parents[2] / "data" / "tokyo"
 
@@ -33,7 +33,7 @@ def test_parts_say_what_the_whole_says(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(long_drives.shares(replace(recording, gnss=None), settings)) == 1
     seam = shares[1].start
     assert recording.gnss is not None
-    silent = rows_of(recording.gnss, (recording.gnss.t < seam - 25.0) | (recording.gnss.t > seam))
+    silent = take_rows(recording.gnss, (recording.gnss.t < seam - 25.0) | (recording.gnss.t > seam))
     monkeypatch.setattr(long_drives, "_SILENCE", 20.0)
     assert [share.start for share in long_drives.shares(replace(recording, gnss=silent), settings)[1:]] == [
         shares[2].start

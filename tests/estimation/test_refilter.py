@@ -22,9 +22,8 @@ from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.batch import batch
-from graphnav.estimation.solvers.ekf import ekf, refilter
+from graphnav.estimation.solvers.ekf import ekf, near, refilter
 from graphnav.estimation.solvers.linearise import Points, advance
-from graphnav.estimation.solvers.near import near
 from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate
 from graphnav.estimation.solvers.recursion import move
 from graphnav.estimation.solvers.rts import backward

@@ -75,6 +75,17 @@ def test_three_kinds_of_files_stand_beside_ours(drive, tmp_path):
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"comparison.csv", "comparison.html", "run.npz", "ekf"}
 
 
+def test_a_file_with_few_rows_is_compared_at_these(drive, tmp_path):
+    """Not between them, where a line cuts the corners of the way and hides what a filter drifts by."""
+    part = moved(0.0)
+    rare = part.take(np.abs(part.t / 2.0 - np.round(part.t / 2.0)) < 1e-6)
+    assert 20 < len(rare) < len(part) / 50
+    write_as("csv", rare, tmp_path / "rare.csv", None)
+    rows = compare(drive, tmp_path / "out", "--against", tmp_path / "rare.csv")
+    assert float(rows["rare"]["h_max_m"]) < 1e-4
+    assert float(rows["rare"]["heading_max_deg"]) < 1e-4
+
+
 def test_a_shift_that_is_asked_for_is_made(drive, tmp_path):
     write_as("csv", moved(0.0, 0.2), tmp_path / "late.csv", None)
     rows = compare(drive, tmp_path / "b", "--against", tmp_path / "late.csv", "--against-shift", "-0.2")

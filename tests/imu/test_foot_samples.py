@@ -15,9 +15,9 @@ from graphnav.core import rotation as ro
 from graphnav.core.notes import key_of
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
-from graphnav.estimation.noise.imu_floor import quietest_density, with_measured_floor
+from graphnav.estimation.noise.imu_floor import bound_density, with_measured_floor
 from graphnav.imu.clipping import find_cut_peaks, with_whole_peaks
-from graphnav.imu.onboard_offset import evidence, offset_learnt, without_onboard_offset
+from graphnav.imu.onboard_offset import compute_evidence, offset_learnt, without_onboard_offset
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import Samples, bridge_gaps
 from graphnav.imu.unresolved import with_coning, with_unresolved_motion
@@ -67,15 +67,15 @@ def test_a_bound_on_white_noise_from_the_quietest_stretch() -> None:
         t = 0.005 * np.arange(1, 4001)
         x = 1e-3 / np.sqrt(0.005) * rng.standard_normal((4000, 3)) + 0.02 * np.sin(0.5 * t)[:, None]
         x[2000:] += rng.standard_normal((2000, 3))  # and then it walks
-        found.append(quietest_density(t, x) / 1e-3)
+        found.append(bound_density(t, x) / 1e-3)
     assert np.mean(np.array(found) < 1.0) <= 0.05  # the least of some ten stretches of which each is below in 0.1 %
     assert max(found) < 1.7
 
 
 def test_what_is_too_short_for_a_bound_has_none() -> None:
     t = 0.005 * np.arange(1, 101)
-    assert quietest_density(t, np.zeros((100, 3))) == np.inf
-    assert quietest_density(t[:1], np.zeros((1, 3))) == np.inf
+    assert bound_density(t, np.zeros((100, 3))) == np.inf
+    assert bound_density(t[:1], np.zeros((1, 3))) == np.inf
 
 
 def test_figures_stated_too_large_are_lowered_for_a_walk_and_for_nothing_else() -> None:
@@ -142,8 +142,8 @@ def test_whether_the_unit_corrects_its_offset_is_told_from_rests() -> None:
         for bias in (1e-3, 1e-2):
             t, rate, force = swaying(seed, bias)
             own, of_unit = Imu(t, rate, force), Imu(t, corrected(t, rate)[0], force)
-            plain.append(evidence(own, offset_learnt(own)))
-            served.append(evidence(of_unit, offset_learnt(of_unit)))
+            plain.append(compute_evidence(own, offset_learnt(own)))
+            served.append(compute_evidence(of_unit, offset_learnt(of_unit)))
     assert max(plain) < chance
     assert min(served[1::2]) > chance
 
@@ -156,7 +156,7 @@ def test_a_unit_that_corrects_its_offset_is_found_out(shared_data: Path, name: s
     assert key_of(said) == "imu.onboard_offset"
     offset = offset_learnt(walk.imu)
     np.testing.assert_array_equal(undone.imu.gyro, walk.imu.gyro + offset)
-    by_rate = [evidence(walk.imu, share * offset) for share in (0.25, 0.5, 1.0, 2.0, 4.0)]
+    by_rate = [compute_evidence(walk.imu, share * offset) for share in (0.25, 0.5, 1.0, 2.0, 4.0)]
     assert np.argmax(by_rate) in {1, 2}
     assert without_onboard_offset(walk, settings_from({"imu": {"onboard_offset": False}})) == (walk, ())
     assert without_onboard_offset(replace(walk, platform="vehicle"), Settings())[1] == ()
@@ -167,7 +167,7 @@ def test_units_that_leave_their_offset_alone_are_left_alone(shared_data: Path) -
         walk = read(path)
         assert without_onboard_offset(walk, Settings()) == (walk, ())
     parked = read(shared_data / "tokyo_20201105" / "recording.toml").crop(0.0, 600.0)
-    assert evidence(parked.imu, offset_learnt(parked.imu)) < -30.0
+    assert compute_evidence(parked.imu, offset_learnt(parked.imu)) < -30.0
 
 
 # ------------------------------------------------------------------------------------------------ what rows stand for

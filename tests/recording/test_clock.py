@@ -10,7 +10,7 @@ import pytest
 
 from graphnav.recording.checks import crosschecks, lags
 from graphnav.recording.checks.clock import clock_of
-from graphnav.recording.draft.agreement import compare
+from graphnav.recording.draft.agreement import compare_with_fixes
 from graphnav.recording.formats import read
 
 
@@ -76,8 +76,10 @@ def test_a_draft_and_the_checks_say_the_same(shared_data: Path, name: str, shift
     drive = read(shared_data / name).crop(0.0, 300.0)
     imu, gnss = replace(drive.imu, t=drive.imu.t + shift), drive.gnss
     assert gnss is not None
-    up = crosschecks.up_of(imu)
-    drafted = compare(imu.t, imu.gyro, imu.accel, up, (gnss.t, gnss.llh, None if gnss.v is None else gnss.v[:, :2]))
+    up = crosschecks.find_up(imu)
+    drafted = compare_with_fixes(
+        imu.t, imu.gyro, imu.accel, up, (gnss.t, gnss.llh, None if gnss.v is None else gnss.v[:, :2])
+    )
     said = clock_of(imu, gnss).late
     assert (drafted.offset is None) == (said is None)
     if drafted.offset is not None and said is not None:

@@ -55,7 +55,8 @@ def test_gpx_without_a_clock_has_no_times_and_says_so(tmp_path: Path) -> None:
     write_as("gpx", made(), tmp_path / "a.gpx")
     track = gpxpy.parse((tmp_path / "a.gpx").read_text()).tracks[0]
     assert track.segments[0].points[0].time is None
-    assert "the clock is not known" in track.description
+    write_as("gpx", made(), tmp_path / "b.gpx", utc_of(made()))
+    assert track.description != gpxpy.parse((tmp_path / "b.gpx").read_text()).tracks[0].description
 
 
 def test_nav_reads_back(tmp_path: Path) -> None:
@@ -179,15 +180,19 @@ def test_convert_writes_a_trajectory_for_other_programs(run, tmp_path, capsys) -
     assert cli.run(["convert", source, "-o", str(tmp_path / "out"), "--export", "nav,tum,kml", "--rate", "10"]) == 0
     assert {p.name for p in (tmp_path / "out").iterdir()} >= {f"trajectory.{kind}" for kind in ("nav", "tum", "kml")}
     assert (
-        cli.run(["convert", source, "-o", str(tmp_path / "out"), "--format", "nmea", "--clock", "gps week 2200"]) == 0
+        cli.run(["convert", source, "-o", str(tmp_path / "out"), "--export", "nmea", "--clock", "gps week 2200"]) == 0
     )
     assert load(tmp_path / "out" / "trajectory.nmea").gps_zero == 2200 * 604800.0
+    assert cli.run(["convert", str(run), "-o", str(tmp_path / "run"), "--export", "nav", "--rate", "10"]) == 0
+    assert (tmp_path / "run" / "trajectory.nav").read_bytes() == (tmp_path / "out" / "trajectory.nav").read_bytes()
 
 
 @pytest.mark.parametrize(
     ("arguments", "key", "name"),
     [
-        (["--format", "gpz", "-o", "OUT"], "log.format_unknown", "'gpx'"),
+        (["--format", "gpz", "-o", "OUT"], "log.format_unknown", "gpz"),
+        (["--format", "gpx", "-o", "OUT"], "log.format_unknown", "--export gpx"),
+        (["--export", "gpz", "-o", "OUT"], "option.unknown_name", "gpx"),
         (["-o", "OUT.gpx", "--export", "nav"], "option.not_here", "--export nav"),
         (["-o", "OUT.gpx", "--point", "roof"], "option.point", "--point roof"),
         (["-o", "OUT.gpx", "--rate", "0"], "option.value", "--rate 0"),

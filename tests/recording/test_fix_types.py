@@ -16,7 +16,7 @@ from test_formats_binary import nav_pvt, write_bag
 
 from graphnav.app import convert
 from graphnav.core.errors import RecordingError
-from graphnav.estimation.alignment.first import some
+from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.recording import Recording
 from graphnav.recording.checks.overview import inspect
 from graphnav.recording.formats import load, read
@@ -77,7 +77,7 @@ def test_types_go_with_their_fixes(tmp_path):
     gnss, t = recording.gnss, recording.gnss.t - recording.start
     assert recording.crop(5.0, 20.0).gnss.type.tolist() == gnss.type[(t >= 5.0) & (t <= 20.0)].tolist()
     assert recording.without("gnss", (5.0, 20.0)).gnss.type.tolist() == gnss.type[(t < 5.0) | (t > 20.0)].tolist()
-    assert some(gnss, np.array([3, 1])).type.tolist() == [3, 1]
+    assert pick_fixes(gnss, np.array([3, 1])).type.tolist() == [3, 1]
     assert np.array_equal(round_recording(recording).gnss.type, gnss.type)
     write_folder(replace(recording, truth=None), tmp_path / "a")
     _, files = convert.convert_log(str(tmp_path / "a"), tmp_path / "b", None)

@@ -21,7 +21,7 @@ from graphnav.recording.checks.overview import inspect
 from graphnav.recording.formats import read
 from graphnav.recording.formats.repair import Remarks, sigmas
 from graphnav.recording.formats.table import Table
-from graphnav.recording.plausibility.fixes import out_of_reach
+from graphnav.recording.plausibility.fixes import find_out_of_reach
 from graphnav.recording.plausibility.screening import screen, screen_recording
 
 Change = Callable[[Recording], Recording]
@@ -272,9 +272,9 @@ def test_reach_grows_with_the_time_between_fixes() -> None:
     t = np.array([0.0, 1.0, 2.0, 3.0, 60.0, 61.0, 62.0])
     p = np.zeros((7, 3))
     p[4:, 0] = 3000.0  # after a minute's outage: 53 m/s
-    assert not out_of_reach(t, p).any()
+    assert not find_out_of_reach(t, p).any()
     p[2, 1] = 3000.0  # within a second
-    assert np.flatnonzero(out_of_reach(t, p)).tolist() == [2]
+    assert np.flatnonzero(find_out_of_reach(t, p)).tolist() == [2]
 
 
 def test_fixes_of_two_places_are_not_trusted(tokyo: Recording) -> None:

@@ -16,7 +16,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import key_of
 from graphnav.recording import ImuNoise
 from graphnav.recording.formats import formats, read
-from graphnav.recording.formats.folder import DEFAULT_SD
+from graphnav.recording.formats.repair import DEFAULT_SD
 from graphnav.recording.formats.schema import rotation_from_letters, rotation_from_vectors
 
 IMU_ROWS = "t,gx,gy,gz,ax,ay,az\n0.01,1,2,3,4,5,6\n0.02,1,2,3,4,5,6\n"

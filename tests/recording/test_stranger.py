@@ -15,6 +15,7 @@ from helpers import refuse_command
 from test_formats_binary import write_bag, write_ubx
 
 from graphnav.app import cli
+from graphnav.core.notes import key_of
 from graphnav.core.timescales import between_clocks
 from graphnav.recording.draft import draft
 from graphnav.recording.draft.guesses import noise_density
@@ -312,3 +313,13 @@ def test_times_of_day_go_on_after_midnight_and_take_the_date_of_another_log(toky
     recording = read(tmp_path)
     assert recording.imu.t == pytest.approx(late, abs=2e-3)
     assert recording.gnss.t == pytest.approx(at, abs=2e-3)
+
+
+def test_what_a_description_states_is_not_said_to_be_assumed(tokyo, tmp_path):
+    stranger.write_bag(tmp_path / "bag", tokyo[0])
+    text = 'format = "graphnav-recording/1"\nplatform = "vehicle"\n'
+    text += '[imu]\nfile = "bag"\ntopic = "/imu/data"\n'
+    assumed = {"imu.axes_assumed", "gnss.lever_arm_unknown"}
+    for imu, gnss, said in (("", "", assumed), ('axes = "FLU"\n', "lever_arm = [0.0, 0.0, 0.9]\n", set())):
+        (tmp_path / "a.toml").write_text(f'{text}{imu}[gnss]\nfile = "bag"\n{gnss}')
+        assert {key_of(r) for r in read(tmp_path / "a.toml").remarks} & assumed == said

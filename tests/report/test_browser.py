@@ -50,7 +50,7 @@ def checked(tab, width):
 def test_every_picture_comes_alive_in_both_colours(tab, pages, page, size):
     tab.open(pages / page, size)
     tab.wait("document.documentElement.dataset.ready !== undefined")
-    tab.read("[...document.querySelectorAll('.plot')].filter(p => !p.closest('details'))", ".js-plotly-plot")
+    tab.read()
     checked(tab, size[0])
     ink = "getComputedStyle(document.querySelector('.js-plotly-plot .xtick text')).fill"
     wanted = "(p => (p.style.color = 'var(--soft)', getComputedStyle(p).color))(document.querySelector('nav'))"
@@ -81,7 +81,7 @@ def test_printing_draws_every_figure_that_is_not_folded(tab, pages):
     tab.open(pages / "batch/report.html")
     tab.wait("document.documentElement.dataset.ready !== undefined")
     tab.run("dispatchEvent(new Event('beforeprint'))")
-    shown = "[...document.querySelectorAll('.plot')].filter(p => !p.closest('details'))"
+    shown = browser.PLOTS
     assert tab.run(f"{shown}.length") > 8
     assert tab.run(f"{shown}.every(p => p.querySelector('.main-svg').clientWidth <= 703)")
     before = tab.run(f"{shown}.map(p => p.dataset.height)")

@@ -29,13 +29,15 @@ from graphnav.evaluation.metrics import Errors
 from graphnav.evaluation.segments import relative_errors
 from graphnav.imu.dynamics import SCALE
 from graphnav.recording import Gnss, Imu, Recording, Truth
+from graphnav.recording.allan import allan_of
+from graphnav.report import allan as allan_page
 from graphnav.report import page
 from graphnav.report import pictures as report_pictures
 from graphnav.report.consistency import consistency
 from graphnav.report.documents import write_comparison, write_report
 from graphnav.report.names import components, has_names
 from graphnav.report.provenance import command, toml_text
-from graphnav.report.sentences import doubts
+from graphnav.report.sentences import list_doubts
 from graphnav.report.summary import fix_table, left_out, sigma_table, verdicts
 from graphnav.report.tables import accuracy_row, excluded_table, span_row
 
@@ -431,8 +433,8 @@ def test_what_cannot_be_trusted_says_so_first(tmp_path, recording):
     assert "cannot be trusted" not in first_words(replace(solution(), noise=partly))
     larger = replace(solution(), records={"gnss_position": record(2.0)})
     assert "sigma cannot be trusted" in first_words(larger)
-    assert doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.02)})
-    assert not doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.3)})
+    assert list_doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.02)})
+    assert not list_doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.3)})
 
 
 def test_the_noise_model_is_a_table(tmp_path, recording):
@@ -603,7 +605,7 @@ def test_an_outlier_that_has_little_weight_says_nothing_against_sigma():
     found = {}
     for name, some in (("weighted", rows), ("as good as the others", replace(rows, weight=np.ones(COUNT)))):
         one = replace(solution("rts"), records={"gnss_position": some})
-        found[name] = [key_of(doubt) for doubt in doubts({"rts": one}, {})]
+        found[name] = [key_of(doubt) for doubt in list_doubts({"rts": one}, {})]
     assert found == {"weighted": [], "as good as the others": ["doubt.sigma"]}
 
 
@@ -636,3 +638,25 @@ def test_a_truth_on_the_earth_is_laid_onto_a_walk_that_counts_from_its_start(rec
     t, laid = report_pictures._truth(walked, {"ekf": walk})
     assert t == pytest.approx(turned.t)
     assert laid == pytest.approx(p, abs=0.05)  # the Earth is round
+
+
+def test_the_page_of_an_allan_variance_draws_the_deviations_and_their_fit(tmp_path):
+    rng, rate = np.random.default_rng(3), 50.0
+    t = np.arange(1, 6001) / rate
+    gyro, accel = rng.normal(0.0, 1e-3, (len(t), 3)), rng.normal([0.0, 0.0, 9.8], 1e-2, (len(t), 3))
+    result = allan_of(t, gyro, accel)
+    path, _, _ = allan_page.write(result, tmp_path)
+    for title, deviation, sigma in (("Gyro", result.gyro, 1e-3), ("Accelerometer", result.accel, 1e-2)):
+        figure = figures_of(path)[title]
+        *axes, fit = figure["data"]
+        for k, trace in enumerate(axes):
+            assert typed(trace["x"]) == pytest.approx(result.tau, rel=1e-6)
+            assert typed(trace["y"]) == pytest.approx(deviation[:, k], rel=1e-6)
+        # white noise: a slope of a half, through sigma / sqrt(rate) at a second
+        assert typed(fit["y"])[0] * np.sqrt(result.tau[0]) == pytest.approx(sigma / np.sqrt(rate), rel=0.05)
+        assert figure["layout"]["xaxis"]["type"] == figure["layout"]["yaxis"]["type"] == "log"
+
+
+def typed(packed):
+    """The numbers of an array as plotly is given it."""
+    return np.frombuffer(base64.b64decode(packed["bdata"]), "<f4")

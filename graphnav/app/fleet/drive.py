@@ -47,7 +47,7 @@ def solve_drive(task: Task) -> Row:
     _forget_peak()
     try:
         with permit_outside(task.outside):
-            key = key_of(task)
+            key = hash_task(task)
             if not task.again and (there := read_row(folder, key)) is not None:
                 return {**there, "drive": task.name, "source": task.source, "skipped": True}
             outcome = run_request(_request(task))
@@ -55,7 +55,7 @@ def solve_drive(task: Task) -> Row:
                 outputs.write_run(outcome, part, task.pages)
             if not task.pages:
                 outputs.remove_pages(folder)
-        row |= {"status": DONE, **_figures(outcome)}
+        row |= {"status": DONE, **_collect_figures(outcome)}
         row["report"] = str(Path("drives") / task.name / "report.html") if task.pages else None
     except GraphnavError as error:
         row |= {"status": REFUSED, "error": str(error)}
@@ -95,15 +95,15 @@ def read_row(folder: Path, key: str | None = None) -> Row | None:
         return None
 
 
-def key_of(task: Task) -> str:
+def hash_task(task: Task) -> str:
     """What a result depends on: this version, all that is asked, and every byte of input."""
     asked = {k: v for k, v in asdict(task).items() if k not in ("name", "source", "folder", "again")}
     asked |= {"graphnav": graphnav.__version__, "noise": task.noise and sha256(Path(task.noise))}
-    asked["input"] = [(name, sha256(path)) for name, path in _input(task.source)]
+    asked["input"] = [(name, sha256(path)) for name, path in _list_inputs(task.source)]
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
 
 
-def _input(source: str) -> Iterator[tuple[str, Path]]:
+def _list_inputs(source: str) -> Iterator[tuple[str, Path]]:
     """The files that a recording is read from, by their names in it; a built-in one has none."""
     path = Path(source)
     if path.is_dir():
@@ -161,7 +161,7 @@ def spans(recording: Recording, length: float, zero: float = 0.0) -> list[tuple[
     return [(float(zero + s), float(zero + s + length)) for s in starts]
 
 
-def _figures(outcome: Outcome) -> Row:
+def _collect_figures(outcome: Outcome) -> Row:
     """What a row says of a drive that was solved."""
     ((name, solution),) = outcome.solutions.items()
     summary = solver_summary(outcome, name, {}, {})
@@ -178,14 +178,14 @@ def _figures(outcome: Outcome) -> Row:
         "keyframes": len(solution.t),
         "against": outcome.against,
         **{key: measured.get(key) for key in MEASURED},
-        **{key: _short(value) for key, value in median_sigmas(solution).items()},
+        **{key: _round_figure(value) for key, value in median_sigmas(solution).items()},
         "spans": len(ends),
-        "span_end_h_median_m": _short(float(np.median(ends))) if ends else None,
+        "span_end_h_median_m": _round_figure(float(np.median(ends))) if ends else None,
         "span_end_h_max_m": max(ends, default=None),
         "left_out": _measure_left_out(solution),
         "warnings": len(outcome.warnings),
         **{
-            f"noise.{group}": _short(figure.get("variance_factor"))
+            f"noise.{group}": _round_figure(figure.get("variance_factor"))
             for group, figure in summary["noise"]["figures"].items()
         },
         "placed": outcome.recording.gnss is not None,
@@ -224,7 +224,7 @@ def _track(outcome: Outcome, solution: Solution) -> list[list[float]] | None:
     return [[round(float(x), 6) for x in point] for point in degrees]
 
 
-def _short(x: float | None) -> float | None:
+def _round_figure(x: float | None) -> float | None:
     """Five digits, as a summary has."""
     return None if x is None or not math.isfinite(x) else float(f"{x:.5g}")
 

@@ -16,9 +16,9 @@ from typing import Any
 from graphnav.app.workflow import parse_noise, parse_withheld
 from graphnav.config import read_settings
 from graphnav.config.files import settings_from
-from graphnav.core.complaints import nearest, read_toml
+from graphnav.core.complaints import read_toml, suggest_nearest
 from graphnav.core.errors import ConfigError
-from graphnav.core.files import exists, inside, read_text
+from graphnav.core.files import exists, is_inside, read_text
 from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.pipeline import KNOWN
 from graphnav.recording.formats import formats
@@ -79,12 +79,12 @@ def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, Drive
     if not exists(source, ConfigError):
         raise ConfigError(f"{source}: no such folder or manifest", key="file.missing")
     if source.is_dir():
-        found = [(_name_of(path, source), str(path), asked, str(path)) for path in _recordings(source)]
+        found = [(_name_of(path, source), str(path), asked, str(path)) for path in _find_recordings(source)]
         if not found:
             raise ConfigError(
                 f'{source}: holds no recording; each is a .toml that says format = "{_FORM}/1"', key="recording.none"
             )
-        return _distinct(found)
+        return _number_clones(found)
     rows = _csv_rows(source) if source.suffix == ".csv" else _toml_rows(source)
     drives = [_drive(source, where, row, asked) for where, row in rows]
     if not drives:
@@ -95,10 +95,10 @@ def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, Drive
         raise ConfigError(
             f"{source}: two drives are named '{named[0]}'; each is a folder of its own", key="manifest.name_twice"
         )
-    return _distinct(drives)
+    return _number_clones(drives)
 
 
-def task_of(
+def build_task(
     drive: tuple[str, str, DriveOptions, str], out: Path, known: dict[Any, dict[str, Any]], **common: Any
 ) -> Task:
     """A drive with its settings read and checked; `known` keeps those that many share.
@@ -110,7 +110,9 @@ def task_of(
     """
     name, source, asked, where = drive
     if asked.solver not in KNOWN:
-        raise ConfigError(f"{where}: no solver '{asked.solver}'; {nearest(asked.solver, KNOWN)}", key="manifest.solver")
+        raise ConfigError(
+            f"{where}: no solver '{asked.solver}'; {suggest_nearest(asked.solver, KNOWN)}", key="manifest.solver"
+        )
     try:
         without = tuple((asked.without or "").split())
         for one in without:
@@ -119,7 +121,7 @@ def task_of(
         if key not in known:
             settings = read_settings(asked.config, asked.profile)
             if asked.settings:
-                settings = settings_from(_over(settings.model_dump(exclude_unset=True), _toml(asked.settings)))
+                settings = settings_from(_overlay(settings.model_dump(exclude_unset=True), _toml(asked.settings)))
             known[key] = parse_noise(asked.noise, settings)[0].model_dump(mode="json")
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}", key=error.key) from None
@@ -132,7 +134,7 @@ def task_of(
     )  # fmt: skip
 
 
-def _recordings(folder: Path) -> list[Path]:
+def _find_recordings(folder: Path) -> list[Path]:
     """Files that say they are a recording, at any depth."""
     found = []
     for place, folders, files in os.walk(folder):
@@ -157,15 +159,15 @@ def _begin(path: Path) -> str:
 def _name_of(path: Path, folder: Path) -> str:
     parts = path.relative_to(folder).with_suffix("").parts
     parts = parts[:-1] if parts[-1] == "recording" and len(parts) > 1 else parts
-    return _plain("_".join(parts))
+    return _clean_name("_".join(parts))
 
 
-def _plain(text: str) -> str:
+def _clean_name(text: str) -> str:
     """A name that every file system takes."""
     return re.sub(r"[^\w.+-]+", "_", text).strip("._")[:120] or "drive"
 
 
-def _distinct(drives: list[tuple[str, str, DriveOptions, str]]) -> list[tuple[str, str, DriveOptions, str]]:
+def _number_clones(drives: list[tuple[str, str, DriveOptions, str]]) -> list[tuple[str, str, DriveOptions, str]]:
     """The same with different names: a number behind those that come again."""
     taken: set[str] = set()
     out = []
@@ -214,7 +216,8 @@ def _check_columns(names: Iterable[str], where: str) -> None:
     unknown = [name for name in names if name not in _COLUMNS]
     if unknown:
         raise ConfigError(
-            f"{where}: no such column '{unknown[0]}'; {nearest(unknown[0], _COLUMNS)}", key="table.column_unknown"
+            f"{where}: no such column '{unknown[0]}'; {suggest_nearest(unknown[0], _COLUMNS)}",
+            key="table.column_unknown",
         )
     if "recording" not in names:
         raise ConfigError(f"{where}: 'recording' is missing", key="manifest.no_recording")
@@ -247,21 +250,21 @@ def _drive(source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions
         raise ConfigError(f"{where}, 'recording': names no recording", key="manifest.no_recording")
     noise = said.get("noise")
     if noise is not None and noise not in MODES:
-        said["noise"] = str(_beside(source, noise, where, "noise"))
+        said["noise"] = str(_find_beside(source, noise, where, "noise"))
     if "config" in said:
-        said["config"] = str(_beside(source, said["config"], where, "config"))
+        said["config"] = str(_find_beside(source, said["config"], where, "config"))
     builtin = recording in formats() and formats()[recording].builtin
-    path = recording if builtin else str(_beside(source, recording, where, "recording"))
+    path = recording if builtin else str(_find_beside(source, recording, where, "recording"))
     name = row.get("name") or Path(recording.removesuffix("/recording.toml")).name.removesuffix(".toml")
     if not isinstance(name, str):
         raise ConfigError(f"{where}, 'name': {name!r} is not a text", key="manifest.value")
-    return _plain(name), path, replace(asked, **said), where
+    return _clean_name(name), path, replace(asked, **said), where
 
 
-def _beside(source: Path, name: str, where: str, key: str) -> Path:
+def _find_beside(source: Path, name: str, where: str, key: str) -> Path:
     """What a manifest names; as elsewhere, that lies in its folder or below unless the command says otherwise."""
     path = source.parent / name
-    if not inside(path, source.parent, ConfigError):
+    if not is_inside(path, source.parent, ConfigError):
         raise ConfigError(
             f"{where}, '{key}': {name} lies outside its folder; say --allow-outside if you trust who wrote it",
             key="file.outside",
@@ -289,10 +292,10 @@ def _write(values: Mapping[str, Any], at: str = "") -> str:
     return "\n".join(lines)
 
 
-def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+def _overlay(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     """Nested values with others over them."""
     out = dict(below)
     for key, value in above.items():
         inner = out.get(key)
-        out[key] = _over(inner, value) if isinstance(value, Mapping) and isinstance(inner, Mapping) else value
+        out[key] = _overlay(inner, value) if isinstance(value, Mapping) and isinstance(inner, Mapping) else value
     return out

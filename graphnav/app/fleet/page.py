@@ -56,11 +56,13 @@ def write_page(rows: Sequence[Row], path: Path, title: str) -> None:
     lead = (
         f"{found['drives']} drives, {found['hours']:.2f} h, {found['km']:.1f} km: {said}; {found['doubtful']} doubtful."
     )
-    spread = [_histogram(numbers(rows, key), label) for key, label in _SPREAD.items() if len(numbers(rows, key)) > 1]
+    spread = [
+        _draw_histogram(numbers(rows, key), label) for key, label in _SPREAD.items() if len(numbers(rows, key)) > 1
+    ]
     parts = [
         f"<h1>{escape(title)}</h1><p>{escape(lead)}</p>",
         f'<h2>How figures are spread</h2><div class="figures">{"".join(spread)}</div>' if spread else "",
-        _maps(rows),
+        _draw_maps(rows),
         "<h2>Drives, worst first</h2>" + _table(worst_first(rows)),
     ]
     body = "".join(parts)
@@ -77,7 +79,7 @@ def _table(rows: Sequence[Row]) -> str:
         name = escape(str(row["drive"]))
         if row.get("report"):
             name = f'<a href="{escape(str(row["report"]))}">{name}</a>'
-        cells = "".join(f"<td>{escape(_short(row.get(key)))}</td>" for key in _TABLE)
+        cells = "".join(f"<td>{escape(_format_value(row.get(key)))}</td>" for key in _TABLE)
         why = escape(str(row.get("error") or row.get("doubts") or ""))
         kind = "" if row["status"] == DONE else ' class="bad"'
         lines.append(f'<tr><td>{name}</td>{cells}<td class="words"><span{kind}>{why}</span></td></tr>')
@@ -89,13 +91,13 @@ def _table(rows: Sequence[Row]) -> str:
     )
 
 
-def _short(value: object) -> str:
+def _format_value(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     return "" if value is None else str(value)
 
 
-def _histogram(x: Array, label: str) -> str:
+def _draw_histogram(x: Array, label: str) -> str:
     """Bars over decades where values are spread over more than one, else over even steps."""
     if x.min() == x.max():
         return f"<figure><figcaption>{escape(label)}: {x[0]:.4g} of all</figcaption></figure>"
@@ -106,23 +108,23 @@ def _histogram(x: Array, label: str) -> str:
     step = width / len(count)
     bars = "".join(
         f'<rect class="bar" x="{k * step:.1f}" y="{height * (1 - n / count.max()):.1f}" width="{max(step - 1, 1):.1f}" '
-        f'height="{height * n / count.max():.1f}"><title>{n}: {_edge(a, log)} to {_edge(b, log)}</title></rect>'
+        f'height="{height * n / count.max():.1f}"><title>{n}: {_label(a, log)} to {_label(b, log)}</title></rect>'
         for k, (n, a, b) in enumerate(zip(count.tolist(), edges, edges[1:], strict=False))
     )
     ends = (
-        f'<text x="0" y="{height + 13}">{_edge(edges[0], log)}</text>'
-        f'<text x="{width}" y="{height + 13}" text-anchor="end">{_edge(edges[-1], log)}</text>'
+        f'<text x="0" y="{height + 13}">{_label(edges[0], log)}</text>'
+        f'<text x="{width}" y="{height + 13}" text-anchor="end">{_label(edges[-1], log)}</text>'
     )
     about = f"{label}: median {np.median(x):.4g}, 95 % below {np.quantile(x, 0.95):.4g}{', log scale' if log else ''}"
     box = f'viewBox="0 0 {width:g} {height + foot:g}" role="img" aria-label="{escape(about)}"'
     return f"<figure><svg {box}>{bars}{ends}</svg><figcaption>{escape(about)}</figcaption></figure>"
 
 
-def _edge(value: float, log: bool) -> str:
+def _label(value: float, log: bool) -> str:
     return f"{10.0**value if log else value:.3g}"
 
 
-def _maps(rows: Sequence[Row]) -> str:
+def _draw_maps(rows: Sequence[Row]) -> str:
     """All tracks, those near each other on one map."""
     placed = [(np.array(row["track"], dtype=float), row) for row in rows if row.get("track")]
     groups: list[list[tuple[Array, Row]]] = []

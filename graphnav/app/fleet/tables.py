@@ -69,7 +69,7 @@ def write_parquet(rows: Sequence[Row], path: Path) -> bool:
 
 
 def worst_first(rows: Sequence[Row]) -> list[Row]:
-    """Drives without a result, those that are doubted, and the rest, each by what they are off."""
+    """Drives without a result, those whose result is doubtful, and the rest, each by the size of its error."""
 
     def badness(row: Row) -> tuple[bool, bool, float]:
         off = next((float(row[key]) for key in _BADNESS if row.get(key) is not None), 0.0)

@@ -55,7 +55,7 @@ class Worker:
     def solve(self, task: Task) -> Row:
         """The row of a drive, whatever becomes of the process."""
         began = time.monotonic()
-        process = self._running()
+        process = self._ensure_process()
         assert process.stdin is not None
         assert process.stdout is not None
         late = threading.Event()
@@ -92,7 +92,7 @@ class Worker:
             self._process.wait()
             self._process = None
 
-    def _running(self) -> subprocess.Popen[str]:
+    def _ensure_process(self) -> subprocess.Popen[str]:
         if self._process is None or self._process.poll() is not None:
             package = str(Path(graphnav.__file__).parents[1])
             path = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])

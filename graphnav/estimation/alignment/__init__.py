@@ -28,7 +28,7 @@ from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment.antennas import baseline_heading
 from graphnav.estimation.alignment.course import COURSE_SIGMA
 from graphnav.estimation.alignment.first import Alignment
-from graphnav.estimation.alignment.motion import Smoother, in_motion, motion, plausible
+from graphnav.estimation.alignment.motion import Smoother, align_in_motion, drop_implausible, motion
 from graphnav.estimation.alignment.rest import at_rest
 from graphnav.recording import Recording
 
@@ -50,11 +50,11 @@ def align(
     EstimationError
         If nothing in the recording can give an attitude.
     """
-    recording = plausible(recording)
+    recording = drop_implausible(recording)
     span = motion(recording, settings, stationary)
     if span is None:
         return at_rest(recording, settings, frame, stationary)
-    return replace(in_motion(recording, settings, frame, smooth, span), motion=span[0], until=span[1])
+    return replace(align_in_motion(recording, settings, frame, smooth, span), motion=span[0], until=span[1])
 
 
 def ready(recording: Recording, settings: Settings, stationary: Array | None = None) -> bool:
@@ -62,9 +62,9 @@ def ready(recording: Recording, settings: Settings, stationary: Array | None = N
 
     Parameters
     ----------
-    stationary : as for `align`; None where nobody has looked for stops yet, which only a quiet IMU stands for then.
+    stationary : as for `align`; None where stops have not been detected yet; a quiet IMU alone stands for them then.
     """
-    span = motion(plausible(recording), settings, NONE if stationary is None else stationary)
+    span = motion(drop_implausible(recording), settings, NONE if stationary is None else stationary)
     if span is None:
         return baseline_heading(recording, settings, stationary) is not None
     return recording.gnss is not None and span[1] < recording.gnss.t[-1]

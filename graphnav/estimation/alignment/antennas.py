@@ -11,7 +11,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.dual_antenna import SENSOR
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
-from graphnav.estimation.alignment.back import stands_until
+from graphnav.estimation.alignment.back import find_stand_end
 from graphnav.estimation.alignment.first import level
 from graphnav.recording import Recording
 
@@ -47,7 +47,7 @@ def baseline_heading(recording: Recording, settings: Settings, stationary: Array
         return None
     begin, first = recording.start, float(recording.imu.t[0]) + SAME_TIME
     if stationary is None:
-        end = stands_until(recording.imu, begin, recording.end)
+        end = find_stand_end(recording.imu, begin, recording.end)
     else:
         end = float(max((b for a, b in stationary if a <= first), default=begin))
     rows = (series.t >= begin - SAME_TIME) & (series.t <= end + SAME_TIME) & np.isfinite(series["heading"])

@@ -37,7 +37,7 @@ def carry_back(
     sd_bg = sd[12:15]
     sd_p, sd_v = np.full(3, 1.0) + 10.0 * sd[3:6], np.full(3, 0.5) + 10.0 * sd[6:9]
     if begin - recording.start > 0.05:
-        still = stands_until(imu, recording.start, begin)
+        still = find_stand_end(imu, recording.start, begin)
         stood, back = still - recording.start, begin - still
         drift = np.zeros(3)
         if back > 0.05:
@@ -67,7 +67,7 @@ def carry_back(
                 ),
             )
             sd_bg = np.full(3, noise.gyro_noise_density / np.sqrt(stood) + noise.gyro_bias_walk * np.sqrt(stood))
-        p, sd_p, v, sd_v = _by_first_fixes(recording, solution.frame, R, (p, sd_p, v, sd_v))
+        p, sd_p, v, sd_v = _refine_by_fixes(recording, solution.frame, R, (p, sd_p, v, sd_v))
         wide = np.hypot(wide, settings.alignment.prior_inflation * drift)
         own = np.hypot(own, np.abs(rotation.rph_jacobian(rotation.to_rph(R))) @ drift)
     sigma = np.concatenate(
@@ -77,7 +77,7 @@ def carry_back(
     return Alignment(state, np.minimum(sigma, np.r_[[np.pi] * 3, [1e6] * 12]), own, notes)
 
 
-def stands_until(imu: Imu, start: float, end: float) -> float:
+def find_stand_end(imu: Imu, start: float, end: float) -> float:
     """How long nothing but vibration is in the samples from the start: one-second means hardly differ. `start` if not.
 
     The last second before the first that differs is left out as well: something may have begun in it.
@@ -101,7 +101,7 @@ def _range(x: Array) -> Array:
     return np.maximum.accumulate(x, axis=0) - np.minimum.accumulate(x, axis=0)
 
 
-def _by_first_fixes(
+def _refine_by_fixes(
     recording: Recording, frame: LocalFrame, R: Array, found: tuple[Array, Array, Array, Array]
 ) -> tuple[Array, Array, Array, Array]:
     """Position and velocity at the start, each with its sigma: as found, or by the first fixes where these know more.

@@ -9,7 +9,7 @@ import numpy as np
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core import rotation
 from graphnav.core.notes import Note
-from graphnav.estimation.alignment.travel import across, travel
+from graphnav.estimation.alignment.travel import average_across, travel
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Gnss
 
@@ -44,9 +44,9 @@ def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> 
     best, dt = tried[least], float(np.median(np.diff(fixes.t)))
     at = np.clip(np.searchsorted(best.t, fixes.t - SAME_TIME), 0, len(best.t) - 1)
     yaw = np.unwrap(np.arctan2(best.states.R_nb[:, 1, 1], best.states.R_nb[:, 0, 1]))
-    way = travel(best.states.p[at, :2], across(fixes.sd), yaw[at])
+    way = travel(best.states.p[at, :2], average_across(fixes.sd), yaw[at])
     gone = fixes.t - fixes.t[0]
-    alike = _alike(float(way.turn[-1]), float(gone[-1]), dt)
+    alike = _count_alike(float(way.turn[-1]), float(gone[-1]), dt)
     own = min(np.pi, float(np.hypot(np.sqrt(alike) * own, _spread(tried, least, alike))))
     wide = max(own, wide)
     # the longer the way, the less do fixes err in its direction, and the more has a biased gyro turned
@@ -87,7 +87,7 @@ def _spread(tried: list[Solution], least: int, alike: float) -> float:
     return float(np.sqrt(np.sum(weight * off**2) / np.sum(weight)))
 
 
-def _alike(turn: float, length: float, dt: float) -> float:
+def _count_alike(turn: float, length: float, dt: float) -> float:
     """How many fixes in a row are worth one at worst, for what changes as quickly as a vehicle's motion.
 
     At a rate w (rad/s), errors of the variance s^2 that are white from fix to fix have the density s^2 dt; the worst

@@ -46,7 +46,7 @@ def level(recording: Recording, begin: float, seconds: float = 1.0) -> Array:
     return np.array([np.arctan2(-f[0], f[2]), np.arctan2(f[1], np.hypot(f[0], f[2]))])
 
 
-def some(gnss: Gnss, rows: Array) -> Gnss:
+def pick_fixes(gnss: Gnss, rows: Array) -> Gnss:
     """Fixes picked by index or mask."""
     pick: dict[str, Any] = {"t": gnss.t[rows], "llh": gnss.llh[rows], "sd": gnss.sd[rows]}
     if gnss.v is not None and gnss.sd_v is not None:

@@ -15,11 +15,11 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
-from graphnav.detectors.base import NONE, inside
+from graphnav.detectors.base import NONE, mask_inside
 from graphnav.estimation.alignment.back import carry_back
 from graphnav.estimation.alignment.course import COURSE_SIGMA, with_course
-from graphnav.estimation.alignment.first import Alignment, level, some
-from graphnav.estimation.alignment.travel import across, integrate_yaw, travel
+from graphnav.estimation.alignment.first import Alignment, level, pick_fixes
+from graphnav.estimation.alignment.travel import average_across, integrate_yaw, travel
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.imu.preintegration import prefix
@@ -39,18 +39,18 @@ _UNLIKELY = 14.0  # by which a log-likelihood is less where one in a million is 
 Smoother = Callable[[Problem, States], Solution]
 
 
-def plausible(recording: Recording) -> Recording:
+def drop_implausible(recording: Recording) -> Recording:
     """Without the fixes that lie far off the running median of five: they would be taken for motion."""
     gnss = recording.gnss
     if gnss is not None and not np.isfinite(gnss.llh).all():
-        gnss = some(gnss, np.flatnonzero(np.isfinite(gnss.llh).all(axis=1)))
+        gnss = pick_fixes(gnss, np.flatnonzero(np.isfinite(gnss.llh).all(axis=1)))
         recording = replace(recording, gnss=gnss)
     if gnss is None or len(gnss.t) < 5:
         return recording
     p = LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
     off = np.linalg.norm(p - median_filter(p, size=(5, 1), mode="nearest"), axis=1)
     usual = np.maximum(np.median(off), np.linalg.norm(gnss.sd[:, :2], axis=1))
-    return replace(recording, gnss=some(gnss, off <= _JUMP * usual))
+    return replace(recording, gnss=pick_fixes(gnss, off <= _JUMP * usual))
 
 
 def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:
@@ -71,10 +71,10 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
         return None
     t, p = gnss.t, LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
     if recording.platform == "vehicle":
-        yaw, still = integrate_yaw(recording.imu, t, _usual_rate(recording.imu)), inside(t, stationary)
+        yaw, still = integrate_yaw(recording.imu, t, _estimate_rate(recording.imu)), mask_inside(t, stationary)
     else:  # a foot turns about every axis
         yaw, still = np.zeros(len(t)), np.zeros(len(t), dtype=bool)
-    sd = across(gnss.sd)
+    sd = average_across(gnss.sd)
     way = travel(p, sd, yaw, still)
     away = np.maximum(way.times_sigma, travel(p, sd, np.zeros(len(t)), still).times_sigma) > _MOVES
     if not away.any():
@@ -90,7 +90,7 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
     return float(max(t[0], np.round(begin, 3))), float(t[last])  # what rounding did to D shall not show
 
 
-def in_motion(
+def align_in_motion(
     recording: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, span: tuple[float, float]
 ) -> Alignment:
     """The first state from the short problem over `span` (s), carried back to the first sample."""
@@ -101,7 +101,7 @@ def in_motion(
         recording.crop(begin - recording.start, end - recording.start),
         gnss=_thin(gnss, begin, end),
     )
-    bias = _usual_rate(imu)
+    bias = _estimate_rate(imu)
     rp = level(recording, begin)
     heading = _heading_of_accelerations(part, frame, rp, bias)
     tried = _try_headings(part, settings, frame, smooth, rp, heading, bias)
@@ -153,7 +153,7 @@ def _heading_of_accelerations(part: Recording, frame: LocalFrame, rp: Array, bia
     return float(-np.angle(z))
 
 
-def _usual_rate(imu: Imu) -> Array:
+def _estimate_rate(imu: Imu) -> Array:
     """Median turn rate, kept within what the sensor's turn-on bias can be, rad/s."""
     limit = 3.0 * imu.noise.gyro_bias_sigma
     return np.clip(np.median(imu.gyro, axis=0), -limit, limit)
@@ -161,13 +161,13 @@ def _usual_rate(imu: Imu) -> Array:
 
 def _thin(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
     """Fixes of a span at most about one a second: enough to align, and quick."""
-    inside = np.flatnonzero((gnss.t >= begin) & (gnss.t <= end))
+    there = np.flatnonzero((gnss.t >= begin) & (gnss.t <= end))
     keep, last = [], -np.inf
-    for i in inside:
+    for i in there:
         if gnss.t[i] - last >= spacing:
             keep.append(i)
             last = gnss.t[i]
-    return some(gnss, np.array(keep))
+    return pick_fixes(gnss, np.array(keep))
 
 
 def _try_headings(

@@ -26,7 +26,7 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
     """Level; the heading is that of two antennas or unknown. Of a foot, `stationary` (N, 2) s are its stances."""
     noise, gnss = recording.imu.noise, recording.gnss
     stances = stationary if recording.platform == "foot" else NONE
-    begin, seconds = _standing(recording, stances)
+    begin, seconds = _find_stand(recording, stances)
     R = rotation.from_rph(np.array([*level(recording, begin, seconds), 0.0]))
     tilt, sd_v = noise.accel_bias_sigma / 9.8 + np.radians(1.0), 0.5
     bias, sd_bias = np.zeros(3), noise.gyro_bias_sigma
@@ -77,7 +77,7 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
     return Alignment(state, sigma, own, (note,), until=float(stances[:_OPENING][-1, 1]) if len(stances) else None)
 
 
-def _standing(recording: Recording, stances: Array) -> tuple[float, float]:
+def _find_stand(recording: Recording, stances: Array) -> tuple[float, float]:
     """From when (s), and for how long, to level: from the start, or for a foot that starts in the air its first stance.
 
     Of a stance the middle half is used.

@@ -66,7 +66,7 @@ def travel(p: Array, sd: Array, yaw: Array, still: NDArray[np.bool_] | None = No
     return Travel(D, np.sqrt(variance[0] + variance + within), turn)
 
 
-def across(sd: Array) -> Array:
+def average_across(sd: Array) -> Array:
     """(N,) m, 1-sigma along one horizontal axis of fixes with `sd` (N, 3)."""
     return np.sqrt(np.mean(sd[:, :2] ** 2, axis=1))
 

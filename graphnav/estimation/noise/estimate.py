@@ -8,7 +8,7 @@ the points that the pass before left, every factor f with redundancy B and the s
     -(B x + A e^-x) / 2 - (ln f + x - m)^2 / (2 s^2)
 
 the likelihood of A / f as a chi-square variable of B degrees of freedom, and the prior. Without a prior that is the
-fixed point f <- f A / B of Foerstner (1979), Koch (1999, section 3.6) and MacKay (1992); no sensor is judged before
+fixed point f <- f A / B of Foerstner (1979), Koch (1999, section 3.6) and MacKay (1992); no sensor is estimated before
 another, so none is believed for having come first. What few rows say is bounded: squares that chance would leave once
 in a thousand times have no more say than that (`CHANCE`), and a row, or what is wrong with wheels for seconds, has a
 weight by which it would be that large.
@@ -233,7 +233,7 @@ def _improve(
         if chain.parameter.noise_groups:
             driven[chain.parameter.name] = process_moments(problem, chain, smoothed, end)
             _improve_process(figures, chain, driven[chain.parameter.name])
-            told = _told(figures, chain)
+            told = _is_observed(figures, chain)
             if chain.parameter.correlation_time is not None and told.any():
                 _improve_time(figures, chain, told, lag_moments(problem, chain, forward, smoothed, end))
     for rows in problem.constraints:
@@ -273,7 +273,7 @@ def _improve_process(figures: _Components, chain: ParameterChain, moments: tuple
         figures.update(group, *_cap(A[:, own], B[:, own], 1, _USUAL))
 
 
-def _told(figures: _Components, chain: ParameterChain) -> Array:
+def _is_observed(figures: _Components, chain: ParameterChain) -> Array:
     """(k,) whether the data say anything of each number of a process."""
     return np.array([figures.freedom.get(group, 0.0) > 1.0 for group in chain.parameter.noise_groups])
 

@@ -225,13 +225,21 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
         other = estimate_noise(base, None, without, (other.points, with_noise(base, other.noise)))
         posed, passes = with_noise(base, other.noise), passes + other.passes
         spans = trim_spans(posed, other.points, spans)
-        refined = trim_spans(posed, other.points, find_spans(base, replace(other.noise, excluded={}), other))
+        again = find_spans(base, replace(other.noise, excluded={}), other)
+        if _length(again) > _length(hidden):  # faults shrink then; where more seems wrong, the filter is lost
+            return replace(one, passes=passes, looks=one.looks + 3)
+        refined = trim_spans(posed, other.points, again)
         if not refined or refined == spans:
             break
         spans, without = refined, replace(without, excluded=dict.fromkeys(FIXES, tuple(refined)))
     ways = [one, *([decide(base, weigh_left_out(posed, other, spans), spans)] if spans else [])]
     best = max(ways, key=lambda way: way.log_evidence)
     return replace(best, passes=passes, looks=sum(way.looks for way in ways) + 4)
+
+
+def _length(spans: list[tuple[float, float]]) -> float:
+    """s"""
+    return sum(end - begin for begin, end in spans)
 
 
 def trim_spans(problem: Problem, smoothed: SmootherPass, spans: list[tuple[float, float]]) -> list[tuple[float, float]]:

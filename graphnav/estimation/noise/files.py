@@ -31,7 +31,7 @@ from graphnav.constraints import list_constraints
 from graphnav.constraints.gnss import ERRORS, OFFSETS, STAMP_ERROR, STAMPS, TIMES, VELOCITY_ERROR
 from graphnav.constraints.raw_gnss import CODE_ERRORS, RATE_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
-from graphnav.core.complaints import nearest
+from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import parse_json, read_text
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, VarianceComponent
@@ -187,7 +187,9 @@ class _Reader:
     def names(self, values: Mapping[str, Any], known: Sequence[str], at: str) -> None:
         for name in values:
             if name not in known:
-                raise ConfigError(f"{self.path}: unknown key '{at}.{name}'; {nearest(name, known)}", key="key.unknown")
+                raise ConfigError(
+                    f"{self.path}: unknown key '{at}.{name}'; {suggest_nearest(name, known)}", key="key.unknown"
+                )
 
     def each(
         self, values: Mapping[str, Any], key: str, known: Sequence[str], read: Callable[[str, Any], Any]

@@ -23,7 +23,7 @@ from graphnav.config import Settings
 from graphnav.core.findings import period_of
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.windows import running
+from graphnav.detectors.windows import sum_running
 from graphnav.recording import ImuNoise, Recording
 
 _CLUSTER = 0.1  # s
@@ -43,8 +43,8 @@ def with_measured_floor(recording: Recording, settings: Settings) -> tuple[Recor
     if recording.platform != "foot" or settings.noise.mode == "stated":
         return recording, ()
     shown = {
-        "gyro_noise_density": quietest_density(imu.t, imu.gyro),
-        "accel_noise_density": quietest_density(imu.t, imu.accel),
+        "gyro_noise_density": bound_density(imu.t, imu.gyro),
+        "accel_noise_density": bound_density(imu.t, imu.accel),
     }
     lower = {name: density for name, density in shown.items() if density < getattr(imu.noise, name)}
     if not lower:
@@ -59,7 +59,7 @@ def with_measured_floor(recording: Recording, settings: Settings) -> tuple[Recor
     )
 
 
-def quietest_density(t: Array, x: Array) -> float:
+def bound_density(t: Array, x: Array) -> float:
     """Bound from above of the white noise density of rows x (N, 3) at times t (N,), per axis; infinite if too short."""
     period = period_of(t)
     size = max(1, round(_CLUSTER / period)) if period < _CLUSTER else 1
@@ -70,5 +70,5 @@ def quietest_density(t: Array, x: Array) -> float:
     mean = x[:n].reshape(count, size, 3).mean(axis=1)
     bend = np.sum((mean[2:] - 2.0 * mean[1:-1] + mean[:-2]) ** 2, axis=1) / (3.0 * 6.0) * (size * period)
     degrees = 3.0 * (stretch - 2) * _INDEPENDENT
-    quietest = float(running(bend[:, None]).means(stretch - 2).min())
+    quietest = float(sum_running(bend[:, None]).means(stretch - 2).min())
     return float(np.sqrt(quietest * degrees / (2.0 * gammaincinv(0.5 * degrees, _CHANCE))))

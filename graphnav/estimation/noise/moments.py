@@ -12,6 +12,10 @@ with r and N of the disturbance smoother (Koopman 1993, "Disturbance smoother fo
 and at rows with residual e and Jacobian H at the smoothed state, r = R^-1 e and N = R^-1 - R^-1 H P^s H^T R^-1. B is
 the component's redundancy, the degrees of freedom that the data tell it by (Foerstner 1979; MacKay 1992 calls it the
 number of well-determined parameters), and E[A] = B where f is right.
+
+Bryson and Frazier, "Smoothing for linear and nonlinear dynamic systems" (1963); Foerstner, Allgemeine
+Vermessungs-Nachrichten 86 (1979); de Jong, JASA 84 (1989); Koopman, Biometrika 80 (1993); MacKay, Neural Computation 4
+(1992); Satterthwaite, Biometrics Bulletin 2 (1946).
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import numpy as np
 
 from graphnav.constraints.gnss import period
 from graphnav.core.rotation import Array
-from graphnav.estimation.alignment.first import some
+from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.recording import Gnss, Recording
 
 
@@ -26,7 +26,7 @@ def space_fixes(recording: Recording, spacing: float) -> Recording:
     gnss = recording.gnss
     if gnss is None or len(gnss.t) < 2 or period(gnss.t) > 0.5 * spacing:
         return recording
-    return replace(recording, gnss=some(gnss, best_fixes(gnss, np.floor((gnss.t - grid_start(gnss)) / spacing))))
+    return replace(recording, gnss=pick_fixes(gnss, best_fixes(gnss, np.floor((gnss.t - grid_start(gnss)) / spacing))))
 
 
 def grid_start(gnss: Gnss) -> float:

@@ -69,7 +69,7 @@ def figure_rows(
         time = next((part for part in middle if part in lasts), None)
         kind = next((part for part in middle if part not in lasts), None)
         # what lasts for minutes and hours has one unit, whatever the type of a fix
-        sigma = _stated_sigma(recording, source, None if time in TIMES[1:] else kind, axis)
+        sigma = _read_sigma(recording, source, None if time in TIMES[1:] else kind, axis)
         words = f"{_OF.get(source, source)}{f' ({kind})' if kind else ''}, {axis}"
         words += ", white" if time is None else f", lasting {time}"
         out.append(
@@ -105,7 +105,7 @@ def _process(source: str, time: str, kind: str | None) -> str:
     return {"gnss_velocity": VELOCITY_ERROR, "nhc": NHC_ERROR, "odometer": ODOMETER_ERROR}.get(source, source)
 
 
-def _stated_sigma(recording: Recording, source: str, kind: str | None, axis: str) -> float | None:
+def _read_sigma(recording: Recording, source: str, kind: str | None, axis: str) -> float | None:
     """Median of what fixes state."""
     gnss = recording.gnss
     if gnss is None or axis not in _AXES:

@@ -59,7 +59,7 @@ from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
 from graphnav.estimation.solvers.watch import Bank, Verdicts
 from graphnav.imu.dynamics import SCALE
 
-_PASSES = 4  # over the opening
+_PASSES = 4  # about where the pass before led
 _REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
 
 
@@ -82,7 +82,7 @@ def ekf(
     began = time.perf_counter()
     K, about = len(problem.t), None
     if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
-        about = _smooth_opening(problem, n) if known is None else known.first(n)
+        about = _smooth_about(problem, backward(problem, _forward(problem, n)))[1] if known is None else known.first(n)
     one = _forward(problem, K, about, progress, decide=decide)
     seconds = time.perf_counter() - began
     filtered, P = one.states, one.P[:, :DIM, :DIM]
@@ -108,16 +108,6 @@ def ekf(
     return FilterPass(**vars(one), solution=solution)
 
 
-def _smooth_opening(problem: Problem, n: int) -> SmootherPass:
-    """Where the first n keyframes are linearised: smoothed, again about that until attitudes stay (Bell 1994)."""
-    about = backward(problem, _forward(problem, n))
-    for _ in range(_PASSES):
-        before, about = about, backward(problem, _forward(problem, n, about))
-        if near_to(about, before):
-            break
-    return about
-
-
 def refilter(
     problem: Problem, about: Points, progress: Progress | None = None, watch: bool = False, drifts: bool = True
 ) -> ForwardRecord:
@@ -130,6 +120,33 @@ def refilter(
     drifts : of such errors those that grow as well.
     """
     return _forward(problem, len(about.values), about, progress, watch, drifts)
+
+
+def near(
+    problem: Problem, about: Points, opening: float | None = None, progress: Progress | None = None
+) -> tuple[ForwardRecord, SmootherPass]:
+    """A drive smoothed again near what is known of it: only figures or weights have changed since.
+
+    Where attitudes do not stay, it is smoothed from the start as a filter would be, with `opening` as for `ekf`.
+    """
+    forward, smoothed, stays = _smooth_about(problem, about, progress)
+    if stays:
+        return forward, smoothed
+    forward = ekf(problem, progress, opening)
+    return forward, backward(problem, forward, progress)
+
+
+def _smooth_about(
+    problem: Problem, about: Points, progress: Progress | None = None
+) -> tuple[ForwardRecord, SmootherPass, bool]:
+    """The first keyframes smoothed about points, and about where that leads until attitudes stay, if they do."""
+    for _ in range(_PASSES):
+        forward = refilter(problem, about, progress)
+        smoothed = backward(problem, forward, progress)
+        if near_to(smoothed, about):
+            return forward, smoothed, True
+        about = smoothed
+    return forward, smoothed, False
 
 
 def _forward(

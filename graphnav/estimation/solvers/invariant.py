@@ -64,7 +64,4 @@ def transport_covariance(P: Array, states: States, moved: States) -> Array:
     T[:] = _I9
     T[:, _THETA, _THETA] = np.swapaxes(moved.R_nb, -1, -2) @ states.R_nb
     T[:, _V, _THETA] = rotation.skew(states.v - moved.v) @ states.R_nb
-    out = np.empty(P.shape)
-    for one, matrix, to in zip(P, T, out, strict=True):
-        turn(one, matrix, to)
-    return out
+    return np.asarray(turn(P, T))

@@ -17,10 +17,12 @@ from graphnav.estimation.solvers.incremental import FINE, Replay, are_due, begin
 from graphnav.estimation.solvers.passes import Progress
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import newest_covariance, smooth_keyframes
+from graphnav.estimation.solvers.tree_marginals import Leaving, newest_covariance
 from graphnav.estimation.solvers.window import SettledStates, turn_limit
 
-_SKIP = 10  # keyframes between two looks at what has moved, as GTSAM's relinearizeSkip
+_SKIP = 10  # keyframes between two looks at what has moved, as GTSAM's relinearizeSkip, at least
+_GROWN = 8  # what a look takes goes with the keyframes there: it comes when there are this part more of them
+_SHARE = 4  # covariances of keyframes are eliminated for in a fourth of the time until the next are to settle
 _ROUNDS = 30
 
 
@@ -38,28 +40,40 @@ class TreeSmoother:
         self.tree, self.lag = Tree(prior, turn_limit(problem.imu_noise)), lag
         self.settled: list[SettledStates] = []
         self._problem = problem
+        self._look = _SKIP  # the keyframe at which to look next at what has moved
+        self._leaving: Leaving | None = None  # of what is to settle
+        self._portion = 0  # variables that are eliminated for that at a keyframe
 
     def add(self, place: Place) -> tuple[Message, Array]:
         """As of `Engine`."""
         tree = self.tree
         turn = tree.add(replace(place, problem=self._problem))
-        if turn > tree.turn or place.k % _SKIP == 0:
+        look = turn > tree.turn or (place.k >= self._look and self._leaving is None)
+        if self._leaving is not None and (self._leaving.step(self._portion) or look):
+            self.settled.append(self._leaving.settled())
+            tree.marginalise(self._leaving.count)
+            self._leaving = None
+        if look:
             tree.relinearise()
+            self._look = place.k + max(_SKIP, len(tree) // _GROWN)
         oldest = tree.keyframes[0].place
-        if are_due(oldest.t, place.t, self.lag):
-            count = int(np.searchsorted(self._problem.t[: place.k], place.t - self.lag)) - oldest.k
+        if self._leaving is None and are_due(oldest.t, place.t, self.lag):
             self._problem, _ = tree.integrate_again(self._problem)
-            self.settled.append(smooth_keyframes(tree, count))
-            tree.marginalise(count)
+            count = int(np.searchsorted(self._problem.t[: place.k], place.t - self.lag)) - oldest.k
+            self._leaving = Leaving(tree, count)
+            self._portion = 1 + _SHARE * self._leaving.left // count
         return tree.newest, newest_covariance(tree)
 
     def finish(self, problem: Problem) -> tuple[Problem, int]:
         """As of `Engine`."""
+        if self._leaving is not None:
+            self.settled.append(self._leaving.settled())
+            self.tree.marginalise(self._leaving.count)
         for _ in range(_ROUNDS):
             self._problem, again = self.tree.integrate_again(self._problem)
             if not self.tree.relinearise(FINE) and not again:
                 break
-        self.settled.append(smooth_keyframes(self.tree, len(self.tree)))
+        self.settled.append(Leaving(self.tree, len(self.tree)).settled())
         return self._problem, self.tree.relinearised
 
 

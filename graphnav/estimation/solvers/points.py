@@ -22,6 +22,7 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.invariant import minus_invariant, plus_invariant, transport_covariance
 from graphnav.estimation.solvers.linearise import Advance, Points, linearise, shift
+from graphnav.estimation.solvers.recursion import turn
 from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.imu.dynamics import SCALE
 
@@ -166,12 +167,8 @@ def _transition(problem: Problem, at: slice, states: States, values: Array) -> t
 
 
 def move_covariance(P: Array, e: Array) -> Array:
-    """Covariances (..., D, D) of errors about points turned into those about states e away from them.
+    """Covariances (K, D, D) of errors about points turned into those about states e (K, D) away from them.
 
     Exp(e + x) = Exp(e) Exp(J_r(e) x) to first order in x.
     """
-    J = rotation.right_jacobian(e[..., :3])
-    P = P.copy()
-    P[..., :3, :] = J @ P[..., :3, :]
-    P[..., :3] = P[..., :3] @ np.swapaxes(J, -1, -2)
-    return P
+    return np.asarray(turn(np.ascontiguousarray(P), rotation.right_jacobian(e[:, :3])))

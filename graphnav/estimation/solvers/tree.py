@@ -20,6 +20,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import gtsam
 import numpy as np
 
 from graphnav.core.rotation import Array
@@ -45,19 +46,18 @@ from graphnav.estimation.solvers.tree_nodes import (
     Made,
     Variable,
     factor,
+    fill_keys,
     fresh_isam,
     interval_factor,
     is_constant,
-    key_list,
+    limit_of,
     read_estimates,
     read_factors,
     row_factor,
     states_of,
-    units_of,
     update_isam,
     write_factors,
 )
-from graphnav.estimation.solvers.window import limits
 
 NODE_EVERY = 30.0  # s from one node of a constant to the next
 _TIED = 1e-5  # of its prior sigma, by which a constant may differ from node to node: 0.03 % of it in ten hours
@@ -85,6 +85,7 @@ class Tree:
         self.variables: dict[int, Variable] = {}
         self._first_sigma: dict[str, Array] = {}
         self._constant: set[str] = set()
+        self.changed = np.inf  # number of the oldest keyframe whose factors were replaced since somebody looked
         self._held = 0  # keyframes at the front that stay as they are: 1 where the first is behind the window
 
     def __len__(self) -> int:
@@ -151,7 +152,7 @@ class Tree:
         if prior.columns:
             node = self._variable(prior.values, np.ones(len(prior.values)), place.t)
             fresh.append((node, None))
-            node.limit = limits(prior.columns, units_of(place))[1]
+            node.limit = limit_of(prior.columns, place)
             nodes = {name: (node, shift(at)) for name, at in prior.columns.items()}
             blocks.append((node, prior.R[:, DIM:]))
         assert place.problem is not None
@@ -201,7 +202,7 @@ class Tree:
             widths = [len(s.mean) for s in own_steps]
             edge = np.concatenate([[0], np.cumsum(widths)])
             node = self._variable(np.zeros(edge[-1]), np.ones(edge[-1]), place.t)
-            node.limit = limits(append_columns({}, own_steps), units_of(place))[1]
+            node.limit = limit_of(append_columns({}, own_steps), place)
             old = self.variables.get(old_key)
             own_A, old_A = np.zeros((edge[-1], edge[-1])), np.zeros((edge[-1], 0 if old is None else len(old.unit)))
             for step, lo, hi in zip(own_steps, edge[:-1], edge[1:], strict=True):
@@ -242,7 +243,7 @@ class Tree:
         off = np.array([k.state.delta[:3] - k.state.point[:3] for k in self.keyframes])
         far = np.einsum("ki,ki->k", off, off) > (share * self.turn) ** 2
         first = self.keyframes[self._held].number
-        limited = (x for x in self.variables.values() if x.last >= first and np.isfinite(x.limit).any())
+        limited = (x for x in self.variables.values() if len(x.limit) and x.last >= first)
         gone = {x.key for x in limited if np.any(np.abs(x.delta - x.point) > share * x.limit)}
         if gone:
             far |= np.array([any(n.key in gone for n, _ in k.nodes.values()) for k in self.keyframes])
@@ -308,6 +309,7 @@ class Tree:
             for node, _ in self.keyframes[i].nodes.values():
                 node.point = node.delta.copy()
         self.relinearised += len(rows)
+        self.changed = min(self.changed, self.keyframes[min(rows)].number)
         self._replace(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
 
     def _runs(self, which: Sequence[int], posed: bool) -> Iterable[list[int]]:
@@ -346,8 +348,9 @@ class Tree:
             del self.variables[key]
         for x in self.variables.values():
             x.last = min(x.last, last.number)
+        self.changed = min(self.changed, self._number)
         self._replace([], own, last.number)
-        last.read(self.isam)
+        self.read()
 
     def hold(self) -> None:
         """The first keyframe is behind the window from now on, and stays as it is."""
@@ -368,7 +371,7 @@ class Tree:
         """Let the first keyframes go, and the parameters' nodes that only they touch."""
         first = self.keyframes[count].number
         gone = [x for x in self.variables.values() if x.last < first]
-        left = set(self.isam.marginalizeLeavesWithIndices(key_list(gone))[1])
+        left = set(self.isam.marginalizeLeavesWithIndices(fill_keys(gtsam.KeyList(), gone))[1])
         for x in gone:
             del self.variables[x.key]
         del self.keyframes[:count]

@@ -17,9 +17,10 @@ from graphnav.estimation.solvers.graph import jacobian_factor
 from graphnav.estimation.solvers.linearise import Columns, shift
 from graphnav.estimation.solvers.stages import Measured, Place
 from graphnav.estimation.solvers.stages import rotate_columns as turned_by
+from graphnav.estimation.solvers.window import limits
 
 LINK = "imu"  # among the constraints of a keyframe: the interval before it
-_WILDFIRE = 1e-3  # of the variables' units: less is not passed on to older ones
+_WILDFIRE = np.inf  # what the newest keyframe changes of older ones is passed on when they are read
 
 
 @dataclass(eq=False)
@@ -34,7 +35,7 @@ class Variable:
     last: int  # and of the last
     t: float  # s, when it began
     anchor: Array = field(default_factory=lambda: np.zeros(0))  # of parameters
-    limit: Array = field(default_factory=lambda: np.zeros(0))  # how far they may move
+    limit: Array = field(default_factory=lambda: np.zeros(0))  # how far they may move; empty where nothing limits them
 
     @property
     def value(self) -> Array:
@@ -67,7 +68,7 @@ class Keyframe:
         return out
 
     def read(self, isam: gtsam.ISAM2) -> None:
-        """Bring its variables up to date."""
+        """Bring its variables up to date, where it is the newest: they are in the root, or were eliminated just now."""
         for x in (self.state, *(node for node, _ in self.nodes.values())):
             x.delta = x.unit * isam.calculateEstimateVector(x.key)
 
@@ -122,7 +123,9 @@ def update_isam(
         for variable, group in order:
             groups.insert2(variable.key, group)
     try:
-        result = isam.update(graph, new, list(gone), groups, None, None if anew is None else key_list(anew))
+        result = isam.update(
+            graph, new, list(gone), groups, None, None if anew is None else fill_keys(gtsam.KeyList(), anew)
+        )
     except RuntimeError as error:  # GTSAM's for a variable that nothing determines
         raise EstimationError(
             f"the smoother's information broke down at {t:.3f} s: check sigmas and units", key="solver.breakdown"
@@ -132,7 +135,8 @@ def update_isam(
 
 
 def read_estimates(isam: gtsam.ISAM2, variables: Collection[Variable]) -> None:
-    """Bring many variables up to date."""
+    """Bring many variables up to date, by back-substitution through the whole tree."""
+    isam.calculateBestEstimate()
     flat = np.asarray(isam.getDelta().vector([x.key for x in variables])).ravel()
     begin = 0
     for x in variables:
@@ -141,9 +145,8 @@ def read_estimates(isam: gtsam.ISAM2, variables: Collection[Variable]) -> None:
         begin = end
 
 
-def key_list(variables: Iterable[Variable]) -> gtsam.KeyList:
-    """The keys of variables."""
-    out = gtsam.KeyList()
+def fill_keys(out: Any, variables: Iterable[Variable]) -> Any:
+    """The keys of variables in a list of GTSAM's."""
     for x in variables:
         out.push_back(x.key)
     return out
@@ -197,9 +200,11 @@ def is_constant(place: Place, name: str) -> bool:
     return p is not None and p.constant
 
 
-def units_of(place: Place) -> dict[str, str]:
+def limit_of(columns: Columns, place: Place) -> Array:
+    """How far parameters of a node may move, empty where nothing limits any of them."""
     assert place.problem is not None
-    return {name: p.unit for name, p in place.problem.parameters.items()}
+    found = limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})[1]
+    return found if np.isfinite(found).any() else np.zeros(0)
 
 
 def write_factors(isam: gtsam.ISAM2, variables: Iterable[Variable]) -> list[tuple[int, str]]:

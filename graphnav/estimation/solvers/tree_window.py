@@ -10,18 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.revision import Renewed, Renewing
-from graphnav.estimation.solvers.stages import Message, Place, Stage
+from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import newest_root, smooth_keyframes
+from graphnav.estimation.solvers.tree_marginals import Leaving, newest_root
 from graphnav.estimation.solvers.window import SettledStates, Window
 
 _ROUNDS = 5
-_ASKED = 16  # parts in which covariances are asked for: rows of an IMU between two keyframes are more
+_PORTION = 48  # variables that are eliminated at one row of the IMU for covariances
 _FINE = 0.02  # of the usual limits, within which the last window is converged
 
 
@@ -32,8 +33,7 @@ class TreeWindow(Window):
         super().__init__(prior, turn)
         self.tree: Tree | None = None
         self._before = 0  # keyframes in the tree before the first stage
-        # stages that are to leave; the newest when that began, and up to which keyframe covariances were asked for
-        self._leaving: tuple[int, Stage, int] | None = None
+        self._leaving: Leaving | None = None  # of stages that are to leave
 
     def push(self, place: Place, ahead: Predicted | None = None) -> float:
         """As of `Window`; the newest message is about the tree's estimate."""
@@ -92,25 +92,20 @@ class TreeWindow(Window):
         return False
 
     def smooth_back(self, count: int, most: int) -> bool:
-        """A part of what the tree has to do for covariances of the first stages; True once they cost little.
-
-        What it makes for one keyframe it has for those before, until a keyframe comes: so the newest are asked for
-        first, and a part is a sixteenth of the window.
-        """
+        """A part of what `settle` does for the first stages, over at most so many; True once it is done."""
         assert self.tree is not None
-        newest = self.stages[-1]
-        if self._leaving is None or self._leaving[1] is not newest:
-            self._leaving = count, newest, len(self.tree) - 1
-        first, _, at = self._leaving
-        at = max(0, at - max(1, len(self.tree) // _ASKED))
-        smooth_keyframes(self.tree, at + 1, at)
-        self._leaving = first, newest, at
-        return at == 0
+        if self._leaving is None:
+            self._leaving = Leaving(self.tree, self._before + count, self._before)
+        return self._leaving.step(_PORTION)
 
     @property
     def leaving(self) -> int:
         """How many stages `smooth_back` is about, 0 if it has not begun."""
-        return 0 if self._leaving is None else self._leaving[0]
+        return 0 if self._leaving is None else self._leaving.count - self._before
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what has been done for stages that are to leave, which is made again."""
+        return {**self.__dict__, "_leaving": None}
 
     def _relinearise(self, count: int) -> None:
         self.relinearized += count
@@ -136,9 +131,11 @@ class TreeWindow(Window):
         gone = self.stages[:count]
         if self.tree is None or not gone:
             return super().settle(0)
-        self._leaving = None
-        self.tree.read()
-        out = smooth_keyframes(self.tree, self._before + count, self._before)
+        if self.leaving != count:
+            self._leaving = Leaving(self.tree, self._before + count, self._before)
+        assert self._leaving is not None
+        self._leaving.read()  # as it is now, wherever a run may have been resumed
+        out, self._leaving = self._leaving.settled(), None
         self.head = gone[-1].message
         del self.stages[:count]
         self._means = None

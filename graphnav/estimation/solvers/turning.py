@@ -26,6 +26,7 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
+from graphnav.estimation.solvers.recursion import turn
 
 _Z = rotation.skew(np.array([0.0, 0.0, 1.0]))
 _I3 = np.eye(3)
@@ -95,11 +96,7 @@ def change_of_point(states: States, e: Array) -> Array:
 
 def covariance_turning(P: Array, states: States, e: Array) -> Array:
     """Covariances (K, 15, 15) of errors about points turned into those about the points moved by e (K, 15)."""
-    back = np.linalg.inv(change_of_point(states, e))
-    P = P.copy()
-    P[:, :_MOVING] = back @ P[:, :_MOVING]
-    P[:, :, :_MOVING] = P[:, :, :_MOVING] @ np.swapaxes(back, -1, -2)
-    return P
+    return np.asarray(turn(P, np.linalg.inv(change_of_point(states, e))))
 
 
 def _about_vertical(psi: Array) -> Array:

@@ -124,7 +124,7 @@ def check_gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Find
         yield Finding(
             "warning",
             f"{count} in GNSS position that the motion and the sigmas do not explain, the largest {size[worst]:.1f} m "
-            f"at {at:.1f} s from the start; a robust kernel or a gate is advisable",
+            f"at {at:.1f} s from the start; an estimated noise model weighs such down, else a robust kernel does",
             "gnss.jump",
         )
 
@@ -171,7 +171,7 @@ def check_mirroring(recording: Recording, track: Track) -> Iterator[Finding]:
         yield describe_mirroring("latitudes or longitudes have", "the turns of the gyro and the force in curves")
 
 
-def mirrored_places(recording: Recording, wrong: Sequence[Finding]) -> list[Finding]:
+def find_mirrored(recording: Recording, wrong: Sequence[Finding]) -> list[Finding]:
     """What `velocities` found, or that the positions are wrong where the gyro turns with the velocities."""
     gnss = recording.gnss
     if gnss is None or gnss.v is None or recording.platform != "vehicle":
@@ -195,7 +195,7 @@ def mirrored_places(recording: Recording, wrong: Sequence[Finding]) -> list[Find
 
 def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Finding]:
     """Axes that the drive contradicts: by the mean force, and by the forward force where another fits it better."""
-    up = crosschecks.up_of(imu)
+    up = crosschecks.find_up(imu)
     if up[2] > 0.8 and (forward is None or forward.correlation < 0.7):
         return
     if forward is None or forward.correlation < 0.7:
@@ -238,7 +238,7 @@ def _letters(R_bs: Array, forward: Array, up: Array) -> str | None:
 
 def check_gyro_sign(imu: Imu) -> Iterator[Finding]:
     """The gyro about the mean force turns against the course: no choice of axes mends that."""
-    if crosschecks.up_of(imu)[2] < 0:
+    if crosschecks.find_up(imu)[2] < 0:
         what = "the accelerometer's sign is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
         yield Finding("warning", f"{what}; negate it in the file", "imu.force_sign")
     else:
@@ -310,7 +310,7 @@ def check_odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iter
 def _wheels_apart(odometer: Odometer, imu: Imu) -> Iterator[Finding]:
     """A wheel that is faster or slower than the others where the vehicle goes straight."""
     assert odometer.wheels is not None
-    turn = imu.gyro @ crosschecks.up_of(imu)
+    turn = imu.gyro @ crosschecks.find_up(imu)
     turn = np.abs(np.interp(odometer.t, imu.t, turn - np.median(turn)))
     # a turn of 0.02 rad/s moves a wheel by 0.02 m/s against the middle
     straight = (np.abs(odometer.speed) > _MIN_SPEED) & (turn < 0.02)

@@ -25,7 +25,7 @@ class ClockOffsets:
     def apart(self) -> float | None:
         """How far the stamps of velocities and places are apart, s, where that is sure."""
         fit = self.between
-        return abs(fit.lag) if fit is not None and fit.correlation > CLEAR and surely(fit) else None
+        return abs(fit.lag) if fit is not None and fit.correlation > CLEAR and is_certain(fit) else None
 
     @property
     def late(self) -> Fit | None:
@@ -33,15 +33,15 @@ class ClockOffsets:
         velocity, places = self.by_velocity, self.by_places
         if velocity is None or places is None:
             one = velocity or places
-            return one if one is not None and one.correlation >= FAIR and surely(one) else None
+            return one if one is not None and one.correlation >= FAIR and is_certain(one) else None
         if self.apart is not None and (velocity.lag * places.lag <= 0.0 or abs(places.lag) < _MATTERS):
             return None  # between the two already, or right for the places
-        sure = [fit for fit in (velocity, places) if fit.correlation >= FAIR and surely(fit)]
+        sure = [fit for fit in (velocity, places) if fit.correlation >= FAIR and is_certain(fit)]
         shared = velocity.lag * places.lag > 0.0 and abs(velocity.lag) >= _MATTERS and velocity.correlation >= FAIR
         return velocity if velocity in sure or (sure and shared) else None
 
 
-def surely(fit: Fit) -> bool:
+def is_certain(fit: Fit) -> bool:
     """Whether a lag is no chance, and large enough to matter."""
     return abs(fit.lag) >= _MATTERS + _SIGNIFICANT * fit.spread
 

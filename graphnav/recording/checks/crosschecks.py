@@ -232,7 +232,7 @@ def _imu_fit(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) 
     return _search(0.5 * (ti + tj), y, x_at, track.t, valid)
 
 
-def up_of(imu: Imu) -> Array:
+def find_up(imu: Imu) -> Array:
     """Unit vector of the mean force: up, in body axes as loaded, (3,)."""
     f = _mean(imu.accel)
     return f / np.linalg.norm(f) if f.any() else np.array([0.0, 0.0, 1.0])
@@ -250,7 +250,7 @@ def forward_fit(imu: Imu, track: Track) -> Fit | None:
     i, j, y = i[real], j[real], y[real]
     if len(y) < MIN_PAIRS or y.std() < 0.25:
         return None
-    level = np.linalg.svd(up_of(imu)[None, :])[2][1:]  # (2, 3)
+    level = np.linalg.svd(find_up(imu)[None, :])[2][1:]  # (2, 3)
     fit = _imu_fit(imu, imu.accel @ level.T, track, i, j, y)
     if fit is None or len(fit.coefficients) != len(level):  # no time in common
         return None
@@ -278,7 +278,7 @@ def yaw_fit(imu: Imu, track: Track) -> Fit | None:
     i, j, y = i[real], j[real], y[real]
     if len(y) < MIN_PAIRS or y.std() < 0.04:
         return None
-    return _imu_fit(imu, imu.gyro @ up_of(imu)[:, None], track, i, j, y)
+    return _imu_fit(imu, imu.gyro @ find_up(imu)[:, None], track, i, j, y)
 
 
 def velocity_fit(track: Track, places: Track) -> Fit | None:

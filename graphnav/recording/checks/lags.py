@@ -67,7 +67,7 @@ def refine_lag(
                 continue
             x = x_at(kept, of)
             L, K, m = x.shape
-            both = quick(t[kept], np.column_stack([x.transpose(1, 0, 2).reshape(K, L * m), y[kept]]))
+            both = remove_slow(t[kept], np.column_stack([x.transpose(1, 0, 2).reshape(K, L * m), y[kept]]))
             x, left = both[:, :-1].reshape(K, L, m).transpose(1, 0, 2), both[:, -1]
             b = regress_each(x, left)
             e = left - (x @ b[..., None])[..., 0]
@@ -93,7 +93,7 @@ def refine_lag(
         return guess, REACH
     near = wide[int(np.nanargmin(seen))] + np.arange(-_STEP, _STEP + _FINE / 2, _FINE)
     close = profile(near)
-    lag = _lowest(near, close)
+    lag = _find_lowest(near, close)
     best = at(lag, rows)
     scores = None if best is None else _scores(t, x_at, valid, best, lag)
     if best is None or scores is None:
@@ -131,7 +131,7 @@ def regress_each(x: Array, y: Array) -> Array:
     return np.asarray(np.linalg.pinv(x, rcond=np.finfo(float).eps * x.shape[1]) @ y)
 
 
-def quick(t: Array, x: Array) -> Array:
+def remove_slow(t: Array, x: Array) -> Array:
     """Columns (N, m) at times t (N,) less their means over the ten seconds around each, and without a mean."""
     lo, hi = np.searchsorted(t, t - _SLOW / 2), np.searchsorted(t, t + _SLOW / 2, side="right")
     total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x - x.mean(0), axis=0)])
@@ -153,7 +153,7 @@ def _scores(
     if len(rows) <= x.shape[1] + 2:
         return None
     change = (x_at(rows, lag + _FINE) - x_at(rows, lag - _FINE)) @ best.b / (2.0 * _FINE)
-    slope = quick(t[rows], change[:, None])[:, 0]
+    slope = remove_slow(t[rows], change[:, None])[:, 0]
     slope = slope - x @ np.linalg.lstsq(x, slope, rcond=None)[0]
     score, information = best.e[inside] * slope, float(slope @ slope)
     if information <= 0.0:
@@ -168,7 +168,7 @@ def _scores(
     return max(lasting, scatter, 1e-300), information
 
 
-def _lowest(lags: Array, values: Array) -> float:
+def _find_lowest(lags: Array, values: Array) -> float:
     """Where evenly spaced values are lowest, by the parabola through the lowest and its neighbours."""
     k = int(np.nanargmin(values))
     if 0 < k < len(lags) - 1 and np.isfinite(values[k - 1 : k + 2]).all():

@@ -23,7 +23,7 @@ from graphnav.recording.checks.aiding import (
     check_imu_axes,
     check_mirroring,
     check_yaw_scale,
-    mirrored_places,
+    find_mirrored,
     odometer_findings,
     overlap_s,
 )
@@ -160,14 +160,15 @@ def inspect(recording: Recording) -> Inspection:
         findings += check_gnss_coverage(recording)
         findings += check_rounding(recording.gnss)
         findings += check_fix_types(recording.gnss)
-        wrong = mirrored_places(recording, list(velocities(recording.gnss)))
+        wrong = find_mirrored(recording, list(velocities(recording.gnss)))
         if overlap or not wrong:
             # against wrong velocities, or on another clock, every position jumps
             findings += wrong or (check_gnss_jumps(recording, track) if overlap else ())
     if recording.raw_gnss is not None and len(recording.raw_gnss):
         facts["raw_gnss"] = raw_facts(recording.raw_gnss)
         findings += raw_findings(recording.raw_gnss)
-    turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis"}
+    # of axes that are wrong already, or of forces without gravity, nothing is told by gravity
+    turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis", "imu.force_scale"}
     if vehicle and overlap and track is not None and recording.gnss is not None:
         clock = whole.clock or clock_of(recording.imu, recording.gnss)
         yaw = crosschecks.yaw_fit(recording.imu, track)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.findings import Finding, period_of
-from graphnav.recording import Recording, rows_of
+from graphnav.recording import Recording, take_rows
 from graphnav.sensors import Series
 
 _ISOLATED = 0.01  # of the rows; what more of them have in common is no fault of single rows
@@ -46,7 +46,7 @@ def _screen(series: Series) -> tuple[Series, list[Finding]]:
             findings.append(Finding("note", f"{said}: left out", f"{sensor.name}.bounds"))
     if not findings:
         return series, []
-    return rows_of(replace(series, values=values), sensor.usable(values)), findings
+    return take_rows(replace(series, values=values), sensor.usable(values)), findings
 
 
 def series_facts(series: Series) -> dict[str, Any]:

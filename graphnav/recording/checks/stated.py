@@ -16,7 +16,7 @@ from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.crosschecks import Track
 
 _LONG = 15.0  # m; no lever arm on a road vehicle is that long
-_RUN = 8.0  # m/s, that nobody walks
+_RUN = 8.0  # m/s, above any walking speed
 # SI figures that no IMU has (a phone's are a tenth or less), and the unit of a data sheet that may have been meant
 _IMPOSSIBLE = {
     "gyro_noise_density": (0.02, "rad/s/sqrt(Hz)", "deg/sqrt(h)"),
@@ -150,21 +150,21 @@ def exchange_lat_lon(gnss: Gnss) -> Gnss | None:
     return replace(gnss, llh=llh) if np.nanmax(np.abs(llh[:, 0])) < 0.5 * np.pi else None
 
 
-def describe_exchange(witness: str) -> Finding:
-    """That they are, by `witness`."""
+def describe_exchange(sensor: str) -> Finding:
+    """That they are, by `sensor`."""
     return Finding(
         "refused",
-        f"latitude and longitude are exchanged: exchanged back, the positions agree with {witness}; exchange the names "
+        f"latitude and longitude are exchanged: exchanged back, the positions agree with {sensor}; exchange the names "
         "in columns of [gnss]",
         "gnss.lat_lon",
     )
 
 
-def describe_mirroring(which: str, witness: str) -> Finding:
-    """That positions have the wrong sign, by `witness`."""
+def describe_mirroring(which: str, sensor: str) -> Finding:
+    """That positions have the wrong sign, by `sensor`."""
     return Finding(
         "refused",
-        f"{which} the wrong sign, by {witness}: south and west are negative; negate the column in the file",
+        f"{which} the wrong sign, by {sensor}: south and west are negative; negate the column in the file",
         "gnss.mirrored",
     )
 

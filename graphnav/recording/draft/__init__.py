@@ -10,14 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import inside
+from graphnav.core.files import is_inside
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import NEAR, Epochs, between_clocks
+from graphnav.core.timescales import NEAR, ClockOffset, between_clocks
 from graphnav.recording import Gnss, Odometer
 from graphnav.recording.draft import guesses, motion
-from graphnav.recording.draft.agreement import CLEAR, FAIR, Agreement, compare
+from graphnav.recording.draft.agreement import CLEAR, FAIR, Agreement, compare_with_fixes
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.sources import JOINED, Source, fix_speed_unit, fixes, plain_name, sources
+from graphnav.recording.draft.logs import Source
+from graphnav.recording.draft.sources import JOINED, find_logs, fix_speed_unit, fixes, plain_name
 from graphnav.recording.formats.schema import FORCE, RATE, SPEED
 from graphnav.recording.formats.writer import quote
 
@@ -48,7 +49,7 @@ def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: 
     RecordingError
         If a file cannot be read, holds nothing that is known, or there is no IMU among them.
     """
-    found = sources(paths, topics)
+    found = find_logs(paths, topics)
     writer = _Writer(folder, topics)
     writer.decisions += [f"left out: {said}" for said in found.left_out]
     text = writer.text(found.sensors, name or folder.resolve().name or "drive")
@@ -63,7 +64,7 @@ def imu_of(path: Path) -> tuple[Array, Array, Array]:
     RecordingError
         As `draft`.
     """
-    source = sources([path]).sensors["imu"]
+    source = find_logs([path]).sensors["imu"]
     gyro, accel = source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
     force = guesses.accel_unit(path, accel, source.find_unit("ax", "accel"))
     rate = guesses.gyro_unit(gyro, source.find_unit("gx", "gyro"), None, vehicle=False)
@@ -76,7 +77,7 @@ class _Writer:
     def __init__(self, folder: Path, asked: Sequence[str]) -> None:
         self.folder = folder
         self.asked = asked  # topics
-        self.epochs: Epochs | None = None  # of the clocks of IMU and fixes
+        self.epochs: ClockOffset | None = None  # of the clocks of IMU and fixes
         self.lines: list[str] = []
         self.decisions: list[str] = []
         self.made: dict[str, dict[str, Array]] = {}
@@ -118,7 +119,7 @@ class _Writer:
         agreement = Agreement()
         if gnss is not None:
             self.epochs = _epochs(source, gnss)
-            agreement = compare(t, gyro, accel, up, fixes(gnss), self.epochs.offset if self.epochs else 0.0)
+            agreement = compare_with_fixes(t, gyro, accel, up, fixes(gnss), self.epochs.offset if self.epochs else 0.0)
         if source.log is None:
             rate = guesses.gyro_unit(gyro, source.find_unit("gx", "gyro"), agreement.turn, vehicle)
             gyro = gyro * RATE[str(rate.value)]
@@ -226,7 +227,7 @@ class _Writer:
             lag = _odometer_lag(source.t, source.values["speed"] * SPEED[str(speed.value)], felt)
             if lag is not None and lag.correlation > FAIR and abs(lag.seconds) > _SMALL:
                 sure = "" if lag.correlation > CLEAR else "CHECK: "
-                self._key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_agree(lag)}")
+                self._key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_describe_agreement(lag)}")
                 self._key("delay_sigma", "0.05", "s, what is left of it; it is estimated")
         self._lever_arm(source.log.odometer if source.log else None, "from the IMU to the middle of the rear axle")
 
@@ -262,7 +263,7 @@ class _Writer:
             if topics[0] in self.asked:
                 others = "as was asked"
             self._key("topic", quote(topics[0]), others if len(topics) > 1 else "the only one")
-        if source.joined_from is None and source.plain is None and not inside(source.path, self.folder):
+        if source.joined_from is None and source.plain is None and not is_inside(source.path, self.folder):
             self.decisions.append(f"{relative}: lies outside the folder of this file; say --allow-outside to read it")
         names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
         if names:
@@ -289,7 +290,7 @@ def _odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> motion.L
     return motion.lag(grid, motion.band(forward[:, 0]), even, motion.band(pull))
 
 
-def _epochs(imu: Source, gnss: Source) -> Epochs | None:
+def _epochs(imu: Source, gnss: Source) -> ClockOffset | None:
     """What lies between the clocks of two logs, where both are known."""
     first = [_first(source, sensor) for source, sensor in ((imu, "imu"), (gnss, "gnss"))]
     zeros = [None if source.log is None else source.log.gps_zero for source in (imu, gnss)]
@@ -301,7 +302,7 @@ def _first(source: Source, sensor: str) -> float:
     return float((source.t if source.log is None else getattr(source.log, sensor).t)[0])
 
 
-def _agree(lag: motion.Lag) -> str:
+def _describe_agreement(lag: motion.Lag) -> str:
     return f"the accelerations agree best with the IMU's so (coherence {lag.correlation:.2f})"
 
 

@@ -77,7 +77,7 @@ def level_axes(up: Array) -> tuple[Array, Array]:
     return first, np.cross(up, first)
 
 
-def compare(
+def compare_with_fixes(
     t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array, Array, Array | None], known: float = 0.0
 ) -> Agreement:
     """IMU (N, 3 each, file axes; gyro in any unit) against fixes (times, positions, velocities or None).

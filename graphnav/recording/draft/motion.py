@@ -59,7 +59,7 @@ def course_of(t: Array, llh: Array, v: Array | None) -> Course:
         grid = np.arange(t[0], t[-1], STEP)
         east, north = (mean(np.interp(grid, t, v[:, k])) for k in (0, 1))
     # nothing is known inside gaps, nor where the means reach into them or over an end
-    gap = mean(_in_gaps(grid, t).astype(float), 4.0 * _WINDOW) > 0.0
+    gap = mean(_mask_gaps(grid, t).astype(float), 4.0 * _WINDOW) > 0.0
     gap |= (grid < grid[0] + 2.0 * _WINDOW) | (grid > grid[-1] - 2.0 * _WINDOW)
     speed = np.hypot(east, north)
     ae, an = np.gradient(east, STEP), np.gradient(north, STEP)
@@ -80,7 +80,7 @@ def on_grid(t: Array, x: Array) -> tuple[Array, Array]:
         return grid, np.empty((0, x.shape[1]))
     both = [np.stack([np.interp(grid + side * _WINDOW / 2, t, c) for c in cumulative.T], -1) for side in (-1, 1)]
     out = (both[1] - both[0]) / _WINDOW
-    out[_in_gaps(grid, t)] = np.nan
+    out[_mask_gaps(grid, t)] = np.nan
     return grid, out
 
 
@@ -111,8 +111,8 @@ def lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None, any
     if len(t) < 50 or len(u) < 50:
         return None
     apart = float(u[0] - t[0])
-    a, b = _even(t, x), _even(u, y)
-    w = np.ones(len(b)) if weight is None else np.nan_to_num(_even(u, weight))
+    a, b = _resample_evenly(t, x), _resample_evenly(u, y)
+    w = np.ones(len(b)) if weight is None else np.nan_to_num(_resample_evenly(u, weight))
     if anywhere:
         shifts, r, slope = _all_lags(a, b, w)
     else:
@@ -145,7 +145,7 @@ def band(x: Array) -> Array:
     return np.where(known, out, np.nan)
 
 
-def _even(t: Array, x: Array) -> Array:
+def _resample_evenly(t: Array, x: Array) -> Array:
     grid = t[0] + STEP * np.arange(round((t[-1] - t[0]) / STEP) + 1)
     known = np.isfinite(x)
     if not known.any():
@@ -210,7 +210,7 @@ def _all_lags(a: Array, b: Array, w: Array) -> tuple[Array, Array, Array]:
         return shifts, np.where(good, xy / np.sqrt(np.abs(xx * yy)), np.nan), np.where(good, xy / yy, np.nan)
 
 
-def _in_gaps(grid: Array, t: Array) -> Array:
+def _mask_gaps(grid: Array, t: Array) -> Array:
     """Grid times inside or next to a gap of more than two seconds."""
     k = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
     return np.asarray(t[k] - t[k - 1] > 2.0)

@@ -231,7 +231,7 @@ def _times(
     said = []
     for name, some in words.items():
         if any(_SLASHES.fullmatch(cell) for cell in some):
-            words[name], doubt = _ordered(some)
+            words[name], doubt = _put_year_first(some)
             said += [doubt] if doubt else []
     daily = next((name for name, some in words.items() if all(not c or _clock(c) is not None for c in some)), None)
     days = next((some for name, some in words.items() if name != daily and _date(some[0]) is not None), None)
@@ -261,7 +261,7 @@ def _times(
     return daily, None, [*said, f"dates of '{daily}' as Unix time in s{why}"]
 
 
-def _ordered(cells: list[str]) -> tuple[list[str], str]:
+def _put_year_first(cells: list[str]) -> tuple[list[str], str]:
     """Dates with slashes with the year first; where nothing tells the day from the month, their times of day."""
     parts = [found.groups() for cell in cells if (found := _SLASHES.fullmatch(cell))]
     day_first, month_first = (any(int(part[k]) > 12 for part in parts) for k in (0, 1))

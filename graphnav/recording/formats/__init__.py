@@ -10,10 +10,11 @@ import pkgutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from graphnav.core.complaints import nearest
+from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import exists, permit_outside
 from graphnav.recording import Recording
+from graphnav.recording.exporters import NAMES as EXPORTED
 from graphnav.recording.formats.registry import Format, Log
 
 __all__ = ["Format", "Log", "formats", "load", "read"]
@@ -26,7 +27,9 @@ def formats() -> dict[str, Format]:
     return {f.name: f for f in sorted(found, key=lambda f: (not f.builtin, f.name))}
 
 
-def read(source: str | Path, topics: Sequence[str] = (), allow_outside: bool = False) -> Recording:
+def read(
+    source: str | Path, topics: Sequence[str] = (), allow_outside: bool = False, name: str | None = None
+) -> Recording:
     """A recording from a folder with recording.toml, a .toml of that form, a log of a known kind, or a built-in name.
 
     Parameters
@@ -37,6 +40,8 @@ def read(source: str | Path, topics: Sequence[str] = (), allow_outside: bool = F
         Of a ROS bag: those to use, each for the sensor that its type is of; the others are found.
     allow_outside
         Whether files that are named in it may lie outside its folder.
+    name
+        The format to read it as; found from the content if None.
 
     Returns
     -------
@@ -46,15 +51,12 @@ def read(source: str | Path, topics: Sequence[str] = (), allow_outside: bool = F
     Raises
     ------
     RecordingError
-        If nothing is there, if nothing knows how to read it, or if what is there cannot be used.
+        If nothing is there, if nothing knows how to read it, or if what is there cannot be used; for a name that no
+        format has.
     """
-    known = formats()
-    exists(Path(source))
-    for candidate in known.values():
-        if candidate.recognises(source):
-            with permit_outside(allow_outside):
-                return _choose(candidate, source, topics).recording(source) if topics else candidate.read(source)
-    raise _unknown(source, known)
+    chosen = _format_of(source, name)
+    with permit_outside(allow_outside):
+        return _choose(chosen, source, topics).recording(source) if topics else chosen.read(source)
 
 
 def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()) -> Log:
@@ -79,13 +81,7 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
     RecordingError
         As `read`, and for a name that no format has.
     """
-    known = formats()
-    if name is not None and name not in known:
-        raise RecordingError(f"--format {name}: no such format; {nearest(name, list(known))}", key="log.format_unknown")
-    exists(Path(source))
-    chosen = known[name] if name else next((f for f in known.values() if f.recognises(source)), None)
-    if chosen is None:
-        raise _unknown(source, known)
+    chosen = _format_of(source, name)
     if topics:
         return _choose(chosen, source, topics)
     if chosen.load is not None:
@@ -95,6 +91,24 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
         r.name, r.imu, r.gnss, r.odometer, r.truth, r.platform, gps_zero=r.gps_zero, files=r.files, remarks=r.remarks,
         sensors=r.sensors,
     )  # fmt: skip
+
+
+def _format_of(source: str | Path, name: str | None) -> Format:
+    """The format of that name, or the first that knows the source."""
+    known = formats()
+    if name is not None and name not in known:
+        written = set(name.split(",")) <= set(EXPORTED)
+        hint = f"--export {name} writes it" if written else suggest_nearest(name, list(known))
+        raise RecordingError(f"--format {name}: no such format of logs; {hint}", key="log.format_unknown")
+    exists(Path(source))
+    chosen = known[name] if name else next((f for f in known.values() if f.recognises(source)), None)
+    if chosen is None:
+        raise _explain_unknown(source, known)
+    if chosen.builtin and not chosen.recognises(source):
+        raise RecordingError(
+            f"--format {name}: is the name of a recording, and {source} is another", key="log.format_unknown"
+        )
+    return chosen
 
 
 def _choose(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:
@@ -107,7 +121,7 @@ def _choose(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:
     return chosen.choose(source, topics)
 
 
-def _unknown(source: str | Path, known: dict[str, Format]) -> RecordingError:
+def _explain_unknown(source: str | Path, known: dict[str, Format]) -> RecordingError:
     """Why nothing can read a source."""
     builtin = ", ".join(name for name, f in known.items() if f.builtin)
     path = Path(source)

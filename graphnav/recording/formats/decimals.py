@@ -33,7 +33,7 @@ def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array
     Raises
     ------
     ValueError
-        If a line has another number of cells or a cell is not a number; a more patient reader may say which.
+        If a line has another number of cells or a cell is not a number; a slower reader says which.
     """
     slabs: list[list[Array]] = [[np.empty(0)] for _ in use]
     blocks: list[Array] = []

@@ -68,10 +68,12 @@ def parse_figure(key: str, value: Any) -> Any:
     if found is None:
         raise ValueError(f"'{value}' is not a number and a unit, such as \"{EXAMPLES[key]}\"")
     number, unit = found.groups()
-    factor = UNITS[key].get(_plain(unit))
+    factor = UNITS[key].get(_normalise_unit(unit))
     if factor is None:
         other = [
-            name for name, units in UNITS.items() if _plain(unit) in units and name.split("_")[0] == key.split("_")[0]
+            name
+            for name, units in UNITS.items()
+            if _normalise_unit(unit) in units and name.split("_")[0] == key.split("_")[0]
         ]
         hint = f"; that is a unit of {other[0]}" if other else ""
         raise ValueError(
@@ -80,7 +82,7 @@ def parse_figure(key: str, value: Any) -> Any:
     return float(number) * factor
 
 
-def _plain(unit: str) -> str:
+def _normalise_unit(unit: str) -> str:
     """One spelling of a unit: lower case, no blanks, ASCII."""
     text = unit.lower().replace(" ", "").replace("·", "").replace("*", "")
     for old, new in (

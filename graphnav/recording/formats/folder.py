@@ -12,32 +12,31 @@ import numpy as np
 
 from graphnav.core.earth import ecef_to_llh, enu_axes
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import beside
-from graphnav.core.rotation import Array
+from graphnav.core.files import resolve_beside
+from graphnav.core.notes import key_of
 from graphnav.core.timescales import parse_clock
 from graphnav.gnss.series import RawGnss
-from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording, Truth
+from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth
 from graphnav.recording.formats import schema
-from graphnav.recording.formats.pulses import count_pulses
-from graphnav.recording.formats.registry import Format, Log
-from graphnav.recording.formats.repair import (
-    DEFAULT_SD,
-    DEFAULT_SD_V,
-    VAGUEST,
-    VAGUEST_V,
-    Remarks,
-    fixes_by_type,
-    geodetic,
-    horizontal_velocity,
-    sigmas,
-    usable_rows,
+from graphnav.recording.formats.csv_sensors import (
+    build_gnss,
+    build_imu,
+    build_odometer,
+    build_series,
+    build_truth,
+    list_needed,
 )
+from graphnav.recording.formats.registry import Format, Log
+from graphnav.recording.formats.repair import Remarks, usable_rows
 from graphnav.recording.formats.table import Table, read_table
 from graphnav.recording.formats.trajectories import read_trajectory
-from graphnav.sensors import Sensor, Series, list_sensors
-from graphnav.sensors.tables import ANGLE
+from graphnav.sensors import list_sensors
 
-_AT_ONCE = 1 << 16  # rows
+_SETTLED = {  # what a log's reader assumes, and the keys that say it
+    "axes_assumed": {"axes", "forward", "up"},
+    "lever_arm_unknown": {"lever_arm"},
+    "sigma_assumed": {"sd"},
+}
 _RAW_FILES = ("rover", "nav", "sp3", "clk", "antex", "base")
 
 
@@ -58,13 +57,16 @@ def read_folder(source: str | Path) -> Recording:
     zeros: list[float] = []  # of their clocks
     topics: dict[str, tuple[str, ...]] = {}  # asked for of each file
     known = list_sensors()
-    for section in (d.imu, d.gnss, d.odometer, *(getattr(d, name) for name in known)):
+    settled: set[str] = set()  # what logs assume and the .toml states
+    for name in ("imu", "gnss", "odometer", *known):
+        section = getattr(d, name)
         if section is not None:
             topics[section.file] = (*topics.get(section.file, ()), *section.topic)
+            settled |= {f"{name}.{said}" for said, keys in _SETTLED.items() if keys & section.model_fields_set}
 
     def table(name: str) -> Table:
         section = getattr(d, name)
-        file = beside(path, section.file, f"{name}.file")
+        file = resolve_beside(path, section.file, f"{name}.file")
         files.append(file)
         required, optional, keep = section.required, section.optional, section.keep
         if name == "truth":
@@ -76,7 +78,7 @@ def read_folder(source: str | Path) -> Recording:
             if not all(column in rows for column in required):
                 read_table(file, required, (), section.columns)  # says what is missing
         if name in known:
-            required = (*required, *_list_needed(known[name], rows))
+            required = (*required, *list_needed(known[name], rows))
         return usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
 
     def sensor(name: str, of_table: Callable[[Any, Table, Remarks], Any], of_log: Callable[[Any, Any], Any]) -> Any:
@@ -85,7 +87,9 @@ def read_folder(source: str | Path) -> Recording:
         if section is None:
             return None
         if section.file not in logs:
-            logs[section.file] = other_log(beside(path, section.file, f"{name}.file"), topics.get(section.file, ()))
+            logs[section.file] = other_log(
+                resolve_beside(path, section.file, f"{name}.file"), topics.get(section.file, ())
+            )
         log = logs[section.file]
         if section.topic and not (log and log.topics):
             raise RecordingError(
@@ -102,23 +106,23 @@ def read_folder(source: str | Path) -> Recording:
                 raise RecordingError(
                     f"{path}: '{name}.{key}' is only for CSV files, and {section.file} is none", key="key.not_here"
                 )
-        remarks.extend(r for r in log.remarks if r not in remarks)
+        remarks.extend(r for r in log.remarks if r not in remarks and key_of(r) not in settled)
         if log.gps_zero is not None:
             zeros.append(log.gps_zero - section.time_offset)
         return of_log(section, held)
 
-    imu = sensor("imu", _imu, _imu_of)
-    gnss = sensor("gnss", _gnss, _gnss_of)
-    odometer = sensor("odometer", _odometer, _odometer_of)
+    imu = sensor("imu", build_imu, _complete_imu)
+    gnss = sensor("gnss", build_gnss, _complete_gnss)
+    odometer = sensor("odometer", build_odometer, _complete_odometer)
     sensors = {
-        name: sensor(name, partial(_series, one), lambda _, held: held)
+        name: sensor(name, partial(build_series, one), lambda _, held: held)
         for name, one in known.items()
         if getattr(d, name) is not None
     }
     gps_zero = parse_clock(d.clock, float(imu.t[0])) if d.clock else next(iter(zeros), None)
     raw = None
     if d.raw_gnss is not None:
-        raw, fixes = _raw_gnss(d.raw_gnss, path, gps_zero, remarks, files)
+        raw, fixes = _load_raw(d.raw_gnss, path, gps_zero, remarks, files)
         if gnss is None:
             gnss = fixes
             remarks.add(
@@ -128,10 +132,10 @@ def read_folder(source: str | Path) -> Recording:
     if d.truth and d.truth.closed_loop_sigma:
         truth = Truth(imu.t[[0, -1]], of=d.truth.of, closed_loop_sigma=d.truth.closed_loop_sigma)
     elif d.truth and d.truth.file and Path(d.truth.file).suffix in (".nav", ".pos", ".tum"):
-        files.append(beside(path, d.truth.file, "truth.file"))
-        truth = _truth_of_log(d.truth, files[-1], remarks)
+        files.append(resolve_beside(path, d.truth.file, "truth.file"))
+        truth = _read_truth(d.truth, files[-1], remarks)
     elif d.truth:
-        truth = _truth(d.truth, table("truth"), remarks)
+        truth = build_truth(d.truth, table("truth"), remarks)
     name = d.name or (path.resolve().parent.name if path.name == "recording.toml" else path.stem)
     return Recording(
         name,
@@ -149,87 +153,7 @@ def read_folder(source: str | Path) -> Recording:
     )
 
 
-def _imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
-    R_bs = d.R_bs
-    gyro = _turn(rows, ("gx", "gy", "gz"), schema.RATE[d.units.gyro], R_bs)
-    accel = _turn(rows, ("ax", "ay", "az"), schema.FORCE[d.units.accel], R_bs)
-    stated = d.figures
-    noise = replace(ImuNoise(), **stated)
-    missing = [key for key in schema.NOISE_FIGURES if key not in stated]
-    if 0 < len(missing) < len(schema.NOISE_FIGURES):
-        remarks.add(
-            "imu.noise_partly", f"[imu.noise] says nothing of {', '.join(missing)}: defaults of a consumer IMU are used"
-        )
-    elif missing:
-        remarks.add(
-            "imu.noise_assumed",
-            "no [imu.noise]: figures of a consumer IMU are assumed "
-            f"(gyro {noise.gyro_noise_density:g} rad/s/sqrt(Hz), "
-            f"accelerometer {noise.accel_noise_density:g} m/s2/sqrt(Hz))",
-        )
-    return Imu(rows["t"], gyro, accel, noise, R_bs, noise_assumed=len(missing) == len(schema.NOISE_FIGURES))
-
-
-def _turn(rows: Table, names: tuple[str, ...], unit: float, R_bs: Array) -> Array:
-    """(N, 3) columns in body axes; of a day of them nothing is held twice."""
-    out = np.empty((len(rows), 3))
-    for k in range(0, len(out), _AT_ONCE):
-        some = slice(k, k + _AT_ONCE)
-        np.matmul(np.stack([rows[name][some] for name in names], -1) * unit, R_bs.T, out=out[some])
-    return out
-
-
-def _gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
-    llh, rows = geodetic(rows, d.units.angle, "GNSS", remarks)
-    every = np.ones(len(rows), dtype=bool)
-    sd = sigmas(rows, ("sd_e", "sd_n", "sd_u"), d.sd, DEFAULT_SD, "GNSS position", every, remarks)
-    vague = (sd > VAGUEST).any(axis=1)
-    if vague.any():
-        if vague.all():
-            raise RecordingError(
-                f"{rows.path}: every fix has a sigma of more than {VAGUEST:g} m and says nothing",
-                key="gnss.sigma_all_vague",
-            )
-        remarks.add(
-            "gnss.sigma_vague", f"{vague.sum()} of {len(rows)} fixes have a sigma of more than {VAGUEST:g} m: left out"
-        )
-        llh, sd, rows = llh[~vague], sd[~vague], rows.take(~vague)
-    v = sd_v = None
-    if "vd" in rows and "vu" not in rows:
-        rows = rows.with_column("vu", -rows["vd"])
-    there = [c for c in ("ve", "vn", "vu") if c in rows]
-    if len(there) == 3:
-        scale = schema.SPEED[d.units.speed]
-        for name in ("sd_ve", "sd_vn", "sd_vu"):  # the file's sigmas have the file's unit, the .toml's are m/s
-            rows = rows.with_column(name, rows[name] * scale) if name in rows else rows
-        v = rows.stack("ve", "vn", "vu") * scale
-        absent = np.isnan(v).any(-1)
-        v[absent] = np.nan
-        sd_v = sigmas(rows, ("sd_ve", "sd_vn", "sd_vu"), d.sd_v, DEFAULT_SD_V, "GNSS velocity", ~absent, remarks)
-        absent |= (sd_v > VAGUEST_V).any(-1)
-        v[absent] = sd_v[absent] = np.nan
-        if absent.all():
-            v = sd_v = None
-            remarks.add("gnss.velocity_blank", "the GNSS velocity columns are blank throughout: no velocities")
-    elif "speed" in rows and "course" in rows:
-        course = rows["course"] * ANGLE[d.units.angle or "deg"]
-        v, sd_v, sentence = horizontal_velocity(
-            rows["speed"] * schema.SPEED[d.units.speed], course, d.sd_v or DEFAULT_SD_V
-        )
-        remarks.add("gnss.velocity_of_course", sentence)
-    elif there:
-        remarks.add(
-            "gnss.velocity_partly",
-            f"GNSS velocities need ve, vn and vu; only {', '.join(there)} is there, so none are used",
-        )
-    kinds = fixes_by_type(rows, d.units.type) if "type" in rows else None
-    gnss = Gnss(
-        rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds, kinds is not None and d.units.type == "rtklib"
-    )
-    return replace(gnss, satellites=rows["satellites"]) if "satellites" in rows else gnss
-
-
-def _raw_gnss(
+def _load_raw(
     d: schema.RawGnssTable, path: Path, zero: float | None, remarks: Remarks, files: list[Path]
 ) -> tuple[RawGnss, Gnss]:
     """The raw observations of [raw_gnss], and the single-point fixes that they make."""
@@ -243,7 +167,8 @@ def _raw_gnss(
     from graphnav.gnss.placing import Corrected
 
     some = {
-        name: tuple(beside(path, file, f"raw_gnss.{name}") for file in getattr(d, name) or ()) for name in _RAW_FILES
+        name: tuple(resolve_beside(path, file, f"raw_gnss.{name}") for file in getattr(d, name) or ())
+        for name in _RAW_FILES
     }
     corrected = Corrected(clock="clock" in d.corrected, troposphere="troposphere" in d.corrected)
     sources = Sources(
@@ -275,68 +200,7 @@ def _raw_gnss(
     return raw, fixes
 
 
-def _odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odometer:
-    t, scale = rows["t"], schema.SPEED[d.units.speed]
-    used = d.readings(tuple(rows.columns))
-    wheels = way = None
-    if any(name in rows for name in schema.WHEELS):
-        wheels = np.stack([rows.get(name, np.full(len(t), np.nan)) for name in schema.WHEELS], -1) * scale
-    if d.metres_per_pulse is not None:
-        if len(t) < 2:
-            raise RecordingError(
-                f"{rows.path}: {len(t)} usable row; pulses need at least 2 to make a speed", key="table.few_rows"
-            )
-        way = d.metres_per_pulse * count_pulses(rows["pulses"], d.pulses, d.signed, remarks)
-        # over both neighbouring periods, so that it is the speed at t and not half a period before
-        ahead, behind = np.minimum(np.arange(len(t)) + 1, len(t) - 1), np.maximum(np.arange(len(t)) - 1, 0)
-        speed = (way[ahead] - way[behind]) / (t[ahead] - t[behind])
-    else:
-        speed = rows.stack(*used).mean(axis=-1) * scale
-    signed = bool((speed < 0.0).any()) if d.signed is None else d.signed
-    return Odometer(
-        t,
-        speed,
-        np.array(d.lever_arm),
-        d.scale_sigma,
-        way=way,
-        pulse=d.metres_per_pulse or 0.0,
-        wheels=wheels,
-        signed=signed,
-        speed_sigma=d.speed_sigma,
-        delay_sigma=d.delay_sigma,
-    )
-
-
-def _list_needed(sensor: Sensor, rows: Table) -> tuple[str, ...]:
-    """The columns that every row must have: the first of the sets that the file has.
-
-    Raises
-    ------
-    RecordingError
-        If it has none of them.
-    """
-    for some in sensor.needs:
-        if all(name in rows for name in some):
-            # of several sets a row may have any, which `Sensor.usable` looks at
-            return some if len([s for s in sensor.needs if all(name in rows for name in s)]) == 1 else ()
-    sets = " or ".join(" and ".join(some) for some in sensor.needs)
-    raise RecordingError(
-        f'{rows.path}: no column {sets}; if it has another name, say columns = {{ name = "..." }}', key="table.column"
-    )
-
-
-def _series(sensor: Sensor, d: Any, rows: Table, remarks: Remarks) -> Series:
-    absent = np.full(len(rows), np.nan)
-    sizes = [column.units[getattr(d.units, column.name)] for column in sensor.columns]
-    values = np.stack([rows.get(name, absent) * size for name, size in zip(sensor.names, sizes, strict=True)], -1)
-    figures = sensor.figures(**{name: getattr(d, name) for name in sensor.figures.model_fields})
-    whole = sensor.usable(values)
-    if not whole.all():
-        remarks.add(f"{sensor.name}.rows_blank", f"{(~whole).sum()} {sensor.name} rows without a measurement dropped")
-    return Series(sensor, rows["t"][whole], values[whole], figures)
-
-
-def _truth_of_log(d: schema.TruthTable, file: Path, remarks: Remarks) -> Truth:
+def _read_truth(d: schema.TruthTable, file: Path, remarks: Remarks) -> Truth:
     """The truth from a trajectory file of another program."""
     for key in ("columns", "units", "keep"):
         if key in d.model_fields_set:
@@ -346,25 +210,6 @@ def _truth_of_log(d: schema.TruthTable, file: Path, remarks: Remarks) -> Truth:
     local = track.frame == "local"
     llh, xyz = (None, track.llh) if local else (track.llh, None)
     return Truth(track.t + d.time_offset, llh, xyz, track.v, track.rph, d.of)
-
-
-def _truth(d: schema.TruthTable, rows: Table, remarks: Remarks) -> Truth:
-    llh = xyz = None
-    if d.frame == "local":
-        xyz = rows.stack("x", "y", "z") if "z" in rows else rows.stack("x", "y")
-    else:
-        llh, rows = geodetic(rows, d.units.angle, "truth", remarks)
-    v = _read_part(rows, ("ve", "vn", "vu"), schema.SPEED[d.units.speed])
-    rph = _read_part(rows, ("roll", "pitch", "heading"), ANGLE[d.units.angle or "deg"])
-    return Truth(rows["t"], llh, xyz, v, rph, d.of)
-
-
-def _read_part(rows: Table, names: tuple[str, ...], scale: float) -> Array | None:
-    """Columns of which some may be missing (NaN then); None if all are."""
-    if not any(name in rows for name in names):
-        return None
-    absent = np.full(len(rows), np.nan)
-    return np.stack([rows.get(name, absent) for name in names], -1) * scale
 
 
 def other_log(file: Path, topics: Sequence[str] = ()) -> Log | None:
@@ -379,7 +224,7 @@ def other_log(file: Path, topics: Sequence[str] = ()) -> Log | None:
     return None
 
 
-def _imu_of(d: schema.ImuTable, imu: Imu) -> Imu:
+def _complete_imu(d: schema.ImuTable, imu: Imu) -> Imu:
     """The IMU of another program's log, with what the .toml adds to it."""
     if {"axes", "forward", "up"} & d.model_fields_set:
         turn = d.R_bs @ imu.R_bs.T  # the .toml speaks of the file's own axes
@@ -390,7 +235,7 @@ def _imu_of(d: schema.ImuTable, imu: Imu) -> Imu:
     )
 
 
-def _gnss_of(d: schema.GnssTable, gnss: Gnss) -> Gnss:
+def _complete_gnss(d: schema.GnssTable, gnss: Gnss) -> Gnss:
     lever_arm = np.array(d.lever_arm) if "lever_arm" in d.model_fields_set else gnss.lever_arm
     sd = gnss.sd if d.sd is None else np.tile(d.sd, (len(gnss.t), 1))
     sd_v = gnss.sd_v
@@ -399,7 +244,7 @@ def _gnss_of(d: schema.GnssTable, gnss: Gnss) -> Gnss:
     return replace(gnss, t=gnss.t + d.time_offset, lever_arm=lever_arm, sd=sd, sd_v=sd_v)
 
 
-def _odometer_of(d: schema.OdometerTable, odometer: Odometer) -> Odometer:
+def _complete_odometer(d: schema.OdometerTable, odometer: Odometer) -> Odometer:
     lever_arm = np.array(d.lever_arm) if "lever_arm" in d.model_fields_set else odometer.lever_arm
     return replace(odometer, t=odometer.t + d.time_offset, lever_arm=lever_arm, scale_sigma=d.scale_sigma)
 

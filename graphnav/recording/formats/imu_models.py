@@ -97,9 +97,9 @@ MODELS = {model.name: model for model in _ALL}
 
 def find_model(name: str) -> ImuModel | None:
     """A model by its name, however it is spelt: capitals, blanks and dashes do not matter."""
-    plain = _plain(name)
-    return next((model for model in _ALL if _plain(model.name) == plain), None)
+    plain = _normalise_name(name)
+    return next((model for model in _ALL if _normalise_name(model.name) == plain), None)
 
 
-def _plain(name: str) -> str:
+def _normalise_name(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())

@@ -30,11 +30,11 @@ from graphnav.recording.formats.kfgins_configuration import (
     find_file,
     mention_unused,
     read_configuration,
+    read_imu_noise,
     read_lever_arm,
-    read_noise,
 )
 from graphnav.recording.formats.registry import Log, first_bytes, log_format
-from graphnav.recording.formats.repair import Remarks, on_earth
+from graphnav.recording.formats.repair import Remarks, is_on_earth
 from graphnav.recording.formats.schema import rotation_from_letters
 from graphnav.recording.formats.text import number_table, text_lines
 from graphnav.recording.formats.trajectories import read_trajectory
@@ -82,7 +82,7 @@ def load(path: Path) -> Log:
     if imu_file is not None:
         imu, speed = _read_imu(imu_file, remarks)
         if config:
-            imu = replace(imu, noise=read_noise(where, config, remarks), noise_assumed=False)
+            imu = replace(imu, noise=read_imu_noise(where, config, remarks), noise_assumed=False)
         if speed is not None:
             odometer = Odometer(imu.t, speed, read_lever_arm(where, config, "odolever"))
             remarks.add(
@@ -268,7 +268,7 @@ def _read_gnss(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
     table = dict(zip(names, number_table(path, rows, names, None).T, strict=True))
     for k in np.flatnonzero(~np.isfinite(table["t"]))[:1]:
         raise RecordingError(f"{path}, line {rows[k][0]}, t: must be a finite number", key="table.cell")
-    beyond = np.flatnonzero(~on_earth(np.radians(table["lat"]), np.radians(table["lon"]), table["h"]))
+    beyond = np.flatnonzero(~is_on_earth(np.radians(table["lat"]), np.radians(table["lon"]), table["h"]))
     if len(beyond):
         raise RecordingError(
             f"{path}, line {rows[beyond[0]][0]}: lat and lon must be degrees, h a height in m", key="table.place"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import inside, read_text
+from graphnav.core.files import is_inside, read_text
 from graphnav.core.rotation import Array
 from graphnav.recording import ImuNoise
 from graphnav.recording.formats.repair import Remarks
@@ -80,7 +80,7 @@ def find_file(config_file: Path, config: dict[str, Any], keys: tuple[str, ...]) 
         *(above / stated for above in (folder, *folder.parents)),
         config_file.parent / stated.name,
     ]:
-        if inside(candidate, folder) and candidate.is_file():
+        if is_inside(candidate, folder) and candidate.is_file():
             return candidate
     raise RecordingError(
         f"{config_file}, {key}: no file {str(stated)[:200]} beside the configuration or below it; elsewhere none is "
@@ -105,7 +105,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
-def read_noise(where: Path, config: dict[str, Any], remarks: Remarks) -> ImuNoise:
+def read_imu_noise(where: Path, config: dict[str, Any], remarks: Remarks) -> ImuNoise:
     """The noise figures of the IMU."""
     section = config.get("imunoise", config.get("imumodel"))
     if not isinstance(section, dict):

@@ -17,7 +17,7 @@ from graphnav.core.files import check_inside, parse_number
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, Truth
 from graphnav.recording.formats.registry import Log, log_format
-from graphnav.recording.formats.repair import Remarks, on_earth
+from graphnav.recording.formats.repair import Remarks, is_on_earth
 from graphnav.recording.formats.schema import rotation_from_letters
 from graphnav.recording.formats.text import text_lines
 
@@ -55,7 +55,7 @@ def load(path: Path) -> Log:
     rows = np.array([_row(file) for file in samples])
     for k in np.flatnonzero(~np.isfinite(rows).all(axis=1))[:1]:
         raise RecordingError(f"{samples[k]}, line 1: a number that is not finite", key="table.not_finite")
-    for k in np.flatnonzero(~on_earth(np.radians(rows[:, 0]), np.radians(rows[:, 1]), rows[:, 2]))[:1]:
+    for k in np.flatnonzero(~is_on_earth(np.radians(rows[:, 0]), np.radians(rows[:, 1]), rows[:, 2]))[:1]:
         raise RecordingError(
             f"{samples[k]}, line 1: lat, lon, alt of {rows[k, :3]} are nowhere on Earth", key="table.place"
         )

@@ -13,7 +13,7 @@ from pathlib import Path
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import check_regular, exists
 from graphnav.core.notes import Note
-from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth, rows_of
+from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth, take_rows
 from graphnav.sensors import Series
 
 
@@ -111,7 +111,7 @@ def _without_nowhere(log: Log) -> Log:
     many = "1 fix" if nowhere.sum() == 1 else f"{nowhere.sum()} fixes"
     return replace(
         log,
-        gnss=rows_of(gnss, ~nowhere),
+        gnss=take_rows(gnss, ~nowhere),
         remarks=(*log.remarks, Note("gnss.nowhere", f"{many} at 0, 0 (no fix) left out")),
     )
 

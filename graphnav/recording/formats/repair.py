@@ -182,7 +182,7 @@ def _check_imu_time(rows: Table, unit: str) -> None:
     )
 
 
-def on_earth(lat: Array, lon: Array, h: Array) -> Mask:
+def is_on_earth(lat: Array, lon: Array, h: Array) -> Mask:
     """Which of some places (N,) in rad and m a drive can be at."""
     with np.errstate(invalid="ignore"):
         near = (np.abs(lat) <= np.pi / 2) & (np.abs(lon) <= 2 * np.pi) & (h >= _LOWEST) & (h <= _SKY)

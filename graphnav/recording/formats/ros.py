@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.core.complaints import nearest
+from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import unix_to_gps
@@ -67,7 +67,7 @@ def load(path: Path, wanted: Sequence[str] = ()) -> Log:
     for name in wanted:
         if name not in (known := [t.name for t in topics]):
             raise RecordingError(
-                f"{path}: no topic '{name}' that can be used; {nearest(name, known)}", key="log.topic_unknown"
+                f"{path}: no topic '{name}' that can be used; {suggest_nearest(name, known)}", key="log.topic_unknown"
             )
     chosen: dict[str, _Topic] = {}
     ranked: dict[str, list[_Topic]] = {}
@@ -155,7 +155,8 @@ def _imu(topic: _Topic, remarks: Remarks) -> Imu | None:
         return None
     t, rows = t[good], rows[good]
     R_bs = rotation_from_letters("FLU")
-    remarks.add("imu.read_as", f"IMU: {topic.name}, rad/s and m/s2 with gravity, taken as forward-left-up (REP 103)")
+    remarks.add("imu.read_as", f"IMU: {topic.name}, rad/s and m/s2 with gravity")
+    remarks.add("imu.axes_assumed", "IMU: axes taken as forward-left-up (REP 103)")
     white = np.median(rows[:, 6:], axis=0)
     noise, assumed = ImuNoise(), True
     if (white > 0).all():
@@ -186,9 +187,8 @@ def _gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
             "gnss.sigma_assumed",
             f"{topic.name}: {np.sum(~known)} fixes without a covariance get sigmas of 3.3, 3.3, 6.6 m",
         )
-    remarks.add(
-        "gnss.read_as", f"GNSS: {topic.name}; heights above the ellipsoid; the antenna's lever arm is taken as zero"
-    )
+    remarks.add("gnss.read_as", f"GNSS: {topic.name}; heights above the ellipsoid")
+    remarks.add("gnss.lever_arm_unknown", "GNSS: the antenna's lever arm is not in the log and taken as zero")
     # many drivers write 0 whatever the fix is: where no other status is to be seen, it says nothing
     kinds = fix_types(rows[:, 6], _STATUS) if rows[:, 6].any() else None
     return Gnss(t, np.column_stack([np.radians(rows[:, :2]), rows[:, 2]]), sd, type=kinds)
@@ -202,10 +202,8 @@ def _twist(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> tuple[Gnss | N
     moving = np.hypot(rows[:, 0], rows[:, 1]) > 1.0
     across = np.median(np.abs(rows[moving, 1]) / np.hypot(rows[moving, 0], rows[moving, 1])) if moving.any() else 0.0
     if topic.kind == _TWISTS[2] or across <= _SIDEWAYS:
-        remarks.add(
-            "odometer.read_as",
-            f"odometer: {topic.name}, linear.x as forward speed in m/s; its lever arm is taken as zero",
-        )
+        remarks.add("odometer.read_as", f"odometer: {topic.name}, linear.x as forward speed in m/s")
+        remarks.add("odometer.lever_arm_unknown", "odometer: its lever arm is not in the log and taken as zero")
         return gnss, Odometer(t, rows[:, 0])
     if gnss is None:
         remarks.add(

@@ -19,7 +19,7 @@ from pydantic import (
 )
 from pydantic.types import Strict
 
-from graphnav.core.complaints import complaint, nearest, read_toml
+from graphnav.core.complaints import complaint, read_toml, suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import parse_clock
@@ -125,7 +125,9 @@ class ImuTable(SensorTable):
     @classmethod
     def _check_model(cls, model: str | None) -> str | None:
         if model is not None and find_model(model) is None:
-            raise ValueError(f"no figures of an IMU called '{model}' are known; {nearest(model, tuple(MODELS))}")
+            raise ValueError(
+                f"no figures of an IMU called '{model}' are known; {suggest_nearest(model, tuple(MODELS))}"
+            )
         return model
 
     @model_validator(mode="after")
@@ -203,7 +205,9 @@ class RawGnssTable(TomlTable):
     def _check_columns(cls, columns: dict[str, str]) -> dict[str, str]:
         for name in columns:
             if name not in cls.columns_known:
-                raise ValueError(f"'{name}' is not one of graphnav's columns; {nearest(name, cls.columns_known)}")
+                raise ValueError(
+                    f"'{name}' is not one of graphnav's columns; {suggest_nearest(name, cls.columns_known)}"
+                )
         return columns
 
     @model_validator(mode="after")

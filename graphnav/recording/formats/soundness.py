@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note
-from graphnav.recording import Gnss, rows_of
+from graphnav.recording import Gnss, take_rows
 from graphnav.recording.formats.registry import Log
-from graphnav.recording.formats.repair import LATEST, VAGUEST, VAGUEST_V, on_earth
+from graphnav.recording.formats.repair import LATEST, VAGUEST, VAGUEST_V, is_on_earth
 
 
 def sound(log: Log, path: Path) -> Log:
@@ -41,30 +41,30 @@ def sound(log: Log, path: Path) -> Log:
         finite = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
         good = finite & (np.abs(imu.t) <= LATEST)
         if not check_rows("IMU", good, "are no numbers or at no time"):
-            imu = rows_of(imu, good)
+            imu = take_rows(imu, good)
     if gnss is not None:
-        gnss = _sound_gnss(gnss, check_rows)
+        gnss = _clean_gnss(gnss, check_rows)
     if odometer is not None:
         good = np.isfinite(odometer.speed) & (np.abs(odometer.t) <= LATEST)
         if not check_rows("odometer", good, "are no numbers or at no time"):
-            odometer = rows_of(odometer, good)
+            odometer = take_rows(odometer, good)
     if truth is not None and truth.llh is not None:
-        good = on_earth(*truth.llh.T) & (np.abs(truth.t) <= LATEST)
+        good = is_on_earth(*truth.llh.T) & (np.abs(truth.t) <= LATEST)
         if not check_rows("truth", good, "are nowhere on Earth or at no time"):
-            truth = rows_of(truth, good)
+            truth = take_rows(truth, good)
     return replace(log, imu=imu, gnss=gnss, odometer=odometer, truth=truth, remarks=tuple(remarks))
 
 
-def _sound_gnss(gnss: Gnss, check_rows: Callable[[str, NDArray[np.bool_], str], bool]) -> Gnss:
+def _clean_gnss(gnss: Gnss, check_rows: Callable[[str, NDArray[np.bool_], str], bool]) -> Gnss:
     """The fixes that are somewhere, and as sure of it as any receiver is that has a fix."""
-    there: NDArray[np.bool_] = np.asarray(on_earth(*gnss.llh.T) & (np.abs(gnss.t) <= LATEST))
+    there: NDArray[np.bool_] = np.asarray(is_on_earth(*gnss.llh.T) & (np.abs(gnss.t) <= LATEST))
     first = gnss.llh[~there][:1]
     at = "".join(f" (the first at {np.degrees(p[0]):.7g}, {np.degrees(p[1]):.7g} deg, {p[2]:.7g} m)" for p in first)
     if not check_rows("GNSS", there, f"are nowhere on Earth or at no time{at}"):
-        gnss = rows_of(gnss, there)
+        gnss = take_rows(gnss, there)
     sure: NDArray[np.bool_] = np.asarray(((gnss.sd > 0.0) & (gnss.sd <= VAGUEST)).all(axis=1))
     if not check_rows("GNSS", sure, f"have a sigma that is not above 0 or beyond {VAGUEST:g} m"):
-        gnss = rows_of(gnss, sure)
+        gnss = take_rows(gnss, sure)
     if gnss.v is None or gnss.sd_v is None:
         return gnss
     with np.errstate(invalid="ignore"):

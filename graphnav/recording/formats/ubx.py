@@ -212,13 +212,11 @@ def _sensors(path: Path, content: _Content, remarks: Remarks) -> tuple[Imu | Non
     imu = None
     if len(there) == 6:
         base = np.unique(series[_GYRO[0]][0])
-        columns = [np.interp(base, *_once(series[k])) for k in (*_GYRO, *_ACCEL)]
+        columns = [np.interp(base, *_drop_repeated(series[k])) for k in (*_GYRO, *_ACCEL)]
         table = np.column_stack(columns)
         imu = Imu(times(base), table[:, :3], table[:, 3:], noise_assumed=True)
-        remarks.add(
-            "imu.read_as",
-            "IMU: ESF rates and forces in the receiver's own axes, taken as RFU; no noise figures in the log",
-        )
+        remarks.add("imu.read_as", "IMU: ESF rates and forces in the receiver's own axes; no noise figures in the log")
+        remarks.add("imu.axes_assumed", "IMU: the receiver's axes taken as right-forward-up")
     elif there:
         remarks.add(
             "imu.axes_missing",
@@ -226,13 +224,14 @@ def _sensors(path: Path, content: _Content, remarks: Remarks) -> tuple[Imu | Non
         )
     odometer = None
     if _SPEED in series:
-        tags, speed = _once(series[_SPEED])
+        tags, speed = _drop_repeated(series[_SPEED])
         odometer = Odometer(times(tags), speed)
-        remarks.add("odometer.read_as", "odometer: ESF speed; its lever arm is not in the log and taken as zero")
+        remarks.add("odometer.read_as", "odometer: ESF speed")
+        remarks.add("odometer.lever_arm_unknown", "odometer: its lever arm is not in the log and taken as zero")
     return imu, odometer
 
 
-def _once(series: Array) -> tuple[Array, Array]:
+def _drop_repeated(series: Array) -> tuple[Array, Array]:
     """Time tags in order, each once, and the values."""
     tags, first = np.unique(series[0], return_index=True)
     return tags, series[1][first]

@@ -7,8 +7,8 @@ from graphnav.recording.odometer.mean import (
     MeanSpeed,
     ReadingStatistics,
     counts,
+    find_longest_step,
     gaps,
-    longest_step,
     quantum,
     reading_sigma,
 )
@@ -19,8 +19,8 @@ __all__ = [
     "ReadingStatistics",
     "counts",
     "faults",
+    "find_longest_step",
     "gaps",
-    "longest_step",
     "quantum",
     "reading_sigma",
 ]

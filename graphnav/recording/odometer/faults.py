@@ -66,7 +66,7 @@ def faults(
     found = [(a, b, GAP) for a, b in gaps(odometer.t, figures.longest)]
     if len(odometer.t) >= 10:
         motion = _motion(odometer, imu, lag) if imu is not None and len(imu.t) > 10 else None
-        found += _wrong(odometer, imu, motion, figures)
+        found += _find_wrong(odometer, imu, motion, figures)
         lag = lag if motion is None else motion.lag
     found.sort()
     return Faults(np.array([f[:2] for f in found], dtype=float).reshape(-1, 2), tuple(f[2] for f in found), lag)
@@ -81,7 +81,7 @@ class _InertialMotion:
     lag: float  # s by which the odometer is late
 
 
-def _ahead_up(imu: Imu) -> tuple[Array, Array]:
+def _find_axes(imu: Imu) -> tuple[Array, Array]:
     """Forward square to up, and up as gravity has it, in body axes."""
     up = np.median(imu.accel, axis=0)
     size = np.linalg.norm(up)
@@ -93,7 +93,7 @@ def _ahead_up(imu: Imu) -> tuple[Array, Array]:
 def _motion(odometer: Odometer, imu: Imu, known: float | None) -> _InertialMotion | None:
     t, speed = odometer.t, odometer.speed
     dt = np.diff(imu.t, prepend=2 * imu.t[0] - imu.t[1])
-    ahead, up = _ahead_up(imu)
+    ahead, up = _find_axes(imu)
     right = np.cross(ahead, up)
     pitch = np.cumsum((imu.gyro @ right - np.median(imu.gyro @ right)) * dt)
     force = imu.accel @ ahead - _G * pitch
@@ -131,7 +131,9 @@ def _motion(odometer: Odometer, imu: Imu, known: float | None) -> _InertialMotio
     return _InertialMotion(np.interp(at, imu.t, gained) + np.interp(at, ends, drift) + 1e6 * hole, inside, lag)
 
 
-def _breaks(odometer: Odometer, motion: _InertialMotion | None, figures: ReadingStatistics) -> list[tuple[int, int]]:
+def _find_breaks(
+    odometer: Odometer, motion: _InertialMotion | None, figures: ReadingStatistics
+) -> list[tuple[int, int]]:
     """Pairs of readings between which x changes by more than it can, the closest pairs that show it, in order."""
     t, v = odometer.t, odometer.speed
     error = figures.step + 6.0 * figures.sigma
@@ -160,11 +162,11 @@ def _breaks(odometer: Odometer, motion: _InertialMotion | None, figures: Reading
                 usual = _USUAL * float(np.percentile(off[moved], 90.0)) if moved.any() else 0.0
                 limit = np.maximum(allowed + _SLOPE * np.maximum(dt, _LAG_ERROR), usual)
                 bad |= known & (off > limit)
-        found += _closest(i[bad], j[bad], found)
+        found += _intersect(i[bad], j[bad], found)
     return sorted(found)
 
 
-def _closest(i: NDArray[np.intp], j: NDArray[np.intp], found: list[tuple[int, int]]) -> list[tuple[int, int]]:
+def _intersect(i: NDArray[np.intp], j: NDArray[np.intp], found: list[tuple[int, int]]) -> list[tuple[int, int]]:
     """What windows [i, j] that overlap have in common (or cover), without those that show a break found already."""
     out: list[tuple[int, int]] = []
     if found:
@@ -179,25 +181,25 @@ def _closest(i: NDArray[np.intp], j: NDArray[np.intp], found: list[tuple[int, in
     return out
 
 
-def _wrong(
+def _find_wrong(
     odometer: Odometer, imu: Imu | None, motion: _InertialMotion | None, figures: ReadingStatistics
 ) -> list[tuple[float, float, str]]:
     t, v = odometer.t, odometer.speed
-    breaks = _breaks(odometer, motion, figures)
+    breaks = _find_breaks(odometer, motion, figures)
     equal = [(a - 1, b - 1) for a, b in runs_of(np.r_[False, v[1:] == v[:-1]])]  # first and last of equal readings
     stays = [(a, b) for a, b in equal if b - a >= 4 and t[b] - t[a] >= _STAYS]
     bad: list[tuple[int, int, str]] = []  # first bad reading, first good one
-    bad += _islands(t, v, motion, breaks, stays, _SPIKE)
-    bad += _stuck(t, v, motion, breaks, stays)
-    bad += _noiseless(v, figures, equal, stays)
+    bad += _find_islands(t, v, motion, breaks, stays, _SPIKE)
+    bad += _find_stuck(t, v, motion, breaks, stays)
+    bad += _find_noiseless(v, figures, equal, stays)
     if motion is not None and imu is not None:
-        bad += _moves(odometer, imu, motion.lag, stays)
-    bad += _islands(t, v, motion, breaks, stays, _ISLAND)
-    bad += [(k + 1, max(m, k + 2), WILD) for k, m in breaks]  # nobody knows which side is right
+        bad += _find_moving_zeros(odometer, imu, motion.lag, stays)
+    bad += _find_islands(t, v, motion, breaks, stays, _ISLAND)
+    bad += [(k + 1, max(m, k + 2), WILD) for k, m in breaks]  # which side is right is unknown
     return _merge(t, bad)
 
 
-def _agree(t: Array, v: Array, motion: _InertialMotion | None, i: int, j: int) -> bool:
+def _can_follow(t: Array, v: Array, motion: _InertialMotion | None, i: int, j: int) -> bool:
     """Whether the motion can have led from one reading to another."""
     apart = t[j] - t[i]
     gained = 0.0 if motion is None else motion.force[j] - motion.force[i]
@@ -206,7 +208,7 @@ def _agree(t: Array, v: Array, motion: _InertialMotion | None, i: int, j: int) -
     return bool(abs(v[j] - v[i] - gained) <= _SLOPE * max(apart, _LAG_ERROR) + _RADIUS * max(v[i], v[j]) + 1e-9)
 
 
-def _islands(
+def _find_islands(
     t: Array,
     v: Array,
     motion: _InertialMotion | None,
@@ -218,7 +220,7 @@ def _islands(
     out, k = [], 0
     while k + 1 < len(breaks):
         (before, begin), (end, after) = breaks[k], breaks[k + 1]
-        if t[after] - t[before] <= longest and _agree(t, v, motion, before, after):
+        if t[after] - t[before] <= longest and _can_follow(t, v, motion, before, after):
             still = any(a <= begin and end <= b for a, b in stays)
             out.append((before + 1, after, WILD if not still else STUCK if v[begin] == 0.0 else FROZEN))
             del breaks[k : k + 2]
@@ -227,7 +229,7 @@ def _islands(
     return out
 
 
-def _stuck(
+def _find_stuck(
     t: Array, v: Array, motion: _InertialMotion | None, breaks: list[tuple[int, int]], stays: list[tuple[int, int]]
 ) -> list[tuple[int, int, str]]:
     """Equal readings with a break at either end or within; the breaks are taken off the list."""
@@ -235,7 +237,7 @@ def _stuck(
     for a, b in stays:
         mine = [(i, j) for i, j in breaks if i <= b and j >= a]
         # a break at the end alone: what comes then is wild, if the motion cannot have led there from the first of them
-        if not mine or (mine[0][0] >= b and not _agree(t, v, motion, a, mine[-1][1])):
+        if not mine or (mine[0][0] >= b and not _can_follow(t, v, motion, a, mine[-1][1])):
             continue
         for one in mine:
             breaks.remove(one)
@@ -249,7 +251,7 @@ def _stuck(
     return out
 
 
-def _noiseless(
+def _find_noiseless(
     v: Array, figures: ReadingStatistics, equal: list[tuple[int, int]], stays: list[tuple[int, int]]
 ) -> list[tuple[int, int, str]]:
     """Readings that stay the same while moving, of a sensor whose noise is above its step: it never is so still."""
@@ -271,10 +273,12 @@ def _find_departure(t: Array, force: Array, earliest: int, k: int) -> int:
     return k
 
 
-def _moves(odometer: Odometer, imu: Imu, lag: float, stays: list[tuple[int, int]]) -> list[tuple[int, int, str]]:
+def _find_moving_zeros(
+    odometer: Odometer, imu: Imu, lag: float, stays: list[tuple[int, int]]
+) -> list[tuple[int, int, str]]:
     """Zeros while the vehicle turns, or shakes as it does when it moves."""
     t, v = odometer.t, odometer.speed
-    up = _ahead_up(imu)[1]
+    up = _find_axes(imu)[1]
     n = max(2, round(1.0 / period_of(imu.t)))
     count = len(imu.t) // n
     gyro, accel = (x[: count * n].reshape(count, n, 3) for x in (imu.gyro, imu.accel))

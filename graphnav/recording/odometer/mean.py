@@ -97,14 +97,14 @@ def counts(odometer: Odometer, step: float | None = None) -> float:
     return step * period_of(t) if telescopes else 0.0
 
 
-def longest_step(t: Array) -> float:
+def find_longest_step(t: Array) -> float:
     """The longest step between stamps that is none of a gap, s: jitter and a dropped row or two are usual."""
     return 3.5 * max(period_of(t), float(np.percentile(np.diff(t), 95.0))) if len(t) > 1 else 0.0
 
 
 def gaps(t: Array, longest: float | None = None) -> Spans:
     """Spans without readings, from where the first one is missing; `longest` as `longest_step` says, if known."""
-    k = np.flatnonzero(np.diff(t) > (longest_step(t) if longest is None else longest))
+    k = np.flatnonzero(np.diff(t) > (find_longest_step(t) if longest is None else longest))
     return np.stack([t[k] + period_of(t), t[k + 1]], -1).reshape(-1, 2)
 
 
@@ -121,7 +121,7 @@ class ReadingStatistics:
     def of(cls, odometer: Odometer) -> ReadingStatistics:
         """As these readings tell."""
         step = quantum(odometer.speed)
-        return cls(step, reading_sigma(odometer, step), counts(odometer, step), longest_step(odometer.t))
+        return cls(step, reading_sigma(odometer, step), counts(odometer, step), find_longest_step(odometer.t))
 
     def sigmas(self, odometer: Odometer) -> tuple[float, float, float]:
         """`white`, `rounding` and `ends` of a `MeanSpeed`."""

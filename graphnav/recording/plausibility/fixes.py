@@ -12,7 +12,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from graphnav.core.earth import LocalFrame
 from graphnav.core.findings import Finding, runs_of
 from graphnav.core.rotation import Array
-from graphnav.recording import Gnss, Recording, rows_of
+from graphnav.recording import Gnss, Recording, take_rows
 
 FASTEST = 150.0  # m/s; the fastest cars that can be bought reach 490 km/h, 136 m/s
 # A receiver cannot follow a reflection that comes more than one and a half code chips late (GPS C/A: 293 m a chip).
@@ -49,14 +49,14 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
                 "gnss.cached",
             )
         )
-        gnss = rows_of(gnss, np.arange(len(gnss.t)) >= cached)
+        gnss = take_rows(gnss, np.arange(len(gnss.t)) >= cached)
     p = _positions(gnss)
-    off = out_of_reach(gnss.t, p)
+    off = find_out_of_reach(gnss.t, p)
     if off.any():
-        findings.append(_unreachable(gnss, p, off, recording.start))
-        gnss = rows_of(gnss, ~off)
+        findings.append(_drop_unreachable(gnss, p, off, recording.start))
+        gnss = take_rows(gnss, ~off)
         p = _positions(gnss)
-    for a, b in frozen_heights(gnss, p):
+    for a, b in find_frozen_heights(gnss, p):
         driven = float(np.hypot(*np.diff(p[a:b, :2], axis=0).T).sum())
         sd = gnss.sd.copy()
         sd[a:b, 2] = np.maximum(sd[a:b, 2], _SLOPE * driven)
@@ -89,7 +89,7 @@ def _positions(gnss: Gnss) -> Array:
     return LocalFrame(middle if np.isfinite(middle).all() else np.zeros(3)).from_llh(gnss.llh)
 
 
-def out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
+def find_out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
     """Fixes at p (M, 3) m, t (M,) s, that cannot be reached from the most that can be reached from each other."""
     lost = np.zeros(len(t), dtype=bool)
     there = np.flatnonzero(np.isfinite(p).all(axis=1))
@@ -118,7 +118,7 @@ def out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
     return lost
 
 
-def _unreachable(gnss: Gnss, p: Array, off: NDArray[np.bool_], start: float) -> Finding:
+def _drop_unreachable(gnss: Gnss, p: Array, off: NDArray[np.bool_], start: float) -> Finding:
     k = int(np.flatnonzero(off)[0])
     kept = np.flatnonzero(~off & np.isfinite(p).all(axis=1))
     near = kept[np.argmin(np.abs(gnss.t[kept] - gnss.t[k]))]
@@ -134,7 +134,7 @@ def _unreachable(gnss: Gnss, p: Array, off: NDArray[np.bool_], start: float) -> 
     )
 
 
-def frozen_heights(gnss: Gnss, p: Array) -> list[tuple[int, int]]:
+def find_frozen_heights(gnss: Gnss, p: Array) -> list[tuple[int, int]]:
     """[first, end) of the fixes whose height stays the same to the last digit while the vehicle drives."""
     same = np.diff(gnss.llh[:, 2]) == 0.0
     way = np.r_[0.0, np.cumsum(np.nan_to_num(np.hypot(*np.diff(p[:, :2], axis=0).T)))]
@@ -170,14 +170,14 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
         yield Finding(
             "warning",
             f"neighbouring fixes scatter by {scatter:.2g} m where their 1-sigma is {sd:.2g} m: look at the unit of the "
-            "sigmas",
+            "sigmas, or at sd in [gnss]",
             "gnss.sigma_small",
         )
     elif scatter < _SMOOTH * sd and np.ptp(p[:, :2]) > 0.0:
         yield Finding(
             "warning",
             f"neighbouring fixes scatter by {scatter:.2g} m only where their 1-sigma is {sd:.2g} m: look at the unit "
-            "of the sigmas",
+            "of the sigmas, or at sd in [gnss]",
             "gnss.sigma_large",
         )
     if gnss.type is not None and (fixed := gnss.type == 1).sum() >= 10:
@@ -196,7 +196,7 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     there: NDArray[np.bool_] = np.asarray(np.isfinite(p).all(axis=1))
     if there.sum() < 2 * _WINDOW:
         return
-    gnss, p = rows_of(gnss, there), p[there, :2]
+    gnss, p = take_rows(gnss, there), p[there, :2]
     dt, period, _ = _steps(gnss)
     jump = _jumps(p, dt)
     sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])

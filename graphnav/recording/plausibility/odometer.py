@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from graphnav.core.findings import Finding, period_of, runs_of
-from graphnav.recording import Odometer, Recording, rows_of
+from graphnav.recording import Odometer, Recording, take_rows
 from graphnav.recording.checks.crosschecks import MIN_PAIRS, Track
 from graphnav.recording.plausibility.fixes import FASTEST
 
@@ -26,7 +26,7 @@ _RATE = 10.0  # Hz that changes of speed need
 def screen(recording: Recording, way: Track | None) -> tuple[Recording, list[Finding]]:
     """The recording without readings that cannot be right, and what was found; `way` is what GNSS says."""
     findings: list[Finding] = []
-    for one in (_beyond, _clock_jump, _other_scale):
+    for one in (_find_beyond, _clock_jump, _other_scale):
         odometer = recording.odometer
         if odometer is None or len(odometer.t) < 2:
             break
@@ -34,11 +34,11 @@ def screen(recording: Recording, way: Track | None) -> tuple[Recording, list[Fin
         if finding is None:
             continue
         findings.append(finding)
-        recording = replace(recording, odometer=None if bad.all() else rows_of(odometer, ~bad))
+        recording = replace(recording, odometer=None if bad.all() else take_rows(odometer, ~bad))
     return recording, findings
 
 
-def track(odometer: Odometer) -> Track | None:
+def build_odometer_track(odometer: Odometer) -> Track | None:
     """The odometer's speed as if it were GNSS's, for where there is none."""
     every = max(1, round(1.0 / (_RATE * period_of(odometer.t)))) if len(odometer.t) > 1 else 1
     t, speed = odometer.t[::every], odometer.speed[::every]
@@ -51,7 +51,7 @@ def track(odometer: Odometer) -> Track | None:
 _Found = tuple[NDArray[np.bool_], Finding | None]
 
 
-def _beyond(odometer: Odometer, way: Track | None, start: float) -> _Found:
+def _find_beyond(odometer: Odometer, way: Track | None, start: float) -> _Found:
     """Readings that no vehicle reaches."""
     bad = ~(np.abs(odometer.speed) <= FASTEST)
     if not bad.any():

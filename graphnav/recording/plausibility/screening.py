@@ -18,7 +18,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.findings import Finding, period_of, runs_of
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.recording import Imu, Recording, rows_of
+from graphnav.recording import Imu, Recording, take_rows
 from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.aiding import check_imu_axes, check_imu_clock, overlap_s
 from graphnav.recording.checks.clock import ClockOffsets, clock_of
@@ -116,7 +116,7 @@ def screen(recording: Recording) -> Screened:
     if recording.platform == "vehicle" and not dead and not wrong_unit:
         way = track
         if way is None and recording.odometer is not None:
-            way = plausibility_odometer.track(recording.odometer)
+            way = plausibility_odometer.build_odometer_track(recording.odometer)
         # stamps that are late by now this, now that have no clock
         if track is not None and not any(f.key == "gnss.stamped_on_arrival" for f in findings):
             assert recording.gnss is not None
@@ -234,7 +234,7 @@ def without_spikes(imu: Imu, start: float, wrong_unit: bool = False) -> tuple[Im
     )
     if bad.mean() > _ISOLATED:
         return imu, [Finding("refused", f"{sentence}: more than can be bridged; look at the log", "imu.spike")]
-    return rows_of(imu, ~bad), [Finding("warning", f"{sentence}: left out, as a gap", "imu.spike")]
+    return take_rows(imu, ~bad), [Finding("warning", f"{sentence}: left out, as a gap", "imu.spike")]
 
 
 def check_dead_axes(recording: Recording) -> Iterator[Finding]:
@@ -244,14 +244,14 @@ def check_dead_axes(recording: Recording) -> Iterator[Finding]:
     whole = recording.duration
     for name, values in (("gyro", imu.gyro), ("accelerometer", imu.accel)):
         for axis in range(3):
-            x, same = _repeats(values @ imu.R_bs[:, axis])
+            x, same = _compare_repeats(values @ imu.R_bs[:, axis])
             a, b = max(runs_of(same), key=lambda run: run[1] - run[0], default=(0, 0))
             lasts = float(imu.t[b] - imu.t[a])
             if lasts < min(_DEAD, 0.9 * whole) or b - a < _DEAD:
                 continue
             others = [k for k in range(3) if k != axis]
-            turned = (_repeats(values @ imu.R_bs[:, k]) for k in others)
-            if not any(_moves(y[a : b + 1], stays[a:b], _STIRS[name]) for y, stays in turned):
+            turned = (_compare_repeats(values @ imu.R_bs[:, k]) for k in others)
+            if not any(_is_moving(y[a : b + 1], stays[a:b], _STIRS[name]) for y, stays in turned):
                 continue
             value = x[a]
             when = (
@@ -269,13 +269,13 @@ def check_dead_axes(recording: Recording) -> Iterator[Finding]:
             )
 
 
-def _repeats(x: Array) -> tuple[Array, Array]:
+def _compare_repeats(x: Array) -> tuple[Array, Array]:
     """An axis (N,) of the file, and which values (N-1,) are that before: turned and back, these differ by rounding."""
     step = np.diff(x)
     return x, np.abs(step, out=step) <= 1e-12 * max(float(x.max()), -float(x.min()))
 
 
-def _moves(x: Array, same: Array, least: float) -> bool:
+def _is_moving(x: Array, same: Array, least: float) -> bool:
     """Whether an axis moves by many steps of its resolution, not only now and then, and with a sensor's noise.
 
     Its standard deviation is then above `least`.
@@ -296,7 +296,7 @@ _SURE = 0.7  # of a correlation, and of a unit vector's component
 
 def check_forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iterator[Finding]:
     """The forward force falls when the speed rises: one axis of the accelerometer is reversed, or all of the IMU."""
-    up = crosschecks.up_of(imu)
+    up = crosschecks.find_up(imu)
     if way is None or forward is None or forward.correlation < _SURE or up[2] < 0.8:
         return
     ahead = forward.coefficients / np.linalg.norm(forward.coefficients)

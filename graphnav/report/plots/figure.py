@@ -134,7 +134,7 @@ class Figure:
 
     Parameters
     ----------
-    titles, ylims : of the panels; limits are decimal logarithms where `log`.
+    titles, ylims : of the panels; limits are decimal logarithms where `log`, and those of x where `x_log`.
     xlim : of all of them, or a list with that of each where they stand `apart`.
     height : of a panel, pixels.
     x : title of the x axis; a figure over `TIME` is zoomed together with all such figures of a page.
@@ -144,7 +144,7 @@ class Figure:
     def __init__(
         self, titles: Sequence[str], xlim: Any, ylims: Sequence[tuple[float, float]], *, units: Sequence[str] = (),
         log: Sequence[bool] | bool = False, height: int = _PANEL, x: str = TIME, apart: bool = False,
-        names: Mapping[float, str] | None = None, equal: bool = False, columns: int = 1,
+        names: Mapping[float, str] | None = None, equal: bool = False, columns: int = 1, x_log: bool = False,
     ) -> None:  # fmt: skip
         count = len(titles)
         rows = -(-count // columns)
@@ -170,6 +170,7 @@ class Figure:
             self.axes[f"xaxis{xname[1:]}"] = {
                 **_LOOK, "range": list(lims[k]), "domain": across, "anchor": yname, "nticks": 6 if columns == 1 else 4,
                 "hoverformat": ".2f", "showline": True, **({"title": {"text": x, "standoff": 6}} if lowest else {}),
+                **({"type": "log"} if x_log else {}),
             }  # fmt: skip
             logarithmic = log if isinstance(log, bool) else log[k]
             look = {**_LOOK, "range": list(ylim), "domain": [max(top - height / inner, 0.0), top], "anchor": xname}

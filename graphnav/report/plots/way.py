@@ -70,12 +70,12 @@ def trajectory(
         panel.way(truth, "truth", "truth", width=3.5, alpha=0.5)
     for number, (name, (t, en)) in enumerate(tracks.items()):
         if number == 0:
-            _underlaid(panel, t, en, spans or {})
+            _draw_spans(panel, t, en, spans or {})
         panel.way(en, name, name, t)
         if number == 0:
-            _stops(panel, t, en, stops, standing)
+            _draw_stops(panel, t, en, stops, standing)
     if tracks:
-        _ends(panel, next(iter(tracks.values()))[1], scale)
+        _mark_ends(panel, next(iter(tracks.values()))[1], scale)
     _scale_bar(figure, panel)
     return figure
 
@@ -110,7 +110,7 @@ def draw_fixes(panel: Panel, fixes: Fixes, k: int | None = None) -> None:
         panel.dots(x[out], y[out], "alert", "excluded fix", 7.0, "x", t=fixes.t[out], way=k is None)
 
 
-def _underlaid(panel: Panel, t: Array, en: Array, spans: Mapping[str, Spans]) -> None:
+def _draw_spans(panel: Panel, t: Array, en: Array, spans: Mapping[str, Spans]) -> None:
     for what, every in spans.items():
         pieces = [(t > a) & (t < b) for a, b in every]
         gap = np.full((1, 2), np.nan)
@@ -119,7 +119,7 @@ def _underlaid(panel: Panel, t: Array, en: Array, spans: Mapping[str, Spans]) ->
             panel.way(np.concatenate(way), SHADES[what], what, width=8.0, alpha=0.5)
 
 
-def _stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) -> None:
+def _draw_stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) -> None:
     if not len(stops) or len(t) < 2:
         return
     begin, end = np.array(stops).T
@@ -127,18 +127,19 @@ def _stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) -> No
     panel.dots(x, y, "stop", standing, 8.0 if len(stops) <= _FEW else 5.0, "D", t=begin, way=True)
 
 
-def _ends(panel: Panel, en: Array, scale: float) -> None:
-    """Where the track starts and ends, the words on the side where the track is not."""
+def _mark_ends(panel: Panel, en: Array, scale: float) -> None:
+    """Where the track starts and ends, the words on the side where the track is not, but inside the map."""
+    west, east = panel.xlim
+    edge = 0.12 * (east - west)  # the room that words take on a phone
     together = bool(np.linalg.norm(en[-1] - en[0]) < 16.0 * scale)
     few = max(1, len(en) // 30)
     for row, inner, marker, words in ((0, few, "^", "start"), (-1, max(-1 - few, -len(en)), "s", "end")):
         panel.dots(en[[row], 0], en[[row], 1], "truth", "", 10.0, marker)
-        left = en[row, 0] < en[min(inner, len(en) - 1), 0]
+        x = en[row, 0]
+        left = bool(x > east - edge or (x < en[min(inner, len(en) - 1), 0] and x > west + edge))
         if not (together and row == 0):
             words = "start and end" if together else words
-            panel.words(
-                float(en[row, 0]), float(en[row, 1]), words, "right" if left else "left", (-8 if left else 8, 0)
-            )
+            panel.words(float(x), float(en[row, 1]), words, "right" if left else "left", (-8 if left else 8, 0))
 
 
 def _scale_bar(figure: Figure, panel: Panel) -> None:

@@ -41,7 +41,7 @@ def urban(
     at twice this. `antennas` adds a second antenna.
     """
     idle = idle_hz if engine else 0.0
-    return _town("urban", seed, duration, tunnels, gnss, odometer, idle, barometer, antennas, exact, rate)
+    return _build_town("urban", seed, duration, tunnels, gnss, odometer, idle, barometer, antennas, exact, rate)
 
 
 def electric(
@@ -49,10 +49,10 @@ def electric(
     barometer: bool = False, antennas: bool = False, exact: bool = False, rate: float = 100.0,
 ) -> Simulated:  # fmt: skip
     """The same sort of town in a car whose stops are silent."""
-    return _town("electric", seed, duration, tunnels, gnss, odometer, 0.0, barometer, antennas, exact, rate)
+    return _build_town("electric", seed, duration, tunnels, gnss, odometer, 0.0, barometer, antennas, exact, rate)
 
 
-def _town(
+def _build_town(
     name: str, seed: int, duration: float, tunnels: int, gnss: str, odometer: bool, idle_hz: float,
     barometer: bool, antennas: bool, exact: bool, rate: float,
 ) -> Simulated:  # fmt: skip
@@ -73,7 +73,7 @@ def _town(
     parts = [
         road_noise(path, stream(seed, "road")),
         Springs(height=0.4).lean(path),
-        movement(path, _sitting(path, seed), (0.0, 0.0, 0.4), stream(seed, "passengers")),
+        movement(path, _seat_passengers(path, seed), (0.0, 0.0, 0.4), stream(seed, "passengers")),
     ]
     if idle_hz:
         motor = Engine(FOUR_CYLINDERS, idle_hz, ORDERS, wander_hz=0.06)
@@ -90,7 +90,7 @@ def _town(
     )  # fmt: skip
 
 
-def _sitting(path: Path, seed: int) -> list[Boarding | Fidget]:
+def _seat_passengers(path: Path, seed: int) -> list[Boarding | Fidget]:
     """People on their seats all along, and the driver getting out at the end."""
     rng = stream(seed, "events")
     times = np.sort(rng.uniform(path.start, path.end, rng.poisson((path.end - path.start) / 60.0)))

@@ -69,7 +69,7 @@ def run(
     if engine:
         motor = Engine(MEAN, engine_hz, (0.5, 1.0, 2.0), spans)
         parts += [motor.lines(path, rate, stream(seed, "engine")), idle_floor(path, stream(seed, "idling"))]
-    events = _events(edges, seed) if passengers else []
+    events = _list_events(edges, seed) if passengers else []
     parts.append(movement(path, events, (0.0, 0.0, 1.2), stream(seed, "passengers")))
     return record(
         "li2024", seed, path,
@@ -86,7 +86,7 @@ def run(
     )  # fmt: skip
 
 
-def _events(edges: tuple[float, ...], seed: int) -> list[Boarding | Fidget]:
+def _list_events(edges: tuple[float, ...], seed: int) -> list[Boarding | Fidget]:
     """Who gets in and out when: a door at stop 1, most at stop 2, two doors at stop 3; no seat is quite still."""
     rng = stream(seed, "events")
 

@@ -47,7 +47,7 @@ def ren2021(
         raise ConfigError(f"walk = {walk}: must be from 1 to {len(WALKS)}", key="simulation.value")
     perimeter, laps, duration = WALKS[walk - 1]
     return _walk(
-        "ren2021", seed, duration, rectangle(perimeter, laps), ELLIPSE2.at(_usable(rate)), exact, compensated, True,
+        "ren2021", seed, duration, rectangle(perimeter, laps), ELLIPSE2.at(_check_rate(rate)), exact, compensated, True,
         {"walk": walk, "laps": laps},
     )  # fmt: skip
 
@@ -66,7 +66,7 @@ def free(
             raise ConfigError(f"{key} = '{value}': must be {', '.join(known)}", key="simulation.value")
     if not 20.0 <= duration <= 7200.0:
         raise ConfigError(f"duration = {duration:g}: must be from 20 to 7200 s", key="simulation.value")
-    length = PACES[pace] * (duration - _rest(seed).sum())
+    length = PACES[pace] * (duration - _draw_rest(seed).sum())
     rng = stream(seed, "course")
     if course == "laps":
         laps = max(1, round(length / 40.0))
@@ -83,18 +83,18 @@ def free(
     else:
         raise ConfigError(f"course = '{course}': must be laps, bends or straight", key="simulation.value")
     return _walk(
-        "gait", seed, duration, parts, PRESETS[imu].at(_usable(rate)), exact, compensated, course == "laps",
+        "gait", seed, duration, parts, PRESETS[imu].at(_check_rate(rate)), exact, compensated, course == "laps",
         {"pace": pace, "course": course},
     )  # fmt: skip
 
 
-def _usable(rate: float) -> float:
+def _check_rate(rate: float) -> float:
     if not 50.0 <= rate <= 2000.0:
         raise ConfigError(f"rate = {rate:g}: must be from 50 to 2000 Hz", key="simulation.value")
     return rate
 
 
-def _rest(seed: int) -> np.ndarray:
+def _draw_rest(seed: int) -> np.ndarray:
     """s at rest before and after the walk."""
     return stream(seed, "rest").uniform([2.0, 1.5], [6.0, 4.0])
 
@@ -103,7 +103,7 @@ def _walk(
     name: str, seed: int, duration: float, parts: list[tuple[float, float]], imu: SimulatedImu, exact: bool,
     compensated: bool, closed: bool, facts: dict[str, object],
 ) -> Simulated:  # fmt: skip
-    rest = _rest(seed)
+    rest = _draw_rest(seed)
     rng = stream(seed, "course")
     along = way(parts, float(rng.uniform(0.0, 360.0)))
     walked = duration - float(rest.sum())

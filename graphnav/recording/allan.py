@@ -80,21 +80,21 @@ def allan_of(t: Array, gyro: Array, accel: Array) -> Allan:
         raise RecordingError(
             f"{duration:.0f} s are too short; an hour at rest is better, a minute the least", key="allan.short"
         )
-    moving = moves_at(t, gyro, accel)
+    moving = find_motion(t, gyro, accel)
     if moving is not None:
         raise RecordingError(
             f"the log moves, first at {moving:.0f} s: an Allan variance is of an IMU at rest; choose a part with "
             "--start and --end",
             key="allan.moves",
         )
-    m = averaging(len(t))
+    m = list_averaging(len(t))
     tau = m * period
     devs = [deviations(x, period, m) for x in (gyro, accel)]
     noises = [_fit(tau, d, len(t)) for d in devs]
     return Allan(tau, devs[0], devs[1], noises[0], noises[1], duration, 1.0 / period)
 
 
-def moves_at(t: Array, gyro: Array, accel: Array) -> float | None:
+def find_motion(t: Array, gyro: Array, accel: Array) -> float | None:
     """The first time (s from the start) at which means over a second leave the median of the log; None at rest."""
     n = max(round(_STEP / float(np.median(np.diff(t)))), 1)
     for samples, limit in ((gyro, _TURNS), (accel, _PUSHES)):
@@ -105,7 +105,7 @@ def moves_at(t: Array, gyro: Array, accel: Array) -> float | None:
     return None
 
 
-def averaging(count: int) -> Array:
+def list_averaging(count: int) -> Array:
     """Numbers of samples to average over, even on a logarithmic scale, up to a ninth of the log."""
     most = max(count // _FEWEST, 1)
     steps = np.logspace(0.0, np.log10(most), max(int(PER_DECADE * np.log10(most)), 1) + 1)

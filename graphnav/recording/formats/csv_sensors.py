@@ -1,0 +1,195 @@
+"""Sensors from the CSV files of recording.toml: its sections say what the columns are, `rows` holds them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from graphnav.core.errors import RecordingError
+from graphnav.core.rotation import Array
+from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Truth
+from graphnav.recording.formats import schema
+from graphnav.recording.formats.pulses import count_pulses
+from graphnav.recording.formats.repair import (
+    DEFAULT_SD,
+    DEFAULT_SD_V,
+    VAGUEST,
+    VAGUEST_V,
+    Remarks,
+    fixes_by_type,
+    geodetic,
+    horizontal_velocity,
+    sigmas,
+)
+from graphnav.recording.formats.table import Table
+from graphnav.sensors import Sensor, Series
+from graphnav.sensors.tables import ANGLE
+
+_AT_ONCE = 1 << 16  # rows
+
+
+def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
+    """Samples in body axes RFU, rad/s and m/s^2, with the noise figures as stated, else a consumer IMU's."""
+    R_bs = d.R_bs
+    gyro = _turn(rows, ("gx", "gy", "gz"), schema.RATE[d.units.gyro], R_bs)
+    accel = _turn(rows, ("ax", "ay", "az"), schema.FORCE[d.units.accel], R_bs)
+    stated = d.figures
+    noise = replace(ImuNoise(), **stated)
+    missing = [key for key in schema.NOISE_FIGURES if key not in stated]
+    if 0 < len(missing) < len(schema.NOISE_FIGURES):
+        remarks.add(
+            "imu.noise_partly", f"[imu.noise] says nothing of {', '.join(missing)}: defaults of a consumer IMU are used"
+        )
+    elif missing:
+        remarks.add(
+            "imu.noise_assumed",
+            "no [imu.noise]: figures of a consumer IMU are assumed "
+            f"(gyro {noise.gyro_noise_density:g} rad/s/sqrt(Hz), "
+            f"accelerometer {noise.accel_noise_density:g} m/s2/sqrt(Hz))",
+        )
+    return Imu(rows["t"], gyro, accel, noise, R_bs, noise_assumed=len(missing) == len(schema.NOISE_FIGURES))
+
+
+def _turn(rows: Table, names: tuple[str, ...], unit: float, R_bs: Array) -> Array:
+    """(N, 3) columns in body axes; of a day of them nothing is held twice."""
+    out = np.empty((len(rows), 3))
+    for k in range(0, len(out), _AT_ONCE):
+        some = slice(k, k + _AT_ONCE)
+        np.matmul(np.stack([rows[name][some] for name in names], -1) * unit, R_bs.T, out=out[some])
+    return out
+
+
+def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
+    """Fixes (rad, m) with their sigmas, without those too vague to say anything; velocities where all axes are told."""
+    llh, rows = geodetic(rows, d.units.angle, "GNSS", remarks)
+    every = np.ones(len(rows), dtype=bool)
+    sd = sigmas(rows, ("sd_e", "sd_n", "sd_u"), d.sd, DEFAULT_SD, "GNSS position", every, remarks)
+    vague = (sd > VAGUEST).any(axis=1)
+    if vague.any():
+        if vague.all():
+            raise RecordingError(
+                f"{rows.path}: every fix has a sigma of more than {VAGUEST:g} m and says nothing",
+                key="gnss.sigma_all_vague",
+            )
+        remarks.add(
+            "gnss.sigma_vague", f"{vague.sum()} of {len(rows)} fixes have a sigma of more than {VAGUEST:g} m: left out"
+        )
+        llh, sd, rows = llh[~vague], sd[~vague], rows.take(~vague)
+    v = sd_v = None
+    if "vd" in rows and "vu" not in rows:
+        rows = rows.with_column("vu", -rows["vd"])
+    there = [c for c in ("ve", "vn", "vu") if c in rows]
+    if len(there) == 3:
+        scale = schema.SPEED[d.units.speed]
+        for name in ("sd_ve", "sd_vn", "sd_vu"):  # the file's sigmas have the file's unit, the .toml's are m/s
+            rows = rows.with_column(name, rows[name] * scale) if name in rows else rows
+        v = rows.stack("ve", "vn", "vu") * scale
+        absent = np.isnan(v).any(-1)
+        v[absent] = np.nan
+        sd_v = sigmas(rows, ("sd_ve", "sd_vn", "sd_vu"), d.sd_v, DEFAULT_SD_V, "GNSS velocity", ~absent, remarks)
+        absent |= (sd_v > VAGUEST_V).any(-1)
+        v[absent] = sd_v[absent] = np.nan
+        if absent.all():
+            v = sd_v = None
+            remarks.add("gnss.velocity_blank", "the GNSS velocity columns are blank throughout: no velocities")
+    elif "speed" in rows and "course" in rows:
+        course = rows["course"] * ANGLE[d.units.angle or "deg"]
+        v, sd_v, sentence = horizontal_velocity(
+            rows["speed"] * schema.SPEED[d.units.speed], course, d.sd_v or DEFAULT_SD_V
+        )
+        remarks.add("gnss.velocity_of_course", sentence)
+    elif there:
+        remarks.add(
+            "gnss.velocity_partly",
+            f"GNSS velocities need ve, vn and vu; only {', '.join(there)} is there, so none are used",
+        )
+    kinds = fixes_by_type(rows, d.units.type) if "type" in rows else None
+    gnss = Gnss(
+        rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds, kinds is not None and d.units.type == "rtklib"
+    )
+    return replace(gnss, satellites=rows["satellites"]) if "satellites" in rows else gnss
+
+
+def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odometer:
+    """Speeds, m/s, of a speed, of several wheels, or of counted pulses."""
+    t, scale = rows["t"], schema.SPEED[d.units.speed]
+    used = d.readings(tuple(rows.columns))
+    wheels = way = None
+    if any(name in rows for name in schema.WHEELS):
+        wheels = np.stack([rows.get(name, np.full(len(t), np.nan)) for name in schema.WHEELS], -1) * scale
+    if d.metres_per_pulse is not None:
+        if len(t) < 2:
+            raise RecordingError(
+                f"{rows.path}: {len(t)} usable row; pulses need at least 2 to make a speed", key="table.few_rows"
+            )
+        way = d.metres_per_pulse * count_pulses(rows["pulses"], d.pulses, d.signed, remarks)
+        # over both neighbouring periods, so that it is the speed at t and not half a period before
+        ahead, behind = np.minimum(np.arange(len(t)) + 1, len(t) - 1), np.maximum(np.arange(len(t)) - 1, 0)
+        speed = (way[ahead] - way[behind]) / (t[ahead] - t[behind])
+    else:
+        speed = rows.stack(*used).mean(axis=-1) * scale
+    signed = bool((speed < 0.0).any()) if d.signed is None else d.signed
+    return Odometer(
+        t,
+        speed,
+        np.array(d.lever_arm),
+        d.scale_sigma,
+        way=way,
+        pulse=d.metres_per_pulse or 0.0,
+        wheels=wheels,
+        signed=signed,
+        speed_sigma=d.speed_sigma,
+        delay_sigma=d.delay_sigma,
+    )
+
+
+def list_needed(sensor: Sensor, rows: Table) -> tuple[str, ...]:
+    """The columns that every row must have: the first of the sets that the file has.
+
+    Raises
+    ------
+    RecordingError
+        If it has none of them.
+    """
+    for some in sensor.needs:
+        if all(name in rows for name in some):
+            # of several sets a row may have any, which `Sensor.usable` looks at
+            return some if len([s for s in sensor.needs if all(name in rows for name in s)]) == 1 else ()
+    sets = " or ".join(" and ".join(some) for some in sensor.needs)
+    raise RecordingError(
+        f'{rows.path}: no column {sets}; if it has another name, say columns = {{ name = "..." }}', key="table.column"
+    )
+
+
+def build_series(sensor: Sensor, d: Any, rows: Table, remarks: Remarks) -> Series:
+    """Rows of a sensor of `graphnav.sensors` in SI units, without those that measure nothing."""
+    absent = np.full(len(rows), np.nan)
+    sizes = [column.units[getattr(d.units, column.name)] for column in sensor.columns]
+    values = np.stack([rows.get(name, absent) * size for name, size in zip(sensor.names, sizes, strict=True)], -1)
+    figures = sensor.figures(**{name: getattr(d, name) for name in sensor.figures.model_fields})
+    whole = sensor.usable(values)
+    if not whole.all():
+        remarks.add(f"{sensor.name}.rows_blank", f"{(~whole).sum()} {sensor.name} rows without a measurement dropped")
+    return Series(sensor, rows["t"][whole], values[whole], figures)
+
+
+def build_truth(d: schema.TruthTable, rows: Table, remarks: Remarks) -> Truth:
+    """Reference places, and velocities (m/s) and angles (rad) where the file has them."""
+    llh = xyz = None
+    if d.frame == "local":
+        xyz = rows.stack("x", "y", "z") if "z" in rows else rows.stack("x", "y")
+    else:
+        llh, rows = geodetic(rows, d.units.angle, "truth", remarks)
+    v = _read_part(rows, ("ve", "vn", "vu"), schema.SPEED[d.units.speed])
+    rph = _read_part(rows, ("roll", "pitch", "heading"), ANGLE[d.units.angle or "deg"])
+    return Truth(rows["t"], llh, xyz, v, rph, d.of)
+
+
+def _read_part(rows: Table, names: tuple[str, ...], scale: float) -> Array | None:
+    """Columns of which some may be missing (NaN then); None if all are."""
+    if not any(name in rows for name in names):
+        return None
+    absent = np.full(len(rows), np.nan)
+    return np.stack([rows.get(name, absent) for name in names], -1) * scale
