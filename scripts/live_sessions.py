@@ -91,7 +91,7 @@ def spoilt(rows: list[Row], rng: random.Random) -> list[Row]:
     """An absurd row every minute, a row that is late every 20 s, and one that comes twice every ten."""
     out: list[Row] = []
     late: list[tuple[int, Row]] = []
-    minute, twenty, ten = 0.0, 20.0, 0.0  # what comes late before there is any other row is lost
+    minute, twenty, ten = 0.0, 30.0, 0.0  # what comes late where rows begin, or their clock was set, is lost
     fix = next((values for sensor, _, values in rows if sensor == "gnss"), None)
     slow = "imu" if fix is None else "gnss"  # whose rows are late
     blank, since, before = (float("nan"),) * 6, 0.0, rows[0][1]
