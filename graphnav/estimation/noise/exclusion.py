@@ -142,6 +142,7 @@ class Explained:
     log_evidence: float
     passes: int  # of filter and smoother
     looks: int  # of the filter alone
+    estimate: NoiseEstimate | None = None  # that the noise is of, where nothing is left out of another than was given
 
 
 def estimate_without_faults(
@@ -161,7 +162,8 @@ def estimate_without_faults(
     """
     found = estimate_noise(base, opening, progress=progress)
     explained = exclude(base, found)
-    found = replace(found, passes=found.passes + explained.passes, looks=explained.looks)
+    passes = found.passes + explained.passes
+    found = replace(explained.estimate or found, passes=passes, looks=explained.looks)
     if not explained.noise.excluded:
         return found
     # from the priors on: figures that were estimated with what is wrong in it are far from what they come to
@@ -229,6 +231,12 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
         if _length(again) > _length(hidden):  # faults shrink then; where more seems wrong, the filter is lost
             return replace(one, passes=passes, looks=one.looks + 3)
         refined = trim_spans(posed, other.points, again)
+        if not refined:  # by figures that they have not led astray there are single outliers and no more
+            free = estimate_noise(base, None, replace(other.noise, excluded={}), (other.points, posed))
+            passes += free.passes
+            likely = free.log_posterior - _OUTLIER * sum(map(_count, free.noise.weights.values()))
+            if likely > one.log_evidence:
+                return Explained(free.noise, likely, passes, one.looks + 3, free)
         if not refined or refined == spans:
             break
         spans, without = refined, replace(without, excluded=dict.fromkeys(FIXES, tuple(refined)))
