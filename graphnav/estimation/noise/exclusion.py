@@ -18,8 +18,10 @@ fault is also as rare beforehand as the tests take it to be, an outlier among in
 best model decides what is left out.
 
 Figures that are estimated with a fault in the data may have grown until they hide it. So the tests are made with the
-prior medians of the figures as well; where they find something else, the figures are estimated without that, each span
-is decided with these, and of the two explanations of all measurements the likelier one stands.
+prior medians of the figures as well; where they find something else, the figures are estimated without that, twice, as
+the spans come to what is wrong; each span is decided with these, and of the two explanations of all measurements the
+likelier one stands. Where these figures know of no span at all, the third is that all is right, by figures that set out
+from them.
 """
 
 from __future__ import annotations
