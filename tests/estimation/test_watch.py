@@ -46,7 +46,7 @@ def test_tests_beside_a_message_are_those_of_the_filter(posed: Problem, monkeypa
     kept: list[Bank] = []
     updated = Bank.updated
     monkeypatch.setattr(Bank, "updated", lambda self, *a: (kept.append(self), updated(self, *a))[1])
-    refilter(problem, ekf(problem), watch=True)
+    refilter(problem, ekf(problem), watch=True, drifts=False)
     mean = problem.prior.mean
     assert mean is not None
     message = first_message(mean, problem.prior.sigma[0])

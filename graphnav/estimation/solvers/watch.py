@@ -254,8 +254,9 @@ class Bank(_Tests):
 class Watch(_Tests):
     """The same tests beside a square-root message R y = z, which is then R y = z - R X b for errors b since each onset.
 
-    With columns B = U / sigma for them at a fix, the QR that takes in its rows leaves behind, below those of the
-    message, rho - Gamma b ~ N(0, 1): rho^T rho is its NIS, and Gamma^T rho and Gamma^T Gamma add to score and info.
+    Of errors that stay alone: one that grows may as well be the IMU's, and no evidence decides as it drives. With
+    columns B = U / sigma for them at a fix, the QR that takes in its rows leaves behind, below those of the message,
+    rho - Gamma b ~ N(0, 1): rho^T rho is its NIS, and Gamma^T rho and Gamma^T Gamma add to score and info.
 
     Parameters
     ----------
@@ -265,7 +266,7 @@ class Watch(_Tests):
     """
 
     def __init__(self, constraints: Iterable[Constraint], period: float, width: int) -> None:
-        self._slots = _slots(constraints, None, period)
+        self._slots = _slots(constraints, None, period, drifts=False)
         self._X: Array | None = np.zeros((width, _width(self._slots)))
         self._stands: tuple[Array, Array] | None = None  # R and R X
 
