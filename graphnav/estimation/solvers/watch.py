@@ -55,20 +55,22 @@ def matters(rows: Constraint, error: Array, speed: Array | float) -> Array:
 
 
 class _Slots:
-    """The tests of one constraint: slot l has columns 2 m l to 2 m (l + 1) of those it has in the bank.
+    """The tests of one constraint: slot l has columns c l to c (l + 1) of those it has in the bank.
 
-    The first m of them are of the part of an error that stays, the others of what it grows by in a minute.
+    The first m of them are of the part of an error that stays, the others of what it grows by in a minute: c is 2 m
+    where errors may grow, else m.
     """
 
-    def __init__(self, columns: slice, L: int, rows: Constraint, drifts: bool) -> None:
+    def __init__(self, begin: int, L: int, rows: Constraint, drifts: bool) -> None:
         m = len(rows.axes)
-        self.columns, self.L, self.m, self.drifts = columns, L, m, drifts
-        self.threshold = float(chdtri(2 * m, FALSE_ALARM))
+        c = 2 * m if drifts else m
+        self.columns, self.L, self.m, self.drifts = slice(begin, begin + L * c), L, m, drifts
+        self.threshold = float(chdtri(c, FALSE_ALARM))
         self.rows = rows
         self.first = np.full(L, np.nan)  # when each slot began, NaN before
-        self.inputs = np.zeros((m, L, 2, m))  # U of each slot
-        self.one, self.prior = np.eye(m), np.eye(2 * m) / WIDE[rows.unit] ** 2
-        self.score, self.info = np.zeros((L, 2 * m)), np.tile(self.prior, (L, 1, 1))
+        self.inputs = np.zeros((m, L, c // m, m))  # U of each slot
+        self.one, self.prior = np.eye(m), np.eye(c) / WIDE[rows.unit] ** 2
+        self.score, self.info = np.zeros((L, c)), np.tile(self.prior, (L, 1, 1))
         self.seen = 0
         self.typical_sigmas = _InnovationLevel(m)
 
@@ -92,26 +94,25 @@ class _Slots:
         if self.drifts:
             minutes = np.where(np.isnan(self.first), 0.0, (t - self.first) / MINUTE)
             self.inputs[:, :, 1] = minutes[:, None] * self.one[:, None]
-        begin = self.columns.start + 2 * self.m * slot
-        return slice(begin, begin + 2 * self.m)
+        c = len(self.prior)
+        return slice(self.columns.start + c * slot, self.columns.start + c * (slot + 1))
 
     def found(self, score: Array, G: Array, weighted: Array, speed: float) -> float | None:
         """When a fault began that a fix adds enough to be sure of, or None.
 
         Parameters
         ----------
-        score : (2 L m,) G^T S^-1 nu.
-        G : (n m, 2 L m) signature, and `weighted` S^-1 G.
+        score : (L c,) G^T S^-1 nu.
+        G : (n m, L c) signature, and `weighted` S^-1 G.
         """
-        L, m = self.L, self.m
-        self.score += score.reshape(L, 2 * m)
-        G3, S3 = (x.reshape(-1, L, 2 * m).swapaxes(0, 1) for x in (G, weighted))
+        self.score += score.reshape(self.score.shape)
+        G3, S3 = (x.reshape(-1, *self.score.shape).swapaxes(0, 1) for x in (G, weighted))
         self.info += G3.swapaxes(1, 2) @ S3
         b = np.linalg.solve(self.info, self.score[..., None])[..., 0]
         T = np.einsum("lm,lm->l", self.score, b) / self.threshold
         if T.max() <= self.typical_sigmas.factor:
             return None
-        now = np.einsum("mlk,lk->lm", self.inputs.reshape(m, L, 2 * m), b)
+        now = np.einsum("mlk,lk->lm", self.inputs.reshape(self.m, *b.shape), b)
         T = np.where(matters(self.rows, now, speed), T, 0.0)
         if T.max() <= self.typical_sigmas.factor:
             return None
@@ -127,15 +128,14 @@ def _slots(constraints: Iterable[Constraint], t: Array | None, period: float, dr
         if t is not None and len(rows) > 1:
             period = float(np.median(np.diff(t[rows.keyframe])))
         L = 1 + int(np.clip(np.log2(LONGEST / max(period, 1e-3)), 0, 12))
-        columns = slice(end, end + 2 * L * len(rows.axes))
-        out[rows.name] = _Slots(columns, L, rows, drifts)
-        end = columns.stop
+        out[rows.name] = _Slots(end, L, rows, drifts)
+        end = out[rows.name].columns.stop
     return out
 
 
 def _width(some: Mapping[str, _Slots]) -> int:
     """How many columns a bank has."""
-    return sum(2 * slots.L * slots.m for slots in some.values())
+    return max((slots.columns.stop for slots in some.values()), default=0)
 
 
 class _InnovationLevel:
@@ -225,7 +225,7 @@ class Bank(_Tests):
         return G
 
     def own(self, name: str, G: Array) -> Array:
-        """(n m, 2 L m) what a signature says of errors of the fixes themselves."""
+        """(n m, L c) what a signature says of errors of the fixes themselves."""
         return G[:, self._slots[name].columns]
 
     def seen(self, name: str, k: int, nis: float, used: bool) -> None:
@@ -287,14 +287,14 @@ class Watch(_Tests):
         self._X, self._stands = None, (R, Z)
 
     def begin(self, name: str, t: float, sigma: Array) -> tuple[slice, slice, Array]:
-        """Begin an onset with fixes of these sigmas (n, m): its columns, those of the kind, and B (n m, 2 L m)."""
+        """Begin an onset with fixes of these sigmas (n, m): its columns, those of the kind, and B (n m, L c)."""
         slots = self._slots[name]
         own = slots.begin(t)
         inputs = slots.inputs.reshape(slots.m, -1)
         return own, slots.columns, (inputs / sigma[..., None]).reshape(sigma.size, -1)
 
     def found(self, name: str, t: float, rho: Array, Gamma: Array, speed: float) -> float | None:
-        """When a fault began, or None, by what a fix has left behind: rho (n m,) and Gamma (n m, 2 L m) of its kind."""
+        """When a fault began, or None, by what a fix has left behind: rho (n m,) and Gamma (n m, L c) of its kind."""
         slots = self._slots[name]
         slots.typical_sigmas.add(t, float(rho @ rho))
         return slots.found(rho @ Gamma, Gamma, Gamma, speed)
