@@ -25,7 +25,8 @@ from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.linearise import Points, Step
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.tree_window import TreeWindow
-from graphnav.estimation.solvers.watch import Verdicts, Watch
+from graphnav.estimation.solvers.verdicts import Verdicts
+from graphnav.estimation.solvers.watch import Watch
 from graphnav.estimation.solvers.window import Message, SettledStates, Window
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import NOISE_FIGURES

@@ -18,7 +18,7 @@ from graphnav.core.notes import Note
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import Alignment, align, ready, with_known_heading
-from graphnav.estimation.noise.exclusion import FIXES
+from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.pipeline import origin
 from graphnav.estimation.preparation import start_sigma

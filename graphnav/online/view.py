@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphnav.estimation.noise.exclusion import FIXES
+from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.solution import to_trajectory
 from graphnav.online.session import Session
 

@@ -25,7 +25,8 @@ from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
 from graphnav.estimation.solvers.rts import backward
-from graphnav.estimation.solvers.watch import MINUTE, Bank, Verdicts
+from graphnav.estimation.solvers.verdicts import Verdicts
+from graphnav.estimation.solvers.watch import MINUTE, Bank
 from graphnav.evaluation.scoring import errors
 from graphnav.recording import Recording
 from graphnav.recording.formats import read

@@ -22,7 +22,7 @@ from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
 from graphnav.estimation.noise.apply import row_weights, with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.exclusion import FIXES, WHEELS
+from graphnav.estimation.noise.explanations import FIXES, WHEELS
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import imu_moments, lag_moments, process_moments, row_moments
 from graphnav.estimation.noise.priors import prior

@@ -16,7 +16,7 @@ from graphnav.detectors import detect
 from graphnav.estimation.alignment import Alignment, align
 from graphnav.estimation.pipeline import origin, run
 from graphnav.estimation.solvers.batch import batch
-from graphnav.estimation.solvers.watch import Verdicts
+from graphnav.estimation.solvers.verdicts import Verdicts
 from graphnav.evaluation.scoring import Errors, errors
 from graphnav.online import Online, rows_of, without_rows
 from graphnav.recording import Recording

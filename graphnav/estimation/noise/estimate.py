@@ -303,17 +303,19 @@ def _improve_time(figures: _Components, chain: ParameterChain, told: Array, lags
     figures.times[p.name] = float(np.clip(found, usual / _TIMES, usual * _TIMES))
 
 
+def limit_squares(squared: Array, m: int) -> Array:
+    """(N,) weights by which squared errors (N,) of m degrees of freedom are no larger than `CHANCE` allows."""
+    return np.asarray(np.minimum(1.0, float(chdtri(m, CHANCE)) / np.maximum(squared, 1e-30)))
+
+
 def _weigh(figures: _Components, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:
     """Weights of the first n rows by their squared errors (n,): of their own, and of the whole with what lasts."""
-    m = len(rows.axes)
-    t, most = problem.t[rows.keyframe], float(chdtri(m, CHANCE))
+    m, t = len(rows.axes), problem.t[rows.keyframe]
     before = np.ones(len(rows)) if rows.weight is None else rows.weight
     some = squared[before[:n] > 0.0]
     # what half of the rows do is no error of rows: the figures have not come to what they are yet
     usual = float(np.median(some)) / float(chdtri(m, 0.5)) if len(some) else 1.0
-    squared = squared / max(usual, 1.0)
-    weight = np.minimum(1.0, most / np.maximum(squared, 1e-30))
-    weight = np.concatenate([weight, before[n:]])  # later ones as they were
+    weight = np.concatenate([limit_squares(squared / max(usual, 1.0), m), before[n:]])  # later ones as they were
     less = (weight < 1.0) & (before > 0.0)
     less |= np.isin(t, t[less])  # with all rows of their times, so that each is known by its number among them
     figures.weights[rows.name] = RowWeights(t[less], weight[less])

@@ -12,10 +12,10 @@ next one:
     IMU         the intervals there that the smoother needs more noise of have it
     rows        single rows there have the weights that were found
 
-An unknown error has a Gaussian prior about zero, as wide as such errors get (`WIDE`), and so has its growth; what that
-width costs in likelihood is the cost of the explanation (MacKay 1992, "Bayesian interpolation": the Occam factor). A
-fault is also as rare beforehand as the tests take it to be, an outlier among intervals or rows as rare as `CHANCE`. The
-best model decides what is left out.
+An unknown error has a Gaussian prior about zero, as wide as such errors get (`watch.WIDE`), and so has its growth; what
+that width costs in likelihood is the cost of the explanation (MacKay 1992, "Bayesian interpolation": the Occam factor).
+A fault is also as rare beforehand as the tests take it to be, an outlier among intervals or rows as rare as `CHANCE`.
+The best model decides what is left out.
 
 Figures that are estimated with a fault in the data may have grown until they hide it. So the tests are made with the
 prior medians of the figures as well; where they find something else, the figures are estimated without that, twice, as
@@ -26,114 +26,30 @@ from them.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from scipy.special import chdtri
 
-from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
+from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
-from graphnav.core.state import Parameter, States
 from graphnav.estimation import faults
 from graphnav.estimation.noise.apply import row_weights, with_noise
-from graphnav.estimation.noise.estimate import CHANCE, NoiseEstimate, estimate_noise
+from graphnav.estimation.noise.estimate import CHANCE, NoiseEstimate, estimate_noise, limit_squares
+from graphnav.estimation.noise.explanations import FIXES, ROWS, WRONG, evidence, mask_within
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import row_moments
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.ekf import refilter
-from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import SmootherPass, points_of, values_of
-from graphnav.estimation.solvers.watch import FALSE_ALARM, MINUTE, WIDE
+from graphnav.estimation.solvers.watch import FALSE_ALARM
 from graphnav.recording import Recording
 
-FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
-ROWS = ("rows",)
-_WRONG: tuple[tuple[str, ...], ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS, ROWS)
 _SINGLE = INTERVALS, ROWS  # outliers: nothing is left out for them
 _ODDS = -float(np.log(FALSE_ALARM))  # by which a fault is less likely beforehand than none
-_NONE = 1e-9  # sigma of an error that is not there
+_SHRINKS = 2  # estimates without a fault: by the first, the span comes to what is wrong; the second is without that
 _OUTLIER = -float(np.log(CHANCE))  # the same of one row, and of one interval of the IMU
-
-
-@dataclass(frozen=True)
-class _Shifted(Constraint):
-    """Rows of a constraint with an error in common within spans."""
-
-    inner: Any = None
-    error: str = ""
-    since: Any = None  # (N,) s since the span began
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        return str(self.inner.name)
-
-    @property
-    def axes(self) -> tuple[str, ...]:  # type: ignore[override]
-        return tuple(self.inner.axes)
-
-    @classmethod
-    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        return np.empty(0)
-
-    @classmethod
-    def build(cls, scene: BuildContext) -> None:
-        return None
-
-    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        unknown = parameters[self.error]  # (n, 2 m), at the beginning of the span and growth in a minute
-        linear = self.inner.linearize(states, {k: v for k, v in parameters.items() if k != self.error}, rows)
-        n, m = linear.residual.shape
-        minutes = (self.since[rows] / MINUTE)[:, None]
-        J = np.concatenate([np.broadcast_to(np.eye(m), (n, m, m)), minutes[..., None] * np.eye(m)], axis=-1)
-        residual = linear.residual + unknown[:, :m] + minutes * unknown[:, m:]
-        return Linearized(residual, linear.jacobians | {self.error: J}, linear.sigma)
-
-
-def with_common_errors(problem: Problem, spans: list[tuple[float, float]], kinds: tuple[str, ...]) -> Problem:
-    """The problem with one unknown error of each of some constraints in each span (s)."""
-    begins, wide = [float(problem.t[0]) - 1.0], [0.0]
-    for a, b in spans:
-        begins += [a, b + 2.0 * SAME_TIME]  # a node holds from this much before it
-        wide += [1.0, 0.0]
-
-    def shifted(rows: Constraint) -> Constraint:
-        if rows.name not in kinds:
-            return rows
-        name, m = f"{rows.name}_fault", len(rows.axes)
-        sigma = np.maximum(np.outer(wide, np.full(2 * m, WIDE[rows.unit])), _NONE)
-        own = Parameter(name, np.zeros(sigma.shape), sigma, rows.unit, begins=np.array(begins))
-        t = problem.t[rows.keyframe]
-        return _Shifted(
-            keyframe=rows.keyframe,
-            parameters=(*rows.parameters, own),
-            weight=rows.weight,
-            inner=rows,
-            error=name,
-            since=t - np.array(begins)[np.searchsorted(begins, t + SAME_TIME, side="right") - 1],
-        )
-
-    return replace(problem, constraints=tuple(shifted(rows) for rows in problem.constraints))
-
-
-def with_own_errors(problem: Problem, spans: list[tuple[float, float]], kinds: tuple[str, ...]) -> Problem:
-    """The problem with an unknown error of each row of some constraints in the spans (s), as a frozen receiver has."""
-
-    def loose(rows: Constraint) -> Constraint:
-        if rows.name not in kinds:
-            return rows
-        t = problem.t[rows.keyframe]
-        within = np.any([(t >= a - SAME_TIME) & (t <= b + SAME_TIME) for a, b in spans], axis=0)
-        sigma: Array = rows.sigma  # type: ignore[attr-defined]
-        weight = np.ones(len(rows)) if rows.weight is None else rows.weight
-        wide = np.min(sigma / np.hypot(sigma, WIDE[rows.unit]), axis=1) ** 2
-        return replace(rows, weight=np.where(within, np.minimum(weight, wide), weight))
-
-    return replace(problem, constraints=tuple(loose(rows) for rows in problem.constraints))
 
 
 @dataclass(frozen=True)
@@ -224,27 +140,30 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
     without = NoiseModel(excluded=dict.fromkeys(FIXES, tuple(hidden)))
     if all(any(a <= begin and end <= b for a, b in spans) for begin, end in hidden):
         return replace(one, looks=one.looks + 2)
-    other, spans, passes = found, hidden, 0
-    for _ in range(2):  # by figures that nothing wrong is in, spans come to what is wrong of them
+    other, spans, passes, looks = found, hidden, 0, one.looks + 2
+    for _ in range(_SHRINKS):
         other = estimate_noise(base, None, without, (other.points, with_noise(base, other.noise)))
-        posed, passes = with_noise(base, other.noise), passes + other.passes
-        spans = trim_spans(posed, other.points, spans)
+        alone = _weigh_alone(with_noise(base, other.noise), other.points)
         again = find_spans(base, replace(other.noise, excluded={}), other)
+        passes, looks = passes + other.passes, looks + 1
         if _length(again) > _length(hidden):  # faults shrink then; where more seems wrong, the filter is lost
-            return replace(one, passes=passes, looks=one.looks + 3)
-        refined = trim_spans(posed, other.points, again)
+            return replace(one, passes=passes, looks=looks)
+        spans, refined = trim_spans(spans, alone), trim_spans(again, alone)
         if not refined:  # by figures that they have not led astray there are single outliers and no more
-            free = estimate_noise(base, None, replace(other.noise, excluded={}), (other.points, posed))
+            near = other.points, with_noise(base, other.noise)
+            free = estimate_noise(base, None, replace(other.noise, excluded={}), near)
             passes += free.passes
             likely = free.log_posterior - _OUTLIER * sum(map(_count, free.noise.weights.values()))
             if likely > one.log_evidence:
-                return Explained(free.noise, likely, passes, one.looks + 3, free)
+                return Explained(free.noise, likely, passes, looks, free)
         if not refined or refined == spans:
             break
         spans, without = refined, replace(without, excluded=dict.fromkeys(FIXES, tuple(refined)))
-    ways = [one, *([decide(base, weigh_left_out(posed, other, spans), spans)] if spans else [])]
-    best = max(ways, key=lambda way: way.log_evidence)
-    return replace(best, passes=passes, looks=sum(way.looks for way in ways) + 4)
+    if not spans:
+        return replace(one, passes=passes, looks=looks)
+    way = decide(base, with_weights(other, alone, spans), spans)
+    best = max(one, way, key=lambda some: some.log_evidence)
+    return replace(best, passes=passes, looks=looks + way.looks)
 
 
 def _length(spans: list[tuple[float, float]]) -> float:
@@ -252,39 +171,46 @@ def _length(spans: list[tuple[float, float]]) -> float:
     return sum(end - begin for begin, end in spans)
 
 
-def trim_spans(problem: Problem, smoothed: SmootherPass, spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
+Weighed = Mapping[str, tuple[Array, Array]]  # by constraint, times (N,) s of its rows, and weights (N,)
+
+
+def trim_spans(spans: list[tuple[float, float]], alone: Weighed) -> list[tuple[float, float]]:
     """Spans (s) without what is right at their ends: fixes where a smoother that does not use them has them.
 
     Tests that go forward in time leave out too much: they date a fault from one of a few onsets, and what comes after
     it is met by a filter that has been led astray.
+
+    Parameters
+    ----------
+    alone : the fixes as that smoother has them; less than 1 is wrong.
     """
-    t = np.unique(np.concatenate([t[weight < 1.0] for t, weight in _weigh_alone(problem, smoothed).values()]))
-    within = [t[np.searchsorted(t, a - SAME_TIME) : np.searchsorted(t, b + SAME_TIME)] for a, b in spans]
+    t = np.unique(np.concatenate([t[weight < 1.0] for t, weight in alone.values()]))
+    within = [t[mask_within(t, [span])] for span in spans]
     return [(float(some[0]), float(some[-1])) for some in within if len(some)]
 
 
-def weigh_left_out(problem: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]) -> NoiseEstimate:
+def with_weights(found: NoiseEstimate, alone: Weighed, spans: list[tuple[float, float]]) -> NoiseEstimate:
     """The estimate with weights for fixes in spans that it leaves out, so that each may be an outlier by itself."""
     weights = dict(found.noise.weights)
-    for name, (t, weight) in _weigh_alone(problem, found.points).items():
+    for name, (t, weight) in alone.items():
         kept = _outside(weights.get(name, RowWeights(np.empty(0), np.empty(0))), spans)
-        inside = np.any([(t >= a - SAME_TIME) & (t <= b + SAME_TIME) for a, b in spans], axis=0)
-        inside &= np.isin(t, t[weight < 1.0])  # with all rows of their times
+        inside = mask_within(t, spans) & np.isin(t, t[weight < 1.0])  # with all rows of their times
         both, of_both = np.concatenate([kept.t, t[inside]]), np.concatenate([kept.weight, weight[inside]])
         order = np.argsort(both, kind="stable")
         weights[name] = RowWeights(both[order], of_both[order])
     return replace(found, noise=replace(found.noise, weights=weights))
 
 
-def _weigh_alone(problem: Problem, smoothed: SmootherPass) -> dict[str, tuple[Array, Array]]:
-    """Times (N,) s of fixes, and weights (N,) by which each is as likely as chance allows where it is not used."""
-    out = {}
-    for rows in problem.constraints:
-        if rows.name in FIXES:
-            squared = row_moments(problem, rows, smoothed, len(rows)).left_out.sum(axis=1)
-            most = chdtri(len(rows.axes), CHANCE)
-            out[rows.name] = problem.t[rows.keyframe], np.minimum(1.0, most / np.maximum(squared, 1e-30))
-    return out
+def _weigh_alone(problem: Problem, smoothed: SmootherPass) -> Weighed:
+    """Fixes, with weights by which each would be as likely as chance allows if it were not used."""
+    return {
+        rows.name: (
+            problem.t[rows.keyframe],
+            limit_squares(row_moments(problem, rows, smoothed, len(rows)).left_out.sum(axis=1), len(rows.axes)),
+        )
+        for rows in problem.constraints
+        if rows.name in FIXES
+    }
 
 
 def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[tuple[float, float]]:
@@ -316,19 +242,19 @@ def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]
     total = before + found.log_prior
     dropped: dict[tuple[str, ...], list[tuple[float, float]]] = {INTERVALS: [], ROWS: []}
     for k, span in enumerate(spans):
-        cost = np.array([0.0 if not kinds else _ODDS for kinds in _WRONG])
+        cost = np.array([0.0 if not kinds else _ODDS for kinds in WRONG])
         for kinds, some, within in ((INTERVALS, of_imu, reach[k]), (ROWS, of_rows, span)):
             outliers = sum(_count(one) - _count(_outside(one, [within])) for one in some.values())
-            cost[_WRONG.index(kinds)] = _OUTLIER * outliers if outliers else np.inf
+            cost[WRONG.index(kinds)] = _OUTLIER * outliers if outliers else np.inf
         one = likelihood[k] - cost
         best = int(np.argmax(one))
         total += float(one[best])
-        if _WRONG[best] != INTERVALS:
+        if WRONG[best] != INTERVALS:
             dropped[INTERVALS].append(reach[k])
-        if _WRONG[best] != ROWS:
+        if WRONG[best] != ROWS:
             dropped[ROWS].append(span)
-        if _WRONG[best] not in _SINGLE:
-            excluded |= {name: (*excluded.get(name, ()), span) for name in _WRONG[best]}
+        if WRONG[best] not in _SINGLE:
+            excluded |= {name: (*excluded.get(name, ()), span) for name in WRONG[best]}
     present = {rows.name for rows in base.constraints}
     excluded = {name: some for name, some in excluded.items() if name in present}
     weights = {name: _outside(some, dropped[INTERVALS]) for name, some in of_imu.items()}
@@ -350,9 +276,7 @@ def _with_next_fix(problem: Problem, spans: list[tuple[float, float]]) -> list[t
 
 def _outside(some: RowWeights, spans: list[tuple[float, float]]) -> RowWeights:
     """The weights of rows outside spans."""
-    keep = np.ones(len(some.t), dtype=bool)
-    for begin, end in spans:
-        keep &= (some.t < begin - SAME_TIME) | (some.t > end + SAME_TIME)
+    keep = ~mask_within(some.t, spans)
     return RowWeights(some.t[keep], some.weight[keep])
 
 
@@ -360,43 +284,6 @@ def excluded_share(problem: Problem, noise: NoiseModel) -> float:
     """Share of the information of the positions that a noise model leaves out."""
     rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
     return 0.0 if rows is None else 1.0 - float(np.mean(row_weights(problem.t[rows.keyframe], noise, rows.name)))
-
-
-def evidence(
-    problem: Problem, about: Points, spans: list[tuple[float, float]], single: Mapping[tuple[str, ...], Problem]
-) -> tuple[float, Array, int]:
-    """Log-likelihood of innovations before all spans, (M, 7) from each span's beginning on, by `_WRONG`, and passes.
-
-    Parameters
-    ----------
-    problem : with its noise model and no fix left out.
-    about : points of all keyframes.
-    spans : s, first and last wrong fix, in order and apart.
-    single : the problem with more noise of single intervals of the IMU, and with less weight of single rows.
-    """
-    edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
-    known = values_of(problem, about)
-    found: list[Array] = []
-    before, passes = 0.0, 0
-    present = {rows.name for rows in problem.constraints}
-    for kinds in _WRONG:
-        possible = present & set(kinds) if kinds == WHEELS else kinds in single or present.issuperset(kinds)
-        if not possible:
-            found.append(np.full(len(spans), -np.inf))
-            continue
-        ways = [single.get(kinds, problem)]
-        if kinds and kinds not in single:
-            ways = [with_common_errors(problem, spans, kinds)]
-        if kinds and set(kinds) <= set(FIXES):
-            ways.append(with_own_errors(problem, spans, kinds))
-        each = []
-        for one in ways:
-            likelihood = refilter(one, points_of(one, about.states, known)).log_likelihood
-            passes += 1
-            before = float(np.sum(likelihood[: edges[0]])) if not kinds else before
-            each.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)])
-        found.append(np.max(each, axis=0))
-    return before, np.array(found).T, passes
 
 
 def join_spans(found: tuple[ExcludedSpan, ...]) -> list[tuple[float, float]]:

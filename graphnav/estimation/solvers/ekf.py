@@ -56,7 +56,8 @@ from graphnav.estimation.solvers.recursion import STRETCH, filter_rows, predict,
 from graphnav.estimation.solvers.retest import finds_fault
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
-from graphnav.estimation.solvers.watch import Bank, Verdicts
+from graphnav.estimation.solvers.verdicts import Verdicts
+from graphnav.estimation.solvers.watch import Bank
 from graphnav.imu.dynamics import SCALE
 
 _PASSES = 4  # about where the pass before led

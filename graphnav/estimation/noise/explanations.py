@@ -1,0 +1,148 @@
+"""What may be wrong in spans of a recording, each as a problem of its own, and how likely it makes the measurements."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
+from graphnav.core.rotation import Array
+from graphnav.core.state import Parameter, States
+from graphnav.estimation.noise.model import INTERVALS
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.ekf import refilter
+from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.passes import points_of, values_of
+from graphnav.estimation.solvers.watch import MINUTE, WIDE
+from graphnav.recording import Recording
+
+FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
+ROWS = ("rows",)
+WRONG: tuple[tuple[str, ...], ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS, ROWS)
+_NONE = 1e-9  # sigma of an error that is not there
+
+
+def mask_within(t: Array, spans: list[tuple[float, float]]) -> Array:
+    """(N,) mask of times (N,) s in spans, ends included."""
+    out = np.zeros(len(t), dtype=bool)
+    for begin, end in spans:
+        out |= (t >= begin - SAME_TIME) & (t <= end + SAME_TIME)
+    return out
+
+
+@dataclass(frozen=True)
+class _Shifted(Constraint):
+    """Rows of a constraint with an error in common within spans."""
+
+    inner: Any = None
+    error: str = ""
+    since: Any = None  # (N,) s since the span began
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return str(self.inner.name)
+
+    @property
+    def axes(self) -> tuple[str, ...]:  # type: ignore[override]
+        return tuple(self.inner.axes)
+
+    @classmethod
+    def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
+        return np.empty(0)
+
+    @classmethod
+    def build(cls, scene: BuildContext) -> None:
+        return None
+
+    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
+        unknown = parameters[self.error]  # (n, 2 m), at the beginning of the span and growth in a minute
+        linear = self.inner.linearize(states, {k: v for k, v in parameters.items() if k != self.error}, rows)
+        n, m = linear.residual.shape
+        minutes = (self.since[rows] / MINUTE)[:, None]
+        J = np.concatenate([np.broadcast_to(np.eye(m), (n, m, m)), minutes[..., None] * np.eye(m)], axis=-1)
+        residual = linear.residual + unknown[:, :m] + minutes * unknown[:, m:]
+        return Linearized(residual, linear.jacobians | {self.error: J}, linear.sigma)
+
+
+def with_common_errors(problem: Problem, spans: list[tuple[float, float]], kinds: tuple[str, ...]) -> Problem:
+    """The problem with one unknown error of each of some constraints in each span (s)."""
+    begins, wide = [float(problem.t[0]) - 1.0], [0.0]
+    for a, b in spans:
+        begins += [a, b + 2.0 * SAME_TIME]  # a node holds from this much before it
+        wide += [1.0, 0.0]
+
+    def shifted(rows: Constraint) -> Constraint:
+        if rows.name not in kinds:
+            return rows
+        name, m = f"{rows.name}_fault", len(rows.axes)
+        sigma = np.maximum(np.outer(wide, np.full(2 * m, WIDE[rows.unit])), _NONE)
+        own = Parameter(name, np.zeros(sigma.shape), sigma, rows.unit, begins=np.array(begins))
+        t = problem.t[rows.keyframe]
+        return _Shifted(
+            keyframe=rows.keyframe,
+            parameters=(*rows.parameters, own),
+            weight=rows.weight,
+            inner=rows,
+            error=name,
+            since=t - np.array(begins)[np.searchsorted(begins, t + SAME_TIME, side="right") - 1],
+        )
+
+    return replace(problem, constraints=tuple(shifted(rows) for rows in problem.constraints))
+
+
+def with_own_errors(problem: Problem, spans: list[tuple[float, float]], kinds: tuple[str, ...]) -> Problem:
+    """The problem with an unknown error of each row of some constraints in the spans (s), as a frozen receiver has."""
+
+    def loose(rows: Constraint) -> Constraint:
+        if rows.name not in kinds:
+            return rows
+        t = problem.t[rows.keyframe]
+        within = mask_within(t, spans)
+        sigma: Array = rows.sigma  # type: ignore[attr-defined]
+        weight = np.ones(len(rows)) if rows.weight is None else rows.weight
+        wide = np.min(sigma / np.hypot(sigma, WIDE[rows.unit]), axis=1) ** 2
+        return replace(rows, weight=np.where(within, np.minimum(weight, wide), weight))
+
+    return replace(problem, constraints=tuple(loose(rows) for rows in problem.constraints))
+
+
+def evidence(
+    problem: Problem, about: Points, spans: list[tuple[float, float]], single: Mapping[tuple[str, ...], Problem]
+) -> tuple[float, Array, int]:
+    """Log-likelihood of innovations before all spans, (M, 7) from each span's beginning on, by `WRONG`, and passes.
+
+    Parameters
+    ----------
+    problem : with its noise model and no fix left out.
+    about : points of all keyframes.
+    spans : s, first and last wrong fix, in order and apart.
+    single : the problem with more noise of single intervals of the IMU, and with less weight of single rows.
+    """
+    edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
+    known = values_of(problem, about)
+    found: list[Array] = []
+    before, passes = 0.0, 0
+    present = {rows.name for rows in problem.constraints}
+    for kinds in WRONG:
+        possible = present & set(kinds) if kinds == WHEELS else kinds in single or present.issuperset(kinds)
+        if not possible:
+            found.append(np.full(len(spans), -np.inf))
+            continue
+        ways = [single.get(kinds, problem)]
+        if kinds and kinds not in single:
+            ways = [with_common_errors(problem, spans, kinds)]
+        if kinds and set(kinds) <= set(FIXES):
+            ways.append(with_own_errors(problem, spans, kinds))
+        each = []
+        for one in ways:
+            likelihood = refilter(one, points_of(one, about.states, known)).log_likelihood
+            passes += 1
+            before = float(np.sum(likelihood[: edges[0]])) if not kinds else before
+            each.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)])
+        found.append(np.max(each, axis=0))
+    return before, np.array(found).T, passes
