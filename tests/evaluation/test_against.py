@@ -107,3 +107,24 @@ def test_what_cannot_stand_beside_ours_is_one_line(drive, tmp_path, capsys, more
     arguments = ["compare", str(drive), "-o", str(tmp_path / "out"), "--solvers", "ekf", "--noise", "stated", *more]
     assert name in refuse_command(capsys, key, *arguments)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("kind", ["nav", "tum"])
+@pytest.mark.parametrize(("period", "offset"), [(1.0, 0.5), (0.2, 0.1), (0.02, 0.0)])
+def test_epochs_of_its_own_cost_a_file_nothing(tmp_path, kind, period, offset):
+    """An exact file, once a second to fifty times, beside a truth of five rows a second, none of them together."""
+
+    def rows(period: float, offset: float) -> Trajectory:
+        part = moved(0.0)
+        return part.take(np.abs((part.t - offset) / period - np.round((part.t - offset) / period)) < 1e-6)
+
+    truth, track = rows(0.2, 0.0), rows(period, offset)
+    write_folder(replace(RECORDING, truth=Truth(truth.t, truth.llh, None, truth.v, truth.rph), gps_zero=ZERO), tmp_path)
+    if kind == "tum":  # neither its place nor its velocity
+        track = replace(track, llh=LocalFrame(track.llh[0]).from_llh(track.llh), frame="local", v=None)
+    utc = np.datetime64("2022-03-09T23:59:42", "us") + np.round(track.t * 1e6).astype("timedelta64[us]")
+    write_as(kind, track, tmp_path / f"its.{kind}", utc)
+    row = compare(tmp_path, tmp_path / "out", "--against", tmp_path / f"its.{kind}")["its"]
+    assert float(row["epochs"]) >= 60
+    assert float(row["h_max_m"]) < 1e-3
+    assert float(row["heading_max_deg"]) < 0.05  # what 0.2 s of a turn are off the shortest arc
