@@ -9,7 +9,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import ConstraintRecord
-from graphnav.report.page import Raw
+from graphnav.report.page import Quantity
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ CONSISTENCY_HEAD = ("used", "rejected", "weight < 0.5", "mean NIS", "components"
 def consistency_row(c: Consistency) -> list[Any]:
     """The cells under `CONSISTENCY_HEAD`."""
     outside = f"{100 * c.outside:.2f} %" if np.isfinite(c.outside) else "-"
-    return [c.count - c.rejected, c.rejected, c.reduced, float(c.mean_nis), c.dof, Raw(outside), c.verdict]
+    return [c.count - c.rejected, c.rejected, c.reduced, float(c.mean_nis), c.dof, Quantity(outside), c.verdict]
 
 
 def mean_or_nan(x: Array) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
 from graphnav.core.notes import Note
 from graphnav.estimation.noise.apply import row_weights
@@ -15,7 +16,6 @@ from graphnav.evaluation.segments import rms
 from graphnav.recording import Recording
 from graphnav.report import page
 from graphnav.report.consistency import consistency
-from graphnav.report.page import Raw
 from graphnav.report.plots import Spans
 from graphnav.report.tables import Withheld
 
@@ -113,7 +113,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
     return words
 
 
-def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> Raw:
+def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> Markup:
     """The few numbers to see first."""
     states = next(iter(solutions.values())).states
     way = float(np.linalg.norm(np.diff(states.p, axis=0), axis=1).sum())
@@ -140,7 +140,7 @@ def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: 
     return page.tiles(out)
 
 
-def believe(name: str, errors: Errors) -> Raw:
+def believe(name: str, errors: Errors) -> Markup:
     """One sentence that compares errors with their sigma (and the truth's own, where it states one)."""
     from graphnav.evaluation.sigmas import judge_sigmas
 
@@ -179,7 +179,7 @@ def believe(name: str, errors: Errors) -> Raw:
     return page.paragraph(f"{name}: the stated sigma is consistent: {measured}.{rest}", "verdict good")
 
 
-def believe_without_truth(solution: Solution) -> Raw:
+def believe_without_truth(solution: Solution) -> Markup:
     """One sentence on what innovations or residuals say of the sigma, where there is no truth to say it."""
     kind, size, used = _measure_consistency(solution)
     name = solution.solver
@@ -204,10 +204,10 @@ def believe_without_truth(solution: Solution) -> Raw:
     return page.paragraph(said, "verdict")
 
 
-def describe_closure(name: str, metrics: Mapping[str, Any] | None) -> list[Raw]:
+def describe_closure(name: str, metrics: Mapping[str, Any] | None) -> list[Markup]:
     """How far from the start a loop ended, where that is the truth."""
     if not metrics or metrics.get("closure_h_m") is None:
         return []
-    h, up, way, share = (page.text(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))
+    h, up, way, share = (page.show(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))
     words = f"the loop of {way} m closes to {h} m horizontally ({share} % of the way) and {up} m in height."
-    return [page.paragraph(Raw(f"{page.text(name)}: {words}"), "verdict")]
+    return [page.paragraph(f"{name}: {words}", "verdict")]
