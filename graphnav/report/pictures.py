@@ -157,9 +157,16 @@ def error_pictures(errors: Mapping[str, Errors], start: float, end: float, spans
         if chosen:
             banded = len(chosen) < 3 and any(s.sigma is not None for s in chosen.values())
             note = "The line belongs inside the band." if banded else ""
-            figure = plots.bands(chosen, parts, unit, end, spans=spans)
+            known = _find_known(chosen)
+            cut = {name: s.take(known) for name, s in chosen.items()}
+            figure = plots.bands(cut, [parts[k] for k in known], unit, end, spans=spans)
             out.append(page.picture(figure, f"{kind.capitalize()} error", note))
     return out
+
+
+def _find_known(series: Mapping[str, Series]) -> list[int]:
+    """The components that any of the series has a value of: a truth may have no heights."""
+    return [k for k in range(3) if any(np.isfinite(s.value[:, k]).any() for s in series.values())]
 
 
 def nees_pictures(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:
@@ -168,10 +175,10 @@ def nees_pictures(errors: Mapping[str, Errors], start: float, end: float, spans:
     for name, e in errors.items():
         series[name] = Series(e.t - start, np.column_stack([e.nees_p, e.nees_v, e.nees_rph]))
         dofs[0] = e.dof_p
-    known = [k for k in range(3) if any(np.isfinite(s.value[:, k]).any() for s in series.values())]
+    known = _find_known(series)
     if not known:
         return []
-    cut = {name: Series(s.t, s.value[:, known]) for name, s in series.items()}
+    cut = {name: s.take(known) for name, s in series.items()}
     figure = plots.nees(cut, [names[k] for k in known], [dofs[k] for k in known], end, spans=spans)
     note = (
         "Squared error over its covariance, divided by its degrees of freedom: about 1 where sigma is true, above the "

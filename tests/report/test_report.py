@@ -227,6 +227,14 @@ def test_report_of_next_to_nothing(tmp_path, recording):
     checked(path)
 
 
+def test_a_truth_without_heights_has_no_panel_of_them():
+    flat = errors_of()
+    flat.p[:, 2] = np.nan
+    (position, _) = report_pictures.error_pictures({"ekf": flat}, START, COUNT, {})
+    (figure,) = (json.loads(unpacked(packed)) for packed in re.findall(r'data-size="\d+">([^<]*)<', position))
+    assert len([name for name in figure["layout"] if name.startswith("yaxis")]) == 2
+
+
 @dataclass(frozen=True)
 class Excluded:
     t_start: float

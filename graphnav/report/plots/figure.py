@@ -175,7 +175,7 @@ class Figure:
             logarithmic = log if isinstance(log, bool) else log[k]
             look = {**_LOOK, "range": list(ylim), "domain": [max(top - height / inner, 0.0), top], "anchor": xname}
             if logarithmic:
-                look |= {"type": "log", "minorloglabels": "complete", "nticks": 4}
+                look |= {"type": "log", "minorloglabels": "complete", "nticks": 3}
             if names is not None:
                 look |= {"tickmode": "array", "tickvals": list(names), "ticktext": list(names.values()), "ticks": ""}
                 look["automargin"] = True
