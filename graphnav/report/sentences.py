@@ -146,7 +146,8 @@ def believe(name: str, errors: Errors) -> Markup:
 
     judged = judge_sigmas(errors)
     if not judged:
-        return page.paragraph(f"{name}: no epoch has both an error and a sigma, so sigma cannot be judged.", "verdict")
+        words = f"{name}: no epoch has both an error and a sigma, so sigma cannot be judged."
+        return page.paragraph(Note("sigma.not_judged", words), "verdict")
     worst = [j for j in judged if j.verdict == "too small"] or [j for j in judged if j.verdict == "unclear"]
     shown = worst or judged
     measured = page.and_list(
@@ -159,49 +160,54 @@ def believe(name: str, errors: Errors) -> Markup:
     blocks = page.and_list([j.block for j in shown])
     if worst and worst[0].verdict == "too small":
         when = " at times" if all(j.inside > 0.9 for j in worst) else ""
-        return page.paragraph(
-            f"{name}: the stated sigma is too small{when}, of {blocks}: {measured}. Errors of the truth itself count "
-            "here as well.",
-            "verdict bad",
-        )
+        words = f"{name}: the stated sigma is too small{when}, of {blocks}: {measured}."
+        words += " Errors of the truth itself count here as well."
+        return page.paragraph(Note("sigma.too_small", words), "verdict bad")
     if worst:
         alike = page.and_list([f"{j.effective:.0f}" for j in worst])
-        return page.paragraph(
+        words = (
             f"{name}: whether sigma of {blocks} can be relied on remains open: {measured}, but the errors are alike "
-            f"for so long that they are worth {alike} independent values, and chance may do that.",
-            "verdict",
+            f"for so long that they are worth {alike} independent values, and chance may do that."
         )
+        return page.paragraph(Note("sigma.unclear", words), "verdict")
     seen = {j.block for j in judged}
     unseen = [what for what in ("position", "velocity", "attitude") if what not in seen]
     rest = f" Nothing is there to judge {page.and_list(unseen)} by." if unseen else ""
     if all(j.verdict == "cautious" for j in judged):
-        return page.paragraph(f"{name}: the stated sigma is cautious: {measured}.{rest}", "verdict")
-    return page.paragraph(f"{name}: the stated sigma is consistent: {measured}.{rest}", "verdict good")
+        return page.paragraph(
+            Note("sigma.cautious", f"{name}: the stated sigma is cautious: {measured}.{rest}"), "verdict"
+        )
+    words = f"{name}: the stated sigma is consistent: {measured}.{rest}"
+    return page.paragraph(Note("sigma.consistent", words), "verdict good")
 
 
 def believe_without_truth(solution: Solution) -> Markup:
     """One sentence on what innovations or residuals say of the sigma, where there is no truth to say it."""
     kind, size, used = _measure_consistency(solution)
-    name = solution.solver
-    missing = "there is no truth to compare with"
+    missing = f"{solution.solver}: there is no truth to compare with"
+    larger, mark = size > _TOO_LARGE[kind], ""
     if used < _FEWEST:
-        return page.paragraph(f"{name}: no truth and too few measurements to judge sigma by.", "verdict")
-    if kind == "innovation":
+        note = Note("no_truth.few", f"{missing}, and too few measurements to judge sigma by.")
+    elif kind == "innovation":
         measured = f"they are {size:.2f} times as large as predicted (RMS; 1 where sigma is true)"
-        if size > _TOO_LARGE[kind]:
-            return page.paragraph(
-                f"{name}: {missing}, and sigma looks too small for the innovations: {measured}.", "verdict bad"
-            )
-        if size < 0.5:
-            return page.paragraph(
-                f"{name}: {missing}; the stated sigma looks cautious for the innovations: {measured}.", "verdict"
-            )
-        return page.paragraph(f"{name}: {missing}. Innovations speak for the stated sigma: {measured}.", "verdict good")
-    measured = f"residuals are {size:.2f} times the measurements' sigma (RMS; 1 or a little less where sigma is true)"
-    if size > _TOO_LARGE[kind]:
-        return page.paragraph(f"{name}: {missing}, and sigma looks too small: {measured}.", "verdict bad")
-    said = f"{name}: {missing}, and residuals of a fit tell little; a filter's innovations tell more. The {measured}."
-    return page.paragraph(said, "verdict")
+        if larger:
+            words, mark = f"{missing}, and sigma looks too small for the innovations: {measured}.", "bad"
+            note = Note("no_truth.too_small", words)
+        elif size < 0.5:
+            words = f"{missing}; the stated sigma looks cautious for the innovations: {measured}."
+            note = Note("no_truth.cautious", words)
+        else:
+            words, mark = f"{missing}. Innovations speak for the stated sigma: {measured}.", "good"
+            note = Note("no_truth.consistent", words)
+    else:
+        measured = f"residuals are {size:.2f} times the measurements' sigma"
+        measured += " (RMS; 1 or a little less where sigma is true)"
+        if larger:
+            note, mark = Note("no_truth.residuals_large", f"{missing}, and sigma looks too small: {measured}."), "bad"
+        else:
+            words = f"{missing}, and residuals of a fit tell little; a filter's innovations tell more. The {measured}."
+            note = Note("no_truth.residuals_only", words)
+    return page.paragraph(note, f"verdict {mark}".strip())
 
 
 def describe_closure(name: str, metrics: Mapping[str, Any] | None) -> list[Markup]:

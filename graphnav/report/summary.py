@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.solution import Solution
@@ -199,7 +200,7 @@ def left_out(solution: Solution, start: float) -> list[Markup]:
     ]
     if less and len(lines) < _LINES:
         lines.append(f"less than half weight, because they are farther off than chance allows: {page.and_list(less)}")
-    return [page.heading("Left out"), page.bullets(lines or ["Nothing was left out."])]
+    return [page.heading("Left out"), page.bullets(lines or [Note("left_out.nothing", "Nothing was left out.")])]
 
 
 def links(files: Sequence[str]) -> list[Markup]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import INTERVALS
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
@@ -187,7 +188,7 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Markup]:
     """How good the sensors were taken to be, and which rows weigh less."""
     noise = solution.noise
     if not rows and not noise.weights:
-        return [page.paragraph("All noise figures are used as they are stated.")]
+        return [page.paragraph(Note("noise.as_stated", "All noise figures are used as they are stated."))]
     out = []
     if rows:
         cells = [
@@ -210,7 +211,8 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Markup]:
             "variances. A figure with few degrees of freedom is mostly what was expected beforehand."
         )
         if len(solution.between) > 1:
-            note += f" The recording was cut into {len(solution.between)} pieces: these are the figures of the first."
+            cut = f"The recording was cut into {len(solution.between)} pieces: these are the figures of the first."
+            out.append(page.paragraph(Note("noise.of_first_piece", cut), "soft"))
         out.append(page.paragraph(note, "soft"))
     less = [
         f"{np.count_nonzero(some.weight < 1.0)} of {len(solution.records[name].t)} rows of {name} are off by "
