@@ -204,8 +204,8 @@ def write_solver(
     done = time.perf_counter()
     report = folder / "report.html"
     failed = _attempt(lambda _: _draw_solver(outcome, name, folder, provenance, detectors), report) if pages else []
-    spent = {"writing": done - began, "report": time.perf_counter() - done}
-    write_json(folder / "summary.json", solver_summary(outcome, name, spent, provenance))
+    seconds = {"writing": done - began, "report": time.perf_counter() - done}
+    write_json(folder / "summary.json", solver_summary(outcome, name, seconds, provenance))
     return failed
 
 

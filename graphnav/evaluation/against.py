@@ -136,8 +136,10 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         )
     if np.any(arm):
         track = interpolate(track, track.t, max_gap=_MAX_GAP, lever_arm=-arm)[0]
-        said = ", ".join(f"{x:.2f}" for x in arm)
-        notes.append(Note("against.point", f"{asked.path.name}: moved to the IMU from [{said}] m (right, forward, up)"))
+        shown = ", ".join(f"{x:.2f}" for x in arm)
+        notes.append(
+            Note("against.point", f"{asked.path.name}: moved to the IMU from [{shown}] m (right, forward, up)")
+        )
     track = replace(track, name=name)
     _, known = interpolate(track, reference.t, max_gap=_MAX_GAP)
     t = reference.t[known]

@@ -242,7 +242,7 @@ def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans
 
 def _list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[Markup]:
     """Why the result cannot be trusted, where it cannot."""
-    return [page.paragraph(said, "verdict bad") for said in words.list_doubts(solutions, errors)]
+    return [page.paragraph(doubt, "verdict bad") for doubt in words.list_doubts(solutions, errors)]
 
 
 def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[Markup]:
@@ -250,8 +250,8 @@ def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -
     if errors:
         return [words.believe(name, e) for name, e in errors.items()]
     # where there is no truth a filter's innovations judge the model that all share better than any residuals
-    met = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
-    return [words.believe_without_truth(solution) for solution in met or solutions.values()]
+    filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
+    return [words.believe_without_truth(solution) for solution in filters or solutions.values()]
 
 
 def _consistency(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:

@@ -100,8 +100,8 @@ def fixes_of(recording: Recording, solution: Solution) -> plots.Fixes | None:
             "sigma 0.1 to 1 m": (sd >= 0.1) & (sd < 1.0),
             "sigma 1 m and more": ~(sd < 1.0),
         }
-        said = {name: rows for name, rows in classes.items() if rows.any()}
-        kinds = said if len(said) > 1 else kinds
+        present = {name: rows for name, rows in classes.items() if rows.any()}
+        kinds = present if len(present) > 1 else kinds
     return plots.Fixes(t - recording.start, solution.frame.from_llh(gnss.llh), out, kinds)
 
 

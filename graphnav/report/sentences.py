@@ -39,8 +39,8 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
         fixes = solution.records.get("gnss_position")
         left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
         if left_out > _MOST:
-            said = f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest "
-            out.append(Note("doubt.left_out", said + "and is left out"))
+            words = f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest "
+            out.append(Note("doubt.left_out", words + "and is left out"))
             break  # all solvers use the same noise model
     wrong = []
     for name, e in errors.items():
@@ -49,8 +49,8 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
             sizes = page.and_list([f"{j.size:.2g} times sigma ({j.block})" for j in small])
             wrong.append(f"{name}: errors are {sizes}")
     if not errors:
-        met = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
-        for solution in met or solutions.values():
+        filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
+        for solution in filters or solutions.values():
             kind, size, used = _measure_consistency(solution)
             if used >= _FEWEST and size > _TOO_LARGE[kind]:
                 wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")

@@ -150,9 +150,9 @@ def _list_stated(recording: Recording, rows: Array) -> list[Any]:
     assert gnss is not None
     out: list[Any] = [float(np.median(np.hypot(gnss.sd[rows, 0], gnss.sd[rows, 1])))]
     if gnss.satellites is not None:
-        said = gnss.satellites[rows]
-        said = said[np.isfinite(said)]
-        out += [Quantity(f"{x:.0f}") for x in (np.median(said), said.min())] if len(said) else ["-", "-"]
+        counts = gnss.satellites[rows]
+        counts = counts[np.isfinite(counts)]
+        out += [Quantity(f"{x:.0f}") for x in (np.median(counts), counts.min())] if len(counts) else ["-", "-"]
     return out
 
 

@@ -315,8 +315,8 @@ def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Markup]
             value, sigma = one.scale * float(p.value[-1, k]), one.scale * float(p.sigma[-1, k])
             known = "yes" if p.observable[k] else "no: mostly the prior"
             before = one.scale * float(p.prior_sigma[k])
-            said = [page.format_measured(value, sigma), page.format_measured(sigma, sigma), before]
-            rows.append([one.words, *said, one.unit, known])
+            shown = [page.format_measured(value, sigma), page.format_measured(sigma, sigma), before]
+            rows.append([one.words, *shown, one.unit, known])
     head = ["parameter", "value", "sigma", "sigma before", "unit", "seen by the data"]
     return [page.table(head, rows)] if rows else []
 
@@ -340,8 +340,8 @@ def run_table(solutions: Mapping[str, Solution]) -> list[Markup]:
     shared = [note for note in next(iter(solutions.values())).notes if all(note in s.notes for s in solutions.values())]
     theirs = [f"{name}: {note}" for name, s in every.items() for note in s.notes if note not in shared]
     table = page.table(["stage", *(page.solver(name) for name in solutions)], rows)
-    said = [*notes, *shared, *theirs]
-    return [page.columns([[table], [page.bullets(said)]]) if said else table]
+    lines = [*notes, *shared, *theirs]
+    return [page.columns([[table], [page.bullets(lines)]]) if lines else table]
 
 
 def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Markup]:

@@ -31,14 +31,14 @@ class Panel:
         self.axes = {"xaxis": figure.x_of(k), "yaxis": _axis("y", k)}
 
     def _add(self, label: str, trace: dict[str, Any], quiet: bool = False, at: str = "", way: bool = False) -> None:
-        said = {"hoverinfo": "skip"}
+        hover = {"hoverinfo": "skip"}
         if not quiet:
             place = ("%{x:.2f}, %{y:.2f} " if way else "%{y:.4~g} ") + self.unit
-            said = {"hovertemplate": f"{place.strip()}{at}<extra>{label}</extra>"}
+            hover = {"hovertemplate": f"{place.strip()}{at}<extra>{label}</extra>"}
         first = bool(label) and label not in self.figure.labels
         self.figure.labels.add(label)
         self.figure.data.append(
-            {"type": "scatter", **self.axes, "name": label, "legendgroup": label, "showlegend": first, **said, **trace}
+            {"type": "scatter", **self.axes, "name": label, "legendgroup": label, "showlegend": first, **hover, **trace}
         )
 
     def line(
