@@ -235,7 +235,7 @@ def _clocks(recording: Recording) -> list[page.TimeAxis]:
 
 def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans) -> Shades:
     """Spans of time worth a tint, s from the start, by what they are."""
-    excluded = [(part.t_start - start, part.t_end - start) for part in getattr(solution, "excluded", ())]
+    excluded = [(part.t_start - start, part.t_end - start) for part in solution.excluded]
     gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
     return {"withheld": gone, "no GNSS": list(outages), "excluded": excluded}
 

@@ -87,7 +87,7 @@ def fixes_of(recording: Recording, solution: Solution) -> plots.Fixes | None:
     if record is not None and len(record.t):
         gone = record.t[record.weight <= 1e-9]
         out |= np.isin(np.round(t, 3), np.round(gone, 3))
-    for part in getattr(solution, "excluded", ()):
+    for part in solution.excluded:
         if part.kind in ("gnss", "gnss_position"):
             out |= (t >= part.t_start) & (t <= part.t_end)
     kinds = {"GNSS fix": np.ones(len(t), dtype=bool)}

@@ -105,7 +105,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
         listed = [f"{a:.0f} to {b:.0f} s" for a, b in outages[:_LISTED]]
         more = [f"{len(outages) - _LISTED} more"] if len(outages) > _LISTED else []
         words += f" There were no GNSS fixes from {page.and_list([*listed, *more])}."
-    excluded = sum(int(part.count) for part in getattr(solution, "excluded", ()))
+    excluded = sum(int(part.count) for part in solution.excluded)
     if excluded:
         words += f" {excluded} measurements were excluded as faulty."
     if not several and solution.stopped:

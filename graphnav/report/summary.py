@@ -184,7 +184,7 @@ def _rows_at(t: Array, of: Array | None) -> np.ndarray:
 
 def left_out(solution: Solution, start: float) -> list[Markup]:
     """What was left out and why, in three lines: the largest spans, the rest together, what weighs less."""
-    spans = sorted(getattr(solution, "excluded", ()), key=lambda p: -p.count)
+    spans = sorted(solution.excluded, key=lambda p: -p.count)
     some = spans[:_LINES] if len(spans) <= _LINES else spans[: _LINES - 1]
     lines = [
         f"{p.kind}, {p.count} rows from {p.t_start - start:.1f} to {p.t_end - start:.1f} s: {p.reason or 'faulty'}"

@@ -241,7 +241,7 @@ def _format_range(log_factor: float, sigma: float) -> Quantity:
 
 def excluded_table(solution: Solution, start: float) -> list[Markup]:
     """What the solver left out of itself, when and why."""
-    parts = getattr(solution, "excluded", ())
+    parts = solution.excluded
     if not parts:
         return []
     rows = [

@@ -7,7 +7,7 @@ import json
 import re
 import tomllib
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -24,7 +24,14 @@ from graphnav.core.state import States
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.table import figure_rows
-from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Separation, Solution, join_solutions
+from graphnav.estimation.solution import (
+    ConstraintRecord,
+    ExcludedSpan,
+    ParameterEstimate,
+    Separation,
+    Solution,
+    join_solutions,
+)
 from graphnav.evaluation.metrics import Errors
 from graphnav.evaluation.segments import relative_errors
 from graphnav.imu.dynamics import SCALE
@@ -236,23 +243,9 @@ def test_a_truth_without_heights_has_no_panel_of_them():
     assert len([name for name in figure["layout"] if name.startswith("yaxis")]) == 2
 
 
-@dataclass(frozen=True)
-class Excluded:
-    t_start: float
-    t_end: float
-    kind: str
-    count: int
-    reason: str
-
-
-@dataclass(frozen=True)
-class Excluding(Solution):
-    excluded: tuple[Excluded, ...] = ()
-
-
 def test_what_was_excluded_is_listed_and_marked(tmp_path, recording):
-    part = Excluded(START + 200.0, START + 219.5, "gnss_position", 20, "jumped by 31 m <sideways>")
-    found = Excluding(**{**vars(solution()), "excluded": (part,)})
+    part = ExcludedSpan("gnss_position", START + 200.0, START + 219.5, 20, "jumped by 31 m <sideways>")
+    found = replace(solution(), excluded=(part,))
     _, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}))
     for words in ("200.0 to 219.5 s", "jumped by 31 m <sideways>", "20 measurements were excluded", "excluded fix"):
         assert words in text, words
@@ -265,8 +258,8 @@ def test_what_was_excluded_is_listed_and_marked(tmp_path, recording):
 
 
 def test_of_many_exclusions_ten_are_shown_and_three_lines_say_what_was_left_out(tmp_path, recording):
-    parts = tuple(Excluded(START + 20.0 * k, START + 20.0 * k + 4.0, "gnss_position", 5 + k, "") for k in range(14))
-    found = Excluding(**{**vars(solution()), "excluded": parts})
+    parts = tuple(ExcludedSpan("gnss_position", START + 20.0 * k, START + 20.0 * k + 4.0, 5 + k) for k in range(14))
+    found = replace(solution(), excluded=parts)
     (shown, folded) = excluded_table(found, START)[1:]
     assert shown.count("<tr>") == 11
     assert "<details>" in folded
