@@ -38,11 +38,14 @@ WANTED = {
         "vn",
         "vu",
         "vd",
+        "sd_ve",
+        "sd_vn",
+        "sd_vu",
         "speed",
         "course",
         "type",
         "satellites",
-    ),
+    ),  # fmt: skip
     "odometer": ("t", "speed", *WHEELS),
     "gravity": ("t", "pull_x", "pull_y", "pull_z"),
 }
