@@ -45,7 +45,7 @@ WANTED = {
         "course",
         "type",
         "satellites",
-    ),  # fmt: skip
+    ),
     "odometer": ("t", "speed", *WHEELS),
     "gravity": ("t", "pull_x", "pull_y", "pull_z"),
 }
