@@ -80,7 +80,7 @@ CONSTANTS = (
     Constant(f"{SOLVERS}.watch", "_CLOCKS"),
     Constant(f"{SOLVERS}.watch", "_BRAKING"),
     Constant(f"{SOLVERS}.verdicts", "_CHANCE", 2.0, whole=True),
-    Constant("graphnav.estimation.preparation", "_FAR_AWAY"),
+    Constant("graphnav.estimation.posing", "_FAR_AWAY"),
     Constant("graphnav.estimation.preparation", "_LOST"),
     Constant("graphnav.estimation.preparation", "_MOST"),
 )

@@ -28,7 +28,8 @@ from graphnav.estimation.long_drives import OVERLAP, crop_solution, shares
 from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.words import describe_far
-from graphnav.estimation.preparation import prepare, start_sigma
+from graphnav.estimation.posing import start_sigma
+from graphnav.estimation.preparation import prepare
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.separation import separation
 from graphnav.estimation.solution import Solution, join_solutions
