@@ -182,26 +182,17 @@ def _begin(problem: Problem, start: NoiseModel | None) -> _Components:
 
 
 def _first_points(problem: Problem, figures: _Components, opening: float | None) -> Points:
-    """Points of a filter that nothing is known before; without what it finds grossly wrong, if that is right."""
+    """Points of a filter that nothing is known before; without what it finds grossly wrong."""
     used = with_noise(problem, figures.model())
-    whole = ekf(used, opening=opening)
-    about = backward(used, whole)
+    about = backward(used, ekf(used, opening=opening))
     # what is grossly wrong takes a filter that uses everything too far away to be linearised there; what seems to drift
     # may as well be the filter, whose heading is not known yet
     sound = weigh_rows(used, refilter(used, about, watch=True, drifts=False).weights)
-    kept = np.ones(len(problem.t), dtype=bool)
-    for rows in sound.constraints:
-        if rows.weight is not None:
-            kept[rows.keyframe[rows.weight == 0.0]] = False
-    if kept.all():
+    if not any(rows.weight is not None and np.any(rows.weight == 0.0) for rows in sound.constraints):
         return about
     try:
-        without = ekf(sound, opening=opening)
-        # right measurements that are left out make those that are left no likelier, and may leave nothing to start at
-        if np.sum(without.log_likelihood[kept]) < np.sum(whole.log_likelihood[kept]):
-            return about
-        return backward(sound, without)
-    except EstimationError:
+        return backward(sound, ekf(sound, opening=opening))
+    except EstimationError:  # by figures that are far off, so much seems wrong that what is left leads nowhere
         return about
 
 
