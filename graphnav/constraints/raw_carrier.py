@@ -39,6 +39,7 @@ from graphnav.constraints.raw_gnss import (
     AXES,
     IONOSPHERE,
     ONE,
+    PER_ROW,
     PreparedRows,
     SatelliteConstraint,
     common_fields,
@@ -199,7 +200,7 @@ class GnssCarrier(SatelliteConstraint):
         found, pairs = both
         raw, j, k = found.raw, pairs.before, pairs.after
         common: dict[str, Any] = common_fields(scene, found)
-        common |= {name: common[name][k] for name in ("keyframe", "s_n", "R_ln", "satellite", "elevation", "level")}
+        common |= {name: common[name][k] for name in PER_ROW}
         if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
             common["robust"] = "cauchy"
         E = len(pairs.epochs)

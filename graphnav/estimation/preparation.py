@@ -25,7 +25,7 @@ from graphnav.detectors import Detections, detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment, align, with_known_heading
 from graphnav.estimation.alignment.first import pick_fixes
-from graphnav.estimation.fixing import fix, split_carriers
+from graphnav.estimation.fixing import fix, float_arcs, split_carriers
 from graphnav.estimation.noise.apply import with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import (
@@ -38,7 +38,7 @@ from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe
 from graphnav.estimation.problem import Problem, build_problem
-from graphnav.estimation.solution import Solution
+from graphnav.estimation.solution import CarrierArcs, Solution
 from graphnav.estimation.solvers.ekf import ekf, near, refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import (
@@ -74,6 +74,7 @@ class Prepared:
     timings: dict[str, float]
     passes: Counter[str] = field(default_factory=Counter)
     fixed: dict[str, Array] = field(default_factory=dict)  # `Solution.fixed` of the filter, and of the others ("")
+    arcs: dict[str, CarrierArcs] = field(default_factory=dict)  # `Solution.arcs`, the same way
 
     @property
     def diverged(self) -> bool:
@@ -204,14 +205,15 @@ def prepare(
     since = book("smoother", filtered)
     passes.update(filter=1, smoother=1)
     del timings["filter"]  # the filter's own solution has it
-    notes, epochs = describe(noise, problem), {}
+    notes, epochs, arcs = describe(noise, problem), {}, {"": float_arcs(problem)}
     if carriers[0] is not None:
         tell("ambiguities")
         fixed = fix(problem, carriers[0], smoothed, aligned.until, progress)
         problem, forward, smoothed = fixed.problem, fixed.forward, fixed.smoothed
         notes, epochs = (*notes, *fixed.notes), {"ekf": fixed.filtered_epochs, "": fixed.smoothed_epochs}
+        arcs = {"ekf": fixed.filtered_arcs, "": fixed.smoothed_arcs}
         book("ambiguities", since)
-    return Prepared(problem, noise, start, aligned, detections, forward, smoothed, notes, timings, passes, epochs)
+    return Prepared(problem, noise, start, aligned, detections, forward, smoothed, notes, timings, passes, epochs, arcs)
 
 
 def _estimate(
