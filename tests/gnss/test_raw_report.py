@@ -107,3 +107,10 @@ def test_pictures_are_of_raw_observations_alone(solved):
     assert parts.count("<figure") == 5 + len(kinds)
     plain = replace(one, records={k: r for k, r in one.records.items() if k not in kinds})
     assert satellite_parts(plain, recording.start, recording.duration, {}) == []
+
+
+def test_what_gtsam_gets_is_at_its_optimum(solved):
+    """Ambiguities are not among a solution's parameters: they come of the rest."""
+    one = solved[2]["batch"]
+    graph, values = one.to_gtsam()
+    assert graph.error(values) == pytest.approx(one.cost, rel=1e-6)
