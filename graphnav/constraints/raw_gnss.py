@@ -20,10 +20,11 @@ Distances are differences against a nominal place of each epoch, so that no digi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphnav.config import Settings
 from graphnav.config.raw_gnss import RawGnssSettings
@@ -68,7 +69,7 @@ PER_ROW = ("keyframe", "s_n", "R_ln", "satellite", "azimuth", "elevation", "leve
 
 @dataclass(frozen=True)
 class PreparedRows:
-    """What both kinds of rows need, of the rows that are used; made once for a scene."""
+    """What all kinds of rows need, of the rows that are used; made once for a scene."""
 
     raw: RawGnss
     keyframe: Array
@@ -81,26 +82,36 @@ class PreparedRows:
     nominal: Array  # (N, 3) m
     ionosphere: Array  # (N,) m
     stretch: Array  # (N,)
-    clock: Parameter
     spacing: float  # s from node to node of whatever changes slowly
 
+    @property
+    def clock(self) -> Parameter:
+        """The receiver's, anew at every epoch."""
+        epochs, first = np.unique(self.raw.t, return_index=True)
+        sigma = np.tile(_CLOCK_SIGMA, (len(epochs), 1))
+        return Parameter(CLOCK, self.raw.receiver_clock[first], sigma, "m, m/s", begins=epochs, reported=True)
 
-def prepare_rows(scene: BuildContext) -> PreparedRows | None:
+    def take(self, which: NDArray[np.bool_]) -> PreparedRows:
+        """Some of the rows."""
+        own = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name not in ("raw", "spacing")}
+        return replace(self, raw=self.raw.take(which), **own)
+
+
+def prepare_every(scene: BuildContext) -> PreparedRows | None:
+    """The rows that are used, with those of epochs that have no keyframe, which is -1 then."""
     raw = select_observations(scene.recording, scene.settings)
     if raw is None:
         return None
-    keyframe = scene.keyframe_at(raw.t)
     geometry = look(raw, raw.antenna, choose_coefficients(raw))
-    used = (keyframe >= 0) & (geometry.elevation >= np.radians(scene.settings.raw_gnss.elevation))
+    used = geometry.elevation >= np.radians(scene.settings.raw_gnss.elevation)
     if not used.any():
         return None
-    raw, keyframe = raw.take(used), keyframe[used]
+    raw = raw.take(used)
     geometry = look(raw, raw.antenna, choose_coefficients(raw))
     frame = scene.frame
-    epochs, first = np.unique(raw.t, return_index=True)
     return PreparedRows(
         raw=raw,
-        keyframe=keyframe,
+        keyframe=scene.keyframe_at(raw.t),
         s_n=(geometry.s - frame.r_e) @ frame.R_ne.T,
         v_n=rotate_earth(raw.v, geometry.distance / C) @ frame.R_ne.T,
         R_ln=earth.enu_axes(earth.ecef_to_llh(raw.antenna)) @ frame.R_ne.T,
@@ -110,19 +121,20 @@ def prepare_rows(scene: BuildContext) -> PreparedRows | None:
         nominal=(raw.antenna - frame.r_e) @ frame.R_ne.T,
         ionosphere=geometry.ionosphere,
         stretch=stretch(raw, geometry),
-        clock=Parameter(
-            CLOCK,
-            raw.receiver_clock[first],
-            np.tile(_CLOCK_SIGMA, (len(epochs), 1)),
-            "m, m/s",
-            begins=epochs,
-            reported=True,
-        ),
-        spacing=node_spacing(scene.settings.gnss.slow_times, _period(raw, scene.settings.raw_gnss)),
+        spacing=node_spacing(scene.settings.gnss.slow_times, period_of_epochs(raw, scene.settings.raw_gnss)),
     )
 
 
-def _period(raw: RawGnss, settings: RawGnssSettings) -> float:
+def prepare_rows(scene: BuildContext) -> PreparedRows | None:
+    """The rows of epochs that have keyframes."""
+    every = scene.share(prepare_every)
+    if every is None or (every.keyframe >= 0).all():
+        return every
+    there = every.keyframe >= 0
+    return every.take(there) if there.any() else None
+
+
+def period_of_epochs(raw: RawGnss, settings: RawGnssSettings) -> float:
     """s between the epochs that are used; a piece of a series may have too few to tell."""
     return period(raw.epochs[0]) if raw.catalogue is None else max(raw.catalogue.period, settings.period)
 
