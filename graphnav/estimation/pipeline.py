@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,9 +26,10 @@ from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation import faults
 from graphnav.estimation.long_drives import OVERLAP, crop_solution, shares
 from graphnav.estimation.noise.imu_floor import with_measured_floor
-from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.words import describe_far
-from graphnav.estimation.preparation import prepare, start_sigma
+from graphnav.estimation.posing import start_sigma
+from graphnav.estimation.preparation import prepare
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.separation import separation
 from graphnav.estimation.solution import Solution, join_solutions
@@ -154,16 +155,30 @@ def _solve_with_retry(
     progress: Progress | None,
     noise: NoiseModel | None,
 ) -> dict[str, Solution]:
-    """`_solve`, and once more without what covariances may not have the digits for."""
+    """`_solve`; where a filter breaks down, without what its covariance may not have the digits for, or as stated."""
     try:
         return _solve(recording, settings, frame, solvers, progress, noise)
     except (EstimationError, np.linalg.LinAlgError) as error:
-        if not settings.standstill.held_position:
+        if isinstance(error, EstimationError) and error.key != "solver.breakdown":
             raise
-        still = settings.standstill.model_copy(update={"held_position": False})
-        again = _solve(recording, settings.model_copy(update={"standstill": still}), frame, solvers, progress, noise)
-        note = Note("standstill.not_held", f"places of stops are not held: with them, {error}")
-        return {name: replace(one, notes=(note, *one.notes)) for name, one in again.items()}
+        for other, model, said in _simpler(settings, noise):
+            try:
+                again = _solve(recording, other, frame, solvers, progress, model)
+            except (EstimationError, np.linalg.LinAlgError):
+                continue
+            note = Note(said.key, f"{said}, {error}")
+            return {name: replace(one, notes=(note, *one.notes)) for name, one in again.items()}
+        raise
+
+
+def _simpler(settings: Settings, noise: NoiseModel | None) -> Iterator[tuple[Settings, NoiseModel | None, Note]]:
+    """Settings and noise models that ask less of a covariance, and what to say of them."""
+    still = settings.standstill.model_copy(update={"held_position": False})
+    if settings.standstill.held_position:
+        settings = settings.model_copy(update={"standstill": still})
+        yield settings, noise, Note("standstill.not_held", "places of stops are not held: with them")
+    if noise is None and settings.noise.mode != "stated":
+        yield settings, STATED, Note("noise.not_estimated", "noise is as stated, and no fix left out: to estimate it")
 
 
 def _solve(

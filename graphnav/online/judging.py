@@ -28,7 +28,7 @@ from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.noise.exclusion import estimate_without_faults
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe
-from graphnav.estimation.preparation import start_sigma
+from graphnav.estimation.posing import start_sigma
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.online.sensors import Sensors, unit_of

@@ -21,7 +21,7 @@ from graphnav.estimation.alignment import Alignment, align, ready, with_known_he
 from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.pipeline import origin
-from graphnav.estimation.preparation import start_sigma
+from graphnav.estimation.posing import start_sigma
 from graphnav.estimation.solution import ExcludedSpan, to_trajectory
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.watch import LONGEST

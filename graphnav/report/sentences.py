@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, key_of
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import own_solutions
@@ -42,6 +42,8 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
             said = f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest "
             out.append(Note("doubt.left_out", said + "and is left out"))
             break  # all solvers use the same noise model
+    notes = dict.fromkeys(note for solution in solutions.values() for note in solution.notes)
+    out += [Note(key, note) for note in notes if (key := key_of(note)) == "doubt.axes"]
     wrong = []
     for name, e in errors.items():
         small = [j for j in judge_sigmas(e) if j.verdict == "too small"]

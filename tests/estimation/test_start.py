@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,11 @@ from test_faults import left_out, moved
 from graphnav import load
 from graphnav.config import Settings
 from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import EstimationError
+from graphnav.core.notes import key_of
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
+from graphnav.estimation import preparation
 from graphnav.estimation.alignment import Alignment, align
 from graphnav.estimation.pipeline import origin, run
 from graphnav.estimation.solvers.batch import batch
@@ -114,3 +118,41 @@ def test_as_it_drives_a_jump_at_rest_is_no_motion(drive: Recording) -> None:
     online.finish()
     found = [against_truth(part, drive) for part in online.settled() if len(part) > 1]
     assert max(one.horizontal.max() for one in found) < 0.1
+
+
+def test_a_filter_that_would_diverge_without_fixes_begins_with_them() -> None:
+    part = load("kitti").crop(195.5, 429.5)  # by figures not estimated yet, tests leave out a quarter of right fixes
+    settings = Settings.model_validate(
+        {"vehicle": {"nhc": False}, "standstill": {"zero_velocity": False, "zero_rate": False, "held_position": False}}
+    )
+    solution = run(part, settings, ("rts",))["rts"]
+    assert left_out(solution, part).mean() < 0.05
+
+
+def test_what_breaks_down_while_noise_is_estimated_is_solved_as_stated(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def break_down(*_: object, **__: object) -> None:
+        raise EstimationError("the filter's covariance broke down", key="solver.breakdown")
+
+    plain = {"noise": {"mode": "stated"}, "standstill": {"held_position": False}}
+    stated = run(drive, Settings.model_validate(plain), ("ekf",))["ekf"]
+    monkeypatch.setattr(preparation, "estimate_without_faults", break_down)
+    solution = run(drive, None, ("ekf",))["ekf"]
+    assert "noise.not_estimated" in map(key_of, solution.notes)
+    np.testing.assert_array_equal(solution.covariance, stated.covariance)
+
+
+def test_axes_that_are_a_quarter_turn_off_are_told(shared_data: Path) -> None:
+    slow = load(shared_data / "canada_rover")  # its accelerations are felt to the left of its course
+    solution = run(slow, Settings.model_validate({"noise": {"mode": "stated"}}), ("rts",))["rts"]
+    assert "doubt.axes" in map(key_of, solution.notes)
+    quarter = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    imu = replace(slow.imu, gyro=slow.imu.gyro @ quarter.T, accel=slow.imu.accel @ quarter.T)
+    turned = run(replace(slow, imu=imu), Settings.model_validate({"noise": {"mode": "stated"}}), ("rts",))["rts"]
+    assert "doubt.axes" not in map(key_of, turned.notes)
+    assert slow.truth is not None
+    assert slow.truth.rph is not None
+    track = turned.trajectory()
+    off = np.interp(slow.truth.t, track.t, np.unwrap(track.rph[:, 2])) - np.unwrap(slow.truth.rph[:, 2])
+    assert abs(np.degrees(np.angle(np.mean(np.exp(1j * off))))) < 10.0

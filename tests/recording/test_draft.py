@@ -51,6 +51,9 @@ DRIVE, _ = oracle.drive(
         ("t_s,lat_deg,lon_deg,h_m,speed_mps,course_deg,epe_m,hdop", "gnss", {"h": "h_m", "course": "course_deg"}),
         ("timestamp,wheel_speed_kmh,gear", "odometer", {"speed": "wheel_speed_kmh"}),
         ("t,wheel_fl_kmh,wheel_fr_kmh,RearLeft,rr", "odometer", {"speed_fl": "wheel_fl_kmh", "speed_rl": "RearLeft"}),
+        ("t_s,lat,lat_std,lon,alt,std_alt,ve,vn,vu,sd_v,speedAccuracy", "gnss",
+         {"lat": "lat", "h": "alt", "sd_u": "sd_v", "sd_ve": "speedAccuracy"}),
+        ("t_s,lat,lon,h,sd_e,sd_n,sd_u,ve,vn,vu,sd_v,hdop", "gnss", {"sd_u": "sd_u", "sd_vn": "sd_v", "speed": None}),
         ("time,temperature,pressure", None, {"t": "time"}),
     ],
 )  # fmt: skip
@@ -58,7 +61,7 @@ def test_columns_are_found_by_meaning(header, sensor, found):
     match = columns.match(header.split(","))
     assert match.sensor == sensor
     for ours, theirs in found.items():
-        assert match.names[ours] == theirs
+        assert match.names.get(ours) == theirs
 
 
 def test_bare_axes_are_told_apart_by_the_file_name():

@@ -26,6 +26,7 @@ from scipy.special import chdtrc, chdtri
 
 from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import TIMES
+from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.estimation.faults import weigh_rows
 from graphnav.estimation.noise.apply import row_weights, with_noise
@@ -181,14 +182,27 @@ def _begin(problem: Problem, start: NoiseModel | None) -> _Components:
 
 
 def _first_points(problem: Problem, figures: _Components, opening: float | None) -> Points:
+    """Points of a filter that nothing is known before; without what it finds grossly wrong, if that is right."""
     used = with_noise(problem, figures.model())
-    about = backward(used, ekf(used, opening=opening))
+    whole = ekf(used, opening=opening)
+    about = backward(used, whole)
     # what is grossly wrong takes a filter that uses everything too far away to be linearised there; what seems to drift
     # may as well be the filter, whose heading is not known yet
     sound = weigh_rows(used, refilter(used, about, watch=True, drifts=False).weights)
-    if not any(rows.weight is not None and np.any(rows.weight == 0.0) for rows in sound.constraints):
+    kept = np.ones(len(problem.t), dtype=bool)
+    for rows in sound.constraints:
+        if rows.weight is not None:
+            kept[rows.keyframe[rows.weight == 0.0]] = False
+    if kept.all():
         return about
-    return backward(sound, ekf(sound, opening=opening))
+    try:
+        without = ekf(sound, opening=opening)
+        # right measurements that are left out make those that are left no likelier, and may leave nothing to start at
+        if np.sum(without.log_likelihood[kept]) < np.sum(whole.log_likelihood[kept]):
+            return about
+        return backward(sound, without)
+    except EstimationError:
+        return about
 
 
 def _carry(points: Points, before: Problem, after: Problem) -> Points:

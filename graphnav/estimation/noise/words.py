@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
+from graphnav.constraints.vehicle import MOUNTING
 from graphnav.core.notes import Note
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.problem import Problem
@@ -23,24 +24,29 @@ _FAR = 5.0  # prior sigmas, which chance does not reach
 
 
 def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
-    """Sentences on constants that the data put farther from what is stated of them than they can be."""
+    """Sentences on parameters that the data put farther from what is stated of them than they can be."""
     out = []
     for chain in problem.chains:
         p = chain.parameter
-        if not p.constant:
+        if p.correlation_time is not None:  # an error, whose size is estimated
             continue
-        value = smoothed.values[-1, shift(problem.columns[p.name])]
-        away = np.abs(value - p.initial) / p.sigma
+        value = smoothed.values[0, shift(problem.columns[p.name])]  # where the prior is of one that walks as well
+        stated, sigma = chain.mean[0], chain.sigma[0]
+        away = np.abs(value - stated) / sigma
         k = int(np.argmax(away))
-        if away[k] > _FAR:
+        if p.name == MOUNTING and away[k] > _FAR and abs(value[k]) > 0.25 * np.pi:
+            said = (
+                f"the IMU's axes are {abs(np.degrees(value[k])):.0f} deg from those of a vehicle that travels forwards"
+            )
+            out.append(Note("doubt.axes", f"The attitude cannot be trusted: {said}; check axes in [imu]"))
+        elif away[k] > _FAR:
             which = f" (number {k + 1} of {p.size})" if p.size > 1 else ""
             out.append(
                 Note(
                     "noise.far_from_stated",
                     f"{p.name}{which} comes out at {value[k]:.2g} {p.unit}, {away[k]:.0f} sigmas from the "
-                    f"{p.initial[k]:.2g} +- {p.sigma[k]:.2g} that is stated of it: what is stated is wrong, or it "
-                    "stands "
-                    "in for an error of another kind",
+                    f"{stated[k]:.2g} +- {sigma[k]:.2g} that is stated of it: what is stated is wrong, or it stands in "
+                    "for an error of another kind",
                 )
             )
     return tuple(out)

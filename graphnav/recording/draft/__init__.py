@@ -169,7 +169,7 @@ class _Writer:
         self.lines += ["", "[gnss]"]
         values = source.values
         late = agreement.late_velocity
-        dropped = ("ve", "vn", "vu", "vd", "speed", "course") if late is not None else ()
+        dropped = ("ve", "vn", "vu", "vd", "sd_ve", "sd_vn", "sd_vu", "speed", "course") if late is not None else ()
         numbers = None
         if "type" in values:
             sd = values.get("sd_e")
@@ -178,6 +178,9 @@ class _Writer:
             if numbers.value is None and theirs != "type":
                 dropped = (*dropped, "type")
                 self.decisions.append(f"types of fixes: column '{theirs}' is left alone: {numbers.why}")
+        missing = {"sd_e", "sd_n", "sd_u"} - values.keys()
+        if missing:  # all three or none
+            dropped = (*dropped, "sd_e", "sd_n", "sd_u")
         self._file(source, "gnss", dropped)
         if source.log is None:
             if "h" not in values:
@@ -194,8 +197,13 @@ class _Writer:
             elif stated := source.find_unit("ve", "speed"):
                 units["speed"] = Guess(stated, "as the column's name says")
             self._units(units)
-            if not {"sd_e", "sd_n", "sd_u"} <= values.keys():
-                why = "CHECK: m, 1-sigma east, north, up; the file states none, this is a receiver without corrections"
+            if missing:
+                none = (
+                    "none" if len(missing) == 3 else f"none {'of heights' if missing == {'sd_u'} else 'of all three'}"
+                )
+                why = (
+                    f"CHECK: m, 1-sigma east, north, up; the file states {none}, this is a receiver without corrections"
+                )
                 self._key("sd", _SD, why)
             height = source.columns.names["h"]
             if "msl" in height.lower() or "alt" in height.lower():

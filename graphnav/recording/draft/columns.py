@@ -11,6 +11,11 @@ _GYRO = r"(?:.*_)?(?:gyr\w*?|angular_(?:velocity|rate)|ang_vel|omega|rotation_ra
 _ACCEL = r"(?:.*_)?(?:acc\w*?|linear_acceleration|total_acceleration|specific_force|imu_a|imu_f|force|a|f)_?"
 _HORIZONTAL = r"sd_?h|(?:.*_)?(?:h_?acc\w*|horizontal_accuracy)|accuracy|eph|epe(?:_m)?"
 _VERTICAL = r"sd_?v|(?:.*_)?(?:v_?acc\w*|vertical_accuracy)|altitude_accuracy|epv"
+_OF_SPEED = r"sd_?v|sd_?speed|(?:.*_)?(?:s_?acc|(?:speed|velocity|vel)_?acc\w*)|eps"
+# what says how uncertain something is, or how satellites stand, is not the thing
+_UNCERTAIN = re.compile(
+    r"(?:.*_)?(?:sd|std|stdev|sigma|var|variance|cov\w*|accuracy|[hvpgt]dop|err\w*|uncertainty|ep[hves])(?:_.*)?|.*_acc"
+)
 _WHEEL, _SPEED = r"(?:wheel_?|speed_?|wheel_?speed_?)*", r"(?:_?wheel)?(?:_?speed)?"
 _PATTERNS: dict[str, tuple[str, ...]] = {
     "t": (
@@ -36,6 +41,9 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
     "sd_e": (r"sd_?e|std_?e|sigma_?e|e(?:ast)?_(?:sd|std|sigma)", _HORIZONTAL),
     "sd_n": (r"sd_?n|std_?n|sigma_?n|n(?:orth)?_(?:sd|std|sigma)", _HORIZONTAL),
     "sd_u": (r"sd_?u|std_?u|sigma_?u|u(?:p)?_(?:sd|std|sigma)", _VERTICAL),
+    "sd_ve": (r"(?:sd|std|sigma)_?ve(?:_?east)?|ve_(?:sd|std|sigma)", _OF_SPEED),
+    "sd_vn": (r"(?:sd|std|sigma)_?vn(?:_?north)?|vn_(?:sd|std|sigma)", _OF_SPEED),
+    "sd_vu": (r"(?:sd|std|sigma)_?vu(?:_?up)?|vu_(?:sd|std|sigma)", _OF_SPEED),
     "speed": (
         r"speed", r"(?:wheel|vehicle|odo(?:meter)?|ground|gps|gnss|can|car)_?(?:speed|velocity)",
         r"speed_over_ground|sog|g_?speed",
@@ -101,10 +109,14 @@ class Columns:
 def match(header: Sequence[str], stem: str = "") -> Columns:
     """Find our columns among a file's; `stem`, the file's name, tells what bare x, y, z are of."""
     spelt = [(name, *split_unit(name)) for name in header]
+    certain = [some for some in spelt if not _UNCERTAIN.fullmatch(some[1])]
     names: dict[str, str] = {}
     units: dict[str, str] = {}
     for ours, patterns in _PATTERNS.items():
-        found = next(((name, unit) for p in patterns for name, plain, unit in spelt if re.fullmatch(p, plain)), None)
+        fit = certain
+        if ours.startswith("sd_"):  # "v" may be vertical, and of velocity where another column is the height's
+            fit = [some for some in spelt if ours in ("sd_e", "sd_n", "sd_u") or some[0] != names.get("sd_u")]
+        found = next(((name, unit) for p in patterns for name, plain, unit in fit if re.fullmatch(p, plain)), None)
         if found is not None:
             names[ours], unit = found
             if unit:

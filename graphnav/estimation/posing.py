@@ -1,0 +1,154 @@
+"""A recording aligned and posed, anew where measurements turn out to be wrong that its start and stops rest on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.raw_phase import GnssPhase
+from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import EstimationError
+from graphnav.core.progress import tell
+from graphnav.core.rotation import Array
+from graphnav.core.state import BLOCKS, States
+from graphnav.detectors import Detections, detect
+from graphnav.estimation.alignment import Alignment, align, with_known_heading
+from graphnav.estimation.alignment.first import pick_fixes
+from graphnav.estimation.fixing import split_carriers
+from graphnav.estimation.noise.exclusion import without_excluded
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.problem import Problem, build_problem
+from graphnav.estimation.solution import Solution
+from graphnav.recording import Recording
+
+_FAR = 0.5  # rad between the stated and the found start attitude, beyond which a filter diverges for a while
+_FAR_AWAY = 100.0  # m, by which single fixes in a city may be wrong
+
+
+@dataclass
+class Clock:
+    """How long each stage has taken, s."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def book(self, stage: str) -> Iterator[None]:
+        """What runs inside belongs to a stage."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A problem, and what it was posed by."""
+
+    problem: Problem
+    carriers: GnssPhase | None  # carrier phases, which the problem does without as long as they have no integers
+    aligned: Alignment
+    detections: Detections
+
+
+@dataclass(frozen=True)
+class Posing:
+    """Aligns and poses a recording.
+
+    `used` is the recording with the fixes that the problem uses; alignment and detectors see them all.
+    """
+
+    recording: Recording
+    used: Recording
+    settings: Settings
+    frame: LocalFrame
+    clock: Clock
+
+    def align(self, recording: Recording, stationary: Array) -> Alignment:
+        """The first state of the recording, or of a part of it."""
+        # of carriers an alignment needs nothing, and solves dozens of problems
+        codes_alone = self.settings.raw_gnss.model_copy(update={"differences": False})
+        settings = self.settings.model_copy(update={"raw_gnss": codes_alone})
+        tell("alignment")
+        with self.clock.book("alignment"):
+            return align(recording, settings, self.frame, _smooth, stationary)
+
+    def pose(self, aligned: Alignment, detections: Detections, parts: bool) -> Posed:
+        """The problem; with the parts that noise figures contribute to its intervals, if these are to change."""
+        tell("preintegration")
+        with self.clock.book("preintegration"):
+            stated = with_known_heading(aligned, self.settings)
+            start = aligned if has_diverged(aligned, stated) else stated
+            problem = build_problem(
+                self.used, self.settings, self.frame, start.state, start_sigma(start), detections.stationary,
+                parts_of_noise=parts,
+            )  # fmt: skip
+        problem, carriers = split_carriers(problem)  # the noise model rests on the codes
+        return Posed(problem, carriers, aligned, detections)
+
+    def pose_later(self, posed: Posed) -> Posed:
+        """The problem with a start that is looked for behind the fixes which the alignment has seen."""
+        gnss, until = self.recording.gnss, posed.aligned.until
+        assert gnss is not None
+        assert until is not None
+        rest = replace(self.recording, gnss=pick_fixes(gnss, gnss.t > until))
+        return self.pose(self.align(rest, posed.detections.stationary), posed.detections, parts=True)
+
+    def pose_without(self, posed: Posed, noise: NoiseModel, parts: bool) -> Posed:
+        """The problem with a start and stops that do not rest on fixes which a noise model leaves out.
+
+        It is the same object where they are the same without.
+        """
+        if not noise.excluded or self.recording.gnss is None:
+            return posed
+        aligned, detections = posed.aligned, posed.detections
+        fixes = without_excluded(self.recording, noise)
+        stops = detect(fixes, self.settings)
+        changed = _differ(stops.stationary, detections.stationary)
+        stops = stops if changed else detections
+        seen = self.recording.end if aligned.until is None else aligned.until
+        if any(begin <= seen for spans in noise.excluded.values() for begin, _ in spans):
+            try:
+                found = self.align(fixes, stops.stationary)
+            except EstimationError:
+                found = aligned
+            if found.motion is not None and found.contradicts(aligned):
+                aligned, changed = found, True
+        return self.pose(aligned, stops, parts) if changed else posed
+
+
+def has_diverged(found: Alignment, stated: Alignment) -> bool:
+    """Whether a filter from the stated start would diverge for a while."""
+    turn = found.state.minus(stated.state)[0, :3]
+    return found.motion is not None and bool(np.linalg.norm(turn) > _FAR)
+
+
+def start_sigma(start: Alignment) -> Array:
+    """(15,) 1-sigma of the start, with a place that the alignment does not claim to know.
+
+    It has the place from fixes that the problem uses too, by sigmas that may be wrong; without fixes it is where the
+    start is said to be.
+    """
+    sigma = start.sigma.copy()
+    if start.motion is None:
+        return sigma
+    sigma[BLOCKS["p"]] = np.hypot(sigma[BLOCKS["p"]], _FAR_AWAY)
+    return sigma
+
+
+def _differ(a: Array, b: Array) -> bool:
+    """Whether one has a stop that the other has nothing of."""
+    return any(
+        not np.any((other[:, 0] < end) & (other[:, 1] > begin)) for one, other in ((a, b), (b, a)) for begin, end in one
+    )
+
+
+def _smooth(problem: Problem, start: States) -> Solution:
+    from graphnav.estimation.solvers.batch import batch
+
+    return batch(split_carriers(problem)[0], start, wanted=(0,), reintegrate=False)

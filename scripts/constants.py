@@ -1,0 +1,229 @@
+"""On which drive does a chosen constant hang? Each halved and doubled over windows of all drives, one left out in turn.
+
+    python scripts/constants.py --data ../shared/data
+    python scripts/constants.py --data ../shared/data --only CHANCE,WIDE --length 300
+
+The figures that are estimated from a recording rest on some that are not: probabilities, priors, physics, and how long
+the computing may take. The table shows for each of these the horizontal errors of filter and smoother (the geometric
+mean over drives, each counted once) against those with the constant as it is, and the range of that if one drive is
+left out. A constant that was fitted to a drive is one whose gain is gone without it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from damage import DAMAGES
+from do_no_harm import DRIVES, HERE, load, placed, settings_of, windows, withheld_of
+from harm_verdict import FLOOR
+
+import graphnav
+from graphnav.app.scores import Withheld, score
+from graphnav.recording import Recording
+
+NOISE, SOLVERS = "graphnav.estimation.noise", "graphnav.estimation.solvers"
+SOLVED = ("ekf", "rts")
+DAMAGED = ("bursts", "drifting")
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A number of a module, and the times by which it is made smaller and larger."""
+
+    module: str
+    name: str
+    why: str  # where it comes from
+    times: float = 2.0
+    whole: bool = False
+
+    def values(self, usual: Any) -> Iterator[tuple[str, Any]]:
+        """What is tried, with a word for it."""
+        for factor in (1.0 / self.times, self.times):
+            if isinstance(usual, dict):
+                value: Any = {key: x * factor for key, x in usual.items()}
+            elif isinstance(usual, tuple):
+                value = tuple(x * factor for x in usual)
+            else:
+                value = max(1, round(usual * factor)) if self.whole else usual * factor
+            yield f"x {factor:g}", value
+
+
+CONSTANTS = (
+    Constant(f"{NOISE}.priors", "WITHIN", "data sheets and receivers: right within a factor of three"),
+    Constant(f"{NOISE}.priors", "TIME_WITHIN", "the same of correlation times"),
+    Constant(f"{NOISE}.priors", "_SHARES", "lasting parts of a stated variance: as much as the whole, all together"),
+    Constant(f"{NOISE}.estimate", "CHANCE", "probability of an outlier", 10.0),
+    Constant(
+        f"{NOISE}.estimate", "_USUAL", "share of squares that count for no more: nearly two in five rows may be wrong"
+    ),
+    Constant(f"{NOISE}.estimate", "_TIMES", "a correlation time between a tenth of a second and an hour"),
+    Constant(f"{NOISE}.estimate", "_LOST", "what a vehicle turns and accelerates by at most while samples are lost"),
+    Constant(
+        f"{NOISE}.estimate",
+        "_FIRST",
+        "computing: figures from so many keyframes are good to a twentieth",
+        2.0,
+        whole=True,
+    ),
+    Constant(f"{NOISE}.estimate", "_ROUNDS", "computing: passes that are made in any case", 2.0, whole=True),
+    Constant(f"{NOISE}.estimate", "_AHEAD", "computing: how far a step is extrapolated"),
+    Constant(
+        f"{NOISE}.exclusion",
+        "_SHRINKS",
+        "computing: a span comes to what is wrong, and is looked at once more",
+        2.0,
+        whole=True,
+    ),
+    Constant(
+        f"{SOLVERS}.watch", "FALSE_ALARM", "probability: one drive in a hundred of an hour, of Gaussian errors", 100.0
+    ),
+    Constant(f"{SOLVERS}.watch", "_ONSET", "95 % of chi-square of one degree of freedom"),
+    Constant(f"{SOLVERS}.watch", "WIDE", "m, m/s: reflections in a city, and speeds in one"),
+    Constant(f"{SOLVERS}.watch", "MINUTE", "s, in which an error may grow by as much as it can be"),
+    Constant(f"{SOLVERS}.watch", "LONGEST", "s: what inertial sensors knew before says little"),
+    Constant(f"{SOLVERS}.watch", "PATIENCE", "s, after which inertial sensors of any grade have lost a position"),
+    Constant(f"{SOLVERS}.watch", "LARGE", "sigmas: less is no fault, however certain"),
+    Constant(f"{SOLVERS}.watch", "_CLOCKS", "s, between the stamps of IMU and receiver"),
+    Constant(f"{SOLVERS}.watch", "_BRAKING", "m/s^2, of a usual manoeuvre"),
+    Constant(f"{SOLVERS}.verdicts", "_CHANCE", "fixes that agree by chance", 2.0, whole=True),
+    Constant("graphnav.estimation.posing", "_FAR_AWAY", "m, single fixes in a city"),
+    Constant(
+        "graphnav.estimation.preparation",
+        "_LOST",
+        "rad: half its square is the share of a vector that linearising loses",
+    ),
+    Constant("graphnav.estimation.preparation", "_MOST", "the larger part"),
+)
+DERIVED = {"CHANCE": ("_OUTLIER", lambda x: -float(np.log(x))), "FALSE_ALARM": ("_ODDS", lambda x: -float(np.log(x)))}
+
+
+@contextmanager
+def changed(constant: Constant, value: Any) -> Iterator[None]:
+    """Every module that has the constant, by its own name or another's, with another value."""
+    usual = getattr(importlib.import_module(constant.module), constant.name)
+    names = [module for module in sys.modules if module.startswith("graphnav")]
+    if constant.name.startswith("_"):
+        names = [constant.module]
+    places = [
+        (vars(sys.modules[module]), constant.name, usual, value)
+        for module in names
+        if vars(sys.modules[module]).get(constant.name) is usual
+    ]
+    if constant.name in DERIVED:
+        name, of = DERIVED[constant.name]
+        place = vars(importlib.import_module(f"{NOISE}.exclusion"))
+        places.append((place, name, place[name], of(value)))
+    try:
+        for place, name, _, new in places:
+            place[name] = new
+        yield
+    finally:
+        for place, name, old, _ in places:
+            place[name] = old
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A part of a drive, what is used of it, and what it is scored on."""
+
+    drive: str
+    part: Recording
+    used: Recording
+    settings: graphnav.Settings
+    withheld: tuple[Withheld, ...]
+
+    def errors(self) -> list[float]:
+        """m, horizontal rms of each solver; no less than what is worth a look."""
+        try:
+            solutions = graphnav.run(self.used, self.settings, SOLVED)
+        except graphnav.GraphnavError:
+            return [float("inf")] * len(SOLVED)
+        metrics = score(self.part, self.used, solutions, self.withheld)[0]
+        return [max(metrics[name].components["h"].rms, FLOOR) for name in SOLVED]
+
+
+def cells(options: argparse.Namespace) -> Iterator[Cell]:
+    """A window of each drive with all its sensors, and one with damaged fixes in one way after the other."""
+    chosen = options.drives.split(",") if options.drives else list(DRIVES)
+    for name, drive in ((name, DRIVES[name]) for name in chosen):
+        source = placed(drive, options.data)
+        whole = load(source)
+        for _, span in windows(whole, drive.source, options):
+            part = whole.crop(*span)
+            withheld = withheld_of(part, part.duration) if part.truth is None else ()
+            used = part
+            for sensor, some in withheld:
+                used = used.without(sensor, some)
+            sensors = "+odometer" if part.odometer is not None else "+nhc"
+            yield Cell(name, part, used, settings_of("estimated", sensors, drive.doppler), withheld)
+    clone = graphnav.load(HERE / "data" / "tokyo")
+    assert clone.gnss is not None
+    for kind in DAMAGED:
+        gnss = DAMAGES[kind](clone, clone.gnss, np.random.default_rng(options.seed))
+        yield Cell("tokyo_clone", clone, replace(clone, gnss=gnss), settings_of("estimated", "+odometer"), ())
+
+
+def by_drive(drives: list[str], ratio: np.ndarray) -> dict[str, float]:
+    """Mean logarithm of ratios (cells, solvers) of each drive."""
+    return {
+        name: float(np.mean(ratio[[k for k, d in enumerate(drives) if d == name]])) for name in dict.fromkeys(drives)
+    }
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=HERE.parent / "shared" / "data")
+    parser.add_argument("--length", type=float, default=120.0, help="s, of a window (120)")
+    parser.add_argument("--windows", type=int, default=1, help="of a drive (1)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--drives", help="names, with commas between (all)")
+    parser.add_argument("--only", help="names of constants, with commas between")
+    options = parser.parse_args(arguments)
+    options.whole = False
+    every = list(cells(options))
+    drives = [cell.drive for cell in every]
+    usual = np.log([cell.errors() for cell in every])
+    print("| constant | is | where it comes from | tried | errors, all drives | one drive left out | most by | there |")
+    print("| --- | ---: | --- | ---: | ---: | ---: | --- | ---: |")
+    for constant in CONSTANTS:
+        if options.only and constant.name not in options.only.split(","):
+            continue
+        here = getattr(importlib.import_module(constant.module), constant.name)
+        for word, value in constant.values(here):
+            with changed(constant, value):
+                ratio = np.log([cell.errors() for cell in every]) - usual
+            one = by_drive(drives, ratio)
+            all_, n = sum(one.values()), len(one)
+            without = {name: (all_ - x) / (n - 1) for name, x in one.items()}
+            most = max(one, key=lambda name: abs(one[name]))
+            mean, low, high, there = np.exp([all_ / n, min(without.values()), max(without.values()), one[most]])
+            where = f"`{constant.module.rsplit('.', 1)[1]}.{constant.name}`"
+            row = [
+                where,
+                describe(here),
+                constant.why,
+                word,
+                f"{mean:.3f}",
+                f"{low:.3f} to {high:.3f}",
+                most,
+                f"{there:.2f}",
+            ]
+            print(f"| {' | '.join(row)} |", flush=True)
+
+
+def describe(value: Any) -> str:
+    """A number, or several."""
+    numbers = value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else (value,)
+    return ", ".join(f"{x:.3g}" for x in numbers)
+
+
+if __name__ == "__main__":
+    main()
