@@ -15,8 +15,9 @@ HEAD = """\
 # Keys of notes, findings and errors
 
 What a run says of a recording and of itself is in `messages` of `summary.json` and `findings` of `graphnav info
---json`: a `key` that stays the same, a `severity` and a `sentence`. `*` stands for the name of a sensor or of what a
-row is about. `python scripts/note_keys.py` makes this list from the code.
+--json`: a `key` that stays the same, a `severity` and a `sentence`. In a report the key is the `data-key` of the
+sentence's element. `*` stands for the name of a sensor or of what a row is about. `python scripts/note_keys.py` makes
+this list from the code.
 
 """
 ERRORS = """

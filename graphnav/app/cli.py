@@ -142,12 +142,12 @@ def detect(
     folder = outputs.output_folder(out)
     with bar(quiet, "detect"), permit_outside(allow_outside):
         tell("reading")
-        used, said = screen_recording(
+        used, notes = screen_recording(
             workflow.read_part(pick_one(context, recording), start, end, withheld, tuple(topic or ()), format)
         )
         tell("detection")
         found = detected(used, settings)
-        found = replace(found, notes=(*said, *found.notes))
+        found = replace(found, notes=(*notes, *found.notes))
         tell("writing")
         with stage_results(folder) as part:
             files = detection_report.write(used, found, part)

@@ -143,7 +143,10 @@ def init(
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The .toml to write.")] = Path(
         "recording.toml"
     ),
-    name: Annotated[str | None, typer.Option("--name", help="Of the recording; default: its folder's.")] = None,
+    name: Annotated[
+        str | None,
+        typer.Option("--name", help="Of the recording; default: as the file, or its folder."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
     topic: Topic = None,
     quiet: Quiet = False,
@@ -161,6 +164,7 @@ def init(
     if out.exists() and not force:
         raise ConfigError(f"-o {out}: is there already; name another file, or say --force", key="output.exists")
     folder = output_folder(out.parent)
+    name = name or (out.stem if out.stem != "recording" else None)
     with bar(quiet, "init"):
         tell("reading")
         drafted = draft(logs, folder, name, topic or ())

@@ -84,10 +84,10 @@ def _with_measured_noise(log: Log) -> Log:
     }
     if not found:
         return log
-    said = ", ".join(f"{key} = {value:g}" for key, value in found.items())
+    figures = ", ".join(f"{key} = {value:g}" for key, value in found.items())
     remark = Note(
         "imu.noise_measured",
-        f"noise: {said} measured, between its quietest and usual state; the other figures are of a consumer IMU",
+        f"noise: {figures} measured, between its quietest and usual state; the other figures are of a consumer IMU",
     )
     noise = replace(imu.noise, **found)
     return replace(log, imu=replace(imu, noise=noise, noise_assumed=False), remarks=(*log.remarks, remark))

@@ -26,8 +26,9 @@ from graphnav.estimation.stops import detections_text
 from graphnav.evaluation.against import own_solutions
 
 if TYPE_CHECKING:
+    from markupsafe import Markup
+
     from graphnav.evaluation.metrics import Metrics
-    from graphnav.report.page import Raw
 
 
 FILES = (
@@ -178,7 +179,7 @@ def write_solver(
     name: str,
     folder: Path,
     provenance: Mapping[str, Any],
-    detectors: Sequence[Raw] | None = None,
+    detectors: Sequence[Markup] | None = None,
     pages: bool = True,
 ) -> list[str]:
     """The files of one solver; a folder that holds older ones keeps none of them under the same names.
@@ -203,13 +204,13 @@ def write_solver(
     done = time.perf_counter()
     report = folder / "report.html"
     failed = _attempt(lambda _: _draw_solver(outcome, name, folder, provenance, detectors), report) if pages else []
-    spent = {"writing": done - began, "report": time.perf_counter() - done}
-    write_json(folder / "summary.json", solver_summary(outcome, name, spent, provenance))
+    seconds = {"writing": done - began, "report": time.perf_counter() - done}
+    write_json(folder / "summary.json", solver_summary(outcome, name, seconds, provenance))
     return failed
 
 
 def _draw_solver(
-    outcome: Outcome, name: str, folder: Path, provenance: Mapping[str, Any], detectors: Sequence[Raw] | None
+    outcome: Outcome, name: str, folder: Path, provenance: Mapping[str, Any], detectors: Sequence[Markup] | None
 ) -> None:
     from graphnav.evaluation.metrics import summary
     from graphnav.report import documents as report

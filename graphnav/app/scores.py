@@ -14,6 +14,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.solution import Solution, to_trajectory
 from graphnav.evaluation.against import Foreign, own_solutions, without_attitude
+from graphnav.evaluation.scoring import MAX_GAP, measure_spacing
 from graphnav.recording import Recording
 
 if TYPE_CHECKING:
@@ -104,17 +105,19 @@ def _choose_epochs(solution: Solution, truth: Array) -> Array:
     """Epochs to compare at: the keyframes where the truth has them and they are many, else (some of) the truth's.
 
     Never others: interpolated between keyframes, a filter would seem to know in an outage what the fix after it
-    will tell. So would another program's, between its rows: they are compared where the truth has them, few or many.
+    will tell. So would another program's, between its rows: of such a file and the truth the denser is interpolated.
     """
     truth = truth[np.isfinite(truth)]
     if len(truth) > 1:
+        foreign = isinstance(solution, Foreign)
         own = solution.track.t if isinstance(solution, Foreign) else solution.t
         t = own[(own >= truth[0] - _SAME) & (own <= truth[-1] + _SAME)]
         k = np.clip(np.searchsorted(truth, t), 1, len(truth) - 1)
         before, after = t - truth[k - 1], truth[k] - t
+        if foreign and len(t) and measure_spacing(own) >= measure_spacing(truth):
+            return np.asarray(t[before + after <= MAX_GAP])
         there = (np.minimum(np.abs(before), np.abs(after)) <= _SAME) | (before + after <= _BETWEEN_ROWS)
-        enough = max(0.8 * min(len(t), len(truth)), 2) if isinstance(solution, Foreign) else max(_ENOUGH, 0.8 * len(t))
-        if there.sum() >= enough:
+        if not foreign and there.sum() >= max(_ENOUGH, 0.8 * len(t)):
             return np.asarray(t[there])
     return _thin(truth, solution, _MOST)
 

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 
 def solver_summary(
-    outcome: Outcome, name: str, spent: Mapping[str, float], provenance: Mapping[str, Any]
+    outcome: Outcome, name: str, seconds: Mapping[str, float], provenance: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What summary.json holds; `spent` are the seconds that writing took."""
+    """What summary.json holds; `seconds` of writing, by what was written."""
     from graphnav.evaluation.metrics import summary
     from graphnav.report.sentences import list_doubts
 
@@ -39,10 +39,10 @@ def solver_summary(
     if errors is not None:
         nees = {key: value for key, value in errors.items() if key.startswith("nees_")}
         errors = {key: value for key, value in errors.items() if key not in nees}
-    doubted = list_doubts({name: solution}, {} if metrics is None or metrics.errors is None else {name: metrics.errors})
-    timings = {**solution.timings, "evaluation": outcome.timings["evaluation"], **spent}
-    said = [Finding("untrusted", doubt, key_of(doubt)) for doubt in doubted]
-    messages = dict.fromkeys([*said, *outcome.checks, *(Finding("note", note, key_of(note)) for note in notes)])
+    doubts = list_doubts({name: solution}, {} if metrics is None or metrics.errors is None else {name: metrics.errors})
+    timings = {**solution.timings, "evaluation": outcome.timings["evaluation"], **seconds}
+    untrusted = [Finding("untrusted", doubt, key_of(doubt)) for doubt in doubts]
+    messages = dict.fromkeys([*untrusted, *outcome.checks, *(Finding("note", note, key_of(note)) for note in notes)])
     rejected = {key: int(np.sum(r.weight <= 1e-9)) for key, r in solution.records.items()}
     return {
         "solver": name,
@@ -60,7 +60,7 @@ def solver_summary(
         "iterations": solution.iterations,
         "passes": {"filter": 0, "smoother": 0, **solution.passes, "eliminations": solution.iterations},
         "noise": noise_summary(outcome, solution),
-        "doubts": list(doubted),
+        "doubts": list(doubts),
         "stopped": solution.stopped,
         "final_cost": solution.cost,
         "timings": {stage: round(seconds, 4) for stage, seconds in timings.items()},

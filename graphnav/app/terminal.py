@@ -36,12 +36,12 @@ _WIDEST = 1000  # characters of a table
 
 def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     """What was read, what is worth knowing, how good it is, and where to look."""
-    lines = [f"warning: {said[0].lower()}{said[1:]}" for said in _list_doubts(outcome)]
+    lines = [f"warning: {doubt[0].lower()}{doubt[1:]}" for doubt in _list_doubts(outcome)]
     lines.append(_describe_recording(outcome))
     lines += [f"  {source} withheld{'' if span is None else f' {span[0]:g}-{span[1]:g} s'}"
               for source, span in outcome.request.withheld]  # fmt: skip
     notes = [note for s in outcome.solutions.values() for note in s.notes]
-    lines += [f"  {said}" for said in _describe_noise(outcome)]
+    lines += [f"  {line}" for line in _describe_noise(outcome)]
     severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
         if key_of(note) in ("noise.imu", "noise.rows"):
@@ -74,8 +74,8 @@ def _describe_noise(outcome: Outcome) -> list[str]:
             continue
         name, _, kind = source.partition(".")
         ratios = [(axis, whole_ratio(noise, source, axis)) for axis in ("horizontal", "up")]
-        said = " and ".join(f"x {short(ratio)} {axis}" for axis, ratio in ratios if ratio is not None)
-        parts.append(f"{_FIXES.get(name, name)}{f' ({kind})' if kind else ''} {said}")
+        factors = " and ".join(f"x {short(ratio)} {axis}" for axis, ratio in ratios if ratio is not None)
+        parts.append(f"{_FIXES.get(name, name)}{f' ({kind})' if kind else ''} {factors}")
     given = outcome.request.noise
     how = "estimated" if given is None else "as given" if given.file is None else f"from {given.file}"
     return [f"noise {how}, in stated sigmas: {', '.join(parts)}"]
@@ -247,8 +247,8 @@ def progress_bar(quiet: bool, work: Sequence[str]) -> Iterator[Progress | None]:
         elapsed = time.monotonic() - began
         pace.reach(stage, share)
         left = pace.estimate_left(elapsed)
-        said = "" if left is None else f"{left:.0f} s left" if left < 90 else f"{left / 60:.0f} min left"
-        bar.update(task, description=stage, completed=pace.done, left=said)
+        remaining = "" if left is None else f"{left:.0f} s left" if left < 90 else f"{left / 60:.0f} min left"
+        bar.update(task, description=stage, completed=pace.done, left=remaining)
         if elapsed > 0.5 and not bar.live.is_started:
             with defer_interrupts():
                 bar.start()

@@ -222,8 +222,8 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
         name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
     }
     solutions |= _read_others(request, recording, solutions)
-    spent: dict[str, float] = {}
-    with _measure_time(spent, "evaluation"):
+    seconds: dict[str, float] = {}
+    with _measure_time(seconds, "evaluation"):
         metrics, against, names = score(recording, used, solutions, moved)
     for found in metrics.values():
         if found.notes:
@@ -238,7 +238,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     densities = _find_densities(used, request.settings, solutions)
     return Outcome(
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
-        tuple(f.sentence for f in checks if f.severity != "note"), timings | spent, checks, densities,
+        tuple(f.sentence for f in checks if f.severity != "note"), timings | seconds, checks, densities,
     )  # fmt: skip
 
 

@@ -52,9 +52,11 @@ def interpolate(
     dt = (trajectory.t[nxt] - trajectory.t[k])[:, None]
 
     frame = LocalFrame(trajectory.llh[0]) if trajectory.frame == "geodetic" else None
+    slope = differentiate(trajectory, max_gap) if trajectory.v is None else None
     if lever_arm is None and 4 * len(t) < len(trajectory):  # with one, the rows around are needed for rates
         rows = np.union1d(k, nxt)
         trajectory, k, nxt = trajectory.take(rows), np.searchsorted(rows, k), np.searchsorted(rows, nxt)
+        slope = None if slope is None else slope[rows]
     p = trajectory.llh if frame is None else frame.from_llh(trajectory.llh)
     R_nl = None if frame is None else np.swapaxes(frame.R_ln(p), -1, -2)
     v = trajectory.v if R_nl is None or trajectory.v is None else np.einsum("kij,kj->ki", R_nl, trajectory.v)
@@ -69,10 +71,12 @@ def interpolate(
             rate = _rates(trajectory.t, R)
             omega = _lerp(rate[k], rate[nxt], s)
     p_at = _lerp(p[k], p[nxt], s)
+    slope = v if slope is None else slope
+    assert slope is not None
+    hermite = p_at + s * (1 - s) * ((1 - 2 * s) * (p[k] - p[nxt]) + dt * ((1 - s) * slope[k] - s * slope[nxt]))
+    p_at = np.where(np.isfinite(hermite), hermite, p_at)
     v_at = None
     if v is not None:
-        hermite = p_at + s * (1 - s) * ((1 - 2 * s) * (p[k] - p[nxt]) + dt * ((1 - s) * v[k] - s * v[nxt]))
-        p_at = np.where(np.isfinite(hermite), hermite, p_at)
         v_at = _lerp(v[k], v[nxt], s)
         if R is not None and R_at is not None:
             seen = _lerp(_apply(np.swapaxes(R[k], -1, -2), v[k]), _apply(np.swapaxes(R[nxt], -1, -2), v[nxt]), s)
@@ -103,6 +107,23 @@ def interpolate(
         gyro_bias=None, accel_bias=None, covariance=cov_at,
     )  # fmt: skip
     return out, ok
+
+
+def differentiate(trajectory: Trajectory, max_gap: float) -> Array:
+    """Velocities of a trajectory's positions, (K, 3) m/s, in its local frame or that of its first row.
+
+    Those of cubic splines, of which none leads across a gap of more than `max_gap` s; NaN for a row alone.
+    """
+    from scipy.interpolate import CubicSpline
+
+    p = trajectory.llh if trajectory.frame == "local" else LocalFrame(trajectory.llh[0]).from_llh(trajectory.llh)
+    v = np.full(p.shape, np.nan)
+    for axis in range(3):
+        rows = np.flatnonzero(np.isfinite(p[:, axis]))
+        for part in np.split(rows, np.flatnonzero(np.diff(trajectory.t[rows]) > max_gap) + 1):
+            if len(part) > 1:
+                v[part, axis] = CubicSpline(trajectory.t[part], p[part, axis])(trajectory.t[part], 1)
+    return v
 
 
 def full_covariance(trajectory: Trajectory) -> Array | None:

@@ -33,6 +33,8 @@ from graphnav.recording.formats.trajectories import read_trajectory
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
 _APPLIED = 1.0  # s; a larger shift is of the clock
 _FEWEST = 10  # rows in common
+_MATTERS, _SIGNIFICANT = 0.02, 3.0  # s and sigmas; a smaller shift is not worth saying, or may be chance
+_STEP = 0.1  # s, between speeds of ours
 
 
 @dataclass(frozen=True)
@@ -134,8 +136,10 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         )
     if np.any(arm):
         track = interpolate(track, track.t, max_gap=_MAX_GAP, lever_arm=-arm)[0]
-        said = ", ".join(f"{x:.2f}" for x in arm)
-        notes.append(Note("against.point", f"{asked.path.name}: moved to the IMU from [{said}] m (right, forward, up)"))
+        shown = ", ".join(f"{x:.2f}" for x in arm)
+        notes.append(
+            Note("against.point", f"{asked.path.name}: moved to the IMU from [{shown}] m (right, forward, up)")
+        )
     track = replace(track, name=name)
     _, known = interpolate(track, reference.t, max_gap=_MAX_GAP)
     t = reference.t[known]
@@ -161,12 +165,13 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
     else:
         return 0.0, []  # said by the caller
     late = _measure_delay(replace(track, t=track.t + shift), reference)
-    if late is None or abs(late) < 0.02:
+    if late is None:
         return shift, notes
     if abs(late) < _APPLIED and shift != own_start:
+        word = "early" if late > 0.0 else "late"
         return shift, [
             *notes,
-            Note("against.late", f"{path.name}: its speed is {-late:+.3f} s late against ours: left as it is"),
+            Note("against.late", f"{path.name}: its speed is {abs(late):.3f} s {word} against ours: left as it is"),
         ]
     leap = ""
     if abs(abs(late) - LEAP) < 0.1:
@@ -178,13 +183,16 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
 
 
 def _measure_delay(track: Trajectory, reference: Solution) -> float | None:
-    """How much later the same speeds are in `reference`, s; None where that is not clear."""
+    """How much later the same speeds are in `reference`, s; None where that is not clear, or within its own error."""
     llh = track.llh if track.frame == "geodetic" else reference.frame.to_llh(np.nan_to_num(track.llh))
     places = crosschecks.track(Gnss(track.t, llh, np.ones((len(track), 3))))
-    v = reference.states.v
-    ours = Track(reference.t, v, np.zeros(len(v)), float(np.median(np.diff(reference.t))))
+    # between its keyframes too, where speeds are no straight lines
+    t, states, _ = reference.at(np.arange(reference.t[0], reference.t[-1], _STEP))
+    ours = Track(t, states.v, np.zeros(len(t)), _STEP)
     fit = crosschecks.velocity_fit(ours, places) if places is not None else None
-    return fit.lag if fit is not None and fit.correlation > CLEAR else None
+    if fit is None or fit.correlation <= CLEAR or abs(fit.lag) < max(_MATTERS, _SIGNIFICANT * fit.spread):
+        return None
+    return fit.lag
 
 
 def _with_attitude(track: Trajectory, reference: Solution) -> Trajectory:

@@ -269,13 +269,13 @@ def _shift_hint(trajectory: Trajectory, truth: Trajectory) -> str:
     middle = 0.5 * (truth.t[0] + truth.t[-1] - trajectory.t[0] - trajectory.t[-1])
     half = 0.5 * (truth.t[-1] - truth.t[0] + trajectory.t[-1] - trajectory.t[0])
     unix = GPS_TO_UNIX - LEAP
-    usual = [
+    known_shifts = [
         (LEAP, "one may be in UTC and the other in GPS time, 18 s ahead"),
         (WEEK * round(middle / WEEK), "one may count GPS seconds of the week and the other continuously"),
         (unix + WEEK * round((abs(middle) - unix) / WEEK), "one may be in Unix time and the other in GPS time"),
         (86400.0 * round(middle / 86400.0), "one may count seconds of the day"),
     ]
-    for shift, sentence in usual:
+    for shift, sentence in known_shifts:
         if shift and abs(abs(middle) - abs(shift)) < half:
             return f"; {sentence} (shift by {np.copysign(shift, middle):+.0f} s)"
     if min(abs(trajectory.t[0]), abs(truth.t[0])) < 1.0:

@@ -58,8 +58,8 @@ class Verdict:
     @property
     def sentence(self) -> str:
         """For people."""
-        said = "not known" if self.value is None else f"{self.value:g}"
-        return f"{self.solver} has {self.requirement.name} {said}, required {self.requirement.text}"
+        shown = "not known" if self.value is None else f"{self.value:g}"
+        return f"{self.solver} has {self.requirement.name} {shown}, required {self.requirement.text}"
 
 
 def parse_requirement(text: str, solvers: Sequence[str] = ()) -> Requirement:

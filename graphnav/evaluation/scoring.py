@@ -9,7 +9,7 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame, enu_axes, llh_to_ecef
 from graphnav.core.errors import RecordingError
-from graphnav.core.interpolation import fit_yaw, full_covariance, interpolate, place_on_earth
+from graphnav.core.interpolation import differentiate, fit_yaw, full_covariance, interpolate, place_on_earth
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
@@ -86,7 +86,7 @@ def errors(
     if trajectory.frame == "local" or truth.frame == "local":
         trajectory, truth = _fit(trajectory, truth, lever_arm, max_gap, at, notes)
     estimate, seen, travel, epochs = _pair_epochs(trajectory, truth, lever_arm, max_gap, at)
-    if _measure_spacing(truth) < _measure_spacing(trajectory) if at is None else _are_between(seen.t, truth.t):
+    if measure_spacing(truth.t) < measure_spacing(trajectory.t) if at is None else _are_between(seen.t, truth.t):
         notes.append(
             Note(
                 "truth.interpolated", "compared at the estimate's own epochs, to which the denser truth is interpolated"
@@ -236,11 +236,11 @@ def _pair_epochs(
     trajectory: Trajectory, truth: Trajectory, lever_arm: Array | None, max_gap: float, at: Array | None
 ) -> tuple[Trajectory, Trajectory, Array, int]:
     """Estimate and truth at the epochs they share, the truth's horizontal velocity there (N, 2), and of how many."""
-    moving = truth if truth.v is not None else replace(truth, v=_differentiate(truth, max_gap))
+    moving = truth if truth.v is not None else replace(truth, v=differentiate(truth, max_gap))
     if at is not None:
         seen, _ = interpolate(moving, at[np.isin(at, trajectory.t)], max_gap=max_gap)
         epochs = len(at)
-    elif _measure_spacing(truth) < _measure_spacing(trajectory):
+    elif measure_spacing(truth.t) < measure_spacing(trajectory.t):
         seen, _ = interpolate(moving, trajectory.t, max_gap=max_gap)
         epochs = len(trajectory)
     else:
@@ -253,26 +253,15 @@ def _pair_epochs(
     return estimate, seen if truth.v is not None else replace(seen, v=None), seen.v[:, :2], epochs
 
 
-def _measure_spacing(trajectory: Trajectory) -> float:
-    """Usual time between rows, s, to 0.1 ms so that rounding decides nothing; infinite for one row."""
-    return float(np.round(np.median(np.diff(trajectory.t)), 4)) if len(trajectory) > 1 else np.inf
+def measure_spacing(t: Array) -> float:
+    """Usual time between rows at t (N,), s, to 0.1 ms so that rounding decides nothing; infinite for one row."""
+    return float(np.round(np.median(np.diff(t)), 4)) if len(t) > 1 else np.inf
 
 
 def _are_between(t: Array, rows: Array) -> bool:
     """Whether some of the times are no row's, to 0.1 ms."""
     k = np.clip(np.searchsorted(rows, t), 1, len(rows) - 1) if len(rows) > 1 else np.zeros(len(t), dtype=int)
     return bool((np.minimum(np.abs(t - rows[k]), np.abs(t - rows[k - 1])) > 1e-4).any())
-
-
-def _differentiate(truth: Trajectory, max_gap: float) -> Array:
-    """Velocity (N, 3) from positions by central differences, NaN beside a gap."""
-    if len(truth) < 3:
-        return np.full((len(truth), 3), np.nan)
-    p = truth.llh if truth.frame == "local" else LocalFrame(truth.llh[0]).from_llh(truth.llh)
-    v = np.asarray(np.gradient(p, truth.t, axis=0))
-    gap = np.diff(truth.t) > max_gap
-    v[np.concatenate([[False], gap]) | np.concatenate([gap, [False]])] = np.nan
-    return v
 
 
 def _nees(e: Array, cov: Array) -> Array:

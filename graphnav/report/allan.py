@@ -21,10 +21,10 @@ def write(result: Allan, folder: Path) -> list[Path]:
     paths = [folder / name for name in ("allan.html", "allan.csv", "noise.toml")]
     table = np.column_stack([result.tau, result.gyro, result.accel])
     np.savetxt(paths[1], table, "%.9g", ",", header="tau,gx,gy,gz,ax,ay,az", comments="")
-    said = f"Allan variance of {result.duration:.0f} s at rest, {result.rate:.4g} Hz; root mean square of the axes"
+    title = f"Allan variance of {result.duration:.0f} s at rest, {result.rate:.4g} Hz; root mean square of the axes"
     lines = "\n".join(["[imu.noise]", *result.lines()])
-    paths[2].write_text(f"# {said}\n{lines}\n", encoding="utf-8")
-    lead = [page.paragraph(said), page.code(lines, "noise")]
+    paths[2].write_text(f"# {title}\n{lines}\n", encoding="utf-8")
+    lead = [page.paragraph(title), page.code(lines, "noise")]
     pictures = [
         page.picture(_picture(result.tau, result.gyro, result.gyro_noise, "rad/s"), "Gyro"),
         page.picture(_picture(result.tau, result.accel, result.accel_noise, "m/s2"), "Accelerometer"),

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import ConstraintRecord
-from graphnav.report.page import Raw
+from graphnav.report.page import Quantity
 
 
 @dataclass(frozen=True)
@@ -25,21 +26,24 @@ class Consistency:
     kind: str
 
     @property
-    def verdict(self) -> str:
+    def verdict(self) -> Note:
         """One sentence on the consistency of sigma."""
         if self.count - self.rejected < 10 or not np.isfinite(self.mean_nis):
-            return "too few to judge"
+            return Note("consistency.few", "too few to judge")
         ratio = self.mean_nis / self.dof
         if self.kind == "residual":
             # a fit takes up part of the noise, so a smoother's residuals are below their sigma, never above
             if ratio > 1.3:
-                return "residuals larger than sigma allows: sigma is too small, or something is unmodelled"
-            return "residuals within their sigma"
+                return Note(
+                    "consistency.residuals_large",
+                    "residuals larger than sigma allows: sigma is too small, or something is unmodelled",
+                )
+            return Note("consistency.residuals_within", "residuals within their sigma")
         if ratio > 1.5:
-            return "innovations larger than predicted: the filter is overconfident"
+            return Note("consistency.overconfident", "innovations larger than predicted: the filter is overconfident")
         if ratio < 0.5:
-            return "innovations smaller than predicted: sigma is wider than it need be"
-        return "innovations as large as predicted: sigma is consistent"
+            return Note("consistency.cautious", "innovations smaller than predicted: sigma is wider than it need be")
+        return Note("consistency.as_predicted", "innovations as large as predicted: sigma is consistent")
 
 
 def consistency(record: ConstraintRecord) -> Consistency:
@@ -69,7 +73,7 @@ CONSISTENCY_HEAD = ("used", "rejected", "weight < 0.5", "mean NIS", "components"
 def consistency_row(c: Consistency) -> list[Any]:
     """The cells under `CONSISTENCY_HEAD`."""
     outside = f"{100 * c.outside:.2f} %" if np.isfinite(c.outside) else "-"
-    return [c.count - c.rejected, c.rejected, c.reduced, float(c.mean_nis), c.dof, Raw(outside), c.verdict]
+    return [c.count - c.rejected, c.rejected, c.reduced, float(c.mean_nis), c.dof, Quantity(outside), c.verdict]
 
 
 def mean_or_nan(x: Array) -> float:

@@ -35,7 +35,7 @@ def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
 def _page(recording: Recording, found: Detections) -> str:
     spans = found.stationary - recording.start
     rows = [
-        [page.Raw(f"{a:.2f} s"), page.Raw(f"{b:.2f} s"), page.Raw(f"{b - a:.2f} s"), format_fired(stop)]
+        [page.Quantity(f"{a:.2f} s"), page.Quantity(f"{b:.2f} s"), page.Quantity(f"{b - a:.2f} s"), format_fired(stop)]
         for (a, b), stop in zip(spans, stops_of(found.all), strict=True)
     ]
     lead = [page.paragraph(line) for line in _words(recording, found)]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
 from graphnav.core.timescales import GPS_TO_UNIX, gps_to_utc
 from graphnav.estimation.solution import Solution
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from graphnav.estimation.noise.table import FigureRow
     from graphnav.evaluation.metrics import Errors
 
-Sections = list[tuple[str, Sequence[str]]]
+Sections = list[tuple[str, Sequence[Markup]]]
 
 
 def write_report(
@@ -42,7 +43,7 @@ def write_report(
     outages: Spans = (),
     findings: Sequence[str] = (),
     provenance: Mapping[str, Any] | None = None,
-    detectors: Sequence[page.Raw] | None = None,
+    detectors: Sequence[Markup] | None = None,
     noise: Sequence[FigureRow] = (),
     beside: Sequence[str] = (),
 ) -> Path:
@@ -146,7 +147,7 @@ def write_report(
         words.list_tiles(recording, only, every),
         *summary.links(beside),
         *summary.fix_table(recording, solution, withheld),
-        page.columns(["".join(summary.sigma_table(solution)), "".join(summary.separation_table(solution))]),
+        page.columns([summary.sigma_table(solution), summary.separation_table(solution)]),
         *summary.left_out(solution, start),
     ]
     return _write(path, page.page(f"{recording.name}: {name}", lead, sections, _clocks(recording)))
@@ -217,7 +218,7 @@ def write_comparison(
     return _write(path, page.page(f"{recording.name}: comparison", lead, sections, _clocks(recording)))
 
 
-def detector_pictures(recording: Recording, solution: Solution) -> list[page.Raw]:
+def detector_pictures(recording: Recording, solution: Solution) -> list[Markup]:
     """The detectors' statistics, for `write_report`: the same for every solver of a recording."""
     return pictures.detection_pictures(recording, solution.detections)
 
@@ -234,26 +235,26 @@ def _clocks(recording: Recording) -> list[page.TimeAxis]:
 
 def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans) -> Shades:
     """Spans of time worth a tint, s from the start, by what they are."""
-    excluded = [(part.t_start - start, part.t_end - start) for part in getattr(solution, "excluded", ())]
+    excluded = [(part.t_start - start, part.t_end - start) for part in solution.excluded]
     gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
     return {"withheld": gone, "no GNSS": list(outages), "excluded": excluded}
 
 
-def _list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[page.Raw]:
+def _list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[Markup]:
     """Why the result cannot be trusted, where it cannot."""
-    return [page.paragraph(said, "verdict bad") for said in words.list_doubts(solutions, errors)]
+    return [page.paragraph(doubt, "verdict bad") for doubt in words.list_doubts(solutions, errors)]
 
 
-def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[page.Raw]:
+def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[Markup]:
     """Per solver, whether its sigma is consistent with its errors."""
     if errors:
         return [words.believe(name, e) for name, e in errors.items()]
     # where there is no truth a filter's innovations judge the model that all share better than any residuals
-    met = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
-    return [words.believe_without_truth(solution) for solution in met or solutions.values()]
+    filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
+    return [words.believe_without_truth(solution) for solution in filters or solutions.values()]
 
 
-def _consistency(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[str]:
+def _consistency(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:
     table = tables.nees_table(errors)
     if not table:
         return []
@@ -261,12 +262,12 @@ def _consistency(errors: Mapping[str, Errors], start: float, end: float, spans: 
     return [*table, page.paragraph(note, "soft"), *_gallery(pictures.nees_pictures(errors, start, end, spans))]
 
 
-def _gallery(images: Sequence[page.Raw]) -> list[str]:
+def _gallery(images: Sequence[Markup]) -> list[Markup]:
     return [page.gallery(images)] if images else []
 
 
-def _fold(title: str, parts: Sequence[str]) -> list[str]:
-    return [page.fold(title, "".join(parts))] if parts else []
+def _fold(title: str, parts: Sequence[Markup]) -> list[Markup]:
+    return [page.fold(title, parts)] if parts else []
 
 
 def _write(path: str | Path, html: str) -> Path:

@@ -1,7 +1,8 @@
 """The HTML around figures and tables: one self-contained page, light or dark as the reader prefers.
 
-Every function takes plain values and escapes them. Figures are drawn by plotly in the reader's browser: plotly's own
-script, 4.8 MB, and the data of all figures go into the page deflated (`page.js` unpacks them).
+`parts.html` and `page.html` are its templates, which escape all that is no markup. Figures are drawn by plotly in the
+reader's browser: plotly's own script, 4.8 MB, and the data of all figures go into the page deflated (`page.js` unpacks
+them).
 """
 
 from __future__ import annotations
@@ -14,32 +15,25 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from html import escape
 from pathlib import Path
 from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
 
 from graphnav.report.plots import PALETTE, TIME, Figure, css_colours
 
 _HERE = Path(__file__).parent
-_PACKED = "application/octet-stream"
-_LEVEL = 5  # two thirds of the time of level 6, less than a hundredth larger
+_LEVEL = 5  # of zlib: two thirds of the time of level 6, less than a hundredth larger
 
 
-class Raw(str):
-    """HTML made here, not to be escaped again."""
-
-
-def text(value: Any) -> str:
-    """A value as escaped words; numbers with four significant digits."""
-    if isinstance(value, Raw):
-        return value
+def show(value: Any) -> Any:
+    """A value as words; numbers with four significant digits."""
     if value is None:
         return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, float):
-        return number(value)
-    return escape(str(value))
+    return number(value) if isinstance(value, float) else value
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -55,64 +49,62 @@ def number(value: float, digits: int = 4) -> str:
     return f"{value:.{min(places, digits)}f}"
 
 
-def format_measured(value: float, sigma: float) -> str:
+class Quantity(str):
+    """A number as it is to be shown, with its unit if need be: it stands to the right in a table."""
+
+
+def format_measured(value: float, sigma: float) -> Quantity:
     """A value with as many places as its sigma gives sense to."""
     if not (math.isfinite(value) and math.isfinite(sigma)) or sigma <= 0:
-        return number(value)
+        return Quantity(number(value))
     places = 1 - math.floor(math.log10(sigma))
-    return f"{value:.{max(places, 0)}f}" if places <= 8 else f"{value:.4g}"
+    return Quantity(f"{value:.{max(places, 0)}f}" if places <= 8 else f"{value:.4g}")
 
 
-def solver(name: str) -> Raw:
+_TEMPLATES = Environment(
+    loader=FileSystemLoader(_HERE), autoescape=True, finalize=show, undefined=StrictUndefined, trim_blocks=True
+)
+_PARTS: Any = _TEMPLATES.get_template("parts.html").module
+bullets, code, columns, digest, download, fold, gallery, heading, links, pairs, paragraph, tiles, verdicts = (
+    getattr(_PARTS, name) for name in (
+        "bullets", "code", "columns", "digest", "download", "fold", "gallery", "heading", "links", "pairs",
+        "paragraph", "tiles", "verdicts",
+    )
+)  # fmt: skip
+
+
+def solver(name: str) -> Markup:
     """A solver's name with its colour."""
-    key = name if name in PALETTE else "other"
-    return Raw(f'<span class="solver"><i style="background:var(--{key})"></i>{escape(name)}</span>')
+    return _PARTS.solver(name, name if name in PALETTE else "other")
 
 
-def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int] = ()) -> Raw:
+def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int] = ()) -> Markup:
     """A table, words left and numbers right; in the columns `best` the smallest number is bold.
 
     A column in which no row has its number is left out.
     """
     rows = [list(row) for row in rows]
-    missing = [bool(rows) and all(isinstance(r[k], float) and math.isnan(r[k]) for r in rows) for k in range(len(head))]
-    kept = [k for k in range(len(head)) if not missing[k]]
-    head, rows, best = (
-        [head[k] for k in kept],
-        [[r[k] for k in kept] for r in rows],
-        [kept.index(k) for k in best if k in kept],
-    )
+    known = [any(not isinstance(row[k], float) or not math.isnan(row[k]) for row in rows) for k in range(len(head))]
+    columns = [k for k in range(len(head)) if known[k] or not rows]
     least = {
         k: min((row[k] for row in rows if isinstance(row[k], float) and math.isfinite(row[k])), default=None)
         for k in (best if len(rows) > 1 else ())
     }
-    body = []
-    for row in rows:
-        cells = []
-        for k, value in enumerate(row):
-            kind = _words(value) if k else ""
-            if k in least and value == least[k]:
-                kind = ' class="best"'
-            cells.append(f"<td{kind}>{text(value)}</td>")
-        body.append(f"<tr>{''.join(cells)}</tr>")
-    marks = [max((_words(row[k]) for row in rows), default="", key=len) if k else "" for k in range(len(head))]
-    heads = "".join(f'<th scope="col"{mark}>{text(h)}</th>' for h, mark in zip(head, marks, strict=True))
-    return Raw(f'<div class="wide"><table><thead><tr>{heads}</tr></thead><tbody>{"".join(body)}</tbody></table></div>')
+
+    def kind(k: int, value: Any) -> str:
+        return "best" if k in least and value == least[k] else _kind(value) if k else ""
+
+    return _PARTS.table(
+        [(head[k], max((_kind(row[k]) for row in rows), default="", key=len) if k else "") for k in columns],
+        [[(row[k], kind(k, row[k])) for k in columns] for row in rows],
+    )
 
 
-def _words(value: Any) -> str:
-    """The class attribute of a cell of words, wider for a sentence."""
-    if isinstance(value, Raw) and value.startswith('<span class="solver"'):
-        return ' class="words"'
-    if not isinstance(value, str) or isinstance(value, Raw):
+def _kind(value: Any) -> str:
+    """The class of a cell of words, wider for a sentence."""
+    if isinstance(value, Quantity) or not isinstance(value, str):
         return ""
-    return ' class="words long"' if len(value) > 24 else ' class="words"'
-
-
-def pairs(values: Mapping[str, Any]) -> Raw:
-    """A table of two columns without a head."""
-    rows = "".join(f'<tr><td>{text(k)}</td><td class="words">{text(v)}</td></tr>' for k, v in values.items())
-    return Raw(f'<div class="wide pairs"><table><tbody>{rows}</tbody></table></div>')
+    return "words long" if len(value) > 24 and not isinstance(value, Markup) else "words"
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -126,70 +118,19 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return out
 
 
-def tiles(values: Iterable[tuple[str, str]]) -> Raw:
-    """The few numbers to see first: (number with unit, what it is)."""
-    inner = "".join(f'<div class="tile"><b>{text(v)}</b><span>{text(k)}</span></div>' for v, k in values)
-    return Raw(f'<div class="tiles">{inner}</div>')
-
-
-def paragraph(words: str, kind: str = "") -> Raw:
-    """A paragraph, of a CSS class if given."""
-    mark = f' class="{kind}"' if kind else ""
-    return Raw(f"<p{mark}>{text(words)}</p>")
-
-
-def heading(words: str) -> Raw:
-    """A heading inside a section."""
-    return Raw(f"<h3>{text(words)}</h3>")
-
-
-def bullets(lines: Iterable[str]) -> Raw:
-    """A list of sentences."""
-    return Raw("<ul>" + "".join(f"<li>{text(line)}</li>" for line in lines) + "</ul>")
-
-
-def picture(figure: Figure, title: str, note: str = "", kind: str = "") -> Raw:
+def picture(figure: Figure, title: str, note: str = "", kind: str = "") -> Markup:
     """A figure with its title above and a note below.
 
     Parameters
     ----------
     kind : "large" takes the whole width; empty shares the width with others.
     """
-    data = json.dumps(figure.json, separators=(",", ":")).encode()
-    time = " data-time" if figure.time else ""
-    parts = [
-        f"<figcaption>{text(title)}</figcaption>",
-        f'<div class="plot" role="img" aria-label="{escape(title)}"{time} style="height:{figure.height}px"></div>',
-        _pack(data),
-        f'<p class="note">{text(note)}</p>' if note else "",
-    ]
-    mark = f' class="{kind}"' if kind else ""
-    return Raw(f"<figure{mark}>{''.join(parts)}</figure>")
-
-
-def gallery(pictures: Iterable[Raw]) -> Raw:
-    """Pictures, two beside each other where there is room."""
-    return Raw(f'<div class="figures">{"".join(pictures)}</div>')
-
-
-def columns(parts: Iterable[str]) -> Raw:
-    """Parts beside each other where there is room."""
-    return Raw(f'<div class="columns">{"".join(f"<div>{part}</div>" for part in parts)}</div>')
+    return _PARTS.picture(figure, title, _pack(json.dumps(figure.json, separators=(",", ":")).encode()), note, kind)
 
 
 def and_list(parts: Sequence[str]) -> str:
     """a, b and c"""
     return parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]
-
-
-def code(words: str, key: str) -> Raw:
-    """Words to copy as they are, in an element of the id `key`."""
-    return Raw(f'<pre id="{key}">{escape(words)}</pre>')
-
-
-def fold(title: str, content: str) -> Raw:
-    """Content that opens on demand."""
-    return Raw(f"<details><summary>{text(title)}</summary>{content}</details>")
 
 
 @dataclass(frozen=True)
@@ -205,51 +146,46 @@ class TimeAxis:
 
 
 def page(
-    title: str, lead: Sequence[str], sections: Sequence[tuple[str, Sequence[str]]], clocks: Sequence[TimeAxis] = ()
+    title: str,
+    lead: Sequence[Markup],
+    sections: Sequence[tuple[str, Sequence[Markup]]],
+    clocks: Sequence[TimeAxis] = (),
 ) -> str:
     """The whole page.
 
     Parameters
     ----------
-    lead : HTML between the title and the first section.
-    sections : heading and HTML parts; sections without parts are left out.
+    lead : between the title and the first section.
+    sections : heading and parts; sections without parts are left out.
     clocks : to choose from, beside seconds from the start.
     """
     sections = [(head, parts) for head, parts in sections if any(parts)]
-    choice = "".join(
-        f'<option value="{one.start!r}"{" data-date" if one.date else ""}>{text(one.words)}</option>' for one in clocks
-    )
-    if choice:
-        choice = f'<select id="clock" aria-label="time axis"><option value="">{TIME}</option>{choice}</select>'
-    links = choice + "".join(f'<a href="#s{k}">{escape(head)}</a>' for k, (head, _) in enumerate(sections))
-    body = "".join(
-        f'<section id="s{k}"><h2>{escape(head)}</h2>{"".join(parts)}</section>'
-        for k, (head, parts) in enumerate(sections)
-    )
-    script = ""
-    if "<figure" in body:
-        script = _library()
-        script += f"<script>{(_HERE / 'page.js').read_text(encoding='utf-8')}</script>"
-        body = f'<noscript><p class="soft">The figures need scripts, which are off.</p></noscript>{body}'
-    style = css_colours() + (_HERE / "page.css").read_text(encoding="utf-8")
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{style}</style>\n</head>\n<body><main>\n"
-        f"<h1>{escape(title)}</h1>\n{''.join(lead)}\n<nav>{links}</nav>\n{body}\n</main>{script}</body>\n</html>\n"
-    )
+    drawn = any("<figure" in part for _, parts in sections for part in parts)
+    return _TEMPLATES.get_template("page.html").render(
+        title=title, lead=lead, sections=sections, clocks=clocks, time=TIME, library=_library() if drawn else None,
+        style=Markup(css_colours() + _read("page.css")), script=Markup(_read("page.js")),
+    )  # fmt: skip
+
+
+def _read(name: str) -> str:
+    return (_HERE / name).read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Something deflated, as base64, and how many bytes it was."""
+
+    size: int
+    data: Markup
 
 
 @lru_cache(maxsize=1)
-def _library() -> str:
+def _library() -> Packed:
     found = importlib.util.find_spec("plotly")
     if found is None or found.origin is None:
         raise ModuleNotFoundError("plotly is not installed")
-    return _pack((Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes(), "plotly-library")
+    return _pack((Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes())
 
 
-def _pack(content: bytes, key: str = "") -> str:
-    """An element that holds something deflated, for `page.js` to unpack."""
-    mark = f' id="{key}"' if key else ""
-    packed = base64.b64encode(zlib.compress(content, _LEVEL)).decode("ascii")
-    return f'<script type="{_PACKED}"{mark} data-size="{len(content)}">{packed}</script>'
+def _pack(content: bytes) -> Packed:
+    return Packed(len(content), Markup(base64.b64encode(zlib.compress(content, _LEVEL)).decode("ascii")))

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from markupsafe import Markup
 
 from graphnav.core.earth import LocalFrame
 from graphnav.core.interpolation import fit_yaw, yaw_matrix
@@ -18,7 +19,6 @@ from graphnav.evaluation.against import own_solutions
 from graphnav.recording import FIX_TYPES, Recording
 from graphnav.report import page, plots
 from graphnav.report.names import components
-from graphnav.report.page import Raw
 from graphnav.report.plots import Series, Shades, Spans
 from graphnav.report.plots.way import draw_fixes
 
@@ -32,7 +32,7 @@ DEG = float(np.degrees(1.0))
 DEG_H = float(np.degrees(3600.0))
 
 
-def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> Raw:
+def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> Markup:
     """The way from above, with what was and what was not used of the fixes."""
     start = recording.start
     first = next(iter(solutions.values()))
@@ -52,7 +52,7 @@ def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], 
     return page.picture(figure, "Plan view", where, kind="large")
 
 
-def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> Raw:
+def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> Markup:
     """Heights over the distance travelled."""
     start, first = recording.start, next(iter(solutions.values()))
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(first.states.p[:, :2], axis=0), axis=1))])
@@ -87,7 +87,7 @@ def fixes_of(recording: Recording, solution: Solution) -> plots.Fixes | None:
     if record is not None and len(record.t):
         gone = record.t[record.weight <= 1e-9]
         out |= np.isin(np.round(t, 3), np.round(gone, 3))
-    for part in getattr(solution, "excluded", ()):
+    for part in solution.excluded:
         if part.kind in ("gnss", "gnss_position"):
             out |= (t >= part.t_start) & (t <= part.t_end)
     kinds = {"GNSS fix": np.ones(len(t), dtype=bool)}
@@ -100,8 +100,8 @@ def fixes_of(recording: Recording, solution: Solution) -> plots.Fixes | None:
             "sigma 0.1 to 1 m": (sd >= 0.1) & (sd < 1.0),
             "sigma 1 m and more": ~(sd < 1.0),
         }
-        said = {name: rows for name, rows in classes.items() if rows.any()}
-        kinds = said if len(said) > 1 else kinds
+        present = {name: rows for name, rows in classes.items() if rows.any()}
+        kinds = present if len(present) > 1 else kinds
     return plots.Fixes(t - recording.start, solution.frame.from_llh(gnss.llh), out, kinds)
 
 
@@ -148,7 +148,7 @@ def error_series(errors: Errors, start: float) -> dict[str, Series]:
     return out
 
 
-def error_pictures(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Raw]:
+def error_pictures(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:
     """Position, velocity and attitude errors with 3 sigma."""
     series = {name: error_series(e, start) for name, e in errors.items()}
     out = []
@@ -157,21 +157,28 @@ def error_pictures(errors: Mapping[str, Errors], start: float, end: float, spans
         if chosen:
             banded = len(chosen) < 3 and any(s.sigma is not None for s in chosen.values())
             note = "The line belongs inside the band." if banded else ""
-            figure = plots.bands(chosen, parts, unit, end, spans=spans)
+            known = _find_known(chosen)
+            cut = {name: s.take(known) for name, s in chosen.items()}
+            figure = plots.bands(cut, [parts[k] for k in known], unit, end, spans=spans)
             out.append(page.picture(figure, f"{kind.capitalize()} error", note))
     return out
 
 
-def nees_pictures(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Raw]:
+def _find_known(series: Mapping[str, Series]) -> list[int]:
+    """The components that any of the series has a value of: a truth may have no heights."""
+    return [k for k in range(3) if any(np.isfinite(s.value[:, k]).any() for s in series.values())]
+
+
+def nees_pictures(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:
     """Squared errors over their covariance."""
     series, names, dofs = {}, ["position", "velocity", "attitude"], [3, 3, 3]
     for name, e in errors.items():
         series[name] = Series(e.t - start, np.column_stack([e.nees_p, e.nees_v, e.nees_rph]))
         dofs[0] = e.dof_p
-    known = [k for k in range(3) if any(np.isfinite(s.value[:, k]).any() for s in series.values())]
+    known = _find_known(series)
     if not known:
         return []
-    cut = {name: Series(s.t, s.value[:, known]) for name, s in series.items()}
+    cut = {name: s.take(known) for name, s in series.items()}
     figure = plots.nees(cut, [names[k] for k in known], [dofs[k] for k in known], end, spans=spans)
     note = (
         "Squared error over its covariance, divided by its degrees of freedom: about 1 where sigma is true, above the "
@@ -180,7 +187,7 @@ def nees_pictures(errors: Mapping[str, Errors], start: float, end: float, spans:
     return [page.picture(figure, "NEES over time", note)]
 
 
-def sigma_pictures(tracks: Mapping[str, Trajectory], start: float, end: float, spans: Shades) -> list[Raw]:
+def sigma_pictures(tracks: Mapping[str, Trajectory], start: float, end: float, spans: Shades) -> list[Markup]:
     """What the solvers themselves say of their uncertainty."""
     out = []
     wanted = (
@@ -200,7 +207,7 @@ def sigma_pictures(tracks: Mapping[str, Trajectory], start: float, end: float, s
     return out
 
 
-def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> list[Raw]:
+def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> list[Markup]:
     """Position, velocity and attitude as estimated, with 3 sigma, and what fixes and receiver said of them."""
     start, end = recording.start, recording.duration
     first = next(iter(solutions.values()))
@@ -237,7 +244,7 @@ def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spa
     return out
 
 
-def separation_pictures(solution: Solution, start: float, end: float, spans: Shades) -> list[Raw]:
+def separation_pictures(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
     """Forward filter less what comes after each keyframe."""
     found = solution.separation
     if found is None or not np.isfinite(found.value).any():
@@ -247,7 +254,7 @@ def separation_pictures(solution: Solution, start: float, end: float, spans: Sha
     return [page.picture(plots.bands(series, ENU, "m", end, spans=spans), "Combined separation and 3 sigma", note)]
 
 
-def quality_pictures(recording: Recording, solution: Solution, spans: Shades) -> list[Raw]:
+def quality_pictures(recording: Recording, solution: Solution, spans: Shades) -> list[Markup]:
     """What fixes state of themselves: 1-sigma, horizontal and up, and satellites."""
     gnss, fixes = recording.gnss, fixes_of(recording, solution)
     if gnss is None or fixes is None or not len(gnss.t):
@@ -276,7 +283,7 @@ def _unwrap(rph: Array) -> Array:
     return np.asarray(out)
 
 
-def bias_pictures(solution: Solution, start: float, end: float, spans: Shades) -> list[Raw]:
+def bias_pictures(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
     """Gyro and accelerometer biases with 3 sigma."""
     sd = np.sqrt(np.maximum(np.diagonal(solution.covariance, axis1=1, axis2=2), 0.0))
     t = solution.t - start
@@ -293,7 +300,7 @@ def bias_pictures(solution: Solution, start: float, end: float, spans: Shades) -
 
 def parameter_pictures(
     parameters: Mapping[str, ParameterEstimate], solver: str, start: float, end: float, spans: Shades
-) -> list[Raw]:
+) -> list[Markup]:
     """Slow parameters over time with 3 sigma, where the data told anything of them."""
     out = []
     for name, p in parameters.items():
@@ -309,7 +316,7 @@ def parameter_pictures(
     return out
 
 
-def zoom_pictures(errors: Mapping[str, Errors], start: float, spans: Spans, what: str = "withheld") -> list[Raw]:
+def zoom_pictures(errors: Mapping[str, Errors], start: float, spans: Spans, what: str = "withheld") -> list[Markup]:
     """Horizontal error in and around each span."""
     if not spans or not errors:
         return []
@@ -321,7 +328,7 @@ def zoom_pictures(errors: Mapping[str, Errors], start: float, spans: Spans, what
     return [page.picture(figure, "Horizontal error in and around each span", kind="large" if len(spans) > 1 else "")]
 
 
-def difference_pictures(solutions: Mapping[str, Solution], start: float, end: float, spans: Shades) -> list[Raw]:
+def difference_pictures(solutions: Mapping[str, Solution], start: float, end: float, spans: Shades) -> list[Markup]:
     """How far the solvers are from the last of them, at the keyframes they share."""
     name, reference = list(own_solutions(solutions).items())[-1]
     series = {}
@@ -337,7 +344,7 @@ def difference_pictures(solutions: Mapping[str, Solution], start: float, end: fl
     return [page.picture(figure, f"Position less that of {name}")]
 
 
-def record_pictures(solution: Solution, start: float, end: float, spans: Shades) -> list[Raw]:
+def record_pictures(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
     """Whitened residuals and NIS of every constraint."""
     out = []
     for kind, record in solution.records.items():
@@ -351,7 +358,7 @@ def record_pictures(solution: Solution, start: float, end: float, spans: Shades)
     return out
 
 
-def timeline_picture(solution: Solution, recording: Recording, spans: Shades) -> list[Raw]:
+def timeline_picture(solution: Solution, recording: Recording, spans: Shades) -> list[Markup]:
     """Which constraint was used when."""
     records = {kind: record for kind, record in solution.records.items() if len(record.t)}
     if not records:
@@ -360,7 +367,7 @@ def timeline_picture(solution: Solution, recording: Recording, spans: Shades) ->
     return [page.picture(figure, "Use of constraints over time", kind="large")]
 
 
-def detection_pictures(recording: Recording, found: Sequence[Detection]) -> list[Raw]:
+def detection_pictures(recording: Recording, found: Sequence[Detection]) -> list[Markup]:
     """Signals and statistics of the detectors."""
     if not found:
         return []

@@ -8,13 +8,14 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
+from markupsafe import Markup
+
 from graphnav.report import page
-from graphnav.report.page import Raw
 
 SETTINGS = "settings.toml"
 
 
-def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any] | None) -> list[Raw]:
+def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any] | None) -> list[Markup]:
     """The command and settings that make the same again; versions and inputs."""
     provenance = dict(provenance or {})
     out = []
@@ -26,14 +27,13 @@ def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any]
         out.append(page.code(command(options, bool(toml)), "command"))
     if toml:
         data = base64.b64encode(toml.encode()).decode("ascii")
-        link = Raw(f'<p><a download="{SETTINGS}" href="data:text/plain;base64,{data}">Save as {SETTINGS}</a></p>')
-        out.append(page.fold("Settings as resolved", link + page.code(toml, "settings")))
+        out.append(page.fold("Settings as resolved", [page.download(SETTINGS, data), page.code(toml, "settings")]))
     inputs = provenance.pop("inputs", {})
     if provenance:
-        listed = [f"{key} {page.text(value)}" for key, value in page.flat(provenance).items()]
+        listed = [f"{key} {page.show(value)}" for key, value in page.flat(provenance).items()]
         out += [page.heading("Versions"), page.paragraph(page.and_list(listed))]
     if inputs:
-        rows = [[name, Raw(f"<code>{page.text(digest)}</code>")] for name, digest in inputs.items()]
+        rows = [[name, page.digest(digest)] for name, digest in inputs.items()]
         out += [page.heading("Inputs"), page.table(["file", "sha256"], rows)]
     return out
 

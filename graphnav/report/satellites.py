@@ -6,18 +6,19 @@ import itertools
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import ConstraintRecord, Solution
 from graphnav.report import page
-from graphnav.report.page import Raw
+from graphnav.report.page import Quantity
 from graphnav.report.plots import Shades
 from graphnav.report.plots import satellites as plots
 
 _ELEVATIONS = (0.0, 15.0, 30.0, 45.0, 60.0, 90.0)  # deg
 
 
-def satellite_parts(solution: Solution, start: float, end: float, spans: Shades) -> list[Raw]:
+def satellite_parts(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
     """The section on satellites, of a solution that has rows of them; nothing otherwise.
 
     Parameters
@@ -65,7 +66,7 @@ def satellite_records(solution: Solution) -> dict[str, ConstraintRecord]:
     return {kind: r for kind, r in solution.records.items() if len(r.satellite) == len(r.t) > 0}
 
 
-def satellite_tables(solution: Solution) -> list[Raw]:
+def satellite_tables(solution: Solution) -> list[Markup]:
     """Residuals of rows of satellites, in sigmas as weighted, by satellite and by elevation."""
     records = satellite_records(solution)
     if not records:
@@ -99,15 +100,15 @@ def _residual_cells(record: ConstraintRecord, some: Array) -> list[Any]:
     used = some & (record.weight >= plots.HALF)
     nis = record.nis[used] / record.residual.shape[1]
     share = 1.0 - np.count_nonzero(used) / count
-    return [count, Raw(f"{100.0 * share:.1f} %"), float(np.sqrt(np.mean(nis))) if len(nis) else "-"]
+    return [count, Quantity(f"{100.0 * share:.1f} %"), float(np.sqrt(np.mean(nis))) if len(nis) else "-"]
 
 
-def ambiguity_table(solution: Solution) -> list[Raw]:
+def ambiguity_table(solution: Solution) -> list[Markup]:
     """How many epochs with carriers against a base station have integer ambiguities."""
     epochs = solution.fixed
     if not len(epochs):
         return []
     fixed = int(np.sum(epochs[:, 1] > 0.0))
-    share = Raw(f"{100.0 * fixed / len(epochs):.1f} %")
+    share = Quantity(f"{100.0 * fixed / len(epochs):.1f} %")
     head = ["epochs with carriers", "ambiguities fixed as integers", "float", "share fixed"]
     return [page.table(head, [[len(epochs), fixed, len(epochs) - fixed, share]])]

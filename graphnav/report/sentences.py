@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
 from graphnav.core.notes import Note, key_of
 from graphnav.estimation.noise.apply import row_weights
@@ -15,7 +16,6 @@ from graphnav.evaluation.segments import rms
 from graphnav.recording import Recording
 from graphnav.report import page
 from graphnav.report.consistency import consistency
-from graphnav.report.page import Raw
 from graphnav.report.plots import Spans
 from graphnav.report.tables import Withheld
 
@@ -39,8 +39,8 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
         fixes = solution.records.get("gnss_position")
         left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
         if left_out > _MOST:
-            said = f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest "
-            out.append(Note("doubt.left_out", said + "and is left out"))
+            words = f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest "
+            out.append(Note("doubt.left_out", words + "and is left out"))
             break  # all solvers use the same noise model
     notes = dict.fromkeys(note for solution in solutions.values() for note in solution.notes)
     out += [Note(key, note) for note in notes if (key := key_of(note)) == "doubt.axes"]
@@ -51,8 +51,8 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
             sizes = page.and_list([f"{j.size:.2g} times sigma ({j.block})" for j in small])
             wrong.append(f"{name}: errors are {sizes}")
     if not errors:
-        met = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
-        for solution in met or solutions.values():
+        filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
+        for solution in filters or solutions.values():
             kind, size, used = _measure_consistency(solution)
             if used >= _FEWEST and size > _TOO_LARGE[kind]:
                 wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")
@@ -107,7 +107,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
         listed = [f"{a:.0f} to {b:.0f} s" for a, b in outages[:_LISTED]]
         more = [f"{len(outages) - _LISTED} more"] if len(outages) > _LISTED else []
         words += f" There were no GNSS fixes from {page.and_list([*listed, *more])}."
-    excluded = sum(int(part.count) for part in getattr(solution, "excluded", ()))
+    excluded = sum(int(part.count) for part in solution.excluded)
     if excluded:
         words += f" {excluded} measurements were excluded as faulty."
     if not several and solution.stopped:
@@ -115,7 +115,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
     return words
 
 
-def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> Raw:
+def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> Markup:
     """The few numbers to see first."""
     states = next(iter(solutions.values())).states
     way = float(np.linalg.norm(np.diff(states.p, axis=0), axis=1).sum())
@@ -142,13 +142,14 @@ def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: 
     return page.tiles(out)
 
 
-def believe(name: str, errors: Errors) -> Raw:
+def believe(name: str, errors: Errors) -> Markup:
     """One sentence that compares errors with their sigma (and the truth's own, where it states one)."""
     from graphnav.evaluation.sigmas import judge_sigmas
 
     judged = judge_sigmas(errors)
     if not judged:
-        return page.paragraph(f"{name}: no epoch has both an error and a sigma, so sigma cannot be judged.", "verdict")
+        words = f"{name}: no epoch has both an error and a sigma, so sigma cannot be judged."
+        return page.paragraph(Note("sigma.not_judged", words), "verdict")
     worst = [j for j in judged if j.verdict == "too small"] or [j for j in judged if j.verdict == "unclear"]
     shown = worst or judged
     measured = page.and_list(
@@ -161,55 +162,60 @@ def believe(name: str, errors: Errors) -> Raw:
     blocks = page.and_list([j.block for j in shown])
     if worst and worst[0].verdict == "too small":
         when = " at times" if all(j.inside > 0.9 for j in worst) else ""
-        return page.paragraph(
-            f"{name}: the stated sigma is too small{when}, of {blocks}: {measured}. Errors of the truth itself count "
-            "here as well.",
-            "verdict bad",
-        )
+        words = f"{name}: the stated sigma is too small{when}, of {blocks}: {measured}."
+        words += " Errors of the truth itself count here as well."
+        return page.paragraph(Note("sigma.too_small", words), "verdict bad")
     if worst:
         alike = page.and_list([f"{j.effective:.0f}" for j in worst])
-        return page.paragraph(
+        words = (
             f"{name}: whether sigma of {blocks} can be relied on remains open: {measured}, but the errors are alike "
-            f"for so long that they are worth {alike} independent values, and chance may do that.",
-            "verdict",
+            f"for so long that they are worth {alike} independent values, and chance may do that."
         )
+        return page.paragraph(Note("sigma.unclear", words), "verdict")
     seen = {j.block for j in judged}
     unseen = [what for what in ("position", "velocity", "attitude") if what not in seen]
     rest = f" Nothing is there to judge {page.and_list(unseen)} by." if unseen else ""
     if all(j.verdict == "cautious" for j in judged):
-        return page.paragraph(f"{name}: the stated sigma is cautious: {measured}.{rest}", "verdict")
-    return page.paragraph(f"{name}: the stated sigma is consistent: {measured}.{rest}", "verdict good")
+        return page.paragraph(
+            Note("sigma.cautious", f"{name}: the stated sigma is cautious: {measured}.{rest}"), "verdict"
+        )
+    words = f"{name}: the stated sigma is consistent: {measured}.{rest}"
+    return page.paragraph(Note("sigma.consistent", words), "verdict good")
 
 
-def believe_without_truth(solution: Solution) -> Raw:
+def believe_without_truth(solution: Solution) -> Markup:
     """One sentence on what innovations or residuals say of the sigma, where there is no truth to say it."""
     kind, size, used = _measure_consistency(solution)
-    name = solution.solver
-    missing = "there is no truth to compare with"
+    missing = f"{solution.solver}: there is no truth to compare with"
+    larger, mark = size > _TOO_LARGE[kind], ""
     if used < _FEWEST:
-        return page.paragraph(f"{name}: no truth and too few measurements to judge sigma by.", "verdict")
-    if kind == "innovation":
+        note = Note("no_truth.few", f"{missing}, and too few measurements to judge sigma by.")
+    elif kind == "innovation":
         measured = f"they are {size:.2f} times as large as predicted (RMS; 1 where sigma is true)"
-        if size > _TOO_LARGE[kind]:
-            return page.paragraph(
-                f"{name}: {missing}, and sigma looks too small for the innovations: {measured}.", "verdict bad"
-            )
-        if size < 0.5:
-            return page.paragraph(
-                f"{name}: {missing}; the stated sigma looks cautious for the innovations: {measured}.", "verdict"
-            )
-        return page.paragraph(f"{name}: {missing}. Innovations speak for the stated sigma: {measured}.", "verdict good")
-    measured = f"residuals are {size:.2f} times the measurements' sigma (RMS; 1 or a little less where sigma is true)"
-    if size > _TOO_LARGE[kind]:
-        return page.paragraph(f"{name}: {missing}, and sigma looks too small: {measured}.", "verdict bad")
-    said = f"{name}: {missing}, and residuals of a fit tell little; a filter's innovations tell more. The {measured}."
-    return page.paragraph(said, "verdict")
+        if larger:
+            words, mark = f"{missing}, and sigma looks too small for the innovations: {measured}.", "bad"
+            note = Note("no_truth.too_small", words)
+        elif size < 0.5:
+            words = f"{missing}; the stated sigma looks cautious for the innovations: {measured}."
+            note = Note("no_truth.cautious", words)
+        else:
+            words, mark = f"{missing}. Innovations speak for the stated sigma: {measured}.", "good"
+            note = Note("no_truth.consistent", words)
+    else:
+        measured = f"residuals are {size:.2f} times the measurements' sigma"
+        measured += " (RMS; 1 or a little less where sigma is true)"
+        if larger:
+            note, mark = Note("no_truth.residuals_large", f"{missing}, and sigma looks too small: {measured}."), "bad"
+        else:
+            words = f"{missing}, and residuals of a fit tell little; a filter's innovations tell more. The {measured}."
+            note = Note("no_truth.residuals_only", words)
+    return page.paragraph(note, f"verdict {mark}".strip())
 
 
-def describe_closure(name: str, metrics: Mapping[str, Any] | None) -> list[Raw]:
+def describe_closure(name: str, metrics: Mapping[str, Any] | None) -> list[Markup]:
     """How far from the start a loop ended, where that is the truth."""
     if not metrics or metrics.get("closure_h_m") is None:
         return []
-    h, up, way, share = (page.text(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))
+    h, up, way, share = (page.show(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))
     words = f"the loop of {way} m closes to {h} m horizontally ({share} % of the way) and {up} m in height."
-    return [page.paragraph(Raw(f"{page.text(name)}: {words}"), "verdict")]
+    return [page.paragraph(f"{name}: {words}", "verdict")]

@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.solution import Solution
@@ -14,7 +16,7 @@ from graphnav.evaluation.segments import relative_errors, rms
 from graphnav.recording import Recording
 from graphnav.report import page
 from graphnav.report.consistency import consistency
-from graphnav.report.page import Raw
+from graphnav.report.page import Quantity
 from graphnav.report.pictures import ENU, fixes_of
 from graphnav.report.tables import Withheld
 
@@ -36,14 +38,13 @@ _SHOWS = {
 }
 
 
-def verdicts(solution: Solution, errors: Errors | None) -> Raw:
+def verdicts(solution: Solution, errors: Errors | None) -> Markup:
     """Position, velocity and attitude: how good, and whether the stated sigma is consistent."""
     judged = _judge_by_records(solution) | ({} if errors is None else _judge_by_truth(errors))
-    cells = []
-    for block in ("position", "velocity", "attitude"):
-        kind, words = judged.get(block, ("", "nothing is there to judge it by"))
-        cells.append(f'<div class="verdict {kind}"><b>{block.capitalize()}</b>{page.text(words)}</div>')
-    return Raw(f'<div class="judged">{"".join(cells)}</div>')
+    nothing = ("", "nothing is there to judge it by")
+    return page.verdicts(
+        [(kind, block.capitalize(), words) for block in _SHOWS for kind, words in [judged.get(block, nothing)]]
+    )
 
 
 def _judge_by_truth(errors: Errors) -> dict[str, tuple[str, str]]:
@@ -84,7 +85,7 @@ def _judge_by_records(solution: Solution) -> dict[str, tuple[str, str]]:
     return out
 
 
-def sigma_table(solution: Solution) -> list[Raw]:
+def sigma_table(solution: Solution) -> list[Markup]:
     """The stated 1-sigma that half, 95 % and all of the keyframes keep within."""
     track = solution.trajectory()
     rows: list[list[Any]] = []
@@ -105,7 +106,7 @@ def sigma_table(solution: Solution) -> list[Raw]:
     return [page.heading("Stated 1-sigma"), page.table(["of", "50 %", "95 %", "largest"], rows)] if rows else []
 
 
-def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> list[Raw]:
+def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> list[Markup]:
     """Fixes of each kind: how many, how many were left out or used, the longest gap, the largest residual."""
     fixes, nan = fixes_of(recording, solution), float("nan")
     if fixes is None:
@@ -149,13 +150,13 @@ def _list_stated(recording: Recording, rows: Array) -> list[Any]:
     assert gnss is not None
     out: list[Any] = [float(np.median(np.hypot(gnss.sd[rows, 0], gnss.sd[rows, 1])))]
     if gnss.satellites is not None:
-        said = gnss.satellites[rows]
-        said = said[np.isfinite(said)]
-        out += [Raw(f"{x:.0f}") for x in (np.median(said), said.min())] if len(said) else ["-", "-"]
+        counts = gnss.satellites[rows]
+        counts = counts[np.isfinite(counts)]
+        out += [Quantity(f"{x:.0f}") for x in (np.median(counts), counts.min())] if len(counts) else ["-", "-"]
     return out
 
 
-def separation_table(solution: Solution) -> list[Raw]:
+def separation_table(solution: Solution) -> list[Markup]:
     """Forward filter less what comes after, per axis: its size, and that over its own sigma."""
     if solution.separation is None:
         return []
@@ -181,9 +182,9 @@ def _rows_at(t: Array, of: Array | None) -> np.ndarray:
     return np.where(np.abs(of[k] - t) <= 1e-3, k, -1)
 
 
-def left_out(solution: Solution, start: float) -> list[Raw]:
+def left_out(solution: Solution, start: float) -> list[Markup]:
     """What was left out and why, in three lines: the largest spans, the rest together, what weighs less."""
-    spans = sorted(getattr(solution, "excluded", ()), key=lambda p: -p.count)
+    spans = sorted(solution.excluded, key=lambda p: -p.count)
     some = spans[:_LINES] if len(spans) <= _LINES else spans[: _LINES - 1]
     lines = [
         f"{p.kind}, {p.count} rows from {p.t_start - start:.1f} to {p.t_end - start:.1f} s: {p.reason or 'faulty'}"
@@ -199,19 +200,18 @@ def left_out(solution: Solution, start: float) -> list[Raw]:
     ]
     if less and len(lines) < _LINES:
         lines.append(f"less than half weight, because they are farther off than chance allows: {page.and_list(less)}")
-    return [page.heading("Left out"), page.bullets(lines or ["Nothing was left out."])]
+    return [page.heading("Left out"), page.bullets(lines or [Note("left_out.nothing", "Nothing was left out.")])]
 
 
-def links(files: Sequence[str]) -> list[Raw]:
+def links(files: Sequence[str]) -> list[Markup]:
     """The files beside the page, to open in other programs."""
-    inner = ", ".join(f'<a href="{page.text(name)}">{page.text(name)}</a>' for name in files)
-    return [Raw(f'<p class="soft screen">Beside this page: {inner}.</p>')] if files else []
+    return [page.links(files)] if files else []
 
 
-def relative_tables(errors: Mapping[str, Errors]) -> list[Raw]:
+def relative_tables(errors: Mapping[str, Errors]) -> list[Markup]:
     """Relative errors by the length of segments, where there is a truth."""
     rows = [
-        [page.solver(name), Raw(f"{r.length:g}"), r.count, r.rms, r.percent, r.p95, r.largest, r.heading_rms]
+        [page.solver(name), Quantity(f"{r.length:g}"), r.count, r.rms, r.percent, r.p95, r.largest, r.heading_rms]
         for name, e in errors.items()
         for r in relative_errors(e)
     ]

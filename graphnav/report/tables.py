@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import INTERVALS
 from graphnav.estimation.solution import ParameterEstimate, Solution
@@ -17,7 +19,7 @@ from graphnav.recording import Recording
 from graphnav.report import page
 from graphnav.report.consistency import CONSISTENCY_HEAD, consistency, consistency_row, mean_or_nan
 from graphnav.report.names import components
-from graphnav.report.page import Raw
+from graphnav.report.page import Quantity
 from graphnav.report.plots import Spans
 
 if TYPE_CHECKING:
@@ -29,7 +31,7 @@ _SHOWN = 10  # excluded spans, stops; the others open on demand
 Withheld = Sequence[tuple[str, tuple[float, float] | None]]
 
 
-def constraint_table(solution: Solution) -> list[Raw]:
+def constraint_table(solution: Solution) -> list[Markup]:
     """Counts of everything used, and the consistency of what left a record."""
     out = []
     rows = [[kind, *consistency_row(consistency(record))] for kind, record in solution.records.items()]
@@ -93,7 +95,9 @@ def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[fl
     ]
 
 
-def accuracy_tables(errors: Mapping[str, Errors], withheld: Withheld, start: float, outages: Spans = ()) -> list[Raw]:
+def accuracy_tables(
+    errors: Mapping[str, Errors], withheld: Withheld, start: float, outages: Spans = ()
+) -> list[Markup]:
     """A table of all solvers over everything, and one for each withheld span."""
     if not errors:
         return []
@@ -104,7 +108,7 @@ def accuracy_tables(errors: Mapping[str, Errors], withheld: Withheld, start: flo
     spans += [("No GNSS", (a, b)) for a, b in outages if not any(c < b and d > a for c, d in gone)]
     if len(errors) == 1 and spans:
         (only,) = errors.values()
-        rows = [[Raw(f"{a:.1f} to {b:.1f} s"), what, *span_row(only, (a, b), start)] for what, (a, b) in spans]
+        rows = [[Quantity(f"{a:.1f} to {b:.1f} s"), what, *span_row(only, (a, b), start)] for what, (a, b) in spans]
         return [
             *out,
             page.heading("Spans without a source"),
@@ -118,7 +122,7 @@ def accuracy_tables(errors: Mapping[str, Errors], withheld: Withheld, start: flo
     return [*out, *_list_notes(errors)]
 
 
-def _list_notes(errors: Mapping[str, Errors]) -> list[Raw]:
+def _list_notes(errors: Mapping[str, Errors]) -> list[Markup]:
     notes = list(dict.fromkeys(note for e in errors.values() for note in e.notes))
     return [page.bullets(notes)] if notes else []
 
@@ -128,11 +132,11 @@ NOISE_HEAD = ("figure", "stated", "used", "unit", "times stated sigma", "1-sigma
               "degrees of freedom", "expected beforehand")  # fmt: skip
 
 
-def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Raw]:
+def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Markup]:
     """How good the sensors were taken to be, and which rows weigh less."""
     noise = solution.noise
     if not rows and not noise.weights:
-        return [page.paragraph("All noise figures are used as they are stated.")]
+        return [page.paragraph(Note("noise.as_stated", "All noise figures are used as they are stated."))]
     out = []
     if rows:
         cells = [
@@ -144,7 +148,7 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Raw]:
                 float(np.exp(0.5 * row.figure.log_factor)),
                 _format_range(row.figure.log_factor, row.figure.sigma),
                 float("nan") if row.correlation_time is None else row.correlation_time,
-                Raw(f"{row.figure.freedom:.0f}"),
+                Quantity(f"{row.figure.freedom:.0f}"),
                 _format_range(row.figure.prior, row.figure.prior_sigma),
             ]
             for row in rows
@@ -155,7 +159,8 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Raw]:
             "variances. A figure with few degrees of freedom is mostly what was expected beforehand."
         )
         if len(solution.between) > 1:
-            note += f" The recording was cut into {len(solution.between)} pieces: these are the figures of the first."
+            cut = f"The recording was cut into {len(solution.between)} pieces: these are the figures of the first."
+            out.append(page.paragraph(Note("noise.of_first_piece", cut), "soft"))
         out.append(page.paragraph(note, "soft"))
     less = [
         f"{np.count_nonzero(some.weight < 1.0)} of {len(solution.records[name].t)} rows of {name} are off by "
@@ -174,32 +179,34 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Raw]:
     return [*out, page.bullets(less)] if less else out
 
 
-def _format_range(log_factor: float, sigma: float) -> Raw:
+def _format_range(log_factor: float, sigma: float) -> Quantity:
     """1-sigma range of a factor on sigma, of the logarithm of that on the variance."""
     if sigma <= 0.0:
-        return Raw("-")
+        return Quantity("-")
     low, high = (page.number(float(np.exp(0.5 * (log_factor + s * sigma))), 2) for s in (-1.0, 1.0))
-    return Raw(f"{low} to {high}")
+    return Quantity(f"{low} to {high}")
 
 
-def excluded_table(solution: Solution, start: float) -> list[Raw]:
+def excluded_table(solution: Solution, start: float) -> list[Markup]:
     """What the solver left out of itself, when and why."""
-    parts = getattr(solution, "excluded", ())
+    parts = solution.excluded
     if not parts:
         return []
-    rows = [[Raw(f"{p.t_start - start:.1f} to {p.t_end - start:.1f} s"), p.kind, int(p.count), p.reason] for p in parts]
+    rows = [
+        [Quantity(f"{p.t_start - start:.1f} to {p.t_end - start:.1f} s"), p.kind, int(p.count), p.reason] for p in parts
+    ]
     return [page.heading("What was excluded"), *_long_table(["when", "what", "rows", "why"], rows)]
 
 
-def _long_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[Raw]:
+def _long_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[Markup]:
     """A table whose later rows are folded."""
     out = [page.table(head, rows[:_SHOWN])]
     if len(rows) > _SHOWN:
-        out.append(page.fold(f"{len(rows) - _SHOWN} more", page.table(head, rows[_SHOWN:])))
+        out.append(page.fold(f"{len(rows) - _SHOWN} more", [page.table(head, rows[_SHOWN:])]))
     return out
 
 
-def rejected_table(solution: Solution, start: float) -> list[Raw]:
+def rejected_table(solution: Solution, start: float) -> list[Markup]:
     """Every rejected measurement with its time; of many the largest."""
     rows: list[tuple[float, list[Any]]] = []
     for kind, r in solution.records.items():
@@ -207,7 +214,7 @@ def rejected_table(solution: Solution, start: float) -> list[Raw]:
         for k in np.flatnonzero(r.weight <= 1e-9):
             worst = int(np.argmax(white[k]))
             size = f"{r.residual[k, worst]:+.3g} {r.unit}, {r.axes[worst]}"
-            rows.append((float(r.t[k]), [Raw(f"{r.t[k] - start:.2f} s"), kind, size, float(white[k, worst])]))
+            rows.append((float(r.t[k]), [Quantity(f"{r.t[k] - start:.2f} s"), kind, size, float(white[k, worst])]))
     if not rows:
         return []
     largest = sorted(rows, key=lambda row: -row[1][3])[:_LISTED]
@@ -218,10 +225,10 @@ def rejected_table(solution: Solution, start: float) -> list[Raw]:
     words = f"{many} rejected measurement{'s' if many > 1 else ''}"
     if many > _LISTED:
         words += f", the {_LISTED} farthest off"
-    return [page.fold(words, table)]
+    return [page.fold(words, [table])]
 
 
-def nees_table(errors: Mapping[str, Errors]) -> list[Raw]:
+def nees_table(errors: Mapping[str, Errors]) -> list[Markup]:
     """Mean NEES per degree of freedom and the share of epochs inside the 95 % region, per solver."""
     from graphnav.evaluation.metrics import average_nees
     from graphnav.evaluation.sigmas import judge_sigmas
@@ -241,14 +248,14 @@ def nees_table(errors: Mapping[str, Errors]) -> list[Raw]:
         for words, (values, dof) in nees.items():
             found = average_nees(values, dof)
             if found is not None:
-                inside, one = Raw(f"{100 * found.inside:.1f} %"), judged[words]
-                worth = Raw(f"{one.effective:.0f}")
+                inside, one = Quantity(f"{100 * found.inside:.1f} %"), judged[words]
+                worth = Quantity(f"{one.effective:.0f}")
                 rows.append([page.solver(name), words, found.mean, inside, found.n, worth, says[one.verdict]])
     head = ["solver", "of", "mean NEES / dof", "epochs inside 95 %", "epochs", "worth independent", "what it says"]
     return [page.table(head, rows)] if rows else []
 
 
-def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Raw]:
+def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Markup]:
     """What was estimated once or slowly: last value and sigma, and what was known before."""
     rows = []
     for name, p in parameters.items():
@@ -256,23 +263,23 @@ def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Raw]:
             value, sigma = one.scale * float(p.value[-1, k]), one.scale * float(p.sigma[-1, k])
             known = "yes" if p.observable[k] else "no: mostly the prior"
             before = one.scale * float(p.prior_sigma[k])
-            said = [Raw(page.format_measured(value, sigma)), Raw(page.format_measured(sigma, sigma)), before]
-            rows.append([one.words, *said, one.unit, known])
+            shown = [page.format_measured(value, sigma), page.format_measured(sigma, sigma), before]
+            rows.append([one.words, *shown, one.unit, known])
     head = ["parameter", "value", "sigma", "sigma before", "unit", "seen by the data"]
     return [page.table(head, rows)] if rows else []
 
 
-def run_table(solutions: Mapping[str, Solution]) -> list[Raw]:
+def run_table(solutions: Mapping[str, Solution]) -> list[Markup]:
     """Seconds by stage, iterations and cost, a column per solver; why each stopped."""
     every, solutions = solutions, own_solutions(solutions)
     stages = list(dict.fromkeys(stage for s in solutions.values() for stage in s.timings))
 
-    def seconds(solution: Solution, stage: str) -> Raw | None:
-        return Raw(f"{solution.timings[stage]:.3f}") if stage in solution.timings else None
+    def seconds(solution: Solution, stage: str) -> Quantity | None:
+        return Quantity(f"{solution.timings[stage]:.3f}") if stage in solution.timings else None
 
     rows: list[list[Any]] = [[f"{stage} [s]", *(seconds(s, stage) for s in solutions.values())] for stage in stages]
     rows += [
-        ["sum [s]", *(Raw(f"<b>{sum(s.timings.values()):.3f}</b>") for s in solutions.values())],
+        ["sum [s]", *(Quantity(f"{sum(s.timings.values()):.3f}") for s in solutions.values())],
         ["iterations", *(s.iterations for s in solutions.values())],
         ["cost", *(float(s.cost) for s in solutions.values())],
     ]
@@ -281,31 +288,31 @@ def run_table(solutions: Mapping[str, Solution]) -> list[Raw]:
     shared = [note for note in next(iter(solutions.values())).notes if all(note in s.notes for s in solutions.values())]
     theirs = [f"{name}: {note}" for name, s in every.items() for note in s.notes if note not in shared]
     table = page.table(["stage", *(page.solver(name) for name in solutions)], rows)
-    said = [*notes, *shared, *theirs]
-    return [page.columns([table, page.bullets(said)]) if said else table]
+    lines = [*notes, *shared, *theirs]
+    return [page.columns([[table], [page.bullets(lines)]]) if lines else table]
 
 
-def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Raw]:
+def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Markup]:
     """Whatever the evaluation measured, as tables that open on demand."""
     if not metrics:
         return []
     plain = {key: value for key, value in metrics.items() if key not in ("spans", "notes")}
-    inner = page.pairs({k: v if v is None or isinstance(v, float) else str(v) for k, v in page.flat(plain).items()})
+    inner = [page.pairs({k: v if v is None or isinstance(v, float) else str(v) for k, v in page.flat(plain).items()})]
     spans = metrics.get("spans")
     if isinstance(spans, Sequence) and spans and isinstance(spans[0], Mapping):
-        inner = Raw(inner + page.table(list(spans[0]), [[s.get(k) for k in spans[0]] for s in spans]))
+        inner.append(page.table(list(spans[0]), [[s.get(k) for k in spans[0]] for s in spans]))
     return [page.fold(f"All measures{' of ' if name else ''}{name}", inner)]
 
 
-def stop_table(solution: Solution, start: float) -> list[Raw]:
+def stop_table(solution: Solution, start: float) -> list[Markup]:
     """Every stop: who found which share of it, and how many rows of which constraint came of it."""
     stops = stops_of_solution(solution)
     if not stops:
         return []
     rows = [
         [
-            Raw(f"{stop.start - start:.2f} s"),
-            Raw(f"{stop.end - stop.start:.2f} s"),
+            Quantity(f"{stop.start - start:.2f} s"),
+            Quantity(f"{stop.end - stop.start:.2f} s"),
             ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in stop.fired.items()),
             ", ".join(f"{count} {name}" for name, count in stop.rows.items()) or "none",
         ]
@@ -317,7 +324,7 @@ def stop_table(solution: Solution, start: float) -> list[Raw]:
     return [*_long_table(["stands from", "for", "share by detector", "rows"], rows), page.paragraph(note, "soft")]
 
 
-def odd(recording: Recording, findings: Sequence[str]) -> list[Raw]:
+def odd(recording: Recording, findings: Sequence[str]) -> list[Markup]:
     """Findings on the recording, each said once."""
     lines = list(dict.fromkeys([*recording.remarks, *findings]))
     if recording.imu.noise_assumed:

@@ -12,9 +12,15 @@ import pytest
 from helpers import refuse_command
 
 from graphnav.app import cli
+from graphnav.app.scores import score
+from graphnav.config import Settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.interpolation import place_on_earth
+from graphnav.core.notes import key_of
 from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.pipeline import run
+from graphnav.estimation.solution import Solution
+from graphnav.evaluation.against import Against, read_against
 from graphnav.recording import Truth
 from graphnav.recording.exporters import write_as
 from graphnav.recording.formats.writer import write_folder
@@ -38,6 +44,18 @@ def moved(east: float, shift: float = 0.0) -> Trajectory:
     part = TRUTH.take((TRUTH.t >= RECORDING.start - 1e-6) & (TRUTH.t <= RECORDING.end))
     frame = LocalFrame(part.llh[0])
     return replace(part, t=part.t + shift, llh=frame.to_llh(frame.from_llh(part.llh) + np.array([east, 0.0, 0.0])))
+
+
+def every(period: float, track: Trajectory, offset: float = 0.0) -> Trajectory:
+    """Its rows at multiples of a period, s, from an offset."""
+    k = (track.t - offset) / period
+    return track.take(np.abs(k - np.round(k)) < 1e-6)
+
+
+@pytest.fixture(scope="module")
+def ekf() -> Solution:
+    """The filter's, with noise as stated."""
+    return run(RECORDING, Settings.model_validate({"noise": {"mode": "stated"}}), ("ekf",))["ekf"]
 
 
 def compare(drive: Path, out: Path, *more: object) -> dict[str, dict[str, str]]:
@@ -78,7 +96,7 @@ def test_three_kinds_of_files_stand_beside_ours(drive, tmp_path):
 def test_a_file_with_few_rows_is_compared_at_these(drive, tmp_path):
     """Not between them, where a line cuts the corners of the way and hides what a filter drifts by."""
     part = moved(0.0)
-    rare = part.take(np.abs(part.t / 2.0 - np.round(part.t / 2.0)) < 1e-6)
+    rare = every(2.0, part)
     assert 20 < len(rare) < len(part) / 50
     write_as("csv", rare, tmp_path / "rare.csv", None)
     rows = compare(drive, tmp_path / "out", "--against", tmp_path / "rare.csv")
@@ -90,6 +108,31 @@ def test_a_shift_that_is_asked_for_is_made(drive, tmp_path):
     write_as("csv", moved(0.0, 0.2), tmp_path / "late.csv", None)
     rows = compare(drive, tmp_path / "b", "--against", tmp_path / "late.csv", "--against-shift", "-0.2")
     assert float(rows["late"]["h_rms_m"]) < 0.01
+
+
+@pytest.mark.parametrize("kind", ["nav", "tum"])
+@pytest.mark.parametrize(("period", "offset"), [(1.0, 0.5), (0.2, 0.1), (0.02, 0.0)])
+def test_epochs_of_its_own_cost_a_file_nothing(ekf, tmp_path, kind, period, offset):
+    """An exact file, once a second to fifty times, beside a truth of five rows a second, none of them together."""
+    truth, track = every(0.2, moved(0.0)), every(period, moved(0.0), offset)
+    drive = replace(RECORDING, truth=Truth(truth.t, truth.llh, None, truth.v, truth.rph), gps_zero=ZERO)
+    if kind == "tum":  # neither its place nor its velocity
+        track = replace(track, llh=LocalFrame(track.llh[0]).from_llh(track.llh), frame="local", v=None)
+    utc = np.datetime64("2022-03-09T23:59:42", "us") + np.round(track.t * 1e6).astype("timedelta64[us]")
+    write_as(kind, track, tmp_path / f"its.{kind}", utc)
+    beside = read_against(Against(tmp_path / f"its.{kind}"), "its", drive, ekf)
+    errors = score(drive, drive, {"ekf": ekf, "its": beside}, ())[0]["its"].errors
+    assert errors is not None
+    assert len(errors) >= 60
+    assert errors.horizontal.max() < 1e-3
+    assert np.degrees(np.abs(errors.rph[:, 2])).max() < 0.05  # what 0.2 s of a turn are off the shortest arc
+
+
+@pytest.mark.parametrize(("period", "late"), [(0.02, 0.0), (0.02, 0.2), (1.0, 0.0), (1.0, 0.2), (2.0, 0.0)])
+def test_a_delay_is_told_where_there_is_one(ekf, tmp_path, period, late):
+    write_as("csv", every(period, moved(0.0, late), late), tmp_path / "its.csv", None)
+    found = read_against(Against(tmp_path / "its.csv"), "its", RECORDING, ekf)
+    assert ("against.late" in [key_of(note) for note in found.notes]) == (late > 0.0)
 
 
 @pytest.mark.parametrize(

@@ -224,6 +224,8 @@ def test_a_phone_with_a_file_per_sensor(tmp_path, capsys):
     assert recording.imu.gyro == pytest.approx(DRIVE.imu.gyro[1 : len(recording.imu.t) + 1], abs=1e-6)
     assert recording.gnss.v[:, :2] == pytest.approx(gnss.v[:, :2], abs=1e-6)
     refuse_command(capsys, "output.exists", "init", *files, "-o", tmp_path / "recording.toml")
+    assert cli.run(["init", *files, "-o", str(tmp_path / "ride.toml"), "--force"]) == 0
+    assert (recording.name, read(tmp_path / "ride.toml").name) == (tmp_path.name, "ride")
 
 
 def test_logs_of_other_programs_are_joined(tmp_path):

@@ -7,7 +7,7 @@ import json
 import re
 import tomllib
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -24,7 +24,14 @@ from graphnav.core.state import States
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.table import figure_rows
-from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Separation, Solution, join_solutions
+from graphnav.estimation.solution import (
+    ConstraintRecord,
+    ExcludedSpan,
+    ParameterEstimate,
+    Separation,
+    Solution,
+    join_solutions,
+)
 from graphnav.evaluation.metrics import Errors
 from graphnav.evaluation.segments import relative_errors
 from graphnav.imu.dynamics import SCALE
@@ -37,9 +44,9 @@ from graphnav.report.consistency import consistency
 from graphnav.report.documents import write_comparison, write_report
 from graphnav.report.names import components, has_names
 from graphnav.report.provenance import command, toml_text
-from graphnav.report.sentences import list_doubts
+from graphnav.report.sentences import believe_without_truth, list_doubts
 from graphnav.report.summary import fix_table, left_out, sigma_table, verdicts
-from graphnav.report.tables import accuracy_row, excluded_table, span_row
+from graphnav.report.tables import accuracy_row, excluded_table, rejected_table, span_row, stop_table
 
 START, COUNT = 1000.0, 600
 NAME = "drive <script>alert('x')</script> & \"co\""
@@ -120,6 +127,7 @@ class Strict(HTMLParser):
     def __init__(self, text):
         super().__init__()
         self.open, self.ids, self.references, self.words, self.tags, self.figures = [], [], [], [], [], []
+        self.keys = []  # of the notes
         self.feed(text)
         self.close()
         assert not self.open
@@ -140,6 +148,8 @@ class Strict(HTMLParser):
         for key, value in attrs:
             if key == "id":
                 self.ids.append(value)
+            if key == "data-key":
+                self.keys.append(value)
             if key in ("src", "href", "xlink:href", "data", "srcset", "action"):
                 self.references.append(value)
 
@@ -211,10 +221,8 @@ def test_report_holds_what_it_was_given(tmp_path, recording):
 
 
 def test_report_without_truth_shows_sigma_instead(tmp_path, recording):
-    parser, text = checked(write(tmp_path, recording))
-    assert "Accuracy" not in text
-    assert "1 sigma as stated" in text
-    assert "there is no truth to compare with" in text
+    parser, _ = checked(write(tmp_path, recording))
+    assert "no_truth.consistent" in parser.keys
     # way, heights, position, velocity and attitude, three sigmas, two biases, what was used when, one constraint
     assert len(parser.figures) == 13
 
@@ -227,23 +235,17 @@ def test_report_of_next_to_nothing(tmp_path, recording):
     checked(path)
 
 
-@dataclass(frozen=True)
-class Excluded:
-    t_start: float
-    t_end: float
-    kind: str
-    count: int
-    reason: str
-
-
-@dataclass(frozen=True)
-class Excluding(Solution):
-    excluded: tuple[Excluded, ...] = ()
+def test_a_truth_without_heights_has_no_panel_of_them():
+    flat = errors_of()
+    flat.p[:, 2] = np.nan
+    (position, _) = report_pictures.error_pictures({"ekf": flat}, START, COUNT, {})
+    (figure,) = (json.loads(unpacked(packed)) for packed in re.findall(r'data-size="\d+">([^<]*)<', position))
+    assert len([name for name in figure["layout"] if name.startswith("yaxis")]) == 2
 
 
 def test_what_was_excluded_is_listed_and_marked(tmp_path, recording):
-    part = Excluded(START + 200.0, START + 219.5, "gnss_position", 20, "jumped by 31 m <sideways>")
-    found = Excluding(**{**vars(solution()), "excluded": (part,)})
+    part = ExcludedSpan("gnss_position", START + 200.0, START + 219.5, 20, "jumped by 31 m <sideways>")
+    found = replace(solution(), excluded=(part,))
     _, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}))
     for words in ("200.0 to 219.5 s", "jumped by 31 m <sideways>", "20 measurements were excluded", "excluded fix"):
         assert words in text, words
@@ -256,8 +258,8 @@ def test_what_was_excluded_is_listed_and_marked(tmp_path, recording):
 
 
 def test_of_many_exclusions_ten_are_shown_and_three_lines_say_what_was_left_out(tmp_path, recording):
-    parts = tuple(Excluded(START + 20.0 * k, START + 20.0 * k + 4.0, "gnss_position", 5 + k, "") for k in range(14))
-    found = Excluding(**{**vars(solution()), "excluded": parts})
+    parts = tuple(ExcludedSpan("gnss_position", START + 20.0 * k, START + 20.0 * k + 4.0, 5 + k) for k in range(14))
+    found = replace(solution(), excluded=parts)
     (shown, folded) = excluded_table(found, START)[1:]
     assert shown.count("<tr>") == 11
     assert "<details>" in folded
@@ -266,7 +268,7 @@ def test_of_many_exclusions_ten_are_shown_and_three_lines_say_what_was_left_out(
     assert lines.count("<li>") <= 3
     assert "18 rows from 260.0 to 264.0 s" in lines
     assert f"{sum(range(5, 17))} rows in 12 more spans" in lines
-    assert "Nothing" in left_out(replace(solution(), records={}), START)[1]
+    assert 'data-key="left_out.nothing"' in left_out(replace(solution(), records={}), START)[1]
 
 
 def cells(table):
@@ -385,11 +387,10 @@ def test_relative_errors_are_those_of_displacements():
 
 
 def test_rejected_measurements_are_listed_with_their_times(tmp_path, recording):
-    _, text = checked(write(tmp_path, recording))
-    assert "1 rejected measurement" in text
     # of row 50, at 51 s: every component is 40 sigma, which is 20 m
-    assert "51.00 s" in text
-    assert "+20 m, east" in text
+    (only,) = cells(rejected_table(solution(), START)[0])
+    assert only[:1] + only[2:] == ["51.00 s", "+20 m, east", "40.00"]
+    assert "51.00 s" in checked(write(tmp_path, recording))[1]
 
 
 def test_stops_and_outages_are_told(tmp_path, recording):
@@ -398,41 +399,44 @@ def test_stops_and_outages_are_told(tmp_path, recording):
     still = Detection("low_band_glrt", t, np.full(len(t), 0.5), 3.0, t > 0, spans)
     found = replace(solution(), detections=(still, replace(still, name="fused")))
     parser, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}, outages=[(200.0, 230.0)]))
-    assert "2 stops were found, 42 s in all" in text
-    assert "no GNSS fixes from 200 to 230 s" in text
-    assert "threshold: below it stands" in text
+    assert [row[:2] for row in cells(stop_table(found, START)[0])] == [["100.00 s", "30.00 s"], ["400.00 s", "12.00 s"]]
+    assert all(words in text for words in ("200 to 230 s", "42 s"))
     assert len(parser.figures) == 14
 
 
 @pytest.mark.parametrize(
-    ("scale", "kind", "words"),
+    ("scale", "kind", "key"),
     [
-        (1.0, "innovation", "Innovations speak for the stated sigma: they are 1.0"),
-        (2.0, "innovation", "sigma looks too small for the innovations: they are 2.0"),
-        (0.4, "innovation", "cautious for the innovations: they are 0.4"),
-        (0.9, "residual", "residuals of a fit tell little"),
-        (1.5, "residual", "sigma looks too small: residuals are 1.5"),
+        (1.0, "innovation", "consistent"),
+        (2.0, "innovation", "too_small"),
+        (0.4, "innovation", "cautious"),
+        (0.9, "residual", "residuals_only"),
+        (1.5, "residual", "residuals_large"),
     ],
 )
-def test_sigma_is_judged_by_what_was_met_where_there_is_no_truth(tmp_path, recording, scale, kind, words):
+def test_sigma_is_judged_by_what_was_met_where_there_is_no_truth(tmp_path, recording, scale, kind, key):
     found = replace(solution(), records={"gnss_position": record(scale, kind)})
-    _, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}))
-    assert words in text
+    said = believe_without_truth(found)
+    assert re.findall(r'data-key="([^"]*)"', said) == [f"no_truth.{key}"]
+    size = np.sqrt(consistency(found.records["gnss_position"]).mean_nis / 3.0)
+    assert f"{size:.2f}" in said
+    assert f"no_truth.{key}" in checked(write_report(tmp_path / "r.html", recording, found, settings={}))[0].keys
 
 
 def test_what_cannot_be_trusted_says_so_first(tmp_path, recording):
-    def first_words(found):
-        _, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}))
-        return " ".join(text.split("estimated the trajectory of")[0].split())
+    def first_keys(found):
+        return [key for key in checked(write_report(tmp_path / "r.html", recording, found, settings={}))[0].keys
+                if key.startswith("doubt.")]  # fmt: skip
 
-    assert "cannot be trusted" not in first_words(solution())
+    assert first_keys(solution()) == []
     t = record().t
     mostly = NoiseModel(excluded={"gnss_position": ((t[100], t[500]),)})  # 401 of 600
-    assert "67 %" in first_words(replace(solution(), noise=mostly))
+    assert first_keys(replace(solution(), noise=mostly)) == ["doubt.left_out"]
+    assert "67 %" in list_doubts({"ekf": replace(solution(), noise=mostly)}, {})[0]
     partly = NoiseModel(excluded={"gnss_position": ((t[100], t[200]),)})
-    assert "cannot be trusted" not in first_words(replace(solution(), noise=partly))
+    assert first_keys(replace(solution(), noise=partly)) == []
     larger = replace(solution(), records={"gnss_position": record(2.0)})
-    assert "sigma cannot be trusted" in first_words(larger)
+    assert first_keys(larger) == ["doubt.sigma"]
     assert list_doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.02)})
     assert not list_doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.3)})
 
@@ -464,8 +468,7 @@ def test_the_noise_model_is_a_table(tmp_path, recording):
             "0.12",
         ):
             assert words in text, words
-    plain = checked(write_report(tmp_path / "r.html", recording, solution(), settings={}))[1]
-    assert "as they are stated" in plain
+    assert "noise.as_stated" in checked(write_report(tmp_path / "r.html", recording, solution(), settings={}))[0].keys
 
 
 def test_pieces_keep_all_weights_and_spans_and_the_report_says_whose_figures_it_has(tmp_path, recording):
@@ -494,14 +497,14 @@ def test_pieces_keep_all_weights_and_spans_and_the_report_says_whose_figures_it_
     assert whole.passes == {"filter": 6, "smoother": 1}
     rows = figure_rows(whole.noise, recording, (100.0, 3600.0))
     shown = replace(whole, t=parts[0].t, states=parts[0].states, covariance=parts[0].covariance)
-    assert "2 pieces" in checked(write_report(tmp_path / "r.html", recording, shown, settings={}, noise=rows))[1]
+    page, _ = checked(write_report(tmp_path / "r.html", recording, shown, settings={}, noise=rows))
+    assert "noise.of_first_piece" in page.keys
 
 
 def test_innovations_speak_for_all_solvers(tmp_path, recording):
     met, fitted = solution("ekf"), replace(solution("batch"), records={"gnss_position": record(kind="residual")})
-    _, text = checked(write_comparison(tmp_path / "c.html", recording, {"ekf": met, "batch": fitted}, settings={}))
-    assert "ekf: there is no truth to compare with. Innovations speak for" in text
-    assert "residuals of a fit tell little" not in text
+    page, _ = checked(write_comparison(tmp_path / "c.html", recording, {"ekf": met, "batch": fitted}, settings={}))
+    assert [key for key in page.keys if key.startswith("no_truth.")] == ["no_truth.consistent"]
 
 
 def test_a_column_without_any_number_is_left_out():
@@ -551,9 +554,10 @@ def test_comparison_has_a_row_per_solver_and_span(tmp_path, recording):
         assert page.number(0.111 * (k + 1)) in text
         assert page.number(7 * 0.111 * (k + 1)) in text
     assert text.count("Withheld 100 to 160 s") == text.count("Withheld 250 to 350 s") == 1
-    assert "batch: the stated sigma is too small" in text
-    assert "rts: the stated sigma is cautious" in text
-    assert "ekf: the stated sigma is consistent" in text
+    said = [key.removeprefix("sigma.") for key in parser.keys if key.startswith("sigma.")]
+    assert dict(zip(solvers, said, strict=True)) == {
+        "ekf": "consistent", "rts": "cautious", "incremental": "consistent", "batch": "too_small",
+    }  # fmt: skip
     assert parser.tags.count("table") >= 5
 
 
@@ -586,13 +590,13 @@ def test_consistency_counts_and_judges():
     used = np.arange(COUNT) != 50
     assert c.mean_nis == pytest.approx((white[used] ** 2).sum(1).mean(), rel=1e-12)
     assert c.outside == pytest.approx((np.abs(white[used]) > 3).mean(), rel=1e-12)
-    assert "consistent" in c.verdict
-    assert consistency(replace(record(), weight=np.zeros(COUNT))).verdict == "too few to judge"
-    assert consistency(replace(record(), nis=np.full(COUNT, np.nan))).verdict == "too few to judge"
-    assert "overconfident" in consistency(record(2.0)).verdict
-    assert "wider" in consistency(record(0.5)).verdict
-    assert "within" in consistency(record(0.5, "residual")).verdict
-    assert "too small" in consistency(record(2.0, "residual")).verdict
+    for one, key in (
+        (record(), "as_predicted"), (replace(record(), weight=np.zeros(COUNT)), "few"),
+        (replace(record(), nis=np.full(COUNT, np.nan)), "few"), (record(2.0), "overconfident"),
+        (record(0.5), "cautious"), (record(0.5, "residual"), "residuals_within"),
+        (record(2.0, "residual"), "residuals_large"),
+    ):  # fmt: skip
+        assert consistency(one).verdict.key == f"consistency.{key}"
 
 
 def test_an_outlier_that_has_little_weight_says_nothing_against_sigma():
@@ -615,14 +619,14 @@ def test_separation_satellites_and_stated_accuracy_are_shown(tmp_path, recording
     apart = Separation(found.t, 0.25 * three, 0.5 * three)
     apart.value[-1] = np.nan
     seen = replace(recording, gnss=replace(recording.gnss, satellites=np.full(len(recording.gnss.t), 17.0)))
-    _, text = checked(write_report(tmp_path / "r.html", seen, replace(found, separation=apart), settings={}))
-    assert "Combined separation and 3 sigma" in text
+    checked(write_report(tmp_path / "r.html", seen, replace(found, separation=apart), settings={}))
     html = (tmp_path / "r.html").read_text()
     rows = re.findall(r"<tr><td[^>]*>(east|north|up)</td>(.*?)</tr>", html)
     assert [axis for axis, _ in rows] == ["east", "north", "up"]
     for _, cells in rows:
         assert [float(x) for x in re.findall(r">([\d.]+)<", cells)] == [0.25, 0.25, 0.25, 0.5]
-    assert "Fixes: stated accuracy and satellites" in text
+    drawn = figures_of(tmp_path / "r.html")
+    assert {"Combined separation and 3 sigma", "Fixes: stated accuracy and satellites"} <= drawn.keys()
     assert re.search(
         r">17<.*>17<", (tmp_path / "r.html").read_text().partition("Fixes</h3>")[2].partition("</table>")[0]
     )

@@ -244,7 +244,7 @@ def _forward(
         k += 1
         if about is not None and k == n:  # from here on linearised where the filter is
             x, P = _leave_points(about, own, all_P, k, x)
-    stack.finish()
+    log_likelihood = stack.finish()
     weights = {c.name: records[c.name].decided for c in fixes}
     errors, errors_ahead = np.array(found[:n]).reshape(n, D), np.array(ahead[:n]).reshape(n, D)
     filtered, predicted = _points(about, errors, found[n:]), _points(about, errors_ahead, ahead[n:])
@@ -263,7 +263,7 @@ def _forward(
         errors,
         errors_ahead,
         updates,
-        stack.log_likelihood,
+        log_likelihood,
     )
 
 

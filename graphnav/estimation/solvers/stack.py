@@ -156,8 +156,8 @@ class Stack:
         k, at = rows.at
         self.root[k, at, at], self.solved[k, at] = root, solved
 
-    def finish(self) -> None:
-        """Work out the innovations of each kind."""
+    def finish(self) -> Array:
+        """Work out the innovations of each kind; returns their log-likelihood (K,), but for a constant."""
         kind = np.full((self.K, self.M), -1)
         weighs = np.zeros((self.K, self.M), dtype=bool)
         for i, c in enumerate(self._constraints):
@@ -175,5 +175,5 @@ class Stack:
             record.residual[:n], record.sigma[:n] = residual[place], sigma[place]
             total = np.bincount(k, np.sum(white[place] ** 2, axis=1), self.K)
             record.nis[:n] = total[k] / np.bincount(k, minlength=self.K)[k]
-        self.log_likelihood = -np.sum(np.log(np.where(spread > 0.0, spread, 1.0)), axis=1)
-        self.log_likelihood -= 0.5 * np.sum(np.where(weighs, white, 0.0) ** 2, axis=1)
+        log_determinant = np.sum(np.log(np.where(spread > 0.0, spread, 1.0)), axis=1)
+        return -log_determinant - 0.5 * np.sum(np.where(weighs, white, 0.0) ** 2, axis=1)

@@ -127,8 +127,8 @@ def _explain_unknown(source: str | Path, known: dict[str, Format]) -> RecordingE
     path = Path(source)
     if path.is_dir():
         there = sorted(p.name for p in path.glob("*.toml"))
-        hint = f"; point at one of {', '.join(there)} in it" if there else ""
-        return RecordingError(f"{path}: the folder holds no recording.toml{hint}", key="recording.none")
+        hint = f"point at one of {', '.join(there)} in it" if there else f"graphnav init {path} -o {path} drafts one"
+        return RecordingError(f"{path}: the folder holds no recording.toml; {hint}", key="recording.none")
     if path.exists():
         if path.suffix == ".csv" or path.name.endswith(".csv.gz"):
             return RecordingError(

@@ -31,14 +31,14 @@ class Panel:
         self.axes = {"xaxis": figure.x_of(k), "yaxis": _axis("y", k)}
 
     def _add(self, label: str, trace: dict[str, Any], quiet: bool = False, at: str = "", way: bool = False) -> None:
-        said = {"hoverinfo": "skip"}
+        hover = {"hoverinfo": "skip"}
         if not quiet:
             place = ("%{x:.2f}, %{y:.2f} " if way else "%{y:.4~g} ") + self.unit
-            said = {"hovertemplate": f"{place.strip()}{at}<extra>{label}</extra>"}
+            hover = {"hovertemplate": f"{place.strip()}{at}<extra>{label}</extra>"}
         first = bool(label) and label not in self.figure.labels
         self.figure.labels.add(label)
         self.figure.data.append(
-            {"type": "scatter", **self.axes, "name": label, "legendgroup": label, "showlegend": first, **said, **trace}
+            {"type": "scatter", **self.axes, "name": label, "legendgroup": label, "showlegend": first, **hover, **trace}
         )
 
     def line(
@@ -175,7 +175,7 @@ class Figure:
             logarithmic = log if isinstance(log, bool) else log[k]
             look = {**_LOOK, "range": list(ylim), "domain": [max(top - height / inner, 0.0), top], "anchor": xname}
             if logarithmic:
-                look |= {"type": "log", "minorloglabels": "complete", "nticks": 4}
+                look |= {"type": "log", "minorloglabels": "complete", "nticks": 3}
             if names is not None:
                 look |= {"tickmode": "array", "tickvals": list(names), "ticktext": list(names.values()), "ticks": ""}
                 look["automargin"] = True

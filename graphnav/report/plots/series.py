@@ -21,6 +21,10 @@ class Series:
     value: Array  # (N, k)
     sigma: Array | None = None  # (N, k)
 
+    def take(self, components: Sequence[int]) -> Series:
+        """Some of the components."""
+        return Series(self.t, self.value[:, components], None if self.sigma is None else self.sigma[:, components])
+
 
 def bands(
     series: Mapping[str, Series], components: Sequence[str], unit: str | Sequence[str], end: float, *, spans: Shades,

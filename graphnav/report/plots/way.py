@@ -61,6 +61,7 @@ def trajectory(
     both = both[np.isfinite(both).all(axis=1)]
     (west, east), (south, north) = (limits([both[:, k]], floor=1.0, always=[en[:, k] for _, en in tracks.values()])
                                     for k in (0, 1))  # fmt: skip
+    south -= 0.06 * (north - south)  # for the scale bar
     scale = max((east - west) / _WIDE, (north - south) / _HIGH)  # m per pixel, the same on both axes
     figure = Figure(["north [m]"], (west, east), [(south, north)], units=["m"], height=_HIGH, x="east [m]", equal=True)
     (panel,) = figure.panels
