@@ -115,6 +115,9 @@ def compare(
         list[float] | None,
         typer.Option("--against-shift", metavar="S", help="To add to the stamps of each --against; default: found."),
     ] = None,
+    loose: Annotated[
+        bool, typer.Option("--loose", help="Solve raw GNSS with its fixes as well, as ekf-loose and so on.")
+    ] = False,
     export: Export = None,
     point: Point = None,
     pages: Pages = True,
@@ -138,7 +141,7 @@ def compare(
                 key="option.count",
             )
     with permit_outside(allow_outside):
-        _solve(asked, solvers, "--solvers", export, point, beside)
+        _solve(asked, solvers, "--solvers", export, point, beside, loose)
 
 
 @commands.command(epilog="\b\nExample:\n  graphnav report out/kitti")
@@ -199,6 +202,7 @@ def _solve(
     export: str | None = None,
     point: str | None = None,
     beside: _Beside | None = None,
+    loose: bool = False,
 ) -> None:
     from graphnav.app import convert, outputs, terminal, workflow
     from graphnav.app.summary import comparison
@@ -214,15 +218,16 @@ def _solve(
     chosen, alone = split_names(solvers, pipeline.KNOWN, option, "solver"), option == "--solver"
     if alone and len(chosen) > 1:
         raise ConfigError(f"--solver {solvers}: smooth uses one; several are for graphnav compare", key="option.value")
-    requirements = [gates.parse_requirement(one, chosen) for one in asked.require or ()]
+    names = workflow.name_runs(chosen, loose)
+    requirements = [gates.parse_requirement(one, names) for one in asked.require or ()]
     given: dict[str, Any] = {
         "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
         "config": asked.config and str(asked.config), "noise": asked.noise, "detectors": asked.detectors,
         "without": asked.without, "rate": asked.rate, "start": asked.start, "end": asked.end, "format": asked.format,
         "topic": asked.topic,
-        "against": (beside and [str(file) for file in beside.files]) or None,
+        "against": (beside and [str(file) for file in beside.files]) or None, "loose": loose or None,
     }  # fmt: skip
-    folder = outputs.output_folder(asked.out, outputs.FILES, () if alone else chosen)
+    folder = outputs.output_folder(asked.out, outputs.FILES, () if alone else names)
     if point is not None and export is None:
         raise ConfigError(f"--point {point}: is of the files of --export; name some", key="option.not_here")
     exported = split_names(export, NAMES, "--export", "format to write") if export is not None else ()
@@ -240,7 +245,7 @@ def _solve(
         asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
         {k: v for k, v in given.items() if v is not None}, noise, exported=exported, point=point,
         topics=tuple(asked.topic or ()), format=asked.format, against=tuple(against),
-        judge_arms=not alone,
+        judge_arms=not alone, loose=loose,
     )  # fmt: skip
     with bar(asked.quiet, *chosen) as progress:
         outcome = workflow.run_request(request, progress)
@@ -249,7 +254,7 @@ def _solve(
             files = (outputs.write_run if alone else outputs.write_comparison)(outcome, part, asked.pages)
         files = final_path(files, part, folder)
         if not asked.pages:
-            outputs.remove_pages(folder, () if alone else chosen)
+            outputs.remove_pages(folder, () if alone else names)
         if exported:  # by itself, so that one that fails takes nothing with it
             with stage_results(folder) as part:
                 more = convert.export_run(outcome, part, exported, point, alone)
@@ -257,9 +262,9 @@ def _solve(
     verdicts = gates.judge(requirements, comparison(outcome, ours=True)) if requirements else []
 
     def values() -> dict[str, Any]:
-        places = {name: folder if alone else folder / name for name in chosen}
+        places = {name: folder if alone else folder / name for name in names}
         each = {name: loads((at / "summary.json").read_text(encoding="utf-8")) for name, at in places.items()}
-        found = each[chosen[0]] if alone else {"recording": outcome.recording.name, "solvers": each}
+        found = each[names[0]] if alone else {"recording": outcome.recording.name, "solvers": each}
         return {**found, "requirements": gates.values(verdicts), "files": files}
 
     show(lambda: terminal.run_text(outcome, files) + gates.text(verdicts), values, asked.quiet, asked.json)

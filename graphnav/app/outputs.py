@@ -220,7 +220,7 @@ def _draw_solver(
         folder / "report.html",
         outcome.recording,
         solution,
-        settings=outcome.request.settings.model_dump(),
+        settings=outcome.request.settings_of(name).model_dump(),
         metrics=None if metrics is None else summary(metrics),
         errors=None if metrics is None else metrics.errors,
         withheld=outcome.used_withheld,

@@ -81,7 +81,7 @@ def solver_summary(
         "remarks": list(outcome.findings),
         "checks": [f.values() for f in outcome.checks],
         "messages": [f.values() for f in messages],
-        "settings": outcome.request.settings.model_dump(),
+        "settings": outcome.request.settings_of(solution.solver).model_dump(),
         "provenance": provenance,
     }
 

@@ -33,6 +33,9 @@ if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Metrics
 
 
+LOOSE = "-loose"  # behind the name of a solver that had fixes in place of raw observations
+
+
 @dataclass(frozen=True)
 class GivenNoise:
     """A noise model, and the file that it is from, if it is from one."""
@@ -60,6 +63,11 @@ class Request:
     exported: tuple[str, ...] = ()  # formats that are to be written as well, of
     point: str | None = None  # "antenna", "imu" or a lever arm
     judge_arms: bool = False  # ask the drive for the signs of lever arms even where nothing is in doubt
+    loose: bool = False  # solve with fixes in place of raw observations as well
+
+    def settings_of(self, name: str) -> Settings:
+        """Those that the solution of a name was made with."""
+        return couple_loosely(self.settings) if name.endswith(LOOSE) else self.settings
 
 
 @dataclass(frozen=True)
@@ -88,6 +96,16 @@ class Outcome:
     def used_withheld(self) -> tuple[Withheld, ...]:
         """What was withheld, in s from the start of `recording`."""
         return _move(self.request.withheld, self.zero)
+
+
+def name_runs(solvers: tuple[str, ...], loose: bool) -> tuple[str, ...]:
+    """The names of the solutions that solvers make."""
+    return tuple(name for solver in solvers for name in ((solver, solver + LOOSE) if loose else (solver,)))
+
+
+def couple_loosely(settings: Settings) -> Settings:
+    """The settings with fixes in place of raw observations."""
+    return settings.model_copy(update={"raw_gnss": settings.raw_gnss.model_copy(update={"coupling": "loose"})})
 
 
 def parse_withheld(text: str) -> Withheld:
@@ -188,7 +206,16 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     from graphnav.report.sentences import list_doubts
 
     given = request.noise
-    solutions = run(used, request.settings, request.solvers, progress, None if given is None else given.model)
+    model = None if given is None else given.model
+    if request.loose and not used.tight(request.settings.raw_gnss.coupling):
+        raise ConfigError(
+            f"--loose: '{used.name}' has no raw observations that are used in place of fixes", key="option.not_here"
+        )
+    solutions = run(used, request.settings, request.solvers, progress, model)
+    if request.loose:
+        others = run(used, couple_loosely(request.settings), request.solvers, progress, model)
+        solutions |= {name + LOOSE: replace(one, solver=name + LOOSE) for name, one in others.items()}
+        solutions = {name: solutions[name] for name in name_runs(request.solvers, True)}
     if given is not None:
         notes += list_unused_noise(given.model, next(iter(solutions.values())))
     solutions = {

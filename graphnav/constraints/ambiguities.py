@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter
 from graphnav.gnss.arcs import Arcs
 
+_PREFIX = "ambiguity."
 _SIGMA = 30.0  # m, 1-sigma about what the codes say: next to nothing known
 
 
@@ -31,4 +34,9 @@ def ambiguities(arcs: Arcs, cycles: Array, wavelength: Array) -> dict[int, Param
 
 def ambiguity_name(slot: str) -> str:
     """The name of the parameter of a slot, "G05.1C"."""
-    return f"ambiguity.{slot}"
+    return f"{_PREFIX}{slot}"
+
+
+def slot_names(parameters: Sequence[str]) -> tuple[str, ...]:
+    """The opposite of `ambiguity_name`."""
+    return tuple(name.removeprefix(_PREFIX) for name in parameters)

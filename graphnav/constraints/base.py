@@ -104,7 +104,7 @@ class Constraint(ABC):
 
     @property
     def labels(self) -> dict[str, Array]:
-        """What a record of rows of satellites has beside them: their names and elevations, (N,) each."""
+        """What a record of rows of satellites has beside them: their names, azimuths and elevations, (N,) each."""
         return {}
 
     def noise_groups(self) -> tuple[tuple[str, ...], Array]:

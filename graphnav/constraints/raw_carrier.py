@@ -39,11 +39,13 @@ from graphnav.constraints.raw_gnss import (
     AXES,
     IONOSPHERE,
     ONE,
+    PER_ROW,
     PreparedRows,
     SatelliteConstraint,
     common_fields,
     ionosphere_parameter,
-    prepare_rows,
+    period_of_epochs,
+    prepare_every,
     range_change,
     select_columns,
 )
@@ -52,7 +54,7 @@ from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.gnss.atmosphere import obliquity
-from graphnav.gnss.carrier import consecutive
+from graphnav.gnss.carrier import consecutive, number_epochs
 from graphnav.gnss.series import median_of_epochs
 from graphnav.gnss.sigmas import carrier_sigma
 from graphnav.gnss.signals import L1, C
@@ -75,7 +77,7 @@ class _Pairs:
 
     before: NDArray[np.intp]  # (N,) of the prepared rows
     after: NDArray[np.intp]
-    epoch: NDArray[np.intp]  # (N,) of `after`, number of the epoch
+    number: NDArray[np.intp]  # (E,) of the epochs, -1 for one that changes are not counted to
     epochs: Array  # (E,) s
     first: NDArray[np.intp]  # (E,) a prepared row of each epoch
     change: Array  # (N,) m, all that does not depend on the estimate
@@ -92,18 +94,19 @@ def _use_differences(recording: Recording, settings: Settings) -> bool:
     s, raw = settings.raw_gnss, recording.raw_gnss
     if raw is None or not s.differences:
         return False
-    return not (s.carrier and s.code and np.isfinite(raw.carrier_difference).any())
+    based = np.isfinite(raw.carrier_difference).any() if raw.catalogue is None else raw.differenced
+    return not (s.carrier and s.code and based)
 
 
 def _pair_rows(scene: BuildContext) -> tuple[PreparedRows, _Pairs] | None:
     if not _use_differences(scene.recording, scene.settings):
         return None
-    found, whole = scene.share(prepare_rows), scene.recording.raw_gnss
+    found, whole = scene.share(prepare_every), scene.recording.raw_gnss
     if found is None or whole is None or not np.isfinite(found.raw.carrier).any():
         return None
     raw = found.raw
-    before, after = consecutive(raw, whole)
-    if not len(after):
+    before, after = consecutive(raw, whole, period_of_epochs(raw, scene.settings.raw_gnss))
+    if not len(after) and raw.catalogue is None:
         return None
     epochs, first, of = np.unique(raw.t, return_index=True, return_inverse=True)
     # of a phase the ionosphere's delay is negative
@@ -111,17 +114,19 @@ def _pair_rows(scene: BuildContext) -> tuple[PreparedRows, _Pairs] | None:
     change = level[after] - level[before]
     clock = np.zeros(len(epochs))
     clock[of[after]] = -median_of_epochs(raw.t[after], change)
-    return found, _Pairs(before, after, of[after], epochs, first, change, clock)
+    some = found.keyframe[after] >= 0  # of a piece, changes to the epoch before it are there already
+    number = number_epochs(raw)[first]
+    return found, _Pairs(before[some], after[some], number, epochs, first, change[some], clock)
 
 
 def _clone_antennas(found: PreparedRows, pairs: _Pairs) -> tuple[Parameter, ...]:
-    return tuple(
-        Parameter(
-            name, found.nominal[pairs.first[k::2]], np.full((len(pairs.epochs[k::2]), 3), _ANYWHERE), "m",
-            begins=pairs.epochs[k::2],
-        )
-        for k, name in enumerate(CLONES)
-    )  # fmt: skip
+    out = []
+    for k, name in enumerate(CLONES):
+        own = np.flatnonzero((pairs.number >= 0) & (pairs.number % 2 == k))
+        own = own if len(own) else np.zeros(1, dtype=int)  # a piece may have none: any begin will do
+        sigma = np.full((len(own), 3), _ANYWHERE)
+        out.append(Parameter(name, found.nominal[pairs.first[own]], sigma, "m", begins=pairs.epochs[own]))
+    return tuple(out)
 
 
 @dataclass(frozen=True)
@@ -145,12 +150,14 @@ class GnssAntennaClone(Constraint):
         if both is None:
             return None
         found, pairs = both
-        own = np.arange(len(pairs.epochs))
+        own = np.flatnonzero((found.keyframe[pairs.first] >= 0) & (pairs.number >= 0))
+        if not len(own):
+            return None
         parameters = [p for p in common_fields(scene, found)["parameters"] if p.name == LEVER_ARM]
         return cls(
             keyframe=found.keyframe[pairs.first[own]],
             lever_arm=found.raw.lever_arm,
-            odd=own % 2,
+            odd=pairs.number[own] % 2,
             parameters=(*parameters, *_clone_antennas(found, pairs)),
         )
 
@@ -198,8 +205,10 @@ class GnssCarrier(SatelliteConstraint):
             return None
         found, pairs = both
         raw, j, k = found.raw, pairs.before, pairs.after
+        if not len(k):
+            return None
         common: dict[str, Any] = common_fields(scene, found)
-        common |= {name: common[name][k] for name in ("keyframe", "s_n", "R_ln", "satellite", "elevation", "level")}
+        common |= {name: common[name][k] for name in PER_ROW}
         if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
             common["robust"] = "cauchy"
         E = len(pairs.epochs)
@@ -231,7 +240,7 @@ class GnssCarrier(SatelliteConstraint):
             s_before=found.s_n[j],
             nominal_before=found.nominal[j],
             time=raw.t[k] - raw.t[j],
-            odd=(pairs.epoch - 1) % 2,
+            odd=number_epochs(raw)[j] % 2,
             which=which,
             slant=delay[k] - delay[j],
             sigma=sigma[:, None],

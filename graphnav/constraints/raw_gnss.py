@@ -19,10 +19,12 @@ Distances are differences against a nominal place of each epoch, so that no digi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphnav.config import Settings
 from graphnav.config.raw_gnss import RawGnssSettings
@@ -62,58 +64,77 @@ _GRADIENT = 2e-6  # of the zenith's delay over the distance to a base station, o
 _RATE_ERROR = np.array([0.05, 0.05, 0.1])  # m/s
 _LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have a variance factor of their own
 _CLASSES = ("strong", "fair", "weak", "faint")
+PER_ROW = ("keyframe", "s_n", "R_ln", "satellite", "azimuth", "elevation", "level")  # of the fields that are shared
 
 
 @dataclass(frozen=True)
 class PreparedRows:
-    """What both kinds of rows need, of the rows that are used; made once for a scene."""
+    """What all kinds of rows need, of the rows that are used; made once for a scene."""
 
     raw: RawGnss
     keyframe: Array
     s_n: Array  # (N, 3) m, satellites
     v_n: Array  # (N, 3) m/s
     R_ln: Array  # (N, 3, 3)
+    azimuth: Array  # (N,) rad, from north to the east
     elevation: Array  # (N,) rad
     known: Array  # (N,) m, distance from the nominal antenna with the delays of the atmosphere
     nominal: Array  # (N, 3) m
     ionosphere: Array  # (N,) m
     stretch: Array  # (N,)
-    clock: Parameter
     spacing: float  # s from node to node of whatever changes slowly
 
+    @property
+    def clock(self) -> Parameter:
+        """The receiver's, anew at every epoch."""
+        epochs, first = np.unique(self.raw.t, return_index=True)
+        sigma = np.tile(_CLOCK_SIGMA, (len(epochs), 1))
+        return Parameter(CLOCK, self.raw.receiver_clock[first], sigma, "m, m/s", begins=epochs, reported=True)
 
-def prepare_rows(scene: BuildContext) -> PreparedRows | None:
+    def take(self, which: NDArray[np.bool_]) -> PreparedRows:
+        """Some of the rows."""
+        own = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name not in ("raw", "spacing")}
+        return replace(self, raw=self.raw.take(which), **own)
+
+
+def prepare_every(scene: BuildContext) -> PreparedRows | None:
+    """The rows that are used, with those of epochs that have no keyframe, which is -1 then."""
     raw = select_observations(scene.recording, scene.settings)
     if raw is None:
         return None
-    keyframe = scene.keyframe_at(raw.t)
     geometry = look(raw, raw.antenna, choose_coefficients(raw))
-    used = (keyframe >= 0) & (geometry.elevation >= np.radians(scene.settings.raw_gnss.elevation))
+    used = geometry.elevation >= np.radians(scene.settings.raw_gnss.elevation)
     if not used.any():
         return None
-    raw, keyframe = raw.take(used), keyframe[used]
+    raw = raw.take(used)
     geometry = look(raw, raw.antenna, choose_coefficients(raw))
     frame = scene.frame
-    epochs, first = np.unique(raw.t, return_index=True)
     return PreparedRows(
         raw=raw,
-        keyframe=keyframe,
+        keyframe=scene.keyframe_at(raw.t),
         s_n=(geometry.s - frame.r_e) @ frame.R_ne.T,
         v_n=rotate_earth(raw.v, geometry.distance / C) @ frame.R_ne.T,
         R_ln=earth.enu_axes(earth.ecef_to_llh(raw.antenna)) @ frame.R_ne.T,
+        azimuth=geometry.azimuth,
         elevation=geometry.elevation,
         known=geometry.distance + geometry.ionosphere + geometry.troposphere,
         nominal=(raw.antenna - frame.r_e) @ frame.R_ne.T,
         ionosphere=geometry.ionosphere,
         stretch=stretch(raw, geometry),
-        clock=Parameter(
-            CLOCK, raw.receiver_clock[first], np.tile(_CLOCK_SIGMA, (len(epochs), 1)), "m, m/s", begins=epochs
-        ),
-        spacing=node_spacing(scene.settings.gnss.slow_times, _period(raw, scene.settings.raw_gnss)),
+        spacing=node_spacing(scene.settings.gnss.slow_times, period_of_epochs(raw, scene.settings.raw_gnss)),
     )
 
 
-def _period(raw: RawGnss, settings: RawGnssSettings) -> float:
+def prepare_rows(scene: BuildContext) -> PreparedRows | None:
+    """The rows of epochs that have keyframes."""
+    every = scene.share(prepare_every)
+    if every is None or (every.keyframe >= 0).all():
+        return every
+    there = every.keyframe >= 0
+    return every.take(there) if there.any() else None
+
+
+def period_of_epochs(raw: RawGnss, settings: RawGnssSettings) -> float:
     """s between the epochs that are used; a piece of a series may have too few to tell."""
     return period(raw.epochs[0]) if raw.catalogue is None else max(raw.catalogue.period, settings.period)
 
@@ -138,6 +159,7 @@ def common_fields(scene: BuildContext, found: PreparedRows) -> dict[str, Any]:
         "R_ln": found.R_ln,
         "lever_arm": raw.lever_arm,
         "satellite": raw.satellite,
+        "azimuth": found.azimuth,
         "elevation": found.elevation,
         "level": np.searchsorted(-np.array(_LEVELS), -np.nan_to_num(raw.cn0, nan=_LEVELS[0]), side="left"),
         "parameters": parameters,
@@ -156,6 +178,9 @@ class SatelliteConstraint(Constraint):
     """Rows of single satellites."""
 
     axes: ClassVar[tuple[str, ...]] = ("range",)
+    words: ClassVar[Mapping[str, tuple[tuple[str, str, float], ...]]] = {
+        CLOCK: (("receiver clock, ahead of GPS time", "µs", 1e6 / C), ("drift of the receiver clock", "m/s", 1.0))
+    }
     noise_axes: ClassVar[tuple[str, ...]] = (*_CLASSES, "horizontal", "up")  # of white parts, and of what lasts
 
     s_n: Array = field(default_factory=lambda: np.empty((0, 3)))  # m
@@ -163,13 +188,15 @@ class SatelliteConstraint(Constraint):
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
     sigma: Array = field(default_factory=lambda: np.empty((0, 1)))
     satellite: Array = field(default_factory=lambda: np.empty(0, dtype=np.int16))  # (N,) graphnav.gnss.signals
+    azimuth: Array = field(default_factory=lambda: np.empty(0))  # (N,) rad, from north to the east
     elevation: Array = field(default_factory=lambda: np.empty(0))  # (N,) rad
     level: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of _CLASSES
 
     @property
     def labels(self) -> dict[str, Array]:
         known, which = np.unique(self.satellite, return_inverse=True)
-        return {"satellite": np.array([satellite_name(s) for s in known])[which], "elevation": self.elevation}
+        names = np.array([satellite_name(s) for s in known])[which]
+        return {"satellite": names, "azimuth": self.azimuth, "elevation": self.elevation}
 
     def noise_groups(self) -> tuple[tuple[str, ...], Array]:
         there, which = np.unique(self.level, return_inverse=True)
@@ -340,8 +367,7 @@ class GnssDoppler(SatelliteConstraint):
         some = np.isfinite(raw.range_rate) & np.isfinite(raw.drift)
         if not some.any():
             return None
-        per_row = ("keyframe", "s_n", "R_ln", "satellite", "elevation", "level")
-        common |= {name: common[name][some] for name in per_row}
+        common |= {name: common[name][some] for name in PER_ROW}
         lasting = Parameter(
             RATE_ERROR, np.zeros(3), _RATE_ERROR, "m/s", correlation_time=SECONDS,
             spacing=found.spacing,

@@ -93,6 +93,7 @@ class GnssPhase(RangeConstraint):
             "s_n": (geometry.s - frame.r_e) @ frame.R_ne.T,
             "R_ln": np.empty((int(used.sum()), 0, 0)),
             "satellite": raw.satellite,
+            "azimuth": geometry.azimuth,
             "elevation": geometry.elevation,
             "level": np.zeros(int(used.sum()), dtype=int),
         }

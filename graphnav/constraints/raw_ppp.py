@@ -23,6 +23,7 @@ from graphnav.constraints.ambiguities import ambiguity_name
 from graphnav.constraints.base import BuildContext, Linearized
 from graphnav.constraints.raw_gnss import (
     BIASES,
+    PER_ROW,
     SATELLITES,
     PreparedRows,
     RangeConstraint,
@@ -55,7 +56,6 @@ class _Free:
 
     found: PreparedRows
     rows: IonosphereFree
-    s_n: Array  # (N, 3) m
     satellites: NDArray[np.int16]  # those that have rows
     which: NDArray[np.intp]  # (N,) satellite
     group: NDArray[np.intp]  # (N,) system, 0 that with most rows
@@ -85,7 +85,7 @@ def _combine_free(scene: BuildContext) -> _Free | None:
     systems, group, many = np.unique(satellites[which] // 100, return_inverse=True, return_counts=True)
     rank = np.empty(len(systems), dtype=np.intp)
     rank[np.argsort(-many, kind="stable")] = np.arange(len(systems))
-    return _Free(found, rows, found.s_n[rows.which], satellites, which, rank[group], len(systems))
+    return _Free(found, rows, satellites, which, rank[group], len(systems))
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class _Ppp(RangeConstraint):
     def _shared_fields(scene: BuildContext, free: _Free, used: NDArray[np.intp]) -> dict[str, Any]:
         rows, common = free.rows, common_fields(scene, free.found)
         at = rows.which[used]
-        common |= {name: common[name][at] for name in ("keyframe", "R_ln", "satellite", "elevation", "level")}
+        common |= {name: common[name][at] for name in PER_ROW}
         common["parameters"] += (
             Parameter(WET, np.zeros(1), np.full(1, _WET), "m", _WET_WALK, spacing=free.found.spacing),
         )
@@ -115,7 +115,6 @@ class _Ppp(RangeConstraint):
                 Parameter(BIASES, np.zeros(size), np.full(size, sigma), "m", _BIAS_WALK, spacing=free.found.spacing),
             )
         return common | {
-            "s_n": free.s_n[used],
             "nominal": free.found.nominal[at],
             "wet": rows.wet[used],
             "group": free.group[used],
@@ -171,6 +170,7 @@ class GnssPppCarrier(_Ppp):
     unit: ClassVar[str] = "m"
 
     ambiguities: tuple[str, ...] = ()  # (S,) names of the parameters, by satellite
+    begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the arc
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -208,8 +208,15 @@ class GnssPppCarrier(_Ppp):
         )
         if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
             common["robust"] = "cauchy"
+        _, first, of = np.unique(rows.arc[used], return_index=True, return_inverse=True)
         sigma = rows.growth[used] * carrier_sigma(raw.cn0, rows.geometry.elevation[used], C / raw.frequency)
-        return cls(offset=(rows.known - rows.carrier)[used], sigma=sigma[:, None], ambiguities=names, **common)
+        return cls(
+            offset=(rows.known - rows.carrier)[used],
+            sigma=sigma[:, None],
+            ambiguities=names,
+            begin=raw.t[first][of],
+            **common,
+        )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         residual, J = self._ranges(states, parameters, rows)

@@ -20,7 +20,9 @@ def select_observations(recording: Recording, settings: Settings) -> RawGnss | N
     s, raw = settings.raw_gnss, recording.raw_gnss
     if raw is None or not recording.tight(s.coupling) or not len(raw):
         return None
-    used = (raw.t >= recording.start - SAME_TIME) & (raw.t <= recording.end + SAME_TIME) & select_usable(raw, s)
+    used = select_usable(raw, s)
+    if raw.catalogue is None:  # a piece of a series has the epoch before it as well, from which carriers change
+        used &= (raw.t >= recording.start - SAME_TIME) & (raw.t <= recording.end + SAME_TIME)
     if s.period > 0.0 and used.any():
         used &= np.isin(raw.t, _keep_apart(np.unique(raw.t[used]), s.period))
     raw = raw.take(used)

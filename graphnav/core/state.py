@@ -47,6 +47,7 @@ class Parameter:
     correlation_time: float | None = None  # s; given, a Gauss-Markov process about zero with `sigma` at all times
     spacing: float = NODE_SPACING  # s, at least, from one of its nodes to the next
     begins: Array | None = None  # (n,) s; given, `initial` and `sigma` hold anew from each of these times on
+    reported: bool = False  # of one that begins anew: a solution holds its values
     noise_groups: tuple[
         str, ...
     ] = ()  # (k,) of a process: the variance component (`graphnav.estimation.noise`) of each number
@@ -55,6 +56,16 @@ class Parameter:
     def size(self) -> int:
         """k"""
         return int(np.shape(self.initial)[-1])
+
+    @property
+    def listed(self) -> bool:
+        """Whether a solution holds its values; places of stops are nobody's calibration."""
+        return self.begins is None or self.reported
+
+    @property
+    def prior_sigma(self) -> Array:
+        """(k,) 1-sigma before any measurement; of one that begins anew, the last."""
+        return np.atleast_2d(self.sigma)[-1]
 
     @cached_property
     def constant(self) -> bool:

@@ -23,53 +23,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import gammaincinv  # scipy.stats would take half a second to import
 
+from graphnav.constraints.ambiguities import slot_names
 from graphnav.constraints.raw_phase import EXACT, GnssPhase, WholeCycles
+from graphnav.constraints.raw_ppp import GnssPppCarrier
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, DIM
+from graphnav.estimation.known_arcs import FEWEST, Arc, Epochs, Known
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.decision import Decision
 from graphnav.estimation.solvers.ekf import ekf, refilter
-from graphnav.estimation.solvers.linearise import Points, linearise
+from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import FilterPass, Progress, SmootherPass, points_of, values_of
 from graphnav.estimation.solvers.rts import backward
 from graphnav.gnss.integers import decorrelate, find_nearest
 
-_SUCCESS, _RATIO, _FEWEST = 0.999, 3.0, 4
+_SUCCESS, _RATIO = 0.999, 3.0
 _ROUNDS = 4  # of the smoother: what one finds tells the next, and the last finds next to nothing
 LOST_PLACE, LOST_SPEED = 10.0, 1.0  # m, m/s, 1-sigma of what is known where integers were wrong: less than codes tell
-_ALARM = 0.001  # of epochs with right integers that fail the test of consistency
-Arc = tuple[str, float]  # its ambiguity, and when it begins, s
-
-
-@dataclass
-class Known:
-    """Differences that have been found: each arc with an integer against the first of those it hangs together with."""
-
-    of: dict[Arc, tuple[Arc, int]] = field(default_factory=dict)  # N_arc - N_first
-    let_go: set[Arc] = field(default_factory=set)
-
-    def find(self, arc: Arc) -> tuple[Arc, int]:
-        """The first arc of those that this one hangs together with, and the difference from it."""
-        return self.of.get(arc, (arc, 0))
-
-    def join(self, a: Arc, b: Arc, cycles: int) -> None:
-        """N_a - N_b is so many cycles."""
-        (first, of_a), (other, of_b) = self.find(a), self.find(b)
-        if first == other:
-            return
-        moved = of_a - of_b - cycles
-        self.of |= {arc: (first, n + moved) for arc, (root, n) in self.of.items() if root == other}
-        self.of |= {first: (first, 0), other: (first, moved)}
-
-    def forget(self, arc: Arc) -> None:
-        """It is not known any more; what hangs together through it still does."""
-        root, _ = self.of.pop(arc, (None, 0))
-        if root == arc:
-            rest = [(other, n) for other, (first, n) in self.of.items() if first == arc]
-            for other, n in rest:
-                self.of[other] = rest[0][0], n - rest[0][1]
 
 
 @dataclass(frozen=True)
@@ -81,6 +53,8 @@ class Fixed:
     smoothed: SmootherPass
     filtered_epochs: Array  # (E, 2) s, and 1 where fixed
     smoothed_epochs: Array  # (E, 2)
+    filtered_arcs: CarrierArcs
+    smoothed_arcs: CarrierArcs
     notes: tuple[str, ...] = ()
 
 
@@ -90,6 +64,15 @@ def split_carriers(problem: Problem) -> tuple[Problem, GnssPhase | None]:
     if phase is None:
         return problem, None
     return replace(problem, constraints=tuple(c for c in problem.constraints if c is not phase)), phase
+
+
+def float_arcs(problem: Problem) -> CarrierArcs:
+    """The arcs of precise point positioning, whose ambiguities are real numbers."""
+    rows = next((c for c in problem.constraints if isinstance(c, GnssPppCarrier)), None)
+    if rows is None:
+        return CarrierArcs()
+    none = np.zeros(len(rows), dtype=bool)
+    return CarrierArcs.from_rows(problem.t[rows.keyframe], rows.which, rows.begin, none, slot_names(rows.ambiguities))
 
 
 def fix(
@@ -127,10 +110,15 @@ def fix(
         if _let_go(epochs, found, smoothed, known):
             found = _hold_arcs(whole, phase, epochs, known)
             smoothed = backward(found, refilter(found, smoothed, progress), progress)
-    filtered = causal.epochs if search else np.stack([epochs.t, np.zeros(len(epochs.t))], -1)
-    fixed = np.array([epochs.differences(k, known) >= _FEWEST for k in epochs.keyframes], dtype=float)
     return Fixed(
-        found, forward, smoothed, filtered, np.stack([epochs.t, fixed], -1), (_note(epochs, known),) if search else ()
+        found,
+        forward,
+        smoothed,
+        filtered_epochs=epochs.fixed(causal.known),
+        smoothed_epochs=epochs.fixed(dict.fromkeys(epochs.keyframes, known)),
+        filtered_arcs=epochs.list_arcs(causal.known),
+        smoothed_arcs=epochs.list_arcs(dict.fromkeys(epochs.keyframes, known)),
+        notes=(_note(epochs, known),) if search else (),
     )
 
 
@@ -140,72 +128,6 @@ def _note(epochs: Epochs, known: Known) -> str:
         f"gnss_phase: {len(known.of)} of {len(every)} arcs of carriers have integer ambiguities; "
         f"{len(known.let_go)} were let go of"
     )
-
-
-class Epochs:
-    """Which arcs there are at each keyframe with carriers, and where their numbers stand."""
-
-    def __init__(self, phase: GnssPhase, columns: dict[str, slice], t: Array) -> None:
-        self.phase, self._all_columns = phase, columns
-        self.columns = {name: columns[name].start for name in phase.slots}
-        self.keyframes = np.unique(phase.keyframe).tolist()
-        self.t, self.time = t[self.keyframes], t
-        self.rows: dict[int, slice] = {}
-        self.active: dict[int, list[Arc]] = {}
-        arcs = [(phase.slots[slot], begin) for slot, begin in zip(phase.slot, phase.begin.tolist(), strict=True)]
-        self._group = dict(zip(phase.slots, phase.group.tolist(), strict=True))
-        self._whole = {arc for arc, whole in zip(arcs, phase.whole.tolist(), strict=True) if whole}
-        edges = np.searchsorted(phase.keyframe, [*self.keyframes, len(t)])
-        for k, lo, hi in zip(self.keyframes, edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-            self.rows[k], self.active[k] = slice(lo, hi), arcs[lo:hi]
-
-    def odd(self, k: int, here: Points, known: Known) -> list[Arc]:
-        """Arcs with integers that an epoch is not consistent with, and is without them.
-
-        Parameters
-        ----------
-        here : a point near enough for the directions to the satellites.
-        """
-        own = self.rows[k]
-        rows = linearise(self.phase, here, self._all_columns, own, np.zeros(own.stop - own.start, dtype=int))
-        arcs = self.active[k]
-        used = np.array([i for i, arc in enumerate(arcs) if arc in known.of], dtype=int)
-        if not len(used):
-            return []
-        sets = [known.find(arcs[i])[0] for i in used]
-        clocks = (np.array([sets.index(one) for one in sets])[:, None] == np.arange(len(sets))).astype(float)
-        A = np.concatenate([rows.linear.jacobians["p"][used, 0], clocks[:, clocks.any(axis=0)]], axis=1)
-        # with the integers in place of the estimates; what they have in common is a clock's
-        at = np.array([self.columns[arcs[i][0]] for i in used]) - DIM
-        off = np.array([known.find(arcs[i])[1] for i in used]) - here.values[0, at]
-        r = rows.residual[used, 0] + self.phase.wavelength[own][used] * off
-        A, r = A / rows.stated[used], r / rows.stated[used, 0]
-        kept = np.ones(len(used), dtype=bool)
-        while True:
-            Q, _ = np.linalg.qr(A[kept][:, A[kept].any(axis=0)])
-            left = r[kept] - Q @ (Q.T @ r[kept])
-            spare = int(kept.sum()) - Q.shape[1]
-            if spare < 1 or left @ left <= 2.0 * gammaincinv(0.5 * spare, 1.0 - _ALARM):
-                break
-            share = np.maximum(1.0 - np.sum(Q * Q, axis=1), 1e-9)  # of its own error that is left in a residual
-            kept[np.flatnonzero(kept)[np.argmax(left**2 / share)]] = False
-        return [arcs[i] for i in used[~kept]]
-
-    def can(self, arc: Arc) -> bool:
-        """Whether it has integers."""
-        return self._group[arc[0]] >= 0 and arc in self._whole
-
-    def sets(self, k: int, known: Known) -> dict[int, list[list[Arc]]]:
-        """By group, the arcs of an epoch, those together that hang together, the largest set first."""
-        out: dict[int, dict[Arc, list[Arc]]] = {}
-        for arc in self.active[k]:
-            if self.can(arc) and arc not in known.let_go:
-                out.setdefault(self._group[arc[0]], {}).setdefault(known.find(arc)[0], []).append(arc)
-        return {group: sorted(sets.values(), key=len, reverse=True) for group, sets in out.items()}
-
-    def differences(self, k: int, known: Known) -> int:
-        """How many differences are known at an epoch."""
-        return sum(len(one) - 1 for sets in self.sets(k, known).values() for one in sets)
 
 
 def _decide(
@@ -250,7 +172,7 @@ def _decide(
         T[i, place[other]], T[i, place[one]] = 1.0, -1.0
     a, C = T @ x, T @ Q @ T.T
     order = np.argsort(np.diagonal(C), kind="stable")
-    while len(order) and given + len(order) >= _FEWEST:
+    while len(order) and given + len(order) >= FEWEST:
         found = decorrelate(C[np.ix_(order, order)])
         if found.success >= _SUCCESS:
             nearest = find_nearest(a[order], found)
@@ -281,7 +203,7 @@ def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Call
     known = before.known
     if odd := bool(epochs.odd(k, here, known)):
         known = Known() if before.odd else known
-        fixed = epochs.differences(k, known) >= _FEWEST
+        fixed = epochs.differences(k, known) >= FEWEST
         return Held(known, True, let_go=before.odd, fixed=fixed, epoch=True)
     sets, found = epochs.sets(k, known), []
     if any(len(some) > 1 for some in sets.values()):
@@ -295,21 +217,17 @@ def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Call
             found = []
         else:
             known = held
-    return Held(known, odd, tuple(found), fixed=epochs.differences(k, known) >= _FEWEST, epoch=True)
+    return Held(known, odd, tuple(found), fixed=epochs.differences(k, known) >= FEWEST, epoch=True)
 
 
 class _Causal:
     """What the filter does at a keyframe: find integers, hold them, let go of those that do not hold."""
 
     def __init__(self, epochs: Epochs) -> None:
-        self._epochs, self._fixed = epochs, dict.fromkeys(epochs.keyframes, 0.0)
+        self._epochs = epochs
+        self.known = {k: Known() for k in epochs.keyframes}  # behind each epoch
         self._unknown = {p.name: float(np.max(p.sigma)) for p in epochs.phase.parameters}
         self._held = Held()
-
-    @property
-    def epochs(self) -> Array:
-        """(E, 2) s, and 1 where fixed."""
-        return np.stack([self._epochs.t, list(self._fixed.values())], -1)
 
     def __call__(self, k: int, here: Points, P: Array) -> Decision | None:
         """Integers to hold from a keyframe on, and ambiguities that are not known any more."""
@@ -317,7 +235,7 @@ class _Causal:
         if k not in epochs.active:
             return None
         held = self._held = hold_on(self._held, epochs, k, here, lambda: P)
-        self._fixed[k] = float(held.fixed)
+        self.known[k] = held.known
         added, values = np.zeros(len(P)), here.values[0]
         if held.let_go:
             for name, at in epochs.columns.items():

@@ -20,7 +20,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import NoiseModel, RowWeights
-from graphnav.estimation.solution import Between, ConstraintRecord, ParameterEstimate, Solution
+from graphnav.estimation.solution import Between, CarrierArcs, ConstraintRecord, ParameterEstimate, Solution
 from graphnav.recording import Recording, take_rows
 
 STRAIGHT, _STATES = 10_800.0, 44  # s, at most solved at once: 3 GB at a keyframe a second and 44 error states
@@ -132,6 +132,7 @@ def crop_solution(solution: Solution, share: Share) -> Solution:
             nis=r.nis[some],
             weight=r.weight[some],
             satellite=r.satellite[some[: len(r.satellite)]],
+            azimuth=r.azimuth[some[: len(r.azimuth)]],
             elevation=r.elevation[some[: len(r.elevation)]],
         )
 
@@ -153,6 +154,11 @@ def crop_solution(solution: Solution, share: Share) -> Solution:
         }
         return replace(model, weights=weights, excluded=spans)
 
+    def stretches(arcs: CarrierArcs) -> CarrierArcs:
+        some = (arcs.begin < end) & (arcs.end >= start)
+        begin, last = np.maximum(arcs.begin[some], start), np.minimum(arcs.end[some], end)
+        return replace(arcs, name=arcs.name[some], begin=begin, end=last, integer=arcs.integer[some])
+
     some, last = inside(solution.t), np.nextafter(end, -np.inf)
     return replace(
         solution,
@@ -164,6 +170,7 @@ def crop_solution(solution: Solution, share: Share) -> Solution:
         detections=tuple(detection(d) for d in solution.detections),
         excluded=tuple(fault for fault in solution.excluded if start <= fault.t_start < end),
         noise=noise(solution.noise),
+        arcs=stretches(solution.arcs),
         fixed=solution.fixed[inside(solution.fixed[:, 0])] if len(solution.fixed) else solution.fixed,
         between=tuple(_Span(b, max(b.start, start), min(b.end, float(last))) for b in solution.between),
     )

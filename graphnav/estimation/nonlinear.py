@@ -20,6 +20,8 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from scipy.sparse import csr_array, diags_array, vstack
+from scipy.sparse.linalg import spsolve
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.errors import EstimationError
@@ -38,6 +40,7 @@ _ESTIMATORS: dict[str, Any] = {
     "tukey": gtsam.noiseModel.mEstimator.Tukey,
     "welsch": gtsam.noiseModel.mEstimator.Welsch,
 }
+_ROUNDS, _SMALL = 20, 1e-9  # of weighting by kernels; of the sigmas before, where no more is gained
 _X, _V, _B, _Q = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B,
                   gtsam.symbol_shorthand.Q)  # fmt: skip
 
@@ -59,7 +62,7 @@ class Exported:
             For a robust kernel that GTSAM does not have as a factor.
         """
         layout = Layout(self.problem)
-        known = _with_places(self.problem, self.states, self.values)
+        known = _with_unlisted(self.problem, self.states, self.values)
         values = gtsam.Values()
         states = self.states
         for k in range(len(states)):
@@ -76,27 +79,43 @@ class Exported:
         return graph, values
 
 
-def _with_places(problem: Problem, states: States, values: dict[str, Array]) -> dict[str, Array]:
-    """The values with those that solutions do not list, such as the places of stops: the best there are given the rest.
-
-    Rows are linear in them, or they are where one step of Gauss and Newton leads.
+def _with_unlisted(problem: Problem, states: States, values: dict[str, Array]) -> dict[str, Array]:
+    """The values with those that solutions do not list, places of stops and ambiguities: the best there are given the
+    rest, all of them together. Rows are linear in them, but for their kernels.
     """
     out = {c.parameter.name: c.mean for c in problem.chains} | values
-    points = Iterate(states, out).points(problem)
-    for chain in problem.chains:
-        name = chain.parameter.name
-        if name in values:
-            continue
-        normal = np.stack([np.diag(s**-2.0) for s in chain.sigma])
-        right = np.zeros_like(chain.mean)
+    chains = [c for c in problem.chains if c.parameter.name not in values]
+    if not chains:
+        return out
+    first = np.cumsum([0, *(c.mean.size for c in chains)])
+    sigma = np.concatenate([c.sigma.ravel() for c in chains])
+    mean = at = np.concatenate([c.mean.ravel() for c in chains])
+    for k in range(_ROUNDS):
+        points = Iterate(states, out).points(problem)
+        parts = [(diags_array(1.0 / sigma), (mean - at) / sigma)]
         for rows in problem.constraints:
-            if name in {p.name for p in rows.parameters}:
+            names = {p.name for p in rows.parameters}
+            own = {c.parameter.name: (c, i) for c, i in zip(chains, first, strict=False) if c.parameter.name in names}
+            if own:
                 linear = linearise(rows, points, problem.columns)
-                weight = linear.kernel()[0][:, None] / linear.sigma**2
-                H, node = linear.H[:, :, problem.columns[name]], chain.node[rows.keyframe]
-                np.add.at(normal, node, np.einsum("nmi,nm,nmj->nij", H, weight, H))
-                np.add.at(right, node, -np.einsum("nmi,nm,nm->ni", H, weight, linear.residual))
-        out[name] = chain.mean + np.linalg.solve(normal, right[..., None])[..., 0]
+                # at first they are too far off for a kernel to tell what is
+                root = np.sqrt(linear.kernel()[0] if k else np.ones(len(rows)))[:, None] / linear.sigma
+                H = csr_array((root.size, len(sigma)))
+                for name, (c, i) in own.items():
+                    block = root[:, :, None] * linear.H[:, :, problem.columns[name]]
+                    column = np.arange(c.parameter.size) + i + c.parameter.size * c.node[rows.keyframe, None, None]
+                    row = np.arange(root.size).reshape(*root.shape, 1)
+                    cells = tuple(np.broadcast_to(x, block.shape).ravel() for x in (row, column))
+                    H = H + csr_array((block.ravel(), cells), H.shape)
+                parts.append((H, -(root * linear.residual).ravel()))
+        A, b = vstack([H for H, _ in parts]).tocsc(), np.concatenate([r for _, r in parts])
+        step = spsolve(A.T @ A, A.T @ b)
+        at = at + step
+        out |= {
+            c.parameter.name: x.reshape(c.mean.shape) for c, x in zip(chains, np.split(at, first[1:-1]), strict=True)
+        }
+        if k and np.all(np.abs(step) < _SMALL * sigma):
+            break
     return out
 
 

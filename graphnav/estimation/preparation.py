@@ -21,7 +21,7 @@ from graphnav.core.rotation import Array
 from graphnav.detectors import Detections
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment, with_known_heading
-from graphnav.estimation.fixing import fix
+from graphnav.estimation.fixing import fix, float_arcs
 from graphnav.estimation.noise.apply import with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import (
@@ -34,6 +34,7 @@ from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe
 from graphnav.estimation.posing import Clock, Posed, Posing, has_diverged
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.ekf import ekf, near, refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import (
@@ -67,6 +68,7 @@ class Prepared:
     timings: dict[str, float]
     passes: Counter[str] = field(default_factory=Counter)
     fixed: dict[str, Array] = field(default_factory=dict)  # `Solution.fixed` of the filter, and of the others ("")
+    arcs: dict[str, CarrierArcs] = field(default_factory=dict)  # `Solution.arcs`, the same way
 
     @property
     def diverged(self) -> bool:
@@ -119,16 +121,17 @@ def prepare(
             smoothed = backward(problem, refilter(problem, smoothed, progress), progress)
         forward, smoothed = _find_way(problem, aligned, known, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
-    notes, epochs = describe(noise, problem), {}
+    notes, epochs, arcs = describe(noise, problem), {}, {"": float_arcs(problem)}
     if posed.carriers is not None:
         tell("ambiguities")
         with clock.book("ambiguities"):
             fixed = fix(problem, posed.carriers, smoothed, aligned.until, progress)
         problem, forward, smoothed = fixed.problem, fixed.forward, fixed.smoothed
         notes, epochs = (*notes, *fixed.notes), {"ekf": fixed.filtered_epochs, "": fixed.smoothed_epochs}
+        arcs = {"ekf": fixed.filtered_arcs, "": fixed.smoothed_arcs}
     start = with_known_heading(aligned, settings)
     return Prepared(
-        problem, noise, start, aligned, posed.detections, forward, smoothed, notes, clock.seconds, passes, epochs
+        problem, noise, start, aligned, posed.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs
     )
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -57,6 +57,7 @@ class ConstraintRecord:
     axes: tuple[str, ...]  # names of the m components
     unit: str
     satellite: Array = field(default_factory=lambda: np.empty(0, dtype=str))  # (N,) names, where rows are of satellites
+    azimuth: Array = field(default_factory=lambda: np.empty(0))  # (N,) rad from north to the east, of these
     elevation: Array = field(default_factory=lambda: np.empty(0))  # (N,) rad, of these
 
 
@@ -74,6 +75,34 @@ class ParameterEstimate:
     def observable(self) -> Array:
         """(k,) whether the data told more than half of what was unknown."""
         return self.sigma[-1] < 0.5 * self.prior_sigma
+
+
+@dataclass(frozen=True)
+class CarrierArcs:
+    """Stretches over which cycles of a signal were counted on, cut where its ambiguity became an integer or none."""
+
+    name: Array = field(default_factory=lambda: np.empty(0, dtype=str))  # (S,) satellite and signal: "G05.1C"
+    begin: Array = field(default_factory=lambda: np.empty(0))  # (S,) s, first epoch of the stretch
+    end: Array = field(default_factory=lambda: np.empty(0))  # (S,) s, last epoch
+    integer: Array = field(default_factory=lambda: np.empty(0, dtype=bool))  # (S,)
+
+    @classmethod
+    def from_rows(cls, t: Array, slot: Array, arc: Array, integer: Array, names: Sequence[str]) -> CarrierArcs:
+        """The stretches of N rows.
+
+        Parameters
+        ----------
+        t : (N,) s, of the epochs.
+        slot : (N,) index of `names`.
+        arc : (N,) s, when each row's arc begins.
+        integer : (N,) whether its ambiguity is held as an integer.
+        """
+        order = np.lexsort((t, slot))
+        key = np.stack([slot[order], arc[order], integer[order]], -1)
+        first = np.flatnonzero(np.any(np.diff(key, axis=0, prepend=np.nan) != 0.0, axis=1))
+        last = np.append(first[1:], len(order))[: len(first)] - 1
+        of = order[first]
+        return cls(np.array(names, dtype=str)[slot[of]], t[of], t[order[last]], integer[of].astype(bool))
 
 
 @dataclass(frozen=True)
@@ -120,6 +149,7 @@ class Solution:
     graphs: tuple[Callable[[], tuple[Any, Any]], ...] = ()  # makes what `to_gtsam` gives, for each piece
     separation: Separation | None = None  # of the filter and its smoother, the same for all solvers
     fixed: Array = field(default_factory=lambda: np.empty((0, 2)))  # s of epochs with carriers, and 1 for integers
+    arcs: CarrierArcs = field(default_factory=CarrierArcs)  # of carriers that have ambiguities
     between: tuple[Between, ...] = ()  # gives states between keyframes, one for each piece of the recording
 
     @property
@@ -261,7 +291,7 @@ def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Soluti
         have = [part.records[name] for part in parts if name in part.records]
         arrays: dict[str, Any] = {
             key: np.concatenate([getattr(r, key) for r in have])
-            for key in ("t", "residual", "sigma", "nis", "weight", "satellite", "elevation")
+            for key in ("t", "residual", "sigma", "nis", "weight", "satellite", "azimuth", "elevation")
         }
         return replace(have[0], **arrays)
 
@@ -290,6 +320,7 @@ def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Soluti
         graphs=tuple(g for p in parts for g in p.graphs),
         separation=_separation_of_all([p.separation for p in parts]),
         fixed=np.concatenate([p.fixed for p in parts]),
+        arcs=CarrierArcs(*(np.concatenate([getattr(p.arcs, f.name) for p in parts]) for f in fields(CarrierArcs))),
         between=tuple(b for p in parts for b in p.between),
     )
 

@@ -15,21 +15,29 @@ _APART = 2.5  # periods, at most: beyond it is a gap
 _JUMP, _THIRD = 2e-3, 1e-5
 
 
-def consecutive(raw: RawGnss, whole: RawGnss) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def consecutive(raw: RawGnss, whole: RawGnss, period: float | None = None) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows (N,) and (N,) of an arc at one epoch and the next.
 
     Parameters
     ----------
     raw : some of the rows of `whole`, with epochs left out or all.
     whole : all that the receiver had: a slip at an epoch that is left out counts.
+    period : s between epochs, where the series is too short to tell.
     """
     arcs, at = find_arcs(whole), rows_in(raw, whole)
-    (epochs, of), arc, slot = raw.epochs, arcs.arc[at], arcs.slot[at]
-    good = np.isfinite(raw.carrier) & np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock) & ~raw.half & (arc >= 0)
+    of, arc, slot = number_epochs(raw), arcs.arc[at], arcs.slot[at]
+    usual = period or (float(np.median(np.diff(raw.epochs[0]))) if len(raw.epochs[0]) > 1 else 1.0)
+    good = (
+        (of >= 0)
+        & np.isfinite(raw.carrier)
+        & np.isfinite(raw.p[:, 0])
+        & np.isfinite(raw.clock)
+        & ~raw.half
+        & (arc >= 0)
+    )
     order = np.flatnonzero(good)
     order = order[np.lexsort((of[order], slot[order]))]
     j, k = order[:-1], order[1:]
-    usual = float(np.median(np.diff(epochs))) if len(epochs) > 1 else 1.0
     kept = (slot[j] == slot[k]) & (arc[j] == arc[k]) & (of[k] - of[j] == 1) & (raw.t[k] - raw.t[j] <= _APART * usual)
     j, k = j[kept], k[kept]
     dt = raw.t[k] - raw.t[j]
@@ -41,6 +49,11 @@ def consecutive(raw: RawGnss, whole: RawGnss) -> tuple[NDArray[np.intp], NDArray
     j, k = j[same], k[same]
     sort = np.lexsort((j, k))
     return j[sort], k[sort]
+
+
+def number_epochs(raw: RawGnss) -> NDArray[np.intp]:
+    """(N,) number of each row's epoch among those that are used; -1 for one that changes are not counted to."""
+    return raw.number if len(raw.number) else raw.epochs[1]
 
 
 def rows_in(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:

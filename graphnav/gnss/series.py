@@ -171,6 +171,8 @@ class RawGnss:
     base_arc: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, dtype=int))
     baseline: float = 0.0  # m, to the base station
     arc_begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the carrier's arc, where it is known
+    # (N,) of the epoch among all that are used, of a piece of a series; -1 for one that came late
+    number: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, dtype=int))
     antenna: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m in e, single-point, of each epoch
     receiver_clock: Array = field(default_factory=lambda: np.empty((0, 2)))  # (N, 2) m and m/s, single-point
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU

@@ -42,6 +42,7 @@ class Geometry:
     s: Array  # (N, 3) m, satellites in the Earth-fixed frame of the reception
     e: Array  # (N, 3) unit vectors to them
     distance: Array  # (N,) m
+    azimuth: Array  # (N,) rad, from north to the east
     elevation: Array  # (N,) rad
     ionosphere: Array  # (N,) m
     troposphere: Array  # (N,) m
@@ -95,7 +96,7 @@ def look(raw: RawGnss, antenna: Array, ionosphere: Array | None) -> Geometry:
     if ionosphere is not None:
         delay = klobuchar(ionosphere, raw.seconds_of_week, llh, azimuth, elevation) * (L1 / raw.frequency) ** 2
     wet = np.zeros(len(raw)) if raw.troposphere else saastamoinen(llh, elevation)
-    return Geometry(s, away / distance[:, None], distance, elevation, delay, wet)
+    return Geometry(s, away / distance[:, None], distance, azimuth, elevation, delay, wet)
 
 
 def stretch(raw: RawGnss, geometry: Geometry) -> Array:

@@ -16,7 +16,8 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.standstill import PLACE
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, Parameter
-from graphnav.estimation.fixing import LOST_PLACE, LOST_SPEED, Epochs, Held, hold_on, split_carriers, with_integers
+from graphnav.estimation.fixing import LOST_PLACE, LOST_SPEED, Held, hold_on, split_carriers, with_integers
+from graphnav.estimation.known_arcs import Epochs
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.noise.model import INTERVALS, STATED, NoiseModel
 from graphnav.estimation.problem import Problem

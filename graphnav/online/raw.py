@@ -150,6 +150,7 @@ class RawEpochs:
     _every: list[float] = field(default_factory=list)  # s
     _rows: dict[float, Array] = field(default_factory=dict)  # (n, _WIDTH), by time
     _arcs: dict[float, Array] = field(default_factory=dict)  # (n,) s, begins of the arcs of their carriers
+    _number: dict[float, int] = field(default_factory=dict)  # of those that are used; -1 of one that came late
     _last: dict[tuple[float, float], tuple[float, Array, float]] = field(
         default_factory=dict
     )  # with a carrier, by slot
@@ -194,6 +195,8 @@ class RawEpochs:
         self._every.insert(k, t)
         self._rows[t] = self._with_place(t, _sane(np.reshape(values, (-1, _WIDTH))))
         if used:
+            # what is counted already stays: an epoch that comes late has no number, and changes pass it by
+            self._number[t] = self._number.get(self.newest, -1) + 1 if t > self.newest else -1
             insort(self._t, t)
         later = self._every[k:]
         if len(later) > 1:  # what came before is to be known again
@@ -214,13 +217,18 @@ class RawEpochs:
         k = bisect_left(self._every, t)
         for x in self._every[:k]:
             del self._rows[x], self._arcs[x]
+            self._number.pop(x, None)
         del self._every[:k], self._t[: bisect_left(self._t, t)]
 
     def between(self, begin: float, end: float) -> RawGnss:
-        """Those that are used from `begin` to `end`, both included, as a series."""
-        t = self._t[bisect_left(self._t, begin) : bisect_right(self._t, end)]
-        series = self._series(t, [self._rows[x] for x in t])
-        return replace(series, arc_begin=np.concatenate([self._arcs[x] for x in t])) if t else series
+        """Those that are used from `begin` to `end`, both included, and the one before, as a series."""
+        t = self._t[max(bisect_left(self._t, begin) - 1, 0) : bisect_right(self._t, end)]
+        rows = [self._rows[x] for x in t]
+        series = self._series(t, rows)
+        if not t:
+            return series
+        number = np.repeat([self._number[x] for x in t], [len(one) for one in rows])
+        return replace(series, arc_begin=np.concatenate([self._arcs[x] for x in t]), number=number)
 
     def _series(self, t: list[float], rows: list[Array]) -> RawGnss:
         if not t:
@@ -257,12 +265,15 @@ class RawEpochs:
         """(n,) s, when the arcs of an epoch's carriers begin; NaN where there is no carrier."""
         assert self.setup.catalogue is not None
         rows, last = self._rows[t], list(self._last.values())
-        if not self.settings.carrier:
+        if not (self.settings.carrier or self.settings.differences):
             return np.full(len(rows), np.nan)
         series = self._series([*(x for x, _, _ in last), t], [*(row[None] for _, row, _ in last), rows])
         order = np.argsort(series.t, kind="stable")
+        series, based = series.take(order), self.setup.catalogue.differenced and self.settings.carrier
+        if not based:
+            series = replace(series, carrier_difference=np.empty(0))
         period = self.setup.catalogue.period
-        found = find_arcs(series.take(order), base_arc=series.base_arc[order], period=period)
+        found = find_arcs(series, base_arc=series.base_arc if based else None, period=period)
         begin = np.empty(len(order))
         begin[order] = found.begin
         out = begin[len(last) :]
@@ -284,19 +295,23 @@ def settings_online(settings: Settings, setup: Recording) -> tuple[Settings, tup
     s = settings.raw_gnss
     if not setup.tight(s.coupling):
         return settings, ()
-    less = {"differences": False, "ppp": False, "code": s.code or s.ppp}
-    note = Note(
-        "online.raw",
-        "of the raw observations codes and Doppler shifts are used online, and carriers against a base station; "
-        "changes of carriers and precise point positioning are not",
-    )
-    return settings.model_copy(update={RAW: s.model_copy(update=less)}), (note,)
+    less = {"ppp": False, "code": s.code or s.ppp}
+    note = Note("online.raw", "precise point positioning is not done online: codes are used, and changes of carriers")
+    return settings.model_copy(update={RAW: s.model_copy(update=less)}), (note,) if s.ppp else ()
 
 
 def codes_alone(settings: Settings) -> Settings:
-    """The settings without carriers: a start and a noise model need nothing of them."""
+    """The settings without carriers: a start needs nothing of them."""
     less = settings.raw_gnss.model_copy(update={"differences": False, "carrier": False})
     return settings.model_copy(update={RAW: less})
+
+
+def without_ambiguities(settings: Settings, setup: Recording) -> Settings:
+    """The settings for a noise model: changes of carriers have figures of their own, ambiguities have none."""
+    s, raw = settings.raw_gnss, setup.raw_gnss
+    if raw is None or not (s.carrier and raw.differenced):
+        return settings
+    return codes_alone(settings)
 
 
 def _fill_columns(raw: RawGnss) -> RawGnss:

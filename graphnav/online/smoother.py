@@ -29,7 +29,7 @@ from graphnav.estimation.solvers.window import first_message
 from graphnav.online.ahead import Live
 from graphnav.online.judging import CatchUp, Judgement
 from graphnav.online.looks import CONTEXT, SURE
-from graphnav.online.raw import codes_alone, settings_online
+from graphnav.online.raw import codes_alone, settings_online, without_ambiguities
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import Tracker
 from graphnav.online.walker import Walker
@@ -285,7 +285,7 @@ class Smoother:
         until = tracker.newest + AFTER
         recording, every = (self.sensors.recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
         due = tracker.newest + min(_THINKING * self.settings.solver.lag, _LONGEST_THOUGHT)
-        settings = codes_alone(self.settings)
+        settings = without_ambiguities(self.settings, self._setup)
         self._judgement = Judgement(recording, every, settings, self.frame, found, times, self.sensors.unit(), due)
 
     def _use(self, judgement: Judgement, tracker: Tracker) -> None:

@@ -21,6 +21,7 @@ from graphnav.report import tables as tables
 from graphnav.report.names import has_names
 from graphnav.report.plots import Shades, Spans
 from graphnav.report.provenance import provenance_tables
+from graphnav.report.satellites import satellite_parts
 from graphnav.report.tables import Withheld
 
 if TYPE_CHECKING:
@@ -114,12 +115,11 @@ def write_report(
             [
                 *_gallery(pictures.timeline_picture(solution, recording, spans)),
                 *tables.constraint_table(solution),
-                *tables.satellite_tables(solution),
-                *tables.ambiguity_table(solution),
                 *tables.rejected_table(solution, start),
                 *_fold("Residuals of each", _gallery(pictures.record_pictures(solution, start, end, spans))),
             ],
         ),
+        ("Satellites", satellite_parts(solution, start, end, spans)),
         (
             "Noise model",
             [

@@ -305,11 +305,12 @@ def parameter_pictures(
     out = []
     for name, p in parameters.items():
         if len(p.t) > 2 and np.any(p.sigma < 0.5 * p.prior_sigma):
-            shown = components(name, p)
+            told = np.any(p.sigma < 0.5 * p.prior_sigma, axis=0)
+            shown = [one for one, drawn in zip(components(name, p), told, strict=True) if drawn]
             scale = np.array([one.scale for one in shown])
-            series = {solver: Series(p.t - start, scale * p.value, scale * p.sigma)}
-            titles = [one.words for one in shown]
-            figure = plots.bands(series, titles, shown[0].unit, end, spans=spans, about_zero=False)
+            series = {solver: Series(p.t - start, scale * p.value[:, told], scale * p.sigma[:, told])}
+            titles, units = [one.words for one in shown], [one.unit for one in shown]
+            figure = plots.bands(series, titles, units, end, spans=spans, about_zero=False)
             words = name.replace("_", " ")
             out.append(page.picture(figure, f"{words[:1].upper()}{words[1:]} and 3 sigma"))
     return out

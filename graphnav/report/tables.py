@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,7 @@ from markupsafe import Markup
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import INTERVALS
-from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.estimation.stops import stops_of_solution
 from graphnav.evaluation.against import own_solutions
 from graphnav.evaluation.segments import rms
@@ -49,57 +48,6 @@ def constraint_table(solution: Solution) -> list[Markup]:
         counted = page.and_list([f"{count} {kind}" for kind, count in solution.counts.items()])
         out.append(page.paragraph(f"Factors or updates by kind: {counted}.", "soft"))
     return out
-
-
-_ELEVATIONS = (0.0, 15.0, 30.0, 45.0, 60.0, 90.0)  # deg
-
-
-def satellite_tables(solution: Solution) -> list[Markup]:
-    """Residuals of rows of satellites, in sigmas as weighted, by satellite and by elevation."""
-    records = {kind: r for kind, r in solution.records.items() if len(r.satellite) == len(r.t) > 0}
-    if not records:
-        return []
-    names = sorted({name for r in records.values() for name in r.satellite.tolist()})
-    which = {kind: np.searchsorted(names, r.satellite) for kind, r in records.items()}
-    by_satellite = [
-        [name, *(cell for kind, r in records.items() for cell in _residual_cells(r, which[kind] == k))]
-        for k, name in enumerate(names)
-    ]
-    by_elevation = [
-        [
-            f"{low:.0f} to {high:.0f} deg",
-            *(
-                cell
-                for r in records.values()
-                for cell in _residual_cells(r, (np.degrees(r.elevation) >= low) & (np.degrees(r.elevation) < high))
-            ),
-        ]
-        for low, high in itertools.pairwise(_ELEVATIONS)
-    ]
-    head = [cell for kind in records for cell in (f"{kind} rows", "refused", "RMS / sigma")]
-    return [page.table(["satellite", *head], by_satellite), page.table(["elevation", *head], by_elevation)]
-
-
-def _residual_cells(record: ConstraintRecord, some: Array) -> list[Any]:
-    """How many rows there are, the share that has less than half of its weight, and the RMS of the others in sigmas."""
-    count = int(np.count_nonzero(some))
-    if not count:
-        return ["-", "-", "-"]
-    used = some & (record.weight >= 0.5)
-    nis = record.nis[used] / record.residual.shape[1]
-    share = 1.0 - np.count_nonzero(used) / count
-    return [count, Quantity(f"{100.0 * share:.1f} %"), float(np.sqrt(np.mean(nis))) if len(nis) else "-"]
-
-
-def ambiguity_table(solution: Solution) -> list[Markup]:
-    """How many epochs with carriers against a base station have integer ambiguities."""
-    epochs = getattr(solution, "fixed", np.empty((0, 2)))
-    if not len(epochs):
-        return []
-    fixed = int(np.sum(epochs[:, 1] > 0.0))
-    share = Quantity(f"{100.0 * fixed / len(epochs):.1f} %")
-    head = ["epochs with carriers", "ambiguities fixed as integers", "float", "share fixed"]
-    return [page.table(head, [[len(epochs), fixed, len(epochs) - fixed, share]])]
 
 
 def _find_largest(x: Array) -> float:

@@ -19,7 +19,7 @@ from graphnav.constraints.raw_gnss import CLOCK
 from graphnav.constraints.raw_phase import GnssPhase, WholeCycles
 from graphnav.core import earth
 from graphnav.estimation import fixing
-from graphnav.estimation.fixing import Known
+from graphnav.estimation.known_arcs import Known
 from graphnav.estimation.pipeline import run
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.atmosphere import NIGHT, directions, klobuchar
@@ -29,7 +29,7 @@ from graphnav.gnss.integers import decorrelate, find_nearest
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import L1, C
 from graphnav.recording.formats import read
-from graphnav.report.tables import satellite_tables
+from graphnav.report.satellites import satellite_tables
 
 STATED = settings_from({"noise": {"mode": "stated"}})
 WAVELENGTH = C / L1

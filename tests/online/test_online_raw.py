@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pickle
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -19,6 +20,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.estimation import fixing
 from graphnav.estimation.pipeline import run
 from graphnav.gnss.arcs import find_arcs
+from graphnav.gnss.carrier import consecutive
 from graphnav.gnss.integers import find_nearest
 from graphnav.online import Online, Row, rows_of, without_rows
 from graphnav.online.lines import head_of, line_of, row_of, setup_of
@@ -53,13 +55,16 @@ def played(setup: Recording, rows: Iterable[Row], how: Settings, engine: str = "
     return online, Trajectory(**arrays)
 
 
-@pytest.mark.parametrize("engine", ["window", "isam2"])
+# a kernel weighs a row by what is known when it comes, so changes of carriers are compared without
+@pytest.mark.parametrize(("engine", "chosen"), [("window", CODES), ("isam2", {"robust": "none"})])
 def test_with_a_long_lag_it_is_the_smoother_of_the_recording(
-    recording: Recording, rows: list[Row], engine: str
+    recording: Recording, rows: list[Row], engine: str, chosen: dict[str, object]
 ) -> None:
-    online, track = played(without_rows(recording), rows, settings_from(LONG), engine)
-    assert "online.raw" in map(key_of, online.notes)
-    whole = run(recording, settings_from(LONG | {"raw_gnss": CODES}), ("batch",))["batch"]
+    how = settings_from(LONG | {"raw_gnss": chosen})
+    online, track = played(without_rows(recording), rows, how, engine)
+    assert online.tracker is not None
+    assert ("gnss_carrier" in online.tracker.in_force) == (chosen is not CODES)
+    whole = run(recording, how, ("batch",))["batch"]
     at = np.argmin(np.abs(whole.t - track.t[:, None]), axis=1)
     same = np.abs(whole.t[at] - track.t) < 1e-6
     assert same.sum() > 80
@@ -81,12 +86,36 @@ def test_a_late_epoch_counts_at_its_own_time(recording: Recording, rows: list[Ro
         late.append(row)
         if held and row[1] > held[0][1] + 1.5:
             late.append(held.pop(0))
-    setup, how = without_rows(recording), settings_from(LONG)
+    setup, how = without_rows(recording), settings_from(LONG | {"raw_gnss": CODES})
     plain, delayed = (played(setup, some, how) for some in (kept, late + held))
     assert delayed[0].late["raw_gnss"] >= 2
     np.testing.assert_array_equal(delayed[1].t, plain[1].t)
     apart = (delayed[1].llh - plain[1].llh) * np.array([6.37e6, 6.37e6 * np.cos(plain[1].llh[0, 0]), 1.0])
     assert np.abs(apart[:, [1, 0, 2]] / plain[1].sd_p).max() < 0.02
+
+
+def test_changes_of_carriers_pass_a_late_epoch_by(recording: Recording) -> None:
+    """It comes when the changes around it are counted, each from one of two places that take turns."""
+    setup = without_rows(recording).raw_gnss
+    assert setup is not None
+    assert recording.raw_gnss is not None
+    kept, used = RawEpochs(setup, Settings().raw_gnss), epochs_of(recording.raw_gnss)[:6]
+    for t, values in (*used[:2], *used[3:5], used[2], used[5]):
+        kept.add(t, values)
+    series = kept.between(used[1][0], used[5][0])
+    t, first = np.unique(series.t, return_index=True)
+    np.testing.assert_array_equal(t, [at for at, _ in used])  # with the one before
+    assert series.number[first].tolist() == [0, 1, -1, 2, 3, 4]
+    before, after = consecutive(series, series, 1.0)
+    pairs = {(float(a), float(b)) for a, b in zip(series.t[before], series.t[after], strict=True)}
+    late = t[2]
+    assert pairs == {(a, b) for a, b in itertools.pairwise(t[t != late].tolist())}
+
+
+def test_precise_point_positioning_is_not_done_online(recording: Recording) -> None:
+    for ppp in (False, True):
+        online = Online(without_rows(recording), settings_from({"raw_gnss": {"ppp": ppp}}))
+        assert ("online.raw" in map(key_of, online.notes)) == ppp
 
 
 def test_it_goes_on_from_its_checkpoint(recording: Recording, rows: list[Row]) -> None:

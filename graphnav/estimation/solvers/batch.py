@@ -225,10 +225,10 @@ def _estimates(
     out = {}
     for chain in problem.chains:
         p = chain.parameter
-        if p.begins is not None:
+        if not p.listed:
             continue
         group = layout.group_of[p.name]
         at = group.columns[p.name]
         sigma = np.sqrt(np.stack([np.diag(covariances[int(k)])[at] for k in group.keys]))
-        out[p.name] = ParameterEstimate(chain.t, point.values[p.name], sigma, p.sigma, p.unit)
+        out[p.name] = ParameterEstimate(chain.t, point.values[p.name], sigma, p.prior_sigma, p.unit)
     return out

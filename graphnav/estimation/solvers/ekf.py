@@ -350,7 +350,7 @@ def _update(
         root, solved, Kt = solve_innovation(HP, HPHt, sigma * sigma, r, some)
         if not left:
             stack.seen(some, root, solved)
-            nis, bent = float(r @ solved), 1.0
+            nis, bent = float(r @ solved), np.ones(hi - lo)
             if rows.robust != "none" and rows.gate is None:  # a gate stands in place of a kernel
                 sigma, bent = solve_robust(HP, HPHt, sigma, r, solved, some)
                 root, solved, Kt = solve_innovation(HP, HPHt, sigma * sigma, r, some)
@@ -360,8 +360,8 @@ def _update(
             e = where.minus(x, at)
     if some.alone:
         refused = rows.gate is not None and nis > rows.gate**2
-        weight = 0.0 if refused else weight * bent
-        record.weight[lo:hi] = weight if hi - lo == 1 else record.used[lo:hi] * (0.0 if refused else bent)
+        weight = 0.0 if refused else weight
+        record.weight[lo:hi] = 0.0 if refused else record.used[lo:hi] * bent
         record.refused[lo:hi] = refused
     if bank is not None:
         bank.seen(rows.name, some.k, nis, weight > 0.0)

@@ -44,8 +44,8 @@ def describe_breakdown(some: RowBlock) -> EstimationError:
     )
 
 
-def solve_robust(HP: Array, HPHt: Array, sigma: Array, r: Array, solved: Array, some: RowBlock) -> tuple[Array, float]:
-    """Sigmas with a kernel's weights in them, and the least weight.
+def solve_robust(HP: Array, HPHt: Array, sigma: Array, r: Array, solved: Array, some: RowBlock) -> tuple[Array, Array]:
+    """Sigmas with a kernel's weights in them, and these (n,), one a row.
 
     As the incremental smoother does with a new keyframe: none at first, then by what the update leaves, a few times.
     """
@@ -58,4 +58,4 @@ def solve_robust(HP: Array, HPHt: Array, sigma: Array, r: Array, solved: Array, 
         sigma = stated / np.repeat(np.sqrt(weight), len(stated) // (hi - lo))
         if left_over:
             solved = solve_innovation(HP, HPHt, sigma * sigma, r, some)[1]
-    return sigma, float(np.min(weight))
+    return sigma, weight

@@ -177,10 +177,10 @@ def parameters_of(problem: Problem, values: Array, sigma: Array) -> dict[str, Pa
     """At each node: the value after the last keyframe that it governs, by those at keyframes (K, D-15)."""
     out = {}
     for chain in problem.chains:
-        if chain.parameter.begins is not None:
-            continue  # a place of a stop is no calibration
+        if not chain.parameter.listed:
+            continue
         p, at, last = chain.parameter, shift(problem.columns[chain.parameter.name]), last_of(chain)
-        out[p.name] = ParameterEstimate(chain.t, values[last, at], sigma[last, at], p.sigma, p.unit)
+        out[p.name] = ParameterEstimate(chain.t, values[last, at], sigma[last, at], p.prior_sigma, p.unit)
     return out
 
 

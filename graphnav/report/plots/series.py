@@ -27,7 +27,7 @@ class Series:
 
 
 def bands(
-    series: Mapping[str, Series], components: Sequence[str], unit: str, end: float, *, spans: Shades,
+    series: Mapping[str, Series], components: Sequence[str], unit: str | Sequence[str], end: float, *, spans: Shades,
     about_zero: bool = True, under: Callable[[Panel, int], None] | None = None,
 ) -> Figure:  # fmt: skip
     """One panel per component: the values, and 3 sigma about zero (errors) or about the value (biases).
@@ -36,6 +36,7 @@ def bands(
 
     Parameters
     ----------
+    unit : of all components, or of each.
     end : of the time axis, s.
     under : draws more into the panel of a component.
     """
@@ -54,8 +55,9 @@ def bands(
                 centre = 0.0 if about_zero else s.value[:, k]
                 extremes += [centre - width, centre + width]
         ylims.append(limits(extremes, symmetric=about_zero, always=always))
-    titles = [f"{c} [{unit}]" for c in components]
-    figure = Figure(titles, (0.0, end), ylims, units=[unit] * len(components))
+    units = [unit] * len(components) if isinstance(unit, str) else unit
+    titles = [f"{c} [{u}]" for c, u in zip(components, units, strict=True)]
+    figure = Figure(titles, (0.0, end), ylims, units=units)
     for k, panel in enumerate(figure.panels):
         panel.shade(spans)
         for name, s in series.items():

@@ -1,0 +1,131 @@
+"""Which arcs of carriers there are at each epoch, and what is known of their ambiguities as integers.
+
+`graphnav.estimation.fixing` finds the integers; here they are kept, put together, and held against the carriers of an
+epoch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import gammaincinv  # scipy.stats would take half a second to import
+
+from graphnav.constraints.ambiguities import slot_names
+from graphnav.constraints.raw_phase import GnssPhase
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM
+from graphnav.estimation.solution import CarrierArcs
+from graphnav.estimation.solvers.linearise import Points, linearise
+
+FEWEST = 4  # differences of an epoch that is fixed: one more than a position needs, so that they check each other
+_ALARM = 0.001  # of epochs with right integers that fail the test of consistency
+Arc = tuple[str, float]  # its ambiguity, and when it begins, s
+
+
+@dataclass
+class Known:
+    """Differences that have been found: each arc with an integer against the first of those it hangs together with."""
+
+    of: dict[Arc, tuple[Arc, int]] = field(default_factory=dict)  # N_arc - N_first
+    let_go: set[Arc] = field(default_factory=set)
+
+    def find(self, arc: Arc) -> tuple[Arc, int]:
+        """The first arc of those that this one hangs together with, and the difference from it."""
+        return self.of.get(arc, (arc, 0))
+
+    def join(self, a: Arc, b: Arc, cycles: int) -> None:
+        """N_a - N_b is so many cycles."""
+        (first, of_a), (other, of_b) = self.find(a), self.find(b)
+        if first == other:
+            return
+        moved = of_a - of_b - cycles
+        self.of |= {arc: (first, n + moved) for arc, (root, n) in self.of.items() if root == other}
+        self.of |= {first: (first, 0), other: (first, moved)}
+
+    def forget(self, arc: Arc) -> None:
+        """It is not known any more; what hangs together through it still does."""
+        root, _ = self.of.pop(arc, (None, 0))
+        if root == arc:
+            rest = [(other, n) for other, (first, n) in self.of.items() if first == arc]
+            for other, n in rest:
+                self.of[other] = rest[0][0], n - rest[0][1]
+
+
+class Epochs:
+    """Which arcs there are at each keyframe with carriers, and where their numbers stand."""
+
+    def __init__(self, phase: GnssPhase, columns: dict[str, slice], t: Array) -> None:
+        self.phase, self._all_columns = phase, columns
+        self.columns = {name: columns[name].start for name in phase.slots}
+        self.keyframes = np.unique(phase.keyframe).tolist()
+        self.t, self.time = t[self.keyframes], t
+        self.rows: dict[int, slice] = {}
+        self.active: dict[int, list[Arc]] = {}
+        arcs = [(phase.slots[slot], begin) for slot, begin in zip(phase.slot, phase.begin.tolist(), strict=True)]
+        self._group = dict(zip(phase.slots, phase.group.tolist(), strict=True))
+        self._whole = {arc for arc, whole in zip(arcs, phase.whole.tolist(), strict=True) if whole}
+        edges = np.searchsorted(phase.keyframe, [*self.keyframes, len(t)])
+        for k, lo, hi in zip(self.keyframes, edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            self.rows[k], self.active[k] = slice(lo, hi), arcs[lo:hi]
+
+    def odd(self, k: int, here: Points, known: Known) -> list[Arc]:
+        """Arcs with integers that an epoch is not consistent with, and is without them.
+
+        Parameters
+        ----------
+        here : a point near enough for the directions to the satellites.
+        """
+        own = self.rows[k]
+        rows = linearise(self.phase, here, self._all_columns, own, np.zeros(own.stop - own.start, dtype=int))
+        arcs = self.active[k]
+        used = np.array([i for i, arc in enumerate(arcs) if arc in known.of], dtype=int)
+        if not len(used):
+            return []
+        sets = [known.find(arcs[i])[0] for i in used]
+        clocks = (np.array([sets.index(one) for one in sets])[:, None] == np.arange(len(sets))).astype(float)
+        A = np.concatenate([rows.linear.jacobians["p"][used, 0], clocks[:, clocks.any(axis=0)]], axis=1)
+        # with the integers in place of the estimates; what they have in common is a clock's
+        at = np.array([self.columns[arcs[i][0]] for i in used]) - DIM
+        off = np.array([known.find(arcs[i])[1] for i in used]) - here.values[0, at]
+        r = rows.residual[used, 0] + self.phase.wavelength[own][used] * off
+        A, r = A / rows.stated[used], r / rows.stated[used, 0]
+        kept = np.ones(len(used), dtype=bool)
+        while True:
+            Q, _ = np.linalg.qr(A[kept][:, A[kept].any(axis=0)])
+            left = r[kept] - Q @ (Q.T @ r[kept])
+            spare = int(kept.sum()) - Q.shape[1]
+            if spare < 1 or left @ left <= 2.0 * gammaincinv(0.5 * spare, 1.0 - _ALARM):
+                break
+            share = np.maximum(1.0 - np.sum(Q * Q, axis=1), 1e-9)  # of its own error that is left in a residual
+            kept[np.flatnonzero(kept)[np.argmax(left**2 / share)]] = False
+        return [arcs[i] for i in used[~kept]]
+
+    def fixed(self, known: Mapping[int, Known]) -> Array:
+        """(E, 2) s, and 1 where enough differences are known; by keyframe."""
+        return np.array([[self.time[k], self.differences(k, known[k]) >= FEWEST] for k in self.keyframes], dtype=float)
+
+    def list_arcs(self, known: Mapping[int, Known]) -> CarrierArcs:
+        """The arcs, and where their ambiguities are held as integers, by what is known at each keyframe."""
+        phase = self.phase
+        integer = [arc in known[k].of for k in self.keyframes for arc in self.active[k]]
+        return CarrierArcs.from_rows(
+            self.time[phase.keyframe], phase.slot, phase.begin, np.array(integer, dtype=bool), slot_names(phase.slots)
+        )
+
+    def can(self, arc: Arc) -> bool:
+        """Whether it has integers."""
+        return self._group[arc[0]] >= 0 and arc in self._whole
+
+    def sets(self, k: int, known: Known) -> dict[int, list[list[Arc]]]:
+        """By group, the arcs of an epoch, those together that hang together, the largest set first."""
+        out: dict[int, dict[Arc, list[Arc]]] = {}
+        for arc in self.active[k]:
+            if self.can(arc) and arc not in known.let_go:
+                out.setdefault(self._group[arc[0]], {}).setdefault(known.find(arc)[0], []).append(arc)
+        return {group: sorted(sets.values(), key=len, reverse=True) for group, sets in out.items()}
+
+    def differences(self, k: int, known: Known) -> int:
+        """How many differences are known at an epoch."""
+        return sum(len(one) - 1 for sets in self.sets(k, known).values() for one in sets)

@@ -1,0 +1,177 @@
+"""Raw GNSS: the sky, which satellites were used when, residuals by satellite and elevation, arcs of carriers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.rotation import Array
+from graphnav.estimation.solution import CarrierArcs, ConstraintRecord
+from graphnav.report.plots.figure import Figure, colour, limits
+from graphnav.report.plots.series import Shades
+from graphnav.report.plots.thinning import BINS
+
+HALF = 0.5  # of a row's weight, below which it counts as refused
+_SKY = 320  # pixels
+_ROW = 15  # pixels of a satellite or signal
+_PLENTY = 4 * BINS  # dots of a cloud, which are drawn without thinning
+_RINGS = (0.0, 30.0, 60.0)  # deg of elevation
+_BINS = np.arange(0.0, 90.1, 5.0)  # deg of elevation
+
+
+def sky(record: ConstraintRecord, solver: str) -> Figure:
+    """Where the satellites stood: the zenith in the middle, the horizon around, north up; refused rows marked.
+
+    Parameters
+    ----------
+    record : of rows of satellites.
+    solver : whose colour to draw in.
+    """
+    off = 90.0 - np.degrees(record.elevation)
+    x, y = off * np.sin(record.azimuth), off * np.cos(record.azimuth)
+    wide = (-180.0, 180.0)
+    figure = Figure([""], wide, [(-97.0, 97.0)], height=_SKY, x="", equal=True)
+    (panel,) = figure.panels
+    for name in figure.axes:
+        figure.axes[name] |= {"visible": False}
+    for ring in _RINGS:
+        r = 90.0 - ring
+        figure.shapes.append({
+            "type": "circle", "xref": "x", "yref": "y", "x0": -r, "x1": r, "y0": -r, "y1": r, "layer": "below",
+            "line": {"color": colour("grid"), "width": 1},
+        })  # fmt: skip
+        panel.words(0.0, r, "" if ring == 0.0 else f"{ring:.0f}°", "left", (2, -2), "ink")
+    for words, at, align, shift in (
+        ("N", (0.0, 90.0), "center", (0, 0)), ("E", (90.0, 0.0), "left", (3, -8)),
+        ("S", (0.0, -90.0), "center", (0, -17)), ("W", (-90.0, 0.0), "right", (-3, -8)),
+    ):  # fmt: skip
+        panel.words(*at, words, align, shift, "ink")
+    refused = record.weight < HALF
+    for name in np.unique(record.satellite):
+        own = _some(np.flatnonzero(record.satellite == name), _PLENTY // 8)
+        panel.dots(x[own], y[own], solver, "used", 3.0, t=record.t[own], way=True)
+        panel.words(float(x[own[-1]]), float(y[own[-1]]), str(name), shift=(4, -4))
+    if refused.any():
+        own = _some(np.flatnonzero(refused))
+        panel.dots(x[own], y[own], "alert", "less than half weight", 4.0, t=record.t[own], way=True)
+    return figure
+
+
+def used_satellites(
+    records: Mapping[str, ConstraintRecord], start: float, end: float, solver: str, *, spans: Shades
+) -> Figure:
+    """How many satellites were used, and how many refused, at each epoch; a panel for each kind of row."""
+    counts, ylims = [], []
+    for record in records.values():
+        t, of = np.unique(record.t, return_inverse=True)
+        good = np.bincount(of, weights=record.weight >= HALF, minlength=len(t))
+        counts.append((t - start, good, np.bincount(of, minlength=len(t)) - good))
+        ylims.append((-0.5, float(np.max(np.bincount(of), initial=1)) * 1.08 + 0.5))
+    figure = Figure([f"{kind}: rows of an epoch" for kind in records], (0.0, end), ylims)
+    for panel, (t, good, refused) in zip(figure.panels, counts, strict=True):
+        panel.shade(spans)
+        panel.line(t, good, solver, "used")
+        panel.line(t, refused, "alert", "less than half weight")
+    return figure
+
+
+def satellite_rows(record: ConstraintRecord, start: float, end: float, solver: str, *, spans: Shades) -> Figure:
+    """A line for each satellite: when its rows were used, and when refused."""
+    every = sorted(set(record.satellite.tolist()))
+    figure, places = _named_rows(every, (0.0, end), {"spans": spans})
+    (panel,) = figure.panels
+    refused = record.weight < HALF
+    for name, row in places.items():
+        own = record.satellite == name
+        for some, look, words, size in (
+            (own & ~refused, solver, "used", 3.0),
+            (own & refused, "alert", "less than half weight", 5.0),
+        ):
+            if some.any():
+                panel.dots(record.t[some] - start, np.full(int(some.sum()), row), look, words, size)
+    return figure
+
+
+def residuals_by_elevation(records: Mapping[str, ConstraintRecord], solver: str) -> Figure:
+    """Every residual over its elevation, and by steps of it their RMS beside the sigma that was stated."""
+    shown = [(kind, np.degrees(r.elevation), r, r.residual[:, 0]) for kind, r in records.items()]
+    units = [r.unit for r in records.values()]
+    ylims = [limits([y[r.weight >= HALF]], symmetric=True) for _, _, r, y in shown]
+    titles = [f"{kind} [{unit}]" for kind, unit in zip(records, units, strict=True)]
+    figure = Figure(titles, (0.0, 90.0), ylims, units=units, x="elevation [deg]")
+    for panel, (_, x, record, y) in zip(figure.panels, shown, strict=True):
+        used = record.weight >= HALF
+        bounded = np.clip(y, 0.98 * panel.ylim[0], 0.98 * panel.ylim[1])
+        for some, look, words, size in ((used, solver, "used", 2.5), (~used, "alert", "less than half weight", 4.0)):
+            rows = _some(np.flatnonzero(some))
+            if len(rows):
+                panel.dots(x[rows], bounded[rows], look, words, size, alpha=0.4, way=True)
+        middle, rms, sigma = _by_elevation(x[used], y[used], record.sigma[used, 0])
+        panel.line(middle, rms, "truth", "RMS in steps of 5 deg", width=2.2)
+        panel.line(middle, sigma, "withheld", "their sigma", width=2.2, dash=True)
+    return figure
+
+
+def residuals_by_satellite(kind: str, record: ConstraintRecord, solver: str) -> Figure:
+    """For each satellite the middle, the middle half and the middle 95 % of its residuals."""
+    every = sorted(set(record.satellite.tolist()))
+    y, used = record.residual[:, 0], record.weight >= HALF
+    parts = {name: np.quantile(own, [0.025, 0.25, 0.5, 0.75, 0.975]) for name in every
+             if len(own := y[used & (record.satellite == name)])}  # fmt: skip
+    reach = limits([np.concatenate([*parts.values(), np.zeros(1)])], symmetric=True)
+    figure, places = _named_rows(every, reach, {"x": f"{kind} [{record.unit}]"})
+    (panel,) = figure.panels
+    panel.line(np.zeros(2), np.array(panel.ylim), "ink", width=0.8, quiet=True)
+    gap = np.nan
+    for a, b, width, words in ((0, 4, 1.5, "middle 95 %"), (1, 3, 5.0, "middle half")):
+        lines = np.array([[q[a], places[n]] for n in parts for q in (parts[n], parts[n][[b] * 5], np.full(5, gap))])
+        panel.way(lines, solver, words, width=width)
+    panel.dots(
+        np.array([q[2] for q in parts.values()]), np.array([places[n] for n in parts]), "truth", "median", 6.0, way=True
+    )
+    return figure
+
+
+def carrier_arcs(arcs: CarrierArcs, start: float, end: float, *, spans: Shades) -> Figure:
+    """A line for each signal of a satellite: its arcs, with integer ambiguities and with real ones."""
+    figure, places = _named_rows(sorted(set(arcs.name.tolist())), (0.0, end), {"spans": spans})
+    (panel,) = figure.panels
+    row = np.array([places[name] for name in arcs.name.tolist()])
+    for some, look, words in ((~arcs.integer, "float", "real number"), (arcs.integer, "fixed", "integer")):
+        if some.any():
+            x = np.stack([arcs.begin[some], arcs.end[some], np.full(int(some.sum()), np.nan)], -1) - start
+            panel.way(np.stack([x.ravel(), np.repeat(row[some], 3)], -1), look, words, width=5.0)
+    first = np.unique(np.stack([row, arcs.begin - start], -1), axis=0)
+    panel.dots(first[:, 1], first[:, 0], "truth", "begins", 3.0, "s", way=True)
+    return figure
+
+
+def _named_rows(every: list[str], xlim: tuple[float, float], more: dict[str, Any]) -> tuple[Figure, dict[str, float]]:
+    """A panel with a line for each name, the first on top, and where these are."""
+    places = {name: float(len(every) - 1 - k) for k, name in enumerate(every)}
+    spans = more.pop("spans", {})
+    figure = Figure(
+        [""], xlim, [(-0.7, len(every) - 0.3)], height=max(_ROW * len(every), 60),
+        names={row: name for name, row in places.items()}, **more,
+    )  # fmt: skip
+    figure.panels[0].shade(spans)
+    return figure, places
+
+
+def _some(rows: NDArray[np.intp], most: int = _PLENTY) -> NDArray[np.intp]:
+    """Rows for a cloud of dots, evenly chosen: it keeps its shape, which extremes alone would not."""
+    return rows[:: -(-len(rows) // most) or 1]
+
+
+def _by_elevation(x: Array, y: Array, sigma: Array) -> tuple[Array, Array, Array]:
+    """Middles (B,) of the steps of elevation that have rows, deg, RMS of these, and of their sigmas."""
+    of = np.digitize(x, _BINS)
+    steps = [of == k for k in np.unique(of) if np.count_nonzero(of == k) > 1]
+    return (
+        np.array([np.mean(x[some]) for some in steps]),
+        np.array([np.sqrt(np.mean(y[some] ** 2)) for some in steps]),
+        np.array([np.sqrt(np.mean(sigma[some] ** 2)) for some in steps]),
+    )

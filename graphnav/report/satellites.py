@@ -1,0 +1,114 @@
+"""What a report shows of raw GNSS, of which a solution has rows by satellite: pictures and tables."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from graphnav.core.rotation import Array
+from graphnav.estimation.solution import ConstraintRecord, Solution
+from graphnav.report import page
+from graphnav.report.page import Quantity
+from graphnav.report.plots import Shades
+from graphnav.report.plots import satellites as plots
+
+_ELEVATIONS = (0.0, 15.0, 30.0, 45.0, 60.0, 90.0)  # deg
+
+
+def satellite_parts(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
+    """The section on satellites, of a solution that has rows of them; nothing otherwise.
+
+    Parameters
+    ----------
+    start : of the recording, s on its own clock; `end` of the time axis from there.
+    """
+    records, name = satellite_records(solution), solution.solver
+    if not records:
+        return []
+    kind, first = next(iter(records.items()))
+    said = {r.kind for r in records.values()}
+    what = " and ".join(sorted(f"{one}s" for one in said)).capitalize()
+    seen = [
+        page.picture(plots.sky(first, name), f"Sky, by the rows of {kind}", "North is up, the zenith in the middle."),
+        page.picture(plots.used_satellites(records, start, end, name, spans=spans), "Rows used and refused"),
+    ]
+    by_satellite = [
+        page.picture(plots.residuals_by_satellite(one, r, name), f"{one}: {r.kind}s by satellite")
+        for one, r in records.items()
+    ]
+    out = [
+        page.gallery(seen),
+        page.gallery(
+            [
+                page.picture(plots.satellite_rows(first, start, end, name, spans=spans), f"{kind}: use by satellite"),
+                page.picture(
+                    plots.residuals_by_elevation(records, name),
+                    f"{what} by elevation",
+                    "What lies beyond a panel is drawn at its edge.",
+                ),
+                *by_satellite,
+            ]
+        ),
+        *satellite_tables(solution),
+    ]
+    if len(solution.arcs.name):
+        note = "An arc ends where the receiver, or the base station's, loses count of the cycles."
+        figure = plots.carrier_arcs(solution.arcs, start, end, spans=spans)
+        out.append(page.gallery([page.picture(figure, "Arcs of carriers, by their ambiguities", note, kind="large")]))
+    return [*out, *ambiguity_table(solution)]
+
+
+def satellite_records(solution: Solution) -> dict[str, ConstraintRecord]:
+    """The records that have rows of satellites, by constraint."""
+    return {kind: r for kind, r in solution.records.items() if len(r.satellite) == len(r.t) > 0}
+
+
+def satellite_tables(solution: Solution) -> list[Markup]:
+    """Residuals of rows of satellites, in sigmas as weighted, by satellite and by elevation."""
+    records = satellite_records(solution)
+    if not records:
+        return []
+    names = sorted({name for r in records.values() for name in r.satellite.tolist()})
+    which = {kind: np.searchsorted(names, r.satellite) for kind, r in records.items()}
+    by_satellite = [
+        [name, *(cell for kind, r in records.items() for cell in _residual_cells(r, which[kind] == k))]
+        for k, name in enumerate(names)
+    ]
+    by_elevation = [
+        [
+            f"{low:.0f} to {high:.0f} deg",
+            *(
+                cell
+                for r in records.values()
+                for cell in _residual_cells(r, (np.degrees(r.elevation) >= low) & (np.degrees(r.elevation) < high))
+            ),
+        ]
+        for low, high in itertools.pairwise(_ELEVATIONS)
+    ]
+    head = [cell for kind in records for cell in (f"{kind} rows", "refused", "RMS / sigma")]
+    return [page.table(["satellite", *head], by_satellite), page.table(["elevation", *head], by_elevation)]
+
+
+def _residual_cells(record: ConstraintRecord, some: Array) -> list[Any]:
+    """How many rows there are, the share that has less than half of its weight, and the RMS of the others in sigmas."""
+    count = int(np.count_nonzero(some))
+    if not count:
+        return ["-", "-", "-"]
+    used = some & (record.weight >= plots.HALF)
+    nis = record.nis[used] / record.residual.shape[1]
+    share = 1.0 - np.count_nonzero(used) / count
+    return [count, Quantity(f"{100.0 * share:.1f} %"), float(np.sqrt(np.mean(nis))) if len(nis) else "-"]
+
+
+def ambiguity_table(solution: Solution) -> list[Markup]:
+    """How many epochs with carriers against a base station have integer ambiguities."""
+    epochs = solution.fixed
+    if not len(epochs):
+        return []
+    fixed = int(np.sum(epochs[:, 1] > 0.0))
+    share = Quantity(f"{100.0 * fixed / len(epochs):.1f} %")
+    head = ["epochs with carriers", "ambiguities fixed as integers", "float", "share fixed"]
+    return [page.table(head, [[len(epochs), fixed, len(epochs) - fixed, share]])]
