@@ -49,7 +49,6 @@ class Sensors:
     oldest: float = -np.inf  # s; rows up to here come too late
     _unit: Array | None = None  # `unit`, once asked for
     _means: dict[str, tuple[float, tuple[float, ...]]] = field(default_factory=dict)  # usual sigmas, and since when
-    _suspect: tuple[float, tuple[float, ...]] | None = None  # an IMU row far ahead of the one before
     set_back: list[Row] = field(default_factory=list)  # the first rows of a clock that was set back
     moved: tuple[float, int] | None = None  # since when (s), and how many fixes are elsewhere than all before
     released: list[Row] = field(default_factory=list)  # rows that were held and are to be taken in now
@@ -197,9 +196,9 @@ class Sensors:
 
     def add_next(self, t: float, values: tuple[float, ...], newest: float) -> bool:
         """Take in an IMU row if nothing is odd about it; False leaves it to `add`. `newest` is the time before it."""
-        if self._suspect is not None or not newest + SAME < t <= newest + self.longest_gap or t <= self.oldest:
+        if not newest + SAME < t <= newest + self.longest_gap or t <= self.oldest or self._clock.undecided:
             return False
-        if len(values) != _WIDTH["imu"] or not imu_reads(values) or self._clock.behind or self._clock.ahead:
+        if len(values) != _WIDTH["imu"] or not imu_reads(values):
             return False
         self._clock.remember(t, values)
         self.imu.append(t, values)
@@ -262,7 +261,7 @@ class Sensors:
 
     def release(self) -> None:
         """No more IMU rows will come: what was held is to be taken in now."""
-        self._clock.go_on()
+        self._clock.release()
         self._sort_out()
 
     def _sort_out(self) -> None:
@@ -275,7 +274,7 @@ class Sensors:
 
     def forget_time(self) -> None:
         """Another clock: what was noted of the times of rows holds no more."""
-        self._means, self._suspect, self._reach = {}, None, Reach()
+        self._means, self._reach = {}, Reach()
 
     def _find_fault(self, sensor: str, values: tuple[float, ...]) -> str | None:
         """What is wrong with a row by itself, as it is counted."""
@@ -307,17 +306,14 @@ class Sensors:
                 self.released += held
                 return False
         if len(self.imu) and t > self.imu.newest + self.longest_gap:
-            # the next row tells whether this stamp was wrong or the IMU away
-            before, self._suspect = self._suspect, (t, values)
-            if before is None or not 0.0 < t - before[0] < self.longest_gap:
-                if before is not None:
-                    self.counts["imu: stamp in the future"] += 1
-                return False
-            self.imu.add(*before)
-            self.counts["imu"] += 1
-        elif self._suspect is not None:
-            self.counts["imu: stamp in the future"] += 1
-        self._suspect = None
+            rows = self._clock.leap(t, values, self.longest_gap)
+            self.counts["imu: stamp in the future"] += 1 - len(rows)
+            for _, when, what in rows:
+                self._clock.remember(when, what)
+                self.imu.append(when, what)
+            self.counts["imu"] += len(rows)
+            self._sort_out()
+            return bool(rows)
         if t > self.imu.newest:
             self._clock.remember(t, values)
             self._clock.go_on()

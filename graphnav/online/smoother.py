@@ -108,7 +108,8 @@ class Smoother:
         if sensor == "imu" and (newest := sensors.imu.newest) > before:
             # a row before this one that was left out leaves no trace: what is done at which row stays the same
             if newest - before > self.settings.keyframes.bridge and len(sensors.imu) > 1 and np.isfinite(before):
-                self._restart(before, f"the IMU was silent from {before:.3f} to {newest:.3f} s")
+                after = float(sensors.imu.t[np.searchsorted(sensors.imu.t, before, side="right")])
+                self._restart(before, f"the IMU was silent from {before:.3f} to {after:.3f} s")
             self._look_if_due(newest, before)
             return
         tracker = self.tracker
@@ -189,6 +190,9 @@ class Smoother:
 
     def finish(self) -> None:
         """Nothing more will come: settle all."""
+        self._settle_all()
+
+    def _settle_all(self) -> None:
         if self.tracker is None:
             try:
                 self._align(last=True)
@@ -329,13 +333,10 @@ class Smoother:
         self.notes.append(Note("online.anew", f"{why}: aligning anew"))
         after = sensors.imu.rows[sensors.imu.t > before].copy()
         later = {name: buffer.after(before) for name, buffer in sensors.aiding.items()}
-        if self.tracker is not None:
-            sensors.imu.drop_after(before)
-            self._judge_at_last()
-            self._advance(self.tracker, last=True)
-            self.tracker.settle(sensors)
-            self._collect(self.tracker)
-            self._faults += self.tracker.excluded + self._left_out
+        for buffer in (sensors.imu, *sensors.aiding.values()):
+            buffer.drop_after(before)
+        self._settle_all()
+        self._faults = self.excluded
         self._begin_anew(before)
         for row in after:
             sensors.imu.add(float(row[0]), tuple(row[1:]))

@@ -158,6 +158,33 @@ def test_a_fix_before_the_first_imu_row_of_another_clock_counts(
     assert twice.sensors.counts["gnss: repeated"] == 1
 
 
+@pytest.mark.parametrize("step", [-1000.0, 3600.0])
+@pytest.mark.parametrize(("sensor", "which"), [("imu", -1), ("imu", -3), ("imu", 0), ("gnss", -1), ("gnss", 0)])
+def test_a_row_that_comes_late_over_a_step_of_the_clock_counts(
+    drive: tuple[Recording, Trajectory], rows: list[Row], step: float, sensor: str, which: int
+) -> None:
+    """By a second, from before the step or from behind it: each piece is as if it had come in its turn."""
+    old = [row for row in rows if row[1] <= 41.9]
+    sent = [*old, *((name, t + step, values) for name, t, values in rows if t > 41.9)]
+    numbers = range(len(old)) if which < 0 else range(len(old), len(sent))
+    k = [n for n in numbers if sent[n][0] == sensor][which]
+    late = [*sent[:k], *sent[k + 1 : k + 25], sent[k], *sent[k + 25 :]]
+    (online, track), (plain, other) = (played(drive[0], some, QUICK) for some in (late, sent))
+    assert sorted(late) == sorted(sent)
+    assert +online.sensors.counts == +plain.sensors.counts
+    assert set(+plain.sensors.counts) == {"imu", "gnss", "odometer"}
+    same(track, other)
+
+
+def test_a_piece_that_an_idle_imu_ends_is_smoothed(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    """Though nothing was aligned when it ended: as at the end of a drive."""
+    some = [row for row in rows if row[1] <= 41.9]
+    alone = played(drive[0], some, QUICK)[1]
+    assert len(alone) > 20
+    track = played(drive[0], [*some, *((s, t, v) for s, t, v in rows if t > 60.0)], QUICK)[1]
+    same(track.take(np.flatnonzero(track.t < 50.0)), alone)
+
+
 def test_a_late_fix_that_is_the_last_row_is_used(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
     """No IMU row follows that could tell of which clock it is."""
     some = [row for row in rows if row[1] <= 26.0]
