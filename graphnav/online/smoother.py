@@ -40,6 +40,7 @@ _ODOMETER = 0.3  # s that a keyframe waits for the odometer
 _SILENT = 2.0  # s after which an odometer is not waited for
 _STEP = 0.5  # s between looks at a walk
 _MISSING = 5  # rows of the IMU in a row, whose work the next one does
+_KNOWN = 4.0  # s before the newest keyframe up to which the stops are known
 _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that level a vehicle without GNSS
 _JUDGED = 120.0  # s of rows by which the sensors are judged again
@@ -100,6 +101,8 @@ class Smoother:
         sensors = self.sensors
         before = sensors.imu.newest
         if sensor == "imu" and sensors.add_next(t, values, before):  # as all but a few do
+            if sensors.contradicted is not None:
+                self._redo_contradicted()
             self._look_if_due(t, before)
             return
         previous = sensors.newest(sensor)
@@ -110,6 +113,8 @@ class Smoother:
             if newest - before > self.settings.keyframes.bridge and len(sensors.imu) > 1 and np.isfinite(before):
                 after = float(sensors.imu.t[np.searchsorted(sensors.imu.t, before, side="right")])
                 self._restart(before, f"the IMU was silent from {before:.3f} to {after:.3f} s")
+            if sensors.contradicted is not None:
+                self._redo_contradicted()
             self._look_if_due(newest, before)
             return
         tracker = self.tracker
@@ -136,6 +141,19 @@ class Smoother:
                 self._dirty = min(self._dirty, previous + 2.0 * SAME_TIME)
         if sensors.imu.newest >= self._due:
             self._look(sensors.imu.newest)
+
+    def _redo_contradicted(self) -> None:
+        """A row of the IMU was taken back: what was made of it is made again."""
+        tracker, t = self.tracker, self.sensors.contradicted
+        self.sensors.contradicted = None
+        if tracker is None or t is None:
+            return
+        if isinstance(tracker, Walker):
+            tracker.finish_entering(self.sensors)
+        self._awake = -np.inf
+        tracker.note_late_row("imu", t)
+        if t <= tracker.newest + SAME_TIME:
+            self._dirty = min(self._dirty, t)
 
     def _look_if_due(self, now: float, before: float) -> None:
         spacing, self._spacing = self._spacing, now - before
@@ -215,6 +233,7 @@ class Smoother:
             self._due = now + _TRY
         if now - first < _LEVEL:
             return
+        sensors.drop_contradicted()
         recording = sensors.recording(-np.inf, now)
         if recording.gnss is None and sensors.setup.gnss is not None and not last:
             self._wait(now)
@@ -358,6 +377,7 @@ class Smoother:
     # --------------------------------------------------------------------------------------------------- running
     def _advance(self, tracker: Tracker, last: bool = False) -> None:
         """Make the keyframes that are due."""
+        self.sensors.learn(tracker.newest - _KNOWN, tracker.stops)
         sensors, period = self.sensors, 1.0 / self.settings.keyframes.rate
         now = sensors.imu.newest
         limit = now if last else now - AFTER

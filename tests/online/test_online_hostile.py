@@ -88,15 +88,20 @@ def test_a_velocity_that_no_vehicle_has_leaves_its_fix(
     assert online.sensors.counts["gnss"] == sum(row[0] == "gnss" for row in rows)
 
 
-def test_a_reading_that_may_be_does_not_shut_the_fixes_out(
-    drive: tuple[Recording, Trajectory], rows: list[Row]
+@pytest.mark.parametrize("at", [36.28, 42.28, 56.52])
+def test_a_reading_that_those_around_contradict_costs_its_interval(
+    drive: tuple[Recording, Trajectory], rows: list[Row], at: float
 ) -> None:
-    """One of -1 rad/s: the drive leans by two degrees, and right fixes seem to drift."""
+    """One of -1 rad/s, by which the drive leans by two degrees: before there is a state, and when there is one."""
     alone = [row for row in rows if row[0] != "odometer"]
-    wild = [(s, t, (-1.0, *v[1:])) if s == "imu" and abs(t - 36.28) < 0.01 else (s, t, v) for s, t, v in alone]
+    wild = [(s, t, (-1.0, *v[1:])) if s == "imu" and abs(t - at) < 0.01 else (s, t, v) for s, t, v in alone]
     assert sum(a != b for a, b in zip(alone, wild, strict=True)) == 1
-    error, _ = off(played(drive[0].without("odometer"), wild, QUICK)[1], drive[1], drive[0])
-    assert np.abs(error).max() < 5.0
+    online, track = played(drive[0].without("odometer"), wild, QUICK)
+    assert online.sensors.counts["imu: contradicted by those around"] == 1
+    assert online.excluded == ()
+    error, sd = off(track, drive[1], drive[0])
+    assert np.abs(error).max() < 0.1
+    assert np.abs(error / sd).max() < 6.0
 
 
 @pytest.mark.parametrize("k", [0, 30])
