@@ -26,7 +26,7 @@ _BLANK = (math.nan,) * 6
 _SUREST = 1e-4  # m, m/s; a tenth of what the phase of a carrier can be measured to
 _MOST = 600  # fixes: what contradicts so many that agreed is believed when there are more of it
 _SET_BACK = 20  # IMU rows one after the other at times that have passed: not some that came late, but another clock
-_LASTING = 1.2  # s, that these last: more than a second, so that one stands at a second that is remembered
+LASTING = 1.2  # s, that these last: more than a second, so that one stands at a second that is remembered
 _REMEMBERED = 36_000  # s, ten hours
 _SLOWEST = 0.5  # s between rows of an IMU (as in `graphnav.recording.formats.repair`)
 _HELD = 200  # rows of other sensors
@@ -168,7 +168,7 @@ class ClockGuard:
         if sensor == "imu":
             if t in times:
                 return False  # sent twice
-            if times and t < max(times) - _LASTING:  # behind these, too
+            if times and t < max(times) - LASTING:  # behind these, too
                 self.behind, self._again, times = [one for one in self.behind if one[0] != "imu"], "", []
             second = int(t)
             if (t, *values) == self._seconds.get(second):
@@ -184,7 +184,7 @@ class ClockGuard:
             return False
         if len(self.behind) - len(times) > _HELD:  # the IMU says nothing
             self.released.append(self.behind.pop(next(k for k, one in enumerate(self.behind) if one[0] != "imu")))
-        return len(times) >= _SET_BACK and max(times) - min(times) >= _LASTING
+        return len(times) >= _SET_BACK and max(times) - min(times) >= LASTING
 
     def hold_early(self, row: Row) -> None:
         """Hold a fix or reading far ahead of the IMU: the clock may have been set ahead, which IMU rows will tell."""
@@ -201,7 +201,7 @@ class ClockGuard:
             return None
         self._sent_again |= self._before[int(t)] == (t, *values)
         self._ahead = [] if self._sent_again else [*self._ahead, ("imu", t, values)]
-        if not self._ahead or t - self._ahead[0][1] < _LASTING:
+        if not self._ahead or t - self._ahead[0][1] < LASTING:
             return []
         rows, self._ahead, self._new = self._ahead, [], True
         return rows
@@ -219,7 +219,7 @@ class ClockGuard:
             self._strands = [*self._strands[1 - _STRANDS :], strand]
         if t not in [row[1] for row in strand]:
             bisect.insort(strand, ("imu", t, values), key=lambda row: row[1])
-        if strand[-1][1] - strand[0][1] < _LASTING:
+        if strand[-1][1] - strand[0][1] < LASTING:
             return []
         self.release()
         return strand

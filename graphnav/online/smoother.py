@@ -120,7 +120,10 @@ class Smoother:
         tracker = self.tracker
         if tracker is not None:
             if isinstance(tracker, Walker):
-                if sensor == "imu" and not tracker.note_missed_row(t):
+                missed = sensor != "imu" or tracker.note_missed_row(t)
+                if sensor == "imu":
+                    tracker.look_again(sensors, t)
+                if not missed:
                     return  # as if it had come in its turn
                 tracker.finish_entering(sensors)
             self._awake = -np.inf
