@@ -88,16 +88,18 @@ def interrupted(rows: list[Row], recording: Recording) -> list[Row]:
 
 
 def spoilt(rows: list[Row], rng: random.Random) -> list[Row]:
-    """An absurd row every minute, a row that is late every 20 s, and one that comes twice every ten."""
+    """An absurd row every minute, one that is late every 20 s and at steps of the clock, one twice every 10 s."""
     out: list[Row] = []
     late: list[tuple[int, Row]] = []
-    minute, twenty, ten = 0.0, 30.0, 0.0  # what comes late where rows begin, or their clock was set, is lost
+    minute, twenty, ten = 0.0, 0.0, 0.0
     fix = next((values for sensor, _, values in rows if sensor == "gnss"), None)
     slow = "imu" if fix is None else "gnss"  # whose rows are late
     blank, since, before = (float("nan"),) * 6, 0.0, rows[0][1]
     for k, row in enumerate(rows):
         sensor, t, _ = row
         since += min(max(t - before, 0.0), 1.0)
+        if abs(t - before) > 60.0:
+            twenty = since
         before = t
         if since >= minute:
             minute += 60.0

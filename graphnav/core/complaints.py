@@ -37,14 +37,27 @@ def read_toml(path: Path, error: type[GraphnavError]) -> tuple[dict[str, Any], s
         if any(line.partition("=")[0].count(".") > 2 * _DEEPEST for line in text.splitlines()):
             raise RecursionError
         values = tomllib.loads(text)
-        for key, value in _leaves(values):
-            if isinstance(value, int) and not -(2**63) <= value < 2**63:
-                raise ValueError(f"'{key}' is a whole number of more than 64 bits")
+        check_whole_numbers(values)
         return values, text
     except RecursionError:
         raise error(f"{path}: not valid TOML (nested too deep)", key="toml.syntax") from None
     except ValueError as cause:  # tomllib's own is one, and that of a number of thousands of digits
         raise error(f"{path}: not valid TOML ({cause})", key="toml.syntax") from None
+
+
+def check_whole_numbers(values: Any) -> None:
+    """Refuse whole numbers that no program means; in hexadecimal they have any number of digits.
+
+    Raises
+    ------
+    ValueError
+        Saying which key of nested tables and lists has one.
+    RecursionError
+        If they are nested deeper than any file of settings.
+    """
+    for key, value in _leaves(values):
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise ValueError(f"'{key}' is a whole number of more than 64 bits")
 
 
 def _leaves(value: Any, key: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:

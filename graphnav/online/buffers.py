@@ -71,6 +71,12 @@ class Buffer:
         """Forget the rows after a time."""
         self._end = self._begin + int(np.searchsorted(self.t, t, side="right"))
 
+    def drop(self, t: float) -> None:
+        """Forget the row at a time."""
+        at = self._begin + int(np.searchsorted(self.t, t))
+        self._data[at : self._end - 1] = self._data[at + 1 : self._end]
+        self._end -= 1
+
     def between(self, begin: float, end: float) -> Array:
         """The rows from `begin` to `end`, both included, as a copy."""
         lo, hi = np.searchsorted(self.t, begin, side="left"), np.searchsorted(self.t, end, side="right")

@@ -220,6 +220,15 @@ class RawEpochs:
             self._number.pop(x, None)
         del self._every[:k], self._t[: bisect_left(self._t, t)]
 
+    def drop_after(self, t: float) -> None:
+        """Forget the epochs after a time."""
+        k, self._last = bisect_right(self._every, t), {}
+        for x in self._every[k:]:
+            del self._rows[x], self._arcs[x]
+        del self._every[k:], self._t[bisect_right(self._t, t) :]
+        for x in self._every:
+            self._remember(x)
+
     def between(self, begin: float, end: float) -> RawGnss:
         """Those that are used from `begin` to `end`, both included, and the one before, as a series."""
         t = self._t[max(bisect_left(self._t, begin) - 1, 0) : bisect_right(self._t, end)]

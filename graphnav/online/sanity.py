@@ -7,6 +7,7 @@ every sensor can have sent pass untouched.
 
 from __future__ import annotations
 
+import bisect
 import math
 from dataclasses import dataclass, field
 from typing import Literal
@@ -25,7 +26,7 @@ _BLANK = (math.nan,) * 6
 _SUREST = 1e-4  # m, m/s; a tenth of what the phase of a carrier can be measured to
 _MOST = 600  # fixes: what contradicts so many that agreed is believed when there are more of it
 _SET_BACK = 20  # IMU rows one after the other at times that have passed: not some that came late, but another clock
-_LASTING = 1.2  # s, that these last: more than a second, so that one stands at a second that is remembered
+LASTING = 1.2  # s, that these last: more than a second, so that one stands at a second that is remembered
 _REMEMBERED = 36_000  # s, ten hours
 _SLOWEST = 0.5  # s between rows of an IMU (as in `graphnav.recording.formats.repair`)
 _HELD = 200  # rows of other sensors
@@ -33,6 +34,7 @@ _OVERTAKING = (
     10.0  # periods; rows that merely overtake each other are closer (as in `graphnav.recording.formats.repair`)
 )
 _HOLE = 1.5  # periods between two rows in which another may have been
+_STRANDS = 3  # clocks that rows far ahead may be of at a time: one, and two that come of wrong stamps
 
 
 def imu_reads(values: tuple[float, ...]) -> bool:
@@ -109,12 +111,14 @@ def _is_near(dt: float, dp: Array) -> bool:
 
 @dataclass
 class ClockGuard:
-    """Notices that the clock of the IMU was set back.
+    """Notices that the clock of the IMU was set back, or ahead.
 
     Rows at times that have passed are late, or sent again, or of a clock that was set back. Late ones fill a hole,
     those sent again are as they were (a row of every second is remembered), and neither goes on and on. A sender that
     begins again before such a step sends rows of the clock before, too, which need not lie in the past of the new one.
-    Fixes and readings far from the newest IMU row wait for the next one, which tells whether the clock was set.
+    Rows far ahead are wrong stamps, or of a clock that was set ahead or of an IMU that was silent, if they last, too.
+    Meanwhile some rows of the clock before may come late: those are held until rows that go on outnumber them. Fixes
+    and readings far from the newest IMU row wait for those that tell whether the clock was set.
     """
 
     _seconds: dict[int, tuple[float, ...]] = field(default_factory=dict)  # the first row of each second
@@ -128,6 +132,13 @@ class ClockGuard:
     _ahead: list[Row] = field(default_factory=list)  # rows far ahead at times of a clock before, held likewise
     _sent_again: bool = False  # whether these are known
     _new: bool = False  # whether they are known to be none of it
+    _strands: list[list[Row]] = field(default_factory=list)  # rows of the IMU far ahead, those near each other together
+    _onward: int = 0  # rows of the IMU that have gone on since some are held
+
+    @property
+    def undecided(self) -> bool:
+        """Whether rows are held."""
+        return bool(self.behind or self.ahead or self._strands)
 
     def remember(self, t: float, values: tuple[float, ...]) -> None:
         """Note a row that was taken, the newest so far."""
@@ -145,7 +156,7 @@ class ClockGuard:
         period = float(np.median(near)) if len(near) else math.inf
         if period > _SLOWEST:
             return False  # one of these two is no time of an IMU
-        if t > times[-1] - _OVERTAKING * period:
+        if t > times[-1] - _OVERTAKING * period or times[0] - _OVERTAKING * period < t < times[0]:
             return True
         k = int(np.searchsorted(times, t))
         return 0 < k < len(times) and bool(times[k] - times[k - 1] > _HOLE * period)
@@ -157,7 +168,7 @@ class ClockGuard:
         if sensor == "imu":
             if t in times:
                 return False  # sent twice
-            if times and t < max(times) - _LASTING:  # behind these, too
+            if times and t < max(times) - LASTING:  # behind these, too
                 self.behind, self._again, times = [one for one in self.behind if one[0] != "imu"], "", []
             second = int(t)
             if (t, *values) == self._seconds.get(second):
@@ -173,7 +184,7 @@ class ClockGuard:
             return False
         if len(self.behind) - len(times) > _HELD:  # the IMU says nothing
             self.released.append(self.behind.pop(next(k for k, one in enumerate(self.behind) if one[0] != "imu")))
-        return len(times) >= _SET_BACK and max(times) - min(times) >= _LASTING
+        return len(times) >= _SET_BACK and max(times) - min(times) >= LASTING
 
     def hold_early(self, row: Row) -> None:
         """Hold a fix or reading far ahead of the IMU: the clock may have been set ahead, which IMU rows will tell."""
@@ -190,19 +201,45 @@ class ClockGuard:
             return None
         self._sent_again |= self._before[int(t)] == (t, *values)
         self._ahead = [] if self._sent_again else [*self._ahead, ("imu", t, values)]
-        if not self._ahead or t - self._ahead[0][1] < _LASTING:
+        if not self._ahead or t - self._ahead[0][1] < LASTING:
             return []
         rows, self._ahead, self._new = self._ahead, [], True
         return rows
 
+    def leap(self, t: float, values: tuple[float, ...], gap: float) -> list[Row]:
+        """Hold an IMU row far ahead; returns those that go on from there, in order, once they last.
+
+        `gap` (s) is that between rows of one clock at most.
+        """
+        for strand in self._strands:
+            if strand[0][1] - gap < t < strand[-1][1] + gap:
+                break
+        else:
+            strand = []
+            self._strands = [*self._strands[1 - _STRANDS :], strand]
+        if t not in [row[1] for row in strand]:
+            bisect.insort(strand, ("imu", t, values), key=lambda row: row[1])
+        if strand[-1][1] - strand[0][1] < LASTING:
+            return []
+        self.release()
+        return strand
+
     def go_on(self) -> None:
-        """Time goes on: the fixes and readings that were held are of this clock, or of none."""
+        """Another row goes on: once these outnumber the rows held, the clock was not set."""
+        self._onward += 1
+        held = sum(row[0] == "imu" for row in self.behind) + sum(map(len, self._strands))
+        if self._again or self._onward >= held:
+            self.release()
+
+    def release(self) -> None:
+        """The fixes and readings that were held are of this clock, or of none."""
         self.released += [row for row in self.behind if row[0] != "imu"] + self.ahead
-        self.behind, self.ahead, self._again = [], [], ""
+        self.behind, self.ahead, self._strands, self._again, self._onward = [], [], [], "", 0
 
     def set_back(self) -> list[Row]:
-        """The rows of the new clock; what is remembered is of the old one from now on."""
-        held, self.behind, self._again = self.behind, [], ""
+        """The rows of the new clock in order; what is remembered is of the old one from now on."""
+        held = sorted(self.behind, key=lambda row: row[1])
+        self.behind, self._strands, self._again, self._onward = [], [], "", 0
         self._before |= self._seconds
         for second in list(self._before)[:-_REMEMBERED]:
             del self._before[second]

@@ -17,6 +17,7 @@ from graphnav.online.raw import RAW, RawEpochs
 from graphnav.online.sanity import ClockGuard, Reach, Row, fix_odds, imu_reads, odometer_reads, with_sane_velocity
 from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.recording.formats.repair import LATEST
+from graphnav.recording.plausibility.readings import ALONE, HOLE, Excesses, find_contradicted, measure_excess
 
 AHEAD = 60.0  # s; stamps of other sensors further than this before the IMU's are wrong
 _WIDTH = {"imu": 6, "gnss": 19, "odometer": 6}  # the last of a fix: six usual sigmas, and whether it is used
@@ -49,7 +50,6 @@ class Sensors:
     oldest: float = -np.inf  # s; rows up to here come too late
     _unit: Array | None = None  # `unit`, once asked for
     _means: dict[str, tuple[float, tuple[float, ...]]] = field(default_factory=dict)  # usual sigmas, and since when
-    _suspect: tuple[float, tuple[float, ...]] | None = None  # an IMU row far ahead of the one before
     set_back: list[Row] = field(default_factory=list)  # the first rows of a clock that was set back
     moved: tuple[float, int] | None = None  # since when (s), and how many fixes are elsewhere than all before
     released: list[Row] = field(default_factory=list)  # rows that were held and are to be taken in now
@@ -58,11 +58,21 @@ class Sensors:
     _clock: ClockGuard = field(default_factory=ClockGuard)
     _reach: Reach = field(default_factory=Reach)
     _before: set[tuple[str | float, ...]] = field(default_factory=set)  # fixes and readings of the clock before
+    contradicted: float | None = None  # s, the row before one that was taken back; None once known
+    _excesses: Excesses = field(init=False)
+    _learnt: float = -np.inf  # s, up to where rows are in these
+    _last: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # the newest two rows of the IMU with their times
 
     def __post_init__(self) -> None:
         self.others = {name: Buffer(len(series.sensor.names)) for name, series in self.setup.sensors.items()}
+        self._excesses = Excesses(self._compared)
         raw, tight = self.setup.raw_gnss, self.setup.tight(self.raw_settings.coupling)
         self.raw = RawEpochs(raw, self.raw_settings) if raw is not None and tight else None
+
+    @property
+    def _compared(self) -> int:
+        """Columns of the IMU of which a reading can be contradicted: a foot is hit for less than a row."""
+        return 3 if self.setup.platform == "foot" else 6
 
     @property
     def aiding(self) -> dict[str, Buffer | RawEpochs]:
@@ -197,14 +207,56 @@ class Sensors:
 
     def add_next(self, t: float, values: tuple[float, ...], newest: float) -> bool:
         """Take in an IMU row if nothing is odd about it; False leaves it to `add`. `newest` is the time before it."""
-        if self._suspect is not None or not newest + SAME < t <= newest + self.longest_gap or t <= self.oldest:
+        if not newest + SAME < t <= newest + self.longest_gap or t <= self.oldest or self._clock.undecided:
             return False
-        if len(values) != _WIDTH["imu"] or not imu_reads(values) or self._clock.behind or self._clock.ahead:
+        if len(values) != _WIDTH["imu"] or not imu_reads(values):
             return False
         self._clock.remember(t, values)
         self.imu.append(t, values)
         self.counts["imu"] += 1
+        self._compare(t, values)
         return True
+
+    def _compare(self, t: float, values: tuple[float, ...]) -> None:
+        """Take the row before the newest back if that and the one before contradict it."""
+        before, now = self._last, (t, *values)
+        self._last = now if before is None else before[1], now
+        if before is None:
+            return
+        for a, b, c, limit in zip(before[0][1:], before[1][1:], values, self._excesses.limits, strict=False):
+            if b - max(a, c) > limit or min(a, c) - b > limit:
+                break
+        else:
+            return
+        near = self.imu.t[-400:]
+        if len(near) < 4 or near[-3] != before[0][0] or near[-2] != before[1][0]:
+            return  # a late row stands between them
+        if np.diff(near[-3:]).max() < HOLE * np.median(np.diff(near)):
+            self.contradicted, self._last = before[0][0], (before[0], now)
+            self.imu.drop(before[1][0])
+            self._count_contradicted(1)
+
+    def _count_contradicted(self, count: int) -> None:
+        self.counts["imu"] -= count
+        self.counts["imu: contradicted by those around"] += count
+
+    def learn(self, until: float, stops: Array) -> None:
+        """Learn from the rows up to a time (s), but those in stops (M, 2), how far readings lie beyond those around."""
+        rows = self.imu.between(self._learnt, until)
+        if len(rows) < 3:
+            return
+        self._learnt = float(rows[-2, 0])
+        t = rows[1:-1, 0, None]
+        moving = ~((t >= stops[:, 0]) & (t <= stops[:, 1])).any(axis=1)
+        self._excesses.add(measure_excess(rows[:, 1 : 1 + self._compared])[moving])
+
+    def drop_contradicted(self) -> None:
+        """Leave out the rows that those around them contradict, but the newest, of which that is not known yet."""
+        rows = self.imu.rows
+        bad = find_contradicted(rows[:, 0], rows[:, 1 : 1 + self._compared].T)
+        for t in rows[bad & (rows[:, 0] < self.imu.newest - ALONE), 0].tolist():
+            self.imu.drop(t)
+            self._count_contradicted(1)
 
     @property
     def fixes(self) -> Array:
@@ -262,7 +314,7 @@ class Sensors:
 
     def release(self) -> None:
         """No more IMU rows will come: what was held is to be taken in now."""
-        self._clock.go_on()
+        self._clock.release()
         self._sort_out()
 
     def _sort_out(self) -> None:
@@ -275,7 +327,7 @@ class Sensors:
 
     def forget_time(self) -> None:
         """Another clock: what was noted of the times of rows holds no more."""
-        self._means, self._suspect, self._reach = {}, None, Reach()
+        self._means, self._reach, self._last, self._learnt = {}, Reach(), None, -np.inf
 
     def _find_fault(self, sensor: str, values: tuple[float, ...]) -> str | None:
         """What is wrong with a row by itself, as it is counted."""
@@ -307,25 +359,26 @@ class Sensors:
                 self.released += held
                 return False
         if len(self.imu) and t > self.imu.newest + self.longest_gap:
-            # the next row tells whether this stamp was wrong or the IMU away
-            before, self._suspect = self._suspect, (t, values)
-            if before is None or not 0.0 < t - before[0] < self.longest_gap:
-                if before is not None:
-                    self.counts["imu: stamp in the future"] += 1
-                return False
-            self.imu.add(*before)
-            self.counts["imu"] += 1
-        elif self._suspect is not None:
-            self.counts["imu: stamp in the future"] += 1
-        self._suspect = None
+            rows = self._clock.leap(t, values, self.longest_gap)
+            self.counts["imu: stamp in the future"] += 1 - len(rows)
+            for _, when, what in rows:
+                self._clock.remember(when, what)
+                self.imu.append(when, what)
+            self.counts["imu"] += len(rows)
+            self._last = None
+            self._sort_out()
+            return bool(rows)
         if t > self.imu.newest:
             self._clock.remember(t, values)
             self._clock.go_on()
             self._sort_out()
+        newest = t > self.imu.newest
         if not self.imu.add(t, values):
             self.counts["imu: repeated"] += 1
             return False
         self.counts["imu"] += 1
+        if newest:
+            self._compare(t, values)
         return True
 
     def _passed(self, t: float) -> str:

@@ -40,6 +40,7 @@ _ODOMETER = 0.3  # s that a keyframe waits for the odometer
 _SILENT = 2.0  # s after which an odometer is not waited for
 _STEP = 0.5  # s between looks at a walk
 _MISSING = 5  # rows of the IMU in a row, whose work the next one does
+_KNOWN = 4.0  # s before the newest keyframe up to which the stops are known
 _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that level a vehicle without GNSS
 _JUDGED = 120.0  # s of rows by which the sensors are judged again
@@ -100,6 +101,8 @@ class Smoother:
         sensors = self.sensors
         before = sensors.imu.newest
         if sensor == "imu" and sensors.add_next(t, values, before):  # as all but a few do
+            if sensors.contradicted is not None:
+                self._redo_contradicted()
             self._look_if_due(t, before)
             return
         previous = sensors.newest(sensor)
@@ -108,13 +111,19 @@ class Smoother:
         if sensor == "imu" and (newest := sensors.imu.newest) > before:
             # a row before this one that was left out leaves no trace: what is done at which row stays the same
             if newest - before > self.settings.keyframes.bridge and len(sensors.imu) > 1 and np.isfinite(before):
-                self._restart(before, f"the IMU was silent from {before:.3f} to {newest:.3f} s")
+                after = float(sensors.imu.t[np.searchsorted(sensors.imu.t, before, side="right")])
+                self._restart(before, f"the IMU was silent from {before:.3f} to {after:.3f} s")
+            if sensors.contradicted is not None:
+                self._redo_contradicted()
             self._look_if_due(newest, before)
             return
         tracker = self.tracker
         if tracker is not None:
             if isinstance(tracker, Walker):
-                if sensor == "imu" and not tracker.note_missed_row(t):
+                missed = sensor != "imu" or tracker.note_missed_row(t)
+                if sensor == "imu":
+                    tracker.look_again(sensors, t)
+                if not missed:
                     return  # as if it had come in its turn
                 tracker.finish_entering(sensors)
             self._awake = -np.inf
@@ -135,6 +144,19 @@ class Smoother:
                 self._dirty = min(self._dirty, previous + 2.0 * SAME_TIME)
         if sensors.imu.newest >= self._due:
             self._look(sensors.imu.newest)
+
+    def _redo_contradicted(self) -> None:
+        """A row of the IMU was taken back: what was made of it is made again."""
+        tracker, t = self.tracker, self.sensors.contradicted
+        self.sensors.contradicted = None
+        if tracker is None or t is None:
+            return
+        if isinstance(tracker, Walker):
+            tracker.finish_entering(self.sensors)
+        self._awake = -np.inf
+        tracker.note_late_row("imu", t)
+        if t <= tracker.newest + SAME_TIME:
+            self._dirty = min(self._dirty, t)
 
     def _look_if_due(self, now: float, before: float) -> None:
         spacing, self._spacing = self._spacing, now - before
@@ -189,6 +211,9 @@ class Smoother:
 
     def finish(self) -> None:
         """Nothing more will come: settle all."""
+        self._settle_all()
+
+    def _settle_all(self) -> None:
         if self.tracker is None:
             try:
                 self._align(last=True)
@@ -211,6 +236,7 @@ class Smoother:
             self._due = now + _TRY
         if now - first < _LEVEL:
             return
+        sensors.drop_contradicted()
         recording = sensors.recording(-np.inf, now)
         if recording.gnss is None and sensors.setup.gnss is not None and not last:
             self._wait(now)
@@ -329,13 +355,10 @@ class Smoother:
         self.notes.append(Note("online.anew", f"{why}: aligning anew"))
         after = sensors.imu.rows[sensors.imu.t > before].copy()
         later = {name: buffer.after(before) for name, buffer in sensors.aiding.items()}
-        if self.tracker is not None:
-            sensors.imu.drop_after(before)
-            self._judge_at_last()
-            self._advance(self.tracker, last=True)
-            self.tracker.settle(sensors)
-            self._collect(self.tracker)
-            self._faults += self.tracker.excluded + self._left_out
+        for buffer in (sensors.imu, *sensors.aiding.values()):
+            buffer.drop_after(before)
+        self._settle_all()
+        self._faults = self.excluded
         self._begin_anew(before)
         for row in after:
             sensors.imu.add(float(row[0]), tuple(row[1:]))
@@ -357,6 +380,7 @@ class Smoother:
     # --------------------------------------------------------------------------------------------------- running
     def _advance(self, tracker: Tracker, last: bool = False) -> None:
         """Make the keyframes that are due."""
+        self.sensors.learn(tracker.newest - _KNOWN, tracker.stops)
         sensors, period = self.sensors, 1.0 / self.settings.keyframes.rate
         now = sensors.imu.newest
         limit = now if last else now - AFTER

@@ -27,7 +27,7 @@ class StepCutter:
     def __init__(self) -> None:
         self.highest: Array | None = None  # as `graphnav.imu.clipping.highest` says
         self._seen = -np.inf  # s, up to where that is known
-        self._pieces: float | None = None  # s, begin of a standing that goes on, of which keyframes were made
+        self.pieces: float | None = None  # s, begin of a standing that goes on, of which keyframes were made
         self.over: float | None = None  # s, begin of one that is over by now: its keyframes are to be made anew
 
     def until(self, sensors: Sensors, settings: Settings, standing: Stops, T: float, limit: float, last: bool) -> Array:
@@ -58,8 +58,8 @@ class StepCutter:
         # a swing is one because of the stance before it
         before = standing.spans[standing.spans[:, 0] <= T]
         begin = max([T - _WALK, *before[:, 0].tolist()]) if len(before) else T
-        pieces, self._pieces = self._pieces, float(standing.spans[-1, 0]) if ongoing and not last else None
-        self.over = pieces if pieces != self._pieces else None
+        pieces, self.pieces = self.pieces, float(standing.spans[-1, 0]) if ongoing and not last else None
+        self.over = pieces if pieces != self.pieces else None
         part = sensors.recording(min(begin, T), limit)
         around = clip_spans(standing.spans, part.start, limit)
         epochs = [cls.epochs(part, settings, around) for cls in kinds_for(part)]

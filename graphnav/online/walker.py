@@ -19,7 +19,8 @@ from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.window import Message
 from graphnav.online.ahead import Live, live, since
 from graphnav.online.chain import Posed
-from graphnav.online.looks import CONTEXT
+from graphnav.online.looks import CONTEXT, SURE
+from graphnav.online.sanity import LASTING
 from graphnav.online.sensors import Sensors
 from graphnav.online.tracker import ROWS_AFTER, Tracker
 from graphnav.recording import Recording
@@ -48,12 +49,24 @@ class _Renewal:
     places: dict[float, Place] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class _Look:
+    """A look for steps: what was known before, and what it found."""
+
+    limit: float  # s, up to where
+    newest: float  # s, the newest keyframe then
+    before: tuple[Array, float, float | None]
+    after: tuple[Array, float, float | None]
+    times: Array  # s, keyframes to be made
+
+
 class Walker(Tracker):
     """Keyframes of a walk."""
 
     at_a_row = _AGAIN
     _work: _Work | None = None
     _renewal = _Renewal()
+    _looks: tuple[_Look, ...] = ()  # that rows which come late may have belonged to
 
     @property
     def busy(self) -> bool:
@@ -88,15 +101,50 @@ class Walker(Tracker):
 
     def _steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
         """Keyframes of a walk that can be made by now, and what they change of those before."""
-        times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
+        before, newest = self._known, self.newest
+        found = times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
+        after = self._known
         if (stood := self._steps.over) is not None:  # how much a foot sways is told from all of its standing
             self._keep(len(self.window) - len(self.window.since(stood + SAME_TIME)))
             times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
+        looks = [one for one in self._looks if one.limit > limit - LASTING - SURE]
+        self._looks = (*looks, _Look(limit, newest, before, after, found))
         self._standing.forget(self.head - CONTEXT)
         dirty = self._steps.changed(sensors, self.head)
         self.note_late_row("imu", dirty)
         self._dirty = min(self._dirty, dirty)
         return times[1:] if len(self.window) or self.opened else times
+
+    @property
+    def _known(self) -> tuple[Array, float, float | None]:
+        """What the next look goes on from."""
+        return self._standing.spans, self._standing.looked, self._steps.pieces
+
+    def _know(self, known: tuple[Array, float, float | None]) -> None:
+        self._standing.spans, self._standing.looked, self._steps.pieces = known
+
+    def look_again(self, sensors: Sensors, t: float) -> None:
+        """A row of the IMU came late, at a time (s): redo the steps that are seen otherwise with it."""
+        looks, now = [one for one in self._looks if one.limit + SURE >= t - SAME_TIME], self._known
+        for one in looks:
+            self._know(one.before)
+            found = self._steps.until(sensors, self.settings, self._standing, one.newest, one.limit, False)
+            if not _are_same((found, self._standing.spans), (one.times, one.after[0])):
+                break
+        else:
+            self._know(now)
+            return
+        self._know(now)
+        self.finish_entering(sensors)
+        if one.newest < self._oldest:
+            return  # it is settled
+        self._know(one.before)
+        self._keep(len(self.window) - len(self.window.since(one.newest + SAME_TIME)))
+        self._motions = {end: motion for end, motion in self._motions.items() if end <= one.newest}
+        self._looks, self._renewal = tuple(x for x in self._looks if x.limit < one.limit), _Renewal()
+        for again in (x for x in looks if x.limit >= one.limit):
+            self.take_steps(sensors, again.limit, False, [], np.inf)
+        self.finish_entering(sensors)
 
     def go_on(self, sensors: Sensors) -> None:
         """A portion of what there is to do."""
@@ -170,3 +218,8 @@ class Walker(Tracker):
             known = self._renewal = _Renewal(self.stops, {place.t: place for place in places})
         fresh = [known.places[stage.place.t] for stage in stages]
         return [replace(stage.place, problem=one.problem, k=one.k) for stage, one in zip(stages, fresh, strict=True)]
+
+
+def _are_same(found: tuple[Array, Array], known: tuple[Array, Array]) -> bool:
+    """Whether keyframes and stances are."""
+    return all(np.array_equal(a, b) for a, b in zip(found, known, strict=True))

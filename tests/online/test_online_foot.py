@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from test_online import joined, same
 from graphnav.config import settings_from
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
-from graphnav.online import Online, Row, rows_of, walker, without_rows
+from graphnav.online import Online, Row, rows_of, steps, walker, without_rows
 from graphnav.online.walker import Walker
 from graphnav.recording import Recording
 from graphnav.simulation import simulate
@@ -109,3 +110,27 @@ def test_what_is_over_is_not_searched_for_slides_and_the_rest_is_as_it_was(walk:
     late = detect(walk, since=since).stationary
     np.testing.assert_array_equal(late[late[:, 1] > since], spans[spans[:, 1] > since])
     assert len(late) == len(spans)
+
+
+def test_a_row_that_comes_late_has_the_steps_redone_that_are_seen_otherwise_with_it(
+    walk: Recording, rows: list[Row], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The stances of a second before it rest on it, too: by a threshold that is told by all rows."""
+    seen, real = [], steps.detect
+
+    def detect_otherwise(recording: Recording, *more: object) -> SimpleNamespace:
+        spans = real(recording, *more).stationary.copy()
+        if np.diff(recording.imu.t).max() > 0.015:  # of 0.01 s between rows
+            seen.append(recording.end)
+            spans[-1, 0] -= 0.01
+        return SimpleNamespace(stationary=spans)
+
+    monkeypatch.setattr(steps, "detect", detect_otherwise)
+    late = list(rows)
+    for k in range(711, 1700, 133):
+        late.insert(k + 59, late.pop(k))
+    track = walked(walk, late)
+    plain = walked(walk, rows)
+    assert seen
+    np.testing.assert_array_equal(track.t, plain.t)
+    np.testing.assert_allclose((track.llh - plain.llh) * [6.4e6, 6.4e6, 1.0], 0.0, atol=1e-4)  # solved again

@@ -88,15 +88,20 @@ def test_a_velocity_that_no_vehicle_has_leaves_its_fix(
     assert online.sensors.counts["gnss"] == sum(row[0] == "gnss" for row in rows)
 
 
-def test_a_reading_that_may_be_does_not_shut_the_fixes_out(
-    drive: tuple[Recording, Trajectory], rows: list[Row]
+@pytest.mark.parametrize("at", [36.28, 42.28, 56.52])
+def test_a_reading_that_those_around_contradict_costs_its_interval(
+    drive: tuple[Recording, Trajectory], rows: list[Row], at: float
 ) -> None:
-    """One of -1 rad/s: the drive leans by two degrees, and right fixes seem to drift."""
+    """One of -1 rad/s, by which the drive leans by two degrees: before there is a state, and when there is one."""
     alone = [row for row in rows if row[0] != "odometer"]
-    wild = [(s, t, (-1.0, *v[1:])) if s == "imu" and abs(t - 36.28) < 0.01 else (s, t, v) for s, t, v in alone]
+    wild = [(s, t, (-1.0, *v[1:])) if s == "imu" and abs(t - at) < 0.01 else (s, t, v) for s, t, v in alone]
     assert sum(a != b for a, b in zip(alone, wild, strict=True)) == 1
-    error, _ = off(played(drive[0].without("odometer"), wild, QUICK)[1], drive[1], drive[0])
-    assert np.abs(error).max() < 5.0
+    online, track = played(drive[0].without("odometer"), wild, QUICK)
+    assert online.sensors.counts["imu: contradicted by those around"] == 1
+    assert online.excluded == ()
+    error, sd = off(track, drive[1], drive[0])
+    assert np.abs(error).max() < 0.1
+    assert np.abs(error / sd).max() < 6.0
 
 
 @pytest.mark.parametrize("k", [0, 30])
@@ -156,6 +161,33 @@ def test_a_fix_before_the_first_imu_row_of_another_clock_counts(
         assert online.sensors.counts["gnss: too late"] == 0
     assert twice.sensors.gnss.t.tolist() == once.sensors.gnss.t.tolist()
     assert twice.sensors.counts["gnss: repeated"] == 1
+
+
+@pytest.mark.parametrize("step", [-1000.0, 3600.0])
+@pytest.mark.parametrize(("sensor", "which"), [("imu", -1), ("imu", -3), ("imu", 0), ("gnss", -1), ("gnss", 0)])
+def test_a_row_that_comes_late_over_a_step_of_the_clock_counts(
+    drive: tuple[Recording, Trajectory], rows: list[Row], step: float, sensor: str, which: int
+) -> None:
+    """By a second, from before the step or from behind it: each piece is as if it had come in its turn."""
+    old = [row for row in rows if row[1] <= 41.9]
+    sent = [*old, *((name, t + step, values) for name, t, values in rows if t > 41.9)]
+    numbers = range(len(old)) if which < 0 else range(len(old), len(sent))
+    k = [n for n in numbers if sent[n][0] == sensor][which]
+    late = [*sent[:k], *sent[k + 1 : k + 25], sent[k], *sent[k + 25 :]]
+    (online, track), (plain, other) = (played(drive[0], some, QUICK) for some in (late, sent))
+    assert sorted(late) == sorted(sent)
+    assert +online.sensors.counts == +plain.sensors.counts
+    assert set(+plain.sensors.counts) == {"imu", "gnss", "odometer"}
+    same(track, other)
+
+
+def test_a_piece_that_an_idle_imu_ends_is_smoothed(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
+    """Though nothing was aligned when it ended: as at the end of a drive."""
+    some = [row for row in rows if row[1] <= 41.9]
+    alone = played(drive[0], some, QUICK)[1]
+    assert len(alone) > 20
+    track = played(drive[0], [*some, *((s, t, v) for s, t, v in rows if t > 60.0)], QUICK)[1]
+    same(track.take(np.flatnonzero(track.t < 50.0)), alone)
 
 
 def test_a_late_fix_that_is_the_last_row_is_used(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:

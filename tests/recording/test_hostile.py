@@ -153,9 +153,10 @@ BOMB = "a0: &a0 [x, x, x, x, x, x, x, x]\n" + "".join(
 YAML = {
     "lever arm of nan": ("antlever: [ 0.5", "antlever: [ .nan", "value", "antlever"),
     "lever arm of inf": ("antlever: [ 0.5", "antlever: [ .inf", "value", "antlever"),
-    "lever arm of 400 digits": ("antlever: [ 0.5", "antlever: [ " + "1" * 400, "value", "antlever"),
+    "lever arm of 400 digits": ("antlever: [ 0.5", "antlever: [ " + "1" * 400, "syntax", "antlever"),
     "tiny time": ("corrtime: 4.0", "corrtime: 1e-320", "value", "corrtime"),
-    "400 digits": ("corrtime: 4.0", f"corrtime: {'9' * 400}", "value", "corrtime"),
+    "400 digits": ("corrtime: 4.0", f"corrtime: {'9' * 400}", "syntax", "corrtime"),
+    "hexadecimal": ("corrtime: 4.0", f"corrtime: 0x{'f' * 4000}", "syntax", "corrtime"),
     "100,000 digits": ("corrtime: 4.0", f"corrtime: {'9' * 100_000}", "syntax", "kf-gins.yaml"),
     "no such date": ("starttime: 345600", "starttime: 2022-13-45", "syntax", "kf-gins.yaml"),
     "deep": ("starttime: 345600", f"starttime: {'[' * 3000}{']' * 3000}", "syntax", "kf-gins.yaml"),

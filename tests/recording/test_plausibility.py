@@ -16,7 +16,7 @@ from graphnav import run
 from graphnav.core.errors import RecordingError
 from graphnav.estimation.solution import to_trajectory
 from graphnav.evaluation.evaluate import evaluate_recording
-from graphnav.recording import Recording
+from graphnav.recording import Recording, take_rows
 from graphnav.recording.checks.overview import inspect
 from graphnav.recording.formats import read
 from graphnav.recording.formats.repair import Remarks, sigmas
@@ -69,6 +69,8 @@ def found(recording: Recording) -> dict[str, str]:
 
 # ---- sound recordings
 
+KITTI = 18374  # a row whose turn rate is 0.338 rad/s between 0.294 and 0.308, where those around go on evenly
+
 SOUND = [
     "oracle_drive/recording.toml",
     "boulder_drive_20250708/recording.toml",
@@ -105,7 +107,8 @@ def test_nothing_is_said_of_a_sound_drive(shared_data: Path, name: str) -> None:
 @pytest.mark.parametrize("name", ["kitti", str(ROOT / "data" / "tokyo")])
 def test_nothing_is_said_of_what_comes_with_the_program(name: str) -> None:
     assert found(load(name)) == {}
-    assert same(load(name), screen(load(name)).recording)
+    left = take_rows(load(name).imu, np.arange(len(load(name).imu.t)) != KITTI) if name == "kitti" else load(name).imu
+    assert same(replace(load(name), imu=left), screen(load(name)).recording)
 
 
 def test_nothing_is_said_of_a_walk(shared_data: Path) -> None:
@@ -150,10 +153,36 @@ def test_a_spike_does_not_move_the_answer(oracle: Recording) -> None:
     assert spiked < 1.5 * error(short) + 0.01
 
 
+@pytest.mark.parametrize(("sensor", "value"), [("gyro", -5.0), ("accel", 100.0)])
+def test_a_reading_that_those_around_contradict_is_left_out(tokyo: Recording, sensor: str, value: float) -> None:
+    """Whichever row it is, and whether there is one or one every few seconds; but not where they come together."""
+    for rows in ([3000], list(range(500, len(tokyo.imu.t) - 500, 150))):
+        left = screen(change(tokyo, "imu", **{sensor: put((rows, 1), value)}))
+        assert [f.key for f in left.findings] == ["imu.contradicted"]
+        assert np.array_equal(left.recording.imu.t, np.delete(tokyo.imu.t, rows))
+    near = change(tokyo, "imu", **{sensor: put(([3000, 3010, 3020], 1), value)})
+    assert same(near, screen(near).recording)
+
+
+def test_a_bump_is_no_fault(tokyo: Recording) -> None:
+    """Where it bumps as much now and then, one bump more is one of them."""
+    rng = np.random.default_rng(1)
+    rows = rng.integers(10, len(tokyo.imu.t) - 10, 200)
+    height = 0.1 * rng.pareto(1.5, 200)
+
+    def bump(x: np.ndarray) -> np.ndarray:
+        x[rows, 1] += height
+        return x
+
+    rough = change(tokyo, "imu", gyro=bump)
+    assert height.max() > 1.0
+    assert same(rough, screen(rough).recording)
+
+
 def test_what_a_foot_hits_is_no_spike(shared_data: Path) -> None:
     walk = load(str(shared_data / "xio_loops" / "short.toml"))
     hard = change(walk, "imu", accel=put((2000, 2), 300.0))  # 30 g
-    assert found(hard) == {}
+    assert same(hard, screen(hard).recording)
     assert found(change(walk, "imu", accel=put((2000, 2), 3000.0))) == {"imu.spike": "warning"}
 
 

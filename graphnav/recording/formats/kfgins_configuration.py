@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.core.complaints import check_whole_numbers
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import is_inside, read_text
 from graphnav.core.rotation import Array
@@ -35,12 +36,13 @@ def read_configuration(path: Path) -> dict[str, Any]:
     try:
         _check_tokens(path, yaml, text)
         values = yaml.safe_load(text)
+        check_whole_numbers(values)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark is not None else ""
         why = " ".join(str(getattr(error, "problem", None) or error).split())
         raise RecordingError(f"{path}{line}: not valid YAML ({why})", key="yaml.syntax") from None
-    except ValueError as error:  # a date that is none, a number of thousands of digits
+    except ValueError as error:  # a date that is none, a number of hundreds of digits
         raise RecordingError(f"{path}: not valid YAML ({error})", key="yaml.syntax") from None
     if not isinstance(values, dict):
         raise RecordingError(f"{path}: not a configuration of KF-GINS or OB_GINS", key="log.no_configuration")

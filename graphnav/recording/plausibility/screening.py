@@ -27,6 +27,7 @@ from graphnav.recording.checks.series import screen_series
 from graphnav.recording.formats.schema import FORCE
 from graphnav.recording.plausibility import fixes as plausibility_gnss
 from graphnav.recording.plausibility import odometer as plausibility_odometer
+from graphnav.recording.plausibility.readings import find_contradicted
 
 # What can be read at all: no accelerometer for vehicles or feet has a range beyond 100 g (those for crash tests have
 # 200 g and more, and cannot tell gravity from their own offset), and no gyro for them one beyond 4000 deg/s.
@@ -134,9 +135,11 @@ def screen(recording: Recording) -> Screened:
 def _without_the_impossible(recording: Recording) -> tuple[Recording, list[Finding], list[Finding], Track | None]:
     """The recording without what cannot be right, findings of the IMU and of the others, and the way by the fixes."""
     of_imu: list[Finding] = list(check_imu_scale(recording))
-    imu, spikes = without_spikes(recording.imu, recording.start, wrong_unit=bool(of_imu))
-    of_imu += spikes
-    recording, of_aiding = screen_series(replace(recording, imu=imu, screened=True))
+    if not of_imu:  # where a unit is wrong throughout, nothing is known of single rows
+        imu, spikes = without_spikes(recording.imu, recording.start)
+        imu, contradicted = without_contradicted(imu, recording.start, forces=recording.platform != "foot")
+        recording, of_imu = replace(recording, imu=imu), [*spikes, *contradicted]
+    recording, of_aiding = screen_series(replace(recording, screened=True))
     track = None
     if recording.gnss is not None and len(recording.gnss.t):
         recording, said = plausibility_gnss.screen(recording)
@@ -211,14 +214,11 @@ def _scale(f: float) -> str | None:
     return "the accelerometer's scale is wrong: look at units.accel in [imu] and at the range that was set"
 
 
-def without_spikes(imu: Imu, start: float, wrong_unit: bool = False) -> tuple[Imu, list[Finding]]:
-    """The IMU without the rows that no sensor can have read, which leaves gaps that are bridged.
-
-    Where a unit is wrong throughout, nothing is known of single rows.
-    """
+def without_spikes(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
+    """The IMU without the rows that no sensor can have read, which leaves gaps that are bridged."""
     gyro, accel = ~(np.abs(imu.gyro) <= GYRO_RANGE), ~(np.abs(imu.accel) <= ACCEL_RANGE)
     bad: NDArray[np.bool_] = np.asarray((gyro | accel).any(axis=1))
-    if wrong_unit or not bad.any():
+    if not bad.any():
         return imu, []
     k = int(np.flatnonzero(bad)[0])
     name, unit, values, wild, most = (
@@ -227,14 +227,32 @@ def without_spikes(imu: Imu, start: float, wrong_unit: bool = False) -> tuple[Im
         else ("gyro", "rad/s", imu.gyro, gyro, GYRO_RANGE)
     )
     value = values[k][wild[k]][0]
-    many = "1 IMU row" if bad.sum() == 1 else f"{bad.sum()} IMU rows"
     sentence = (
-        f"{many} that no sensor can have read (the first, of the {name}, {value:.4g} {unit} at "
+        f"{_rows(bad)} that no sensor can have read (the first, of the {name}, {value:.4g} {unit} at "
         f"{imu.t[k] - start:.2f} s from the start; {most:g} {unit} is beyond any range)"
     )
     if bad.mean() > _ISOLATED:
         return imu, [Finding("refused", f"{sentence}: more than can be bridged; look at the log", "imu.spike")]
     return take_rows(imu, ~bad), [Finding("warning", f"{sentence}: left out, as a gap", "imu.spike")]
+
+
+def without_contradicted(imu: Imu, start: float, forces: bool) -> tuple[Imu, list[Finding]]:
+    """The IMU without single rows that those before and after contradict, which leaves gaps that are bridged.
+
+    With `forces`, of the accelerometer, too: what stands on tyres and springs is hit for more than a row, but not a
+    foot, and no hit turns a body there and back.
+    """
+    sensors = (imu.gyro, imu.accel) if forces else (imu.gyro,)
+    bad = find_contradicted(imu.t, (values @ imu.R_bs[:, axis] for values in sensors for axis in range(3)))
+    if not bad.any():
+        return imu, []
+    first = float(imu.t[bad][0]) - start
+    sentence = f"{_rows(bad)} that those before and after contradict (the first at {first:.2f} s from the start)"
+    return take_rows(imu, ~bad), [Finding("note", f"{sentence}: left out, as a gap", "imu.contradicted")]
+
+
+def _rows(bad: NDArray[np.bool_]) -> str:
+    return "1 IMU row" if bad.sum() == 1 else f"{bad.sum()} IMU rows"
 
 
 def check_dead_axes(recording: Recording) -> Iterator[Finding]:

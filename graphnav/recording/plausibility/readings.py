@@ -1,0 +1,122 @@
+"""Single readings of an IMU that those before and after contradict.
+
+How far a reading lies beyond both of its neighbours is nothing where a signal is smooth, and as much as bumps are high
+where there are bumps. The largest of these excesses are taken to fall off as a power (B. M. Hill, A simple general
+approach to inference about the tail of a distribution, Annals of Statistics 3, 1975), which is slower than those of
+any recording do. A reading so far beyond all others that a thousand recordings would have one is none of the motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.core.findings import period_of
+from graphnav.core.rotation import Array
+
+TAIL = 100  # excesses that tell how the largest fall off: to a tenth
+RARE = 1e-3  # readings as far beyond the others that a recording has by chance
+ALONE = 1.0  # s around a single reading without another; more of them are something that happened
+_SINGLE = 0.01  # of the rows; what more of them have in common is no fault of single rows
+_TELL = 5  # times `TAIL`, rows in motion of which these are the largest fifth
+HOLE = 1.5  # periods between two rows that are no neighbours
+
+
+def measure_excess(x: Array) -> Array:
+    """How far each of the values (N, ...) but the first and the last lies beyond both its neighbours, (N-2, ...)."""
+    low, high = np.minimum(x[:-2], x[2:]), np.maximum(x[:-2], x[2:])
+    middle = x[1:-1]
+    return np.asarray(np.maximum(middle - high, low - middle).clip(min=0.0))
+
+
+def count_expected(excess: Array, others: Array, resolution: float) -> Array:
+    """How many excesses as large or larger are to be expected among others.
+
+    Parameters
+    ----------
+    excess : (M,) above zero.
+    others : (M, TAIL + 1) the next smaller ones of each, the largest first.
+    resolution : in which they are told, in their unit: less than half of it says nothing of how they fall off.
+
+    Returns
+    -------
+    (M,)
+    """
+    fall, last = _fall(others, resolution)
+    return np.asarray(TAIL * (excess / last) ** (-1.0 / fall))
+
+
+def _fall(others: Array, resolution: float | Array) -> tuple[Array, Array]:
+    """How slowly excesses (M, TAIL + 1) fall off, and the smallest of each row."""
+    last = others[:, -1]
+    return np.log(others[:, :-1] / last[:, None]).mean(axis=1) + 0.5 * resolution / last, last
+
+
+def find_contradicted(t: Array, readings: Iterable[Array]) -> NDArray[np.bool_]:
+    """Which rows hold a reading that those before and after contradict.
+
+    Parameters
+    ----------
+    t : (N,) s.
+    readings : (N,) along each axis of the sensors.
+
+    Returns
+    -------
+    (N,) True where one does, and none of the rows within a second of it.
+    """
+    bad = np.zeros(len(t), dtype=bool)
+    if len(t) < TAIL + 3:
+        return bad
+    near = np.diff(t) < HOLE * period_of(t)
+    between = near[:-1] & near[1:]
+    for x in readings:
+        excess = measure_excess(x) * between
+        bad[1:-1] |= excess > _find_limit(excess)
+    rows = np.flatnonzero(bad)
+    apart = np.diff(t[rows], prepend=-np.inf, append=np.inf) > ALONE
+    bad[rows[~(apart[:-1] & apart[1:])]] = False
+    return bad
+
+
+def _find_limit(excess: Array) -> float:
+    """The largest excess (of N) that is one of the motion; looked for from the smallest on: none hides another."""
+    found = excess[excess > 0.0]
+    most = min(int(_SINGLE * len(excess)), len(found) - TAIL - 1)
+    if most < 1:
+        return np.inf
+    resolution = float(found.min())
+    largest = -np.sort(-np.partition(found, -(most + TAIL + 1))[-(most + TAIL + 1) :])
+    others = np.lib.stride_tricks.sliding_window_view(largest[1:], TAIL + 1)
+    rare = np.flatnonzero(count_expected(largest[:most], others[:most], resolution) < RARE)
+    return float(largest[rare[-1] + 1]) if len(rare) else np.inf
+
+
+class Excesses:
+    """The largest excesses of a session so far, axis by axis, and which would be none of its motion.
+
+    Parameters
+    ----------
+    axes : how many there are.
+    """
+
+    def __init__(self, axes: int) -> None:
+        self.limits = (np.inf,) * axes
+        self._largest = np.zeros((TAIL + 1, axes))
+        self._least = np.full(axes, np.inf)  # above zero: the resolution
+        self._count = 0
+
+    def add(self, excess: Array) -> None:
+        """Take in those (N, axes) of rows in motion: a stop says nothing of the next bump."""
+        self._count += len(excess)
+        self._least = np.minimum(self._least, np.where(excess > 0.0, excess, np.inf).min(axis=0, initial=np.inf))
+        both = np.concatenate([self._largest, excess])
+        self._largest = -np.sort(-both, axis=0)[: TAIL + 1]
+        if self._count < _TELL * TAIL:
+            return
+        limits = np.full(len(self._least), np.inf)
+        told = np.flatnonzero(self._largest[-1] > 0.0)
+        fall, last = _fall(self._largest.T[told], self._least[told])
+        limits[told] = last * (TAIL / RARE) ** fall
+        self.limits = tuple(limits.tolist())
