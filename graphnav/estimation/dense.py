@@ -16,8 +16,8 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
-from graphnav.imu.dynamics import ImuFactors, as_biases
-from graphnav.imu.preintegration import Intervals, within
+from graphnav.imu.dynamics import EarthMotion, as_biases
+from graphnav.imu.preintegration import within
 from graphnav.imu.samples import Samples
 
 
@@ -90,15 +90,7 @@ class Dense:
         first, last = int(k[0]), int(k[-1]) + 1
         samples, used = self.samples.between(self.t[first], self.t[last]), slice(first, last)
         dR, dV, dP = within(samples, self.t[first : last + 1], t, self.ba[used], self.bg[used])
-        n = len(t)
-        none = np.zeros((n, 3, 3))
-        start = self.states[k]
-        intervals = Intervals(
-            self.t[k], t, dR, dV, dP, none, none, none, none, none, start.ba, start.bg,
-            np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 0, 0)), np.zeros((n, 0, 0, 0)), none, none,
-            np.zeros((n, 3)), none,
-        )  # fmt: skip
-        return ImuFactors(intervals, self.frame).propagate(slice(None), start, linear=False)[0]
+        return EarthMotion(t - self.t[k], self.frame).reach(slice(None), self.states[k], dR, dP, dV)
 
 
 def _distribute(miss: Array, s: Array, T: Array) -> Array:

@@ -109,7 +109,7 @@ class _Span:
 
 
 def crop_solution(solution: Solution, share: Share) -> Solution:
-    """What a solution of a part says of the part's own span."""
+    """What a solution of a part says of the part's own span, without the graph that it was solved with."""
     start, end = share.start, share.end
     if np.isneginf(start) and np.isposinf(end):
         return solution
@@ -172,5 +172,6 @@ def crop_solution(solution: Solution, share: Share) -> Solution:
         noise=noise(solution.noise),
         arcs=stretches(solution.arcs),
         fixed=solution.fixed[inside(solution.fixed[:, 0])] if len(solution.fixed) else solution.fixed,
+        graphs=(),  # which hold all that was built for the part, ten times what is said of it
         between=tuple(_Span(b, max(b.start, start), min(b.end, float(last))) for b in solution.between),
     )

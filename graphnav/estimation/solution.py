@@ -166,7 +166,8 @@ class Solution:
 
         Parameters
         ----------
-        piece : of a recording that was cut where its IMU was silent for too long.
+        piece : of a recording that was cut where its IMU was silent for too long. One that was solved in parts because
+            of its length has none.
 
         Raises
         ------
@@ -175,7 +176,9 @@ class Solution:
         """
         if not 0 <= piece < len(self.graphs):
             raise EstimationError(
-                f"to_gtsam: no piece {piece}; the solution has {len(self.graphs)}", key="pieces.none_such"
+                f"to_gtsam: no piece {piece}; the solution has {len(self.graphs)}"
+                + ("" if self.graphs else ": it was solved in parts; solve one hour of it"),
+                key="pieces.none_such",
             )
         return self.graphs[piece]()
 

@@ -68,31 +68,40 @@ def by_scale(by_bias: Array, mean: Array, k: int) -> Array:
     return np.asarray(by_bias[..., _TO[:k]] * mean[:, None, _FROM[:k]])
 
 
+class EarthMotion:
+    """How states move in a local frame over times T (n,) when it is known what the force did; the module's formulas."""
+
+    def __init__(self, T: Array, frame: LocalFrame) -> None:
+        self._frame, self._h = frame, T[:, None]
+        turned = frame.omega_n * self._h
+        gamma1, gamma2 = rotation.integrals(turned)
+        self.back = np.swapaxes(rotation.exp(turned), -1, -2)  # (n, 3, 3) E^T
+        h = self._h[..., None]
+        self._once, self._twice = h * gamma1, h * h * gamma2  # (n, 3, 3) int E, iint E
+
+    def reach(self, rows: slice, start: States, dR: Array, dP: Array, dV: Array) -> States:
+        """The states at the ends of times `rows`, by dR (n, 3, 3), dP and dV (n, 3) in the axes of their starts."""
+        frame, h, back = self._frame, self._h[rows], self.back[rows]
+        by_place = start.p @ frame.W.T
+        G = frame.gravity_n(start.p) + start.p @ frame.W2.T
+        bent, u = start.v @ frame.gravity_gradient.T, start.v + by_place  # gravity changes along the way
+        p = start.p + h * (u + h * h / 6.0 * bent) + mv(self._twice[rows], G) + mv(start.R_nb, dP)
+        p = mv(back, p)
+        v = mv(back, u + 0.5 * h * h * bent + mv(self._once[rows], G) + mv(start.R_nb, dV)) - p @ frame.W.T
+        return States(back @ start.R_nb @ dR, p, v, start.ba, start.bg)
+
+
 class ImuFactors:
     """Prediction over preintegrated intervals in a local frame; what does not depend on states is done once."""
 
     def __init__(self, intervals: Intervals, frame: LocalFrame) -> None:
         self.intervals, self.frame = intervals, frame
-        T = intervals.T[:, None]
-        h = T[..., None]
-        omega = frame.omega_n
-        W = self.W = frame.W
-        self.W2 = frame.W2
-        E = rotation.exp(omega * T)
-        gamma1, gamma2 = rotation.integrals(omega * T)
-        self.back = np.swapaxes(E, -1, -2)
-        gradient = frame.gravity_gradient
-        n = len(intervals)
+        self._earth = EarthMotion(intervals.T, frame)
+        n, W = len(intervals), frame.W
+        back = self.back = self._earth.back
         self.post = np.zeros((n, 6, 6))  # from (E p, E u) to (p, v)
-        self.post[:, :3, :3] = self.post[:, 3:, 3:] = self.back
-        self.post[:, 3:, :3] = -W @ self.back
-        coast = np.zeros((n, 6, 6))  # (E p, E u) at the end from (p, v) at the start, without force
-        coast[:, :3, :3] = _I3 + h * W
-        coast[:, :3, 3:] = h * (_I3 + h * h / 6.0 * gradient)
-        coast[:, 3:, :3] = W
-        coast[:, 3:, 3:] = _I3 + 0.5 * h * h * gradient
-        self._coast, self.coast = coast, self.post @ coast
-        self.pushed = self.post @ np.concatenate([gamma2 * h * h, gamma1 * h], axis=1)  # by G: iint E, int E
+        self.post[:, :3, :3] = self.post[:, 3:, 3:] = back
+        self.post[:, 3:, :3] = -W @ back
         # d(theta, dP, dV) / d(ba, bg), (n, 9, 6)
         self.bias = np.zeros((n, 9, 6))
         self.bias[:, :3, 3:] = intervals.theta_bg
@@ -108,12 +117,15 @@ class ImuFactors:
 
     @cached_property
     def inner(self) -> Array:
-        """(n, 6, 6) `coast`, and what gravity at the start changes with its position."""
-        h, by_place = self.intervals.T[:, None, None], self.frame.gravity_gradient + self.W2
-        coast = self._coast.copy()
-        coast[:, :3, :3] += 0.5 * h * h * by_place
-        coast[:, 3:, :3] += h * by_place
-        return np.asarray(self.post @ coast)
+        """(n, 6, 6) derivative of the end's (p, v) by the start's, that of gravity with it."""
+        frame, h = self.frame, self.intervals.T[:, None, None]
+        gradient, by_place = frame.gravity_gradient, frame.gravity_gradient + frame.W2
+        ahead = np.empty((len(h), 6, 6))  # of (E p, E u)
+        ahead[:, :3, :3] = _I3 + h * frame.W + 0.5 * h * h * by_place
+        ahead[:, :3, 3:] = h * (_I3 + h * h / 6.0 * gradient)
+        ahead[:, 3:, :3] = frame.W + h * by_place
+        ahead[:, 3:, 3:] = _I3 + 0.5 * h * h * gradient
+        return np.asarray(self.post @ ahead)
 
     @cached_property
     def whitener(self) -> Array:
@@ -126,12 +138,10 @@ class ImuFactors:
         """
         return np.linalg.inv(np.linalg.cholesky(self.intervals.covariance))
 
-    def propagate(
-        self, rows: slice, start: States, scale: Array | None = None, linear: bool = True
-    ) -> tuple[States, Array]:
+    def propagate(self, rows: slice, start: States, scale: Array | None = None) -> tuple[States, Array]:
         """The states at the ends of intervals `rows` and F (n, 15, 15) there, from the states at their starts.
 
-        `scale` is (k,), (n, k) or None, k 6 or 18. Without `linear` F is not made, and empty.
+        `scale` is (k,), (n, k) or None, k 6 or 18.
         """
         iv, R = self.intervals, start.R_nb
         n = len(R)
@@ -142,13 +152,8 @@ class ImuFactors:
         turn, moved = bent[:, :3], self.step[rows] + bent[:, 3:]  # dP, dV
         dR = iv.dR[rows] @ rotation.exp(turn)
 
+        end = self._earth.reach(rows, start, dR, moved[:, :3], moved[:, 3:])
         turned = self._turn(rows, R)
-        G = self.frame.gravity_n(start.p) + start.p @ self.W2.T
-        pv = mv(self.coast[rows], np.concatenate([start.p, start.v], -1)) + mv(turned, moved) + mv(self.pushed[rows], G)
-        end = States(self.back[rows] @ R @ dR, pv[:, :3], pv[:, 3:], start.ba, start.bg)
-        if not linear:
-            return end, np.empty((0, DIM, DIM))
-
         F = np.zeros((n, DIM, DIM))
         F[:, 0:3, 0:3] = np.swapaxes(dR, -1, -2)
         # right_jacobian(turn) is I - [turn]x/2 for the small turns this is used for
@@ -218,7 +223,7 @@ class ImuFactors:
         Rt = np.swapaxes(R_nb, -1, -2) @ Et
         out = J.copy()
         out[:, 3:6] = Rt @ J[:, 3:6]
-        out[:, 6:9] = Rt @ (J[:, 6:9] + self.W @ J[:, 3:6])
+        out[:, 6:9] = Rt @ (J[:, 6:9] + self.frame.W @ J[:, 3:6])
         return out
 
     def _body(self, r: Array, R_nb: Array) -> Array:

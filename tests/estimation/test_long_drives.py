@@ -11,6 +11,7 @@ import pytest
 
 from graphnav import load
 from graphnav.config import Settings
+from graphnav.core.errors import EstimationError
 from graphnav.core.notes import key_of
 from graphnav.estimation import long_drives
 from graphnav.estimation.pipeline import run
@@ -58,6 +59,11 @@ def test_parts_say_what_the_whole_says(monkeypatch: pytest.MonkeyPatch) -> None:
             assert np.quantile(sd / sd_whole, 0.1) > 0.9
         every = np.concatenate([b.times(50.0) for b in one.between])
         assert np.all(np.diff(every) > 0.0)  # and nothing is there twice
+        assert one.covariance.base is None  # nor held beyond what is said
+        with pytest.raises(EstimationError) as told:
+            one.to_gtsam()
+        assert told.value.key == "pieces.none_such"
+        assert whole[name].covariance.base is None
 
 
 def test_a_drive_with_states_of_its_own_for_each_satellite_is_cut_sooner(monkeypatch: pytest.MonkeyPatch) -> None:

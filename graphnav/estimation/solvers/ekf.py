@@ -86,10 +86,9 @@ def ekf(
         about = _smooth_about(problem, backward(problem, _forward(problem, n)))[1] if known is None else known.first(n)
     one = _forward(problem, K, about, progress, decide=decide)
     seconds = time.perf_counter() - began
-    filtered, P = one.states, one.P[:, :DIM, :DIM]
+    filtered, P = one.states, one.P[:, :DIM, :DIM].copy()  # a view would hold what is known of the parameters too
     if about is not None:
         n = len(about.values) - 1
-        P = P.copy()
         P[:n] = transport_covariance(P[:n], about.states[:n], filtered[:n])
     solution = Solution(
         solver="ekf",

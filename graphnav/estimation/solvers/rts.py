@@ -148,13 +148,14 @@ def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None
     found = found or backward(problem, forward)
     smoothed, all_values, all_P = found.states, found.values, found.P
     records = {rows.name: residual_record(problem, rows, found) for rows in problem.constraints}
+    covariance = all_P[:, :DIM, :DIM].copy()  # a view would hold what is known of the parameters too
     seconds = time.perf_counter() - began
     return Solution(
         solver="rts",
         frame=problem.frame,
         t=problem.t,
         states=smoothed,
-        covariance=all_P[:, :DIM, :DIM],
+        covariance=covariance,
         parameters=parameters_of(problem, all_values, sigmas_of(all_P)),
         records=records,
         counts=forward.solution.counts,
@@ -162,5 +163,5 @@ def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None
         stopped="one pass forward and one back",
         timings={**forward.solution.timings, "smoother": seconds},
         notes=problem.notes,
-        between=(dense(problem, smoothed, all_P[:, :DIM, :DIM], scale_at(problem.columns, all_values), smooth=True),),
+        between=(dense(problem, smoothed, covariance, scale_at(problem.columns, all_values), smooth=True),),
     )

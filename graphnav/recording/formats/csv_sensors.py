@@ -53,11 +53,12 @@ def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
 
 
 def _turn(rows: Table, names: tuple[str, ...], unit: float, R_bs: Array) -> Array:
-    """(N, 3) columns in body axes; of a day of them nothing is held twice."""
+    """(N, 3) columns in body axes, and no longer in the table: of a day of them nothing is held twice."""
     out = np.empty((len(rows), 3))
     for k in range(0, len(out), _AT_ONCE):
         some = slice(k, k + _AT_ONCE)
         np.matmul(np.stack([rows[name][some] for name in names], -1) * unit, R_bs.T, out=out[some])
+    rows.release(*names)
     return out
 
 

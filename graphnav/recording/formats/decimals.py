@@ -18,7 +18,7 @@ from graphnav.core.files import parse_number
 from graphnav.core.rotation import Array
 
 _BLOCK = 1 << 18  # bytes handled at once: keeps the working arrays in the processor's cache
-_SLAB = 1 << 22  # rows of a column that are put together: 32 MB, which go back to the system when they are let go
+_SLAB = 1 << 22  # rows of a column held in one piece: 32 MB, which go back to the system when they are let go
 _COMMA, _MINUS, _POINT, _LINE = b",-.\n"
 _PAD = 16  # bytes before a block, for words that reach back beyond it
 _MOST = 16  # digits read on each side of the point
@@ -35,28 +35,26 @@ def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array
     ValueError
         If a line has another number of cells or a cell is not a number; a slower reader says which.
     """
-    slabs: list[list[Array]] = [[np.empty(0)] for _ in use]
-    blocks: list[Array] = []
+    slabs: list[list[Array]] = [[] for _ in use]
     rows = 0
     while block := file.read(_BLOCK):
-        blocks.append(_columns(block + file.readline(), width, list(use)))
-        rows += blocks[-1].shape[1]
-        if rows >= _SLAB:
-            _put_together(blocks, slabs)
-            rows = 0
-    _put_together(blocks, slabs)
+        found = _columns(block + file.readline(), width, list(use))
+        done = 0
+        while done < found.shape[1]:
+            at = rows % _SLAB
+            count = min(found.shape[1] - done, _SLAB - at)
+            for column, values in zip(slabs, found, strict=True):
+                if not at:
+                    column.append(np.empty(_SLAB))  # of which the system gives what is written to
+                column[-1][at : at + count] = values[done : done + count]
+            done, rows = done + count, rows + count
     columns = []
     for column in slabs:
-        columns.append(np.concatenate(column))
+        if column:
+            column[-1] = column[-1][: (rows - 1) % _SLAB + 1]
+        columns.append(np.concatenate([np.empty(0), *column]))
         column.clear()
     return columns
-
-
-def _put_together(blocks: list[Array], slabs: list[list[Array]]) -> None:
-    """Move blocks (len(slabs), n) of rows to the end of their columns."""
-    for k, column in enumerate(slabs):
-        column.append(np.concatenate([block[k] for block in blocks] or [np.empty(0)]))
-    blocks.clear()
 
 
 def _columns(text: bytes, width: int, use: list[int]) -> Array:

@@ -54,6 +54,11 @@ class Table:
         """Columns side by side, (N, len(names))."""
         return np.stack([self.columns[n] for n in names], -1)
 
+    def release(self, *names: str) -> None:
+        """Let go of columns that nothing is to be read from any more: of a day of an IMU each is 140 MB."""
+        for name in names:
+            del self.columns[name]
+
     def take(self, mask: Mask) -> Table:
         """The rows of a mask or an index array."""
         return replace(self, columns={n: c[mask] for n, c in self.columns.items()}, rows=self.rows[mask])
