@@ -374,3 +374,23 @@ def test_a_receiver_that_repeats_a_fix_is_left_out(begin: float, doppler: bool) 
     # of right ones beside it no more than it is long itself
     right = ~same & ((t < begin - 5.0) | (t > begin + 17.0))
     assert not left_out(found, recording)[right].any()
+
+
+def test_fixes_that_drift_for_a_minute_are_left_out_and_nothing_else() -> None:
+    recording = read(
+        Path(__file__).parents[2] / "data" / "tokyo"
+    )  # real; some of its velocities are outliers while the positions drift
+    assert recording.gnss is not None
+    since = recording.gnss.t - recording.start - 52.0
+    drifting = (since > 0.0) & (since < 60.0)
+    wrong = moved(recording, drifting, np.outer(0.3 * since[drifting], [1.0, 0.0, 0.0]))
+    solution = run(wrong, None, ("rts",))["rts"]
+    out = left_out(solution, wrong)
+    assert out[drifting].mean() > 0.9
+    assert out[~drifting].mean() < 0.1
+    assert recording.truth is not None
+    track = solution.trajectory()
+    truth = solution.frame.from_llh(recording.truth.llh)
+    antenna = solution.states.p + solution.states.R_nb @ recording.gnss.lever_arm
+    off = [antenna[:, k] - np.interp(track.t, recording.truth.t, truth[:, k]) for k in (0, 1)]
+    assert np.sqrt(np.mean(np.hypot(*off) ** 2)) < 0.5  # 4.5 m where one of the other sensor's outliers decides

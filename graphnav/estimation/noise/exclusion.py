@@ -10,7 +10,7 @@ next one:
                 each has one of its own
     wheels      what is assumed of wheels, and the odometer, have one such error in common there
     IMU         the intervals there that the smoother needs more noise of have it
-    rows        single rows there have the weights that were found
+    rows        single rows there have the weights that were found, as those of the others where one sensor is wrong
 
 An unknown error has a Gaussian prior about zero, as wide as such errors get (`watch.WIDE`), and so has its growth; what
 that width costs in likelihood is the cost of the explanation (MacKay 1992, "Bayesian interpolation": the Occam factor).
@@ -36,7 +36,7 @@ from graphnav.core.rotation import Array
 from graphnav.estimation import faults
 from graphnav.estimation.noise.apply import row_weights, with_noise
 from graphnav.estimation.noise.estimate import CHANCE, NoiseEstimate, estimate_noise, limit_squares
-from graphnav.estimation.noise.explanations import FIXES, ROWS, WRONG, evidence, mask_within
+from graphnav.estimation.noise.explanations import FIXES, ONE_SENSOR, ROWS, WRONG, evidence, mask_within
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import row_moments
 from graphnav.estimation.problem import Problem
@@ -138,7 +138,8 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
     hidden = find_spans(base, NoiseModel(medians), found)
     without = NoiseModel(excluded=dict.fromkeys(FIXES, tuple(hidden)))
-    if all(any(a <= begin and end <= b for a, b in spans) for begin, end in hidden):
+    left_out = _join(span for kind in FIXES for span in one.noise.excluded.get(kind, ()))
+    if all(any(a <= begin and end <= b for a, b in left_out) for begin, end in hidden):
         return replace(one, looks=one.looks + 2)
     other, spans, passes, looks = found, hidden, 0, one.looks + 2
     for _ in range(_SHRINKS):
@@ -146,7 +147,7 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
         alone = _weigh_alone(with_noise(base, other.noise), other.points)
         again = find_spans(base, replace(other.noise, excluded={}), other)
         passes, looks = passes + other.passes, looks + 1
-        if _length(again) > _length(hidden):  # faults shrink then; where more seems wrong, the filter is lost
+        if _length(again) > 2.0 * _length(hidden):  # more seems wrong outside than inside: the filter is lost
             return replace(one, passes=passes, looks=looks)
         spans, refined = trim_spans(spans, alone), trim_spans(again, alone)
         if not refined:  # by figures that they have not led astray there are single outliers and no more
@@ -230,35 +231,36 @@ def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]
     noise = replace(found.noise, excluded={})
     reach = _with_next_fix(base, spans)
     outside = {name: _outside(some, reach if name in INTERVALS else spans) for name, some in noise.weights.items()}
-    of_imu = {name: some for name, some in noise.weights.items() if name in INTERVALS}
-    of_rows = {name: some for name, some in noise.weights.items() if name not in INTERVALS}
-    used, disturbed, weighted = (
-        with_noise(base, replace(noise, weights=outside | some)) for some in ({}, of_imu, of_rows)
-    )
+    # outliers that an explanation has beside what it says is wrong
+    beside: dict[tuple[str, ...], dict[str, RowWeights]] = {
+        kinds: {name: some for name, some in noise.weights.items() if name not in (*kinds, *INTERVALS)}
+        for kinds in (*ONE_SENSOR, ROWS)
+    }
+    beside[INTERVALS] = {name: some for name, some in noise.weights.items() if name in INTERVALS}
+    used = with_noise(base, replace(noise, weights=outside))
     known = values_of(with_noise(base, found.noise), found.points)
     about = points_of(used, found.points.states, known)
-    before, likelihood, looks = evidence(used, about, spans, {INTERVALS: disturbed, ROWS: weighted})
+    posed = {kinds: with_noise(base, replace(noise, weights=outside | some)) for kinds, some in beside.items()}
+    before, likelihood, looks = evidence(used, about, spans, posed)
     excluded: dict[str, tuple[tuple[float, float], ...]] = {}
     total = before + found.log_prior
-    dropped: dict[tuple[str, ...], list[tuple[float, float]]] = {INTERVALS: [], ROWS: []}
+    dropped: dict[str, list[tuple[float, float]]] = {name: [] for name in noise.weights}
     for k, span in enumerate(spans):
-        cost = np.array([0.0 if not kinds else _ODDS for kinds in WRONG])
-        for kinds, some, within in ((INTERVALS, of_imu, reach[k]), (ROWS, of_rows, span)):
+        cost = np.array([0.0 if not kinds or kinds in _SINGLE else _ODDS for kinds in WRONG])
+        for kinds, some in beside.items():
+            within = reach[k] if kinds == INTERVALS else span
             outliers = sum(_count(one) - _count(_outside(one, [within])) for one in some.values())
-            cost[WRONG.index(kinds)] = _OUTLIER * outliers if outliers else np.inf
+            cost[WRONG.index(kinds)] += _OUTLIER * outliers if outliers or kinds not in _SINGLE else np.inf
         one = likelihood[k] - cost
-        best = int(np.argmax(one))
-        total += float(one[best])
-        if WRONG[best] != INTERVALS:
-            dropped[INTERVALS].append(reach[k])
-        if WRONG[best] != ROWS:
-            dropped[ROWS].append(span)
-        if WRONG[best] not in _SINGLE:
-            excluded |= {name: (*excluded.get(name, ()), span) for name in WRONG[best]}
+        best = WRONG[int(np.argmax(one))]
+        total += float(np.max(one))
+        for name in noise.weights.keys() - beside.get(best, {}).keys():
+            dropped[name].append(reach[k] if name in INTERVALS else span)
+        if best not in _SINGLE:
+            excluded |= {name: (*excluded.get(name, ()), span) for name in best}
     present = {rows.name for rows in base.constraints}
     excluded = {name: some for name, some in excluded.items() if name in present}
-    weights = {name: _outside(some, dropped[INTERVALS]) for name, some in of_imu.items()}
-    weights |= {name: _outside(some, dropped[ROWS]) for name, some in of_rows.items()}
+    weights = {name: _outside(some, dropped[name]) for name, some in noise.weights.items()}
     return Explained(replace(noise, weights=weights, excluded=excluded), total, 0, looks)
 
 

@@ -24,6 +24,7 @@ from graphnav.recording import Recording
 FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
 ROWS = ("rows",)
 WRONG: tuple[tuple[str, ...], ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS, ROWS)
+ONE_SENSOR = FIXES[:1], FIXES[1:], WHEELS  # wrong in a span: the others are not, but may have outliers there
 _NONE = 1e-9  # sigma of an error that is not there
 
 
@@ -112,7 +113,7 @@ def with_own_errors(problem: Problem, spans: list[tuple[float, float]], kinds: t
 
 
 def evidence(
-    problem: Problem, about: Points, spans: list[tuple[float, float]], single: Mapping[tuple[str, ...], Problem]
+    problem: Problem, about: Points, spans: list[tuple[float, float]], beside: Mapping[tuple[str, ...], Problem]
 ) -> tuple[float, Array, int]:
     """Log-likelihood of innovations before all spans, (M, 7) from each span's beginning on, by `WRONG`, and passes.
 
@@ -121,7 +122,7 @@ def evidence(
     problem : with its noise model and no fix left out.
     about : points of all keyframes.
     spans : s, first and last wrong fix, in order and apart.
-    single : the problem with more noise of single intervals of the IMU, and with less weight of single rows.
+    beside : by `WRONG`, the problem with more noise of single intervals of the IMU or less weight of single rows.
     """
     edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
     known = values_of(problem, about)
@@ -129,15 +130,16 @@ def evidence(
     before, passes = 0.0, 0
     present = {rows.name for rows in problem.constraints}
     for kinds in WRONG:
-        possible = present & set(kinds) if kinds == WHEELS else kinds in single or present.issuperset(kinds)
+        possible = present & set(kinds) if kinds == WHEELS else kinds in (INTERVALS, ROWS) or present.issuperset(kinds)
         if not possible:
             found.append(np.full(len(spans), -np.inf))
             continue
-        ways = [single.get(kinds, problem)]
-        if kinds and kinds not in single:
-            ways = [with_common_errors(problem, spans, kinds)]
+        base = beside.get(kinds, problem)
+        ways = [base]
+        if kinds and kinds not in (INTERVALS, ROWS):
+            ways = [with_common_errors(base, spans, kinds)]
         if kinds and set(kinds) <= set(FIXES):
-            ways.append(with_own_errors(problem, spans, kinds))
+            ways.append(with_own_errors(base, spans, kinds))
         each = []
         for one in ways:
             likelihood = refilter(one, points_of(one, about.states, known)).log_likelihood
