@@ -19,7 +19,7 @@ The first passes see the first `_FIRST` keyframes only; the last ones see all.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
@@ -62,6 +62,12 @@ class NoiseEstimate:
     log_prior: float
     passes: int  # of filter and smoother
     looks: int = 0  # passes of the filter alone, for measurements that are wrong
+    converged: bool = True
+
+    @property
+    def outliers(self) -> int:
+        """Rows and intervals that have less weight than others."""
+        return sum(int(np.sum(some.weight < 1.0)) for some in self.noise.weights.values())
 
 
 @dataclass
@@ -76,6 +82,7 @@ class _Components:
     excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
     steps: dict[str, float] = field(default_factory=dict)  # the latest of each, as it was found
     ahead: float = 1.0  # times its own length that a step is taken at most
+    known: bool = False  # whether they were estimated before
 
     def model(self) -> NoiseModel:
         figures = {}
@@ -138,13 +145,31 @@ def estimate_noise(
         If the filter breaks down.
     """
     figures = _begin(problem, start)
-    about = (
-        _first_points(problem, figures, opening)
-        if near is None
-        else _carry(*near, with_noise(problem, figures.model()))
-    )
-    passes, total = int(near is None), len(problem.t)
-    warm = start is not None and bool(start.figures)
+    if near is not None:
+        return _iterate(problem, figures, _carry(*near, with_noise(problem, figures.model())), progress, intervals)
+    found: list[NoiseEstimate] = []
+    for about in (tried := _first_points(problem, figures, opening)):
+        try:
+            found.append(_iterate(problem, _begin(problem, start), about, progress, intervals))
+        except EstimationError:  # from there nothing leads anywhere
+            if about is tried[-1] and not found:
+                raise
+    # of figures that are still on their way nobody knows how likely they will be
+    told = [one for one in found if one.converged] or found[-1:]
+    best = max(told, key=lambda one: one.log_posterior + np.log(CHANCE) * one.outliers)
+    return replace(best, passes=len(tried) + sum(one.passes for one in found))
+
+
+def _iterate(
+    problem: Problem,
+    figures: _Components,
+    about: Points,
+    progress: Callable[[str, float], None] | None,
+    intervals: bool,
+) -> NoiseEstimate:
+    """The estimate from figures, and points to linearise at, on."""
+    passes, total = 0, len(problem.t)
+    warm = figures.known
     rounds = _AGAIN if warm else _ROUNDS
     ends = [total] if total <= 2 * _FIRST or warm else [_FIRST, total]
     for end in ends:
@@ -164,7 +189,7 @@ def estimate_noise(
             if k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log):
                 break
             before, figures.ahead = now, _AHEAD if k > 1 and now > before else 1.0
-    return NoiseEstimate(figures.model(), smoothed, forward, now, prior_then, passes)
+    return NoiseEstimate(figures.model(), smoothed, forward, now, prior_then, passes, converged=k + 1 < _MOST)
 
 
 def _begin(problem: Problem, start: NoiseModel | None) -> _Components:
@@ -178,22 +203,29 @@ def _begin(problem: Problem, start: NoiseModel | None) -> _Components:
     if start is None:
         return _Components(log, times)
     log |= {name: start.figures[name].log_factor for name in log if name in start.figures}
-    return _Components(log, times, times=dict(start.times), weights=dict(start.weights), excluded=start.excluded)
+    return _Components(
+        log,
+        times,
+        times=dict(start.times),
+        weights=dict(start.weights),
+        excluded=start.excluded,
+        known=bool(start.figures),
+    )
 
 
-def _first_points(problem: Problem, figures: _Components, opening: float | None) -> Points:
-    """Points of a filter that nothing is known before; without what it finds grossly wrong."""
+def _first_points(problem: Problem, figures: _Components, opening: float | None) -> list[Points]:
+    """Points of a filter that nothing is known before; and without what it finds grossly wrong, if there is any."""
     used = with_noise(problem, figures.model())
     about = backward(used, ekf(used, opening=opening))
     # what is grossly wrong takes a filter that uses everything too far away to be linearised there; what seems to drift
     # may as well be the filter, whose heading is not known yet
     sound = weigh_rows(used, refilter(used, about, watch=True, drifts=False).weights)
     if not any(rows.weight is not None and np.any(rows.weight == 0.0) for rows in sound.constraints):
-        return about
+        return [about]
     try:
-        return backward(sound, ekf(sound, opening=opening))
+        return [about, backward(sound, ekf(sound, opening=opening))]
     except EstimationError:  # by figures that are far off, so much seems wrong that what is left leads nowhere
-        return about
+        return [about]
 
 
 def _carry(points: Points, before: Problem, after: Problem) -> Points:
