@@ -65,9 +65,10 @@ class NoiseEstimate:
     converged: bool = True
 
     @property
-    def outliers(self) -> int:
-        """Rows and intervals that have less weight than others."""
-        return sum(int(np.sum(some.weight < 1.0)) for some in self.noise.weights.values())
+    def log_evidence(self) -> float:
+        """Of the measurements, where each row and interval that has less weight than others is an outlier by chance."""
+        outliers = sum(int(np.sum(some.weight < 1.0)) for some in self.noise.weights.values())
+        return self.log_posterior + float(np.log(CHANCE)) * outliers
 
 
 @dataclass
@@ -147,8 +148,8 @@ def estimate_noise(
     figures = _begin(problem, start)
     if near is not None:
         return _iterate(problem, figures, _carry(*near, with_noise(problem, figures.model())), progress, intervals)
-    found: list[NoiseEstimate] = []
-    for about in (tried := _first_points(problem, figures, opening)):
+    tried, found = _first_points(problem, figures, opening), list[NoiseEstimate]()
+    for about in tried:
         try:
             found.append(_iterate(problem, _begin(problem, start), about, progress, intervals))
         except EstimationError:  # from there nothing leads anywhere
@@ -156,7 +157,7 @@ def estimate_noise(
                 raise
     # of figures that are still on their way nobody knows how likely they will be
     told = [one for one in found if one.converged] or found[-1:]
-    best = max(told, key=lambda one: one.log_posterior + np.log(CHANCE) * one.outliers)
+    best = max(told, key=lambda one: one.log_evidence)
     return replace(best, passes=len(tried) + sum(one.passes for one in found))
 
 

@@ -154,9 +154,8 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
             near = other.points, with_noise(base, other.noise)
             free = estimate_noise(base, None, replace(other.noise, excluded={}), near)
             passes += free.passes
-            likely = free.log_posterior - _OUTLIER * sum(map(_count, free.noise.weights.values()))
-            if likely > one.log_evidence:
-                return Explained(free.noise, likely, passes, looks, free)
+            if free.log_evidence > one.log_evidence:
+                return Explained(free.noise, free.log_evidence, passes, looks, free)
         if not refined or refined == spans:
             break
         spans, without = refined, replace(without, excluded=dict.fromkeys(FIXES, tuple(refined)))
