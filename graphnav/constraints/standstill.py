@@ -2,9 +2,13 @@
 
 Skog et al. 2010 (zero velocity), Li 2024 (the same, found by the engine's idling). While the wheels stand::
 
-    zero velocity:   v
+    zero velocity:   R_nb^T v
     zero rate:       omega_b - b_g - R_nb^T omega_n        mean over the interval that ends at the keyframe
     held position:   p - a                                 a: one unknown place for each stop
+
+The velocity is taken in the body, where an unknown heading has no part in it: in n, a filter that comes to a stop with
+a speed left over would learn from it that its heading is right. So would it from a way that it has gone since the stop
+began, so the place is held from the end of the first interval on, whose velocity is known by then.
 
 For a foot the first and the last give way to `graphnav.constraints.foot`; the second holds where it really stands.
 
@@ -125,7 +129,8 @@ class ZeroVelocity(_Standing):
     """The platform does not move (ZUPT)."""
 
     name: ClassVar[str] = "zero_velocity"
-    axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
+    turns: ClassVar[bool] = True
+    axes: ClassVar[tuple[str, ...]] = ("right", "forward", "up")
     unit: ClassVar[str] = "m/s"
 
     sigma: Array = field(default_factory=lambda: np.empty((0, 3)))
@@ -136,12 +141,14 @@ class ZeroVelocity(_Standing):
         if not len(rows) or not scene.settings.standstill.zero_velocity or scene.recording.platform == "foot":
             return None
         force, _ = unrest(scene, rows, stop)
-        # the sway of a body is not known by axis in n: its largest for all
+        # how a body sways is not told by axis: its largest for all
         sigma = np.hypot(_STILL_V, force.max(axis=1, keepdims=True) / _SWAY)
         return cls(keyframe=rows + 1, sigma=np.broadcast_to(sigma, (len(rows), 3)))
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        return Linearized(states.v, {"v": np.broadcast_to(_I3, (len(states), 3, 3))}, self.sigma[rows])
+        R_bn = np.swapaxes(states.R_nb, -1, -2)
+        v_b = mv(R_bn, states.v)
+        return Linearized(v_b, {"theta": rotation.skew(v_b), "v": R_bn}, self.sigma[rows])
 
 
 @dataclass(frozen=True)
@@ -199,13 +206,9 @@ class HeldPosition(_Standing):
             return None
         force, _ = unrest(scene, rows, stop)
         sigma = np.hypot(_STILL_P, force.max(axis=1, keepdims=True) / _SWAY**2)
-        # a row for the start of each stop, which is the end of an interval in motion
-        first = np.flatnonzero(np.diff(stop, prepend=-1))
-        keyframe = np.concatenate([rows[first], rows + 1])
-        order = np.argsort(keyframe, kind="stable")
         return cls(
-            keyframe=keyframe[order],
-            sigma=np.repeat(np.concatenate([sigma[first], sigma])[order], 3, axis=1),
+            keyframe=rows + 1,
+            sigma=np.repeat(sigma, 3, axis=1),
             parameters=(_guess_places(scene, np.unique(stop)),),
         )
 

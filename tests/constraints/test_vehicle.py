@@ -15,8 +15,9 @@ from graphnav.constraints.base import BuildContext
 from graphnav.constraints.standstill import PLACE, HeldPosition, ZeroRate, ZeroVelocity
 from graphnav.constraints.vehicle import AXLE, MOUNTING, ODOMETER_DELAY, ODOMETER_SCALE, NonHolonomic, OdometerSpeed
 from graphnav.core import rotation
-from graphnav.core.earth import LocalFrame
-from graphnav.core.state import States
+from graphnav.core.earth import RATE, LocalFrame
+from graphnav.core.rotation import mv
+from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import keyframe_times
@@ -115,9 +116,27 @@ def test_a_stop_is_a_stop(exact: tuple[Recording, Trajectory]) -> None:
     states = truth_states(truth, scene.t[rows.keyframe], scene.frame)
     place = np.tile(states.p[0], (len(rows), 1))
     assert np.abs(rows.linearize(states, {PLACE: place}, slice(None)).residual).max() < 1e-6
-    assert scene.t[rows.keyframe[0]] == pytest.approx(STOP[0])
+    assert scene.t[rows.keyframe[0] - 1] == pytest.approx(STOP[0])
     assert scene.t[rows.keyframe[-1]] == pytest.approx(STOP[1])
-    assert len(rows) == len(ZeroVelocity.build(scene)) + 1
+    np.testing.assert_array_equal(rows.keyframe, ZeroVelocity.build(scene).keyframe)
+
+
+def test_a_stop_with_a_speed_left_over_tells_no_heading(exact: tuple[Recording, Trajectory]) -> None:
+    """A turn of attitude and velocity about the vertical changes no row of its first keyframe, whatever the speed."""
+    recording, truth = exact
+    scene = scene_of(recording, Settings())
+    made = [cls.build(scene) for cls in (ZeroVelocity, ZeroRate, HeldPosition)]
+    first = min(int(rows.keyframe[0]) for rows in made)
+    still = truth_states(truth, scene.t[[first]], scene.frame)
+    rolling = replace(still, v=mv(still.R_nb, np.array([[0.0, 1.7, 0.0]])))
+    turn = np.zeros((1, DIM))
+    turn[0, BLOCKS["theta"]] = still.R_nb[0, 2]
+    turn[0, BLOCKS["v"]] = np.cross([0.0, 0.0, 1.0], rolling.v[0])
+    for rows in made:
+        assert rows.keyframe[0] == first
+        linear = rows.linearize(rolling, {PLACE: rolling.p}, slice(0, 1))
+        change = sum(mv(J, turn[:, BLOCKS[name]]) for name, J in linear.jacobians.items() if name in BLOCKS)
+        assert np.abs(change).max() < 2.0 * RATE  # the Earth's, turned
 
 
 def test_a_restless_stop_is_believed_less(exact: tuple[Recording, Trajectory]) -> None:

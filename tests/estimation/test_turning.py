@@ -139,7 +139,7 @@ def test_no_row_that_says_so_feels_a_turn_but_by_the_earths_rate(walk: Online) -
 
 def test_fixes_and_places_do_not_say_so() -> None:
     kinds: dict[str, type[Constraint]] = {kind.name: kind for kind in list_constraints()}
-    for name in ("gnss_position", "gnss_velocity", "held_position", "zero_velocity", "dual_antenna_heading"):
+    for name in ("gnss_position", "gnss_velocity", "held_position", "dual_antenna_heading"):
         assert not kinds[name].turns
 
 
