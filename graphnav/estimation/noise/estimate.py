@@ -36,7 +36,7 @@ from graphnav.estimation.noise.priors import TIME_WITHIN, prior
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, points_of, values_of
+from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, near_to, points_of, values_of
 from graphnav.estimation.solvers.rts import backward
 from graphnav.imu.preintegration import NOISE_FIGURES
 
@@ -84,6 +84,7 @@ class _Components:
     steps: dict[str, float] = field(default_factory=dict)  # the latest of each, as it was found
     ahead: float = 1.0  # times its own length that a step is taken at most
     known: bool = False  # whether they were estimated before
+    same_data: bool = False  # and of the same measurements
 
     def model(self) -> NoiseModel:
         figures = {}
@@ -130,6 +131,7 @@ def estimate_noise(
     near: tuple[Points, Problem] | None = None,
     progress: Callable[[str, float], None] | None = None,
     intervals: bool = False,
+    changed: bool = False,
 ) -> NoiseEstimate:
     """Estimate the noise model of a problem posed with stated noise and with the parts of its intervals' noise.
 
@@ -139,13 +141,14 @@ def estimate_noise(
     start : figures to set out from, weights of rows, and what is left out; prior medians when None.
     near : points of all keyframes to linearise at first, and the problem that they are of.
     intervals : single intervals of the IMU may have more noise than the others.
+    changed : the figures to set out from were estimated with other measurements left out, and may have far to go.
 
     Raises
     ------
     EstimationError
         If the filter breaks down.
     """
-    figures = _begin(problem, start)
+    figures = _begin(problem, start, changed)
     if near is not None:
         return _iterate(problem, figures, _carry(*near, with_noise(problem, figures.model())), progress, intervals)
     tried, found = _first_points(problem, figures, opening), list[NoiseEstimate]()
@@ -171,7 +174,7 @@ def _iterate(
     """The estimate from figures, and points to linearise at, on."""
     passes, total = 0, len(problem.t)
     warm = figures.known
-    rounds = _AGAIN if warm else _ROUNDS
+    rounds = _AGAIN if figures.same_data else _ROUNDS
     ends = [total] if total <= 2 * _FIRST or warm else [_FIRST, total]
     for end in ends:
         before = -np.inf
@@ -193,7 +196,7 @@ def _iterate(
     return NoiseEstimate(figures.model(), smoothed, forward, now, prior_then, passes, converged=k + 1 < _MOST)
 
 
-def _begin(problem: Problem, start: NoiseModel | None) -> _Components:
+def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) -> _Components:
     names = [f"imu.{name}" for name in NOISE_FIGURES]
     for rows in problem.constraints:
         names += [*rows.noise_groups()[0], *(g for p in (*rows.parameters, *rows.processes) for g in p.noise_groups)]
@@ -211,11 +214,12 @@ def _begin(problem: Problem, start: NoiseModel | None) -> _Components:
         weights=dict(start.weights),
         excluded=start.excluded,
         known=bool(start.figures),
+        same_data=bool(start.figures) and not changed,
     )
 
 
 def _first_points(problem: Problem, figures: _Components, opening: float | None) -> list[Points]:
-    """Points of a filter that nothing is known before; and without what it finds grossly wrong, if there is any."""
+    """Points of a filter that nothing is known before, and of one without what seems grossly wrong, if they differ."""
     used = with_noise(problem, figures.model())
     about = backward(used, ekf(used, opening=opening))
     # what is grossly wrong takes a filter that uses everything too far away to be linearised there; what seems to drift
@@ -224,9 +228,11 @@ def _first_points(problem: Problem, figures: _Components, opening: float | None)
     if not any(rows.weight is not None and np.any(rows.weight == 0.0) for rows in sound.constraints):
         return [about]
     try:
-        return [about, backward(sound, ekf(sound, opening=opening))]
+        without = backward(sound, ekf(sound, opening=opening))
+        one, other = (_pass(used, points, len(problem.t))[1] for points in (about, without))
     except EstimationError:  # by figures that are far off, so much seems wrong that what is left leads nowhere
         return [about]
+    return [one] if near_to(other, one) else [about, without]
 
 
 def _carry(points: Points, before: Problem, after: Problem) -> Points:

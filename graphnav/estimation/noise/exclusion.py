@@ -18,10 +18,10 @@ A fault is also as rare beforehand as the tests take it to be, an outlier among 
 The best model decides what is left out.
 
 Figures that are estimated with a fault in the data may have grown until they hide it. So the tests are made with the
-prior medians of the figures as well; where they find something else, the figures are estimated without that, twice, as
-the spans come to what is wrong; each span is decided with these, and of the two explanations of all measurements the
-likelier one stands. Where these figures know of no span at all, the third is that all is right, by figures that set out
-from them.
+prior medians of the figures as well. Where they find something else, the figures are estimated without it, from those
+found on, twice, as the spans come to what is wrong; each span is decided with these, and of these explanations of all
+measurements the likeliest stands. Where these figures know of no span at all, the third is that all is right, by
+figures that set out from them.
 """
 
 from __future__ import annotations
@@ -137,19 +137,23 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
     one = decide(base, found, spans)
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
     hidden = find_spans(base, NoiseModel(medians), found)
-    without = NoiseModel(excluded=dict.fromkeys(FIXES, tuple(hidden)))
+    without = NoiseModel(found.noise.figures, found.noise.times, excluded=dict.fromkeys(FIXES, tuple(hidden)))
     left_out = _join(span for kind in FIXES for span in one.noise.excluded.get(kind, ()))
     if all(any(a <= begin and end <= b for a, b in left_out) for begin, end in hidden):
         return replace(one, looks=one.looks + 2)
     other, spans, passes, looks = found, hidden, 0, one.looks + 2
+    best = one
     for _ in range(_SHRINKS):
-        other = estimate_noise(base, None, without, (other.points, with_noise(base, other.noise)))
+        other = estimate_noise(base, None, without, (other.points, with_noise(base, other.noise)), changed=True)
         alone = _weigh_alone(with_noise(base, other.noise), other.points)
         again = find_spans(base, replace(other.noise, excluded={}), other)
         passes, looks = passes + other.passes, looks + 1
-        if _length(again) > 2.0 * _length(hidden):  # more seems wrong outside than inside: the filter is lost
-            return replace(one, passes=passes, looks=looks)
         spans, refined = trim_spans(spans, alone), trim_spans(again, alone)
+        if spans:
+            way = decide(base, with_weights(other, alone, spans), spans)
+            best, looks = max(best, way, key=lambda some: some.log_evidence), looks + way.looks
+        if _length(again) > 2.0 * _length(hidden):  # more seems wrong outside than inside: the filter is lost
+            break
         if not refined:  # by figures that they have not led astray there are single outliers and no more
             near = other.points, with_noise(base, other.noise)
             free = estimate_noise(base, None, replace(other.noise, excluded={}), near)
@@ -159,11 +163,7 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
         if not refined or refined == spans:
             break
         spans, without = refined, replace(without, excluded=dict.fromkeys(FIXES, tuple(refined)))
-    if not spans:
-        return replace(one, passes=passes, looks=looks)
-    way = decide(base, with_weights(other, alone, spans), spans)
-    best = max(one, way, key=lambda some: some.log_evidence)
-    return replace(best, passes=passes, looks=looks + way.looks)
+    return replace(best, passes=passes, looks=looks)
 
 
 def _length(spans: list[tuple[float, float]]) -> float:
