@@ -2,9 +2,10 @@
 
     GRAPHNAV_DATA=../shared/data python scripts/detectors_alone.py
 
-Shares of the standing and of the moving seconds that are called stationary, and medians of how late stops begin and
-end; then the horizontal rms of every solver over six minutes without GNSS, which are spread evenly over the drive. The
-noise model is estimated once for each drive, with all fixes, so that nothing but the stops differs between the lines.
+Shares of the standing and of the moving seconds that are called stationary, of what is called stationary the share
+that stands (precision), and medians of how late stops begin and end; then the horizontal rms of every solver over six
+minutes without GNSS, which are spread evenly over the drive. The noise model is estimated once for each drive, with all
+fixes, so that nothing but the stops differs between the lines.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from withheld_spans import runs_of
 from graphnav import load
 from graphnav.app.scores import Withheld, score
 from graphnav.config import Settings, settings_from
+from graphnav.config.detectors import FUSED
 from graphnav.detectors import detect, list_detectors
 from graphnav.detectors.base import longer_than, mask_inside, spans_of
 from graphnav.estimation.noise.model import NoiseModel
@@ -35,6 +37,7 @@ FIRE = ("fused", "low_band_glrt", "glrt", "acceleration_variance", "acceleration
         "fft", NOBODY)  # fmt: skip
 MINUTE, COUNT = 60.0, 6  # s withheld at a time, and how many times
 SLOW, EXACT = 0.1, 0.01  # m/s, below which a velocity is rest: a receiver's, and that of a simulated truth
+STEP = 0.02  # s
 SHORTEST = 2.0  # s; of what rolls through zero the truth's epochs do not tell whether it stands
 
 
@@ -74,12 +77,22 @@ def settings_of(fire: str) -> Settings:
     return settings_from({"detectors": {"fire": [fire]}})
 
 
+def stationary(recording: Recording, fire: str) -> Array:
+    """(M, 2) s, what a detector calls stationary, or at least so many of them, each by itself."""
+    if not fire.isdigit():
+        return detect(recording, settings_of(fire)).stationary
+    t = np.arange(recording.start, recording.end, STEP)
+    votes = [mask_inside(t, detect(recording, settings_of(name)).stationary) for name in list_detectors()]
+    return longer_than(
+        spans_of(np.sum(votes, axis=0) >= int(fire), t), settings_of(FUSED).detectors.fusion.min_duration
+    )
+
+
 def found_by(drive: Drive, recording: Recording, fire: str) -> list[str]:
-    """Standing and moving seconds called stationary (%), stops found, and how late they begin and end (s)."""
+    """Standing and moving seconds called stationary, precision (%), stops found, how late they begin and end (s)."""
     if fire == NOBODY:
-        return ["-"] * 5
-    found = detect(recording, settings_of(fire)).stationary
-    t = np.arange(*drive.known, 0.02)
+        return ["-"] * 6
+    found, t = stationary(recording, fire), np.arange(*drive.known, STEP)
     still, called = mask_inside(t, drive.stops), mask_inside(t, found)
     late = []
     for begin, end in drive.stops:
@@ -89,6 +102,7 @@ def found_by(drive: Drive, recording: Recording, fire: str) -> list[str]:
     middle = np.median(late, axis=0) if late else np.full(2, np.nan)
     return [
         f"{100.0 * called[still].mean():.1f}", f"{100.0 * called[~still].mean():.2f}",
+        f"{100.0 * still[called].mean():.2f}" if called.any() else "-",
         f"{len(late)} of {len(drive.stops)}", f"{middle[0]:+.2f}", f"{middle[1]:+.2f}",
     ]  # fmt: skip
 
@@ -121,27 +135,25 @@ def rms(drive: Drive, fire: str, noise: NoiseModel) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--drives", default="tokyo_20201105,boulder_drive_20250708,oracle_drive,li2024")
-    parser.add_argument("--fire", default=",".join(FIRE), help="comma separated (%(default)s)")
+    parser.add_argument("--fire", default=",".join(FIRE), help="comma separated (%(default)s); 2: where two of them do")
     parser.add_argument("--without", choices=("odometer",), help="take a sensor away altogether")
+    parser.add_argument("--no-solvers", action="store_true", help="what is found alone")
     options = parser.parse_args()
     assert set(list_detectors()) < set(FIRE)
-    print(
-        "| drive | fires | found, % | false, % | stops | begins late, s | ends late, s | IMU alone: found, % ", end=""
-    )
-    print(
-        f"| false, % | {' | '.join(f'{name}, m' for name in SOLVERS)} |\n|{' --- |' * (9 + len(SOLVERS))}", flush=True
-    )
+    head = ["drive", "fires", "found, %", "false, %", "right, %", "stops", "begins late, s", "ends late, s"]
+    head += ["IMU alone: found, %", "false, %", "right, %"]
+    head += [] if options.no_solvers else [f"{name}, m" for name in SOLVERS]
+    print(f"| {' | '.join(head)} |\n|{' --- |' * len(head)}", flush=True)
     for drive in drives(Path(os.environ["GRAPHNAV_DATA"]), options.drives.split(",")):
         if options.without and drive.recording.odometer is not None:
             drive = Drive(drive.name, drive.recording.without(options.without), drive.stops, drive.known)
         blind = drive.recording.without("gnss")
         blind = blind.without("odometer") if blind.odometer is not None else blind
-        noise = run(drive.recording, solvers=("ekf",))["ekf"].noise
+        noise = None if options.no_solvers else run(drive.recording, solvers=("ekf",))["ekf"].noise
         for fire in options.fire.split(","):
-            errors = rms(drive, fire, noise)
-            cells = [*found_by(drive, drive.recording, fire), *found_by(drive, blind, fire)[:2]]
-            print(f"| {drive.name} | {fire} | {' | '.join(cells)} | ", end="")
-            print(f"{' | '.join(f'{errors[name]:.2f}' for name in SOLVERS)} |", flush=True)
+            cells = [*found_by(drive, drive.recording, fire), *found_by(drive, blind, fire)[:3]]
+            cells += [] if noise is None else [f"{error:.2f}" for error in rms(drive, fire, noise).values()]
+            print(f"| {drive.name} | {fire} | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,6 +26,8 @@ from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.batch import batch, solve_rows
 from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.incremental import Replay, incremental
+from graphnav.estimation.solvers.isam import isam2
 from graphnav.estimation.solvers.robust import weight_and_cost
 from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
 from graphnav.estimation.solvers.rts import rts
@@ -32,6 +35,7 @@ from graphnav.imu.dynamics import SCALE
 from graphnav.recording import Gnss, Recording
 from graphnav.recording.formats import read
 
+Replayed = Callable[[Problem], Replay]
 KERNELS = ("none", "huber", "cauchy", "geman-mcclure", "tukey", "welsch")
 NO_WHEELS = {"nhc": False, "odometer": False}
 WHITE = {
@@ -157,6 +161,20 @@ def test_both_are_the_dense_least_squares_solution(trio: Trio) -> None:
             p = solution.parameters[chain.parameter.name]
             np.testing.assert_allclose((p.value - expected_value) / sigma, 0.0, atol=1e-3, err_msg=solution.solver)
             np.testing.assert_allclose(p.sigma, sigma, rtol=1e-3, err_msg=solution.solver)
+
+
+@pytest.mark.parametrize("solve", [isam2, lambda problem: incremental(problem, lag=1e9)], ids=["isam2", "window"])
+def test_what_takes_keyframe_by_keyframe_is_batch_and_filter_on_a_linear_problem(trio: Trio, solve: Replayed) -> None:
+    """What has settled is the elimination of everything; what was live, of everything so far: the filter's update."""
+    found, filtered = solve(trio.problem), ekf(trio.problem).solution
+    for mine, its in ((found.settled, trio.batch), (found.live, filtered)):
+        np.testing.assert_allclose(mine.states.minus(its.states) / sigmas(its), 0.0, atol=2e-3, err_msg=its.solver)
+        one, other = mine.covariance, its.covariance
+        np.testing.assert_allclose(normalised(one, other), normalised(other, other), atol=2e-3, err_msg=its.solver)
+    for name, p in trio.batch.parameters.items():
+        own = found.settled.parameters[name]
+        np.testing.assert_allclose((own.value - p.value) / p.sigma, 0.0, atol=2e-3, err_msg=name)
+        np.testing.assert_allclose(own.sigma, p.sigma, rtol=2e-3, err_msg=name)
 
 
 # --------------------------------------------------------------------------------------------------- covariances

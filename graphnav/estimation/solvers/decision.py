@@ -10,6 +10,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.recursion import gain, update
 
 
 @dataclass(frozen=True)
@@ -32,11 +33,9 @@ def hold(one: Decision | None, x: Any, P: Array, where: Any) -> tuple[Any, Array
     P = P + np.diag(one.added)
     if not len(one.residual):
         return x, P
-    PHt, R = P @ one.H.T, np.diag(one.sigma**2)
-    K = np.linalg.solve(one.H @ PHt + R, PHt.T).T
-    M = np.eye(len(P)) - K @ one.H
-    P = M @ P @ M.T + K @ R @ K.T
-    P, d = 0.5 * (P + P.T), -(K @ one.residual)
+    HP, variance = one.H @ P, one.sigma**2
+    _, _, Kt = gain(HP, HP @ one.H.T, variance, one.residual)
+    P, d = update(P, HP, one.H, Kt, variance), -(one.residual @ Kt)
     if isinstance(x, np.ndarray):
         return x + d, P
     to = where.plus(x, d)

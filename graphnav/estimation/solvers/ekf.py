@@ -52,7 +52,7 @@ from graphnav.estimation.solvers.passes import (
     sigmas_of,
 )
 from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate
-from graphnav.estimation.solvers.recursion import STRETCH, filter_rows, predict, solve, update
+from graphnav.estimation.solvers.recursion import STRETCH, filter_rows, predict, update
 from graphnav.estimation.solvers.retest import finds_fault
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
@@ -339,7 +339,6 @@ def _update(
     rows, lo, hi = some.parts[0]
     record = stack.records[rows.name]
     weight, root_weight = weights_of(record, lo, hi) if some.alone else (1.0, stack.root_weight[some.at])
-    tests = bank if bank is not None and weight > 0.0 and rows.name in bank else None
     at, e = where.about(x)
     for left in range(where.passes(some) - 1, -1, -1):
         r, H, sigma = where.rows(some, at)
@@ -369,14 +368,7 @@ def _update(
     if taken is not None:
         taken.add(some, Kt, -solved, root)
     P = update(P, HP, H, Kt, sigma * sigma)
-    fault = None
-    if tests is not None:
-        G = tests.signature(rows.name, some.k, H)
-        weighted = tests.own(rows.name, G).copy()
-        solve(root, weighted)
-        fault = tests.updated(rows.name, Kt.T, G, weighted, r, where.speed(some.k, x))
-    elif bank is not None:
-        bank.taken(Kt.T, H)
+    fault = None if bank is None else bank.updated(rows.name, some.k, H, Kt.T, r, root, where.speed(some.k))
     to = where.plus(at, d)
     return to, where.carry(P, at, to), fault
 

@@ -152,7 +152,7 @@ class AtPoints:
         """The points stay."""
         return P
 
-    def speed(self, k: int, x: Array | None = None) -> float:
+    def speed(self, k: int) -> float:
         """m/s."""
         return float(self._speed[k])
 

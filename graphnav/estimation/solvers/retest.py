@@ -9,7 +9,6 @@ from __future__ import annotations
 from graphnav.core.rotation import Array
 from graphnav.estimation.solvers.passes import Updates
 from graphnav.estimation.solvers.points import AtPoints
-from graphnav.estimation.solvers.recursion import solve
 from graphnav.estimation.solvers.stack import Stack
 from graphnav.estimation.solvers.watch import Bank
 
@@ -26,16 +25,9 @@ def finds_fault(bank: Bank, given: AtPoints, decay: Array, stack: Stack, updates
             bank.predicted(given.F[k - 1], decay[k - 1])
         for some in stack.together(k):
             at, name, taken = some.at, some.parts[0][0].name, bool(updates.taken[some.number])
-            H, K, solved = given.H[at], updates.Kt[at].T, stack.solved[at]
-            root = stack.root[k, at[1], at[1]].copy()
+            H, solved, root = given.H[at], stack.solved[at], stack.root[k, at[1], at[1]].copy()
             r = root @ (root.T @ solved)
             bank.seen(name, k, float(r @ solved), taken)
-            if taken and name in bank:
-                G = bank.signature(name, k, H)
-                weighted = bank.own(name, G).copy()
-                solve(root, weighted)
-                if bank.updated(name, K, G, weighted, r, given.speed(k)) is not None:
-                    return True
-            elif taken:
-                bank.taken(K, H)
+            if taken and bank.updated(name, k, H, updates.Kt[at].T, r, root, given.speed(k)) is not None:
+                return True
     return False

@@ -15,7 +15,7 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.elimination import predict, update
-from graphnav.estimation.solvers.stages import Columns, Message, Place, Stage, at_points, plus, width
+from graphnav.estimation.solvers.stages import Columns, Message, Place, Stage, at_points, follows, group_runs, plus
 
 if TYPE_CHECKING:
     from graphnav.estimation.solvers.window import Window
@@ -101,39 +101,22 @@ class LinearisationPoint:
 
 def remake(before: Message, points: Sequence[LinearisationPoint], places: Sequence[Place]) -> list[Stage]:
     """Stages about given points; `points[0]` is that of the message before them."""
+
+    def alike(last: int, k: int) -> bool:
+        same = places[k].linked == places[last].linked and points[k + 1].columns == points[last + 1].columns
+        return same and follows(places[k], places[last])
+
     out: list[Stage] = []
-    for run in _runs(points, places):
+    for run in group_runs(range(len(places)), alike):
         linked, own = places[run[0]].linked, [places[k] for k in run]
         part = [points[k + 1] for k in run]
         around = [points[run[0]], *part] if linked else part
-        columns = part[-1].columns
-        values = np.zeros((len(around), width(columns) - DIM))
-        for row, point in zip(values, around, strict=True):
-            row[: len(point.values)] = point.values
-        states = States.stack([point.state for point in around])
-        for place, point, linear in zip(own, part, at_points(own, states, values, columns, linked), strict=True):
+        states, values = States.stack([point.state for point in around]), [point.values for point in around]
+        linears = at_points(own, states, values, part[-1].columns, linked)
+        for place, point, linear in zip(own, part, linears, strict=True):
             plain, bent = (tuple(m for m in linear.measured if (m.kernel == "none") == one) for one in (True, False))
             ahead = predict(before, place, linear.link, plain, point.state, point.values, point.columns)
             stage, _ = update(ahead, bent, weighted=True)
             before = stage.message
             out.append(stage)
     return out
-
-
-def _runs(points: Sequence[LinearisationPoint], places: Sequence[Place]) -> list[list[int]]:
-    """Indices of places that can be linearised together: one problem, keyframe after keyframe, the same columns."""
-    runs: list[list[int]] = []
-    for k, place in enumerate(places):
-        last = places[k - 1] if runs else None
-        alike = (
-            last is not None
-            and place.linked == last.linked
-            and place.problem is last.problem
-            and place.k == last.k + 1
-            and points[k + 1].columns == points[k].columns
-        )
-        if alike:
-            runs[-1].append(k)
-        else:
-            runs.append([k])
-    return runs

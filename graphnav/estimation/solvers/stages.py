@@ -18,7 +18,7 @@ columns on the right, which go through the same QR.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -274,7 +274,7 @@ def measure(place: Place, state: States, values: Array, columns: Columns, late: 
     rows = place.problem.constraints
     if late is not None:
         rows = tuple(c for c in rows if waits(c) == late)
-    return at_points([place], state, values[None], columns, linked=False, rows=rows)[0]
+    return at_points([place], state, [values], columns, linked=False, rows=rows)[0]
 
 
 def waits(rows: Constraint) -> bool:
@@ -282,25 +282,50 @@ def waits(rows: Constraint) -> bool:
     return rows.looks_ahead or rows.robust != "none"
 
 
+def pad(rows: Sequence[Array], width: int) -> Array:
+    """(n, width) of rows that may be shorter, zero behind their ends: parameters that had not begun."""
+    out = np.zeros((len(rows), width))
+    for whole, row in zip(out, rows, strict=True):
+        whole[: len(row)] = row
+    return out
+
+
+def follows(place: Place, last: Place) -> bool:
+    """Whether a keyframe is the next after another of the same problem, so that they can be linearised together."""
+    return place.problem is last.problem and place.k == last.k + 1
+
+
+def group_runs(which: Iterable[int], alike: Callable[[int, int], bool]) -> list[list[int]]:
+    """Indices in runs, in which each is `alike` the one before it."""
+    runs: list[list[int]] = []
+    for k in which:
+        if runs and alike(runs[-1][-1], k):
+            runs[-1].append(k)
+        else:
+            runs.append([k])
+    return runs
+
+
 def at_points(
     places: Sequence[Place],
     states: States,
-    values: Array,
+    values: Sequence[Array],
     columns: Columns,
     linked: bool = True,
     rows: Sequence[Constraint] | None = None,
 ) -> list[Linear]:
     """The rows of consecutive keyframes of one problem at given points, all at once.
 
-    `states` and `values` (n, D-15) are at the keyframes; with `linked` there is one more of them, the first, at the
-    keyframe before. `rows` are the constraints that are wanted, if not all.
+    `states` and `values` (n, up to D-15) are at the keyframes; with `linked` there is one more of them, the first, at
+    the keyframe before. `rows` are the constraints that are wanted, if not all.
     """
     problem, first, n = places[0].problem, places[0].k, len(places)
     assert problem is not None
     D, skip = width(columns), int(linked)
+    points = Points(states, pad(values, D - DIM))
     links: list[Array | None] = [None] * n
     if linked:
-        scale = scale_at(columns, values[0])
+        scale = scale_at(columns, points.values[0])
         motion = ImuFactors(problem.intervals[slice(first - 1, first - 1 + n)], problem.frame)
         link = np.zeros((n, DIM, DIM + D + 1))
         link[:, :, :DIM], link[:, :, DIM : 2 * DIM], S, link[:, :, -1] = linearise_links(motion, states, scale)
@@ -314,7 +339,7 @@ def at_points(
         if lo == hi or any(p.name not in columns for p in constraint.parameters):
             continue  # none here, or of parameters that have not begun
         at = constraint.keyframe[lo:hi] - first + skip
-        linear = linearise(constraint, Points(states, values), columns, slice(lo, hi), at)
+        linear = linearise(constraint, points, columns, slice(lo, hi), at)
         sigma = linear.sigma
         H, b = linear.H / sigma[..., None], -linear.residual / sigma
         edge = np.searchsorted(at, np.arange(n + 1) + skip)

@@ -37,6 +37,8 @@ from graphnav.estimation.solvers.stages import (
     Place,
     append_columns,
     at_points,
+    follows,
+    group_runs,
     measure,
     predict_stage,
 )
@@ -280,19 +282,22 @@ class Tree:
         links = {k for i in rows for k in (i, i + 1) if k < len(self) and LINK in self.keyframes[k].slots}
         made: list[Made] = []
         gone: list[int] = []
-        for run in list(self._runs(sorted(rows | links), posed=renewed is not None)):
+
+        def alike(last: int, i: int) -> bool:
+            a, b = self.keyframes[last], self.keyframes[i]
+            same = i == last + 1 and a.columns == b.columns and LINK in a.slots and LINK in b.slots
+            return same and (renewed is not None or follows(b.place, a.place))  # or they will be of one problem
+
+        for run in group_runs(sorted(rows | links), alike):
             own = self.keyframes[run[0] : run[-1] + 1]
             places = [k.place for k in own]
             if renewed is not None:
                 places = list(renewed(run[0] - self._held, run[-1] + 1 - self._held))
             linked = run[0] in links
             around = self.keyframes[run[0] - 1 : run[-1] + 1] if linked else own
-            columns = own[-1].columns
-            values = np.zeros((len(around), sum(at.stop - at.start for at in columns.values())))
-            for row, keyframe in zip(values, around, strict=True):
-                known = keyframe.values
-                row[: len(known)] = known
-            for i, linear in zip(run, at_points(places, states_of(around), values, columns, linked), strict=True):
+            values = [k.values for k in around]
+            linears = at_points(places, states_of(around), values, own[-1].columns, linked)
+            for i, linear in zip(run, linears, strict=True):
                 keyframe = self.keyframes[i]
                 if i in links:
                     assert linear.link is not None
@@ -311,25 +316,6 @@ class Tree:
         self.relinearised += len(rows)
         self.changed = min(self.changed, self.keyframes[min(rows)].number)
         self._replace(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
-
-    def _runs(self, which: Sequence[int], posed: bool) -> Iterable[list[int]]:
-        """Indices that can be linearised together: keyframe after keyframe of one problem, the same columns.
-
-        `posed` are keyframes that will be posed again, together.
-        """
-        run: list[int] = []
-        for i in which:
-            k = self.keyframes[i]
-            if run:
-                last = self.keyframes[run[-1]]
-                alike = i == run[-1] + 1 and k.columns == last.columns and LINK in k.slots and LINK in last.slots
-                same = posed or (k.place.problem is last.place.problem and k.place.k == last.place.k + 1)
-                if not (alike and same):
-                    yield run
-                    run = []
-            run.append(i)
-        if run:
-            yield run
 
     # ---------------------------------------------------------------------------------------------------- leaving
     def truncate(self, keep: int) -> None:

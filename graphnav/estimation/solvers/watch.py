@@ -31,7 +31,7 @@ from scipy.special import chdtri, gammaincinv
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
-from graphnav.estimation.solvers.recursion import move
+from graphnav.estimation.solvers.recursion import move, solve
 
 PATIENCE = 60.0  # s, after which fixes that are refused may be the ones that are right
 _EVERY = 8  # fixes between two looks at what is usual
@@ -213,40 +213,32 @@ class Bank(_Tests):
         """The filter has gone on to the next keyframe, by a step as `graphnav.estimation.solvers.recursion` has it."""
         self.X = move(F, decay, self.X)
 
-    def signature(self, name: str, k: int, H: Array) -> Array:
-        """(n m, C) mean of an innovation at keyframe k for unit errors since each onset; a fix itself has them."""
-        slots = self._slots[name]
-        self.X[:, slots.begin(float(self._t[k]))] = 0.0
-        G = -(H @ self.X)
-        own = G[:, slots.columns].reshape(-1, *slots.inputs.shape)
-        G[:, slots.columns] = (own + slots.inputs).reshape(len(G), -1)
-        return G
-
-    def own(self, name: str, G: Array) -> Array:
-        """(n m, L c) what a signature says of errors of the fixes themselves."""
-        return G[:, self._slots[name].columns]
-
     def seen(self, name: str, k: int, nis: float, used: bool) -> None:
         """The filter has seen an innovation of so many squared sigmas, used or not."""
         if slots := self._slots.get(name):
             slots.typical_sigmas.add(float(self._t[k]), nis, used)
 
-    def taken(self, K: Array, H: Array) -> None:
-        """The filter has used rows H with the gain K that are not tested."""
-        self.X -= K @ (H @ self.X)
-
-    def updated(self, name: str, K: Array, G: Array, weighted: Array, r: Array, speed: float) -> float | None:
-        """The filter has used an innovation; when a fault began, or None.
+    def updated(self, name: str, k: int, H: Array, K: Array, r: Array, root: Array, speed: float) -> float | None:
+        """The filter has used rows at keyframe k; when a fault began that they are enough to be sure of, or None.
 
         Parameters
         ----------
-        K : (D, n m) gain.
-        G : (n m, C) its signature, and `weighted` S^-1 times its `own`.
-        r : (n m,) residual, -nu.
+        H, K : (n m, D) and the gain (D, n m).
+        r : (n m,) residual, -nu, and the lower root of its covariance S.
         speed : m/s, of the vehicle.
         """
+        if name not in self:
+            self.X -= K @ (H @ self.X)
+            return None
+        slots = self._slots[name]
+        self.X[:, slots.begin(float(self._t[k]))] = 0.0
+        G = -(H @ self.X)
+        own = G[:, slots.columns]
+        own[:] = (own.reshape(-1, *slots.inputs.shape) + slots.inputs).reshape(own.shape)  # a fix itself has the error
+        weighted = own.copy()
+        solve(root, weighted)
         self.X += K @ G
-        return self._slots[name].found(-(r @ weighted), self.own(name, G), weighted, speed)
+        return slots.found(-(r @ weighted), own, weighted, speed)
 
 
 class Watch(_Tests):

@@ -27,6 +27,7 @@ from graphnav.estimation.solvers.stages import (
     Stage,
     append_columns,
     measure,
+    pad,
     plus,
     predict_stage,
     width,
@@ -251,9 +252,7 @@ class Window:
         """(n,) how far the smoothed states are from their points, 1 at the limit."""
         means, limit = self.means()[1:], self._limit[1]
         if self._moved is None and means:
-            e = np.zeros((len(means), max(len(x) for x in means)))
-            for row, x in zip(e, means, strict=True):
-                row[: len(x)] = x
+            e = pad(means, max(len(x) for x in means))
             turn = self._turned(e) / self.turn
             self._moved = np.maximum(turn, np.abs(e[:, DIM:] / limit[: e.shape[1] - DIM]).max(axis=1, initial=0.0))
         return np.empty(0) if self._moved is None else self._moved
