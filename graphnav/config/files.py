@@ -94,8 +94,8 @@ def settings_text(settings: Settings) -> str:
             if isinstance(value, BaseModel):
                 nested[name] = value
                 continue
-            said = f"# {name} =" if value is None else f"{name} = {toml_value(value)}"
-            lines.append(f"{said:<30} # {field.description}")
+            setting = f"# {name} =" if value is None else f"{name} = {toml_value(value)}"
+            lines.append(f"{setting:<30} # {field.description}")
         for name, inner in nested.items():
             place = f"{at}.{name}" if at else name
             if any(not isinstance(getattr(inner, key), BaseModel) for key in type(inner).model_fields):

@@ -46,7 +46,7 @@ OFFSETS = {f"prior.{name}": name for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET)
 _I3 = np.eye(3)
 _MINUTE = 60.0  # s
 _WHITE = 1e-3  # s, a correlation time that leaves nothing from one fix to the next
-_WINDOW = 0.05  # s each side over which turn rate and force at a fix are averaged
+_HALF_WINDOW = 0.05  # s each side over which turn rate and force at a fix are averaged
 
 
 def _make_empty(*shape: int) -> Array:
@@ -355,8 +355,8 @@ def acceleration(states: States, accel: Array, g_n: Array) -> tuple[Array, dict[
 
 def average_around(imu: Imu, x: Array, t: Array) -> Array:
     """(N, 3) mean of an IMU signal around times t: one sample's vibration would be noise times lever arm."""
-    lo = np.searchsorted(imu.t, t - _WINDOW)
-    hi = np.maximum(np.searchsorted(imu.t, t + _WINDOW), lo + 1)
+    lo = np.searchsorted(imu.t, t - _HALF_WINDOW)
+    hi = np.maximum(np.searchsorted(imu.t, t + _HALF_WINDOW), lo + 1)
     lo, hi = np.minimum(lo, len(imu.t) - 1), np.minimum(hi, len(imu.t))
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(x, axis=0)])
     return (total[hi] - total[lo]) / (hi - lo)[:, None]

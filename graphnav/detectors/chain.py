@@ -24,7 +24,7 @@ from graphnav.detectors.windows import Blocks
 
 _INNER = 1.5  # s of a stretch that say what its force and rate are
 LONGEST = 60.0  # s between stretches over which a difference of speed still means something
-_LEAST = 0.02  # m/s, 1-sigma of any such difference
+_LEAST_SIGMA = 0.02  # m/s, 1-sigma of any such difference
 _SIGMAS = 3.0
 _G = 9.81  # m/s^2
 _TURN_ON = 1.0e-4  # rad/s, of what a gyro's bias may differ from its mean over the stretches
@@ -60,7 +60,7 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
     if np.abs(yaw).max() > _STRAIGHT:
         return _UNKNOWN
     if n1 <= n0:
-        return Link(0.0, _SIGMAS * _LEAST, 0.0, 0.0)
+        return Link(0.0, _SIGMAS * _LEAST_SIGMA, 0.0, 0.0)
     off = left[n1:].mean()
     left = left[n0:n1]
     v = left.sum() * b.period
@@ -73,7 +73,7 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
     share = np.linspace(0.0, 1.0, len(left))
     way = np.cumsum(left - share * off) * b.period
     way -= share * way[-1]
-    tolerance = _SIGMAS * float(np.hypot(_LEAST, np.linalg.norm(doubt)))
+    tolerance = _SIGMAS * float(np.hypot(_LEAST_SIGMA, np.linalg.norm(doubt)))
     return Link(float(v.imag), tolerance, float(np.abs(way).max()), float(np.abs(way.mean())))
 
 
@@ -119,7 +119,7 @@ def find_speed_beside(b: Blocks, span: Array, way: int) -> Outwards | None:
     of_force, of_rate = (float(np.sqrt(x[:n0].var(axis=0).max() * b.period)) for x in (force, rate))
     known = 1.0 / (n0 * b.period)
     doubt = (
-        np.full(n, _LEAST),
+        np.full(n, _LEAST_SIGMA),
         0.5 * _G * T**2 * np.hypot(_TURN_ON, of_rate * np.sqrt(known)),
         _G * of_rate * np.sqrt(T**3 / 3.0),
         of_force * np.sqrt(T + T**2 * known),
@@ -196,8 +196,9 @@ def moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
             speed = change[m] - change[of]
             if len(sure):
                 nearest = int(np.argmin(apart))
-                out[group[m]] = abs(known[group[of[nearest]]] + speed[nearest]) > max(apart[nearest], _SIGMAS * _LEAST)
+                away = abs(known[group[of[nearest]]] + speed[nearest])
+                out[group[m]] = away > max(apart[nearest], _SIGMAS * _LEAST_SIGMA)
             else:
                 # no speed is known: a stretch faster than another one in the chain moves
-                out[group[m]] = bool((speed > np.maximum(apart, _SIGMAS * _LEAST)).any())
+                out[group[m]] = bool((speed > np.maximum(apart, _SIGMAS * _LEAST_SIGMA)).any())
     return out

@@ -76,9 +76,9 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
         )
     whole = t_last - t_first < (1.0 + _STRETCH) * length * period
     half = 0.5 * length * period
-    calm = _weigh_idling(w, settings) if labels is None and settings.find_line else np.zeros(w.count)
+    quiet = _weigh_idling(w, settings) if labels is None and settings.find_line else np.zeros(w.count)
     inner = whole & (
-        mask_within(t, labels.still, half) if labels else (calm < 1.0) & ~mask_within(t, scene.certain, half)
+        mask_within(t, labels.still, half) if labels else (quiet < 1.0) & ~mask_within(t, scene.certain, half)
     )
     line = idle_line(w, np.flatnonzero(inner)) if settings.find_line else None
     notes: list[str] = []
@@ -114,7 +114,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     found = np.full(w.count, np.nan)
     if usable:
         found = np.where(whole, np.nanmax(np.where(asked, quotient, np.nan), axis=1), np.nan)
-        found = np.maximum(np.maximum(found, calm), _divide_speed(t, settings, scene.known))
+        found = np.maximum(np.maximum(found, quiet), _divide_speed(t, settings, scene.known))
     mask = found < 1.0
     details = {"peak_frequency": where, "peak_amplitude": height, "bands": np.array(bands), **picture}
     if line is not None:

@@ -169,8 +169,8 @@ def _screen_motion(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array
     for k, (begin, end) in enumerate(certain):
         for start, last in spans[(spans[:, 0] < begin) & (spans[:, 1] > end)]:
             one = link(b, np.array([start, begin]), np.array([end, last]))
-            said = max(float(s.speed[there].max()) for s in speeds if (there := (s.t >= begin) & (s.t <= end)).any())
-            keep[k] = one.peak + one.tolerance >= said
+            fastest = max(float(s.speed[there].max()) for s in speeds if (there := (s.t >= begin) & (s.t <= end)).any())
+            keep[k] = one.peak + one.tolerance >= fastest
     return certain[keep]
 
 

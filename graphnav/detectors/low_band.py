@@ -28,7 +28,7 @@ from graphnav.recording import ImuNoise
 
 NAME = "low_band_glrt"
 _DOWN, _UP = 1.5, 0.7  # decades that the data may move the threshold down and up
-_MOVING = 30.0  # s of certain motion that say where the threshold must not be
+_LEAST_MOTION = 30.0  # s of certain motion that say where the threshold must not be
 _QUIETEST = 1.0  # s that say how much noise there can be at most
 _TRUSTED = 0.05  # of the stated noise is the least that is believed
 _OVERSTATED = 2.0  # times what the quietest windows allow
@@ -138,7 +138,7 @@ def _threshold(
                 "the IMU's stated noise is too large to tell stops by it: only the stillest stretches count",
             ),
         )
-    if label.sum() * period >= _MOVING:
+    if label.sum() * period >= _LEAST_MOTION:
         # some of these windows may be mislabelled; the threshold keeps clear of the others
         start = min(start, max(float(np.quantile(x[label], MISTAKEN)) - np.log10(2.0), start - _DOWN))
     return float(10.0**start), notes

@@ -24,11 +24,11 @@ from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation import faults
+from graphnav.estimation.building import start_sigma
 from graphnav.estimation.long_drives import OVERLAP, crop_solution, shares
 from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.words import describe_far
-from graphnav.estimation.posing import start_sigma
 from graphnav.estimation.preparation import prepare
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.separation import separation
@@ -128,8 +128,8 @@ def _run(
     found: list[dict[str, Solution]] = []
     parts = [share for piece in pieces for share in shares(piece, settings)]
     if len(parts) > len(pieces):
-        said = f"too long to be solved at once: solved in {len(parts)} parts that overlap by {OVERLAP:.0f} s"
-        notes.append(Note("pieces.parts", said))
+        sentence = f"too long to be solved at once: solved in {len(parts)} parts that overlap by {OVERLAP:.0f} s"
+        notes.append(Note("pieces.parts", sentence))
     for part in parts:
         try:
             # matrices here have thirty rows: threads for them cost more than the work, twenty times on a busy machine
@@ -161,12 +161,12 @@ def _solve_with_retry(
     except (EstimationError, np.linalg.LinAlgError) as error:
         if isinstance(error, EstimationError) and error.key != "solver.breakdown":
             raise
-        for other, model, said in _simpler(settings, noise):
+        for other, model, reason in _simpler(settings, noise):
             try:
                 again = _solve(recording, other, frame, solvers, progress, model)
             except (EstimationError, np.linalg.LinAlgError):
                 continue
-            note = Note(said.key, f"{said}, {error}")
+            note = Note(reason.key, f"{reason}, {error}")
             return {name: replace(one, notes=(note, *one.notes)) for name, one in again.items()}
         raise
 

@@ -136,9 +136,9 @@ def build_problem(
         times = keyframe_times(recording.start, recording.end, epochs, settings.keyframes.rate)
     t = times
     samples = bridge_gaps(recording.imu)
-    said: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     if recording.platform == "foot":
-        samples, said = with_whole_peaks(samples, recording.imu.R_bs, highest)
+        samples, remarks = with_whole_peaks(samples, recording.imu.R_bs, highest)
         samples = with_unresolved_motion(samples, recording.imu.noise)
         samples = with_coning(samples) if settings.imu.coning else samples
     motion = known.get(float(t[1])) if known and len(t) == 2 else None
@@ -160,7 +160,7 @@ def build_problem(
         motion=motion,
         prior=prior,
         constraints=built,
-        notes=(*_notes(samples, recording), *said, *(note for rows in built for note in rows.notes)),
+        notes=(*_notes(samples, recording), *remarks, *(note for rows in built for note in rows.notes)),
         imu_noise=recording.imu.noise,
     )
 
@@ -173,8 +173,8 @@ def _build_constraints(scene: BuildContext, ahead: bool | None) -> tuple[Constra
 
 
 def _note_differences(rows: Constraint) -> Constraint:
-    said = f"{rows.name}: gives no Jacobians, so they are made of differences, which takes longer"
-    return replace(rows, notes=(*rows.notes, Note("constraint.differences", said)))
+    sentence = f"{rows.name}: gives no Jacobians, so they are made of differences, which takes longer"
+    return replace(rows, notes=(*rows.notes, Note("constraint.differences", sentence)))
 
 
 def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Array:

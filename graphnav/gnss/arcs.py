@@ -65,7 +65,7 @@ def find_arcs(
     if len(raw.arc_begin):
         return _known_arcs(raw, slots, slot)
     epochs, epoch = raw.epochs
-    usual = period or (float(np.median(np.diff(epochs))) if len(epochs) > 1 else np.inf)
+    typical = period or (float(np.median(np.diff(epochs))) if len(epochs) > 1 else np.inf)
     there = np.isfinite(raw.carrier) & np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock)
     if base_arc is not None:
         there &= base_arc >= 0
@@ -75,7 +75,7 @@ def find_arcs(
     same = slot[now] == slot[before]
     since = raw.t[now] - raw.t[before]
     held = np.nan_to_num(raw.lock[now], nan=-1.0) > since if len(raw.lock) else np.zeros_like(same)
-    held |= (epoch[now] - epoch[before] == 1) & (since < 1.5 * usual)
+    held |= (epoch[now] - epoch[before] == 1) & (since < 1.5 * typical)
     kept = same & held & ~raw.slip[now] & (raw.half[now] == raw.half[before])
     if base_arc is not None:
         kept &= base_arc[now] == base_arc[before]

@@ -23,7 +23,7 @@ EARTH_RATE = 7.2921151467e-5  # rad/s, of WGS-84
 _OLDEST = {GPS: 7201.0, GALILEO: 14400.0, BEIDOU: 21601.0, QZSS: 7201.0, GLONASS: 1800.0}  # s from toe; RTKLIB's limits
 _TILT = np.radians(5.0)  # of the frame of geostationary BeiDou satellites
 _MU_R, _J2, _RATE_R, _RADIUS_R = 3.9860044e14, 1.0826257e-3, 7.292115e-5, 6378136.0  # PZ-90
-_STEP = 60.0  # s at most, of the integration of GLONASS orbits
+_INTEGRATION_STEP = 60.0  # s at most, of the integration of GLONASS orbits
 
 
 @dataclass(frozen=True)
@@ -265,10 +265,10 @@ class Ephemerides:
         for _ in range(2):
             since = t - (eph["toe"] - zero) - (eph["clock"] + eph["drift"] * since)
         x = np.concatenate([eph["p"], eph["v"]], axis=1)
-        steps = int(np.ceil(np.max(np.abs(since)) / _STEP)) or 1
+        steps = int(np.ceil(np.max(np.abs(since)) / _INTEGRATION_STEP)) or 1
         for j in range(steps):
-            h = np.clip(since - np.sign(since) * j * _STEP, -_STEP, _STEP)
-            h = np.where(np.abs(since) > j * _STEP, h, 0.0)[:, None]
+            h = np.clip(since - np.sign(since) * j * _INTEGRATION_STEP, -_INTEGRATION_STEP, _INTEGRATION_STEP)
+            h = np.where(np.abs(since) > j * _INTEGRATION_STEP, h, 0.0)[:, None]
             x = _step_runge_kutta(lambda state: _glonass_motion(state, eph["a"]), x, h)
         return {
             "p": x[:, :3],

@@ -208,8 +208,8 @@ def _interpolate_orbit(nodes: tuple[Array, Array], t: Array, zero: float) -> Arr
     weight *= np.where(_NODES % 2 == 0, -1.0, 1.0)
     placed = rotate_earth(p[use].reshape(-1, 3), -x.ravel()).reshape(len(t), _NODES, 3)
     out = np.einsum("nk,nki->ni", weight, placed)
-    usual = float(np.median(np.diff(at)))
-    out[(t < at[0] - 1.0) | (t > at[-1] + 1.0) | (span > 2.0 * _NODES * usual)] = np.nan
+    typical = float(np.median(np.diff(at)))
+    out[(t < at[0] - 1.0) | (t > at[-1] + 1.0) | (span > 2.0 * _NODES * typical)] = np.nan
     return np.asarray(out)
 
 

@@ -128,8 +128,8 @@ def _plausible(obs: Observations) -> Observations:
         return obs
     code, carrier, doppler = (np.where(bad, np.nan, x) for x in (obs.code, obs.carrier, obs.doppler))
     sentence = f"{bad.sum()} observations are beyond what a receiver can measure and are left out"
-    said = Note("raw.impossible", sentence)
-    return replace(obs, code=code, carrier=carrier, doppler=doppler, remarks=(*obs.remarks, said))
+    remark = Note("raw.impossible", sentence)
+    return replace(obs, code=code, carrier=carrier, doppler=doppler, remarks=(*obs.remarks, remark))
 
 
 @dataclass(frozen=True)

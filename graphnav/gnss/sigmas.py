@@ -18,7 +18,7 @@ _PHASE = 1e-3  # m at the zenith: reflections and the loop's own, the same sourc
 _IONOSPHERE, _TROPOSPHERE = 0.5, 0.3
 _CARRIER = 0.003  # m at the zenith, of reflections in each of two receivers' carriers (RTKLIB 2.4.3, rtkpos.c, varerr)
 LEAST = 20.0  # dB-Hz that a signal without a C/N0, or below it, is taken to have
-_USUAL = 45.0  # dB-Hz where a file says nothing of it
+_DEFAULT = 45.0  # dB-Hz where a file says nothing of it
 
 
 def code_sigma(cn0: Array, elevation: Array, ionosphere: Array) -> Array:
@@ -51,4 +51,4 @@ def _thermal(cn0: Array, wavelength: Array) -> Array:
 
 
 def _power(cn0: Array) -> Array:
-    return np.maximum(np.where(np.isfinite(cn0), cn0, _USUAL), LEAST)
+    return np.maximum(np.where(np.isfinite(cn0), cn0, _DEFAULT), LEAST)

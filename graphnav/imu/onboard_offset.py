@@ -47,11 +47,11 @@ def without_onboard_offset(recording: Recording, settings: Settings) -> tuple[Re
     if compute_evidence(imu, offset) < 2.0 * np.log(_ODDS):
         return recording, ()
     most = 1e3 * float(np.abs(offset).max())
-    said = Note(
+    note = Note(
         "imu.onboard_offset",
         f"the unit corrected its gyro's offset while it rested, by up to {most:.1f} mrad/s: undone",
     )
-    return replace(recording, imu=replace(imu, gyro=imu.gyro + offset)), (said,)
+    return replace(recording, imu=replace(imu, gyro=imu.gyro + offset)), (note,)
 
 
 def offset_learnt(imu: Imu) -> Array:

@@ -21,10 +21,10 @@ _BLOCK = 1 << 18  # bytes handled at once: keeps the working arrays in the proce
 _SLAB = 1 << 22  # rows of a column held in one piece: 32 MB, which go back to the system when they are let go
 _COMMA, _MINUS, _POINT, _LINE = b",-.\n"
 _PAD = 16  # bytes before a block, for words that reach back beyond it
-_MOST = 16  # digits read on each side of the point
+_MOST_DIGITS = 16  # digits read on each side of the point
 _U = np.uint64
 _TENS = 10 ** np.arange(19, dtype=_U)
-_LAST = np.array([2**64 - 2 ** (64 - 8 * k) for k in range(9)], _U)  # the last k bytes of a word
+_LAST_BYTES = np.array([2**64 - 2 ** (64 - 8 * k) for k in range(9)], _U)  # the last k bytes of a word
 
 
 def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array]:
@@ -73,7 +73,7 @@ def _columns(text: bytes, width: int, use: list[int]) -> Array:
     negative = b[first] == _MINUS
     n_whole, n_part = point - first - negative, np.maximum(stop - point - 1, 0)
     digits = n_whole + n_part
-    plain = (n_whole <= _MOST) & (n_part <= _MOST) & (digits > 0) & (digits < len(_TENS))
+    plain = (n_whole <= _MOST_DIGITS) & (n_part <= _MOST_DIGITS) & (digits > 0) & (digits < len(_TENS))
     n_whole, n_part = n_whole * plain, n_part * plain
     whole, whole_plain = _digits(text, point, n_whole)
     part, part_plain = _digits(text, stop, n_part)
@@ -110,7 +110,7 @@ def _digits(text: bytes, end: Array, n: Array) -> tuple[Array, Array]:
 def _eight(text: bytes, end: Array, n: Array) -> tuple[Array, Array]:
     """`_digits` for n of 8 at most."""
     words = np.ndarray(len(text) - 7, "<u8", text, 0, (1,))  # the eight bytes from each byte on, the first lowest
-    within = _LAST.take(n)
+    within = _LAST_BYTES.take(n)
     word = (words.take(end - 8) ^ _U(0x3030303030303030)) & within
     plain = ((word + _U(0x0606060606060606) | word) & _U(0xF0F0F0F0F0F0F0F0)) == 0
     word = word * _U(10) + (word >> _U(8))  # pairs of digits, then fours, then eight

@@ -322,16 +322,16 @@ def fixes_by_type(rows: Table, numbers: str) -> NDArray[np.intp] | None:
     RecordingError
         For a number that is no type, naming the line and the numbers there are.
     """
-    said, known = rows["type"], NMEA_TYPES if numbers == "nmea" else {k: k for k in FIX_TYPES}
-    bad = np.flatnonzero(~np.isnan(said) & ~np.isin(said, list(known)))
+    types, known = rows["type"], NMEA_TYPES if numbers == "nmea" else {k: k for k in FIX_TYPES}
+    bad = np.flatnonzero(~np.isnan(types) & ~np.isin(types, list(known)))
     if len(bad):
         there = ", ".join(f"{k} {FIX_TYPES[ours]}" for k, ours in known.items() if ours)
         hint = "" if numbers == "nmea" else '; if they are GGA\'s, say units = { type = "nmea" }'
         where = rows.where(bad[0], "type")
         raise RecordingError(
-            f"{where}: {said[bad[0]]:g} is no type of fix: {there}, blank where unknown{hint}", key="gnss.type"
+            f"{where}: {types[bad[0]]:g} is no type of fix: {there}, blank where unknown{hint}", key="gnss.type"
         )
-    return fix_types(said, known)
+    return fix_types(types, known)
 
 
 # 1-sigma of a vertical velocity that is taken as zero because a receiver gives only speed and course: a slope of 10 %
