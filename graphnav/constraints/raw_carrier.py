@@ -84,7 +84,7 @@ class _Pairs:
     clock: Array  # (E,) m, of the receiver since the epoch before, roughly
 
 
-def _epochs(recording: Recording, settings: Settings) -> Array:
+def _list_epochs(recording: Recording, settings: Settings) -> Array:
     raw = select_observations(recording, settings) if _use_differences(recording, settings) else None
     return np.empty(0) if raw is None else np.unique(raw.t[np.isfinite(raw.carrier)])
 
@@ -142,7 +142,7 @@ class GnssAntennaClone(Constraint):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        return _epochs(recording, settings)
+        return _list_epochs(recording, settings)
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssAntennaClone | None:
@@ -196,7 +196,7 @@ class GnssCarrier(SatelliteConstraint):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        return _epochs(recording, settings)
+        return _list_epochs(recording, settings)
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssCarrier | None:
@@ -249,7 +249,7 @@ class GnssCarrier(SatelliteConstraint):
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        antenna, lever = self._antenna(states, parameters)
+        antenna, lever = self._place_antenna(states, parameters)
         odd = self.odd[rows]
         before = np.where(odd[:, None] == 0, parameters[CLONES[0]], parameters[CLONES[1]])
         nearer, e = range_change(self.s_n[rows], antenna, self.nominal[rows])

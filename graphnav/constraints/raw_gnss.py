@@ -202,7 +202,7 @@ class SatelliteConstraint(Constraint):
         there, which = np.unique(self.level, return_inverse=True)
         return tuple(f"{self.name}.{_CLASSES[int(k)]}" for k in there), which[:, None]
 
-    def _antenna(self, states: States, parameters: dict[str, Array]) -> tuple[Array, Array]:
+    def _place_antenna(self, states: States, parameters: dict[str, Array]) -> tuple[Array, Array]:
         """Antennas in n (N, 3), and lever arms (3,) or (N, 3)."""
         lever = parameters.get(LEVER_ARM, self.lever_arm)
         return states.p + rotation.mv(states.R_nb, lever), lever
@@ -245,7 +245,7 @@ class RangeConstraint(SatelliteConstraint):
         self, states: States, parameters: dict[str, Array], rows: slice | Array, delay: str, factor: Array
     ) -> tuple[Array, dict[str, Array], Array]:
         """Residuals (n,), Jacobians, and directions (n, 3); a parameter delays each row by its factor (n,)."""
-        antenna, lever = self._antenna(states, parameters)
+        antenna, lever = self._place_antenna(states, parameters)
         change, e = range_change(self.s_n[rows], antenna, self.nominal[rows])
         residual = change + self.offset[rows] + parameters[CLOCK][:, 0] + factor * parameters[delay][:, 0]
         J = {
@@ -386,7 +386,7 @@ class GnssDoppler(SatelliteConstraint):
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        antenna, lever = self._antenna(states, parameters)
+        antenna, lever = self._place_antenna(states, parameters)
         u, moved = antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
         away = self.s_n[rows] - antenna
         distance = np.linalg.norm(away, axis=1)[:, None]

@@ -56,7 +56,7 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
         return _UNKNOWN
     rate = b.rate[i:j]
     bias = 0.5 * (rate[:n0].mean(axis=0) + rate[n1:].mean(axis=0))
-    left, yaw = _level(b.force[i:j], rate - bias, n0, b.period)
+    left, yaw = _level_force(b.force[i:j], rate - bias, n0, b.period)
     if np.abs(yaw).max() > _STRAIGHT:
         return _UNKNOWN
     if n1 <= n0:
@@ -112,7 +112,7 @@ def find_speed_beside(b: Blocks, span: Array, way: int) -> Outwards | None:
     if n0 < 3 or j - i <= n0:
         return None
     force, rate, t = b.force[i:j][::way], b.rate[i:j][::way], b.t[i:j][::way]
-    left, yaw = _level(force, way * (rate - rate[:n0].mean(axis=0)), n0, b.period)
+    left, yaw = _level_force(force, way * (rate - rate[:n0].mean(axis=0)), n0, b.period)
     n = int(np.argmax(np.append(np.abs(yaw[n0:]) > _STRAIGHT, True)))
     left, yaw, T = left[n0 : n0 + n], np.abs(yaw[n0 : n0 + n]), b.period * np.arange(1, n + 1)
     # densities of white noise, by the scatter in the stretch, and what they leave of its means
@@ -147,14 +147,14 @@ def at_rest_until(b: Blocks, span: Array, way: int, most: float, limit: float) -
         return end
     force, rate, t = b.force[i:j][::way], b.rate[i:j][::way], b.t[i:j][::way]
     # backwards in time everything turns the other way
-    left, _ = _level(force, way * (rate - rate[:n0].mean(axis=0)), n0, b.period)
+    left, _ = _level_force(force, way * (rate - rate[:n0].mean(axis=0)), n0, b.period)
     speed = np.abs(np.cumsum(left[n0:]) * b.period)
     over = np.flatnonzero(speed > limit)
     last = n0 + (int(over[0]) if len(over) else len(speed)) - 1
     return float(t[last])
 
 
-def _level(force: Array, omega: Array, still: int, period: float) -> tuple[NDArray[np.complex128], Array]:
+def _level_force(force: Array, omega: Array, still: int, period: float) -> tuple[NDArray[np.complex128], Array]:
     """Horizontal force (n,), right + i forward, without gravity and without what it was at first; and the yaw.
 
     The first `still` rows stand; `omega` (n, 3) is without bias.

@@ -130,7 +130,7 @@ def window_means(b: Blocks, length: float) -> Means | None:
     )
 
 
-def _means(scene: Scene) -> Means | None:
+def _compute_means(scene: Scene) -> Means | None:
     return window_means(scene.blocks, scene.settings.glrt.window)
 
 
@@ -148,7 +148,7 @@ class _Windowed(Detector):
     @classmethod
     def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
         name, settings, noise = cls.name, scene.settings.glrt, scene.recording.imu.noise
-        m = scene.share(_means)
+        m = scene.share(_compute_means)
         least = _AT_NOISE[name]
         if m is None:
             none = np.zeros(0)

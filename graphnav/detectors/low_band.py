@@ -110,14 +110,14 @@ def detect_low_band(
     spread = measure_spreads(low, window)
     s = scale(low, noise, settings, spread)
     found = compute_statistic(spread, s)
-    threshold, notes = _threshold(t, found, settings, moving, low.period, s)
+    threshold, notes = _find_threshold(t, found, settings, moving, low.period, s)
     mask = found < threshold
     # a window says nothing of where in it motion began: only what all windows over it call still is
     spans = spans_of(mask, t, 0.5 * settings.window)
     return Detection(NAME, t, found, threshold, mask, longer_than(spans, settings.window), notes), s
 
 
-def _threshold(
+def _find_threshold(
     t: Array, found: Array, settings: LowBandSettings, moving: Array, period: float, s: Scale
 ) -> tuple[float, tuple[str, ...]]:
     if not settings.from_data:

@@ -139,7 +139,7 @@ def _run(
         except EstimationError as error:
             if len(parts) == 1:
                 raise
-            notes.append(Note("pieces.left_out", f"{_span(recording, part.recording)} left out: {error}"))
+            notes.append(Note("pieces.left_out", f"{_describe_span(recording, part.recording)} left out: {error}"))
     if not found:
         raise EstimationError(
             f"'{recording.name}': no piece between its IMU gaps can be solved", key="pieces.none_solved"
@@ -161,7 +161,7 @@ def _solve_with_retry(
     except (EstimationError, np.linalg.LinAlgError) as error:
         if isinstance(error, EstimationError) and error.key != "solver.breakdown":
             raise
-        for other, model, reason in _simpler(settings, noise):
+        for other, model, reason in _simplify(settings, noise):
             try:
                 again = _solve(recording, other, frame, solvers, progress, model)
             except (EstimationError, np.linalg.LinAlgError):
@@ -171,7 +171,7 @@ def _solve_with_retry(
         raise
 
 
-def _simpler(settings: Settings, noise: NoiseModel | None) -> Iterator[tuple[Settings, NoiseModel | None, Note]]:
+def _simplify(settings: Settings, noise: NoiseModel | None) -> Iterator[tuple[Settings, NoiseModel | None, Note]]:
     """Settings and noise models that ask less of a covariance, and what to say of them."""
     still = settings.standstill.model_copy(update={"held_position": False})
     if settings.standstill.held_position:
@@ -344,5 +344,5 @@ def _split_pieces(recording: Recording, settings: Settings) -> tuple[list[Record
     return pieces, notes
 
 
-def _span(recording: Recording, piece: Recording) -> str:
+def _describe_span(recording: Recording, piece: Recording) -> str:
     return f"{piece.start - recording.start:.0f} to {piece.end - recording.start:.0f} s"

@@ -66,7 +66,7 @@ class Problem:
     @cached_property
     def chains(self) -> tuple[ParameterChain, ...]:
         """The parameters with their nodes."""
-        return _chains(self.parameters.values(), self.t)
+        return _build_chains(self.parameters.values(), self.t)
 
     @cached_property
     def columns(self) -> dict[str, slice]:
@@ -160,7 +160,7 @@ def build_problem(
         motion=motion,
         prior=prior,
         constraints=built,
-        notes=(*_notes(samples, recording), *remarks, *(note for rows in built for note in rows.notes)),
+        notes=(*_describe_samples(samples, recording), *remarks, *(note for rows in built for note in rows.notes)),
         imu_noise=recording.imu.noise,
     )
 
@@ -203,7 +203,7 @@ def to_samples(stationary: Array | None, recording: Recording) -> Array:
     return np.stack([t[first[kept]], t[last[kept]]], -1)
 
 
-def _chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterChain, ...]:
+def _build_chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterChain, ...]:
     chains = []
     for p in parameters:
         if p.begins is not None:
@@ -229,7 +229,7 @@ def _keep_apart(keyframes: bytes, spacing: float) -> Array:
     return np.array(out)
 
 
-def _notes(samples: Samples, recording: Recording) -> tuple[str, ...]:
+def _describe_samples(samples: Samples, recording: Recording) -> tuple[str, ...]:
     if not len(samples.bridged):
         return ()
     length = samples.bridged[:, 1] - samples.bridged[:, 0]

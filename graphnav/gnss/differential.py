@@ -52,9 +52,9 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     for satellite, signal in sorted({(int(s), int(g)) for s, g in zip(rover.satellite, rover.signal, strict=True)}):
         own = (rover.satellite == satellite) & (rover.signal == signal)
         there = base.satellite == satellite
-        counted = there & (arc >= 0) & (base.signal == _partner(base, arc, satellite // 100, signal))
+        counted = there & (arc >= 0) & (base.signal == _find_partner(base, arc, satellite // 100, signal))
         if counted.sum() > 1:
-            carrier_difference[own], base_arc[own] = _within_arcs(
+            carrier_difference[own], base_arc[own] = _draw_within_arcs(
                 rover.t[own], base.t[counted], of_carrier[counted], arc[counted]
             )
         if (satellite, signal) in alike:
@@ -76,7 +76,7 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     ), notes
 
 
-def _partner(base: RawGnss, arc: NDArray[np.intp], system: int, signal: int) -> int:
+def _find_partner(base: RawGnss, arc: NDArray[np.intp], system: int, signal: int) -> int:
     """The base's signal whose carriers stand against those of a rover's signal, the same for all of a system.
 
     The same one, else that of the same frequency that the base has most of: by how much of a cycle they are apart is
@@ -89,7 +89,7 @@ def _partner(base: RawGnss, arc: NDArray[np.intp], system: int, signal: int) -> 
     return int(found[np.argmax(many)])
 
 
-def _within_arcs(t: Array, at: Array, value: Array, arc: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+def _draw_within_arcs(t: Array, at: Array, value: Array, arc: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
     """Values (N,) on lines between times of one arc, and that arc; NaN and -1 between two arcs and far from any time.
 
     At a base's own epoch, but for the milliseconds that clocks are apart by, its value holds without a line.

@@ -105,8 +105,8 @@ class Ephemerides:
         same = {(k.satellite, k.toe, k.toc, k.fnav): k for k in kepler}
         alike = {(g.satellite, g.toe): g for g in glonass}
         return Ephemerides(
-            _columns(Kepler, sorted(same.values(), key=lambda k: k.toe)),
-            _columns(Glonass, sorted(alike.values(), key=lambda g: g.toe)),
+            _take_columns(Kepler, sorted(same.values(), key=lambda k: k.toe)),
+            _take_columns(Glonass, sorted(alike.values(), key=lambda g: g.toe)),
             klobuchar,
             remarks,
         )
@@ -269,7 +269,7 @@ class Ephemerides:
         for j in range(steps):
             h = np.clip(since - np.sign(since) * j * _INTEGRATION_STEP, -_INTEGRATION_STEP, _INTEGRATION_STEP)
             h = np.where(np.abs(since) > j * _INTEGRATION_STEP, h, 0.0)[:, None]
-            x = _step_runge_kutta(lambda state: _glonass_motion(state, eph["a"]), x, h)
+            x = _step_runge_kutta(lambda state: _derive_glonass(state, eph["a"]), x, h)
         return {
             "p": x[:, :3],
             "v": x[:, 3:],
@@ -278,7 +278,7 @@ class Ephemerides:
         }
 
 
-def _columns(kind: type, some: list) -> dict[str, Array]:  # type: ignore[type-arg]
+def _take_columns(kind: type, some: list) -> dict[str, Array]:  # type: ignore[type-arg]
     whole = {f.name: np.array([getattr(one, f.name) for one in some]) for f in fields(kind)}
     whole["satellite"] = whole["satellite"].astype(np.int16)
     if not some:
@@ -308,7 +308,7 @@ def rotate_earth(p: Array, seconds: Array) -> Array:
     return _turn_about_z(p, EARTH_RATE * seconds)
 
 
-def _glonass_motion(x: Array, a: Array) -> Array:
+def _derive_glonass(x: Array, a: Array) -> Array:
     p, v = x[:, :3], x[:, 3:]
     r2 = np.sum(p * p, axis=1)
     r3 = r2 * np.sqrt(r2)

@@ -99,7 +99,7 @@ def once(obs: Observations) -> Observations:
     RecordingError
         If their times are years apart.
     """
-    obs = _plausible(obs)
+    obs = _drop_impossible(obs)
     span = float(np.ptp(obs.t)) if len(obs) else 0.0
     if not span <= _LONGEST:
         raise RecordingError(
@@ -120,7 +120,7 @@ def once(obs: Observations) -> Observations:
     )
 
 
-def _plausible(obs: Observations) -> Observations:
+def _drop_impossible(obs: Observations) -> Observations:
     """Without the values that no receiver can have measured."""
     with np.errstate(invalid="ignore"):
         bad = (np.abs(obs.code) > _FARTHEST) | (np.abs(obs.doppler) > _FASTEST) | (np.abs(obs.carrier) > _MOST_CYCLES)

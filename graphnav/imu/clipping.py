@@ -50,13 +50,13 @@ def find_cut_peaks(t: Array, x: Array, least: float, highest: Array | None = Non
     `highest` (2,) is what the sensor is known to have read at other times, up and down.
     """
     most = np.zeros(2) if highest is None else highest
-    if not (sure := _flat(t, x, least, _BAND, most)):
+    if not (sure := _find_flat(t, x, least, _BAND, most)):
         return []
-    soft = _flat(t, x, least, _SOFT_BAND, most)
+    soft = _find_flat(t, x, least, _SOFT_BAND, most)
     return soft + [p for p in sure if all(p.last <= q.first or q.last <= p.first for q in soft)]
 
 
-def _flat(t: Array, x: Array, least: float, band: float, highest: Array) -> list[Peak]:
+def _find_flat(t: Array, x: Array, least: float, band: float, highest: Array) -> list[Peak]:
     """The peaks that are within `band` of their height for longer than their sides allow."""
     found = []
     for sign, most in zip((1.0, -1.0), highest, strict=True):

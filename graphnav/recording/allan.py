@@ -51,10 +51,13 @@ class Allan:
         """The lines to paste under [imu.noise]: root mean squares over the axes."""
         out = []
         for name, noise, unit in (("gyro", self.gyro_noise, "rad/s"), ("accel", self.accel_noise, "m/s2")):
-            out.append(_line(f"{name}_noise_density", _rms(noise.white), f"{unit}/sqrt(Hz)"))
-            walk, why = _rms(noise.walk), "rate random walk"
+            out.append(_line(f"{name}_noise_density", _compute_rms(noise.white), f"{unit}/sqrt(Hz)"))
+            walk, why = _compute_rms(noise.walk), "rate random walk"
             if walk == 0.0:
-                walk, why = _rms(noise.instability / np.sqrt(noise.floor)), "bias instability over the root of its time"
+                walk, why = (
+                    _compute_rms(noise.instability / np.sqrt(noise.floor)),
+                    "bias instability over the root of its time",
+                )
             out.append(_line(f"{name}_bias_walk", walk, f"{unit}/sqrt(s): {why}"))
         return out
 
@@ -139,7 +142,7 @@ def _fit(tau: Array, deviation: Array, count: int) -> AllanFigures:
     return AllanFigures(white, instability, walk, tau[np.argmin(deviation, axis=0)])
 
 
-def _rms(x: Array) -> float:
+def _compute_rms(x: Array) -> float:
     return float(np.sqrt(np.mean(np.square(x))))
 
 

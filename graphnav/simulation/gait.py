@@ -123,9 +123,9 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     begins = np.where(np.arange(K) == 0, off - typical, strike)
     ends = np.where(np.arange(K) == K - 1, strike + typical, off)
 
-    pitch = _pitch(t, steps, begins, ends, style, vary) + sway[:, 0]
-    psi = _heading(t, steps, begins, style, vary)
-    roll = _roll(t, steps, begins, style, vary) + sway[:, 1]
+    pitch = _make_pitch(t, steps, begins, ends, style, vary) + sway[:, 0]
+    psi = _make_heading(t, steps, begins, style, vary)
+    roll = _make_roll(t, steps, begins, style, vary) + sway[:, 1]
 
     # the stride in whose swing each time lies, and how far it is through it
     k = np.clip(np.searchsorted(off[:-1], t) - 1, 0, K - 2)
@@ -148,7 +148,7 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     up = h + air * (gaussian_filter1d(h, _SWING / STEP) - h) + gaussian_filter1d(clearance, style.give / STEP)
     east = base[:, 0] + along * np.sin(psi) + aside * np.cos(psi)
     north = base[:, 1] + along * np.cos(psi) - aside * np.sin(psi)
-    x = np.column_stack([east, north, up, roll, pitch, psi]) + _ring(t, strike[1:], style, rng)
+    x = np.column_stack([east, north, up, roll, pitch, psi]) + _make_ring(t, strike[1:], style, rng)
     stances = np.column_stack([begins + _FLAT * (ends - begins), begins + _HEEL_OFF * (ends - begins)])
     stances[0, 0], stances[-1, 1] = 0.0, end
     return Foot(spline(0.0, STEP, x, DEGREE), 0.0, end, np.column_stack([strike, off]), stances)
@@ -163,7 +163,7 @@ def _smooth(t: Array, knots: list[Array], values: list[Array]) -> Array:
     return gaussian_filter1d(out, _MUSCLE / STEP, mode="nearest")
 
 
-def _pitch(t: Array, steps: Footprints, begins: Array, ends: Array, style: Style, vary: Array) -> Array:
+def _make_pitch(t: Array, steps: Footprints, begins: Array, ends: Array, style: Style, vary: Array) -> Array:
     K, D = len(steps), ends - begins
     knots, values = [steps.strike[1:]], [style.strike_pitch * vary[1:, 3]]
     for share, value in _ROLLING:
@@ -181,7 +181,7 @@ def _pitch(t: Array, steps: Footprints, begins: Array, ends: Array, style: Style
     return np.deg2rad(_smooth(t, knots, values))
 
 
-def _heading(t: Array, steps: Footprints, begins: Array, style: Style, vary: Array) -> Array:
+def _make_heading(t: Array, steps: Footprints, begins: Array, style: Style, vary: Array) -> Array:
     """Turning on the floor with the heel's rising, the rest in the air with a little swing of the toes."""
     S = steps.strike[1:] - steps.off[:-1]
     D = steps.off - begins
@@ -193,7 +193,7 @@ def _heading(t: Array, steps: Footprints, begins: Array, style: Style, vary: Arr
     return _smooth(t, knots, values)
 
 
-def _roll(t: Array, steps: Footprints, begins: Array, style: Style, vary: Array) -> Array:
+def _make_roll(t: Array, steps: Footprints, begins: Array, style: Style, vary: Array) -> Array:
     """On the outer edge at the strike, level on the floor, inward at lift-off, outward in the air."""
     S = steps.strike[1:] - steps.off[:-1]
     D = steps.off - begins
@@ -215,7 +215,7 @@ def _share_of_swing(u: Array) -> Array:
     return BSpline(knots, _SPEED / _SPEED.mean(), len(_SPEED) - 1).antiderivative()(u)
 
 
-def _ring(t: Array, strikes: Array, style: Style, rng: np.random.Generator) -> Array:
+def _make_ring(t: Array, strikes: Array, style: Style, rng: np.random.Generator) -> Array:
     """(J, 6) what is left of a strike: shoe, flesh and mounting ring and die out within some 0.15 s.
 
     Movements of `style.impact` and turns such as go with them at a foot's size.

@@ -18,7 +18,7 @@ from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
 
 SEEDS = 10
-RATE = 50.0  # Hz, of the IMU; keyframes are a second apart
+RATE = 100.0  # Hz, of the IMU; keyframes are a second apart
 # Wheels and stops hold exactly on these drives, which no sigma is made for; simulated ones that slip and sway are in
 # `tests/constraints/test_vehicle.py`.
 INERTIAL = {

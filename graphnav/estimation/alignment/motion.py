@@ -103,7 +103,7 @@ def align_in_motion(
     )
     bias = _estimate_rate(imu)
     rp = level(recording, begin)
-    heading = _heading_of_accelerations(part, frame, rp, bias)
+    heading = _fit_heading(part, frame, rp, bias)
     tried = _try_headings(part, settings, frame, smooth, rp, heading, bias)
     if not tried:
         raise EstimationError(
@@ -133,7 +133,7 @@ def align_in_motion(
     return carry_back(recording, settings, best, R, wide, own, begin, notes)
 
 
-def _heading_of_accelerations(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> float:
+def _fit_heading(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> float:
     """Heading (rad) at the start of `part` by which levelled accelerations become those of the fixes.
 
     With both horizontal accelerations as complex numbers east + i north, fixes = z * felt + d by least squares;

@@ -65,7 +65,7 @@ def faults(
     figures = figures or ReadingStatistics.of(odometer)
     found = [(a, b, GAP) for a, b in gaps(odometer.t, figures.longest)]
     if len(odometer.t) >= 10:
-        motion = _motion(odometer, imu, lag) if imu is not None and len(imu.t) > 10 else None
+        motion = _compute_motion(odometer, imu, lag) if imu is not None and len(imu.t) > 10 else None
         found += _find_wrong(odometer, imu, motion, figures)
         lag = lag if motion is None else motion.lag
     found.sort()
@@ -90,7 +90,7 @@ def _find_axes(imu: Imu) -> tuple[Array, Array]:
     return ahead / max(float(np.linalg.norm(ahead)), 1e-9), up
 
 
-def _motion(odometer: Odometer, imu: Imu, known: float | None) -> _InertialMotion | None:
+def _compute_motion(odometer: Odometer, imu: Imu, known: float | None) -> _InertialMotion | None:
     t, speed = odometer.t, odometer.speed
     dt = np.diff(imu.t, prepend=2 * imu.t[0] - imu.t[1])
     ahead, up = _find_axes(imu)

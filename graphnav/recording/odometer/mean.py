@@ -133,7 +133,7 @@ class ReadingStatistics:
         return float(np.sqrt(max(self.sigma**2 - rounding**2, 0.0))), rounding, 0.0
 
 
-def _from_zero(steps: NDArray[Any]) -> NDArray[Any]:
+def _sum_from_zero(steps: NDArray[Any]) -> NDArray[Any]:
     """Running sums, from zero."""
     out = np.zeros(len(steps) + 1, dtype=steps.dtype)
     np.cumsum(steps, out=out[1:])
@@ -170,25 +170,25 @@ class MeanSpeed:
             across |= (t[:-1] < end) & (t[1:] > begin)
         bad = across | ~good[1:] | ~good[:-1]
         counted = odometer.way is not None
-        distance = odometer.way if odometer.way is not None else _from_zero(0.5 * (speed[1:] + speed[:-1]) * step)
+        distance = odometer.way if odometer.way is not None else _sum_from_zero(0.5 * (speed[1:] + speed[:-1]) * step)
         white, rounding, ends = figures.sigmas(odometer)
         return cls(
             t,
             speed,
             np.asarray(distance),
             counted,
-            _from_zero(bad.astype(np.intp)),
-            _from_zero((speed[1:] != speed[:-1]).astype(np.intp)),
+            _sum_from_zero(bad.astype(np.intp)),
+            _sum_from_zero((speed[1:] != speed[:-1]).astype(np.intp)),
             white=white,
             rounding=rounding,
             ends=ends,
         )
 
-    def _segment(self, x: Array) -> NDArray[np.intp]:
+    def _find_segment(self, x: Array) -> NDArray[np.intp]:
         """The segment k between t[k] and t[k+1] in which x lies."""
         return np.minimum(np.maximum(np.searchsorted(self.t, x, side="right") - 1, 0), len(self.t) - 2)
 
-    def _at(self, k: NDArray[np.intp], x: Array) -> tuple[Array, Array]:
+    def _interpolate(self, k: NDArray[np.intp], x: Array) -> tuple[Array, Array]:
         """Way and speed at x in the segments k."""
         s, step = x - self.t[k], self.t[k + 1] - self.t[k]
         slope = (self.speed[k + 1] - self.speed[k]) / step
@@ -206,9 +206,9 @@ class MeanSpeed:
         a, b = np.asarray(a, dtype=float) + delay, np.asarray(b, dtype=float) + delay
         if len(self.t) < 2:
             return np.full(np.shape(a), np.nan), np.full(np.shape(a), np.nan)
-        ka, kb = self._segment(a), self._segment(b)
+        ka, kb = self._find_segment(a), self._find_segment(b)
         kb = np.where((b == self.t[kb]) & (kb > ka), kb - 1, kb)
-        (distance_a, v_a), (distance_b, v_b) = self._at(ka, a), self._at(kb, b)
+        (distance_a, v_a), (distance_b, v_b) = self._interpolate(ka, a), self._interpolate(kb, b)
         mean, slope = (distance_b - distance_a) / (b - a), (v_b - v_a) / (b - a)
         covered = (a >= self.t[0]) & (b <= self.t[-1]) & (self.bad[kb + 1] == self.bad[ka])
         return np.where(covered, mean, np.nan), np.where(covered, slope, np.nan)
