@@ -40,15 +40,13 @@ from graphnav.constraints.raw_gnss import (
     IONOSPHERE,
     ONE,
     PER_ROW,
-    PreparedRows,
     SatelliteConstraint,
     common_fields,
     ionosphere_parameter,
-    period_of_epochs,
-    prepare_every,
     range_change,
     select_columns,
 )
+from graphnav.constraints.raw_rows import PreparedRows, period_of_epochs, prepare_every
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import rotation
 from graphnav.core.rotation import Array

@@ -21,16 +21,8 @@ from numpy.typing import NDArray
 from graphnav.config import Settings
 from graphnav.constraints.ambiguities import ambiguity_name
 from graphnav.constraints.base import BuildContext, Linearized
-from graphnav.constraints.raw_gnss import (
-    BIASES,
-    PER_ROW,
-    SATELLITES,
-    PreparedRows,
-    RangeConstraint,
-    common_fields,
-    prepare_rows,
-    select_columns,
-)
+from graphnav.constraints.raw_gnss import BIASES, PER_ROW, SATELLITES, RangeConstraint, common_fields, select_columns
+from graphnav.constraints.raw_rows import PreparedRows, prepare_rows
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array

@@ -33,7 +33,7 @@ LONG = {"noise": {"mode": "stated"}, "solver": {"lag": 1000.0}}
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
-    path = oracle.vehicle_path(130.0, 25.0)
+    path = oracle.vehicle_path(130.0, 50.0)
     made, _ = oracle.drive(path, seed=3, outages=[(60.0, 75.0)], gnss_velocity_sd=(0.1, 0.1, 0.1))
     return raw_drive.with_observations(made, path, noise=1.0, seed=2, carrier=0.003).crop(0.0, 100.0)
 
@@ -126,7 +126,7 @@ def test_it_goes_on_from_its_checkpoint(recording: Recording, rows: list[Row]) -
     for k, row in enumerate(kept):
         online.add(row)
         parts += online.settled()
-        if k % 750 == 749:
+        if k % 1500 == 1499:
             online = pickle.loads(pickle.dumps(online))
     online.finish()
     parts += online.settled()
@@ -168,7 +168,7 @@ def test_loose_coupling_uses_the_fixes(recording: Recording, rows: list[Row]) ->
 # ------------------------------------------------------------------------------------------- carriers against a base
 @pytest.fixture(scope="module")
 def rtk() -> Recording:
-    path = oracle.vehicle_path(130.0, 25.0)
+    path = oracle.vehicle_path(130.0, 50.0)
     made, _ = oracle.drive(path, seed=3, gnss_velocity_sd=(0.1, 0.1, 0.1))
     made = raw_drive.with_observations(made, path, noise=0.3, seed=2).crop(0.0, 50.0)
     return with_carriers(made, path, 0.003)[0]
