@@ -94,13 +94,13 @@ CONSTANTS = (
     Constant(f"{SOLVERS}.watch", "_CLOCKS", "s, between the stamps of IMU and receiver"),
     Constant(f"{SOLVERS}.watch", "_BRAKING", "m/s^2, of a usual manoeuvre"),
     Constant(f"{SOLVERS}.verdicts", "_CHANCE", "fixes that agree by chance", 2.0, whole=True),
-    Constant("graphnav.estimation.posing", "_FAR_AWAY", "m, single fixes in a city"),
+    Constant("graphnav.estimation.building", "_FAR_AWAY", "m, single fixes in a city"),
     Constant(
         "graphnav.estimation.preparation",
         "_LOST",
         "rad: half its square is the share of a vector that linearising loses",
     ),
-    Constant("graphnav.estimation.preparation", "_MOST", "the larger part"),
+    Constant("graphnav.estimation.preparation", "_MOST_WRONG", "the larger part"),
 )
 DERIVED = {"CHANCE": ("_OUTLIER", lambda x: -float(np.log(x))), "FALSE_ALARM": ("_ODDS", lambda x: -float(np.log(x)))}
 

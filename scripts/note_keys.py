@@ -55,14 +55,18 @@ def _error_key(call: ast.Call) -> str | None:
     return _text(named[0]) if named and name.lower().endswith("error") else None
 
 
-def list_keys(key_of: Callable[[ast.Call], str | None] = _key) -> list[str]:
-    """All keys, sorted."""
-    calls = (
+def list_calls() -> list[ast.Call]:
+    """All calls of the code."""
+    return [
         node
         for path in sorted((ROOT / "graphnav").rglob("*.py"))
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.Call)
-    )
+    ]
+
+
+def list_keys(calls: list[ast.Call], key_of: Callable[[ast.Call], str | None]) -> list[str]:
+    """The keys that calls give, sorted."""
     return sorted({key for call in calls if (key := key_of(call))})
 
 
@@ -77,7 +81,8 @@ def _table(keys: list[str]) -> str:
 
 def page() -> str:
     """docs/keys.md."""
-    return HEAD + _table(list_keys()) + ERRORS + _table(list_keys(_error_key))
+    calls = list_calls()
+    return HEAD + _table(list_keys(calls, _key)) + ERRORS + _table(list_keys(calls, _error_key))
 
 
 if __name__ == "__main__":

@@ -26,6 +26,10 @@ Array = NDArray[np.float64]
 AXLE = (0.15, -0.9, -0.65)  # m, RFU, IMU to the point that does not slip sideways
 
 
+class NotTileable(ValueError):
+    """A path that does not end as it begins."""
+
+
 @dataclass(frozen=True)
 class ExactPath:
     """The IMU's exact motion at N + 1 times and its N error-free samples, one for each period between them."""
@@ -60,9 +64,9 @@ class ExactPath:
         """
         turn = self.rph[-1] - self.rph[0]
         if np.abs(self.v[[0, -1]]).max() > 1e-9 or np.abs(self.llh[-1] - self.llh[0]).max() > 1e-12:
-            raise ValueError("only a closed lap that stands at both ends can be tiled")
+            raise NotTileable("only a closed lap that stands at both ends can be tiled")
         if np.abs(np.sin(turn / 2)).max() > 1e-9:
-            raise ValueError("only a lap that ends in its first attitude can be tiled")
+            raise NotTileable("only a lap that ends in its first attitude can be tiled")
 
         def rows(a: Array) -> Array:
             return np.concatenate([a[:1], np.tile(a[1:], (count, 1))])

@@ -22,11 +22,13 @@ import oracle
 import pytest
 from helpers import STEPS, difference, random_states
 
+import graphnav
 from graphnav.app import cli
 from graphnav.config import Settings, read_settings
 from graphnav.constraints import list_constraints
 from graphnav.constraints.base import BuildContext, assemble
 from graphnav.core.earth import LocalFrame
+from graphnav.core.notes import key_of
 from graphnav.detectors import detect
 from graphnav.detectors import list_detectors as known_detectors
 from graphnav.detectors.scene import Scene
@@ -116,8 +118,16 @@ def test_what_a_page_shows_of_a_command_is_what_it_prints(text, clone, capsys):
         assert numbers[0][:last] == pytest.approx(numbers[1][:last], rel=0.05, abs=0.02)
 
 
+ENOUGH = 110.0  # s, as long as data/tokyo
+
+
 def run_alone(text, said):
-    """Run Python as a program would, in a copy of this process: nothing that it registers or draws stays here."""
+    """Run Python as a program would, in a copy of this process: nothing that it registers or draws stays here.
+
+    A recording that it loads ends after `ENOUGH` s.
+    """
+    load = graphnav.load
+    graphnav.load = lambda *given, **options: load(*given, **options).crop(0.0, ENOUGH)
     with said.open("w", encoding="utf-8") as file, redirect_stdout(file), redirect_stderr(file):
         matplotlib.use("Agg", force=True)
         warnings.resetwarnings()
@@ -202,6 +212,16 @@ def test_the_example_of_a_detector_finds_the_stops():
     assert inside.any(axis=1).all()
     nothing = module.Steady.detect(Scene(recording.crop(0.0, 1.0), settings))
     assert len(nothing.intervals) == 0
+
+
+def test_own_constraints_and_detectors_are_used_together():
+    constraint, detector = example("constraints.md").NotSteep, example("detectors.md").Steady
+    recording = read(ROOT / "data" / "tokyo").crop(0.0, 60.0)
+    stated = Settings(noise={"mode": "stated"})
+    solution = graphnav.run(recording, stated, ("ekf",), constraints=[constraint], detectors=[detector])["ekf"]
+    assert solution.counts["not_steep"] == len(solution.t)
+    assert "steady" in [found.name for found in solution.detections]
+    assert "constraint.differences" in map(key_of, solution.notes)
 
 
 def test_the_site_builds_and_every_link_in_it_leads_somewhere(tmp_path):

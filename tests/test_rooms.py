@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -46,9 +47,10 @@ def room_of(path: Path) -> str:
     return "" if first == "__init__.py" else first.removesuffix(".py")
 
 
-def imported(path: Path) -> set[str]:
-    """Dotted names of everything a file imports, at its top or inside functions."""
-    names: set[str] = set()
+@cache
+def read_code(path: Path) -> tuple[set[str], bool]:
+    """Dotted names of everything a file imports, at its top or inside functions; and whether it prints."""
+    names, prints = set[str](), False
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
@@ -56,12 +58,14 @@ def imported(path: Path) -> set[str]:
             assert node.level == 0, f"{path}: a relative import; name the module in full"
             assert node.module is not None
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return names
+        elif isinstance(node, ast.Call):
+            prints |= isinstance(node.func, ast.Name) and node.func.id == "print"
+    return names, prints
 
 
 def rooms_used(path: Path) -> set[str]:
     """Rooms of graphnav that a file imports from."""
-    own = {name.split(".")[1] for name in imported(path) if name.startswith("graphnav.")}
+    own = {name.split(".")[1] for name in read_code(path)[0] if name.startswith("graphnav.")}
     return {room for room in own if (PACKAGE / room).is_dir() or (PACKAGE / f"{room}.py").exists()}
 
 
@@ -81,18 +85,12 @@ def test_a_room_imports_from_what_it_names(room):
 
 @pytest.mark.parametrize(("library", "rooms"), [("gtsam", GTSAM_ROOMS), ("matplotlib", MATPLOTLIB_ROOMS)])
 def test_heavy_libraries_stay_in_their_rooms(library, rooms):
-    users = {room_of(path) for path in FILES if any(name.split(".")[0] == library for name in imported(path))}
+    users = {room_of(path) for path in FILES if any(name.split(".")[0] == library for name in read_code(path)[0])}
     assert users == rooms
 
 
 def test_only_the_command_line_prints():
-    printing = {
-        str(path.relative_to(PACKAGE))
-        for path in FILES
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
-    }
-    assert printing == PRINTING
+    assert {str(path.relative_to(PACKAGE)) for path in FILES if read_code(path)[1]} == PRINTING
 
 
 def loaded(*arguments: str) -> set[str]:

@@ -177,7 +177,7 @@ def test_a_profile_of_another_platform_is_refused_and_a_missing_odometer_is_said
 
 
 def test_a_run_can_be_repeated_with_the_settings_in_its_summary(tmp_path):
-    options = ["--end", "60", "--solver", "ekf", "--noise", "stated", "--quiet"]
+    options = ["--end", "40", "--solver", "ekf", "--noise", "stated", "--quiet"]
     assert cli.run(["smooth", str(TOKYO), "--profile", "car", *options, "-o", str(tmp_path / "a")]) == 0
     again = ["--config", str(tmp_path / "a" / "summary.json")]
     assert cli.run(["smooth", str(TOKYO), *again, *options, "-o", str(tmp_path / "b")]) == 0
@@ -249,10 +249,10 @@ def test_ctrl_c_waits_for_what_must_not_be_cut():
 
 
 def test_a_full_disk_leaves_the_older_results_as_they_were(tmp_path):
-    smooth = ["smooth", str(TOKYO), "--solver", "ekf", "--noise", "stated", "-o", str(tmp_path)]
-    assert cli.run([*smooth, "--end", "50", "--quiet"]) == 0
+    smooth = ["smooth", "kitti", "--solver", "ekf", "--noise", "stated", "-o", str(tmp_path)]
+    assert cli.run([*smooth, "--end", "20", "--quiet"]) == 0
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
-    command = [PROGRAM, *smooth, "--end", "60"]
+    command = [PROGRAM, *smooth, "--end", "30"]
     run = subprocess.run(command, **full_disk(), capture_output=True, text=True, timeout=300)
     assert run.returncode == 2
     assert re.fullmatch(r"graphnav: -o .*: cannot be written \(File too large\); .*\n", run.stderr)

@@ -53,7 +53,7 @@ def read_settings(path: str | Path | None = None, profile: str | None = None) ->
     values: Mapping[str, Any] = {}
     text = ""
     if path is not None and Path(path).suffix == ".json":
-        values = _settings_of_run(Path(path))
+        values = _take_settings_of_run(Path(path))
     elif path is not None:
         values, text = read_toml(Path(path), ConfigError)
     if profile is not None:
@@ -65,7 +65,7 @@ def read_settings(path: str | Path | None = None, profile: str | None = None) ->
     return settings_from(values, "settings" if path is None else str(path), text)
 
 
-def _settings_of_run(path: Path) -> Mapping[str, Any]:
+def _take_settings_of_run(path: Path) -> Mapping[str, Any]:
     """What a summary.json keeps."""
     try:
         values = parse_json(read_text(path, ConfigError))["settings"]
@@ -94,8 +94,8 @@ def settings_text(settings: Settings) -> str:
             if isinstance(value, BaseModel):
                 nested[name] = value
                 continue
-            said = f"# {name} =" if value is None else f"{name} = {toml_value(value)}"
-            lines.append(f"{said:<30} # {field.description}")
+            setting = f"# {name} =" if value is None else f"{name} = {toml_value(value)}"
+            lines.append(f"{setting:<30} # {field.description}")
         for name, inner in nested.items():
             place = f"{at}.{name}" if at else name
             if any(not isinstance(getattr(inner, key), BaseModel) for key in type(inner).model_fields):

@@ -20,14 +20,14 @@ def _switch(value: Any) -> Any:
     return value
 
 
-def _kernel(value: Any) -> Any:
+def _check_kernel(value: Any) -> Any:
     value = _BY_NAME.get(value, value) if isinstance(value, str | bool) else value
     if value not in (*SWITCH, *KERNELS):
         raise ValueError(f"'{value}' must be one of {', '.join((*SWITCH, *KERNELS))}")
     return value
 
 
-def _gate(value: Any) -> Any:
+def _check_gate(value: Any) -> Any:
     if value is None or isinstance(value, str | bool):
         value = _BY_NAME.get(value, value)
     number = isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < float("inf")
@@ -37,8 +37,8 @@ def _gate(value: Any) -> Any:
 
 
 Switch = Annotated[Literal["off", "on", "automatic"], BeforeValidator(_switch)]
-Kernel = Annotated[str, BeforeValidator(_kernel)]
-Gate = Annotated[float | str, BeforeValidator(_gate)]
+Kernel = Annotated[str, BeforeValidator(_check_kernel)]
+Gate = Annotated[float | str, BeforeValidator(_check_gate)]
 
 
 class Outliers(Section):

@@ -125,8 +125,8 @@ class Settings(Section):
         for name in sensors:
             if name not in list_sensors():
                 raise ValueError(f"no sensor '{name}' is known; {suggest_nearest(name, tuple(list_sensors()))}")
-        usual = SensorSettings()  # which need not be kept
-        return {name: one for name, one in sensors.items() if one != usual}
+        default = SensorSettings()  # which need not be kept
+        return {name: one for name, one in sensors.items() if one != default}
 
     def sensor(self, name: str) -> SensorSettings:
         """How a sensor is used; as usual where nothing is set."""

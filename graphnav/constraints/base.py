@@ -145,13 +145,13 @@ class Constraint(ABC):
                 delta[:, at] = step
                 return self.residual(states.plus(delta), parameters, rows)
 
-            jacobians[block] = _differences(residual_at, np.full(3, _STEPS[block]))
+            jacobians[block] = _differentiate(residual_at, np.full(3, _STEPS[block]))
         for p in self.parameters:
 
             def along(step: Array, name: str = p.name) -> Array:
                 return self.residual(states, parameters | {name: parameters[name] + step}, rows)
 
-            jacobians[p.name] = _differences(along, 1e-3 * np.atleast_2d(p.sigma)[0])
+            jacobians[p.name] = _differentiate(along, 1e-3 * np.atleast_2d(p.sigma)[0])
         sigma: Array = self.sigma  # type: ignore[attr-defined]
         return Linearized(self.residual(states, parameters, rows), jacobians, sigma[rows])
 
@@ -164,7 +164,7 @@ class Constraint(ABC):
 _STEPS = {"theta": 1e-5, "p": 1e-1, "v": 1e-2, "ba": 1e-3, "bg": 1e-5}
 
 
-def _differences(f: Callable[[Array], Array], steps: Array) -> Array:
+def _differentiate(f: Callable[[Array], Array], steps: Array) -> Array:
     """(n, m, k) central differences of f (n, m) of a vector (k,) about zero."""
     ways = np.diag(steps)
     return np.stack([(f(d) - f(-d)) / (2.0 * h) for d, h in zip(ways, steps, strict=True)], -1)

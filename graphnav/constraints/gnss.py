@@ -46,7 +46,7 @@ OFFSETS = {f"prior.{name}": name for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET)
 _I3 = np.eye(3)
 _MINUTE = 60.0  # s
 _WHITE = 1e-3  # s, a correlation time that leaves nothing from one fix to the next
-_WINDOW = 0.05  # s each side over which turn rate and force at a fix are averaged
+_HALF_WINDOW = 0.05  # s each side over which turn rate and force at a fix are averaged
 
 
 def _make_empty(*shape: int) -> Array:
@@ -155,7 +155,7 @@ class GnssPosition(Constraint):
             p_n=p_n,
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
             sigma=sd,
-            unit_error=_running_median(gnss.t[used], sd)
+            unit_error=_compute_running_median(gnss.t[used], sd)
             if scene.typical_sigmas is None
             else scene.typical_sigmas[used],
             usual_error=np.median(sd if scene.typical_sigmas is None else scene.typical_sigmas, axis=0),
@@ -179,7 +179,7 @@ class GnssPosition(Constraint):
         return names, 2 * which[:, None] + np.array([0, 0, 1])
 
     def typical_error(self) -> Array:
-        return _typical_error(self)
+        return _bound_typical_error(self)
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         C, R = self.R_ln[rows], states.R_nb
@@ -273,13 +273,13 @@ class GnssVelocity(Constraint):
             g_n=scene.frame.gravity_n(scene.frame.from_llh(gnss.llh[used])),
             omega_n=scene.frame.omega_n,
             lever_arm=gnss.lever_arm,
-            unit_error=_running_median(gnss.t[used], gnss.sd_v[used]),
+            unit_error=_compute_running_median(gnss.t[used], gnss.sd_v[used]),
             processes=(lasting, *_stamp_error(scene.settings, gnss.t[used])),
             **_build_common(scene, VELOCITY_TIME_OFFSET),
         )
 
     def typical_error(self) -> Array:
-        return _typical_error(self)
+        return _bound_typical_error(self)
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         C = self.R_ln[rows]
@@ -303,7 +303,7 @@ class GnssVelocity(Constraint):
         return Linearized(residual, jacobians, self.sigma[rows])
 
 
-def _typical_error(rows: GnssPosition | GnssVelocity) -> Array:
+def _bound_typical_error(rows: GnssPosition | GnssVelocity) -> Array:
     """At least what the receiver claims: a fix that keeps to that is no wrong one, however good the others are."""
     lasting = sum((p.sigma**2 for p in rows.parameters if p.name.startswith((*ERRORS, VELOCITY_ERROR))), np.zeros(3))
     whole = np.sqrt(rows.sigma**2 + lasting * rows.unit_error**2)
@@ -323,7 +323,7 @@ def node_spacing(slow_times: tuple[float, ...], dt: float) -> float:
     return max(dt, min(0.2 * SECONDS, *(0.01 * time for time in slow_times), NODE_SPACING))
 
 
-def _running_median(t: Array, sigma: Array) -> Array:
+def _compute_running_median(t: Array, sigma: Array) -> Array:
     """Running median of sigmas over a minute.
 
     A lasting error times a sigma that jumps from fix to fix would jump with it, and so give itself away.
@@ -355,8 +355,8 @@ def acceleration(states: States, accel: Array, g_n: Array) -> tuple[Array, dict[
 
 def average_around(imu: Imu, x: Array, t: Array) -> Array:
     """(N, 3) mean of an IMU signal around times t: one sample's vibration would be noise times lever arm."""
-    lo = np.searchsorted(imu.t, t - _WINDOW)
-    hi = np.maximum(np.searchsorted(imu.t, t + _WINDOW), lo + 1)
+    lo = np.searchsorted(imu.t, t - _HALF_WINDOW)
+    hi = np.maximum(np.searchsorted(imu.t, t + _HALF_WINDOW), lo + 1)
     lo, hi = np.minimum(lo, len(imu.t) - 1), np.minimum(hi, len(imu.t))
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(x, axis=0)])
     return (total[hi] - total[lo]) / (hi - lo)[:, None]

@@ -40,15 +40,13 @@ from graphnav.constraints.raw_gnss import (
     IONOSPHERE,
     ONE,
     PER_ROW,
-    PreparedRows,
     SatelliteConstraint,
     common_fields,
     ionosphere_parameter,
-    period_of_epochs,
-    prepare_every,
     range_change,
     select_columns,
 )
+from graphnav.constraints.raw_rows import PreparedRows, period_of_epochs, prepare_every
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
@@ -84,7 +82,7 @@ class _Pairs:
     clock: Array  # (E,) m, of the receiver since the epoch before, roughly
 
 
-def _epochs(recording: Recording, settings: Settings) -> Array:
+def _list_epochs(recording: Recording, settings: Settings) -> Array:
     raw = select_observations(recording, settings) if _use_differences(recording, settings) else None
     return np.empty(0) if raw is None else np.unique(raw.t[np.isfinite(raw.carrier)])
 
@@ -142,7 +140,7 @@ class GnssAntennaClone(Constraint):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        return _epochs(recording, settings)
+        return _list_epochs(recording, settings)
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssAntennaClone | None:
@@ -196,7 +194,7 @@ class GnssCarrier(SatelliteConstraint):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        return _epochs(recording, settings)
+        return _list_epochs(recording, settings)
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssCarrier | None:
@@ -249,7 +247,7 @@ class GnssCarrier(SatelliteConstraint):
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        antenna, lever = self._antenna(states, parameters)
+        antenna, lever = self._place_antenna(states, parameters)
         odd = self.odd[rows]
         before = np.where(odd[:, None] == 0, parameters[CLONES[0]], parameters[CLONES[1]])
         nearer, e = range_change(self.s_n[rows], antenna, self.nominal[rows])

@@ -20,36 +20,32 @@ Distances are differences against a nominal place of each epoch, so that no digi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graphnav.config import Settings
-from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.constraints.base import BuildContext, Constraint, Linearized
-from graphnav.constraints.gnss import LEVER_ARM, TIMES, antenna_velocity, average_around, node_spacing, period
+from graphnav.constraints.gnss import LEVER_ARM, TIMES, antenna_velocity, average_around
+from graphnav.constraints.raw_rows import CLOCK, PreparedRows, prepare_rows
 from graphnav.constraints.raw_selection import select_observations
-from graphnav.core import earth, rotation
+from graphnav.core import rotation
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.gnss.atmosphere import obliquity
-from graphnav.gnss.ephemeris import rotate_earth
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import code_sigma, rate_sigma
 from graphnav.gnss.signals import L1, NAMES, C, satellite_name, signal_name
-from graphnav.gnss.single_point import choose_coefficients, look, signal_groups, stretch
+from graphnav.gnss.single_point import signal_groups
 from graphnav.recording import Recording
 
-CLOCK = "receiver_clock"
 BIASES = "gnss_signal_biases"
 IONOSPHERE = "gnss_ionosphere"
 CODE_ERRORS = tuple(f"gnss_code_error_of_{time}" for time in TIMES)
 SATELLITES = "gnss_satellite_errors"
 RATE_ERROR = "gnss_doppler_error"
-_CLOCK_SIGMA = np.array([100.0, 10.0])  # m, m/s, about the single-point solution: next to nothing known
 _ZENITH = 1.5  # m, 1-sigma of what the model of the ionosphere is wrong by: half of the delay on an ordinary day
 # unit/sqrt(s), of what changes over hours. Even a lever arm walks, by a centimetre in three hours: all that rows depend
 # on beside states and clocks has its nodes in common then, one variable of the graph
@@ -65,78 +61,6 @@ _RATE_ERROR = np.array([0.05, 0.05, 0.1])  # m/s
 _LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have a variance factor of their own
 _CLASSES = ("strong", "fair", "weak", "faint")
 PER_ROW = ("keyframe", "s_n", "R_ln", "satellite", "azimuth", "elevation", "level")  # of the fields that are shared
-
-
-@dataclass(frozen=True)
-class PreparedRows:
-    """What all kinds of rows need, of the rows that are used; made once for a scene."""
-
-    raw: RawGnss
-    keyframe: Array
-    s_n: Array  # (N, 3) m, satellites
-    v_n: Array  # (N, 3) m/s
-    R_ln: Array  # (N, 3, 3)
-    azimuth: Array  # (N,) rad, from north to the east
-    elevation: Array  # (N,) rad
-    known: Array  # (N,) m, distance from the nominal antenna with the delays of the atmosphere
-    nominal: Array  # (N, 3) m
-    ionosphere: Array  # (N,) m
-    stretch: Array  # (N,)
-    spacing: float  # s from node to node of whatever changes slowly
-
-    @property
-    def clock(self) -> Parameter:
-        """The receiver's, anew at every epoch."""
-        epochs, first = np.unique(self.raw.t, return_index=True)
-        sigma = np.tile(_CLOCK_SIGMA, (len(epochs), 1))
-        return Parameter(CLOCK, self.raw.receiver_clock[first], sigma, "m, m/s", begins=epochs, reported=True)
-
-    def take(self, which: NDArray[np.bool_]) -> PreparedRows:
-        """Some of the rows."""
-        own = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name not in ("raw", "spacing")}
-        return replace(self, raw=self.raw.take(which), **own)
-
-
-def prepare_every(scene: BuildContext) -> PreparedRows | None:
-    """The rows that are used, with those of epochs that have no keyframe, which is -1 then."""
-    raw = select_observations(scene.recording, scene.settings)
-    if raw is None:
-        return None
-    geometry = look(raw, raw.antenna, choose_coefficients(raw))
-    used = geometry.elevation >= np.radians(scene.settings.raw_gnss.elevation)
-    if not used.any():
-        return None
-    raw = raw.take(used)
-    geometry = look(raw, raw.antenna, choose_coefficients(raw))
-    frame = scene.frame
-    return PreparedRows(
-        raw=raw,
-        keyframe=scene.keyframe_at(raw.t),
-        s_n=(geometry.s - frame.r_e) @ frame.R_ne.T,
-        v_n=rotate_earth(raw.v, geometry.distance / C) @ frame.R_ne.T,
-        R_ln=earth.enu_axes(earth.ecef_to_llh(raw.antenna)) @ frame.R_ne.T,
-        azimuth=geometry.azimuth,
-        elevation=geometry.elevation,
-        known=geometry.distance + geometry.ionosphere + geometry.troposphere,
-        nominal=(raw.antenna - frame.r_e) @ frame.R_ne.T,
-        ionosphere=geometry.ionosphere,
-        stretch=stretch(raw, geometry),
-        spacing=node_spacing(scene.settings.gnss.slow_times, period_of_epochs(raw, scene.settings.raw_gnss)),
-    )
-
-
-def prepare_rows(scene: BuildContext) -> PreparedRows | None:
-    """The rows of epochs that have keyframes."""
-    every = scene.share(prepare_every)
-    if every is None or (every.keyframe >= 0).all():
-        return every
-    there = every.keyframe >= 0
-    return every.take(there) if there.any() else None
-
-
-def period_of_epochs(raw: RawGnss, settings: RawGnssSettings) -> float:
-    """s between the epochs that are used; a piece of a series may have too few to tell."""
-    return period(raw.epochs[0]) if raw.catalogue is None else max(raw.catalogue.period, settings.period)
 
 
 def common_fields(scene: BuildContext, found: PreparedRows) -> dict[str, Any]:
@@ -202,7 +126,7 @@ class SatelliteConstraint(Constraint):
         there, which = np.unique(self.level, return_inverse=True)
         return tuple(f"{self.name}.{_CLASSES[int(k)]}" for k in there), which[:, None]
 
-    def _antenna(self, states: States, parameters: dict[str, Array]) -> tuple[Array, Array]:
+    def _place_antenna(self, states: States, parameters: dict[str, Array]) -> tuple[Array, Array]:
         """Antennas in n (N, 3), and lever arms (3,) or (N, 3)."""
         lever = parameters.get(LEVER_ARM, self.lever_arm)
         return states.p + rotation.mv(states.R_nb, lever), lever
@@ -245,7 +169,7 @@ class RangeConstraint(SatelliteConstraint):
         self, states: States, parameters: dict[str, Array], rows: slice | Array, delay: str, factor: Array
     ) -> tuple[Array, dict[str, Array], Array]:
         """Residuals (n,), Jacobians, and directions (n, 3); a parameter delays each row by its factor (n,)."""
-        antenna, lever = self._antenna(states, parameters)
+        antenna, lever = self._place_antenna(states, parameters)
         change, e = range_change(self.s_n[rows], antenna, self.nominal[rows])
         residual = change + self.offset[rows] + parameters[CLOCK][:, 0] + factor * parameters[delay][:, 0]
         J = {
@@ -386,7 +310,7 @@ class GnssDoppler(SatelliteConstraint):
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        antenna, lever = self._antenna(states, parameters)
+        antenna, lever = self._place_antenna(states, parameters)
         u, moved = antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
         away = self.s_n[rows] - antenna
         distance = np.linalg.norm(away, axis=1)[:, None]

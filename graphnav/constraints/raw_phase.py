@@ -23,7 +23,8 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.ambiguities import ambiguities, ambiguity_name
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
-from graphnav.constraints.raw_gnss import IONOSPHERE, RangeConstraint, common_fields, ionosphere_parameter, prepare_rows
+from graphnav.constraints.raw_gnss import IONOSPHERE, RangeConstraint, common_fields, ionosphere_parameter
+from graphnav.constraints.raw_rows import prepare_rows
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.gnss.arcs import find_arcs

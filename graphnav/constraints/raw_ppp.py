@@ -21,16 +21,8 @@ from numpy.typing import NDArray
 from graphnav.config import Settings
 from graphnav.constraints.ambiguities import ambiguity_name
 from graphnav.constraints.base import BuildContext, Linearized
-from graphnav.constraints.raw_gnss import (
-    BIASES,
-    PER_ROW,
-    SATELLITES,
-    PreparedRows,
-    RangeConstraint,
-    common_fields,
-    prepare_rows,
-    select_columns,
-)
+from graphnav.constraints.raw_gnss import BIASES, PER_ROW, SATELLITES, RangeConstraint, common_fields, select_columns
+from graphnav.constraints.raw_rows import PreparedRows, prepare_rows
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
@@ -102,7 +94,7 @@ class _Ppp(RangeConstraint):
         return np.empty(0) if raw is None else np.unique(raw.t)
 
     @staticmethod
-    def _shared_fields(scene: BuildContext, free: _Free, used: NDArray[np.intp]) -> dict[str, Any]:
+    def _collect_shared_fields(scene: BuildContext, free: _Free, used: NDArray[np.intp]) -> dict[str, Any]:
         rows, common = free.rows, common_fields(scene, free.found)
         at = rows.which[used]
         common |= {name: common[name][at] for name in PER_ROW}
@@ -121,7 +113,7 @@ class _Ppp(RangeConstraint):
             "which": free.which[used],
         }
 
-    def _ranges(
+    def _linearize_free_ranges(
         self, states: States, parameters: dict[str, Array], rows: slice | Array
     ) -> tuple[Array, dict[str, Array]]:
         """Residuals (n,) without ambiguities and code biases, and Jacobians."""
@@ -145,7 +137,7 @@ class GnssPppCode(_Ppp):
         if free is None:
             return None
         rows, raw = free.rows, free.found.raw.take(free.rows.which)
-        common = cls._shared_fields(scene, free, np.arange(len(rows.which)))
+        common = cls._collect_shared_fields(scene, free, np.arange(len(rows.which)))
         size, hours = len(free.satellites), scene.settings.gnss.slow_times[1]
         common["parameters"] += (
             Parameter(
@@ -157,7 +149,7 @@ class GnssPppCode(_Ppp):
         return cls(offset=rows.known - rows.code, sigma=sigma[:, None], **common)
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        residual, J = self._ranges(states, parameters, rows)
+        residual, J = self._linearize_free_ranges(states, parameters, rows)
         own, J[SATELLITES] = select_columns(parameters[SATELLITES], self.which[rows])
         return Linearized((residual + own)[:, None], J, self.sigma[rows])
 
@@ -186,7 +178,7 @@ class GnssPppCarrier(_Ppp):
         if not len(used):
             return None
         raw = free.found.raw.take(rows.which[used])
-        common = cls._shared_fields(scene, free, used)
+        common = cls._collect_shared_fields(scene, free, used)
         names = tuple(ambiguity_name(f"{satellite_name(s)}.free") for s in free.satellites)
         begins_at: list[NDArray[np.intp]] = []
         for k in range(len(names)):
@@ -219,7 +211,7 @@ class GnssPppCarrier(_Ppp):
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        residual, J = self._ranges(states, parameters, rows)
+        residual, J = self._linearize_free_ranges(states, parameters, rows)
         own = (self.which[rows][:, None] == np.arange(len(self.ambiguities))).astype(float)
         residual = residual + np.sum(own * parameters[ORBITS], axis=1)
         J[ORBITS] = own[:, None]

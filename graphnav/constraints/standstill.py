@@ -37,7 +37,7 @@ PLACE = "stop_position"
 _NEIGHBOURS = 5  # intervals over which unrest is looked for
 _SWAY = 2.0 * np.pi  # rad/s, the slowest swaying of a body on springs
 _STILL_V, _STILL_P = 1e-3, 1e-3  # m/s, m: no body stands stiller than this
-_FAR = 60.0  # m/s; times the seconds without a fix: how far from the last one a stop may be
+_FASTEST = 60.0  # m/s; times the seconds without a fix: how far from the last one a stop may be
 _ROLLING = 0.1  # rad/s; a foot that rolls over its stance turns quicker
 _LIFTING = 0.15  # s at either end of standing, in which the heel may have begun to lift
 _STANDING = 0.6  # s; in a walk no stance is that quiet for so long
@@ -62,10 +62,10 @@ def _find_standing(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array
     """
     iv = scene.intervals
     rate = iv.rate[rows]
-    usual = np.empty((len(rows), 3))
+    typical = np.empty((len(rows), 3))
     for one in np.unique(stop):
-        usual[stop == one] = np.median(rate[stop == one], axis=0)
-    still = np.linalg.norm(rate - usual, axis=1) < _ROLLING
+        typical[stop == one] = np.median(rate[stop == one], axis=0)
+    still = np.linalg.norm(rate - typical, axis=1) < _ROLLING
     run = np.cumsum(np.r_[True, (np.diff(stop) != 0) | (np.diff(still) != 0)][: len(rows)]) - 1
     lasts = np.bincount(run, weights=iv.T[rows])
     keep = still & (lasts[run] >= _STANDING)
@@ -228,5 +228,5 @@ def _guess_places(scene: BuildContext, stops: Array) -> Parameter:
         place = np.stack([np.interp(begins, gnss.t, axis) for axis in p.T], -1)
         after = np.clip(np.searchsorted(gnss.t, begins), 1, len(gnss.t) - 1)
         away = np.minimum(np.abs(gnss.t[after] - begins), np.abs(begins - gnss.t[after - 1]))
-    sigma = np.repeat((100.0 + _FAR * away)[:, None], 3, axis=1)
+    sigma = np.repeat((100.0 + _FASTEST * away)[:, None], 3, axis=1)
     return Parameter(PLACE, place, sigma, "m", begins=begins)

@@ -88,7 +88,7 @@ def complaint(source: str | Path, error: ValidationError, model: type[BaseModel]
 def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
     key = ".".join(loc)
     if first["type"] == "extra_forbidden":
-        return Note("key.unknown", f"unknown key '{key}'{_suggestion(loc, model)}")
+        return Note("key.unknown", f"unknown key '{key}'{_suggest(loc, model)}")
     if first["type"] == "missing":
         return Note("key.missing", f"'{key}' is missing")
     if first["type"] == "value_error":  # our own sentence
@@ -133,19 +133,19 @@ def split_names(text: str, known: Sequence[str], option: str, what: str) -> tupl
     return names
 
 
-def _tables(model: type[BaseModel], at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], type[BaseModel]]]:
+def _list_tables(model: type[BaseModel], at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], type[BaseModel]]]:
     """Every table of a file by its place, the whole file first."""
     yield at, model
     for name, field in model.model_fields.items():
         options = (field.annotation, *getattr(field.annotation, "__args__", ()))
         for inner in options:
             if isinstance(inner, type) and issubclass(inner, BaseModel):
-                yield from _tables(inner, (*at, name))
+                yield from _list_tables(inner, (*at, name))
 
 
-def _suggestion(loc: tuple[str, ...], model: type[BaseModel]) -> str:
+def _suggest(loc: tuple[str, ...], model: type[BaseModel]) -> str:
     """'; did you mean ...' with the nearest key of the table `loc` lies in, else of any table."""
-    tables = dict(_tables(model))
+    tables = dict(_list_tables(model))
     here = loc[:-1]
     while here not in tables:
         here = here[:-1]
@@ -165,7 +165,7 @@ def _suggestion(loc: tuple[str, ...], model: type[BaseModel]) -> str:
 
 def _describe_key(loc: tuple[str, ...], model: type[BaseModel]) -> str:
     """The unit and the sentence of a key, in brackets."""
-    tables = dict(_tables(model))
+    tables = dict(_list_tables(model))
     for n in range(len(loc), 0, -1):  # an entry of a tuple has the key of the tuple
         field = tables[loc[: n - 1]].model_fields.get(loc[n - 1]) if loc[: n - 1] in tables else None
         if field is not None:

@@ -36,7 +36,7 @@ def llh_to_ecef(llh: Array) -> Array:
     return columns((n + h) * c * np.cos(lon), (n + h) * c * np.sin(lon), (n * (1 - E2) + h) * s)
 
 
-def _normal(r: Array) -> tuple[Array, Array, Array]:
+def _find_normal(r: Array) -> tuple[Array, Array, Array]:
     """Sine and cosine of geodetic latitude and the distance from the axis (Bowring 1976, closed form).
 
     In error by less than 1e-12 rad below 10 km of height.
@@ -53,7 +53,7 @@ def _normal(r: Array) -> tuple[Array, Array, Array]:
 
 def ecef_to_llh(r: Array) -> Array:
     """Inverse of `llh_to_ecef`, exact to a micrometre below 10 km of height."""
-    s, c, p = _normal(r)
+    s, c, p = _find_normal(r)
     h = p * c + r[..., 2] * s - A * np.sqrt(1.0 - E2 * s * s)
     return np.stack([np.arctan2(s, c), np.arctan2(r[..., 1], r[..., 0]), h], -1)
 
@@ -68,16 +68,16 @@ def enu_axes(llh: Array) -> Array:
 
 def gravity(lat: Array, h: Array) -> Array:
     """Magnitude of normal gravity, m/s^2, at geodetic latitude (rad) and height (m)."""
-    return _gravity(np.sin(lat) ** 2, h)
+    return _compute_gravity(np.sin(lat) ** 2, h)
 
 
-def _gravity(s2: Array, h: Array) -> Array:
+def _compute_gravity(s2: Array, h: Array) -> Array:
     surface = _GAMMA_E * (1.0 + _K_SOMIGLIANA * s2) / np.sqrt(1.0 - E2 * s2)
     return surface * (1.0 - 2.0 / A * (1.0 + F + _M - 2.0 * F * s2) * h + 3.0 * (h / A) ** 2)
 
 
-def _gravity_one(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Gravity (m/s^2) at one point, both in ECEF: `_normal` and `_gravity` in plain numbers."""
+def _compute_gravity_one(x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Gravity (m/s^2) at one point, both in ECEF: `_find_normal` and `_compute_gravity` in plain numbers."""
     p = math.sqrt(x * x + y * y)
     za, pb = z * A, p * B
     size = math.sqrt(za * za + pb * pb)
@@ -151,9 +151,9 @@ class LocalFrame:
         """
         r = self.r_e + np.asarray(p_n, dtype=float) @ self.R_ne
         if r.size == 3:  # a filter asks for one at a time
-            return (np.array(_gravity_one(*r.ravel().tolist())) @ self.R_ne.T).reshape(r.shape)
-        s, c, p = _normal(r)
+            return (np.array(_compute_gravity_one(*r.ravel().tolist())) @ self.R_ne.T).reshape(r.shape)
+        s, c, p = _find_normal(r)
         h = p * c + r[..., 2] * s - A * np.sqrt(1.0 - E2 * s * s)
-        size = -_gravity(s * s, h)
+        size = -_compute_gravity(s * s, h)
         down = np.stack([size * c / p * r[..., 0], size * c / p * r[..., 1], size * s], -1)
         return down @ self.R_ne.T

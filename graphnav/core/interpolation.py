@@ -68,22 +68,22 @@ def interpolate(
     if R is not None:
         R_at = R[k] @ rotation.exp(s * rotation.log(np.swapaxes(R[k], -1, -2) @ R[nxt]))
         if lever_arm is not None:
-            rate = _rates(trajectory.t, R)
-            omega = _lerp(rate[k], rate[nxt], s)
-    p_at = _lerp(p[k], p[nxt], s)
+            rate = _compute_rates(trajectory.t, R)
+            omega = _blend(rate[k], rate[nxt], s)
+    p_at = _blend(p[k], p[nxt], s)
     slope = v if slope is None else slope
     assert slope is not None
     hermite = p_at + s * (1 - s) * ((1 - 2 * s) * (p[k] - p[nxt]) + dt * ((1 - s) * slope[k] - s * slope[nxt]))
     p_at = np.where(np.isfinite(hermite), hermite, p_at)
     v_at = None
     if v is not None:
-        v_at = _lerp(v[k], v[nxt], s)
+        v_at = _blend(v[k], v[nxt], s)
         if R is not None and R_at is not None:
-            seen = _lerp(_apply(np.swapaxes(R[k], -1, -2), v[k]), _apply(np.swapaxes(R[nxt], -1, -2), v[nxt]), s)
+            seen = _blend(_apply(np.swapaxes(R[k], -1, -2), v[k]), _apply(np.swapaxes(R[nxt], -1, -2), v[nxt]), s)
             turned = _apply(R_at, seen)
             v_at = np.where(np.isfinite(turned), turned, v_at)
     cov = full_covariance(trajectory)
-    cov_at = None if cov is None else _lerp(cov[k], cov[nxt], s[:, :, None])
+    cov_at = None if cov is None else _blend(cov[k], cov[nxt], s[:, :, None])
 
     swing = None
     if lever_arm is not None and R_at is not None and omega is not None:
@@ -100,10 +100,10 @@ def interpolate(
     rph = None if R_at is None else rotation.to_rph(R_at)
     known = cov_at is not None and bool(np.isfinite(cov_at[:, 6:9, 6:9]).all((1, 2)).any())
     if known and cov_at is not None and swing is not None and rph is not None and R_at is not None:
-        cov_at = _at_point(cov_at, R_at, rph, np.asarray(lever_arm, dtype=float), swing)
+        cov_at = _move_to_point(cov_at, R_at, rph, np.asarray(lever_arm, dtype=float), swing)
     out = replace(
         trajectory, t=t, llh=p_at if frame is None else frame.to_llh(p_at), v=v_at, rph=rph,
-        sd_p=_sd(cov_at, 0, None), sd_v=_sd(cov_at, 3, None), sd_rph=_sd(cov_at, 6, None),
+        sd_p=_take_sigmas(cov_at, 0, None), sd_v=_take_sigmas(cov_at, 3, None), sd_rph=_take_sigmas(cov_at, 6, None),
         gyro_bias=None, accel_bias=None, covariance=cov_at,
     )  # fmt: skip
     return out, ok
@@ -168,13 +168,13 @@ def place_on_earth(trajectory: Trajectory, frame: LocalFrame, yaw: float, offset
         turn = np.zeros((9, 9))
         turn[0:3, 0:3] = turn[3:6, 3:6] = R_nm
         turn[6:9, 6:9] = np.eye(3)
-        cov = _sandwich(turn, cov)
+        cov = _propagate(turn, cov)
     R_lb = trajectory.R_lb
     return replace(
         trajectory, llh=frame.to_llh(p_n), frame="geodetic", covariance=cov,
         v=None if trajectory.v is None else _apply(R_lm, trajectory.v),
         rph=None if R_lb is None else rotation.to_rph(R_lm @ R_lb),
-        sd_p=_sd(cov, 0, trajectory.sd_p), sd_v=_sd(cov, 3, trajectory.sd_v),
+        sd_p=_take_sigmas(cov, 0, trajectory.sd_p), sd_v=_take_sigmas(cov, 3, trajectory.sd_v),
     )  # fmt: skip
 
 
@@ -188,7 +188,7 @@ def _bracket(times: Array, t: Array, max_gap: float) -> tuple[Any, Array, Any]:
     return k, s, inside & ((dt <= max_gap) | on_row)
 
 
-def _rates(t: Array, R: Array) -> Array:
+def _compute_rates(t: Array, R: Array) -> Array:
     """Body rates (K, 3), rad/s, at the rows: central differences that weigh the nearer neighbour more."""
     if len(t) < 2:
         return np.zeros((len(t), 3))
@@ -198,7 +198,7 @@ def _rates(t: Array, R: Array) -> Array:
     return np.concatenate([rate[:1], inner, rate[-1:]])
 
 
-def _lerp(a: Array, b: Array, s: Array) -> Array:
+def _blend(a: Array, b: Array, s: Array) -> Array:
     # Not a + s (b - a): a NaN neighbour must not spoil a time that falls on a row.
     return np.where(s == 0, a, np.where(s == 1, b, (1 - s) * a + s * b))
 
@@ -207,7 +207,7 @@ def _apply(R: Array, v: Array) -> Array:
     return np.einsum("...ij,...j->...i", R, v)
 
 
-def _sandwich(A: Array, cov: Array) -> Array:
+def _propagate(A: Array, cov: Array) -> Array:
     """A P A' where a NaN in P spoils only the variances it enters."""
     out = A @ np.nan_to_num(cov) @ np.swapaxes(A, -1, -2)
     missing = np.isnan(np.diagonal(cov, axis1=-2, axis2=-1)).astype(float)
@@ -215,16 +215,16 @@ def _sandwich(A: Array, cov: Array) -> Array:
     return np.where(spoilt[..., :, None] | spoilt[..., None, :], np.nan, out)
 
 
-def _at_point(cov: Array, R_lb: Array, rph: Array, arm: Array, swing: Array) -> Array:
+def _move_to_point(cov: Array, R_lb: Array, rph: Array, arm: Array, swing: Array) -> Array:
     """Covariance of the point at the end of a lever arm: d(R l) = -R [l]x theta, d(R (w x l)) alike."""
     to_theta = np.linalg.inv(rotation.rph_jacobian(rph))
     A = np.broadcast_to(np.eye(9), cov.shape).copy()
     A[:, 0:3, 6:9] = -R_lb @ rotation.skew(arm) @ to_theta
     A[:, 3:6, 6:9] = -R_lb @ rotation.skew(swing) @ to_theta
-    return _sandwich(A, cov)
+    return _propagate(A, cov)
 
 
-def _sd(cov: Array | None, first: int, had: Array | None) -> Array | None:
+def _take_sigmas(cov: Array | None, first: int, had: Array | None) -> Array | None:
     if cov is None:
         return had
     variance = np.diagonal(cov, axis1=-2, axis2=-1)[:, first : first + 3]

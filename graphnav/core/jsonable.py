@@ -34,17 +34,17 @@ def write_json(path: Path, values: Any) -> None:
 
 def json_text(values: Any) -> str:
     """Values as JSON, as `write_json` writes them: indented, a list of numbers or words on one line."""
-    return _text(values, "\n")
+    return _write_value(values, "\n")
 
 
 _ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)  # of the C library, as it has no indent
 
 
-def _text(value: Any, line: str) -> str:
+def _write_value(value: Any, line: str) -> str:
     """A value as JSON; `line` is the end of a line and the indent of the next."""
     deeper = line + "  "
     if isinstance(value, Mapping):
-        inner = [f"{_ENCODER.encode(str(key))}: {_text(one, deeper)}" for key, one in value.items()]
+        inner = [f"{_ENCODER.encode(str(key))}: {_write_value(one, deeper)}" for key, one in value.items()]
         return f"{{{deeper}{f',{deeper}'.join(inner)}{line}}}" if inner else "{}"
     if isinstance(value, np.ndarray | np.generic):
         if value.ndim == 2 and value.dtype.kind in "iuf" and np.isfinite(value).all():  # a row a line, all at once
@@ -56,8 +56,8 @@ def _text(value: Any, line: str) -> str:
             if not any(isinstance(one, Mapping | np.ndarray | list | tuple) for one in value):
                 return _ENCODER.encode(value)
         except (TypeError, ValueError):
-            return f"[{', '.join(_text(one, deeper) for one in value)}]"
-        return f"[{deeper}{f',{deeper}'.join(_text(one, deeper) for one in value)}{line}]"
+            return f"[{', '.join(_write_value(one, deeper) for one in value)}]"
+        return f"[{deeper}{f',{deeper}'.join(_write_value(one, deeper) for one in value)}{line}]"
     if isinstance(value, float) and not math.isfinite(value):
         return "null"
     return _ENCODER.encode(value if value is None or isinstance(value, str | int | float | bool) else str(value))

@@ -70,7 +70,7 @@ def coefficients(theta2: Array) -> tuple[Array, Array, Array, Array]:
     return a, b, c, d
 
 
-def _polynomial(v: Array, first: Array, second: Array) -> Array:
+def _evaluate_polynomial(v: Array, first: Array, second: Array) -> Array:
     """I + first [v]x + second [v]x^2."""
     S = skew(v)
     return _I3 + first[..., None, None] * S + second[..., None, None] * (S @ S)
@@ -83,7 +83,7 @@ def exp(v: Array) -> Array:
         return _exp_one(*v.ravel().tolist()).reshape(*v.shape, 3)
     x = np.sqrt(np.sum(v * v, axis=-1) + _TINY)
     half = np.sin(0.5 * x) / x
-    return _polynomial(v, np.sin(x) / x, 2.0 * half * half)
+    return _evaluate_polynomial(v, np.sin(x) / x, 2.0 * half * half)
 
 
 def _exp_one(x: float, y: float, z: float) -> Array:
@@ -120,7 +120,7 @@ def right_jacobian(v: Array) -> Array:
     """Jr with Exp(v + d) = Exp(v) Exp(Jr d) to first order; (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, dtype=float)
     _, b, c, _ = coefficients(np.sum(v * v, axis=-1))
-    return _polynomial(v, -b, c)
+    return _evaluate_polynomial(v, -b, c)
 
 
 def right_jacobian_inverse(v: Array) -> Array:
@@ -132,7 +132,7 @@ def right_jacobian_inverse(v: Array) -> Array:
     a, b, _, _ = coefficients(theta2)
     small = theta2 < 1e-4
     second = np.where(small, 1.0 / 12.0 + theta2 / 720.0, (1.0 - 0.5 * a / b) / np.where(small, 1.0, theta2))
-    return _polynomial(v, np.full_like(theta2, 0.5), second)
+    return _evaluate_polynomial(v, np.full_like(theta2, 0.5), second)
 
 
 def _right_jacobian_inverse_one(x: float, y: float, z: float) -> Array:

@@ -24,7 +24,7 @@ from graphnav.detectors.windows import Blocks
 
 _INNER = 1.5  # s of a stretch that say what its force and rate are
 LONGEST = 60.0  # s between stretches over which a difference of speed still means something
-_LEAST = 0.02  # m/s, 1-sigma of any such difference
+_LEAST_SIGMA = 0.02  # m/s, 1-sigma of any such difference
 _SIGMAS = 3.0
 _G = 9.81  # m/s^2
 _TURN_ON = 1.0e-4  # rad/s, of what a gyro's bias may differ from its mean over the stretches
@@ -56,11 +56,11 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
         return _UNKNOWN
     rate = b.rate[i:j]
     bias = 0.5 * (rate[:n0].mean(axis=0) + rate[n1:].mean(axis=0))
-    left, yaw = _level(b.force[i:j], rate - bias, n0, b.period)
+    left, yaw = _level_force(b.force[i:j], rate - bias, n0, b.period)
     if np.abs(yaw).max() > _STRAIGHT:
         return _UNKNOWN
     if n1 <= n0:
-        return Link(0.0, _SIGMAS * _LEAST, 0.0, 0.0)
+        return Link(0.0, _SIGMAS * _LEAST_SIGMA, 0.0, 0.0)
     off = left[n1:].mean()
     left = left[n0:n1]
     v = left.sum() * b.period
@@ -73,7 +73,7 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
     share = np.linspace(0.0, 1.0, len(left))
     way = np.cumsum(left - share * off) * b.period
     way -= share * way[-1]
-    tolerance = _SIGMAS * float(np.hypot(_LEAST, np.linalg.norm(doubt)))
+    tolerance = _SIGMAS * float(np.hypot(_LEAST_SIGMA, np.linalg.norm(doubt)))
     return Link(float(v.imag), tolerance, float(np.abs(way).max()), float(np.abs(way.mean())))
 
 
@@ -112,14 +112,14 @@ def find_speed_beside(b: Blocks, span: Array, way: int) -> Outwards | None:
     if n0 < 3 or j - i <= n0:
         return None
     force, rate, t = b.force[i:j][::way], b.rate[i:j][::way], b.t[i:j][::way]
-    left, yaw = _level(force, way * (rate - rate[:n0].mean(axis=0)), n0, b.period)
+    left, yaw = _level_force(force, way * (rate - rate[:n0].mean(axis=0)), n0, b.period)
     n = int(np.argmax(np.append(np.abs(yaw[n0:]) > _STRAIGHT, True)))
     left, yaw, T = left[n0 : n0 + n], np.abs(yaw[n0 : n0 + n]), b.period * np.arange(1, n + 1)
     # densities of white noise, by the scatter in the stretch, and what they leave of its means
     of_force, of_rate = (float(np.sqrt(x[:n0].var(axis=0).max() * b.period)) for x in (force, rate))
     known = 1.0 / (n0 * b.period)
     doubt = (
-        np.full(n, _LEAST),
+        np.full(n, _LEAST_SIGMA),
         0.5 * _G * T**2 * np.hypot(_TURN_ON, of_rate * np.sqrt(known)),
         _G * of_rate * np.sqrt(T**3 / 3.0),
         of_force * np.sqrt(T + T**2 * known),
@@ -147,14 +147,14 @@ def at_rest_until(b: Blocks, span: Array, way: int, most: float, limit: float) -
         return end
     force, rate, t = b.force[i:j][::way], b.rate[i:j][::way], b.t[i:j][::way]
     # backwards in time everything turns the other way
-    left, _ = _level(force, way * (rate - rate[:n0].mean(axis=0)), n0, b.period)
+    left, _ = _level_force(force, way * (rate - rate[:n0].mean(axis=0)), n0, b.period)
     speed = np.abs(np.cumsum(left[n0:]) * b.period)
     over = np.flatnonzero(speed > limit)
     last = n0 + (int(over[0]) if len(over) else len(speed)) - 1
     return float(t[last])
 
 
-def _level(force: Array, omega: Array, still: int, period: float) -> tuple[NDArray[np.complex128], Array]:
+def _level_force(force: Array, omega: Array, still: int, period: float) -> tuple[NDArray[np.complex128], Array]:
     """Horizontal force (n,), right + i forward, without gravity and without what it was at first; and the yaw.
 
     The first `still` rows stand; `omega` (n, 3) is without bias.
@@ -196,8 +196,9 @@ def moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
             speed = change[m] - change[of]
             if len(sure):
                 nearest = int(np.argmin(apart))
-                out[group[m]] = abs(known[group[of[nearest]]] + speed[nearest]) > max(apart[nearest], _SIGMAS * _LEAST)
+                away = abs(known[group[of[nearest]]] + speed[nearest])
+                out[group[m]] = away > max(apart[nearest], _SIGMAS * _LEAST_SIGMA)
             else:
                 # no speed is known: a stretch faster than another one in the chain moves
-                out[group[m]] = bool((speed > np.maximum(apart, _SIGMAS * _LEAST)).any())
+                out[group[m]] = bool((speed > np.maximum(apart, _SIGMAS * _LEAST_SIGMA)).any())
     return out

@@ -76,9 +76,9 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
         )
     whole = t_last - t_first < (1.0 + _STRETCH) * length * period
     half = 0.5 * length * period
-    calm = _weigh_idling(w, settings) if labels is None and settings.find_line else np.zeros(w.count)
+    quiet = _weigh_idling(w, settings) if labels is None and settings.find_line else np.zeros(w.count)
     inner = whole & (
-        mask_within(t, labels.still, half) if labels else (calm < 1.0) & ~mask_within(t, scene.certain, half)
+        mask_within(t, labels.still, half) if labels else (quiet < 1.0) & ~mask_within(t, scene.certain, half)
     )
     line = idle_line(w, np.flatnonzero(inner)) if settings.find_line else None
     notes: list[str] = []
@@ -87,11 +87,11 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
         if not shown:
             return Detection("fft", t, np.full(w.count, np.nan), 1.0, t < t, NONE, tuple(notes))
     factor = 1.0 if line is None else line.frequency / LINE_OF_THE_PAPER
-    bands, clipped = _bands(settings, factor, w.frequencies)
+    bands, clipped = _select_bands(settings, factor, w.frequencies)
     if clipped:
         notes.append(Note("detectors.fft.bands_cut", clipped))
     height, where, picture = _measure(w, bands)
-    quotient = _quotients(height, settings)
+    quotient = _compute_quotients(height, settings)
     asked: Mask = np.asarray(np.isfinite(quotient).any(axis=0))
     if line is not None:
         notes.append(Note("detectors.fft.line", _describe(line)))
@@ -101,7 +101,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
             met = met | np.isin(CONDITIONS, _ALWAYS)
         left_out = [name for name, ok, seen in zip(CONDITIONS, met, asked, strict=True) if seen and not ok]
         asked = asked & met
-        quotient = np.column_stack([quotient, _off_line(where, asked, line)])
+        quotient = np.column_stack([quotient, _measure_off_line(where, asked, line)])
         asked = np.append(asked, True)
         if left_out:
             notes.append(
@@ -114,7 +114,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     found = np.full(w.count, np.nan)
     if usable:
         found = np.where(whole, np.nanmax(np.where(asked, quotient, np.nan), axis=1), np.nan)
-        found = np.maximum(np.maximum(found, calm), _divide_speed(t, settings, scene.known))
+        found = np.maximum(np.maximum(found, quiet), _divide_speed(t, settings, scene.known))
     mask = found < 1.0
     details = {"peak_frequency": where, "peak_amplitude": height, "bands": np.array(bands), **picture}
     if line is not None:
@@ -130,7 +130,7 @@ def _weigh_idling(w: Windows, settings: FftSettings) -> Array:
     by what they have there, above the lower one.
     """
     height = _measure(w, [(0.0, LOWEST)])[0][:, :, 0]
-    x = log_statistic((height / _limits(settings)).max(axis=1))
+    x = log_statistic((height / _find_limits(settings)).max(axis=1))
     split = valley(x, float(np.nanmin(x)), 0.0, FEWEST_WINDOWS)
     return np.asarray(10.0 ** (x - (0.0 if split is None else split)))
 
@@ -144,7 +144,7 @@ def _detect_line(height: Array, where: Array, line: IdleLine) -> Mask:
     return near
 
 
-def _off_line(where: Array, asked: Mask, line: IdleLine) -> Array:
+def _measure_off_line(where: Array, asked: Mask, line: IdleLine) -> Array:
     """How far the line of each window is from where it was seen while idling; above 1 it is another.
 
     While driving an engine's lines move with its speed. Of the channels whose Peak-1 is asked for the nearest counts.
@@ -155,7 +155,7 @@ def _off_line(where: Array, asked: Mask, line: IdleLine) -> Array:
     return np.asarray(np.nanmin(np.abs(where[:, channels, 1] - middle), axis=1) / reach)
 
 
-def _bands(settings: FftSettings, factor: float, frequencies: Array) -> tuple[list[tuple[float, float]], str]:
+def _select_bands(settings: FftSettings, factor: float, frequencies: Array) -> tuple[list[tuple[float, float]], str]:
     ends = [0.0, *(factor * end for end in settings.bands)]
     top = float(frequencies[-1])
     bands = [(min(a, top), min(b, top)) for a, b in pairwise(ends)]
@@ -184,9 +184,9 @@ def _measure(w: Windows, bands: Sequence[tuple[float, float]]) -> tuple[Array, A
     return height, where, picture
 
 
-def _quotients(height: Array, settings: FftSettings) -> Array:
+def _compute_quotients(height: Array, settings: FftSettings) -> Array:
     """(W, 8) as in `CONDITIONS`: all below 1 is stationary, NaN what cannot be seen."""
-    limit = _limits(settings)
+    limit = _find_limits(settings)
     # fmax leaves out a peak that cannot be seen
     size = np.fmax(np.fmax(height[..., 0], height[..., 1]), height[..., 2]) / limit
     peak0 = height[:, :, 0]
@@ -195,7 +195,7 @@ def _quotients(height: Array, settings: FftSettings) -> Array:
     return np.column_stack([size, *ratios])
 
 
-def _limits(settings: FftSettings) -> Array:
+def _find_limits(settings: FftSettings) -> Array:
     """(3,) m/s^2, m/s^2, rad/s: what no peak of forward force, up force and pitch rate may exceed."""
     return np.array([settings.force_limit * MG, settings.force_limit * MG, np.radians(settings.rate_limit)])
 

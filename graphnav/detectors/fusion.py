@@ -143,9 +143,9 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
                 f"{_count(int(moves.sum()) - measured)} smooth but no stop: the force before or after shows speed",
             )
         )
-    share = _still_in_motion(found, certain)
+    share = _share_still_in_motion(found, certain)
     if share > _BLIND:
-        unseen = ~moves & np.isnan(known) & np.array([not _zero(speeds, span) for span in spans])
+        unseen = ~moves & np.isnan(known) & np.array([not _reads_zero(speeds, span) for span in spans])
         moves |= unseen
         notes.append(
             Note(
@@ -169,12 +169,12 @@ def _screen_motion(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array
     for k, (begin, end) in enumerate(certain):
         for start, last in spans[(spans[:, 0] < begin) & (spans[:, 1] > end)]:
             one = link(b, np.array([start, begin]), np.array([end, last]))
-            said = max(float(s.speed[there].max()) for s in speeds if (there := (s.t >= begin) & (s.t <= end)).any())
-            keep[k] = one.peak + one.tolerance >= said
+            fastest = max(float(s.speed[there].max()) for s in speeds if (there := (s.t >= begin) & (s.t <= end)).any())
+            keep[k] = one.peak + one.tolerance >= fastest
     return certain[keep]
 
 
-def _still_in_motion(found: Detection, certain: Array) -> float:
+def _share_still_in_motion(found: Detection, certain: Array) -> float:
     """Share of the windows in certain motion that look still; 0 where there are too few to tell."""
     step = float(found.t[1] - found.t[0]) if len(found.t) > 1 else 0.0
     moving = mask_within(found.t, certain, _INNER) & np.isfinite(found.statistic)
@@ -197,13 +197,13 @@ def _leads_to_speed(b: Blocks, span: Array, speeds: list[Speeds], settings: Fusi
             beside = beside or find_speed_beside(b, span, way)
             if beside is None:
                 break
-            excess = [_excess(beside, s, k, max(s.late, settings.odometer_delay)) for k in at.tolist()]
+            excess = [_find_excess(beside, s, k, max(s.late, settings.odometer_delay)) for k in at.tolist()]
             if take_median(*np.array(excess)) > 0.0:
                 return True
     return False
 
 
-def _excess(beside: Outwards, s: Speeds, k: int, late: float) -> float:
+def _find_excess(beside: Outwards, s: Speeds, k: int, late: float) -> float:
     """m/s by which a measured speed is greater than all that a stop leads to while it was measured; -inf if unknown."""
     there = beside.within(s.t[k] - s.half - late, s.t[k] + s.half)
     if there is None:
@@ -211,7 +211,7 @@ def _excess(beside: Outwards, s: Speeds, k: int, late: float) -> float:
     return float(s.speed[k] - np.max(beside.speed[there] + np.hypot(beside.tolerance[there], s.limit[k])))
 
 
-def _zero(speeds: list[Speeds], span: Array) -> bool:
+def _reads_zero(speeds: list[Speeds], span: Array) -> bool:
     """Whether an odometer that is alive reads zero all along a span."""
     for s in speeds:
         near = (s.t >= span[0] - _AROUND) & (s.t <= span[1] + _AROUND)

@@ -26,7 +26,7 @@ from graphnav.detectors.thresholds import find_fewest_errors, own_threshold
 from graphnav.detectors.windows import Blocks, find_unbroken, sum_running, window_times
 
 _TINY = 1e-300
-_STEP = 0.1  # s between windows
+_WINDOW_STEP = 0.1  # s between windows
 _SCALE = 0.05  # of g that a sensor's scale and bias may be off
 # twice the expectation under noise alone: three axes of each sensor, one direction of the magnitude
 _AT_NOISE = {
@@ -114,7 +114,7 @@ class Means:
 def window_means(b: Blocks, length: float) -> Means | None:
     """Means over windows of `length` s that begin a tenth of a second apart; None where there is no window."""
     # the blocks between two windows are summed once, for all of them
-    group = max(1, min(round(_STEP / b.period), round(0.5 * length / b.period)))
+    group = max(1, min(round(_WINDOW_STEP / b.period), round(0.5 * length / b.period)))
     count = len(b.t) // group
     rows = b.mean[: count * group].reshape(count, group, -1).mean(axis=1)
     middle = b.t[: count * group].reshape(count, group).mean(axis=1)
@@ -130,7 +130,7 @@ def window_means(b: Blocks, length: float) -> Means | None:
     )
 
 
-def _means(scene: Scene) -> Means | None:
+def _compute_means(scene: Scene) -> Means | None:
     return window_means(scene.blocks, scene.settings.glrt.window)
 
 
@@ -148,7 +148,7 @@ class _Windowed(Detector):
     @classmethod
     def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
         name, settings, noise = cls.name, scene.settings.glrt, scene.recording.imu.noise
-        m = scene.share(_means)
+        m = scene.share(_compute_means)
         least = _AT_NOISE[name]
         if m is None:
             none = np.zeros(0)
@@ -215,7 +215,7 @@ def _find_quietest(m: Means) -> Array:
     rate = m.rows[:, 8] - np.einsum("wj,wj->w", m.rows[:, 3:6], m.rows[:, 3:6])
     scatter = force / max(float(np.median(force)), _TINY) + rate / max(float(np.median(rate)), _TINY)
     scatter = np.where(m.whole, scatter, np.inf)
-    few = min(round(1.0 / _STEP), len(scatter)) - 1
+    few = min(round(1.0 / _WINDOW_STEP), len(scatter)) - 1
     return np.asarray(scatter <= np.partition(scatter, few)[few])
 
 

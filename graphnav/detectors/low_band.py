@@ -28,7 +28,7 @@ from graphnav.recording import ImuNoise
 
 NAME = "low_band_glrt"
 _DOWN, _UP = 1.5, 0.7  # decades that the data may move the threshold down and up
-_MOVING = 30.0  # s of certain motion that say where the threshold must not be
+_LEAST_MOTION = 30.0  # s of certain motion that say where the threshold must not be
 _QUIETEST = 1.0  # s that say how much noise there can be at most
 _TRUSTED = 0.05  # of the stated noise is the least that is believed
 _OVERSTATED = 2.0  # times what the quietest windows allow
@@ -110,14 +110,14 @@ def detect_low_band(
     spread = measure_spreads(low, window)
     s = scale(low, noise, settings, spread)
     found = compute_statistic(spread, s)
-    threshold, notes = _threshold(t, found, settings, moving, low.period, s)
+    threshold, notes = _find_threshold(t, found, settings, moving, low.period, s)
     mask = found < threshold
     # a window says nothing of where in it motion began: only what all windows over it call still is
     spans = spans_of(mask, t, 0.5 * settings.window)
     return Detection(NAME, t, found, threshold, mask, longer_than(spans, settings.window), notes), s
 
 
-def _threshold(
+def _find_threshold(
     t: Array, found: Array, settings: LowBandSettings, moving: Array, period: float, s: Scale
 ) -> tuple[float, tuple[str, ...]]:
     if not settings.from_data:
@@ -138,7 +138,7 @@ def _threshold(
                 "the IMU's stated noise is too large to tell stops by it: only the stillest stretches count",
             ),
         )
-    if label.sum() * period >= _MOVING:
+    if label.sum() * period >= _LEAST_MOTION:
         # some of these windows may be mislabelled; the threshold keeps clear of the others
         start = min(start, max(float(np.quantile(x[label], MISTAKEN)) - np.log10(2.0), start - _DOWN))
     return float(10.0**start), notes

@@ -65,9 +65,9 @@ def speeds(recording: Recording, settings: FusionSettings) -> list[Speeds]:
     """Speeds of every sensor that knows any."""
     found = []
     if recording.odometer is not None and len(recording.odometer.t) > 2:
-        found.append(_odometer(recording.odometer, settings))
+        found.append(_read_odometer(recording.odometer, settings))
     if recording.gnss is not None and len(recording.gnss.t) > 2:
-        found += _gnss(recording.gnss, settings)
+        found += _read_gnss(recording.gnss, settings)
     return [s for s in found if len(s.t) >= _MEDIAN]
 
 
@@ -79,7 +79,7 @@ def find_moving(found: list[Speeds]) -> Array:
         k = np.arange(len(excess))
         fast = take_median(excess[np.maximum(k - 1, 0)], excess, excess[np.minimum(k + 1, len(k) - 1)]) > 0.0
         breaks = np.diff(s.t) > _LONGEST
-        spans = [spans_of(fast[a:b], s.t[a:b]) for a, b in _pieces(breaks)]
+        spans = [spans_of(fast[a:b], s.t[a:b]) for a, b in _split_pieces(breaks)]
         one = union([p for p in spans if len(p)]) if any(len(p) for p in spans) else NONE
         if len(one):
             one = one + np.array([s.half, -s.half - s.late])
@@ -92,7 +92,7 @@ def take_median(a: Array, b: Array, c: Array) -> Array:
     return np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
 
 
-def _pieces(breaks: np.ndarray) -> list[tuple[int, int]]:
+def _split_pieces(breaks: np.ndarray) -> list[tuple[int, int]]:
     """[start, end) between the breaks."""
     ends = (np.flatnonzero(breaks) + 1).tolist()
     return list(zip([0, *ends], [*ends, len(breaks) + 1], strict=True))
@@ -105,13 +105,13 @@ def find_smallest_step(values: Array) -> float:
     return float(np.quantile(steps, 0.05)) if len(steps) else 0.0
 
 
-def _odometer(o: Odometer, settings: FusionSettings) -> Speeds:
+def _read_odometer(o: Odometer, settings: FusionSettings) -> Speeds:
     # one pulse in a period may be the jitter of a wheel that stands on a tooth
     limit = max(settings.max_speed, 1.5 * find_smallest_step(o.speed))
     return Speeds(o.t, o.speed[:, None], np.full(len(o.t), limit), settings.odometer_delay)
 
 
-def _gnss(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:
+def _read_gnss(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:
     found = []
     if gnss.v is not None:
         there = np.isfinite(gnss.v[:, :2]).all(axis=1)

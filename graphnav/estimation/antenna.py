@@ -29,11 +29,11 @@ from graphnav.recording import Recording, take_rows
 
 _UNKNOWN = 2.0  # m, 1-sigma before the drive
 _FINE = 0.3  # m, 1-sigma of fixes that tell
-_LONG = 0.25  # m, of a part of an arm whose sign matters, or of an error of one: tapes do better
+_LEAST_PART = 0.25  # m, of a part of an arm whose sign matters, or of an error of one: tapes do better
 _OPPOSITE = 0.5  # of how far it is found from where it is stated, it may be from where the other sign puts it
 _PART = 240.0  # s
-_FEWEST = 30  # fixes
-_SURE = 8.0  # sigmas: 4, and twice that because errors of fixes are alike for minutes
+_FEWEST_FIXES = 30  # fixes
+_SURE_SIGMAS = 8.0  # sigmas: 4, and twice that because errors of fixes are alike for minutes
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Antenna:
     @property
     def agrees(self) -> bool:
         """Whether the drive has nothing against what is stated."""
-        return bool((np.abs(self.found - self.stated) <= _SURE * self.sigma).all())
+        return bool((np.abs(self.found - self.stated) <= _SURE_SIGMAS * self.sigma).all())
 
     @property
     def finding(self) -> Finding:
@@ -85,7 +85,7 @@ def find_wrong_arms(recording: Recording) -> list[Finding]:
     Of a vehicle with fixes that are precise enough to tell, by the part of the drive that turns most; else nothing.
     """
     gnss = recording.gnss
-    if recording.platform != "vehicle" or gnss is None or len(gnss.t) < _FEWEST:
+    if recording.platform != "vehicle" or gnss is None or len(gnss.t) < _FEWEST_FIXES:
         return []
     if np.median(gnss.sd[:, :2]) > _FINE:
         return []
@@ -100,9 +100,9 @@ def find_wrong_arms(recording: Recording) -> list[Finding]:
         ("gnss", antenna.stated, antenna.found, antenna.sigma, ("right", "forward", "up")),
         *((("odometer", *axle, ("forward",)),) if axle is not None else ()),
     ):
-        sure = np.abs(found - stated) > _SURE * sigma
+        sure = np.abs(found - stated) > _SURE_SIGMAS * sigma
         nearer = np.abs(found + stated) < _OPPOSITE * np.abs(found - stated)
-        wrong = sure & (np.abs(stated) > _LONG) & (found * stated < 0.0) & nearer
+        wrong = sure & (np.abs(stated) > _LEAST_PART) & (found * stated < 0.0) & nearer
         for k in np.flatnonzero(wrong):
             out.append(
                 Finding(
@@ -112,7 +112,7 @@ def find_wrong_arms(recording: Recording) -> list[Finding]:
                     f"{name}.lever_arm_sign",
                 )
             )
-    if not out and not antenna.agrees and np.abs(antenna.found - antenna.stated).max() > _LONG:
+    if not out and not antenna.agrees and np.abs(antenna.found - antenna.stated).max() > _LEAST_PART:
         out.append(antenna.finding)
     return out
 

@@ -95,8 +95,8 @@ class Epochs:
         while True:
             Q, _ = np.linalg.qr(A[kept][:, A[kept].any(axis=0)])
             left = r[kept] - Q @ (Q.T @ r[kept])
-            spare = int(kept.sum()) - Q.shape[1]
-            if spare < 1 or left @ left <= 2.0 * gammaincinv(0.5 * spare, 1.0 - _ALARM):
+            freedom = int(kept.sum()) - Q.shape[1]
+            if freedom < 1 or left @ left <= 2.0 * gammaincinv(0.5 * freedom, 1.0 - _ALARM):
                 break
             share = np.maximum(1.0 - np.sum(Q * Q, axis=1), 1e-9)  # of its own error that is left in a residual
             kept[np.flatnonzero(kept)[np.argmax(left**2 / share)]] = False

@@ -74,7 +74,7 @@ class Exported:
                 node = np.concatenate([known[name][j] for name in group.columns])
                 values.insert(_Q(key - layout.K), node)
         graph = gtsam.NonlinearFactorGraph()
-        for one in _factors(self.problem, layout):
+        for one in _make_factors(self.problem, layout):
             graph.push_back(one)
         return graph, values
 
@@ -127,17 +127,17 @@ def state_at(values: gtsam.Values, k: int) -> States:
     return States(*(np.asarray(part)[None] for part in parts))
 
 
-def _factors(problem: Problem, layout: Layout) -> Iterator[Any]:
+def _make_factors(problem: Problem, layout: Layout) -> Iterator[Any]:
     """Intervals, rows, and the priors of parameters with their way from node to node."""
     unit = gtsam.noiseModel.Unit.Create(DIM)
     scale = (SCALE,) if SCALE in problem.columns else ()
     for k in range(layout.K - 1):
-        yield _custom(unit, layout, (k, k + 1), scale, _interval_at(problem, k))
+        yield _make_custom(unit, layout, (k, k + 1), scale, _evaluate_interval(problem, k))
     for rows in (problem.prior, *problem.constraints):
         names = tuple(p.name for p in rows.parameters)
         for i, k in enumerate(rows.keyframe.tolist()):
             if rows.weight is None or rows.weight[i] > 0.0:
-                yield _custom(_noise(rows, i), layout, (k,), names, _row_at(rows, i, problem))
+                yield _make_custom(_make_noise(rows, i), layout, (k,), names, _evaluate_row(rows, i, problem))
     chains = {chain.parameter.name: chain for chain in problem.chains}
     for group in layout.groups:
         own, means = [chains[name] for name in group.columns], gtsam.Values()
@@ -156,7 +156,7 @@ def _factors(problem: Problem, layout: Layout) -> Iterator[Any]:
 Evaluated = Callable[[States, dict[str, Array]], tuple[Array, Array, dict[str, Array]]]
 
 
-def _interval_at(problem: Problem, k: int) -> Evaluated:
+def _evaluate_interval(problem: Problem, k: int) -> Evaluated:
     motion = type(problem.motion)(problem.intervals[k : k + 1], problem.frame)
 
     def evaluate(states: States, given: dict[str, Array]) -> tuple[Array, Array, dict[str, Array]]:
@@ -166,7 +166,7 @@ def _interval_at(problem: Problem, k: int) -> Evaluated:
     return evaluate
 
 
-def _row_at(rows: Constraint, i: int, problem: Problem) -> Evaluated:
+def _evaluate_row(rows: Constraint, i: int, problem: Problem) -> Evaluated:
     columns, which, at = problem.columns, slice(i, i + 1), np.zeros(1, dtype=int)
     width = max((column.stop for column in columns.values()), default=DIM) - DIM
 
@@ -182,7 +182,9 @@ def _row_at(rows: Constraint, i: int, problem: Problem) -> Evaluated:
     return evaluate
 
 
-def _custom(noise: Any, layout: Layout, keyframes: tuple[int, ...], names: tuple[str, ...], evaluate: Evaluated) -> Any:
+def _make_custom(
+    noise: Any, layout: Layout, keyframes: tuple[int, ...], names: tuple[str, ...], evaluate: Evaluated
+) -> Any:
     """A factor over keyframes and the nodes of parameters in force at the first of them."""
     first = np.array(keyframes[:1])
     nodes = [
@@ -200,7 +202,7 @@ def _custom(noise: Any, layout: Layout, keyframes: tuple[int, ...], names: tuple
         residual, J, by_parameter = evaluate(states, given)
         if H is not None:
             parts = zip(np.split(J, len(keyframes), axis=1), states.R_nb, strict=True)
-            blocks = [block for part, R_nb in parts for block in _state_blocks(part, R_nb)]
+            blocks = [block for part, R_nb in parts for block in _split_blocks(part, R_nb)]
             for k, block in enumerate([*blocks, *(A[0] for _, A in layout.parameter_blocks(first, by_parameter))]):
                 H[k] = np.asfortranarray(block)
         return residual
@@ -208,13 +210,13 @@ def _custom(noise: Any, layout: Layout, keyframes: tuple[int, ...], names: tuple
     return gtsam.CustomFactor(noise, keys, error)
 
 
-def _state_blocks(J: Array, R_nb: Array) -> tuple[Array, Array, Array]:
+def _split_blocks(J: Array, R_nb: Array) -> tuple[Array, Array, Array]:
     """(m, 15) by our error state as the blocks of Pose3, velocity and bias; GTSAM moves positions in body axes."""
     turned = J[:, BLOCKS["p"]] @ R_nb
     return np.hstack([J[:, BLOCKS["theta"]], turned]), J[:, BLOCKS["v"]], J[:, BLOCKS["ba"].start :]
 
 
-def _noise(rows: Constraint, i: int) -> Any:
+def _make_noise(rows: Constraint, i: int) -> Any:
     unit = gtsam.noiseModel.Unit.Create(len(rows.axes))
     if rows.robust == "none":
         return unit

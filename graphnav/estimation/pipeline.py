@@ -24,11 +24,11 @@ from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation import faults
+from graphnav.estimation.building import start_sigma
 from graphnav.estimation.long_drives import OVERLAP, crop_solution, shares
 from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.words import describe_far
-from graphnav.estimation.posing import start_sigma
 from graphnav.estimation.preparation import prepare
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.separation import separation
@@ -128,8 +128,8 @@ def _run(
     found: list[dict[str, Solution]] = []
     parts = [share for piece in pieces for share in shares(piece, settings)]
     if len(parts) > len(pieces):
-        said = f"too long to be solved at once: solved in {len(parts)} parts that overlap by {OVERLAP:.0f} s"
-        notes.append(Note("pieces.parts", said))
+        sentence = f"too long to be solved at once: solved in {len(parts)} parts that overlap by {OVERLAP:.0f} s"
+        notes.append(Note("pieces.parts", sentence))
     for part in parts:
         try:
             # matrices here have thirty rows: threads for them cost more than the work, twenty times on a busy machine
@@ -139,7 +139,7 @@ def _run(
         except EstimationError as error:
             if len(parts) == 1:
                 raise
-            notes.append(Note("pieces.left_out", f"{_span(recording, part.recording)} left out: {error}"))
+            notes.append(Note("pieces.left_out", f"{_describe_span(recording, part.recording)} left out: {error}"))
     if not found:
         raise EstimationError(
             f"'{recording.name}': no piece between its IMU gaps can be solved", key="pieces.none_solved"
@@ -161,17 +161,17 @@ def _solve_with_retry(
     except (EstimationError, np.linalg.LinAlgError) as error:
         if isinstance(error, EstimationError) and error.key != "solver.breakdown":
             raise
-        for other, model, said in _simpler(settings, noise):
+        for other, model, reason in _simplify(settings, noise):
             try:
                 again = _solve(recording, other, frame, solvers, progress, model)
             except (EstimationError, np.linalg.LinAlgError):
                 continue
-            note = Note(said.key, f"{said}, {error}")
+            note = Note(reason.key, f"{reason}, {error}")
             return {name: replace(one, notes=(note, *one.notes)) for name, one in again.items()}
         raise
 
 
-def _simpler(settings: Settings, noise: NoiseModel | None) -> Iterator[tuple[Settings, NoiseModel | None, Note]]:
+def _simplify(settings: Settings, noise: NoiseModel | None) -> Iterator[tuple[Settings, NoiseModel | None, Note]]:
     """Settings and noise models that ask less of a covariance, and what to say of them."""
     still = settings.standstill.model_copy(update={"held_position": False})
     if settings.standstill.held_position:
@@ -344,5 +344,5 @@ def _split_pieces(recording: Recording, settings: Settings) -> tuple[list[Record
     return pieces, notes
 
 
-def _span(recording: Recording, piece: Recording) -> str:
+def _describe_span(recording: Recording, piece: Recording) -> str:
     return f"{piece.start - recording.start:.0f} to {piece.end - recording.start:.0f} s"

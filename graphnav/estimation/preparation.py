@@ -21,6 +21,7 @@ from graphnav.core.rotation import Array
 from graphnav.detectors import Detections
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment, with_known_heading
+from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
 from graphnav.estimation.fixing import fix, float_arcs
 from graphnav.estimation.noise.apply import with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
@@ -32,7 +33,6 @@ from graphnav.estimation.noise.exclusion import (
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe
-from graphnav.estimation.posing import Clock, Posed, Posing, has_diverged
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.ekf import ekf, near, refilter
@@ -49,7 +49,7 @@ from graphnav.estimation.solvers.rts import backward
 from graphnav.recording import Recording
 
 _LOST = 0.1  # rad by which a filter may be off for a smoother to rest on it
-_MOST = 0.5  # share of the fixes that can be wrong; beyond it, it is the start that is
+_MOST_WRONG = 0.5  # share of the fixes that can be wrong; beyond it, it is the start that is
 _WHEELS = (NonHolonomic, OdometerSpeed)
 
 
@@ -98,21 +98,21 @@ def prepare(
     """
     clock, passes = Clock(), Counter[str]()
     spacing = settings.noise.spacing if noise is None else noise.spacing
-    every = Posing(recording, recording, settings, frame, clock)
+    every = ProblemBuilder(recording, recording, settings, frame, clock)
     aligned = every.align(recording, detections.stationary)
     if noise is None and (settings.noise.mode == "stated" or aligned.motion is None or not settings.gnss.position):
         noise, spacing = STATED, STATED.spacing
-    posing = replace(every, used=space_fixes(recording, spacing)) if spacing else every
-    posed, known = posing.pose(aligned, detections, parts=noise != STATED), None
+    builder = replace(every, used=space_fixes(recording, spacing)) if spacing else every
+    built, known = builder.build(aligned, detections, parts=noise != STATED), None
     if noise is None:
         tell("noise")
         with clock.book("noise"):
-            noise, known, posed = _find_noise(posing, posed, progress, passes)
+            noise, known, built = _find_noise(builder, built, progress, passes)
             noise = replace(noise, spacing=spacing)
     else:
-        posed = posing.pose_without(posed, noise, parts=noise != STATED)
-    aligned = posed.aligned
-    problem = without_parts(with_noise(posed.problem, noise))
+        built = builder.build_without(built, noise, parts=noise != STATED)
+    aligned = built.aligned
+    problem = without_parts(with_noise(built.problem, noise))
     forward = ekf(problem, progress, aligned.until)  # its own solution has the time it takes
     with clock.book("smoother"):
         smoothed = backward(problem, forward, progress)
@@ -122,51 +122,53 @@ def prepare(
         forward, smoothed = _find_way(problem, aligned, known, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
     notes, epochs, arcs = describe(noise, problem), {}, {"": float_arcs(problem)}
-    if posed.carriers is not None:
+    if built.carriers is not None:
         tell("ambiguities")
         with clock.book("ambiguities"):
-            fixed = fix(problem, posed.carriers, smoothed, aligned.until, progress)
+            fixed = fix(problem, built.carriers, smoothed, aligned.until, progress)
         problem, forward, smoothed = fixed.problem, fixed.forward, fixed.smoothed
         notes, epochs = (*notes, *fixed.notes), {"ekf": fixed.filtered_epochs, "": fixed.smoothed_epochs}
         arcs = {"ekf": fixed.filtered_arcs, "": fixed.smoothed_arcs}
     start = with_known_heading(aligned, settings)
     return Prepared(
-        problem, noise, start, aligned, posed.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs
+        problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs
     )
 
 
 def _find_noise(
-    posing: Posing, posed: Posed, progress: Progress | None, passes: Counter[str]
-) -> tuple[NoiseModel, Points | None, Posed]:
+    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str]
+) -> tuple[NoiseModel, Points | None, BuiltProblem]:
     """The noise model, points to linearise at, and the problem: with start and stops that rest on nothing wrong."""
-    best = _estimate(posed, posing.settings, progress, passes)
-    if excluded_share(posed.problem, best.noise) > _MOST:
+    best = _estimate(built, builder.settings, progress, passes)
+    if excluded_share(built.problem, best.noise) > _MOST_WRONG:
         # most fixes contradict what came of the start: it is looked for in what follows
         try:
-            later = posing.pose_later(posed)
-            again = _estimate(later, posing.settings, progress, passes)
-            if excluded_share(later.problem, again.noise) < excluded_share(posed.problem, best.noise):
-                posed, best = later, again
+            later = builder.build_later(built)
+            again = _estimate(later, builder.settings, progress, passes)
+            if excluded_share(later.problem, again.noise) < excluded_share(built.problem, best.noise):
+                built, best = later, again
         except EstimationError:
             pass  # nothing moves later on
-    without = posing.pose_without(posed, best.noise, parts=True)
-    if without is not posed:
-        posed = without
-        best = estimate_noise(posed.problem, posed.aligned.until, best.noise, progress=progress)
+    without = builder.build_without(built, best.noise, parts=True)
+    if without is not built:
+        built = without
+        best = estimate_noise(built.problem, built.aligned.until, best.noise, progress=progress)
         passes.update(filter=best.passes, smoother=best.passes)
-    best = with_disturbed_intervals(posed.problem, best)
+    best = with_disturbed_intervals(built.problem, best)
     passes.update(filter=best.passes + best.looks + 1, smoother=best.passes)
     plain = NoiseModel(excluded=best.noise.excluded)
-    if _is_likelier(posed.problem, plain, best):
-        return plain, None, posed
+    if _is_likelier(built.problem, plain, best):
+        return plain, None, built
     # of what the estimation has left only its points are wanted any more: the rest is half of all memory
-    return best.noise, Points(best.points.states, best.points.values), posed
+    return best.noise, Points(best.points.states, best.points.values), built
 
 
-def _estimate(posed: Posed, settings: Settings, progress: Progress | None, passes: Counter[str]) -> NoiseEstimate:
+def _estimate(
+    built: BuiltProblem, settings: Settings, progress: Progress | None, passes: Counter[str]
+) -> NoiseEstimate:
     """The noise model, with spans of wrong measurements left out if they are to be."""
     estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
-    found = estimate(posed.problem, posed.aligned.until, progress=progress)
+    found = estimate(built.problem, built.aligned.until, progress=progress)
     passes.update(filter=found.passes + found.looks, smoother=found.passes)
     return found
 

@@ -66,7 +66,7 @@ class Problem:
     @cached_property
     def chains(self) -> tuple[ParameterChain, ...]:
         """The parameters with their nodes."""
-        return _chains(self.parameters.values(), self.t)
+        return _build_chains(self.parameters.values(), self.t)
 
     @cached_property
     def columns(self) -> dict[str, slice]:
@@ -136,9 +136,9 @@ def build_problem(
         times = keyframe_times(recording.start, recording.end, epochs, settings.keyframes.rate)
     t = times
     samples = bridge_gaps(recording.imu)
-    said: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     if recording.platform == "foot":
-        samples, said = with_whole_peaks(samples, recording.imu.R_bs, highest)
+        samples, remarks = with_whole_peaks(samples, recording.imu.R_bs, highest)
         samples = with_unresolved_motion(samples, recording.imu.noise)
         samples = with_coning(samples) if settings.imu.coning else samples
     motion = known.get(float(t[1])) if known and len(t) == 2 else None
@@ -160,7 +160,7 @@ def build_problem(
         motion=motion,
         prior=prior,
         constraints=built,
-        notes=(*_notes(samples, recording), *said, *(note for rows in built for note in rows.notes)),
+        notes=(*_describe_samples(samples, recording), *remarks, *(note for rows in built for note in rows.notes)),
         imu_noise=recording.imu.noise,
     )
 
@@ -173,8 +173,8 @@ def _build_constraints(scene: BuildContext, ahead: bool | None) -> tuple[Constra
 
 
 def _note_differences(rows: Constraint) -> Constraint:
-    said = f"{rows.name}: gives no Jacobians, so they are made of differences, which takes longer"
-    return replace(rows, notes=(*rows.notes, Note("constraint.differences", said)))
+    sentence = f"{rows.name}: gives no Jacobians, so they are made of differences, which takes longer"
+    return replace(rows, notes=(*rows.notes, Note("constraint.differences", sentence)))
 
 
 def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Array:
@@ -203,7 +203,7 @@ def to_samples(stationary: Array | None, recording: Recording) -> Array:
     return np.stack([t[first[kept]], t[last[kept]]], -1)
 
 
-def _chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterChain, ...]:
+def _build_chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterChain, ...]:
     chains = []
     for p in parameters:
         if p.begins is not None:
@@ -229,7 +229,7 @@ def _keep_apart(keyframes: bytes, spacing: float) -> Array:
     return np.array(out)
 
 
-def _notes(samples: Samples, recording: Recording) -> tuple[str, ...]:
+def _describe_samples(samples: Samples, recording: Recording) -> tuple[str, ...]:
     if not len(samples.bridged):
         return ()
     length = samples.bridged[:, 1] - samples.bridged[:, 0]

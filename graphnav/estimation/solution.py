@@ -318,17 +318,17 @@ def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Soluti
         notes=(*notes, *dict.fromkeys(note for part in parts for note in part.notes)),
         detections=tuple(d for p in parts for d in p.detections),
         excluded=tuple(f for p in parts for f in p.excluded),
-        noise=_noise_of_all([p.noise for p in parts]),
+        noise=_join_noise([p.noise for p in parts]),
         passes=_add_counts([dict(p.passes) for p in parts]),
         graphs=tuple(g for p in parts for g in p.graphs),
-        separation=_separation_of_all([p.separation for p in parts]),
+        separation=_join_separations([p.separation for p in parts]),
         fixed=np.concatenate([p.fixed for p in parts]),
         arcs=CarrierArcs(*(np.concatenate([getattr(p.arcs, f.name) for p in parts]) for f in fields(CarrierArcs))),
         between=tuple(b for p in parts for b in p.between),
     )
 
 
-def _noise_of_all(parts: list[NoiseModel]) -> NoiseModel:
+def _join_noise(parts: list[NoiseModel]) -> NoiseModel:
     """Weights and spans of all pieces, and the figures of the first: each piece has its own."""
     weights = {}
     for name in dict.fromkeys(key for part in parts for key in part.weights):
@@ -339,7 +339,7 @@ def _noise_of_all(parts: list[NoiseModel]) -> NoiseModel:
     return replace(parts[0], weights=weights, excluded=excluded)
 
 
-def _separation_of_all(parts: list[Separation | None]) -> Separation | None:
+def _join_separations(parts: list[Separation | None]) -> Separation | None:
     known = [part for part in parts if part is not None]
     if not known:
         return None

@@ -41,9 +41,9 @@ def stops_of(found: Sequence[Detection], records: Mapping[str, ConstraintRecord]
     found : by all detectors; those of one name are of pieces of the recording, and "fused" is what they come to.
     records : of a solver that used them; without, no rows are told.
     """
-    spans = _spans(found, FUSED)
+    spans = _collect_spans(found, FUSED)
     names = dict.fromkeys(d.name for d in found if d.name != FUSED)
-    seconds = {name: seconds_in(_spans(found, name), spans) for name in names}
+    seconds = {name: seconds_in(_collect_spans(found, name), spans) for name in names}
     made = {kind.name for kind in list_constraints() if kind.of_stops}
     used = {name: np.sort(record.t[record.weight > 0.0]) for name, record in (records or {}).items() if name in made}
     out = []
@@ -74,6 +74,6 @@ def detections_text(found: Sequence[Detection], records: Mapping[str, Constraint
     return "\n".join([HEAD, *rows]) + "\n"
 
 
-def _spans(found: Sequence[Detection], name: str) -> Array:
+def _collect_spans(found: Sequence[Detection], name: str) -> Array:
     """(M, 2) s, all intervals of one name."""
     return np.concatenate([np.empty((0, 2)), *(d.intervals for d in found if d.name == name)])

@@ -49,9 +49,9 @@ def read_antex(path: Path) -> Antennas:
             elif label == "TYPE / SERIAL NO":
                 name = line[20:23].strip()
             elif label == "VALID FROM":
-                begin = _date(line)
+                begin = _parse_date(line)
             elif label == "VALID UNTIL":
-                end = _date(line)
+                end = _parse_date(line)
             elif label == "START OF FREQUENCY":
                 band = int(line[4:6])
             elif label == "NORTH / EAST / UP":
@@ -133,7 +133,7 @@ def shapiro_delay(satellite: Array, antenna: Array) -> Array:
     return np.asarray(2.0 * 3.986004418e14 / C**2 * np.log((r + s + between) / (r + s - between)))
 
 
-def _date(line: str) -> float:
+def _parse_date(line: str) -> float:
     fields = np.array([line[:43].split()[:6]], dtype=float)
     days, good = calendar_days(fields)
     if not good.all():

@@ -63,9 +63,9 @@ def find_arcs(
     key = raw.satellite.astype(np.int64) * 1000 + raw.signal
     slots, slot = np.unique(key, return_inverse=True)
     if len(raw.arc_begin):
-        return _known_arcs(raw, slots, slot)
+        return _take_known_arcs(raw, slots, slot)
     epochs, epoch = raw.epochs
-    usual = period or (float(np.median(np.diff(epochs))) if len(epochs) > 1 else np.inf)
+    typical = period or (float(np.median(np.diff(epochs))) if len(epochs) > 1 else np.inf)
     there = np.isfinite(raw.carrier) & np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock)
     if base_arc is not None:
         there &= base_arc >= 0
@@ -75,7 +75,7 @@ def find_arcs(
     same = slot[now] == slot[before]
     since = raw.t[now] - raw.t[before]
     held = np.nan_to_num(raw.lock[now], nan=-1.0) > since if len(raw.lock) else np.zeros_like(same)
-    held |= (epoch[now] - epoch[before] == 1) & (since < 1.5 * usual)
+    held |= (epoch[now] - epoch[before] == 1) & (since < 1.5 * typical)
     kept = same & held & ~raw.slip[now] & (raw.half[now] == raw.half[before])
     if base_arc is not None:
         kept &= base_arc[now] == base_arc[before]
@@ -88,20 +88,20 @@ def find_arcs(
     base = count[np.minimum(first_of_slot, max(len(count) - 1, 0))] if len(count) else np.zeros(len(slots), dtype=int)
     arc[order] = count - base[slot[order]]
     firsts = [order[begins_here & (slot[order] == k)] for k in range(len(slots))]
-    return Arcs(slot, arc, *_names(slots), tuple(raw.t[k] for k in firsts), int(slipped.sum()))
+    return Arcs(slot, arc, *_name_slots(slots), tuple(raw.t[k] for k in firsts), int(slipped.sum()))
 
 
-def _known_arcs(raw: RawGnss, slots: NDArray[np.int64], slot: NDArray[np.intp]) -> Arcs:
+def _take_known_arcs(raw: RawGnss, slots: NDArray[np.int64], slot: NDArray[np.intp]) -> Arcs:
     """The arcs of a piece of a series, which were found as its epochs came."""
     arc, begins = np.full(len(raw), -1), []
     for k in range(len(slots)):
         own = np.flatnonzero((slot == k) & np.isfinite(raw.arc_begin))
         t, arc[own] = np.unique(raw.arc_begin[own], return_inverse=True)
         begins.append(t)
-    return Arcs(slot, arc, *_names(slots), tuple(begins), 0)
+    return Arcs(slot, arc, *_name_slots(slots), tuple(begins), 0)
 
 
-def _names(slots: NDArray[np.int64]) -> tuple[tuple[str, ...], Ids, Ids]:
+def _name_slots(slots: NDArray[np.int64]) -> tuple[tuple[str, ...], Ids, Ids]:
     """Names, satellites and signals of slots."""
     satellites, signals = (slots // 1000).astype(np.int16), (slots % 1000).astype(np.int16)
     return (

@@ -26,7 +26,7 @@ def consecutive(raw: RawGnss, whole: RawGnss, period: float | None = None) -> tu
     """
     arcs, at = find_arcs(whole), rows_in(raw, whole)
     of, arc, slot = number_epochs(raw), arcs.arc[at], arcs.slot[at]
-    usual = period or (float(np.median(np.diff(raw.epochs[0]))) if len(raw.epochs[0]) > 1 else 1.0)
+    typical = period or (float(np.median(np.diff(raw.epochs[0]))) if len(raw.epochs[0]) > 1 else 1.0)
     good = (
         (of >= 0)
         & np.isfinite(raw.carrier)
@@ -38,7 +38,7 @@ def consecutive(raw: RawGnss, whole: RawGnss, period: float | None = None) -> tu
     order = np.flatnonzero(good)
     order = order[np.lexsort((of[order], slot[order]))]
     j, k = order[:-1], order[1:]
-    kept = (slot[j] == slot[k]) & (arc[j] == arc[k]) & (of[k] - of[j] == 1) & (raw.t[k] - raw.t[j] <= _APART * usual)
+    kept = (slot[j] == slot[k]) & (arc[j] == arc[k]) & (of[k] - of[j] == 1) & (raw.t[k] - raw.t[j] <= _APART * typical)
     j, k = j[kept], k[kept]
     dt = raw.t[k] - raw.t[j]
     sent = dt - (raw.code[k] - raw.code[j]) / C + (raw.receiver_clock[k, 0] - raw.receiver_clock[j, 0]) / C

@@ -24,7 +24,7 @@ from graphnav.gnss.single_point import choose_coefficients, look
 
 _OLDEST = 15.0  # s between a base's epochs that a line is drawn through
 _SAME_EPOCH = 2e-3  # s: two receivers that keep their clocks within a millisecond of the nominal epoch
-_LEAST = np.radians(5.0)  # elevation of a base's satellites
+_LEAST_ELEVATION = np.radians(5.0)  # elevation of a base's satellites
 
 
 def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[RawGnss, tuple[str, ...]]:
@@ -39,7 +39,7 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     base = replace(base, klobuchar=rover.klobuchar, antenna=np.tile(position, (len(base), 1)))
     geometry = look(base, base.antenna, choose_coefficients(base))
     arcs = find_arcs(base, still=True)
-    high = geometry.elevation > _LEAST
+    high = geometry.elevation > _LEAST_ELEVATION
     known = geometry.distance + geometry.troposphere - base.clock
     error = known + geometry.ionosphere - base.code
     of_carrier = known - geometry.ionosphere - C / base.frequency * base.carrier
@@ -52,9 +52,9 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     for satellite, signal in sorted({(int(s), int(g)) for s, g in zip(rover.satellite, rover.signal, strict=True)}):
         own = (rover.satellite == satellite) & (rover.signal == signal)
         there = base.satellite == satellite
-        counted = there & (arc >= 0) & (base.signal == _partner(base, arc, satellite // 100, signal))
+        counted = there & (arc >= 0) & (base.signal == _find_partner(base, arc, satellite // 100, signal))
         if counted.sum() > 1:
-            carrier_difference[own], base_arc[own] = _within_arcs(
+            carrier_difference[own], base_arc[own] = _draw_within_arcs(
                 rover.t[own], base.t[counted], of_carrier[counted], arc[counted]
             )
         if (satellite, signal) in alike:
@@ -66,17 +66,17 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
             continue
         difference[own] = _interpolate(rover.t[own], base.t[there], error[there])
     missing = np.isnan(difference) & np.isfinite(rover.code) & np.isfinite(rover.p[:, 0])
-    said: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     if missing.any():
         sentence = f"{int(missing.sum())} of {len(rover)} codes have no counterpart at the base and are not used"
-        said = (Note("raw.without_base", sentence),)
+        notes = (Note("raw.without_base", sentence),)
     away = float(np.linalg.norm(np.median(rover.antenna, axis=0) - position))
     return replace(
         rover, difference=difference, carrier_difference=carrier_difference, base_arc=base_arc, baseline=away
-    ), said
+    ), notes
 
 
-def _partner(base: RawGnss, arc: NDArray[np.intp], system: int, signal: int) -> int:
+def _find_partner(base: RawGnss, arc: NDArray[np.intp], system: int, signal: int) -> int:
     """The base's signal whose carriers stand against those of a rover's signal, the same for all of a system.
 
     The same one, else that of the same frequency that the base has most of: by how much of a cycle they are apart is
@@ -89,7 +89,7 @@ def _partner(base: RawGnss, arc: NDArray[np.intp], system: int, signal: int) -> 
     return int(found[np.argmax(many)])
 
 
-def _within_arcs(t: Array, at: Array, value: Array, arc: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+def _draw_within_arcs(t: Array, at: Array, value: Array, arc: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
     """Values (N,) on lines between times of one arc, and that arc; NaN and -1 between two arcs and far from any time.
 
     At a base's own epoch, but for the milliseconds that clocks are apart by, its value holds without a line.

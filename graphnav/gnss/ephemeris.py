@@ -23,7 +23,7 @@ EARTH_RATE = 7.2921151467e-5  # rad/s, of WGS-84
 _OLDEST = {GPS: 7201.0, GALILEO: 14400.0, BEIDOU: 21601.0, QZSS: 7201.0, GLONASS: 1800.0}  # s from toe; RTKLIB's limits
 _TILT = np.radians(5.0)  # of the frame of geostationary BeiDou satellites
 _MU_R, _J2, _RATE_R, _RADIUS_R = 3.9860044e14, 1.0826257e-3, 7.292115e-5, 6378136.0  # PZ-90
-_STEP = 60.0  # s at most, of the integration of GLONASS orbits
+_INTEGRATION_STEP = 60.0  # s at most, of the integration of GLONASS orbits
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,8 @@ class Ephemerides:
         same = {(k.satellite, k.toe, k.toc, k.fnav): k for k in kepler}
         alike = {(g.satellite, g.toe): g for g in glonass}
         return Ephemerides(
-            _columns(Kepler, sorted(same.values(), key=lambda k: k.toe)),
-            _columns(Glonass, sorted(alike.values(), key=lambda g: g.toe)),
+            _take_columns(Kepler, sorted(same.values(), key=lambda k: k.toe)),
+            _take_columns(Glonass, sorted(alike.values(), key=lambda g: g.toe)),
             klobuchar,
             remarks,
         )
@@ -265,11 +265,11 @@ class Ephemerides:
         for _ in range(2):
             since = t - (eph["toe"] - zero) - (eph["clock"] + eph["drift"] * since)
         x = np.concatenate([eph["p"], eph["v"]], axis=1)
-        steps = int(np.ceil(np.max(np.abs(since)) / _STEP)) or 1
+        steps = int(np.ceil(np.max(np.abs(since)) / _INTEGRATION_STEP)) or 1
         for j in range(steps):
-            h = np.clip(since - np.sign(since) * j * _STEP, -_STEP, _STEP)
-            h = np.where(np.abs(since) > j * _STEP, h, 0.0)[:, None]
-            x = _step_runge_kutta(lambda state: _glonass_motion(state, eph["a"]), x, h)
+            h = np.clip(since - np.sign(since) * j * _INTEGRATION_STEP, -_INTEGRATION_STEP, _INTEGRATION_STEP)
+            h = np.where(np.abs(since) > j * _INTEGRATION_STEP, h, 0.0)[:, None]
+            x = _step_runge_kutta(lambda state: _derive_glonass(state, eph["a"]), x, h)
         return {
             "p": x[:, :3],
             "v": x[:, 3:],
@@ -278,7 +278,7 @@ class Ephemerides:
         }
 
 
-def _columns(kind: type, some: list) -> dict[str, Array]:  # type: ignore[type-arg]
+def _take_columns(kind: type, some: list) -> dict[str, Array]:  # type: ignore[type-arg]
     whole = {f.name: np.array([getattr(one, f.name) for one in some]) for f in fields(kind)}
     whole["satellite"] = whole["satellite"].astype(np.int16)
     if not some:
@@ -308,7 +308,7 @@ def rotate_earth(p: Array, seconds: Array) -> Array:
     return _turn_about_z(p, EARTH_RATE * seconds)
 
 
-def _glonass_motion(x: Array, a: Array) -> Array:
+def _derive_glonass(x: Array, a: Array) -> Array:
     p, v = x[:, :3], x[:, 3:]
     r2 = np.sum(p * p, axis=1)
     r3 = r2 * np.sqrt(r2)

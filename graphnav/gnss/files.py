@@ -81,8 +81,8 @@ def find_moved_points(block: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """
     there = block == ord(".")
     at, told = there.argmax(axis=-1), there.any(axis=-1)
-    usual = np.array([np.bincount(x[y]).argmax() if y.any() else 0 for x, y in zip(at.T, told.T, strict=True)])
-    return np.asarray(told & (at != usual))
+    typical = np.array([np.bincount(x[y]).argmax() if y.any() else 0 for x, y in zip(at.T, told.T, strict=True)])
+    return np.asarray(told & (at != typical))
 
 
 def numbers(block: NDArray[np.uint8], width: int) -> Array:

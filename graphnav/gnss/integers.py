@@ -102,7 +102,7 @@ def _search(z: Array, L: Array, D: Array) -> tuple[tuple[float, list[int]], tupl
     n = len(z)
     weight, own = (1.0 / D).tolist(), z.tolist()
     centre, given = own.copy(), [0] * n
-    step, spent = [0] * n, [0.0] * (n + 1)  # spent[k]: distance of levels k and above
+    step, reached = [0] * n, [0.0] * (n + 1)  # reached[k]: distance of levels k and above
     best: list[tuple[float, list[int]]] = []
     columns = [L[k + 1 :, k].tolist() for k in range(n)]
 
@@ -116,10 +116,10 @@ def _search(z: Array, L: Array, D: Array) -> tuple[tuple[float, list[int]], tupl
     enter(k)
     while True:
         off = given[k] - centre[k]
-        distance = spent[k + 1] + off * off * weight[k]
+        distance = reached[k + 1] + off * off * weight[k]
         if len(best) < 2 or distance < best[1][0]:
             if k:
-                spent[k] = distance
+                reached[k] = distance
                 k -= 1
                 enter(k)
                 continue

@@ -114,9 +114,9 @@ def load_raw(
         raise RecordingError(
             f"{sources.rover[0]}: no epoch has enough satellites for a position", key="raw.few_satellites"
         )
-    said = [*obs.remarks, *remarks]
+    notes = [*obs.remarks, *remarks]
     if raw.klobuchar is None:
-        said.append(
+        notes.append(
             Note(
                 "raw.no_ionosphere",
                 "no ionosphere coefficients in the navigation files: the delay of the night is assumed (5 ns at the "
@@ -126,12 +126,12 @@ def load_raw(
     raw, fixes = _correct_times(raw, fixes)
     if sources.base:
         raw, more = _difference_by_base(raw, sources, nav, precise)
-        said += more
+        notes += more
         one = primary(raw) & np.isfinite(raw.difference)
         if one.any():
             better = raw.take(one)
             fixes = solve(replace(better, code=better.code + better.difference))
-    return raw, fixes, tuple(said)
+    return raw, fixes, tuple(notes)
 
 
 def _difference_by_base(
@@ -155,7 +155,7 @@ def _difference_by_base(
     away = float(np.linalg.norm(np.median(raw.antenna, axis=0) - position))
     base, _ = place(obs, nav, precise, position)
     base_fixes = solve(base.take(primary(base) & np.isfinite(base.p[:, 0])))
-    said = list(obs.remarks)
+    notes = list(obs.remarks)
     off = np.nanmedian(np.linalg.norm(base_fixes.p - position, axis=1))
     if not off < _BASE_OFF:
         raise RecordingError(
@@ -164,11 +164,11 @@ def _difference_by_base(
         )
     if given is None:
         sentence = f"the base's position is that of its header, {off:.1f} m from its own single-point positions"
-        said.append(Note("raw.base_position", sentence))
+        notes.append(Note("raw.base_position", sentence))
     base, _ = _correct_times(base, base_fixes)
     raw, more = with_differences(raw, base, position)
-    said += [Note("raw.base", f"codes are differences against a base {away / 1e3:.1f} km away"), *more]
-    return raw, said
+    notes += [Note("raw.base", f"codes are differences against a base {away / 1e3:.1f} km away"), *more]
+    return raw, notes
 
 
 def _check_dates(obs: Observations, nav: Ephemerides | None, precise: Orbits | None, sources: Sources) -> None:

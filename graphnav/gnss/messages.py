@@ -80,17 +80,17 @@ class Decoder:
             return
         satellite = 100 * system + number
         if system in (GPS, QZSS) and len(words) >= 10 and words[0] >> 24 != 0x8B:
-            self._lnav(satellite, Bits.of(words[:10], 30, 6), gps)
+            self._parse_lnav(satellite, Bits.of(words[:10], 30, 6), gps)
         elif system == GALILEO and len(words) >= 8:
-            own = self._fnav if payload[2] == _E5A else self._inav
+            own = self._parse_fnav if payload[2] == _E5A else self._parse_inav
             own(satellite, Bits.of(words[:8], 32), gps)
         elif system == BEIDOU and len(words) >= 10:
-            (self._d1 if 5 < number < 59 else self._d2)(satellite, Bits.of(words[:10], 30), gps)
+            (self._parse_d1 if 5 < number < 59 else self._parse_d2)(satellite, Bits.of(words[:10], 30), gps)
         elif system == GLONASS and len(words) >= 4:
             self._channels[satellite] = payload[3] - 7
-            self._string(satellite, Bits.of(words[:4], 32), gps)
+            self._parse_string(satellite, Bits.of(words[:4], 32), gps)
 
-    def _lnav(self, satellite: int, bits: Bits, gps: float) -> None:
+    def _parse_lnav(self, satellite: int, bits: Bits, gps: float) -> None:
         number = bits.u((43, 3))
         if number == 4 and bits.u((50, 6)) == 56 and satellite // 100 == GPS:
             scale = [2.0**-30, 2.0**-27, 2.0**-24, 2.0**-24, 2.0**11, 2.0**14, 2.0**16, 2.0**16]
@@ -123,7 +123,7 @@ class Decoder:
             delay=(one.s((160, 8)) * 2.0**-31, np.nan),
         )  # fmt: skip
 
-    def _inav(self, satellite: int, page: Bits, gps: float) -> None:
+    def _parse_inav(self, satellite: int, page: Bits, gps: float) -> None:
         # an even and an odd page of 128 bits each, padded; alert pages hold none of this
         if page.u((0, 2)) != 0 or page.u((128, 2)) != 2:
             return
@@ -154,7 +154,7 @@ class Decoder:
             delay=(five.s((47, 10)) * 2.0**-32, five.s((57, 10)) * 2.0**-32),
         )  # fmt: skip
 
-    def _fnav(self, satellite: int, page: Bits, gps: float) -> None:
+    def _parse_fnav(self, satellite: int, page: Bits, gps: float) -> None:
         number = page.u((0, 6))
         if not 1 <= number <= 4:
             return
@@ -181,7 +181,7 @@ class Decoder:
             delay=(one.s((143, 10)) * 2.0**-32, np.nan), fnav=True,
         )  # fmt: skip
 
-    def _d1(self, satellite: int, bits: Bits, gps: float) -> None:
+    def _parse_d1(self, satellite: int, bits: Bits, gps: float) -> None:
         number = bits.u((15, 3))
         if number not in (1, 2, 3):
             return
@@ -214,7 +214,7 @@ class Decoder:
             delay=(one.s((98, 10)) * 1e-10, one.s((108, 4), (120, 6)) * 1e-10),
         )  # fmt: skip
 
-    def _d2(self, satellite: int, bits: Bits, gps: float) -> None:
+    def _parse_d2(self, satellite: int, bits: Bits, gps: float) -> None:
         page = bits.u((42, 4))
         if bits.u((15, 3)) != 1 or not 1 <= page <= 10:
             return
@@ -256,7 +256,7 @@ class Decoder:
             delay=(s(*at(1, (102, 10))) * 1e-10, s(*at(1, (120, 10))) * 1e-10),
         )  # fmt: skip
 
-    def _string(self, satellite: int, bits: Bits, gps: float) -> None:
+    def _parse_string(self, satellite: int, bits: Bits, gps: float) -> None:
         number = bits.u((1, 4))
         if not 1 <= number <= 4:
             return

@@ -53,7 +53,7 @@ def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
     raw : a row for each satellite and epoch, of its first signal.
     whole : all that the receiver has, with the second ones.
     """
-    second = _second(raw, whole)
+    second = _find_second(raw, whole)
     which = np.flatnonzero(second >= 0)
     if not len(which):
         return None
@@ -95,11 +95,11 @@ def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
         carrier=np.where(good, carrier, np.nan),
         wet=by_wet,
         growth=np.hypot(alpha, beta),
-        arc=_joint_arcs(arcs, first_rows, second[which], good),
+        arc=_number_joint_arcs(arcs, first_rows, second[which], good),
     )
 
 
-def _second(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
+def _find_second(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
     """(N,) the row of `whole` with the second signal of each row; -1 where there is none.
 
     Of several signals of a band that of which there are most carriers, for each satellite one throughout.
@@ -121,7 +121,7 @@ def _second(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
     return out
 
 
-def _joint_arcs(
+def _number_joint_arcs(
     arcs: Arcs, first: NDArray[np.intp], second: NDArray[np.intp], good: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
     """(N,) numbers of arcs in which neither signal has slipped."""

@@ -114,7 +114,7 @@ def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
     try:
         value = numbers(lines.block(own, 4, 60), 14)
         names = [bytes(x).decode() for x in lines.block(own, 1, 4)]
-        ids = {name: _id_of(name) for name in set(names)}
+        ids = {name: _find_id(name) for name in set(names)}
     except ValueError:
         for k in own:
             try:
@@ -146,7 +146,7 @@ def _read_clk(path: Path) -> tuple[Array, Ids, Array]:
     names = [row[1].decode("latin-1") for row in rows]
     try:
         table = np.array([[*row[2:8], row[9]] for row in rows]).astype(float)
-        ids = {name: _id_of(name) for name in set(names)}
+        ids = {name: _find_id(name) for name in set(names)}
         t = _read_dates(table[:, :6], scale)
         if not np.isfinite(table).all():
             raise ValueError
@@ -156,7 +156,7 @@ def _read_clk(path: Path) -> tuple[Array, Ids, Array]:
     return t[satellite >= 0], satellite[satellite >= 0], table[satellite >= 0, 6]
 
 
-def _id_of(name: str) -> int:
+def _find_id(name: str) -> int:
     """The number of a satellite; -1 of one that no receiver observes, as those that carry a receiver."""
     if name[0].isalpha() and name[0] not in SYSTEMS:
         return -1
@@ -208,8 +208,8 @@ def _interpolate_orbit(nodes: tuple[Array, Array], t: Array, zero: float) -> Arr
     weight *= np.where(_NODES % 2 == 0, -1.0, 1.0)
     placed = rotate_earth(p[use].reshape(-1, 3), -x.ravel()).reshape(len(t), _NODES, 3)
     out = np.einsum("nk,nki->ni", weight, placed)
-    usual = float(np.median(np.diff(at)))
-    out[(t < at[0] - 1.0) | (t > at[-1] + 1.0) | (span > 2.0 * _NODES * usual)] = np.nan
+    typical = float(np.median(np.diff(at)))
+    out[(t < at[0] - 1.0) | (t > at[-1] + 1.0) | (span > 2.0 * _NODES * typical)] = np.nan
     return np.asarray(out)
 
 

@@ -77,7 +77,7 @@ def _read(path: Path, found: _Navigation) -> None:
         raise RecordingError(
             f"{path}: a RINEX {version:g} file of type '{lines[0][20:40].strip()}', not of navigation", key="file.kind"
         )
-    k = _header(lines, path, found)
+    k = _read_header(lines, path, found)
     default = {"G": "R", "H": "S"}.get(kind, "G") if version < 3.0 else ""
     message = ""
     while k < len(lines):
@@ -88,7 +88,7 @@ def _read(path: Path, found: _Navigation) -> None:
             if words[:1] != ["EPH"] or message not in _KNOWN:
                 end = next((j for j in range(k + 1, len(lines)) if lines[j].startswith(">")), len(lines))
                 if words[:1] == ["ION"] and message == "LNAV":
-                    _ionosphere(lines[k + 1 : end], found)
+                    _take_ionosphere(lines[k + 1 : end], found)
                 elif words[:1] == ["EPH"]:
                     found.skipped[message] = found.skipped.get(message, 0) + 1
                 k = end
@@ -112,14 +112,14 @@ def _read(path: Path, found: _Navigation) -> None:
             if not whole:
                 raise ValueError
             at = 23 if not default else 22
-            values = _values([(text, at), *((line, at - 19) for line in lines[k + 1 : k + count])])
-            _add(found, system, int(name[1:]), _date(text, bool(default)), values, message)
+            values = _parse_values([(text, at), *((line, at - 19) for line in lines[k + 1 : k + count])])
+            _add(found, system, int(name[1:]), _parse_date(text, bool(default)), values, message)
         except (ValueError, IndexError):
             found.broken.append(k + 1)
         k += count if whole else 1
 
 
-def _values(rows: list[tuple[str, int]]) -> list[float]:
+def _parse_values(rows: list[tuple[str, int]]) -> list[float]:
     """Clock terms of the first line, then four a line; NaN for blanks."""
     out = []
     for number, (line, begin) in enumerate(rows):
@@ -131,7 +131,7 @@ def _values(rows: list[tuple[str, int]]) -> list[float]:
     return out
 
 
-def _date(text: str, short: bool) -> np.datetime64:
+def _parse_date(text: str, short: bool) -> np.datetime64:
     fields = np.array([[parse_number(word) for word in (text[2:22] if short else text[3:23]).split()]])
     if fields.shape != (1, 6):
         raise ValueError
@@ -193,16 +193,16 @@ def _add(found: _Navigation, system: int, number: int, date: np.datetime64, v: l
     )  # fmt: skip
 
 
-def _header(lines: list[str], path: Path, found: _Navigation) -> int:
+def _read_header(lines: list[str], path: Path, found: _Navigation) -> int:
     for k, line in enumerate(lines):
         label, body = line[60:].strip(), line[:60].replace("D", "E")
         try:
             if label == "ION ALPHA":
-                found.klobuchar["a"] = _coefficients(body[2:])
+                found.klobuchar["a"] = _parse_coefficients(body[2:])
             elif label == "ION BETA":
-                found.klobuchar["b"] = _coefficients(body[2:])
+                found.klobuchar["b"] = _parse_coefficients(body[2:])
             elif label == "IONOSPHERIC CORR" and line[:4] in ("GPSA", "GPSB"):
-                found.klobuchar[line[3].lower()] = _coefficients(body[5:])
+                found.klobuchar[line[3].lower()] = _parse_coefficients(body[5:])
         except ValueError:
             raise RecordingError(
                 f"{path}, line {k + 1}: the header's '{label}' cannot be read", key="rinex.header"
@@ -212,7 +212,7 @@ def _header(lines: list[str], path: Path, found: _Navigation) -> int:
     raise RecordingError(f"{path}: the header has no END OF HEADER; the file is cut off", key="rinex.cut")
 
 
-def _coefficients(body: str) -> list[float]:
+def _parse_coefficients(body: str) -> list[float]:
     """Four numbers of twelve columns each."""
     found = [parse_number(body[12 * i : 12 * (i + 1)]) for i in range(4)]
     if not np.isfinite(found).all():
@@ -220,12 +220,12 @@ def _coefficients(body: str) -> list[float]:
     return found
 
 
-def _ionosphere(lines: list[str], found: _Navigation) -> None:
+def _take_ionosphere(lines: list[str], found: _Navigation) -> None:
     """Klobuchar's coefficients of version 4, if they are whole."""
     if len(lines) < 3:
         return
     try:
-        v = _values([(lines[0], 23), (lines[1], 4), (lines[2], 4)])
+        v = _parse_values([(lines[0], 23), (lines[1], 4), (lines[2], 4)])
     except ValueError:
         return
     if np.isfinite(v[:8]).all():

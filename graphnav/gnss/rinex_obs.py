@@ -60,7 +60,9 @@ def parse_observations(data: bytes, path: Path) -> Observations:
     lines = Lines(data)
     header = read_header(lines, path)
     remarks: list[str] = []
-    stamp, zero, flag, rows, cells = (_version_2 if header.version < 3.0 else _version_3)(lines, header, path, remarks)
+    stamp, zero, flag, rows, cells = (_read_version_2 if header.version < 3.0 else _read_version_3)(
+        lines, header, path, remarks
+    )
     if not len(rows.line):
         raise RecordingError(f"{path}: holds a header and no observations", key="file.no_rows")
     unknown: set[str] = set()
@@ -75,7 +77,7 @@ def parse_observations(data: bytes, path: Path) -> Observations:
             if find_moved_points(block[:, :, :14]).any():
                 raise ValueError
         except ValueError:
-            raise _bad_field(rows, own, types, block[:, :, :14], path) from None
+            raise _refuse_field(rows, own, types, block[:, :, :14], path) from None
         value[value == 0.0] = np.nan  # absent (RINEX 2.11, table A2)
         lli = block[:, :, 14].astype(np.intp) - 48
         lli[(lli < 0) | (lli > 9)] = 0
@@ -87,7 +89,7 @@ def parse_observations(data: bytes, path: Path) -> Observations:
         }
         for signal in dict.fromkeys(name[1:] for name in named if is_known_signal(system, name[1:])):
             at = {kind: [k for k, name in enumerate(named) if name == kind + signal] for kind in _KINDS}
-            one = {kind: _first_of(value[:, some]) for kind, some in at.items()}
+            one = {kind: _take_first(value[:, some]) for kind, some in at.items()}
             there = ~np.isnan(one["C"]) | ~np.isnan(one["L"])
             lost = lli[:, at["L"][0]] if at["L"] else np.zeros(len(own), dtype=np.intp)
             k = rows.epoch[own]
@@ -134,7 +136,7 @@ def _translate_name(name: str, system: int, version: float) -> str:
     return f"{kind}{band}{attribute}"
 
 
-def _since_week(fields: Array, scale: str, used: NDArray[np.bool_]) -> tuple[Array, float]:
+def _count_since_week(fields: Array, scale: str, used: NDArray[np.bool_]) -> tuple[Array, float]:
     """Seconds (n,) of the GPS week of the first used of some dates (n, 6), and where it begins (s since the GPS epoch).
 
     Days and seconds are kept apart: seconds since the epoch are good to 0.2 us only.
@@ -150,20 +152,20 @@ def _since_week(fields: Array, scale: str, used: NDArray[np.bool_]) -> tuple[Arr
     return (since - 7 * week) * 86400.0 + hour * 3600.0 + minute * 60.0 + second + ahead, week * WEEK
 
 
-def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> _Body:
+def _read_version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> _Body:
     first = lines.first()
     first[: header.end] = 0
     epoch = np.flatnonzero(first == ord(">"))
     if not len(epoch):
         raise RecordingError(f"{path}: holds a header and no observations", key="file.no_rows")
     try:
-        fields = _calendar(lines, epoch, 2, 4)
+        fields = _parse_calendar(lines, epoch, 2, 4)
         flag, count = numbers(lines.block(epoch, 29, 35), 3).T
     except ValueError:
-        raise _bad_epoch(lines, epoch, path) from None
+        raise _refuse_epoch(lines, epoch, path) from None
     bad = (flag < 0) | (count < 0) | (~calendar_days(fields)[1] & ~(flag > 1))
     if bad.any():
-        raise _bad_epoch(lines, epoch[bad], path)
+        raise _refuse_epoch(lines, epoch[bad], path)
     flag, count = np.nan_to_num(flag).astype(int), np.nan_to_num(count).astype(int)
     system = _SYSTEM_OF[first]
     own = np.flatnonzero(system >= 0)
@@ -175,7 +177,7 @@ def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
         own, of = own[:-1], of[:-1]  # its last field may be cut
     if not (flag <= 1).any():
         raise RecordingError(f"{path}: holds a header and no observations", key="file.no_rows")
-    stamp, zero = _since_week(fields, header.scale, flag <= 1)
+    stamp, zero = _count_since_week(fields, header.scale, flag <= 1)
     try:
         number = numbers(lines.block(own, 1, 3), 2)[:, 0]
     except ValueError:
@@ -193,7 +195,7 @@ def _version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
     return stamp, zero, flag, rows, cells
 
 
-def _first_of(value: Array) -> Array:
+def _take_first(value: Array) -> Array:
     """(n,) the first number in each row of (n, m) that is there, else NaN."""
     out = np.full(len(value), np.nan)
     for column in value.T[::-1]:
@@ -201,7 +203,7 @@ def _first_of(value: Array) -> Array:
     return out
 
 
-def _calendar(lines: Lines, epoch: NDArray[np.intp], begin: int, year: int) -> Array:
+def _parse_calendar(lines: Lines, epoch: NDArray[np.intp], begin: int, year: int) -> Array:
     """(n, 6) date and time of epoch lines, year first."""
     n = len(epoch)
     whole = [numbers(lines.block(epoch, begin, begin + year), year)]
@@ -213,7 +215,7 @@ def _calendar(lines: Lines, epoch: NDArray[np.intp], begin: int, year: int) -> A
     return np.concatenate(whole, axis=1).reshape(n, 6)
 
 
-def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> _Body:
+def _read_version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> _Body:
     types = len(next(iter(header.types.values())))
     each = -(-types // 5)  # lines of a satellite
     epochs: list[int] = []
@@ -269,12 +271,12 @@ def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
     if not len(epoch):
         raise RecordingError(f"{path}: holds a header and no observations", key="file.no_rows")
     try:
-        fields = _calendar(lines, epoch, 0, 3)
+        fields = _parse_calendar(lines, epoch, 0, 3)
     except ValueError:
-        raise _bad_epoch(lines, epoch, path, 0) from None
+        raise _refuse_epoch(lines, epoch, path, 0) from None
     fields[:, 0] += np.where(fields[:, 0] < 80, 2000, 1900)
     if (bad := ~calendar_days(fields)[1]).any():
-        raise _bad_epoch(lines, epoch[bad], path, 0)
+        raise _refuse_epoch(lines, epoch[bad], path, 0)
     rows = _SatelliteLines(
         np.array(first_line, dtype=np.intp), np.array(of, dtype=np.intp), np.array(satellite, dtype=np.int16)
     )
@@ -283,7 +285,7 @@ def _version_2(lines: Lines, header: Header, path: Path, remarks: list[str]) -> 
         parts = [lines.block(rows.line[which] + j, 0, 5 * _WIDTH) for j in range(each)]
         return np.concatenate(parts, axis=1)[:, : _WIDTH * types]
 
-    stamp, zero = _since_week(fields, header.scale, np.ones(len(epoch), dtype=bool))
+    stamp, zero = _count_since_week(fields, header.scale, np.ones(len(epoch), dtype=bool))
     return stamp, zero, np.array(flags), rows, cells
 
 
@@ -302,7 +304,7 @@ def _say_cut(
         remarks.append(Note("raw.short_epochs", f"{path.name}: {sentence}"))
 
 
-def _bad_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int = 2) -> RecordingError:
+def _refuse_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int = 2) -> RecordingError:
     """For the first epoch line that is none; its date begins at a column, two digits of the year in version 2."""
     end = begin + 27 if begin else 26
     for k in epoch:
@@ -319,7 +321,7 @@ def _bad_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int = 2
     return RecordingError(f"{path}: the line of an epoch cannot be read", key="rinex.epoch")
 
 
-def _bad_field(
+def _refuse_field(
     rows: _SatelliteLines, own: NDArray[np.intp], types: list[str], block: NDArray[np.uint8], path: Path
 ) -> RecordingError:
     """For the first field that is no number, of those (n, m, 14) of some rows."""

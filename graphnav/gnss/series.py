@@ -99,7 +99,7 @@ def once(obs: Observations) -> Observations:
     RecordingError
         If their times are years apart.
     """
-    obs = _plausible(obs)
+    obs = _drop_impossible(obs)
     span = float(np.ptp(obs.t)) if len(obs) else 0.0
     if not span <= _LONGEST:
         raise RecordingError(
@@ -120,7 +120,7 @@ def once(obs: Observations) -> Observations:
     )
 
 
-def _plausible(obs: Observations) -> Observations:
+def _drop_impossible(obs: Observations) -> Observations:
     """Without the values that no receiver can have measured."""
     with np.errstate(invalid="ignore"):
         bad = (np.abs(obs.code) > _FARTHEST) | (np.abs(obs.doppler) > _FASTEST) | (np.abs(obs.carrier) > _MOST_CYCLES)
@@ -128,8 +128,8 @@ def _plausible(obs: Observations) -> Observations:
         return obs
     code, carrier, doppler = (np.where(bad, np.nan, x) for x in (obs.code, obs.carrier, obs.doppler))
     sentence = f"{bad.sum()} observations are beyond what a receiver can measure and are left out"
-    said = Note("raw.impossible", sentence)
-    return replace(obs, code=code, carrier=carrier, doppler=doppler, remarks=(*obs.remarks, said))
+    remark = Note("raw.impossible", sentence)
+    return replace(obs, code=code, carrier=carrier, doppler=doppler, remarks=(*obs.remarks, remark))
 
 
 @dataclass(frozen=True)

@@ -18,37 +18,37 @@ _PHASE = 1e-3  # m at the zenith: reflections and the loop's own, the same sourc
 _IONOSPHERE, _TROPOSPHERE = 0.5, 0.3
 _CARRIER = 0.003  # m at the zenith, of reflections in each of two receivers' carriers (RTKLIB 2.4.3, rtkpos.c, varerr)
 LEAST = 20.0  # dB-Hz that a signal without a C/N0, or below it, is taken to have
-_USUAL = 45.0  # dB-Hz where a file says nothing of it
+_DEFAULT = 45.0  # dB-Hz where a file says nothing of it
 
 
 def code_sigma(cn0: Array, elevation: Array, ionosphere: Array) -> Array:
     """(N,) m, 1-sigma of a code; `ionosphere` (N,) m is the delay that was modelled."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
-    own = _CODE_POWER * 10.0 ** (-0.1 * _power(cn0)) + (_CODE * rising) ** 2
+    own = _CODE_POWER * 10.0 ** (-0.1 * _compute_power(cn0)) + (_CODE * rising) ** 2
     return np.asarray(np.sqrt(own + (_IONOSPHERE * ionosphere) ** 2 + (0.1 * _TROPOSPHERE * rising) ** 2))
 
 
 def rate_sigma(cn0: Array, elevation: Array) -> Array:
     """(N,) m/s, 1-sigma of a range rate."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
-    return np.asarray(np.sqrt(_RATE_POWER * 10.0 ** (-0.1 * _power(cn0)) + (_RATE * rising) ** 2))
+    return np.asarray(np.sqrt(_RATE_POWER * 10.0 ** (-0.1 * _compute_power(cn0)) + (_RATE * rising) ** 2))
 
 
 def carrier_sigma(cn0: Array, elevation: Array, wavelength: Array) -> Array:
     """(N,) m, 1-sigma of a carrier: the loop's thermal noise, wavelength / 2 pi sqrt(B / C/N0), and reflections."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
-    return np.asarray(np.sqrt(_thermal(cn0, wavelength) + (_PHASE * rising) ** 2))
+    return np.asarray(np.sqrt(_compute_thermal(cn0, wavelength) + (_PHASE * rising) ** 2))
 
 
 def carrier_difference_sigma(cn0: Array, elevation: Array, wavelength: Array) -> Array:
     """(N,) m, 1-sigma of the difference of two receivers' carriers."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
-    return np.asarray(np.sqrt(2.0 * (_thermal(cn0, wavelength) + _CARRIER**2 * (1.0 + rising**2))))
+    return np.asarray(np.sqrt(2.0 * (_compute_thermal(cn0, wavelength) + _CARRIER**2 * (1.0 + rising**2))))
 
 
-def _thermal(cn0: Array, wavelength: Array) -> Array:
-    return np.asarray((wavelength / (2.0 * np.pi)) ** 2 * _BANDWIDTH * 10.0 ** (-0.1 * _power(cn0)))
+def _compute_thermal(cn0: Array, wavelength: Array) -> Array:
+    return np.asarray((wavelength / (2.0 * np.pi)) ** 2 * _BANDWIDTH * 10.0 ** (-0.1 * _compute_power(cn0)))
 
 
-def _power(cn0: Array) -> Array:
-    return np.maximum(np.where(np.isfinite(cn0), cn0, _USUAL), LEAST)
+def _compute_power(cn0: Array) -> Array:
+    return np.maximum(np.where(np.isfinite(cn0), cn0, _DEFAULT), LEAST)

@@ -184,14 +184,14 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True) -> 
     cofactor[~found] = np.nan
     biases = np.where(present, np.concatenate([np.zeros((E, 1)), x[:, 4:]], axis=1), np.nan)
     clock = np.where(present[:, 0], x[:, 3], x[:, 3])
-    v, drift, covariance_v = _velocities(raw, of, place, (E, S), x, mask, robust)
+    v, drift, covariance_v = _solve_velocities(raw, of, place, (E, S), x, mask, robust)
     return SinglePoint(
         t, x[:, :3], clock, biases, cofactor, v, drift, covariance_v, counted.astype(np.intp), rms, groups, group,
         np.where(used, r, np.nan), np.where(used, weight, 0.0),
     )  # fmt: skip
 
 
-def _velocities(
+def _solve_velocities(
     raw: RawGnss, of: NDArray[np.intp], place: NDArray[np.intp], shape: tuple[int, int], x: Array, mask: float,
     robust: bool,
 ) -> tuple[Array, Array, Array]:  # fmt: skip

@@ -62,7 +62,7 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
     RecordingError
         If no raw measurements are in it.
     """
-    found = _frames(data)
+    found = _find_frames(data)
     if not any(len(rows) for rows in found.rows):
         raise RecordingError(f"{path}: no RXM-RAWX messages; switch them on in the receiver", key="raw.no_messages")
     remarks = []
@@ -91,7 +91,8 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
         zero=WEEK * week0, t=t, satellite=satellite, signal=signal,
         code=np.where(status & _CODE > 0, rows["code"], np.nan),
         carrier=np.where(has_carrier, rows["carrier"], np.nan), doppler=rows["doppler"].astype(float),
-        cn0=rows["cn0"].astype(float), slip=_slips(t, satellite, signal, lock), half=status & _HALF == 0, lock=lock,
+        cn0=rows["cn0"].astype(float), slip=_find_slips(t, satellite, signal, lock), half=status & _HALF == 0,
+        lock=lock,
         channels={
             100 * GLONASS + int(r["sv"]): int(r["channel"]) - 7 for r in rows[(rows["gnss"] == 6) & known]
         } if (rows["gnss"] == 6).any() else {},
@@ -104,7 +105,7 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
     return once(obs.take(known)), decoder.ephemerides
 
 
-def _slips(t: np.ndarray, satellite: np.ndarray, signal: np.ndarray, lock: np.ndarray) -> np.ndarray:
+def _find_slips(t: np.ndarray, satellite: np.ndarray, signal: np.ndarray, lock: np.ndarray) -> np.ndarray:
     """(N,) whether the carrier has been in lock for less than since the epoch before."""
     order = np.lexsort((t, signal, satellite))
     s, g, x, at = satellite[order], signal[order], lock[order], t[order]
@@ -116,7 +117,7 @@ def _slips(t: np.ndarray, satellite: np.ndarray, signal: np.ndarray, lock: np.nd
     return out
 
 
-def _frames(data: bytes) -> _RawMessages:
+def _find_frames(data: bytes) -> _RawMessages:
     """All messages that are used, their check sums tested."""
     out = _RawMessages()
     at = data.find(SYNC)
@@ -134,7 +135,7 @@ def _frames(data: bytes) -> _RawMessages:
         if end > len(data):
             out.cut = True
             break
-        if not _sums(data[at + 2 : end - 2], data[end - 2 : end]):
+        if not _check_sums(data[at + 2 : end - 2], data[end - 2 : end]):
             out.broken += 1
             at = data.find(SYNC, at + 2)
             continue
@@ -152,7 +153,7 @@ def _frames(data: bytes) -> _RawMessages:
     return out
 
 
-def _sums(body: bytes, stated: bytes) -> bool:
+def _check_sums(body: bytes, stated: bytes) -> bool:
     """Fletcher's sums of a frame."""
     x = np.frombuffer(body, dtype=np.uint8).astype(np.int64)
     return stated == bytes((int(x.sum()) & 0xFF, int(np.sum(x * np.arange(len(x), 0, -1))) & 0xFF))

@@ -30,7 +30,7 @@ _RANGE_END = 0.95  # of the highest reading: a range that ends lower than that f
 _BAND = 0.01  # b
 _SOFT_BAND = 0.03  # b, of an axis that is known to end: it does so softly
 _TOO_FLAT = 2.5  # q
-_FEWEST = 3  # rows of a flat top
+_FEWEST_ROWS = 3  # rows of a flat top
 _LEAST = {"gyro": 4.0, "accel": 19.0}  # rad/s, m/s^2: no range ends lower (250 deg/s, 2 g)
 _DOUBT = 0.5  # of what is added
 
@@ -50,13 +50,13 @@ def find_cut_peaks(t: Array, x: Array, least: float, highest: Array | None = Non
     `highest` (2,) is what the sensor is known to have read at other times, up and down.
     """
     most = np.zeros(2) if highest is None else highest
-    if not (sure := _flat(t, x, least, _BAND, most)):
+    if not (sure := _find_flat(t, x, least, _BAND, most)):
         return []
-    soft = _flat(t, x, least, _SOFT_BAND, most)
+    soft = _find_flat(t, x, least, _SOFT_BAND, most)
     return soft + [p for p in sure if all(p.last <= q.first or q.last <= p.first for q in soft)]
 
 
-def _flat(t: Array, x: Array, least: float, band: float, highest: Array) -> list[Peak]:
+def _find_flat(t: Array, x: Array, least: float, band: float, highest: Array) -> list[Peak]:
     """The peaks that are within `band` of their height for longer than their sides allow."""
     found = []
     for sign, most in zip((1.0, -1.0), highest, strict=True):
@@ -67,7 +67,7 @@ def _flat(t: Array, x: Array, least: float, band: float, highest: Array) -> list
             top = y[begin:end].max()
             rows = begin + np.flatnonzero(y[begin:end] >= (1.0 - band) * top)
             first, last = int(rows[0]), int(rows[-1]) + 1
-            if last - first < _FEWEST or first < 2 or last + 2 > len(y):
+            if last - first < _FEWEST_ROWS or first < 2 or last + 2 > len(y):
                 continue
             up = (y[first - 1] - y[first - 2]) / (t[first - 1] - t[first - 2])
             down = (y[last] - y[last + 1]) / (t[last + 1] - t[last])

@@ -47,27 +47,27 @@ def without_onboard_offset(recording: Recording, settings: Settings) -> tuple[Re
     if compute_evidence(imu, offset) < 2.0 * np.log(_ODDS):
         return recording, ()
     most = 1e3 * float(np.abs(offset).max())
-    said = Note(
+    note = Note(
         "imu.onboard_offset",
         f"the unit corrected its gyro's offset while it rested, by up to {most:.1f} mrad/s: undone",
     )
-    return replace(recording, imu=replace(imu, gyro=imu.gyro + offset)), (said,)
+    return replace(recording, imu=replace(imu, gyro=imu.gyro + offset)), (note,)
 
 
 def offset_learnt(imu: Imu) -> Array:
     """(N, 3) rad/s that the unit would have taken off more than at the start; a rest at the start had begun before."""
     active = np.zeros(len(imu.t), dtype=bool)
-    for begin, end in _rests(imu):
+    for begin, end in _find_rests(imu):
         active[begin:end] = (begin == 0) | (imu.t[begin:end] > imu.t[begin] + _AFTER)
-    return np.asarray(np.cumsum(imu.gyro * (_RATE * active * _periods(imu))[:, None], axis=0))
+    return np.asarray(np.cumsum(imu.gyro * (_RATE * active * _find_periods(imu))[:, None], axis=0))
 
 
 def compute_evidence(imu: Imu, offset: Array) -> float:
     """Twice the logarithm of how much likelier the rows are if the unit took `offset` (N, 3) off than if it did not."""
-    T = _periods(imu)[:, None]
+    T = _find_periods(imu)[:, None]
     angle, bent = np.cumsum(imu.gyro * T, axis=0), np.cumsum(offset * T, axis=0)
     total = 0.0
-    for begin, end in _rests(imu):
+    for begin, end in _find_rests(imu):
         if np.count_nonzero(np.diff(offset[begin:end, 0])) * float(np.median(T)) < _SHORTEST:
             continue
         first = np.flatnonzero(np.diff(((imu.t[begin:end] - imu.t[begin]) / _BLOCK).astype(int), prepend=-1))
@@ -87,7 +87,7 @@ def compute_evidence(imu: Imu, offset: Array) -> float:
     return total
 
 
-def _rests(imu: Imu) -> Iterator[tuple[int, int]]:
+def _find_rests(imu: Imu) -> Iterator[tuple[int, int]]:
     """First row and the one after the last of each stretch that seems to the unit a rest long enough."""
     still = (np.abs(imu.gyro) < _RESTS).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
@@ -96,5 +96,5 @@ def _rests(imu: Imu) -> Iterator[tuple[int, int]]:
             yield int(begin), int(end)
 
 
-def _periods(imu: Imu) -> Array:
+def _find_periods(imu: Imu) -> Array:
     return np.diff(imu.t, prepend=imu.t[0])

@@ -171,7 +171,7 @@ def within(samples: Samples, keyframes: Array, t: Array, ba: Array, bg: Array) -
     dR, dV, dP = np.empty((len(t), 3, 3)), np.empty((len(t), 3)), np.empty((len(t), 3))
     for rows in chunks(pieces.count):
         dt, index = pieces.pad(rows)
-        R, V, P = _means(_less(samples.gyro, index, bg[rows]), _less(samples.accel, index, ba[rows]), dt)
+        R, V, P = _integrate_pieces(_unbias(samples.gyro, index, bg[rows]), _unbias(samples.accel, index, ba[rows]), dt)
         place = np.full(len(pieces.count), -1)
         place[rows] = np.arange(len(rows))
         here = np.flatnonzero(place[interval] >= 0)
@@ -180,7 +180,7 @@ def within(samples: Samples, keyframes: Array, t: Array, ba: Array, bg: Array) -
     return dR, dV, dP
 
 
-def _less(x: Array, index: Array, bias: Array) -> Array:
+def _unbias(x: Array, index: Array, bias: Array) -> Array:
     """(L, 3, n) samples of (L, n) pieces less the bias (n, 3) of each interval.
 
     Pieces first and intervals last here and below: every operation then runs along contiguous numbers.
@@ -203,7 +203,7 @@ def _rotate(R: Array, x: Array) -> Array:
     return R[:, :, 0] * x[:, None, 0] + R[:, :, 1] * x[:, None, 1] + R[:, :, 2] * x[:, None, 2]
 
 
-def _means(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Array]:
+def _integrate_pieces(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Array]:
     """R (L+1, 3, 3, n), V, P (L+1, 3, n) (start frame) at the edges of (L, n) pieces."""
     L, n = dt.shape
     h = dt[:, None]
@@ -218,7 +218,7 @@ def _means(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Array]:
         step[:, i, i] += cosine
         step[:, j, i] += sine[:, k]
         step[:, i, j] -= sine[:, k]
-    R = np.ascontiguousarray(_products(turn).transpose(0, 2, 3, 1))
+    R = np.ascontiguousarray(_multiply_up(turn).transpose(0, 2, 3, 1))
     one = _cross(phi, f)
     two = _cross(phi, one)
     V = running_sum(_rotate(R[:-1], (f + b * one + c * two) * h))
@@ -226,7 +226,7 @@ def _means(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Array]:
     return R, V, P
 
 
-def _products(turn: Array) -> Array:
+def _multiply_up(turn: Array) -> Array:
     """Running products of rotations (L, n, 3, 3) along the first axis, from one: one more than there are factors."""
     L, n = turn.shape[:2]
     out = np.empty((L + 1, n, 3, 3))
@@ -258,8 +258,8 @@ def _integrate(
     parts_of_noise: bool = False,
 ) -> Intervals:
     L, n = dt.shape
-    w, f = _less(samples.gyro, index, bg), _less(samples.accel, index, ba)
-    R, V, P = _means(w, f, dt)
+    w, f = _unbias(samples.gyro, index, bg), _unbias(samples.accel, index, ba)
+    R, V, P = _integrate_pieces(w, f, dt)
     T = dt.sum(0)
     A = running_sum((-0.5 * dt)[:, None, None] * (R[:-1] + R[1:]))
     # the rest in cells of a few pieces, within which A is a straight line

@@ -57,7 +57,7 @@ def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
     length = t_fill - imu.t[gap]
     at = gap + 1  # the made-up sample stands before the row that ends the gap
     fill = {name: 0.5 * (getattr(imu, name)[gap] + getattr(imu, name)[gap + 1]) for name in ("gyro", "accel")}
-    extra = {name: _structure(getattr(imu, name), length / period) * length for name in ("gyro", "accel")}
+    extra = {name: _compute_structure(getattr(imu, name), length / period) * length for name in ("gyro", "accel")}
     return Samples(
         t=np.insert(imu.t, at, t_fill),
         gyro=np.insert(imu.gyro, at, fill["gyro"], axis=0),
@@ -69,7 +69,7 @@ def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
     )
 
 
-def _structure(x: Array, lags: Array) -> Array:
+def _compute_structure(x: Array, lags: Array) -> Array:
     """Half the mean squared change per axis over each lag (in samples)."""
     steps = np.maximum(1, np.rint(lags)).astype(int)
     values = {}

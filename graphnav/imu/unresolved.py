@@ -31,12 +31,12 @@ def with_unresolved_motion(samples: Samples, noise: ImuNoise) -> Samples:
     period = float(np.median(np.diff(samples.t)))
     return replace(
         samples,
-        extra_gyro=samples.extra_gyro + _density(samples.gyro, noise.gyro_noise_density, period),
-        extra_accel=samples.extra_accel + _density(samples.accel, noise.accel_noise_density, period),
+        extra_gyro=samples.extra_gyro + _estimate_density(samples.gyro, noise.gyro_noise_density, period),
+        extra_accel=samples.extra_accel + _estimate_density(samples.accel, noise.accel_noise_density, period),
     )
 
 
-def _density(x: Array, white: float, period: float) -> Array:
+def _estimate_density(x: Array, white: float, period: float) -> Array:
     """White density squared (N,) of rows (N, 3); `white` is the sensor's own density."""
     change = np.sum(np.diff(x, axis=0) ** 2, axis=1) / 3.0
     change = np.maximum(change - 2.0 * white**2 / period, 0.0)

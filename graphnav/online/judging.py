@@ -23,12 +23,12 @@ from graphnav.core.rotation import Array
 from graphnav.detectors import detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment
+from graphnav.estimation.building import start_sigma
 from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.noise.exclusion import estimate_without_faults
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe
-from graphnav.estimation.posing import start_sigma
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.online.sensors import Sensors, unit_of

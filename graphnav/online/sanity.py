@@ -24,7 +24,7 @@ Row = tuple[str, float, tuple[float, ...]]  # sensor, time (s), values
 
 _BLANK = (math.nan,) * 6
 _SUREST = 1e-4  # m, m/s; a tenth of what the phase of a carrier can be measured to
-_MOST = 600  # fixes: what contradicts so many that agreed is believed when there are more of it
+_MOST_FIXES = 600  # fixes: what contradicts so many that agreed is believed when there are more of it
 _SET_BACK = 20  # IMU rows one after the other at times that have passed: not some that came late, but another clock
 LASTING = 1.2  # s, that these last: more than a second, so that one stands at a second that is remembered
 _REMEMBERED = 36_000  # s, ten hours
@@ -81,7 +81,7 @@ class Reach:
 
     _t: float = -math.inf
     _p: Array | None = None  # (3,) m, Earth-fixed, of the newest that was taken
-    _count: int = 0  # in a row, up to `_MOST`
+    _count: int = 0  # in a row, up to `_MOST_FIXES`
     _others: list[Row] = field(default_factory=list)  # out of reach of these, one after the other within reach
     _last: tuple[float, Array] | None = None  # the newest of the others
 
@@ -91,7 +91,7 @@ class Reach:
         if self._p is None or _is_near(t - self._t, p - self._p):
             if t > self._t:
                 self._t, self._p = t, p
-            self._count = min(self._count + 1, _MOST)
+            self._count = min(self._count + 1, _MOST_FIXES)
             self._others.clear()
             return []
         if self._last is None or not self._others or not _is_near(t - self._last[0], p - self._last[1]):
@@ -101,7 +101,7 @@ class Reach:
         if len(self._others) <= self._count:
             return None
         rows, self._others = self._others, []
-        self._t, self._p, self._count = t, p, min(len(rows), _MOST)
+        self._t, self._p, self._count = t, p, min(len(rows), _MOST_FIXES)
         return rows
 
 

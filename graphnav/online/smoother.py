@@ -18,10 +18,10 @@ from graphnav.core.notes import Note
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import Alignment, align, ready, with_known_heading
+from graphnav.estimation.building import start_sigma
 from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.pipeline import origin
-from graphnav.estimation.posing import start_sigma
 from graphnav.estimation.solution import ExcludedSpan, to_trajectory
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.watch import LONGEST

@@ -11,7 +11,7 @@ from graphnav.online.sensors import Row
 from graphnav.online.smoother import Smoother
 from graphnav.recording import Recording
 
-_MOST = 100  # failures that are remembered
+_MOST_FAILURES = 100  # failures that are remembered
 
 
 class Online(Smoother):
@@ -66,7 +66,7 @@ class Online(Smoother):
         now = self.sensors.imu.newest
         at = traceback.extract_tb(error.__traceback__)[-1]
         said = f"at {now:.3f} s: {type(error).__name__}: {error} in {Path(at.filename).name}:{at.lineno}"
-        self.failures = [*self.failures[-_MOST:], said]
+        self.failures = [*self.failures[-_MOST_FAILURES:], said]
         since = self._last_settled
         self.notes.append(
             Note(

@@ -78,12 +78,12 @@ class Gnss:
         return {name: n for k, name in FIX_TYPES.items() if (n := int(np.count_nonzero(self.type == k)))}
 
 
-def fix_types(said: Array, numbers: dict[int, int] | None = None) -> NDArray[np.intp] | None:
+def fix_types(types: Array, numbers: dict[int, int] | None = None) -> NDArray[np.intp] | None:
     """Types of fixes by the numbers of `FIX_TYPES`.
 
     Parameters
     ----------
-    said
+    types
         (N,) what a log says, NaN where it is blank.
     numbers
         The log's own numbers -> those of `FIX_TYPES`; these when None.
@@ -94,9 +94,9 @@ def fix_types(said: Array, numbers: dict[int, int] | None = None) -> NDArray[np.
         (N,), 0 where a number is blank or means no type; None if no fix says its type.
     """
     numbers = {k: k for k in FIX_TYPES} if numbers is None else numbers
-    found = np.zeros(len(said), dtype=np.intp)
+    found = np.zeros(len(types), dtype=np.intp)
     for theirs, ours in numbers.items():
-        found[said == theirs] = ours
+        found[types == theirs] = ours
     return found if found.any() else None
 
 

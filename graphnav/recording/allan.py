@@ -18,10 +18,10 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 
 PER_DECADE = 12  # averaging times
-_FEWEST = 9  # periods of the longest averaging time that the log must hold
+_FEWEST_PERIODS = 9  # periods of the longest averaging time that the log must hold
 _SHORTEST = 60.0  # s of a log that is worth it
 _FLAT = 2.0 / np.pi * np.log(2.0)
-_STEP = 1.0  # s, of the means that show whether the log moves
+_MEANS_OF = 1.0  # s, of the means that show whether the log moves
 _TURNS, _PUSHES = np.radians(1.0), 0.1  # rad/s, m/s^2: more than this from the median, and it moves
 
 
@@ -51,10 +51,13 @@ class Allan:
         """The lines to paste under [imu.noise]: root mean squares over the axes."""
         out = []
         for name, noise, unit in (("gyro", self.gyro_noise, "rad/s"), ("accel", self.accel_noise, "m/s2")):
-            out.append(_line(f"{name}_noise_density", _rms(noise.white), f"{unit}/sqrt(Hz)"))
-            walk, why = _rms(noise.walk), "rate random walk"
+            out.append(_line(f"{name}_noise_density", _compute_rms(noise.white), f"{unit}/sqrt(Hz)"))
+            walk, why = _compute_rms(noise.walk), "rate random walk"
             if walk == 0.0:
-                walk, why = _rms(noise.instability / np.sqrt(noise.floor)), "bias instability over the root of its time"
+                walk, why = (
+                    _compute_rms(noise.instability / np.sqrt(noise.floor)),
+                    "bias instability over the root of its time",
+                )
             out.append(_line(f"{name}_bias_walk", walk, f"{unit}/sqrt(s): {why}"))
         return out
 
@@ -96,7 +99,7 @@ def allan_of(t: Array, gyro: Array, accel: Array) -> Allan:
 
 def find_motion(t: Array, gyro: Array, accel: Array) -> float | None:
     """The first time (s from the start) at which means over a second leave the median of the log; None at rest."""
-    n = max(round(_STEP / float(np.median(np.diff(t)))), 1)
+    n = max(round(_MEANS_OF / float(np.median(np.diff(t)))), 1)
     for samples, limit in ((gyro, _TURNS), (accel, _PUSHES)):
         means = samples[: len(samples) // n * n].reshape(-1, n, 3).mean(1)
         far = np.flatnonzero((np.abs(means - np.median(means, axis=0)) > limit).any(-1))
@@ -107,7 +110,7 @@ def find_motion(t: Array, gyro: Array, accel: Array) -> float | None:
 
 def list_averaging(count: int) -> Array:
     """Numbers of samples to average over, even on a logarithmic scale, up to a ninth of the log."""
-    most = max(count // _FEWEST, 1)
+    most = max(count // _FEWEST_PERIODS, 1)
     steps = np.logspace(0.0, np.log10(most), max(int(PER_DECADE * np.log10(most)), 1) + 1)
     return np.unique(np.round(steps).astype(int))
 
@@ -139,7 +142,7 @@ def _fit(tau: Array, deviation: Array, count: int) -> AllanFigures:
     return AllanFigures(white, instability, walk, tau[np.argmin(deviation, axis=0)])
 
 
-def _rms(x: Array) -> float:
+def _compute_rms(x: Array) -> float:
     return float(np.sqrt(np.mean(np.square(x))))
 
 

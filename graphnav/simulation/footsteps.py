@@ -1,4 +1,4 @@
-"""Where and when one foot of a walker stands: footprints along a way of straights and corners."""
+"""Where and when one foot of a walker stands: footprints along a route of straights and corners."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 
-_GRID = 0.005  # m, between the points at which a way is integrated
+_GRID = 0.005  # m, between the points at which a route is integrated
 
 
 @dataclass(frozen=True)
-class Way:
+class Route:
     """The middle line of a walk, by arc length."""
 
     s: Array  # (G,) m
@@ -30,7 +30,7 @@ class Way:
         return xy, np.interp(s, self.s, self.heading)
 
 
-def way(parts: Sequence[tuple[float, float]], heading: float = 0.0) -> Way:
+def route(parts: Sequence[tuple[float, float]], heading: float = 0.0) -> Route:
     """From parts (m, deg): each so long, and turning evenly by so much, to the right positive; `heading` in deg."""
     edges = np.concatenate([[0.0], np.cumsum([length for length, _ in parts])])
     turned = heading + np.concatenate([[0.0], np.cumsum([turn for _, turn in parts])])
@@ -38,11 +38,11 @@ def way(parts: Sequence[tuple[float, float]], heading: float = 0.0) -> Way:
     psi = np.deg2rad(np.interp(s, edges, turned))
     step = np.column_stack([np.sin(psi), np.cos(psi)])
     moved = np.cumsum(0.5 * (step[1:] + step[:-1]), axis=0) * (s[1] - s[0])
-    return Way(s, np.concatenate([np.zeros((1, 2)), moved]), psi)
+    return Route(s, np.concatenate([np.zeros((1, 2)), moved]), psi)
 
 
 def rectangle(perimeter: float, laps: int, corner: float = 0.6, ratio: float = 0.55) -> list[tuple[float, float]]:
-    """Parts of a way `laps` times around, to the left, that ends where it began, just after a corner.
+    """Parts of a route `laps` times around, to the left, that ends where it began, just after a corner.
 
     `perimeter` counts the arcs of radius `corner`, m; `ratio` is the short side's over the long one's.
     """
@@ -90,17 +90,17 @@ class Cadence:
 
 
 def footsteps(
-    along: Way, cadence: Cadence, start: float, walked: float, end: float, rng: np.random.Generator, *,
+    along: Route, cadence: Cadence, start: float, walked: float, end: float, rng: np.random.Generator, *,
     side: float = 0.08, toe_out: float = 6.0, closed: bool = False,
 ) -> Footprints:  # fmt: skip
-    """Footprints of a foot `side` m right of the way, which walks from `start` for `walked` s of a recording to `end`.
+    """Footprints of a foot `side` m right of the route, which walks from `start` for `walked` s of one to `end`.
 
     It begins and ends with strides of some two thirds, standing beside the other foot; strides are shorter in
     corners. A foot that turns does a third of it on the floor, on its ball. `toe_out` in deg; `closed` puts the last
     footprint on the first.
     """
     count = max(3, round(along.length / cadence.length + 0.7))
-    # the way's curvature over a stride, from equal strides
+    # the route's curvature over a stride, from equal strides
     even = np.linspace(0.0, along.length, count + 1)
     turn = np.abs(np.diff(along.at(even)[1]))
     part = 1.0 + cadence.length_jitter * rng.standard_normal(count) - 0.2 * np.minimum(turn / 1.57, 1.0)

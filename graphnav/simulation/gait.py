@@ -119,13 +119,13 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     vary = 1.0 + style.jitter * rng.standard_normal((K, 11))
     sway = np.deg2rad(0.03) * _sway(len(t), rng, 2)
     # a first and a last stance begin and end as the others do
-    usual = float(np.median(off[1:-1] - strike[1:-1]))
-    begun = np.where(np.arange(K) == 0, off - usual, strike)
-    ended = np.where(np.arange(K) == K - 1, strike + usual, off)
+    typical = float(np.median(off[1:-1] - strike[1:-1]))
+    begins = np.where(np.arange(K) == 0, off - typical, strike)
+    ends = np.where(np.arange(K) == K - 1, strike + typical, off)
 
-    pitch = _pitch(t, steps, begun, ended, style, vary) + sway[:, 0]
-    psi = _heading(t, steps, begun, style, vary)
-    roll = _roll(t, steps, begun, style, vary) + sway[:, 1]
+    pitch = _make_pitch(t, steps, begins, ends, style, vary) + sway[:, 0]
+    psi = _make_heading(t, steps, begins, style, vary)
+    roll = _make_roll(t, steps, begins, style, vary) + sway[:, 1]
 
     # the stride in whose swing each time lies, and how far it is through it
     k = np.clip(np.searchsorted(off[:-1], t) - 1, 0, K - 2)
@@ -148,8 +148,8 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     up = h + air * (gaussian_filter1d(h, _SWING / STEP) - h) + gaussian_filter1d(clearance, style.give / STEP)
     east = base[:, 0] + along * np.sin(psi) + aside * np.cos(psi)
     north = base[:, 1] + along * np.cos(psi) - aside * np.sin(psi)
-    x = np.column_stack([east, north, up, roll, pitch, psi]) + _ring(t, strike[1:], style, rng)
-    stances = np.column_stack([begun + _FLAT * (ended - begun), begun + _HEEL_OFF * (ended - begun)])
+    x = np.column_stack([east, north, up, roll, pitch, psi]) + _make_ring(t, strike[1:], style, rng)
+    stances = np.column_stack([begins + _FLAT * (ends - begins), begins + _HEEL_OFF * (ends - begins)])
     stances[0, 0], stances[-1, 1] = 0.0, end
     return Foot(spline(0.0, STEP, x, DEGREE), 0.0, end, np.column_stack([strike, off]), stances)
 
@@ -163,42 +163,42 @@ def _smooth(t: Array, knots: list[Array], values: list[Array]) -> Array:
     return gaussian_filter1d(out, _MUSCLE / STEP, mode="nearest")
 
 
-def _pitch(t: Array, steps: Footprints, begun: Array, ended: Array, style: Style, vary: Array) -> Array:
-    K, D = len(steps), ended - begun
+def _make_pitch(t: Array, steps: Footprints, begins: Array, ends: Array, style: Style, vary: Array) -> Array:
+    K, D = len(steps), ends - begins
     knots, values = [steps.strike[1:]], [style.strike_pitch * vary[1:, 3]]
     for share, value in _ROLLING:
         # before it starts and after it ends to walk, the foot is flat
         rows = np.arange(K)[(1 if share < _HEEL_OFF else 0) : (K - 1 if share > _FLAT else K)]
-        knots.append(begun[rows] + share * D[rows])
+        knots.append(begins[rows] + share * D[rows])
         values.append(np.where(rows == 0, min(value, -0.3), value) * vary[rows, 4])
     S = steps.strike[1:] - steps.off[:-1]
     for share, value, column in ((0.0, style.off_pitch, 5), (0.17, style.last_pitch, 6), (0.88, style.high_pitch, 7)):
         knots.append(steps.off[:-1] + share * S)
         values.append(value * vary[:-1, column])
     # at rest, level but for what the shoe gives way
-    knots += [np.array([-1.0, begun[0] + 0.35 * D[0]]), np.array([begun[-1] + 0.4 * D[-1], steps.off[-1] + 1.0])]
+    knots += [np.array([-1.0, begins[0] + 0.35 * D[0]]), np.array([begins[-1] + 0.4 * D[-1], steps.off[-1] + 1.0])]
     values += [np.full(2, -0.3), np.full(2, -0.3)]
     return np.deg2rad(_smooth(t, knots, values))
 
 
-def _heading(t: Array, steps: Footprints, begun: Array, style: Style, vary: Array) -> Array:
+def _make_heading(t: Array, steps: Footprints, begins: Array, style: Style, vary: Array) -> Array:
     """Turning on the floor with the heel's rising, the rest in the air with a little swing of the toes."""
     S = steps.strike[1:] - steps.off[:-1]
-    D = steps.off - begun
+    D = steps.off - begins
     middle = 0.5 * (steps.leave[:-1] + steps.land[1:]) + np.deg2rad(style.swing_yaw) * (vary[:-1, 8] - 1.0) / 0.06
-    knots = [steps.strike[1:], (begun + 0.35 * D)[:-1], steps.off[:-1], steps.off[:-1] + 0.45 * S]
+    knots = [steps.strike[1:], (begins + 0.35 * D)[:-1], steps.off[:-1], steps.off[:-1] + 0.45 * S]
     values = [steps.land[1:], steps.land[:-1], steps.leave[:-1], middle]
     knots += [np.array([-1.0, 0.0]), np.array([steps.strike[-1] + 0.1, steps.off[-1] + 1.0])]
     values += [np.full(2, steps.land[0]), np.full(2, steps.land[-1])]
     return _smooth(t, knots, values)
 
 
-def _roll(t: Array, steps: Footprints, begun: Array, style: Style, vary: Array) -> Array:
+def _make_roll(t: Array, steps: Footprints, begins: Array, style: Style, vary: Array) -> Array:
     """On the outer edge at the strike, level on the floor, inward at lift-off, outward in the air."""
     S = steps.strike[1:] - steps.off[:-1]
-    D = steps.off - begun
+    D = steps.off - begins
     rows = slice(0, -1)
-    knots = [steps.strike[1:], (begun + 0.25 * D)[rows], (begun + 0.6 * D)[rows], steps.off[rows]]
+    knots = [steps.strike[1:], (begins + 0.25 * D)[rows], (begins + 0.6 * D)[rows], steps.off[rows]]
     values = [3.0 * vary[1:, 9], 0.4 * (vary[rows, 10] - 1.0) / 0.06, 0.2 * vary[rows, 10], -3.0 * vary[rows, 9]]
     knots += [steps.off[:-1] + 0.45 * S, np.array([-1.0, 0.0]), np.array([steps.strike[-1] + 0.15, t[-1]])]
     values += [style.swing_roll * vary[:-1, 10], np.zeros(2), np.zeros(2)]
@@ -215,7 +215,7 @@ def _share_of_swing(u: Array) -> Array:
     return BSpline(knots, _SPEED / _SPEED.mean(), len(_SPEED) - 1).antiderivative()(u)
 
 
-def _ring(t: Array, strikes: Array, style: Style, rng: np.random.Generator) -> Array:
+def _make_ring(t: Array, strikes: Array, style: Style, rng: np.random.Generator) -> Array:
     """(J, 6) what is left of a strike: shoe, flesh and mounting ring and die out within some 0.15 s.
 
     Movements of `style.impact` and turns such as go with them at a foot's size.

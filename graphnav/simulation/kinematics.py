@@ -83,7 +83,7 @@ class _AxleMotion:
     euler: Array  # (n, 3) rate of the body against l, in body axes
 
 
-def _axle_motion(path: Path, shake: Shake, mount: Mount, t: Array) -> _AxleMotion:
+def _derive_axle_motion(path: Path, shake: Shake, mount: Mount, t: Array) -> _AxleMotion:
     x = path.spline(np.clip(t, path.start, path.end))
     dx = path.spline.derivative()(np.clip(t, path.start, path.end))
     base, d_base = x[:, [BANK, SLOPE, HEADING]], dx[:, [BANK, SLOPE, HEADING]]
@@ -97,12 +97,12 @@ def _axle_motion(path: Path, shake: Shake, mount: Mount, t: Array) -> _AxleMotio
     # in a bend to the right the tyres give way to the left
     v_road = np.column_stack([-speed * np.sin(slip), speed * np.cos(slip), np.zeros(len(t))])
     return _AxleMotion(
-        rotation.mv(R_base, v_road), R_base, _euler_rate(base, d_base), np.array(mount.above_axle) + shaken[:, :3],
-        d_shaken[:, :3], rotation.from_rph(body), _euler_rate(body, d_body),
+        rotation.mv(R_base, v_road), R_base, _turn_rate(base, d_base), np.array(mount.above_axle) + shaken[:, :3],
+        d_shaken[:, :3], rotation.from_rph(body), _turn_rate(body, d_body),
     )  # fmt: skip
 
 
-def _euler_rate(rph: Array, rate: Array) -> Array:
+def _turn_rate(rph: Array, rate: Array) -> Array:
     """Turn rate against the local level in the turned axes, (n, 3), from angles and their rates (n, 3).
 
     R = Rz(-heading) Rx(pitch) Ry(roll), each rate about the axis it turns.
@@ -112,7 +112,7 @@ def _euler_rate(rph: Array, rate: Array) -> Array:
     return np.column_stack([pitch * cr + heading * cp * sr, roll - heading * sp, pitch * sr - heading * cp * cr])
 
 
-def _radii(lat: Array, h: Array) -> tuple[Array, Array]:
+def _compute_radii(lat: Array, h: Array) -> tuple[Array, Array]:
     """(metres per radian along the meridian, radius of the prime vertical), with the height in them."""
     w = 1.0 - E2 * np.sin(lat) ** 2
     return A * (1.0 - E2) / w**1.5 + h, A / np.sqrt(w) + h
@@ -120,7 +120,7 @@ def _radii(lat: Array, h: Array) -> tuple[Array, Array]:
 
 def _level(felt: _AxleMotion, lat: Array, h: Array) -> tuple[Array, Array, Array, Array, Array]:
     """(V in l, V in v, turn over the Earth in v, Earth's rate in v, gravity in v), each (n, 3)."""
-    north, east = _radii(lat, h)
+    north, east = _compute_radii(lat, h)
     ve, vn = felt.v_axle[:, 0], felt.v_axle[:, 1]
     transport = np.column_stack([-vn / north, ve / east, ve * np.tan(lat) / east])
     earth = RATE * np.column_stack([np.zeros_like(lat), np.cos(lat), np.sin(lat)])
@@ -153,14 +153,14 @@ def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Sh
         b = min(a + _CHUNK, count)
         n = b - a
         nodes = np.append((t[a:b, None] + _NODES / rate).ravel(), t[b])
-        felt = _axle_motion(path, shake, mount, nodes)
-        axle[a + 1 : b + 1] = _travel(axle[a], _means(felt.v_axle), 1.0 / rate)
+        felt = _derive_axle_motion(path, shake, mount, nodes)
+        axle[a + 1 : b + 1] = _travel(axle[a], _compute_means(felt.v_axle), 1.0 / rate)
         # between two samples the place hardly changes: what is left of a straight line is 1e-5 m
         place = axle[a:b, None] + _NODES[:, None] * (axle[a + 1 : b + 1] - axle[a:b])[:, None]
         place = np.concatenate([place.reshape(-1, 3), axle[b : b + 1]])
         V_l, V_v, omega, earth, g = _level(felt, place[:, 0], place[:, 2])
-        gyro[a:b] = _means(omega + earth)
-        accel[a:b] = np.diff(V_v[::3], axis=0) * rate + _means(np.cross(omega + 2.0 * earth, V_v) - g)
+        gyro[a:b] = _compute_means(omega + earth)
+        accel[a:b] = np.diff(V_v[::3], axis=0) * rate + _compute_means(np.cross(omega + 2.0 * earth, V_v) - g)
         rows = slice(a, b + 1)
         V[rows], R[rows], omega_eb[rows] = V_l[::3], felt.R_lv[::3], omega[::3]
         arm[rows] = rotation.mv(felt.R_base[::3], felt.arm[::3])
@@ -175,11 +175,11 @@ def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Sh
     def point(times: Array, lever_arm_b: Array) -> tuple[Array, Array]:
         """(llh, velocity in local ENU) of a point fixed to the IMU, at times within the drive, (M, 3) each."""
         times = np.clip(np.asarray(times, dtype=float), t[0], t[-1])
-        felt = _axle_motion(path, shake, mount, times)
+        felt = _derive_axle_motion(path, shake, mount, times)
         k = np.clip(((times - t[0]) * rate).astype(int), 0, count - 1)
         u = ((times - t[k]) * rate)[:, None]
         # cubic Hermite through the axle's places and their rates
-        d0, d1 = (_place_rate(axle[j], _axle_motion(path, shake, mount, t[j]).v_axle) / rate for j in (k, k + 1))
+        d0, d1 = (_place_rate(axle[j], _derive_axle_motion(path, shake, mount, t[j]).v_axle) / rate for j in (k, k + 1))
         change = axle[k + 1] - axle[k]
         place = axle[k] + u * (d0 + u * (3 * change - 2 * d0 - d1 + u * (d0 + d1 - 2 * change)))
         V_l, _, omega, _, _ = _level(felt, place[:, 0], place[:, 2])
@@ -191,14 +191,14 @@ def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Sh
     return TrueMotion(t, llh, v, R_lb, omega_eb @ R_vb, gyro @ R_vb, accel @ R_vb, axle, point)
 
 
-def _means(x: Array) -> Array:
+def _compute_means(x: Array) -> Array:
     """Means (n, 3) over n periods of values (3 n + 1, 3) at their Lobatto nodes."""
     inner = _WEIGHTS[1] * (x[1::3] + x[2::3])
     return inner + _WEIGHTS[0] * (x[:-1:3] + x[3::3])
 
 
 def _place_rate(llh: Array, v: Array) -> Array:
-    north, east = _radii(llh[:, 0], llh[:, 2])
+    north, east = _compute_radii(llh[:, 0], llh[:, 2])
     return np.column_stack([v[:, 1] / north, v[:, 0] / (east * np.cos(llh[:, 0])), v[:, 2]])
 
 

@@ -97,13 +97,13 @@ def drive(
     edges = start + np.r_[0.0, np.cumsum(durations)]
     v1 = np.array([m.speed for m in manoeuvres], dtype=float)
     v0 = np.r_[0.0, v1[:-1]]
-    way = 0.5 * (v0 + v1) * durations
+    length = 0.5 * (v0 + v1) * durations
     for k, m in enumerate(manoeuvres):
         if v0[k] * v1[k] < 0:
             raise ConfigError(
                 f"manoeuvre {k}: stop before changing between forward and reverse", key="manoeuvre.direction"
             )
-        if m.turn and way[k] == 0:
+        if m.turn and length[k] == 0:
             raise ConfigError(f"manoeuvre {k}: cannot turn on the spot", key="manoeuvre.on_the_spot")
 
     t = centres(start, float(edges[-1]), STEP, DEGREE)
@@ -113,13 +113,13 @@ def drive(
     speed = v0[i] + gain * u * u * (3.0 - 2.0 * u)
     speed[np.abs(speed) < 1e-9] = 0.0  # of a manoeuvre whose end rounding puts beside the grid
     covered = (v0[i] * u + gain * (u**3 - 0.5 * u**4)) * durations[i]
-    share = np.divide(covered, way[i], out=np.zeros_like(t), where=way[i] != 0)
+    share = np.divide(covered, length[i], out=np.zeros_like(t), where=length[i] != 0)
     share = share * share * (3.0 - 2.0 * share)
 
     def along(ends: Sequence[float], first: float) -> Array:
         last, before = np.array(ends, dtype=float), np.r_[first, ends[:-1]]
         # where nothing is covered, nothing can change
-        last = np.where(way == 0, before, last)
+        last = np.where(length == 0, before, last)
         return before[i] + (last - before)[i] * share
 
     turned = heading + np.cumsum([m.turn for m in manoeuvres])

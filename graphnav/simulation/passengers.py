@@ -46,7 +46,7 @@ def movement(
     push = np.zeros((len(t), 3))  # heave, pitch, roll, as static answers
     for event in events:
         if isinstance(event, Fidget):
-            there = _hump(t, event.t, rng.uniform(0.5, 1.2)) * event.size
+            there = _make_hump(t, event.t, rng.uniform(0.5, 1.2)) * event.size
             push += there[:, None] * rng.normal(0.0, (0.2, 0.5, 0.6)) * (_SINKS, _PITCHES, _ROLLS)
             continue
         load = np.array([-_SINKS, -event.end * _PITCHES, event.side * _ROLLS])
@@ -54,12 +54,12 @@ def movement(
             # holding on and swinging in or out, then the weight is there or gone
             seated = event.t + rng.uniform(1.5, 2.5)
             push += (event.weight * _step(t, seated, rng.uniform(0.6, 1.0)))[:, None] * load
-            push += (0.5 * _hump(t, seated, rng.uniform(0.4, 0.7)))[:, None] * load * rng.uniform(0.3, 1.0, 3)
+            push += (0.5 * _make_hump(t, seated, rng.uniform(0.4, 0.7)))[:, None] * load * rng.uniform(0.3, 1.0, 3)
             slam = seated + rng.uniform(1.5, 2.5)
         else:
             slam = event.t + rng.uniform(2.0, 4.0)
         for at, size in ((event.t, 0.2), (slam, 0.8)):  # unlatching, shutting
-            push += (size * _hump(t, at, 0.06))[:, None] * load * (0.3, 0.5, 1.0)
+            push += (size * _make_hump(t, at, 0.06))[:, None] * load * (0.3, 0.5, 1.0)
     swung = np.zeros_like(push)
     for k, (hz, damping) in enumerate(((1.4, 0.3), (1.6, 0.3), (1.8, 0.25))):
         swung[:, k] = signal.lfilter(*oscillator(hz, damping), push[:, k])
@@ -74,6 +74,6 @@ def _step(t: Array, at: float, width: float) -> Array:
     return u * u * (3.0 - 2.0 * u)
 
 
-def _hump(t: Array, at: float, width: float) -> Array:
+def _make_hump(t: Array, at: float, width: float) -> Array:
     """A push that comes and goes within some `width` s."""
     return np.exp(-0.5 * ((t - at) / (0.4 * width)) ** 2)

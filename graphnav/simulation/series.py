@@ -17,7 +17,7 @@ from graphnav.simulation.splines import stream
 from graphnav.simulation.vibration import gauss_markov
 
 
-def _epochs(motion: TrueMotion, rate: float) -> Array:
+def _list_epochs(motion: TrueMotion, rate: float) -> Array:
     """Whole periods from the start of a drive on, s."""
     t0, t1 = motion.t[0], motion.t[-1]
     return np.asarray(t0 + np.arange(int((t1 - t0) * rate + 1e-6) + 1) / rate)
@@ -36,7 +36,7 @@ class BarometerModel:
 
     def read(self, motion: TrueMotion, seed: int) -> tuple[Series, dict[str, float]]:
         """The readings of a drive, and the offset (m, at the start) and scale error in them."""
-        t, rng = _epochs(motion, self.rate), stream(seed, "barometer")
+        t, rng = _list_epochs(motion, self.rate), stream(seed, "barometer")
         offset, scale = self.weather * rng.standard_normal(), self.scale * rng.standard_normal()
         white, steps = rng.standard_normal((2, len(t)))
         steps[0] = 0.0
@@ -65,7 +65,7 @@ class DualAntennaModel:
 
     def read(self, motion: TrueMotion, seed: int) -> tuple[Series, dict[str, float]]:
         """The readings of a drive, and the degrees by which the baseline is turned in heading and pitch."""
-        t, rng = _epochs(motion, self.rate), stream(seed, "second antenna")
+        t, rng = _list_epochs(motion, self.rate), stream(seed, "second antenna")
         turned = np.radians(self.turned) * rng.standard_normal(2)
         white = rng.standard_normal((len(t), 2))
         slow = gauss_markov(len(t), 1.0 / (self.rate * self.slow_time), stream(seed, "second antenna slow"), 2)

@@ -107,10 +107,10 @@ class Engine:
         wander = self.wander_hz * gauss_markov(len(t), _SLOW / self.wander_time, rng)
         f = self.frequency(v, wander)
         load = 1.0 + (self.moving_gain - 1.0) * v * v / (v * v + 1.0)
-        accel, turn = _amplitudes(self.idle, len(t))
+        accel, turn = _draw_amplitudes(self.idle, len(t))
         for a, b, idle in self.spans:
             weight = np.clip(0.5 + np.minimum(t - a, b - t) / 2.0, 0.0, 1.0)
-            for value, other in zip((accel, turn), _amplitudes(idle, len(t)), strict=True):
+            for value, other in zip((accel, turn), _draw_amplitudes(idle, len(t)), strict=True):
                 value += weight.reshape(-1, *(1,) * (value.ndim - 1)) * (other - value)
         omega = 2.0 * np.pi * f[:, None] * np.array(self.orders)
         # The mean over a sample weakens a line; beyond Nyquist an IMU's own low-pass leaves little of it.
@@ -127,7 +127,7 @@ class Engine:
         return _EngineOrders(phase.antiderivative(), phase, size, size.derivative(), np.array(self.orders), phases)
 
 
-def _amplitudes(idle: Idle, count: int) -> tuple[Array, Array]:
+def _draw_amplitudes(idle: Idle, count: int) -> tuple[Array, Array]:
     accel = np.array(idle.accel_mg) * MG
     turn = np.deg2rad(np.array(idle.pitch_rate_deg_s))
     return np.tile(accel, (count, 1, 1)), np.tile(turn, (count, 1))

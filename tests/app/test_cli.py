@@ -172,18 +172,7 @@ def test_comparison_csv_has_a_row_per_solver_with_the_numbers_of_the_summaries(c
 
 
 def test_of_a_run_over_a_comparison_its_own_page_is_drawn_again(tmp_path):
-    part = [
-        str(Path(__file__).parents[2] / "data" / "tokyo"),
-        "-o",
-        str(tmp_path),
-        "--solver",
-        "ekf",
-        "--noise",
-        "stated",
-        "--end",
-        "60",
-        "--quiet",
-    ]
+    part = ["kitti", "-o", str(tmp_path), "--solver", "ekf", "--noise", "stated", "--end", "30", "--quiet"]
     assert cli.run(["compare", *part]) == 0
     assert cli.run(["smooth", *part]) == 0
     before = (tmp_path / "report.html").read_bytes()

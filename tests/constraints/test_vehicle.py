@@ -154,6 +154,9 @@ def test_a_restless_stop_is_believed_less(exact: tuple[Recording, Trajectory]) -
     np.testing.assert_allclose(restless.sigma[t < 91.0], calm.sigma[t < 91.0])
 
 
+STATED = {"noise": {"mode": "stated"}}  # where what is asked has nothing to do with how good the sensors are
+
+
 def estimated(recording: Recording, **settings: dict[str, object]) -> Solution:
     return run(recording, settings_from(settings), ("batch",))["batch"]
 
@@ -173,9 +176,9 @@ def test_calibration_is_recovered() -> None:
 
 
 def test_a_late_odometer_is_found_out(shared_data: Path) -> None:
-    recording = oracle.oracle_drive(shared_data, 3)[0].crop(0.0, 300.0)
+    recording = oracle.oracle_drive(shared_data, 3, rate=50.0)[0].crop(0.0, 300.0)
     late = replace(recording.odometer, t=recording.odometer.t + 0.35, delay_sigma=0.3)
-    delay = estimated(replace(recording, odometer=late)).parameters[ODOMETER_DELAY]
+    delay = estimated(replace(recording, odometer=late), **STATED).parameters[ODOMETER_DELAY]
     assert delay.value[0, 0] == pytest.approx(0.35, abs=0.02)
     assert abs(delay.value[0, 0] - 0.35) < 4.0 * delay.sigma[0, 0]
 
@@ -192,7 +195,7 @@ def test_an_unsigned_odometer_backs_up() -> None:
     blind = replace(odometer, speed=np.abs(odometer.speed), way=way, signed=False)
     far = {}
     for name, sensor in (("signed", odometer), ("unsigned", blind)):
-        solution = estimated(replace(recording, odometer=sensor).without("gnss", (begin, end)))
+        solution = estimated(replace(recording, odometer=sensor).without("gnss", (begin, end)), **STATED)
         truth = made.recording.truth
         p = solution.frame.from_llh(truth.llh)
         inside = (solution.t > backs[0]) & (solution.t < backs[-1])
@@ -208,11 +211,11 @@ def heading(truth: Trajectory) -> Array:
 
 
 def test_an_odometer_stuck_at_zero_is_not_believed(shared_data: Path) -> None:
-    recording = oracle.oracle_drive(shared_data, 4)[0].crop(300.0, 560.0)  # with the outage
+    recording = oracle.oracle_drive(shared_data, 4, rate=50.0)[0].crop(300.0, 560.0)  # with the outage
     odometer = recording.odometer
     stuck = (odometer.t > 440.0) & (odometer.t < 460.0)  # in the outage, at speed
     broken = replace(recording, odometer=replace(odometer, speed=np.where(stuck, 0.0, odometer.speed)))
-    good, bad = (estimated(r) for r in (recording, broken))
+    good, bad = (estimated(r, **STATED) for r in (recording, broken))
     t = good.t[(good.t > 415.0) & (good.t < 475.0)]
     gap = [s.frame.to_llh(s.states.p[np.searchsorted(s.t, t)]) for s in (good, bad)]
     assert np.abs((gap[0] - gap[1]) * [6.4e6, 6.4e6, 1.0]).max() < 0.2
@@ -269,8 +272,8 @@ def test_the_last_half_minute_of_a_motorway(shared_data: Path) -> None:
 
 def test_sigma_survives_long_stops_in_the_dark(shared_data: Path) -> None:
     """Eight minutes with nothing but stops: metres on the Earth, millimetres against the place of a stop."""
-    recording, _ = oracle.oracle_drive(shared_data, 5, rtk=False, odometer=False)
-    inertial = settings_from({"vehicle": {"nhc": False}})
+    recording, _ = oracle.oracle_drive(shared_data, 5, rtk=False, odometer=False, rate=50.0)
+    inertial = settings_from({"vehicle": {"nhc": False}, **STATED})
     found = run(recording.without("gnss", (135.0, 600.0)), inertial)
     for name, solution in found.items():
         variance = np.diagonal(solution.covariance, axis1=1, axis2=2)

@@ -313,7 +313,7 @@ CASES = {"as stated": {}, "imu": {"imu": 3.0}, "fixes worse": {"fixes": 3.0}, "f
 
 @pytest.fixture(scope="module", params=list(CASES))
 def estimated(request: pytest.FixtureRequest) -> Estimated:
-    path = oracle.vehicle_path(duration=240, seed=11)
+    path = oracle.vehicle_path(duration=240, rate=50.0, seed=11)
     drives = [made(path, seed, **CASES[request.param]) for seed in SEEDS]
     return Estimated(drives, [estimate_noise(d.base, d.opening) for d in drives])
 
@@ -561,7 +561,7 @@ def test_of_a_second_the_best_fix_is_used() -> None:
 @pytest.fixture(scope="module")
 def late() -> tuple[Recording, Trajectory]:
     """Fixes of 2 cm that are stamped when they arrive, up to 0.4 s late."""
-    recording, truth = oracle.drive(oracle.vehicle_path(duration=200, seed=6), seed=5)
+    recording, truth = oracle.drive(oracle.vehicle_path(duration=200, rate=50.0, seed=6), seed=5)
     gnss = recording.gnss
     assert gnss is not None
     t = gnss.t + np.random.default_rng(3).uniform(0.0, 0.4, len(gnss.t))
@@ -594,5 +594,5 @@ def test_a_constant_far_beyond_its_prior_is_said(late: tuple[Recording, Trajecto
     assert [line.split()[0] for line in describe_far(base, backward(base, ekf(base, opening=opening)))] == [
         "gnss_time_offset"
     ]
-    well, opening = posed(oracle.drive(oracle.vehicle_path(duration=200, seed=6), seed=5)[0])
+    well, opening = posed(oracle.drive(oracle.vehicle_path(duration=200, rate=50.0, seed=6), seed=5)[0])
     assert not describe_far(well, backward(well, ekf(well, opening=opening)))

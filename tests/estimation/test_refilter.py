@@ -35,7 +35,10 @@ from graphnav.imu.dynamics import SCALE
 def posed() -> Problem:
     """Every constraint of a vehicle, fixes with velocities and errors that last."""
     recording, _ = oracle.drive(
-        oracle.vehicle_path(duration=200, seed=7), seed=5, gnss_velocity_sd=(0.1, 0.1, 0.1), odometer_rate=20.0
+        oracle.vehicle_path(duration=200, rate=50.0, seed=7),
+        seed=5,
+        gnss_velocity_sd=(0.1, 0.1, 0.1),
+        odometer_rate=20.0,
     )
     settings = Settings()
     frame = LocalFrame(origin(recording))

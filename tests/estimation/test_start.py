@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import at_rate
 from test_faults import left_out, moved
 
 from graphnav import load
@@ -30,7 +31,7 @@ from graphnav.recording import Recording
 @pytest.fixture(scope="module")
 def drive(shared_data: Path) -> Recording:
     """It stands for 89 s, and again from 129 to 154 s; fixes of 2 cm."""
-    return load(shared_data / "oracle_drive").crop(0.0, 180.0)
+    return at_rate(load(shared_data / "oracle_drive").crop(0.0, 180.0), 50.0)
 
 
 def shifted(recording: Recording, begin: float, end: float, by: float, each: float = 0.0) -> Recording:
@@ -112,7 +113,7 @@ def test_at_the_end_what_is_refused_is_tried_if_it_is_more(right: int, first: bo
 
 
 def test_as_it_drives_a_jump_at_rest_is_no_motion(drive: Recording) -> None:
-    wrong = shifted(drive, 30.0, 70.0, 40.0)
+    wrong = at_rate(shifted(drive, 30.0, 70.0, 40.0), 25.0)
     online = Online(without_rows(wrong), Settings())
     for row in rows_of(wrong)[1]:
         online.add(row)

@@ -49,6 +49,16 @@ def plain(drive: tuple[Recording, Trajectory], rows: list[Row]) -> Trajectory:
     return played(drive[0], rows, QUICK)[1]
 
 
+@pytest.fixture(scope="module", params=[-1000.0, 3600.0])
+def stepped(
+    request: pytest.FixtureRequest, drive: tuple[Recording, Trajectory], rows: list[Row]
+) -> tuple[list[Row], list[Row], Online, Trajectory]:
+    """Rows before a step of the clock, all of them with those behind it, and what becomes of them."""
+    old = [row for row in rows if row[1] <= 41.9]
+    sent = [*old, *((name, t + request.param, values) for name, t, values in rows if t > 41.9)]
+    return old, sent, *played(drive[0], sent, QUICK)
+
+
 def between(rows: list[Row], more: list[Row]) -> list[Row]:
     """Rows in order of time, those of `more` where they belong."""
     return sorted([*rows, *more], key=lambda row: row[1])
@@ -163,18 +173,19 @@ def test_a_fix_before_the_first_imu_row_of_another_clock_counts(
     assert twice.sensors.counts["gnss: repeated"] == 1
 
 
-@pytest.mark.parametrize("step", [-1000.0, 3600.0])
 @pytest.mark.parametrize(("sensor", "which"), [("imu", -1), ("imu", -3), ("imu", 0), ("gnss", -1), ("gnss", 0)])
 def test_a_row_that_comes_late_over_a_step_of_the_clock_counts(
-    drive: tuple[Recording, Trajectory], rows: list[Row], step: float, sensor: str, which: int
+    drive: tuple[Recording, Trajectory],
+    stepped: tuple[list[Row], list[Row], Online, Trajectory],
+    sensor: str,
+    which: int,
 ) -> None:
     """By a second, from before the step or from behind it: each piece is as if it had come in its turn."""
-    old = [row for row in rows if row[1] <= 41.9]
-    sent = [*old, *((name, t + step, values) for name, t, values in rows if t > 41.9)]
+    old, sent, plain, other = stepped
     numbers = range(len(old)) if which < 0 else range(len(old), len(sent))
     k = [n for n in numbers if sent[n][0] == sensor][which]
     late = [*sent[:k], *sent[k + 1 : k + 25], sent[k], *sent[k + 25 :]]
-    (online, track), (plain, other) = (played(drive[0], some, QUICK) for some in (late, sent))
+    online, track = played(drive[0], late, QUICK)
     assert sorted(late) == sorted(sent)
     assert +online.sensors.counts == +plain.sensors.counts
     assert set(+plain.sensors.counts) == {"imu", "gnss", "odometer"}

@@ -15,7 +15,7 @@ from graphnav.estimation.alignment.back import find_stand_end
 from graphnav.estimation.alignment.first import level
 from graphnav.recording import Recording
 
-_FEWEST = 3  # readings: their median is none of one that is wrong
+_FEWEST_READINGS = 3  # readings: their median is none of one that is wrong
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def baseline_heading(recording: Recording, settings: Settings, stationary: Array
     else:
         end = float(max((b for a, b in stationary if a <= first), default=begin))
     rows = (series.t >= begin - SAME_TIME) & (series.t <= end + SAME_TIME) & np.isfinite(series["heading"])
-    if end <= begin or np.count_nonzero(rows) < _FEWEST:
+    if end <= begin or np.count_nonzero(rows) < _FEWEST_READINGS:
         return None
     of_level = rotation.from_rph(np.array([*level(recording, begin), 0.0])) @ np.array(series.figures.baseline)
     heading = rotation.wrap(series["heading"][rows] - np.arctan2(of_level[0], of_level[1]))

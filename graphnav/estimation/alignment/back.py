@@ -89,14 +89,14 @@ def find_stand_end(imu: Imu, start: float, end: float) -> float:
         return start
     force = imu.accel[rows][: size * blocks].reshape(blocks, size, 3).mean(axis=1)
     rate = imu.gyro[rows][: size * blocks].reshape(blocks, size, 3).mean(axis=1)
-    moves = np.any((_range(force) > 0.25) | (_range(rate) > 0.02), axis=1)
+    moves = np.any((_measure_range(force) > 0.25) | (_measure_range(rate) > 0.02), axis=1)
     if not moves.any():
         return end
     stood = int(np.argmax(moves)) - 1
     return float(imu.t[size * stood - 1]) if stood >= 2 else start
 
 
-def _range(x: Array) -> Array:
+def _measure_range(x: Array) -> Array:
     """(N, k) highest less lowest so far."""
     return np.maximum.accumulate(x, axis=0) - np.minimum.accumulate(x, axis=0)
 

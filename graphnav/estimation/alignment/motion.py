@@ -28,12 +28,12 @@ from graphnav.recording import Gnss, Imu, Recording
 
 _DIRECTION = 0.5 * COURSE_SIGMA  # rad, to which the fixes shall know the direction of travel: less than the rest does
 _FIXES = 10  # that the short problem wants to see
-_FEWEST = 3  # without which there is no acceleration
+_FEWEST_FIXES = 3  # without which there is no acceleration
 _MOVES = 5.0  # sigmas of way that are motion: noise gets there once in 270 000 fixes, exp(-5^2/2)
 _BEFORE = 10.0  # s of the stretch before the motion
-_JUMP = 6.0  # times what fixes usually are off their running median, or their sigma
+_OUTLYING = 6.0  # times what fixes usually are off their running median, or their sigma
 _TURNS = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)  # rad, of the start headings that are tried from the first guess
-_FIRST = 10  # iterations by which a start either has converged or creeps
+_FIRST_ITERATIONS = 10  # iterations by which a start either has converged or creeps
 _UNLIKELY = 14.0  # by which a log-likelihood is less where one in a million is left: -ln 1e-6
 
 Smoother = Callable[[Problem, States], Solution]
@@ -50,7 +50,7 @@ def drop_implausible(recording: Recording) -> Recording:
     p = LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
     off = np.linalg.norm(p - median_filter(p, size=(5, 1), mode="nearest"), axis=1)
     usual = np.maximum(np.median(off), np.linalg.norm(gnss.sd[:, :2], axis=1))
-    return replace(recording, gnss=pick_fixes(gnss, off <= _JUMP * usual))
+    return replace(recording, gnss=pick_fixes(gnss, off <= _OUTLYING * usual))
 
 
 def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:
@@ -64,10 +64,10 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
     if gnss is None:
         return None
     used = (gnss.t >= recording.start) & (gnss.t <= recording.end)
-    if np.count_nonzero(used) < _FEWEST:
+    if np.count_nonzero(used) < _FEWEST_FIXES:
         return None
     gnss = _thin(gnss, recording.start, recording.end)
-    if len(gnss.t) < _FEWEST:
+    if len(gnss.t) < _FEWEST_FIXES:
         return None
     t, p = gnss.t, LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
     if recording.platform == "vehicle":
@@ -86,7 +86,7 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
     # at the speed that followed it took a while to get that far
     speed = np.abs(way.D[last] - way.D[first]) / max(t[last] - t[first], 1.0)
     under_way = np.abs(way.D[first]) / speed if speed > 0.0 else np.inf
-    begin = min(t[first] - _BEFORE - under_way, t[max(last - _FEWEST + 1, 0)])
+    begin = min(t[first] - _BEFORE - under_way, t[max(last - _FEWEST_FIXES + 1, 0)])
     return float(max(t[0], np.round(begin, 3))), float(t[last])  # what rounding did to D shall not show
 
 
@@ -103,7 +103,7 @@ def align_in_motion(
     )
     bias = _estimate_rate(imu)
     rp = level(recording, begin)
-    heading = _heading_of_accelerations(part, frame, rp, bias)
+    heading = _fit_heading(part, frame, rp, bias)
     tried = _try_headings(part, settings, frame, smooth, rp, heading, bias)
     if not tried:
         raise EstimationError(
@@ -116,24 +116,24 @@ def align_in_motion(
     wide = settings.alignment.prior_inflation * np.sqrt(np.diag(P))
     J = rotation.rph_jacobian(rotation.to_rph(R))
     own = np.sqrt(np.diag(J @ P @ J.T))
-    said: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     if recording.platform == "vehicle":
         assert part.gnss is not None
         found = with_course(tried, part.gnss, own[2], wide[2])
         R = rotation.exp(np.array([0.0, 0.0, -found.turn])) @ R  # heading is clockwise, rotation about up is not
-        own[2], wide[2], said = found.own, found.wide, found.notes
+        own[2], wide[2], notes = found.own, found.wide, found.notes
     notes = (
         Note(
             "alignment.motion",
             f"aligned over {begin - recording.start:.0f} to {end - recording.start:.0f} s: roll and pitch to "
             f"{np.degrees(own[:2].max()):.2g} deg, heading to {np.degrees(own[2]):.2g} deg",
         ),
-        *said,
+        *notes,
     )
     return carry_back(recording, settings, best, R, wide, own, begin, notes)
 
 
-def _heading_of_accelerations(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> float:
+def _fit_heading(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> float:
     """Heading (rad) at the start of `part` by which levelled accelerations become those of the fixes.
 
     With both horizontal accelerations as complex numbers east + i north, fixes = z * felt + d by least squares;
@@ -183,7 +183,7 @@ def _try_headings(
     tried = [_try(part, settings, frame, smooth, end, bias) for end in ends[:-1]]
     assert part.gnss is not None
     worth = max(1.0, len(part.gnss.t) / (2.0 * np.pi))
-    few = settings.solver.model_copy(update={"max_iterations": min(_FIRST, settings.solver.max_iterations)})
+    few = settings.solver.model_copy(update={"max_iterations": min(_FIRST_ITERATIONS, settings.solver.max_iterations)})
     last = _try(part, settings.model_copy(update={"solver": few}), frame, smooth, ends[-1], bias)
     best = min((one.cost for one in tried if np.isfinite(one.cost)), default=np.inf)
     if last.iterations >= few.max_iterations and last.cost < best + _UNLIKELY * worth:

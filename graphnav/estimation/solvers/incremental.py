@@ -125,7 +125,7 @@ def replay(problem: Problem, solver: str, engine: Engine, lag: float, progress: 
         if progress is not None and k % 64 == 0:
             progress(solver, k / K)
     problem, again = engine.finish(problem)
-    spent = time.perf_counter() - began
+    elapsed = time.perf_counter() - began
     parts, live = engine.settled, States.stack([newest.state for newest in points])
     # in the order that the problem has its parameters in
     columns = parts[-1].columns[-1]
@@ -149,7 +149,7 @@ def replay(problem: Problem, solver: str, engine: Engine, lag: float, progress: 
         iterations=1,
         cost=cost_at(problem, at),
         stopped=f"every keyframe settled with {whole}",
-        timings={solver: spent},
+        timings={solver: elapsed},
         notes=(
             *problem.notes,
             Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe(seconds)),

@@ -21,7 +21,7 @@ from graphnav.recording.checks.stated import describe_exchange, describe_mirrori
 from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
 from graphnav.sensors.tables import TIME
 
-_SURE = 4.0  # sigmas
+_SURE_SIGMAS = 4.0  # sigmas
 _NO_BETTER = 0.05  # of a correlation
 _MIN_SPEED = 5.0  # m/s, at which wheels are compared
 
@@ -148,7 +148,7 @@ def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterato
         return
     lag = forward.lag
     leap = ", the leap seconds between GPS time and UTC" if abs(abs(lag) - 18.0) < 0.5 else ""
-    certain = abs(lag) - 4.0 * forward.spread > _SURE * GnssSettings().time_offset_sigma
+    certain = abs(lag) - 4.0 * forward.spread > _SURE_SIGMAS * GnssSettings().time_offset_sigma
     # what the odometer is off by as well is the receiver's
     own = odometer is None or odometer.correlation < 0.9 or abs(odometer.lag - lag) > 0.5 * abs(lag)
     mend = f"{-lag:+.2f} to time_offset in [imu]" if own else f"{lag:+.2f} to time_offset in [gnss]"
@@ -163,8 +163,8 @@ def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterato
 def check_mirroring(recording: Recording, track: Track) -> Iterator[Finding]:
     """A course that turns against the gyro because the positions are a mirror image, by exchange or by a sign."""
     other = exchange_lat_lon(recording.gnss) if recording.gnss is not None else None
-    way = crosschecks.track(replace(other, v=None)) if other is not None else None
-    yaw = crosschecks.yaw_fit(recording.imu, way) if way is not None else None
+    alone = crosschecks.track(replace(other, v=None)) if other is not None else None
+    yaw = crosschecks.yaw_fit(recording.imu, alone) if alone is not None else None
     if yaw is not None and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
         yield describe_exchange("the turns of the gyro")
     elif (crosschecks.sideways_correlation(recording.imu, track) or 0.0) > 0.0:  # the gyro turns as the force says
@@ -178,8 +178,8 @@ def find_mirrored(recording: Recording, wrong: Sequence[Finding]) -> list[Findin
         return list(wrong)
     if not any(f.key == "gnss.velocity_axes" for f in wrong):
         return list(wrong)
-    ways = [crosschecks.track(one) for one in (gnss, replace(gnss, v=None))]
-    fits = [crosschecks.yaw_fit(recording.imu, way) for way in ways if way is not None]
+    tracks = [crosschecks.track(one) for one in (gnss, replace(gnss, v=None))]
+    fits = [crosschecks.yaw_fit(recording.imu, track) for track in tracks if track is not None]
     by_velocity, by_places = (
         [fit.coefficients[0] if fit is not None and fit.correlation > 0.8 else 0.0 for fit in fits]
         if len(fits) == 2

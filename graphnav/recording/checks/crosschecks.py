@@ -289,12 +289,12 @@ def velocity_fit(track: Track, places: Track) -> Fit | None:
     i, j, y = i[real], j[real], y[real]
     if len(y) < MIN_PAIRS or y.std() < 0.25:
         return None
-    t, way = track.t, np.zeros((len(track.t), 2))
-    way[1:] = np.cumsum(0.5 * (track.v[1:, :2] + track.v[:-1, :2]) * np.diff(t)[:, None], axis=0)
+    t, travelled = track.t, np.zeros((len(track.t), 2))
+    travelled[1:] = np.cumsum(0.5 * (track.v[1:, :2] + track.v[:-1, :2]) * np.diff(t)[:, None], axis=0)
 
     def speed(of: Index, lag: Lags) -> Array:
         a, b = (np.add.outer(lag, places.t[of] + side * places.width[of] / 2) for side in (-1.0, 1.0))
-        gone = [np.interp(b, t, axis) - np.interp(a, t, axis) for axis in way.T]
+        gone = [np.interp(b, t, axis) - np.interp(a, t, axis) for axis in travelled.T]
         return np.asarray(np.hypot(*gone) / places.width[of])
 
     def x_at(rows: Index, lag: Lags) -> Array:
@@ -343,12 +343,12 @@ def odometer_fit(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
     return fit, float(np.median(track.speed[rows][moving] / x[moving]))
 
 
-def sideways_correlation(imu: Imu, way: Track) -> float | None:
+def sideways_correlation(imu: Imu, track: Track) -> float | None:
     """Correlation of the force to the right with what the gyro's turns ask for at the way's speed.
 
     None where there are no curves.
     """
-    seconds = np.arange(max(way.t[0], imu.t[0]), min(way.t[-1], imu.t[-1]) - 1.0)
+    seconds = np.arange(max(track.t[0], imu.t[0]), min(track.t[-1], imu.t[-1]) - 1.0)
     if len(seconds) < MIN_PAIRS:
         return None
     edge = np.searchsorted(imu.t, np.r_[seconds, seconds[-1] + 1.0])
@@ -356,7 +356,7 @@ def sideways_correlation(imu: Imu, way: Track) -> float | None:
     force, turn = (
         np.diff(np.r_[0.0, np.cumsum(x)][edge]) / np.maximum(count, 1) for x in (imu.accel[:, 0], imu.gyro[:, 2])
     )
-    wanted = -np.interp(seconds + 0.5, way.t, way.speed) * turn  # to the left in a curve to the left
+    wanted = -np.interp(seconds + 0.5, track.t, track.speed) * turn  # to the left in a curve to the left
     used = count > 0
     if used.sum() < MIN_PAIRS or wanted[used].std() == 0.0 or force[used].std() == 0.0:
         return None

@@ -25,7 +25,7 @@ _SLOW = 10.0  # s; what changes slower than this is the road (as in `graphnav.re
 _STEP, _FINE, _FINEST = 0.1, 0.02, 0.005  # s, of the grids of lags
 _AT_ONCE = 1 << 16  # rows times lags, so that what is at work stays small
 _PARTS, _STUDENT = 4, 3.0  # parts, and the variance of Student's t with the degrees of freedom of their scatter
-_FAR = 5.0  # robust sigmas beyond which a row is an error of the fix
+_OUTLYING = 5.0  # robust sigmas beyond which a row is an error of the fix
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def refine_lag(
         if found is None:
             return guess, REACH
         off = np.abs(found.e - np.median(found.e))
-        rows = found.rows[off <= _FAR * np.median(off) / 0.6745]
+        rows = found.rows[off <= _OUTLYING * np.median(off) / 0.6745]
 
     def profile(lags: Array) -> Array:
         return np.array([np.nan if one is None else one.unexplained for one in at_each(lags, rows)])

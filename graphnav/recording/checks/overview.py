@@ -86,8 +86,8 @@ class Inspection:
 
     def values(self) -> dict[str, Any]:
         """All of it, for JSON."""
-        said = [f.values() for f in self.findings]
-        return {"name": self.name, "platform": self.platform, **self.facts, "findings": said}
+        findings = [f.values() for f in self.findings]
+        return {"name": self.name, "platform": self.platform, **self.facts, "findings": findings}
 
     def text(self) -> str:
         """A summary of several lines for people."""
@@ -174,8 +174,8 @@ def inspect(recording: Recording) -> Inspection:
         yaw = crosschecks.yaw_fit(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
-        if turns_back and (said := list(check_mirroring(recording, track))):
-            findings += said
+        if turns_back and (mirrored := list(check_mirroring(recording, track))):
+            findings += mirrored
         elif not turned:
             findings += check_gyro_sign(recording.imu) if turns_back else check_imu_axes(recording.imu, forward, track)
             findings += check_yaw_scale(yaw)

@@ -34,16 +34,16 @@ def _screen(series: Series) -> tuple[Series, list[Finding]]:
         if not lost:
             continue
         size, unit = next(iter(column.units.values())), next(iter(column.units))
-        said = (
+        sentence = (
             f"[{sensor.name}]: {lost} of {int(there.sum())} values of {column.name} lie outside "
             f"{column.lowest / size:g} to {column.highest / size:g} {unit}"
         )
         needed = any(column.name in some for some in sensor.needs)
         if needed and lost > max(_ISOLATED * there.sum(), 1):
             hint = f"say units = {{ {column.name} = ... }}, one of {', '.join(column.units)}"
-            findings.append(Finding("refused", f"{said}: if it is another unit, {hint}", f"{sensor.name}.unit"))
+            findings.append(Finding("refused", f"{sentence}: if it is another unit, {hint}", f"{sensor.name}.unit"))
         else:
-            findings.append(Finding("note", f"{said}: left out", f"{sensor.name}.bounds"))
+            findings.append(Finding("note", f"{sentence}: left out", f"{sensor.name}.bounds"))
     if not findings:
         return series, []
     return take_rows(replace(series, values=values), sensor.usable(values)), findings

@@ -15,7 +15,7 @@ from graphnav.recording import Gnss, ImuNoise, Recording, Truth
 from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.crosschecks import Track
 
-_LONG = 15.0  # m; no lever arm on a road vehicle is that long
+_LONGEST_ARM = 15.0  # m; no lever arm on a road vehicle is that long
 _RUN = 8.0  # m/s, above any walking speed
 # SI figures that no IMU has (a phone's are a tenth or less), and the unit of a data sheet that may have been meant
 _IMPOSSIBLE = {
@@ -45,7 +45,7 @@ def check_lever_arms(recording: Recording) -> Iterator[Finding]:
     """Lever arms in another unit than metres."""
     for name in ("gnss", "odometer"):
         sensor = getattr(recording, name)
-        if sensor is not None and (length := float(np.linalg.norm(sensor.lever_arm))) > _LONG:
+        if sensor is not None and (length := float(np.linalg.norm(sensor.lever_arm))) > _LONGEST_ARM:
             yield Finding(
                 "warning",
                 f"the lever arm in [{name}] is {length:.3g} m long: it is to be in metres",
@@ -104,27 +104,27 @@ def velocities(gnss: Gnss) -> Iterator[Finding]:
         return
     p, v, m = crosschecks.local_positions(gnss), gnss.v, max(1, round(1.0 / float(np.median(np.diff(gnss.t)))))
     dt = gnss.t[m:] - gnss.t[:-m]
-    way = p[m:] - p[:-m]
+    moved = p[m:] - p[:-m]
     # by the trapezoids of all rows between, which follow a change of speed
     steps = 0.5 * (v[1:] + v[:-1]) * np.diff(gnss.t)[:, None]
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(np.nan_to_num(steps), axis=0)])
-    said = total[m:] - total[:-m]
+    stated = total[m:] - total[:-m]
     holes = np.concatenate([[0], np.cumsum(np.isnan(steps).any(axis=1))])
     real = (dt < 1.5 * max(1.0, float(np.median(dt)))) & (holes[m:] == holes[:-m])
-    size = np.hypot(way[:, 0], way[:, 1])
+    size = np.hypot(moved[:, 0], moved[:, 1])
     moving = real & (size > 2.0) & (size < 60.0 * dt)
     if moving.sum() >= crosschecks.MIN_PAIRS:
         other = exchange_lat_lon(gnss)
         if other is not None:
             q = crosschecks.local_positions(other)
             off, mended = (
-                float(np.median(np.linalg.norm((x[m:] - x[:-m] - said)[moving, :2], axis=1))) for x in (p, q)
+                float(np.median(np.linalg.norm((x[m:] - x[:-m] - stated)[moving, :2], axis=1))) for x in (p, q)
             )
             if mended < _MENDED * off:
                 yield describe_exchange("the velocities")
                 return
-        yield from _horizontal(way[moving, :2], said[moving, :2])
-    climb, meant = way[real, 2], said[real, 2]
+        yield from _horizontal(moved[moving, :2], stated[moving, :2])
+    climb, meant = moved[real, 2], stated[real, 2]
     if len(climb) >= crosschecks.MIN_PAIRS and climb.std() > 0.0 and meant.std() > 0.0:
         alike = float(np.corrcoef(climb, meant)[0, 1])
         ratio = float(climb @ meant) / float(meant @ meant)
@@ -169,11 +169,11 @@ def describe_mirroring(which: str, sensor: str) -> Finding:
     )
 
 
-def _horizontal(way: Array, said: Array) -> Iterator[Finding]:
+def _horizontal(moved: Array, stated: Array) -> Iterator[Finding]:
     """Which change of the velocities (N, 2) agrees with the ways (N, 2), if they do not themselves."""
 
     def miss(change: Array) -> float:
-        return float(np.median(np.linalg.norm(way - said @ change.T, axis=1)))
+        return float(np.median(np.linalg.norm(moved - stated @ change.T, axis=1)))
 
     changes: list[tuple[Array, str]] = [
         (np.array([[0.0, 1.0], [1.0, 0.0]]), "east and north velocity are exchanged: exchange the names in columns"),
@@ -187,7 +187,7 @@ def _horizontal(way: Array, said: Array) -> Iterator[Finding]:
         changes.append((factor * np.eye(2), f"the velocities are in {unit}: {hint} in [gnss]"))
     misses = [miss(change) for change, _ in changes]
     best = int(np.argmin(misses))
-    if misses[best] < 0.3 * miss(np.eye(2)) and misses[best] < 0.2 * float(np.median(np.linalg.norm(way, axis=1))):
+    if misses[best] < 0.3 * miss(np.eye(2)) and misses[best] < 0.2 * float(np.median(np.linalg.norm(moved, axis=1))):
         sentence = f"by the positions {changes[best][1]}"
         if best < turned:
             yield Finding("warning", sentence, "gnss.velocity_axes")

@@ -51,7 +51,7 @@ def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: 
     """
     found = find_logs(paths, topics)
     writer = _Writer(folder, topics)
-    writer.decisions += [f"left out: {said}" for said in found.left_out]
+    writer.decisions += [f"left out: {reason}" for reason in found.left_out]
     text = writer.text(found.sensors, name or folder.resolve().name or "drive")
     return Draft(text, tuple(writer.decisions), writer.made)
 

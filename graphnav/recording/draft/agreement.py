@@ -12,7 +12,7 @@ from graphnav.recording.checks.clock import ClockOffsets, clock_of
 from graphnav.recording.draft import motion
 
 CLEAR, FAIR = 0.8, 0.5  # correlations: sure, likely
-_FAR = 0.75  # the least for a shift of clocks that have nothing in common
+_LEAST_CORRELATION = 0.75  # the least for a shift of clocks that have nothing in common
 _TWO_CLOCKS = 0.15  # s; velocities further from the positions than this have a latency of their own
 
 
@@ -136,4 +136,4 @@ def _turn_lag(grid: Array, rate: Array, course: motion.Course) -> motion.Lag | N
     if near is not None and near.correlation > FAIR:
         return near
     far = motion.lag(grid, rate, course.t, course.turn, course.speed**2, anywhere=True)
-    return far if far is not None and far.correlation > _FAR else near
+    return far if far is not None and far.correlation > _LEAST_CORRELATION else near

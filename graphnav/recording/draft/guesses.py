@@ -113,19 +113,19 @@ def speed_unit(t: Array, speed: Array, course: motion.Course | None, stated: str
     return Guess("km/h" if large > 45 else "m/s", f"95 % of the speeds are below {large:.3g}; a guess")
 
 
-def fix_numbers(said: Array, sd: Array | None) -> Guess:
+def fix_numbers(types: Array, sd: Array | None) -> Guess:
     """Whose numbers types of fixes (N,) are, "rtklib", "nmea" or None, by the horizontal sigmas (N,) m of the fixes.
 
     A fixed solution is 1 or 4, and nothing else is that precise; what follows from it must fit the other numbers.
     """
     if sd is None:
         return Guess(None, "no sigmas tell whose numbers they are")
-    usual = {int(k): float(np.median(sd[said == k])) for k in np.unique(said[np.isfinite(said)])}
-    precise = {k for k, s in usual.items() if s < _FIXED}
+    typical = {int(k): float(np.median(sd[types == k])) for k in np.unique(types[np.isfinite(types)])}
+    precise = {k for k, s in typical.items() if s < _FIXED}
     for whose, fixed, known in (("rtklib", 1, range(7)), ("nmea", 4, (0, 1, 2, 4, 5, 9))):
         floats = {2} if whose == "rtklib" else {5}  # that have settled may state as little
-        if fixed in precise and precise <= {fixed} | floats and set(usual) <= set(known):
-            return Guess(whose, f"fixes of {fixed} state {usual[fixed]:.2g} m at the median, as fixed ones do")
+        if fixed in precise and precise <= {fixed} | floats and set(typical) <= set(known):
+            return Guess(whose, f"fixes of {fixed} state {typical[fixed]:.2g} m at the median, as fixed ones do")
     return Guess(None, "its numbers and the sigmas do not tell whose they are")
 
 

@@ -19,7 +19,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 
 STEP = 0.1  # s, of the common grid
-_WINDOW = 1.0  # s, of the moving mean over everything
+_MEAN_OVER = 1.0  # s, of the moving mean over everything
 _SLOW = 3.0  # m/s; slower than this a course means little
 _FEWEST, _TRIMS = 50, 3
 NEAR = 3.0  # s, how far apart clocks are looked for that already overlap
@@ -59,8 +59,8 @@ def course_of(t: Array, llh: Array, v: Array | None) -> Course:
         grid = np.arange(t[0], t[-1], STEP)
         east, north = (mean(np.interp(grid, t, v[:, k])) for k in (0, 1))
     # nothing is known inside gaps, nor where the means reach into them or over an end
-    gap = mean(_mask_gaps(grid, t).astype(float), 4.0 * _WINDOW) > 0.0
-    gap |= (grid < grid[0] + 2.0 * _WINDOW) | (grid > grid[-1] - 2.0 * _WINDOW)
+    gap = mean(_mask_gaps(grid, t).astype(float), 4.0 * _MEAN_OVER) > 0.0
+    gap |= (grid < grid[0] + 2.0 * _MEAN_OVER) | (grid > grid[-1] - 2.0 * _MEAN_OVER)
     speed = np.hypot(east, north)
     ae, an = np.gradient(east, STEP), np.gradient(north, STEP)
     slow = (speed < _SLOW) | gap
@@ -75,16 +75,16 @@ def course_of(t: Array, llh: Array, v: Array | None) -> Course:
 def on_grid(t: Array, x: Array) -> tuple[Array, Array]:
     """Samples (N, k) as means over a second on an even grid; NaN inside gaps."""
     cumulative = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x[1:] * np.diff(t)[:, None], axis=0)])
-    grid = np.arange(t[0] + _WINDOW / 2, t[-1] - _WINDOW / 2, STEP)
+    grid = np.arange(t[0] + _MEAN_OVER / 2, t[-1] - _MEAN_OVER / 2, STEP)
     if not len(grid):
         return grid, np.empty((0, x.shape[1]))
-    both = [np.stack([np.interp(grid + side * _WINDOW / 2, t, c) for c in cumulative.T], -1) for side in (-1, 1)]
-    out = (both[1] - both[0]) / _WINDOW
+    both = [np.stack([np.interp(grid + side * _MEAN_OVER / 2, t, c) for c in cumulative.T], -1) for side in (-1, 1)]
+    out = (both[1] - both[0]) / _MEAN_OVER
     out[_mask_gaps(grid, t)] = np.nan
     return grid, out
 
 
-def mean(x: Array, window: float = _WINDOW) -> Array:
+def mean(x: Array, window: float = _MEAN_OVER) -> Array:
     """Moving mean over some seconds, of the grid."""
     n = 2 * round(window / STEP / 2)
     kernel = np.ones(n + 1)

@@ -96,8 +96,8 @@ def read_plain(path: Path) -> Plain | None:
     if any("," in cell for cell in rows[0]):
         done.append("decimal commas")
     columns = {name: x for name, some in cells.items() if (x := _numbers(some)) is not None}
-    dated, daily, said = _times(cells, columns, layout.above)
-    return Plain(columns, ", ".join([*done, *said]), dated, daily) if done or said else None
+    dated, daily, more = _times(cells, columns, layout.above)
+    return Plain(columns, ", ".join([*done, *more]), dated, daily) if done or more else None
 
 
 def seconds_of_clock(t: Array) -> Array | None:
@@ -178,9 +178,9 @@ def _lay_out(path: Path, lines: Lines) -> _Layout | None:
     mark = _mark_of([line for _, line in lines[first : first + 2]])
     row = _split(lines[first][1], mark)
     head, units = first - 1, []
-    said = [_split(_COMMENT.sub("", line), mark) for _, line in lines[max(first - 2, 0) : first]]
-    if len(said) == 2 and len(said[0]) == len(said[1]) == len(row) and _are_units(said[1]):
-        head, units = first - 2, said[1]
+    two = [_split(_COMMENT.sub("", line), mark) for _, line in lines[max(first - 2, 0) : first]]
+    if len(two) == 2 and len(two[0]) == len(two[1]) == len(row) and _are_units(two[1]):
+        head, units = first - 2, two[1]
     names = _split(_COMMENT.sub("", lines[head][1]), mark)
     if mark is None and len(names) > len(row):  # names of several words stand farther apart
         names = re.split(r"\s{2,}", _COMMENT.sub("", lines[head][1]).strip())
@@ -228,11 +228,11 @@ def _times(
     Dates alone stand in a column beside times of day, or in a line above the header.
     """
     words = {name: some for name, some in cells.items() if name not in columns and any(some)}
-    said = []
+    notes = []
     for name, some in words.items():
         if any(_SLASHES.fullmatch(cell) for cell in some):
             words[name], doubt = _put_year_first(some)
-            said += [doubt] if doubt else []
+            notes += [doubt] if doubt else []
     daily = next((name for name, some in words.items() if all(not c or _clock(c) is not None for c in some)), None)
     days = next((some for name, some in words.items() if name != daily and _date(some[0]) is not None), None)
     if days is not None and any(":" in cell for cell in days):
@@ -246,19 +246,19 @@ def _times(
         seconds += DAY * np.cumsum(np.diff(seconds, prepend=seconds[:1]) < -0.5 * DAY)  # over midnight
         if days is None or (begin := _date(days[0])) is None:
             columns[daily] = seconds
-            return None, daily, [*said, f"times of day of '{daily}' as s since midnight"]
+            return None, daily, [*notes, f"times of day of '{daily}' as s since midnight"]
         midnight = begin.replace(tzinfo=UTC).timestamp()
         columns[daily] = midnight + seconds
-        return daily, None, [*said, f"dates and times of day of '{daily}' as Unix time in s; CHECK: taken as UTC"]
+        return daily, None, [*notes, f"dates and times of day of '{daily}' as Unix time in s; CHECK: taken as UTC"]
     else:
-        return None, None, said
+        return None, None, notes
     stamps = [_date(text) for text in clocks]
     if any(x is None for x in stamps):
-        return None, None, said
+        return None, None, notes
     zone = stamps[0] is not None and stamps[0].tzinfo is not None
     columns[daily] = np.array([(x if x.tzinfo else x.replace(tzinfo=UTC)).timestamp() for x in stamps if x is not None])
     why = "" if zone else "; CHECK: they state no zone and are taken as UTC"
-    return daily, None, [*said, f"dates of '{daily}' as Unix time in s{why}"]
+    return daily, None, [*notes, f"dates of '{daily}' as Unix time in s{why}"]
 
 
 def _put_year_first(cells: list[str]) -> tuple[list[str], str]:

@@ -27,7 +27,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
 
         def add(block: Trajectory, utc: Array | None = None) -> None:
             require_geodetic(block, path)
-            file.write(_rows(block))
+            file.write(_write_rows(block))
 
         yield add
 
@@ -38,7 +38,7 @@ def rows(trajectory: Trajectory) -> str:
     Digits: a microsecond, a micrometre on the ground (1e-11 deg), 0.01 mm in height, 0.01 mm/s, 1e-7 deg;
     sigmas and biases six significant.
     """
-    return _rows(trajectory).decode("ascii")
+    return _write_rows(trajectory).decode("ascii")
 
 
 def columns(trajectory: Trajectory) -> list[tuple[Array | None, str]]:
@@ -62,7 +62,7 @@ def columns(trajectory: Trajectory) -> list[tuple[Array | None, str]]:
     ]
 
 
-def _rows(trajectory: Trajectory) -> bytes:
+def _write_rows(trajectory: Trajectory) -> bytes:
     parts = columns(trajectory)
     table = np.concatenate([values for values, _ in parts if values is not None], axis=1)
     forms = [form for values, one in parts for form in ([one] * values.shape[1] if values is not None else [""] * 3)]

@@ -38,7 +38,7 @@ def rows_bytes(table: Array, row_format: str, last: Array | None = None) -> byte
     """
     table, form = np.asarray(table, dtype=float), row_format + "\n"
     assert len(_FIELD.findall(form)) == table.shape[1] + (last is not None), "a format of other columns"
-    if None not in _kinds(form) and can_compile() and table.size >= (_FEW if "numba" in sys.modules else _MANY):
+    if None not in _list_kinds(form) and can_compile() and table.size >= (_FEW if "numba" in sys.modules else _MANY):
         return b"".join(
             _write_compiled(table[k : k + _ROWS], form, None if last is None else last[k : k + _ROWS])
             for k in range(0, len(table), _ROWS)
@@ -58,7 +58,7 @@ def _write_plainly(table: Array, form: str, last: Array | None) -> bytes:
 def _write_compiled(table: Array, form: str, last: Array | None) -> bytes:
     from graphnav.recording.exporters import rows  # and Numba with it
 
-    kinds = np.array(_kinds(form))
+    kinds = np.array(_list_kinds(form))
     whole = [k for k, one in enumerate(_FIELD.finditer(form)) if one[0] == "%d"]
     if whole:
         table = table.copy()
@@ -81,7 +81,7 @@ def _write_compiled(table: Array, form: str, last: Array | None) -> bytes:
     return b"".join(parts)
 
 
-def _kinds(form: str) -> list[int | None]:
+def _list_kinds(form: str) -> list[int | None]:
     """What `graphnav.recording.exporters.rows` calls the fields of a format, None for those that it does not know."""
 
     def kind(one: re.Match[str]) -> int | None:

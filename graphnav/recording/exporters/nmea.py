@@ -34,20 +34,20 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
                     f"{path}: NMEA needs the time of day, and what t counts from is not known; give --clock",
                     key="export.time_of_day",
                 )
-            file.write("".join(_sentences(block, utc)))
+            file.write("".join(_write_sentences(block, utc)))
 
         yield add
 
 
-def _sentences(trajectory: Trajectory, utc: Array) -> list[str]:
+def _write_sentences(trajectory: Trajectory, utc: Array) -> list[str]:
     day = utc.astype("datetime64[D]")
     of_day = (utc - day) / np.timedelta64(1, "us") * 1e-6
     dates = [f"{d[8:10]}{d[5:7]}{d[2:4]}" for d in np.datetime_as_string(day).tolist()]
-    latitude, longitude = _angles(trajectory.llh[:, 0], 2, "NS"), _angles(trajectory.llh[:, 1], 3, "EW")
-    motion = _motion(trajectory)
+    latitude, longitude = _write_angles(trajectory.llh[:, 0], 2, "NS"), _write_angles(trajectory.llh[:, 1], 3, "EW")
+    motion = _write_motion(trajectory)
     text = []
     for k, seconds in enumerate(of_day.tolist()):
-        clock, place = _clock(seconds), f"{latitude[k]},{longitude[k]}"
+        clock, place = _write_clock(seconds), f"{latitude[k]},{longitude[k]}"
         text.append(sentence(f"GNGGA,{clock},{place},1,,,{trajectory.llh[k, 2]:.4f},M,0.0,M,,"))
         text.append(sentence(f"GNRMC,{clock},A,{place},{motion[k]},{dates[k]},,,A"))
         if trajectory.sd_p is not None and np.isfinite(trajectory.sd_p[k]).all():
@@ -61,12 +61,12 @@ def sentence(body: str) -> str:
     return f"${body}*{reduce(xor, body.encode()):02X}\r\n"
 
 
-def _clock(seconds: float) -> str:
+def _write_clock(seconds: float) -> str:
     ms = round(seconds * 1000)
     return f"{ms // 3600000:02d}{ms // 60000 % 60:02d}{ms // 1000 % 60:02d}.{ms % 1000:03d}"
 
 
-def _angles(radians: Array, width: int, signs: str) -> list[str]:
+def _write_angles(radians: Array, width: int, signs: str) -> list[str]:
     """Degrees and minutes with seven decimals, 0.2 mm, and the hemisphere."""
     minutes = np.round(np.abs(np.rad2deg(radians)) * 60.0, 7)
     whole = np.floor(minutes / 60.0)
@@ -77,7 +77,7 @@ def _angles(radians: Array, width: int, signs: str) -> list[str]:
     ]
 
 
-def _motion(trajectory: Trajectory) -> list[str]:
+def _write_motion(trajectory: Trajectory) -> list[str]:
     """Speed over ground in knots and course in degrees, blank where they are not known."""
     if trajectory.v is None:
         return [","] * len(trajectory)

@@ -28,7 +28,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
     RecordingError
         If pyarrow is not installed.
     """
-    pa, pq = _pyarrow(path)
+    pa, pq = _import_pyarrow(path)
     schema = pa.schema([(column, pa.float64()) for column in HEADER.split(",")], metadata={"name": name})
     # bytes of like meaning together pack to about half; a dictionary of doubles that never repeat only costs
     with pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=False, use_byte_stream_split=True) as file:
@@ -44,7 +44,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
         yield add
 
 
-def _pyarrow(path: Path) -> tuple[Any, Any]:
+def _import_pyarrow(path: Path) -> tuple[Any, Any]:
     try:
         import pyarrow
         import pyarrow.parquet

@@ -32,7 +32,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
                 )
             if frame is None:
                 frame = LocalFrame(block.llh[0])
-                file.write(_head(block).encode())
+                file.write(_write_head(block).encode())
             p_n, R_nb = block.llh, R_lb
             if block.frame == "geodetic":
                 p_n = frame.from_llh(block.llh)
@@ -45,7 +45,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
         yield add
 
 
-def _head(block: Trajectory) -> str:
+def _write_head(block: Trajectory) -> str:
     about = "a local frame"
     if block.frame == "geodetic":
         lat, lon, h = block.llh[0] * np.array([np.rad2deg(1.0), np.rad2deg(1.0), 1.0])

@@ -21,10 +21,10 @@ _BLOCK = 1 << 18  # bytes handled at once: keeps the working arrays in the proce
 _SLAB = 1 << 22  # rows of a column held in one piece: 32 MB, which go back to the system when they are let go
 _COMMA, _MINUS, _POINT, _LINE = b",-.\n"
 _PAD = 16  # bytes before a block, for words that reach back beyond it
-_MOST = 16  # digits read on each side of the point
+_MOST_DIGITS = 16  # digits read on each side of the point
 _U = np.uint64
 _TENS = 10 ** np.arange(19, dtype=_U)
-_LAST = np.array([2**64 - 2 ** (64 - 8 * k) for k in range(9)], _U)  # the last k bytes of a word
+_LAST_BYTES = np.array([2**64 - 2 ** (64 - 8 * k) for k in range(9)], _U)  # the last k bytes of a word
 
 
 def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array]:
@@ -38,7 +38,7 @@ def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array
     slabs: list[list[Array]] = [[] for _ in use]
     rows = 0
     while block := file.read(_BLOCK):
-        found = _columns(block + file.readline(), width, list(use))
+        found = _parse_columns(block + file.readline(), width, list(use))
         done = 0
         while done < found.shape[1]:
             at = rows % _SLAB
@@ -57,7 +57,7 @@ def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array
     return columns
 
 
-def _columns(text: bytes, width: int, use: list[int]) -> Array:
+def _parse_columns(text: bytes, width: int, use: list[int]) -> Array:
     """The same of a few whole lines."""
     if b"\r" in text:
         text = text.replace(b"\r\n", b"\n")
@@ -68,15 +68,15 @@ def _columns(text: bytes, width: int, use: list[int]) -> Array:
     begin, end = edges[:-1].reshape(-1, width) + 1, edges[1:].reshape(-1, width)
     if (b[end] != np.where(np.arange(width) < width - 1, _COMMA, _LINE)).any():
         raise ValueError("not lines of so many cells")
-    point = _points(np.flatnonzero(b == _POINT), begin, end)
+    point = _find_points(np.flatnonzero(b == _POINT), begin, end)
     first, point, stop = (x[:, use].T.ravel() for x in (begin, point, end))
     negative = b[first] == _MINUS
     n_whole, n_part = point - first - negative, np.maximum(stop - point - 1, 0)
     digits = n_whole + n_part
-    plain = (n_whole <= _MOST) & (n_part <= _MOST) & (digits > 0) & (digits < len(_TENS))
+    plain = (n_whole <= _MOST_DIGITS) & (n_part <= _MOST_DIGITS) & (digits > 0) & (digits < len(_TENS))
     n_whole, n_part = n_whole * plain, n_part * plain
-    whole, whole_plain = _digits(text, point, n_whole)
-    part, part_plain = _digits(text, stop, n_part)
+    whole, whole_plain = _parse_digits(text, point, n_whole)
+    part, part_plain = _parse_digits(text, stop, n_part)
     scale = _TENS[n_part]
     number = whole * scale + part
     value = number / scale
@@ -86,7 +86,7 @@ def _columns(text: bytes, width: int, use: list[int]) -> Array:
     return value.reshape(len(use), -1)
 
 
-def _points(points: Array, begin: Array, end: Array) -> Array:
+def _find_points(points: Array, begin: Array, end: Array) -> Array:
     """Where in each cell the decimal point is; its end where there is none."""
     if len(points) == end.size and ((points := points.reshape(end.shape)) >= begin).all() and (points < end).all():
         return points
@@ -96,21 +96,21 @@ def _points(points: Array, begin: Array, end: Array) -> Array:
     return at
 
 
-def _digits(text: bytes, end: Array, n: Array) -> tuple[Array, Array]:
+def _parse_digits(text: bytes, end: Array, n: Array) -> tuple[Array, Array]:
     """The numbers written by the n digits (16 at most) that stand before `end`, and whether digits they are."""
-    value, plain = _eight(text, end, np.minimum(n, 8))
+    value, plain = _parse_eight(text, end, np.minimum(n, 8))
     long = np.flatnonzero(n > 8)
     if len(long):
-        high, high_plain = _eight(text, end[long] - 8, n[long] - 8)
+        high, high_plain = _parse_eight(text, end[long] - 8, n[long] - 8)
         value[long] += high * _U(10**8)
         plain[long] &= high_plain
     return value, plain
 
 
-def _eight(text: bytes, end: Array, n: Array) -> tuple[Array, Array]:
-    """`_digits` for n of 8 at most."""
+def _parse_eight(text: bytes, end: Array, n: Array) -> tuple[Array, Array]:
+    """`_parse_digits` for n of 8 at most."""
     words = np.ndarray(len(text) - 7, "<u8", text, 0, (1,))  # the eight bytes from each byte on, the first lowest
-    within = _LAST.take(n)
+    within = _LAST_BYTES.take(n)
     word = (words.take(end - 8) ^ _U(0x3030303030303030)) & within
     plain = ((word + _U(0x0606060606060606) | word) & _U(0xF0F0F0F0F0F0F0F0)) == 0
     word = word * _U(10) + (word >> _U(8))  # pairs of digits, then fours, then eight

@@ -62,7 +62,7 @@ def read_folder(source: str | Path) -> Recording:
         section = getattr(d, name)
         if section is not None:
             topics[section.file] = (*topics.get(section.file, ()), *section.topic)
-            settled |= {f"{name}.{said}" for said, keys in _SETTLED.items() if keys & section.model_fields_set}
+            settled |= {f"{name}.{figure}" for figure, keys in _SETTLED.items() if keys & section.model_fields_set}
 
     def table(name: str) -> Table:
         section = getattr(d, name)
@@ -186,8 +186,8 @@ def _load_raw(
         raise RecordingError(
             f"{path}: 'raw_gnss.columns' is only for a CSV file, and {d.rover[0]} is none", key="key.not_here"
         )
-    raw, found, said = load_raw(sources, zero - d.time_offset, given)
-    remarks.extend(said)
+    raw, found, notes = load_raw(sources, zero - d.time_offset, given)
+    remarks.extend(notes)
     good = np.isfinite(found.p[:, 0])
     sd = np.sqrt(np.diagonal(found.covariance[good], axis1=1, axis2=2))
     v = np.einsum("nij,nj->ni", enu_axes(ecef_to_llh(found.p[good])), found.v[good])

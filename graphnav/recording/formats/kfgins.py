@@ -47,10 +47,10 @@ _IMU_KEYS, _GNSS_KEYS = ("imupath", "imufile"), ("gnsspath", "gnssfile")
 def recognises(path: Path) -> bool:
     """Whether this is a configuration of either program, a folder with one, or one of their data files."""
     if path.is_dir():
-        return _config_in(path) is not None or any(_kind(p) == "imu" for p in _data_files(path))
+        return _find_config(path) is not None or any(_guess_kind(p) == "imu" for p in _list_data_files(path))
     if path.suffix.lower() in (".yaml", ".yml"):
         return _names_data(path)
-    return path.is_file() and _kind(path) is not None
+    return path.is_file() and _guess_kind(path) is not None
 
 
 def load(path: Path) -> Log:
@@ -63,13 +63,13 @@ def load(path: Path) -> Log:
     """
     remarks = Remarks()
     config: dict[str, Any] = {}
-    config_file = path if path.suffix.lower() in (".yaml", ".yml") else _config_in(path) if path.is_dir() else None
+    config_file = path if path.suffix.lower() in (".yaml", ".yml") else _find_config(path) if path.is_dir() else None
     if config_file is not None:
         config = read_configuration(config_file)
         imu_file = find_file(config_file, config, _IMU_KEYS)
         gnss_file = find_file(config_file, config, _GNSS_KEYS)
     else:
-        imu_file, gnss_file = _pair(path)
+        imu_file, gnss_file = _find_pair(path)
         remarks.add(
             "log.no_configuration",
             "no configuration (.yaml) of KF-GINS or OB_GINS beside it: the antenna's lever arm is taken as zero",
@@ -91,7 +91,7 @@ def load(path: Path) -> Log:
     if gnss_file is not None:
         gnss = _read_gnss(gnss_file, read_lever_arm(where, config, "antlever"), remarks)
     folder = where.parent if config else where
-    if nav := _truth_file(folder, remarks) if folder.is_dir() else None:
+    if nav := _find_truth(folder, remarks) if folder.is_dir() else None:
         check_inside([nav], folder)
         track = read_trajectory(nav)
         truth = Truth(track.t, track.llh, v=track.v, rph=track.rph)
@@ -114,7 +114,7 @@ def load(path: Path) -> Log:
 # ---- files
 
 
-def _config_in(folder: Path) -> Path | None:
+def _find_config(folder: Path) -> Path | None:
     found = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in (".yaml", ".yml") and _names_data(p)]
     return found[0] if found else None
 
@@ -124,13 +124,13 @@ def _names_data(path: Path) -> bool:
     return any(f"\n{key}:" in f"\n{head}" for key in _IMU_KEYS)
 
 
-def _data_files(folder: Path) -> list[Path]:
+def _list_data_files(folder: Path) -> list[Path]:
     return [p for p in sorted(folder.iterdir()) if p.suffix.lower() in (".txt", ".pos", ".bin") and p.is_file()]
 
 
-def _kind(path: Path) -> str | None:
+def _guess_kind(path: Path) -> str | None:
     """'imu' or 'gnss' by the numbers of the first rows, None for anything else."""
-    rows = _first_rows(path)
+    rows = _read_first_rows(path)
     if rows is None:
         return None
     t, rest = rows[:, 0], rows[:, 1:7]
@@ -144,7 +144,7 @@ def _kind(path: Path) -> str | None:
     return None
 
 
-def _first_rows(path: Path) -> Array | None:
+def _read_first_rows(path: Path) -> Array | None:
     raw = first_bytes(path)
     if path.suffix.lower() == ".bin":
         return np.frombuffer(raw[: len(raw) // 56 * 56], "<f8").reshape(-1, 7)[:20] if len(raw) >= 112 else None
@@ -159,9 +159,9 @@ def _first_rows(path: Path) -> Array | None:
     return rows if rows.ndim == 2 and len(rows) else None
 
 
-def _pair(path: Path) -> tuple[Path | None, Path | None]:
+def _find_pair(path: Path) -> tuple[Path | None, Path | None]:
     if path.is_file():
-        kind = _kind(path)
+        kind = _guess_kind(path)
         if kind is None:
             raise RecordingError(
                 f"{path}: neither an IMU text (seconds of week, three angle and three velocity increments) nor a GNSS "
@@ -169,7 +169,7 @@ def _pair(path: Path) -> tuple[Path | None, Path | None]:
                 key="file.kind",
             )
         return (path, None) if kind == "imu" else (None, path)
-    kinds = {p: _kind(p) for p in _data_files(path)}
+    kinds = {p: _guess_kind(p) for p in _list_data_files(path)}
     out = []
     for wanted in ("imu", "gnss"):
         found = [p for p, kind in kinds.items() if kind == wanted]
@@ -187,7 +187,7 @@ def _pair(path: Path) -> tuple[Path | None, Path | None]:
     return out[0], out[1]
 
 
-def _truth_file(folder: Path, remarks: Remarks) -> Path | None:
+def _find_truth(folder: Path, remarks: Remarks) -> Path | None:
     """The truth, which no key names: the only .nav file, or the only one called truth."""
     found = [p for p in sorted(folder.iterdir()) if p.suffix.lower() == ".nav" and "navresult" not in p.name.lower()]
     named = [p for p in found if "truth" in p.name.lower()]

@@ -25,7 +25,7 @@ _FIX_PERIOD = 1.0  # s; the smoothed positions of an INS, taken more often, woul
 _COLUMNS = 30
 
 
-def _oxts(path: Path) -> Path | None:
+def _find_oxts(path: Path) -> Path | None:
     """The folder that holds timestamps.txt and data, at or below `path`."""
     for folder in (path, path / "oxts", *sorted(path.glob("*/oxts"))):
         if (folder / "timestamps.txt").is_file() and (folder / "data").is_dir():
@@ -41,18 +41,18 @@ def load(path: Path) -> Log:
     RecordingError
         Naming the file that cannot be used.
     """
-    folder = _oxts(path)
+    folder = _find_oxts(path)
     if folder is None:
         raise RecordingError(f"{path}: no KITTI folder 'oxts' with timestamps.txt and data in it", key="log.no_folder")
     remarks = Remarks()
     samples = sorted((folder / "data").glob("*.txt"))
     check_inside([folder / "timestamps.txt", *samples], path)
-    t, zero = _times(folder / "timestamps.txt")
+    t, zero = _read_times(folder / "timestamps.txt")
     if len(samples) != len(t):
         raise RecordingError(
             f"{folder}: {len(t)} time stamps but {len(samples)} files in data", key="log.files_missing"
         )
-    rows = np.array([_row(file) for file in samples])
+    rows = np.array([_parse_row(file) for file in samples])
     for k in np.flatnonzero(~np.isfinite(rows).all(axis=1))[:1]:
         raise RecordingError(f"{samples[k]}, line 1: a number that is not finite", key="table.not_finite")
     for k in np.flatnonzero(~is_on_earth(np.radians(rows[:, 0]), np.radians(rows[:, 1]), rows[:, 2]))[:1]:
@@ -104,7 +104,7 @@ def load(path: Path) -> Log:
     )
 
 
-def _times(path: Path) -> tuple[Array, str]:
+def _read_times(path: Path) -> tuple[Array, str]:
     """Seconds since midnight of the first stamp, and that day."""
     stamps = []
     for number, line in enumerate(text_lines(path), 1):
@@ -121,7 +121,7 @@ def _times(path: Path) -> tuple[Array, str]:
     return (np.array(stamps) - day) / np.timedelta64(1, "ns") * 1e-9, str(day)
 
 
-def _row(path: Path) -> list[float]:
+def _parse_row(path: Path) -> list[float]:
     text = " ".join(text_lines(path))
     try:
         values = [parse_number(x) for x in text.split()]
@@ -144,5 +144,5 @@ def _number(text: str) -> bool:
 
 
 FORMAT = log_format(
-    "kitti-raw", "a raw drive of KITTI, the folder with oxts in it", lambda p: _oxts(p) is not None, load
+    "kitti-raw", "a raw drive of KITTI, the folder with oxts in it", lambda p: _find_oxts(p) is not None, load
 )

@@ -60,7 +60,7 @@ def load(path: Path) -> Log:
         If no sentence gives a position, naming the first line that is no sentence, if any.
     """
     remarks = Remarks()
-    epochs, broken, lines = _epochs(path)
+    epochs, broken, lines = _collect_epochs(path)
     if broken:
         remarks.add(
             "log.broken_lines",
@@ -77,7 +77,7 @@ def load(path: Path) -> Log:
             "gnss.not_measured",
             f"{simulated} GGA positions that the receiver only estimated, or was told, were left out",
         )
-    t, zero = _times(epochs, fixes, remarks)
+    t, zero = _date_fixes(epochs, fixes, remarks)
     separation = np.array([_number(e.gga.sep) for e in fixes])
     height = np.array([_number(e.gga.alt) for e in fixes])
     if np.isnan(separation).any():
@@ -97,8 +97,8 @@ def load(path: Path) -> Log:
         ],
         -1,
     )
-    sd = _sigmas(fixes, remarks)
-    v, sd_v = _velocities(fixes, remarks)
+    sd = _read_sigmas(fixes, remarks)
+    v, sd_v = _read_velocities(fixes, remarks)
     order = np.argsort(t, kind="stable")
     order = order[np.concatenate([[True], np.diff(t[order]) > 0]) & np.isfinite(llh[order]).all(-1)]
     if len(order) < len(t):
@@ -116,7 +116,7 @@ def load(path: Path) -> Log:
     return Log(path.stem, gnss=gnss, gps_zero=zero, remarks=tuple(remarks))
 
 
-def _epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
+def _collect_epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
     """Epochs in the order of the file, the numbers of broken lines, and how many lines hold anything."""
     import pynmeagps
 
@@ -190,7 +190,7 @@ def _number(value: Any) -> float:
         return float("nan")
 
 
-def _times(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Remarks) -> tuple[Array, float | None]:
+def _date_fixes(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Remarks) -> tuple[Array, float | None]:
     """GPS seconds of week of the fixes and where the week begins; a time that falls back by half a day is the next."""
     days, day, before = {}, 0, epochs[0].time
     for e in epochs:
@@ -215,7 +215,7 @@ def _times(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Remarks) -> tuple
     return t, zero
 
 
-def _sigmas(fixes: list[_Epoch], remarks: Remarks) -> Array:
+def _read_sigmas(fixes: list[_Epoch], remarks: Remarks) -> Array:
     sd = np.full((len(fixes), 3), np.nan)
     for k, e in enumerate(fixes):
         if e.gst is not None:
@@ -237,7 +237,7 @@ def _sigmas(fixes: list[_Epoch], remarks: Remarks) -> Array:
     return sd
 
 
-def _velocities(fixes: list[_Epoch], remarks: Remarks) -> tuple[Array | None, Array | None]:
+def _read_velocities(fixes: list[_Epoch], remarks: Remarks) -> tuple[Array | None, Array | None]:
     speed = np.array([np.nan if e.speed is None else e.speed for e in fixes])
     course = np.radians([np.nan if e.course is None else e.course for e in fixes])
     if np.isnan(speed).all():

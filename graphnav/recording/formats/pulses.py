@@ -48,8 +48,8 @@ def _unwrap(pulses: Array, step: Array, signed: bool | None, remarks: Remarks) -
     whole = np.mod(step + 0.5 * modulus, modulus) - 0.5 * modulus if signed else np.mod(step, modulus)
     ran_over = whole != step
     # one that began anew at zero did not run over: nothing near the end of the range, and a step like no other
-    usual = np.abs(step[~ran_over]).max(initial=0.0)
-    anew = ran_over & (np.abs(whole) > 4.0 * usual + 4.0)
+    typical = np.abs(step[~ran_over]).max(initial=0.0)
+    anew = ran_over & (np.abs(whole) > 4.0 * typical + 4.0)
     whole[anew] = 0.0
     for mask, what in ((ran_over & ~anew, f"ran over ({modulus:.0f})"), (anew, "began anew")):
         if mask.any():

@@ -95,7 +95,7 @@ def log_format(
         from graphnav.recording.formats.soundness import sound  # which imports this module
 
         log = choose(path, topics) if choose is not None and topics else load(path)
-        return replace(_without_nowhere(sound(log, path)), files=log.files or _files(path))
+        return replace(_without_nowhere(sound(log, path)), files=log.files or _list_files(path))
 
     return Format(
         name, about, can_read, lambda source: load_log(source).recording(source), load=load_log,
@@ -116,7 +116,7 @@ def _without_nowhere(log: Log) -> Log:
     )
 
 
-def _files(path: Path) -> tuple[Path, ...]:
+def _list_files(path: Path) -> tuple[Path, ...]:
     """A file, or those of a folder."""
     return tuple(sorted(file for file in path.iterdir() if file.is_file())) if path.is_dir() else (path,)
 

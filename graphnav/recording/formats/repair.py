@@ -86,7 +86,7 @@ def usable_rows(
         first = np.flatnonzero(blank)[0]
         at = f" (first at t = {rows['t'][first]:.3f} s)" if np.isfinite(rows["t"][first]) else ""
         what = "blank, NaN or infinite" if sensor == "odometer" else "blank or NaN"
-        remarks.add(f"{sensor}.rows_blank", f"{_rows(blank, label)} with {what} values dropped{at}")
+        remarks.add(f"{sensor}.rows_blank", f"{_tell_rows(blank, label)} with {what} values dropped{at}")
         rows = rows.take(~blank)
 
     t = rows["t"]
@@ -111,7 +111,8 @@ def usable_rows(
     if repeated.any():
         remarks.add(
             f"{sensor}.rows_repeated",
-            f"{_rows(repeated, label)} with the time of the row before dropped (first at t = {t[repeated][0]:.3f} s)",
+            f"{_tell_rows(repeated, label)} with the time of the row before dropped "
+            f"(first at t = {t[repeated][0]:.3f} s)",
         )
         rows = rows.take(~repeated)
     if sensor == "imu":
@@ -160,7 +161,7 @@ def _check_passes(rows: Table, label: str) -> None:
             )
 
 
-def _rows(mask: Mask, label: str) -> str:
+def _tell_rows(mask: Mask, label: str) -> str:
     n = int(mask.sum())
     return f"{n} {label} row{'s' if n > 1 else ''}"
 
@@ -203,7 +204,8 @@ def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tup
     if nowhere.any() and not nowhere.all():
         first = rows["t"][nowhere][0]
         remarks.add(
-            f"{label.lower()}.nowhere", f"{_rows(nowhere, label)} at 0, 0 (no fix) dropped (first at t = {first:.3f} s)"
+            f"{label.lower()}.nowhere",
+            f"{_tell_rows(nowhere, label)} at 0, 0 (no fix) dropped (first at t = {first:.3f} s)",
         )
         rows = rows.take(~nowhere)
     lat, lon, h = rows["lat"], rows["lon"], rows["h"]
@@ -218,12 +220,12 @@ def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tup
     if len(beyond):
         k = beyond[0]
         swapped = np.abs(lon * scale).max() <= np.pi / 2
-        hint = "; are lat and lon swapped?" if swapped else _other_form(lat, lon, label)
+        hint = "; are lat and lon swapped?" if swapped else _guess_other_form(lat, lon, label)
         raise RecordingError(f"{rows.where(k, 'lat')}: {lat[k]:g} is not a latitude{hint}", key="table.place")
     beyond = np.flatnonzero((lon * scale < -np.pi - 1e-9) | (lon * scale > 2 * np.pi))
     if len(beyond):
         turned = lon.min() * scale >= -2 * np.pi and lon.max() * scale <= 2 * np.pi
-        hint = "; is it a whole turn off? Add 360 deg" if turned else _other_form(lat, lon, label)
+        hint = "; is it a whole turn off? Add 360 deg" if turned else _guess_other_form(lat, lon, label)
         raise RecordingError(
             f"{rows.where(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude{hint}", key="table.place"
         )
@@ -238,7 +240,7 @@ def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tup
     return np.stack([lat * scale, lon, h], -1), rows
 
 
-def _other_form(lat: Array, lon: Array, label: str) -> str:
+def _guess_other_form(lat: Array, lon: Array, label: str) -> str:
     """What latitudes and longitudes out of range may be instead."""
     if all((np.abs(x) % 100.0 < 60.0).all() and np.abs(x).max() < 100.0 * top for x, top in ((lat, 91), (lon, 181))):
         whole, minutes = divmod(abs(lat[0]), 100.0)
@@ -278,7 +280,7 @@ def sigmas(
     sd = rows.stack(*names)
     for k, name in enumerate(names):
         zero = used & (sd[:, k] == 0)
-        floor = _floor(sd[used & (sd[:, k] > 0), k])
+        floor = _find_floor(sd[used & (sd[:, k] > 0), k])
         bad = np.flatnonzero(used & ((sd[:, k] < 0) | ((sd[:, k] < _SUREST) & ~zero) | (zero & (floor is None))))
         if len(bad):
             raise RecordingError(
@@ -300,7 +302,7 @@ def sigmas(
 _FINEST = 5  # decimals that are written on purpose; with more, a column is not rounded
 
 
-def _floor(positive: Array) -> float | None:
+def _find_floor(positive: Array) -> float | None:
     """What a sigma is at most that was printed as zero: half a unit of the last decimal of the others in its column.
 
     Where they are not rounded it is the smallest of them; None where there is none.
@@ -322,16 +324,16 @@ def fixes_by_type(rows: Table, numbers: str) -> NDArray[np.intp] | None:
     RecordingError
         For a number that is no type, naming the line and the numbers there are.
     """
-    said, known = rows["type"], NMEA_TYPES if numbers == "nmea" else {k: k for k in FIX_TYPES}
-    bad = np.flatnonzero(~np.isnan(said) & ~np.isin(said, list(known)))
+    types, known = rows["type"], NMEA_TYPES if numbers == "nmea" else {k: k for k in FIX_TYPES}
+    bad = np.flatnonzero(~np.isnan(types) & ~np.isin(types, list(known)))
     if len(bad):
         there = ", ".join(f"{k} {FIX_TYPES[ours]}" for k, ours in known.items() if ours)
         hint = "" if numbers == "nmea" else '; if they are GGA\'s, say units = { type = "nmea" }'
         where = rows.where(bad[0], "type")
         raise RecordingError(
-            f"{where}: {said[bad[0]]:g} is no type of fix: {there}, blank where unknown{hint}", key="gnss.type"
+            f"{where}: {types[bad[0]]:g} is no type of fix: {there}, blank where unknown{hint}", key="gnss.type"
         )
-    return fix_types(said, known)
+    return fix_types(types, known)
 
 
 # 1-sigma of a vertical velocity that is taken as zero because a receiver gives only speed and course: a slope of 10 %

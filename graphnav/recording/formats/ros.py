@@ -80,11 +80,11 @@ def load(path: Path, wanted: Sequence[str] = ()) -> Log:
             left = ", ".join(t.name for t in found[1:])
             why = "as was asked" if found[0].name in wanted else "having the most messages"
             remarks.add("log.topic", f"{found[0].name} is used, {why}; not {left}")
-    imu = _imu(chosen["imu"], remarks) if "imu" in chosen else None
-    gnss = _gnss(chosen["fix"], remarks) if "fix" in chosen else None
+    imu = _read_imu(chosen["imu"], remarks) if "imu" in chosen else None
+    gnss = _read_gnss(chosen["fix"], remarks) if "fix" in chosen else None
     odometer = None
     if "twist" in chosen:
-        gnss, odometer = _twist(chosen["twist"], gnss, remarks)
+        gnss, odometer = _read_twist(chosen["twist"], gnss, remarks)
     first = float(next(s.t[0] for s in (imu, gnss, odometer) if s is not None))
     zero = float(unix_to_gps(np.array([first]))[0] - first) if first > _UNIX else None
     remarks.add(
@@ -94,11 +94,11 @@ def load(path: Path, wanted: Sequence[str] = ()) -> Log:
     return Log(
         name, imu, gnss, odometer, gps_zero=zero,
         remarks=tuple(remarks), mount_known=False,
-        topics=_topics(ranked, odometer is not None),
+        topics=_choose_topics(ranked, odometer is not None),
     )  # fmt: skip
 
 
-def _topics(ranked: dict[str, list[_Topic]], wheel: bool) -> dict[str, tuple[str, ...]]:
+def _choose_topics(ranked: dict[str, list[_Topic]], wheel: bool) -> dict[str, tuple[str, ...]]:
     """By sensor, the topic that is used, and those that could be."""
     of = {"imu": "imu", "fix": "gnss"} | ({"twist": "odometer"} if wheel else {})
     return {of[role]: tuple(t.name for t in found) for role, found in ranked.items() if found and role in of}
@@ -119,7 +119,7 @@ def _read(path: Path) -> tuple[list[_Topic], set[str]]:
                 message: Any = reader.deserialize(raw, connection.msgtype)
                 topic = topics.setdefault(connection.topic, _Topic(connection.topic, connection.msgtype))
                 topic.t.append(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
-                topic.rows.append(_row(message, connection.msgtype))
+                topic.rows.append(_read_row(message, connection.msgtype))
     except Exception as error:  # a broken bag fails in whatever library reads its storage
         raise RecordingError(
             f"{path}: cannot be read as a ROS bag ({' '.join(str(error).split())[:200]})", key="file.damaged"
@@ -127,7 +127,7 @@ def _read(path: Path) -> tuple[list[_Topic], set[str]]:
     return [t for t in topics.values() if t.rows], others
 
 
-def _row(message: Any, kind: str) -> list[float]:
+def _read_row(message: Any, kind: str) -> list[float]:
     if kind == _IMU:
         w, f = message.angular_velocity, message.linear_acceleration
         white = (message.angular_velocity_covariance[0], message.linear_acceleration_covariance[0])
@@ -140,15 +140,15 @@ def _row(message: Any, kind: str) -> list[float]:
     return [twist.linear.x, twist.linear.y, twist.linear.z]
 
 
-def _table(topic: _Topic) -> tuple[Array, Array]:
+def _build_table(topic: _Topic) -> tuple[Array, Array]:
     """Times and rows in order of time, each time once."""
     t, rows = np.array(topic.t), np.array(topic.rows, dtype=float)
     t, first = np.unique(t, return_index=True)
     return t, rows[first]
 
 
-def _imu(topic: _Topic, remarks: Remarks) -> Imu | None:
-    t, rows = _table(topic)
+def _read_imu(topic: _Topic, remarks: Remarks) -> Imu | None:
+    t, rows = _build_table(topic)
     good = np.isfinite(rows[:, :6]).all(-1)
     if good.sum() < 2:
         remarks.add("imu.topic_not_used", f"{topic.name}: fewer than two usable messages, so it is not used")
@@ -171,8 +171,8 @@ def _imu(topic: _Topic, remarks: Remarks) -> Imu | None:
     return Imu(t, rows[:, :3] @ R_bs.T, rows[:, 3:6] @ R_bs.T, noise, R_bs, assumed)
 
 
-def _gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
-    t, rows = _table(topic)
+def _read_gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
+    t, rows = _build_table(topic)
     good = np.isfinite(rows[:, :3]).all(-1) & (rows[:, 6] >= 0) & (rows[:, :2] != 0).any(-1)
     if not good.any():
         remarks.add("gnss.topic_not_used", f"{topic.name}: no message has a fix, so it is not used")
@@ -194,9 +194,9 @@ def _gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
     return Gnss(t, np.column_stack([np.radians(rows[:, :2]), rows[:, 2]]), sd, type=kinds)
 
 
-def _twist(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> tuple[Gnss | None, Odometer | None]:
+def _read_twist(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> tuple[Gnss | None, Odometer | None]:
     """A velocity over ground goes to the fixes, a speed of the body becomes the odometer."""
-    t, rows = _table(topic)
+    t, rows = _build_table(topic)
     good = np.isfinite(rows).all(-1)
     t, rows = t[good], rows[good]
     moving = np.hypot(rows[:, 0], rows[:, 1]) > 1.0

@@ -41,7 +41,7 @@ def load(path: Path) -> Log:
     remarks = Remarks(track.notes)
     lines = text_lines(path)
     first = next(line.split() for line in lines if line.strip() and line.lstrip()[0] not in "#%")
-    zero = _week_of(path, first)
+    zero = _find_week(path, first)
     t = track.t
     titles = next(line for line in lines if line.startswith("%") and "latitude" in line and "=" not in line)
     scale = titles.strip("% ").split()[0].split(",")[0]
@@ -77,7 +77,7 @@ def load(path: Path) -> Log:
     return Log(path.stem, gnss=gnss, gps_zero=zero, remarks=tuple(remarks))
 
 
-def _week_of(path: Path, fields: list[str]) -> float:
+def _find_week(path: Path, fields: list[str]) -> float:
     """Where the week of the first row begins, s since the GPS epoch in the file's own time scale."""
     try:
         if "/" in fields[0]:

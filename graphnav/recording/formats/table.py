@@ -69,7 +69,7 @@ class Table:
 
     def where(self, row: int, name: str) -> str:
         """'file, line 12, column lat' for an error about one cell."""
-        for k, (number, _) in enumerate(_data_lines(self.path)):
+        for k, (number, _) in enumerate(_list_lines(self.path)):
             if k == self.rows[row]:
                 return f"{self.path}, line {number}, column '{self.file_names[name]}'"
         return f"{self.path}, column '{self.file_names[name]}'"
@@ -99,7 +99,7 @@ def read_table(
         Naming file, line, column and cell, for anything that is not a table of numbers.
     """
     renamed = dict(renamed or {})
-    skip, header = _header(path)
+    skip, header = _read_header(path)
     if keep is not None:
         required, renamed = (*required, Table.KEEP), {**renamed, Table.KEEP: keep}
     file_names = {}
@@ -138,7 +138,7 @@ def read_header(path: Path) -> list[str]:
     RecordingError
         If the file is none.
     """
-    return _header(path)[1]
+    return _read_header(path)[1]
 
 
 def first_rows(path: Path, count: int) -> list[list[str]]:
@@ -150,7 +150,7 @@ def first_rows(path: Path, count: int) -> list[list[str]]:
         If the file cannot be read.
     """
     try:
-        return [[cell.strip().strip('"') for cell in line.split(",")] for _, line in islice(_data_lines(path), count)]
+        return [[cell.strip().strip('"') for cell in line.split(",")] for _, line in islice(_list_lines(path), count)]
     except UnicodeDecodeError:
         raise RecordingError(
             f"{path}: holds bytes that are not UTF-8 text; save it as UTF-8", key="file.text"
@@ -183,7 +183,7 @@ def _open_bytes(path: Path) -> IO[bytes]:
     return file
 
 
-def _header(path: Path) -> tuple[int, list[str]]:
+def _read_header(path: Path) -> tuple[int, list[str]]:
     """How many lines come before the data, and the column names."""
     with _open_bytes(path) as raw:
         start = raw.read(1 << 16)
@@ -235,13 +235,13 @@ def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> list[Arr
     try:
         with _open(path) as file:
             text = file.read()
-        values = _loadtxt(text, skip, header, use)
+        values = _load_text(text, skip, header, use)
     except ValueError:
         values = _parse_cells(path, header, use)
     return list(np.ascontiguousarray(values.T))
 
 
-def _loadtxt(text: str, skip: int, header: list[str], use: list[int]) -> Array:
+def _load_text(text: str, skip: int, header: list[str], use: list[int]) -> Array:
     # With usecols NumPy checks only that no row is too short for those.
     for line in text.splitlines()[skip:]:
         cells = line.partition("#")[0].strip()
@@ -261,7 +261,7 @@ def _loadtxt(text: str, skip: int, header: list[str], use: list[int]) -> Array:
     return values.reshape(-1, len(use))
 
 
-def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
+def _list_lines(path: Path) -> Iterator[tuple[int, str]]:
     """(line number, text) of every line after the header that holds something."""
     with _open(path) as file:
         seen_header = False
@@ -272,7 +272,7 @@ def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
             seen_header = seen_header or bool(line)
 
 
-def _hint(cell: str, cells: list[str], header: list[str], use: list[int]) -> str:
+def _suggest_cause(cell: str, cells: list[str], header: list[str], use: list[int]) -> str:
     """What a cell that is no number may be, and what to do."""
     if [one.strip('"') for one in cells] == header:
         return "; the header is there again: cut the file in two there, or take the line out"
@@ -287,7 +287,7 @@ def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
     """The slow and careful way, which says what is wrong and where."""
     rows = []
     try:
-        for number, line in _data_lines(path):
+        for number, line in _list_lines(path):
             cells = [cell.strip() for cell in line.split(",")]
             if len(cells) != len(header):
                 raise RecordingError(
@@ -302,7 +302,7 @@ def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
                 except ValueError:
                     raise RecordingError(
                         f"{path}, line {number}, column '{header[column]}': '{cell[:40]}' is not a number"
-                        f"{_hint(cell, cells, header, use)}",
+                        f"{_suggest_cause(cell, cells, header, use)}",
                         key="table.cell",
                     ) from None
             rows.append(row)

@@ -68,18 +68,18 @@ def read_trajectory(path: str | Path) -> Trajectory:
         raise RecordingError(f"{path}: no rows in it; a trajectory file needs at least one", key="file.no_rows")
     first = rows[0][1]
     if any(line.lstrip().startswith("%") for _, line in numbered[:100]):
-        return _rtklib(path, [line for _, line in numbered if line.lstrip().startswith("%")], rows)
+        return _read_rtklib(path, [line for _, line in numbered if line.lstrip().startswith("%")], rows)
     if re.match(r"\s*\d{4}/\d\d/\d\d[\s,]", first):
         raise RecordingError(
             f"{path}: an RTKLIB solution without its header; write it again with out-outhead=on", key="rtklib.no_header"
         )
     if re.search(r"[A-Za-z_]{1,}", re.sub(r"(?i)\bnan\b|\d[eE][-+]?\d", "", first)):
-        return _csv(path, rows)
+        return _read_csv(path, rows)
     width = len(first.split())
     if width == 11:
-        return _kf_gins(path, rows)
+        return _read_kf_gins(path, rows)
     if width == 8:
-        return _tum(path, rows)
+        return _read_tum(path, rows)
     raise RecordingError(
         f"{path}, line {rows[0][0]}: {width} columns without a header; expected a CSV header with t, lat, lon, h, "
         "11 columns (KF-GINS .nav), 8 columns (TUM) or an RTKLIB .pos",
@@ -145,7 +145,7 @@ def _build(
     )
 
 
-def _csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
+def _read_csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     names = [field.strip().strip('"') for field in rows[0][1].split(",")]
     rows = rows[1:]
     if not rows:
@@ -184,7 +184,7 @@ def _csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     )  # fmt: skip
 
 
-def _kf_gins(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
+def _read_kf_gins(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     names = ["week", "sow", "lat", "lon", "h", "vn", "ve", "vd", "roll", "pitch", "yaw"]
     table = number_table(path, rows, names, None)
     t = table[:, 1] + WEEK * (table[:, 0] - table[0, 0])  # KF-GINS itself writes week 0
@@ -193,7 +193,7 @@ def _kf_gins(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     return _build(path, rows, t, position, [], v=v, rph=table[:, 8:11] * _DEG)
 
 
-def _tum(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
+def _read_tum(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     names = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
     table = number_table(path, rows, names, None)
     norm = np.linalg.norm(table[:, 4:8], axis=1)
@@ -207,7 +207,7 @@ def _tum(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     return _build(path, rows, table[:, 0], table[:, 1:4], [], rph=rph, local=True)
 
 
-def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Trajectory:
+def _read_rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Trajectory:
     titles = next((line for line in reversed(head) if re.search(r"\bQ\b.*\bns\b", line) and "=" not in line), None)
     if titles is None:
         raise RecordingError(
@@ -249,7 +249,7 @@ def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Traject
             Note("trajectory.height", f"{path.name}: heights are above mean sea level, not above the ellipsoid")
         )
     dated = "/" in rows[0][1].split(separator)[0]
-    t, numeric = _rtklib_times(path, rows, separator) if dated else (None, rows)
+    t, numeric = _read_rtklib_times(path, rows, separator) if dated else (None, rows)
     table = number_table(path, numeric, names, separator)
     if t is None:
         t = table[:, 1] + WEEK * (table[:, 0] - table[0, 0])
@@ -272,7 +272,7 @@ def _rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Traject
     )  # fmt: skip
 
 
-def _rtklib_times(
+def _read_rtklib_times(
     path: Path, rows: list[tuple[int, str]], separator: str | None
 ) -> tuple[Array, list[tuple[int, str]]]:
     """Seconds of the week from date and time, and the rows with both taken out so that they are numbers."""

@@ -55,7 +55,7 @@ def load(path: Path) -> Log:
     RecordingError
         If no position and no sensor is in it.
     """
-    content = _messages(path)
+    content = _collect_messages(path)
     remarks = Remarks()
     if content.broken:
         remarks.add("log.broken_frames", f"{content.broken} broken frames were skipped")
@@ -63,12 +63,12 @@ def load(path: Path) -> Log:
     if not fixes and not content.samples:
         what = f"{len(content.pvt)} NAV-PVT messages without a fix" if content.pvt else "no NAV-PVT and no ESF messages"
         raise RecordingError(f"{path}: {what} in {path.stat().st_size} bytes; nothing to use", key="log.no_messages")
-    dated = [start for start in map(_week_start, fixes) if start is not None]
+    dated = [start for start in map(_find_week_start, fixes) if start is not None]
     zero = dated[0] if dated else None
     if fixes and zero is None:
         remarks.add("log.clock_unknown", "clock: no NAV-PVT has a date, so the GPS week is not known")
-    gnss = _gnss(fixes, content, remarks) if fixes else None
-    imu, odometer = _sensors(path, content, remarks)
+    gnss = _read_gnss(fixes, content, remarks) if fixes else None
+    imu, odometer = _read_sensors(path, content, remarks)
     if zero is not None:
         remarks.add("log.clock", "clock: seconds of the GPS week (iTOW)")
     return Log(
@@ -77,7 +77,7 @@ def load(path: Path) -> Log:
     )  # fmt: skip
 
 
-def _messages(path: Path) -> _Content:
+def _collect_messages(path: Path) -> _Content:
     import pyubx2
 
     content = _Content()
@@ -136,7 +136,7 @@ def _note(content: _Content, message: Any, is_raw: bool) -> int | None:
             content.samples.setdefault(kind, []).append((tag, signed * _SCALE[kind]))
 
 
-def _week_start(message: Any) -> float | None:
+def _find_week_start(message: Any) -> float | None:
     """Where the GPS week of a NAV-PVT began, s since the GPS epoch; None without a date."""
     try:
         date = datetime.date(message.year, message.month, message.day)
@@ -149,14 +149,14 @@ def _week_start(message: Any) -> float | None:
     return float(WEEK * np.round((gps - message.iTOW * 1e-3) / WEEK))
 
 
-def _tow(messages: list[Any]) -> Array:
+def _unroll_tow(messages: list[Any]) -> Array:
     """Times of NAV-PVT messages in s, running on over the end of a week."""
     t = np.array([m.iTOW for m in messages]) * 1e-3
     return np.asarray(t + WEEK * np.cumsum(np.concatenate([[0.0], np.diff(t) < -0.5 * WEEK])))
 
 
-def _gnss(fixes: list[Any], content: _Content, remarks: Remarks) -> Gnss:
-    t = _tow(fixes)
+def _read_gnss(fixes: list[Any], content: _Content, remarks: Remarks) -> Gnss:
+    t = _unroll_tow(fixes)
     best = [content.precise.get(m.iTOW, m) for m in fixes]
     best = [m if p is not m and getattr(p, "invalidLlh", False) else p for p, m in zip(best, fixes, strict=True)]
     llh = np.array([[np.radians(m.lat), np.radians(m.lon), m.height * 1e-3] for m in best])
@@ -183,19 +183,19 @@ def _gnss(fixes: list[Any], content: _Content, remarks: Remarks) -> Gnss:
     remarks.add(
         "gnss.lever_arm_unknown", "GNSS: position of the antenna; its lever arm is not in the log and taken as zero"
     )
-    kinds = np.array([_type(m) for m in fixes])[order]
+    kinds = np.array([_classify_fix(m) for m in fixes])[order]
     used = np.array([float(m.numSV) for m in fixes])[order]
     return Gnss(t[order], llh[order], sd[order], v[order], sd_v[order], type=fix_types(kinds), satellites=used)
 
 
-def _type(message: Any) -> int:
+def _classify_fix(message: Any) -> int:
     """Of FIX_TYPES: by the carrier phases, then by the corrections; one that leans on an IMU is of neither kind."""
     if message.carrSoln in (1, 2):
         return 1 if message.carrSoln == 2 else 2
     return 0 if message.fixType == 4 else 4 if message.diffSoln else 5
 
 
-def _sensors(path: Path, content: _Content, remarks: Remarks) -> tuple[Imu | None, Odometer | None]:
+def _read_sensors(path: Path, content: _Content, remarks: Remarks) -> tuple[Imu | None, Odometer | None]:
     """The receiver's IMU and wheel, on the clock of the fixes where there are any."""
     series = {k: np.array(v, dtype=float).T for k, v in content.samples.items()}
     for k in series:
@@ -204,7 +204,7 @@ def _sensors(path: Path, content: _Content, remarks: Remarks) -> tuple[Imu | Non
     there = [k for k in (*_GYRO, *_ACCEL) if k in series]
     if not series:
         return None, None
-    tick, offset = _clock(content, remarks)
+    tick, offset = _fit_clock(content, remarks)
 
     def times(tags: Array) -> Array:
         return tags * tick + offset
@@ -237,14 +237,14 @@ def _drop_repeated(series: Array) -> tuple[Array, Array]:
     return tags, series[1][first]
 
 
-def _clock(content: _Content, remarks: Remarks) -> tuple[float, float]:
+def _fit_clock(content: _Content, remarks: Remarks) -> tuple[float, float]:
     """Seconds per time tag, and GPS seconds of the week at tag 0, by which tags came last before which fix."""
     if len(content.last_tag) < 2:
         remarks.add("log.sensor_clock_unknown", "clock of the sensors: their own time tags, taken as ms")
         return _TICKS[0], 0.0
     number, tags = np.array(content.last_tag, dtype=float).T
     tags = tags + _WRAP * np.cumsum(np.concatenate([[0.0], np.diff(tags) < -0.5 * _WRAP]))
-    t = _tow(content.pvt)[number.astype(int)]
+    t = _unroll_tow(content.pvt)[number.astype(int)]
     slope = (t[-1] - t[0]) / max(tags[-1] - tags[0], 1.0)
     tick = min(_TICKS, key=lambda x: abs(np.log(max(slope, 1e-12) / x)))
     if abs(slope / tick - 1.0) > 0.01:

@@ -37,13 +37,19 @@ def write_recording(log: Log, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     files = [
         f
-        for f in (_imu(log), _gnss(log), _odometer(log), *map(_series, log.sensors.values()), _truth(log))
+        for f in (
+            _write_imu(log),
+            _write_gnss(log),
+            _write_odometer(log),
+            *map(_write_series, log.sensors.values()),
+            _write_truth(log),
+        )
         if f is not None
     ]
     for file in files:
         write_csv(folder / file.name, file.header, file.columns)
     path = folder / "recording.toml"
-    path.write_text(_toml(log), encoding="utf-8")
+    path.write_text(_write_toml(log), encoding="utf-8")
     return [path, *(folder / file.name for file in files)]
 
 
@@ -86,14 +92,14 @@ def degrees(angle: Array) -> Array:
     return best
 
 
-def _imu(log: Log) -> _File | None:
+def _write_imu(log: Log) -> _File | None:
     if log.imu is None:
         return None
     columns = [log.imu.t, *log.imu.gyro.T, *log.imu.accel.T]
     return _File("imu.csv.gz", ["t", "gx", "gy", "gz", "ax", "ay", "az"], columns)
 
 
-def _gnss(log: Log) -> _File | None:
+def _write_gnss(log: Log) -> _File | None:
     if log.gnss is None:
         return None
     gnss = log.gnss
@@ -112,7 +118,7 @@ def _gnss(log: Log) -> _File | None:
     return _File("gnss.csv.gz", header, columns)
 
 
-def _odometer(log: Log) -> _File | None:
+def _write_odometer(log: Log) -> _File | None:
     if log.odometer is None:
         return None
     odometer = log.odometer
@@ -124,7 +130,7 @@ def _odometer(log: Log) -> _File | None:
     return _File("odometer.csv.gz", header, columns)
 
 
-def _series(series: Series) -> _File:
+def _write_series(series: Series) -> _File:
     """Its columns in the units that are usual in files; those that no row has are left out."""
     header, columns = ["t"], [series.t]
     for column in series.sensor.columns:
@@ -135,7 +141,7 @@ def _series(series: Series) -> _File:
     return _File(f"{series.sensor.name}.csv.gz", header, columns)
 
 
-def _truth(log: Log) -> _File | None:
+def _write_truth(log: Log) -> _File | None:
     truth = log.truth
     if truth is None or truth.closed_loop_sigma is not None:
         return None
@@ -167,7 +173,7 @@ def write_csv(path: Path, header: list[str], columns: list[Array]) -> None:
             file.write(text.replace("nan", "").encode())
 
 
-def _toml(log: Log) -> str:
+def _write_toml(log: Log) -> str:
     lines = [*(f"# {line}" for line in log.remarks), ""] if log.remarks else []
     lines += [
         'format = "graphnav-recording/1"',
@@ -183,23 +189,23 @@ def _toml(log: Log) -> str:
     else:
         lines += ['file = "imu.csv.gz"            # t,gx,gy,gz,ax,ay,az; s, rad/s, m/s2']
         lines += ['axes = "RFU"                   # x right, y forward, z up, whatever they were in the log']
-        lines += _noise(log.imu.noise, log.imu.noise_assumed)
+        lines += _write_noise(log.imu.noise, log.imu.noise_assumed)
     if log.gnss is not None:
         lines += [
             "",
             "[gnss]",
             'file = "gnss.csv.gz"           # t,lat,lon,h,...; s, deg, m, m/s; 1-sigmas in m and m/s',
         ]
-        lines += [f"lever_arm = {_vector(log.gnss.lever_arm)}    # from the IMU to the antenna, m: right, forward, up"]
+        lines += [f"lever_arm = {_show(log.gnss.lever_arm)}    # from the IMU to the antenna, m: right, forward, up"]
     if log.odometer is not None:
         lines += ["", "[odometer]", 'file = "odometer.csv.gz"       # t,speed; s, m/s, forward positive']
-        lines += [f"lever_arm = {_vector(log.odometer.lever_arm)}    # to the point that does not slip sideways, m"]
-        lines += _odometer_keys(log.odometer)
+        lines += [f"lever_arm = {_show(log.odometer.lever_arm)}    # to the point that does not slip sideways, m"]
+        lines += _write_odometer_keys(log.odometer)
     for name, series in log.sensors.items():
         units = ", ".join(f"{c.name} in {next(iter(c.units))}" for c in series.sensor.columns)
         lines += ["", f"[{name}]", f'file = "{name}.csv.gz"'.ljust(31) + f"# t in s; {units}"]
         lines += [
-            f"{key} = {_toml_value(value)}" for key, value in series.figures.model_dump(exclude_none=True).items()
+            f"{key} = {_format_value(value)}" for key, value in series.figures.model_dump(exclude_none=True).items()
         ]
     if log.truth is not None:
         lines += ["", "[truth]                        # only for evaluation"]
@@ -214,7 +220,7 @@ def _toml(log: Log) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _odometer_keys(odometer: Odometer) -> list[str]:
+def _write_odometer_keys(odometer: Odometer) -> list[str]:
     lines = []
     if odometer.way is not None:
         lines += [f"metres_per_pulse = {float(odometer.pulse)!r}", 'pulses = "cumulative"']
@@ -226,7 +232,7 @@ def _odometer_keys(odometer: Odometer) -> list[str]:
     return lines
 
 
-def _noise(noise: ImuNoise, assumed: bool) -> list[str]:
+def _write_noise(noise: ImuNoise, assumed: bool) -> list[str]:
     if assumed:
         return [
             "# no noise figures are in the log: those of a consumer IMU are assumed until [imu.noise] or model is given"
@@ -238,12 +244,12 @@ def _noise(noise: ImuNoise, assumed: bool) -> list[str]:
     return lines
 
 
-def _toml_value(value: Any) -> str:
+def _format_value(value: Any) -> str:
     """JSON's numbers, texts and lists are TOML's as well."""
     return quote(value) if isinstance(value, str) else json.dumps(value)
 
 
-def _vector(values: Array) -> str:
+def _show(values: Array) -> str:
     return "[" + ", ".join(repr(float(x)) for x in values) + "]"
 
 

@@ -35,7 +35,7 @@ _RADIUS = 0.05  # of the speed: scale, and tyres on bumps
 _DEAF = 1.0  # m/s, below which passive sensors do not see a wheel turn (ABS: about 3 km/h)
 _BACKWARD = 6.0  # m/s, the fastest that anyone reverses
 _WINDOWS = (0.0, 0.5, 1.0, 2.0, 4.0)  # s over which x is compared; 0: neighbours
-_USUAL = 6.0  # times the 90th percentile of the drive itself: an IMU or axes that are worse than thought
+_TIMES_TYPICAL = 6.0  # times the 90th percentile of the drive itself: an IMU or axes that are worse than thought
 _LATEST = 1.5  # s an odometer may be late (or a third of it early)
 _ALIKE = 0.05  # m/s in a second, on average: as good as no change
 _STAYS = 0.5  # s of equal readings (five at least) that may be stuck
@@ -65,7 +65,7 @@ def faults(
     figures = figures or ReadingStatistics.of(odometer)
     found = [(a, b, GAP) for a, b in gaps(odometer.t, figures.longest)]
     if len(odometer.t) >= 10:
-        motion = _motion(odometer, imu, lag) if imu is not None and len(imu.t) > 10 else None
+        motion = _compute_motion(odometer, imu, lag) if imu is not None and len(imu.t) > 10 else None
         found += _find_wrong(odometer, imu, motion, figures)
         lag = lag if motion is None else motion.lag
     found.sort()
@@ -90,7 +90,7 @@ def _find_axes(imu: Imu) -> tuple[Array, Array]:
     return ahead / max(float(np.linalg.norm(ahead)), 1e-9), up
 
 
-def _motion(odometer: Odometer, imu: Imu, known: float | None) -> _InertialMotion | None:
+def _compute_motion(odometer: Odometer, imu: Imu, known: float | None) -> _InertialMotion | None:
     t, speed = odometer.t, odometer.speed
     dt = np.diff(imu.t, prepend=2 * imu.t[0] - imu.t[1])
     ahead, up = _find_axes(imu)
@@ -159,8 +159,8 @@ def _find_breaks(
                 off = np.where(fast < _BACKWARD, np.minimum(off, np.min(other, axis=0)), off)
             if known.any():
                 moved = known & (fast > 0.0)
-                usual = _USUAL * float(np.percentile(off[moved], 90.0)) if moved.any() else 0.0
-                limit = np.maximum(allowed + _SLOPE * np.maximum(dt, _LAG_ERROR), usual)
+                typical = _TIMES_TYPICAL * float(np.percentile(off[moved], 90.0)) if moved.any() else 0.0
+                limit = np.maximum(allowed + _SLOPE * np.maximum(dt, _LAG_ERROR), typical)
                 bad |= known & (off > limit)
         found += _intersect(i[bad], j[bad], found)
     return sorted(found)
@@ -259,8 +259,8 @@ def _find_noiseless(
         return []
     repeats = np.array([b - a for a, b in equal if v[a] != 0.0])
     single: int = max(int((v != 0.0).sum()) - int(np.sum(repeats + 1)), 0)
-    usual = np.percentile(np.r_[repeats, np.zeros(single)], 99.0) if len(repeats) + single > 0 else 0.0
-    return [(a + 1, b + 1, FROZEN) for a, b in stays if v[a] != 0.0 and b - a > _LONGER * (usual + 1.0)]
+    typical = np.percentile(np.r_[repeats, np.zeros(single)], 99.0) if len(repeats) + single > 0 else 0.0
+    return [(a + 1, b + 1, FROZEN) for a, b in stays if v[a] != 0.0 and b - a > _LONGER * (typical + 1.0)]
 
 
 def _find_departure(t: Array, force: Array, earliest: int, k: int) -> int:

@@ -20,7 +20,7 @@ Spans = Array  # (M, 2) s, [first bad reading, next good one)
 
 _FINEST = 1e-7  # m/s, differences below are the rounding of floating point
 _MAD = 1.4826  # sigma over the median size of a normal variable
-_STEP = np.sqrt(1.0 / 12.0)  # 1-sigma of a rounding error, in steps
+_ROUNDING = np.sqrt(1.0 / 12.0)  # 1-sigma of a rounding error, in steps
 
 
 def quantum(speed: Array) -> float:
@@ -58,7 +58,7 @@ def reading_sigma(odometer: Odometer, step: float | None = None) -> float:
     if odometer.speed_sigma is not None:
         return odometer.speed_sigma
     t, speed = odometer.t, odometer.speed
-    rounding = _STEP * (quantum(speed) if step is None else step)
+    rounding = _ROUNDING * (quantum(speed) if step is None else step)
     if len(t) < 10:
         return rounding
     steps = np.diff(t)
@@ -128,12 +128,12 @@ class ReadingStatistics:
         if odometer.speed_sigma is not None:
             return float(odometer.speed_sigma), 0.0, 0.0
         if self.pulse:  # each end of a count is wrong by up to one pulse, evenly: a difference of two
-            return 0.0, 0.0, float(np.sqrt(2.0) * _STEP * self.pulse)
-        rounding = _STEP * self.step
+            return 0.0, 0.0, float(np.sqrt(2.0) * _ROUNDING * self.pulse)
+        rounding = _ROUNDING * self.step
         return float(np.sqrt(max(self.sigma**2 - rounding**2, 0.0))), rounding, 0.0
 
 
-def _from_zero(steps: NDArray[Any]) -> NDArray[Any]:
+def _sum_from_zero(steps: NDArray[Any]) -> NDArray[Any]:
     """Running sums, from zero."""
     out = np.zeros(len(steps) + 1, dtype=steps.dtype)
     np.cumsum(steps, out=out[1:])
@@ -149,8 +149,8 @@ class MeanSpeed:
 
     t: Array  # (M,) s
     speed: Array  # (M,) m/s
-    way: Array  # (M,) m up to t
-    straight: bool  # whether `way` is counted, and so interpolated evenly between readings
+    distance: Array  # (M,) m up to t
+    straight: bool  # whether `distance` is counted, and so interpolated evenly between readings
     bad: NDArray[np.intp]  # (M,) how many of the segments between readings up to t are bad
     changes: NDArray[np.intp]  # (M,) how often the reading changed up to t
     white: float  # m/s, the part of a reading's sigma that is new with every reading
@@ -170,32 +170,32 @@ class MeanSpeed:
             across |= (t[:-1] < end) & (t[1:] > begin)
         bad = across | ~good[1:] | ~good[:-1]
         counted = odometer.way is not None
-        way = odometer.way if odometer.way is not None else _from_zero(0.5 * (speed[1:] + speed[:-1]) * step)
+        distance = odometer.way if odometer.way is not None else _sum_from_zero(0.5 * (speed[1:] + speed[:-1]) * step)
         white, rounding, ends = figures.sigmas(odometer)
         return cls(
             t,
             speed,
-            np.asarray(way),
+            np.asarray(distance),
             counted,
-            _from_zero(bad.astype(np.intp)),
-            _from_zero((speed[1:] != speed[:-1]).astype(np.intp)),
+            _sum_from_zero(bad.astype(np.intp)),
+            _sum_from_zero((speed[1:] != speed[:-1]).astype(np.intp)),
             white=white,
             rounding=rounding,
             ends=ends,
         )
 
-    def _segment(self, x: Array) -> NDArray[np.intp]:
+    def _find_segment(self, x: Array) -> NDArray[np.intp]:
         """The segment k between t[k] and t[k+1] in which x lies."""
         return np.minimum(np.maximum(np.searchsorted(self.t, x, side="right") - 1, 0), len(self.t) - 2)
 
-    def _at(self, k: NDArray[np.intp], x: Array) -> tuple[Array, Array]:
+    def _interpolate(self, k: NDArray[np.intp], x: Array) -> tuple[Array, Array]:
         """Way and speed at x in the segments k."""
         s, step = x - self.t[k], self.t[k + 1] - self.t[k]
         slope = (self.speed[k + 1] - self.speed[k]) / step
         speed = self.speed[k] + slope * s
         if self.straight:
-            return self.way[k] + (self.way[k + 1] - self.way[k]) / step * s, speed
-        return self.way[k] + 0.5 * (self.speed[k] + speed) * s, speed
+            return self.distance[k] + (self.distance[k + 1] - self.distance[k]) / step * s, speed
+        return self.distance[k] + 0.5 * (self.speed[k] + speed) * s, speed
 
     def __call__(self, a: Array, b: Array, delay: float | Array = 0.0) -> tuple[Array, Array]:
         """Means over [a + delay, b + delay] and their derivative by the delay, (N,) each: m/s, m/s^2.
@@ -206,10 +206,10 @@ class MeanSpeed:
         a, b = np.asarray(a, dtype=float) + delay, np.asarray(b, dtype=float) + delay
         if len(self.t) < 2:
             return np.full(np.shape(a), np.nan), np.full(np.shape(a), np.nan)
-        ka, kb = self._segment(a), self._segment(b)
+        ka, kb = self._find_segment(a), self._find_segment(b)
         kb = np.where((b == self.t[kb]) & (kb > ka), kb - 1, kb)
-        (way_a, v_a), (way_b, v_b) = self._at(ka, a), self._at(kb, b)
-        mean, slope = (way_b - way_a) / (b - a), (v_b - v_a) / (b - a)
+        (distance_a, v_a), (distance_b, v_b) = self._interpolate(ka, a), self._interpolate(kb, b)
+        mean, slope = (distance_b - distance_a) / (b - a), (v_b - v_a) / (b - a)
         covered = (a >= self.t[0]) & (b <= self.t[-1]) & (self.bad[kb + 1] == self.bad[ka])
         return np.where(covered, mean, np.nan), np.where(covered, slope, np.nan)
 

@@ -22,15 +22,15 @@ _FROZEN = (60.0, 300.0)  # s, and m driven: a road or the receiver's own noise m
 _SLOPE = 0.1  # what a road climbs at most: so far may a height be from what it was
 _CARRIER = 1e-3  # m: a two-hundredth of the carrier's wave (0.19 m), what its phase can be measured to
 _WAVE = 0.19  # m, of L1
-_USUAL = 2.0  # m/s^2, what vehicles accelerate at usually
+_ACCELERATION = 2.0  # m/s^2, what vehicles accelerate at usually
 _UNBELIEVED = 10.0  # times a sigma that is right the scatter of neighbouring fixes never is: errors last, scatter less
 _SMOOTH = 2e-3  # of the sigma; filtered fixes of phones scatter by five thousandths
-_MOST = 8.0  # m/s^2, what tyres grip
-_WINDOW = 11  # fixes, of which most steps are right even where half of the fixes are off
+_GRIP = 8.0  # m/s^2, what tyres grip
+_MEAN_OF = 11  # fixes, of which most steps are right even where half of the fixes are off
 _MINORITY = 0.2  # of the fixes: fewer that are off are outvoted by the rest
 _ISOLATED = 0.01  # of the steps
 _ALIKE = 0.25  # of their size by which steps between two groups differ; those of reflections are of all sizes
-_MOVING = 3.0  # m/s, below which a step says little of the time it took
+_LEAST_SPEED = 3.0  # m/s, below which a step says little of the time it took
 
 
 def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
@@ -137,9 +137,11 @@ def _drop_unreachable(gnss: Gnss, p: Array, off: NDArray[np.bool_], start: float
 def find_frozen_heights(gnss: Gnss, p: Array) -> list[tuple[int, int]]:
     """[first, end) of the fixes whose height stays the same to the last digit while the vehicle drives."""
     same = np.diff(gnss.llh[:, 2]) == 0.0
-    way = np.r_[0.0, np.cumsum(np.nan_to_num(np.hypot(*np.diff(p[:, :2], axis=0).T)))]
+    distance = np.r_[0.0, np.cumsum(np.nan_to_num(np.hypot(*np.diff(p[:, :2], axis=0).T)))]
     lasting, driven = _FROZEN
-    return [(a, b + 1) for a, b in runs_of(same) if gnss.t[b] - gnss.t[a] >= lasting and way[b] - way[a] >= driven]
+    return [
+        (a, b + 1) for a, b in runs_of(same) if gnss.t[b] - gnss.t[a] >= lasting and distance[b] - distance[a] >= driven
+    ]
 
 
 def _steps(gnss: Gnss) -> tuple[Array, float, NDArray[np.bool_]]:
@@ -158,7 +160,7 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
     bend = bend[np.isfinite(bend).all(axis=1)]
     # white errors of s bend by s sqrt(6)
     scatter = float(np.median(np.abs(bend))) / 0.6745 / np.sqrt(6.0) if len(bend) >= 10 else float("nan")
-    driven = _USUAL * period**2 / np.sqrt(6.0)
+    driven = _ACCELERATION * period**2 / np.sqrt(6.0)
     if sd < _CARRIER:
         yield Finding(
             "warning",
@@ -194,14 +196,14 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
 def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     """Fixes that go back and forth between two places a constant step apart: no vote tells which are right."""
     there: NDArray[np.bool_] = np.asarray(np.isfinite(p).all(axis=1))
-    if there.sum() < 2 * _WINDOW:
+    if there.sum() < 2 * _MEAN_OF:
         return
     gnss, p = take_rows(gnss, there), p[there, :2]
     dt, period, _ = _steps(gnss)
     jump = _jumps(p, dt)
     sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
     # the speed changes by what tyres grip over half the window; over a long gap no step shows, and none is taken
-    limit = 5.0 * np.hypot(sd[1:], sd[:-1]) + _MOST * np.maximum(0.5 * _WINDOW * period, dt) * dt
+    limit = 5.0 * np.hypot(sd[1:], sd[:-1]) + _GRIP * np.maximum(0.5 * _MEAN_OF * period, dt) * dt
     big = np.flatnonzero(np.linalg.norm(jump, axis=1) > limit)
     if not len(big):
         return
@@ -227,7 +229,7 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
 
 def _jumps(p: Array, dt: Array) -> Array:
     """What steps between fixes at p (M, 2) m differ by from the usual pace around them, (M - 1, 2) m."""
-    rate = median_filter(np.diff(p, axis=0) / dt[:, None], size=(_WINDOW, 1), mode="nearest")
+    rate = median_filter(np.diff(p, axis=0) / dt[:, None], size=(_MEAN_OF, 1), mode="nearest")
     return np.asarray(np.diff(p, axis=0) - rate * dt[:, None])
 
 
@@ -251,28 +253,28 @@ def check_arrival_stamps(gnss: Gnss, p: Array) -> Iterator[Finding]:
     dt = np.diff(gnss.t)
     p = p[:, :2]
     # the mean steps: of fixes that arrive in bursts, the median says nothing
-    period = float(np.median(uniform_filter1d(dt, _WINDOW, mode="nearest")))
+    period = float(np.median(uniform_filter1d(dt, _MEAN_OF, mode="nearest")))
     near = (dt < 3.5 * period) & np.isfinite(p[1:]).all(axis=1) & np.isfinite(p[:-1]).all(axis=1)
-    way = np.diff(p, axis=0)
-    way[~near] = 0.0
-    count = np.maximum(uniform_filter1d(near.astype(float), _WINDOW, mode="nearest"), 0.5 / _WINDOW)
-    pace = np.maximum(uniform_filter1d(np.where(near, dt, 0.0), _WINDOW, mode="nearest") / count, 1e-9)
-    usual = uniform_filter1d(way, _WINDOW, axis=0, mode="nearest") / count[:, None]
-    usual_size = np.linalg.norm(usual, axis=1)
-    moving = near & (usual_size > _MOVING * pace)
-    if moving.sum() < 2 * _WINDOW:
+    step = np.diff(p, axis=0)
+    step[~near] = 0.0
+    count = np.maximum(uniform_filter1d(near.astype(float), _MEAN_OF, mode="nearest"), 0.5 / _MEAN_OF)
+    pace = np.maximum(uniform_filter1d(np.where(near, dt, 0.0), _MEAN_OF, mode="nearest") / count, 1e-9)
+    typical = uniform_filter1d(step, _MEAN_OF, axis=0, mode="nearest") / count[:, None]
+    typical_size = np.linalg.norm(typical, axis=1)
+    moving = near & (typical_size > _LEAST_SPEED * pace)
+    if moving.sum() < 2 * _MEAN_OF:
         return
     uneven = (dt / pace - 1.0)[moving]
-    ahead = (np.sum(way * usual, axis=1)[moving] / usual_size[moving] ** 2) - 1.0
+    ahead = (np.sum(step * typical, axis=1)[moving] / typical_size[moving] ** 2) - 1.0
     # of most stamps: some fixes that are missing make steps uneven, too
     spread = float(np.median(np.abs(uneven - np.median(uneven)))) / 0.6745
-    speed = float(np.median(usual_size[moving] / pace[moving]))
+    speed = float(np.median(typical_size[moving] / pace[moving]))
     sd = float(np.median(gnss.sd[:, :2]))
     late = spread * period / np.sqrt(2.0)  # two stamps make a step
     if speed * late < sd or spread == 0.0:
         return
     # stamps so late that fixes overtook each other: against the motion by more than sigmas explain
-    back = float((ahead + 1.0 < -5.0 * np.sqrt(2.0) * sd / usual_size[moving]).mean())
+    back = float((ahead + 1.0 < -5.0 * np.sqrt(2.0) * sd / typical_size[moving]).mean())
     ahead = np.clip(ahead, -3.0, 3.0)
     slope = float(uneven @ ahead / (uneven @ uneven))
     error = float(np.std(ahead - slope * uneven)) / float(np.linalg.norm(uneven))

@@ -13,9 +13,9 @@ from graphnav.recording import Odometer, Recording, take_rows
 from graphnav.recording.checks.crosschecks import MIN_PAIRS, Track
 from graphnav.recording.plausibility.fixes import FASTEST
 
-_JUMP = 1.0  # s, and ten periods: a silence of the odometer that may be a jump of its clock
+_CLOCK_STEP = 1.0  # s, and ten periods: a silence of the odometer that may be a jump of its clock
 _RADIUS = 0.1  # by which a tyre may differ from another: wear, load, pressure, a spare wheel
-_MOVING = 5.0  # m/s, above which speeds are compared
+_LEAST_SPEED = 5.0  # m/s, above which speeds are compared
 _LASTING = 10.0  # s; shorter is slip, or a fix's error
 _CLEAR = (
     4.0  # times by which one clock fits better than the other (white errors: one in thousands with 20 of them a side)
@@ -23,14 +23,14 @@ _CLEAR = (
 _RATE = 10.0  # Hz that changes of speed need
 
 
-def screen(recording: Recording, way: Track | None) -> tuple[Recording, list[Finding]]:
-    """The recording without readings that cannot be right, and what was found; `way` is what GNSS says."""
+def screen(recording: Recording, track: Track | None) -> tuple[Recording, list[Finding]]:
+    """The recording without readings that cannot be right, and what was found; `track` is what GNSS says."""
     findings: list[Finding] = []
     for one in (_find_beyond, _clock_jump, _other_scale):
         odometer = recording.odometer
         if odometer is None or len(odometer.t) < 2:
             break
-        bad, finding = one(odometer, way, recording.start)
+        bad, finding = one(odometer, track, recording.start)
         if finding is None:
             continue
         findings.append(finding)
@@ -51,7 +51,7 @@ def build_odometer_track(odometer: Odometer) -> Track | None:
 _Found = tuple[NDArray[np.bool_], Finding | None]
 
 
-def _find_beyond(odometer: Odometer, way: Track | None, start: float) -> _Found:
+def _find_beyond(odometer: Odometer, track: Track | None, start: float) -> _Found:
     """Readings that no vehicle reaches."""
     bad = ~(np.abs(odometer.speed) <= FASTEST)
     if not bad.any():
@@ -66,33 +66,33 @@ def _find_beyond(odometer: Odometer, way: Track | None, start: float) -> _Found:
     )
 
 
-def _misfit(odometer: Odometer, way: Track, rows: NDArray[np.bool_], later: float) -> float:
+def _misfit(odometer: Odometer, track: Track, rows: NDArray[np.bool_], later: float) -> float:
     """Mean size of the GNSS speed less that of `rows` of the odometer `later` s later, m/s; NaN of too few."""
     t, speed = odometer.t[rows] + later, odometer.speed[rows]
     if len(t) < 2:
         return float("nan")
-    both = (way.t > t[0]) & (way.t < t[-1])
+    both = (track.t > t[0]) & (track.t < t[-1])
     if both.sum() < MIN_PAIRS:
         return float("nan")
-    off = way.speed[both] - np.abs(np.interp(way.t[both], t, speed))
-    return float(np.mean(np.minimum(np.abs(off), _MOVING)))  # a wild fix has no more say than that
+    off = track.speed[both] - np.abs(np.interp(track.t[both], t, speed))
+    return float(np.mean(np.minimum(np.abs(off), _LEAST_SPEED)))  # a wild fix has no more say than that
 
 
-def _clock_jump(odometer: Odometer, way: Track | None, start: float) -> _Found:
+def _clock_jump(odometer: Odometer, track: Track | None, start: float) -> _Found:
     """A silence that was none: without it the readings on one side fit the GNSS speed, and with it they do not."""
     t = odometer.t
     none = np.zeros(len(t), dtype=bool)
-    if way is None:
+    if track is None:
         return none, None
     period = period_of(t)
     step = np.diff(t)
-    for k in np.flatnonzero(step > max(_JUMP, 10.0 * period))[:20]:
+    for k in np.flatnonzero(step > max(_CLOCK_STEP, 10.0 * period))[:20]:
         jump = float(step[k] - period)
         for after in (True, False):
             side = (t > t[k]) if after else (t <= t[k])
             shift = -jump if after else jump
-            as_read, moved = _misfit(odometer, way, side, 0.0), _misfit(odometer, way, side, shift)
-            other = _misfit(odometer, way, ~side, 0.0)
+            as_read, moved = _misfit(odometer, track, side, 0.0), _misfit(odometer, track, side, shift)
+            other = _misfit(odometer, track, ~side, 0.0)
             if moved * _CLEAR < as_read and (np.isnan(other) or other * _CLEAR < as_read):
                 leap = ", the leap seconds between GPS time and UTC" if abs(jump - 18.0) < 0.5 else ""
                 return side, Finding(
@@ -105,41 +105,41 @@ def _clock_jump(odometer: Odometer, way: Track | None, start: float) -> _Found:
     return none, None
 
 
-def _other_scale(odometer: Odometer, way: Track | None, start: float) -> _Found:
+def _other_scale(odometer: Odometer, track: Track | None, start: float) -> _Found:
     """Spans in which the odometer has another scale against GNSS than it has elsewhere, where it is nearly 1."""
     t = odometer.t
     bad = np.zeros(len(t), dtype=bool)
-    if way is None:
+    if track is None:
         return bad, None
-    half = np.maximum(0.5 * way.width, period_of(t))
+    half = np.maximum(0.5 * track.width, period_of(t))
     meant = np.r_[0.0, np.cumsum(0.5 * (odometer.speed[1:] + odometer.speed[:-1]) * np.diff(t))]
-    read = np.abs(np.interp(way.t + half, t, meant) - np.interp(way.t - half, t, meant)) / (2.0 * half)
-    k = np.clip(np.searchsorted(t, way.t), 1, len(t) - 1)
-    there = (way.t - half > t[0]) & (way.t + half < t[-1]) & (t[k] - t[k - 1] < _JUMP)
-    at = np.flatnonzero(there & (way.speed > _MOVING) & (read > 0.0))
+    read = np.abs(np.interp(track.t + half, t, meant) - np.interp(track.t - half, t, meant)) / (2.0 * half)
+    k = np.clip(np.searchsorted(t, track.t), 1, len(t) - 1)
+    there = (track.t - half > t[0]) & (track.t + half < t[-1]) & (t[k] - t[k - 1] < _CLOCK_STEP)
+    at = np.flatnonzero(there & (track.speed > _LEAST_SPEED) & (read > 0.0))
     if len(at) < MIN_PAIRS:
         return bad, None
-    off = np.log(read[at] / way.speed[at])
-    seconds = max(1, round(_LASTING / way.period))
-    usual = median_filter(off, size=min(seconds + 1 - seconds % 2, len(off)), mode="nearest")
-    right = np.abs(usual) < np.log1p(_RADIUS)
-    if right.sum() * way.period < _LASTING:
+    off = np.log(read[at] / track.speed[at])
+    seconds = max(1, round(_LASTING / track.period))
+    typical = median_filter(off, size=min(seconds + 1 - seconds % 2, len(off)), mode="nearest")
+    right = np.abs(typical) < np.log1p(_RADIUS)
+    if right.sum() * track.period < _LASTING:
         return bad, None  # another unit, or another wheel, throughout
     own = float(np.median(off[right]))
     noise = float(np.median(np.abs(off[right] - own))) / 0.6745
     # two tyres, one as large and one as small as may be
-    wrong = np.abs(usual - own) > max(np.log((1.0 + _RADIUS) / (1.0 - _RADIUS)), 6.0 * noise)
+    wrong = np.abs(typical - own) > max(np.log((1.0 + _RADIUS) / (1.0 - _RADIUS)), 6.0 * noise)
     spans: list[tuple[float, float, float]] = []
     for a, b in runs_of(wrong):
-        begin, end = way.t[at[a]], way.t[at[b - 1]]
+        begin, end = track.t[at[a]], track.t[at[b - 1]]
         factor = float(np.median(off[a:b]))
         # a scale is one factor; fixes among high houses make speeds of all sizes
         scatter = float(np.median(np.abs(off[a:b] - factor))) / 0.6745
-        if end - begin < _LASTING - 2.0 * way.period or scatter > np.log1p(_RADIUS):
+        if end - begin < _LASTING - 2.0 * track.period or scatter > np.log1p(_RADIUS):
             continue
         # up to the neighbours that are right: what lies between is not known
-        low = way.t[at[a - 1]] if a > 0 else -np.inf
-        high = way.t[at[b]] if b < len(at) else np.inf
+        low = track.t[at[a - 1]] if a > 0 else -np.inf
+        high = track.t[at[b]] if b < len(at) else np.inf
         bad |= (t > low) & (t < high)
         spans.append((float(begin - start), float(end - start), float(np.exp(factor - own))))
     if not spans:

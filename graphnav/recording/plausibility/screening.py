@@ -115,17 +115,17 @@ def screen(recording: Recording) -> Screened:
     findings = [*of_imu, *dead, *of_aiding]
     wrong_unit = any(f.key in _UNITS for f in of_imu)
     if recording.platform == "vehicle" and not dead and not wrong_unit:
-        way = track
-        if way is None and recording.odometer is not None:
-            way = plausibility_odometer.build_odometer_track(recording.odometer)
+        path = track
+        if path is None and recording.odometer is not None:
+            path = plausibility_odometer.build_odometer_track(recording.odometer)
         # stamps that are late by now this, now that have no clock
         if track is not None and not any(f.key == "gnss.stamped_on_arrival" for f in findings):
             assert recording.gnss is not None
             clock = clock_of(recording.imu, recording.gnss)
             forward = clock.by_velocity if track.instant else clock.by_places
         else:
-            forward = crosschecks.forward_fit(recording.imu, way) if way is not None else None
-        findings += check_forward_sign(recording.imu, way, forward)
+            forward = crosschecks.forward_fit(recording.imu, path) if path is not None else None
+        findings += check_forward_sign(recording.imu, path, forward)
         if clock is not None and track is not None:
             odometer = crosschecks.odometer_fit(recording.odometer, track) if recording.odometer is not None else None
             findings += check_imu_clock(clock, None if odometer is None else odometer[0])
@@ -142,15 +142,15 @@ def _without_the_impossible(recording: Recording) -> tuple[Recording, list[Findi
     recording, of_aiding = screen_series(replace(recording, screened=True))
     track = None
     if recording.gnss is not None and len(recording.gnss.t):
-        recording, said = plausibility_gnss.screen(recording)
-        of_aiding += said
+        recording, more = plausibility_gnss.screen(recording)
+        of_aiding += more
         assert recording.gnss is not None
         track = crosschecks.track(recording.gnss)
         if track is not None and overlap_s(recording) <= 0:
             track = None
     if recording.odometer is not None and len(recording.odometer.t):
-        recording, said = plausibility_odometer.screen(recording, track)
-        of_aiding += said
+        recording, more = plausibility_odometer.screen(recording, track)
+        of_aiding += more
     return recording, of_imu, of_aiding, track
 
 
@@ -173,8 +173,8 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
         for x in imu.gyro.T:
             turn += (x - np.median(x)) ** 2
         np.sqrt(turn, out=turn)
-        calm = turn <= np.percentile(turn, _QUIET)
-        f = float(np.median(np.linalg.norm(imu.accel[calm], axis=1)))
+        quiet = turn <= np.percentile(turn, _QUIET)
+        f = float(np.median(np.linalg.norm(imu.accel[quiet], axis=1)))
     if (sentence := _scale(f)) is not None:
         g = _STANDARD_GRAVITY if recording.gnss is None else _gravity(recording)
         yield Finding(
@@ -309,20 +309,20 @@ def _is_moving(x: Array, same: Array, least: float) -> bool:
     return float((steps[1:] * steps[:-1] < 0.0).mean()) > _NOISY
 
 
-_SURE = 0.7  # of a correlation, and of a unit vector's component
+_LEAST_CORRELATION = 0.7  # of a correlation, and of a unit vector's component
 
 
-def check_forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iterator[Finding]:
+def check_forward_sign(imu: Imu, track: Track | None, forward: Fit | None) -> Iterator[Finding]:
     """The forward force falls when the speed rises: one axis of the accelerometer is reversed, or all of the IMU."""
     up = crosschecks.find_up(imu)
-    if way is None or forward is None or forward.correlation < _SURE or up[2] < 0.8:
+    if track is None or forward is None or forward.correlation < _LEAST_CORRELATION or up[2] < 0.8:
         return
     ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
-    if ahead[1] > -_SURE:
+    if ahead[1] > -_LEAST_CORRELATION:
         return
     along = f"the forward force falls when the speed rises (correlation {-forward.correlation:.2f})"
     if (
-        side := crosschecks.sideways_correlation(imu, way)
+        side := crosschecks.sideways_correlation(imu, track)
     ) is not None and side > 0:  # then nothing is turned: the other axes are right
         column = "a" + _AXIS[int(np.argmax(np.abs(imu.R_bs[1])))]
         yield Finding(
@@ -332,5 +332,5 @@ def check_forward_sign(imu: Imu, way: Track | None, forward: Fit | None) -> Iter
             "imu.forward_reversed",
         )
         return
-    for said in check_imu_axes(imu, forward, way):
-        yield Finding("refused", f"{along}: {said.sentence}", "imu.axes_turned")
+    for finding in check_imu_axes(imu, forward, track):
+        yield Finding("refused", f"{along}: {finding.sentence}", "imu.axes_turned")

@@ -66,8 +66,8 @@ def _build_town(
         Manoeuvre(2.0, -1.2), Manoeuvre(4.0, -1.2, 50.0), Manoeuvre(4.0, -1.0, -65.0), Manoeuvre(2.0, 0.0),
         Manoeuvre(2.0, 0.0), Manoeuvre(2.0, 0.5), Manoeuvre(1.0, 0.0), Manoeuvre(15.0, 0.0),
     ]  # fmt: skip
-    way = duration - 20.0 - sum(m.duration for m in parking)
-    plan = [Manoeuvre(20.0, 0.0), *streets(way, rng, hills=0.06, pause=0.5), *parking]
+    length = duration - 20.0 - sum(m.duration for m in parking)
+    plan = [Manoeuvre(20.0, 0.0), *streets(length, rng, hills=0.06, pause=0.5), *parking]
     path = drive(plan, heading=float(rng.uniform(0.0, 360.0)), slip_per_accel=0.005)
     mount = Mount(above_axle=(0.1, 1.4, 0.6), angles=(0.8, -1.2, 1.5))
     parts = [
@@ -105,8 +105,8 @@ def spread_gaps(path: Path, count: int, length: Span, rng: np.random.Generator) 
     gaps = []
     for part in np.array_split(np.arange(len(t))[90:], max(count, 1))[:count]:
         seconds = int(rng.uniform(*length))
-        way = np.convolve(moved[part], np.ones(seconds), "valid")
-        first = float(t[part[int(np.argmax(way))]])
+        share = np.convolve(moved[part], np.ones(seconds), "valid")
+        first = float(t[part[int(np.argmax(share))]])
         gaps.append((first + 0.5, first + seconds + 0.5))
     return tuple(gaps)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.core.errors import ConfigError
-from graphnav.simulation.footsteps import Cadence, footsteps, rectangle, way
+from graphnav.simulation.footsteps import Cadence, footsteps, rectangle, route
 from graphnav.simulation.gait import Sole, Style
 from graphnav.simulation.gait import walk as walk_over
 from graphnav.simulation.inertial import DEG_H, DEG_SQRT_H, SimulatedImu, Triad, accelerometer, gyroscope
@@ -105,7 +105,7 @@ def _walk(
 ) -> Simulated:  # fmt: skip
     rest = _draw_rest(seed)
     rng = stream(seed, "course")
-    along = way(parts, float(rng.uniform(0.0, 360.0)))
+    along = route(parts, float(rng.uniform(0.0, 360.0)))
     walked = duration - float(rest.sum())
     speed = along.length / walked
     steps = footsteps(along, Cadence.of(speed), float(rest[0]), walked, duration, stream(seed, "steps"), closed=closed)

@@ -55,7 +55,7 @@ def run(
     if stops_every and stops_every < 4.0:
         raise ConfigError(f"stops_every = {stops_every:g}: must be 0 or at least 4 min", key="simulation.value")
 
-    plan = _square(60.0 * stops_every)
+    plan = _drive_square(60.0 * stops_every)
     path = drive(plan, heading=90.0)
     shake = Shake(
         (
@@ -74,7 +74,7 @@ def run(
     )  # fmt: skip
 
 
-def _square(every: float) -> list[Manoeuvre]:
+def _drive_square(every: float) -> list[Manoeuvre]:
     """The manoeuvres, with stops of a minute at multiples of `every` s from the 20th minute on."""
     plan, t = [Manoeuvre(600.0, 0.0), Manoeuvre(_GAIN, _SPEED)], 600.0 + _GAIN
     due = every * max(1.0, -(-1200.0 // every)) if every else float("inf")

@@ -1,4 +1,4 @@
-"""A recording aligned and posed, anew where measurements turn out to be wrong that its start and stops rest on."""
+"""A recording aligned and its problem built; anew where measurements are wrong that its start and stops rest on."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
 
-_FAR = 0.5  # rad between the stated and the found start attitude, beyond which a filter diverges for a while
+_DIVERGED_BY = 0.5  # rad between the stated and the found start attitude, beyond which a filter diverges for a while
 _FAR_AWAY = 100.0  # m, by which single fixes in a city may be wrong
 
 
@@ -47,8 +47,8 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Posed:
-    """A problem, and what it was posed by."""
+class BuiltProblem:
+    """A problem, and what it was built from."""
 
     problem: Problem
     carriers: GnssPhase | None  # carrier phases, which the problem does without as long as they have no integers
@@ -57,8 +57,8 @@ class Posed:
 
 
 @dataclass(frozen=True)
-class Posing:
-    """Aligns and poses a recording.
+class ProblemBuilder:
+    """Aligns a recording and builds its problem.
 
     `used` is the recording with the fixes that the problem uses; alignment and detectors see them all.
     """
@@ -78,7 +78,7 @@ class Posing:
         with self.clock.book("alignment"):
             return align(recording, settings, self.frame, _smooth, stationary)
 
-    def pose(self, aligned: Alignment, detections: Detections, parts: bool) -> Posed:
+    def build(self, aligned: Alignment, detections: Detections, parts: bool) -> BuiltProblem:
         """The problem; with the parts that noise figures contribute to its intervals, if these are to change."""
         tell("preintegration")
         with self.clock.book("preintegration"):
@@ -89,24 +89,24 @@ class Posing:
                 parts_of_noise=parts,
             )  # fmt: skip
         problem, carriers = split_carriers(problem)  # the noise model rests on the codes
-        return Posed(problem, carriers, aligned, detections)
+        return BuiltProblem(problem, carriers, aligned, detections)
 
-    def pose_later(self, posed: Posed) -> Posed:
+    def build_later(self, built: BuiltProblem) -> BuiltProblem:
         """The problem with a start that is looked for behind the fixes which the alignment has seen."""
-        gnss, until = self.recording.gnss, posed.aligned.until
+        gnss, until = self.recording.gnss, built.aligned.until
         assert gnss is not None
         assert until is not None
         rest = replace(self.recording, gnss=pick_fixes(gnss, gnss.t > until))
-        return self.pose(self.align(rest, posed.detections.stationary), posed.detections, parts=True)
+        return self.build(self.align(rest, built.detections.stationary), built.detections, parts=True)
 
-    def pose_without(self, posed: Posed, noise: NoiseModel, parts: bool) -> Posed:
+    def build_without(self, built: BuiltProblem, noise: NoiseModel, parts: bool) -> BuiltProblem:
         """The problem with a start and stops that do not rest on fixes which a noise model leaves out.
 
         It is the same object where they are the same without.
         """
         if not noise.excluded or self.recording.gnss is None:
-            return posed
-        aligned, detections = posed.aligned, posed.detections
+            return built
+        aligned, detections = built.aligned, built.detections
         fixes = without_excluded(self.recording, noise)
         stops = detect(fixes, self.settings)
         changed = _differ(stops.stationary, detections.stationary)
@@ -119,13 +119,13 @@ class Posing:
                 found = aligned
             if found.motion is not None and found.contradicts(aligned):
                 aligned, changed = found, True
-        return self.pose(aligned, stops, parts) if changed else posed
+        return self.build(aligned, stops, parts) if changed else built
 
 
 def has_diverged(found: Alignment, stated: Alignment) -> bool:
     """Whether a filter from the stated start would diverge for a while."""
     turn = found.state.minus(stated.state)[0, :3]
-    return found.motion is not None and bool(np.linalg.norm(turn) > _FAR)
+    return found.motion is not None and bool(np.linalg.norm(turn) > _DIVERGED_BY)
 
 
 def start_sigma(start: Alignment) -> Array:

@@ -1,0 +1,95 @@
+"""Satellites seen from the places of a drive: what all kinds of rows of raw observations are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphnav.config.raw_gnss import RawGnssSettings
+from graphnav.constraints.base import BuildContext
+from graphnav.constraints.gnss import node_spacing, period
+from graphnav.constraints.raw_selection import select_observations
+from graphnav.core import earth
+from graphnav.core.rotation import Array
+from graphnav.core.state import Parameter
+from graphnav.gnss.ephemeris import rotate_earth
+from graphnav.gnss.series import RawGnss
+from graphnav.gnss.signals import C
+from graphnav.gnss.single_point import choose_coefficients, look, stretch
+
+CLOCK = "receiver_clock"
+_CLOCK_SIGMA = np.array([100.0, 10.0])  # m, m/s, about the single-point solution: next to nothing known
+
+
+@dataclass(frozen=True)
+class PreparedRows:
+    """What all kinds of rows need, of the rows that are used; made once for a scene."""
+
+    raw: RawGnss
+    keyframe: Array
+    s_n: Array  # (N, 3) m, satellites
+    v_n: Array  # (N, 3) m/s
+    R_ln: Array  # (N, 3, 3)
+    azimuth: Array  # (N,) rad, from north to the east
+    elevation: Array  # (N,) rad
+    known: Array  # (N,) m, distance from the nominal antenna with the delays of the atmosphere
+    nominal: Array  # (N, 3) m
+    ionosphere: Array  # (N,) m
+    stretch: Array  # (N,)
+    spacing: float  # s from node to node of whatever changes slowly
+
+    @property
+    def clock(self) -> Parameter:
+        """The receiver's, anew at every epoch."""
+        epochs, first = np.unique(self.raw.t, return_index=True)
+        sigma = np.tile(_CLOCK_SIGMA, (len(epochs), 1))
+        return Parameter(CLOCK, self.raw.receiver_clock[first], sigma, "m, m/s", begins=epochs, reported=True)
+
+    def take(self, which: NDArray[np.bool_]) -> PreparedRows:
+        """Some of the rows."""
+        own = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name not in ("raw", "spacing")}
+        return replace(self, raw=self.raw.take(which), **own)
+
+
+def prepare_every(scene: BuildContext) -> PreparedRows | None:
+    """The rows that are used, with those of epochs that have no keyframe, which is -1 then."""
+    raw = select_observations(scene.recording, scene.settings)
+    if raw is None:
+        return None
+    geometry = look(raw, raw.antenna, choose_coefficients(raw))
+    used = geometry.elevation >= np.radians(scene.settings.raw_gnss.elevation)
+    if not used.any():
+        return None
+    raw = raw.take(used)
+    geometry = look(raw, raw.antenna, choose_coefficients(raw))
+    frame = scene.frame
+    return PreparedRows(
+        raw=raw,
+        keyframe=scene.keyframe_at(raw.t),
+        s_n=(geometry.s - frame.r_e) @ frame.R_ne.T,
+        v_n=rotate_earth(raw.v, geometry.distance / C) @ frame.R_ne.T,
+        R_ln=earth.enu_axes(earth.ecef_to_llh(raw.antenna)) @ frame.R_ne.T,
+        azimuth=geometry.azimuth,
+        elevation=geometry.elevation,
+        known=geometry.distance + geometry.ionosphere + geometry.troposphere,
+        nominal=(raw.antenna - frame.r_e) @ frame.R_ne.T,
+        ionosphere=geometry.ionosphere,
+        stretch=stretch(raw, geometry),
+        spacing=node_spacing(scene.settings.gnss.slow_times, period_of_epochs(raw, scene.settings.raw_gnss)),
+    )
+
+
+def prepare_rows(scene: BuildContext) -> PreparedRows | None:
+    """The rows of epochs that have keyframes."""
+    every = scene.share(prepare_every)
+    if every is None or (every.keyframe >= 0).all():
+        return every
+    there = every.keyframe >= 0
+    return every.take(there) if there.any() else None
+
+
+def period_of_epochs(raw: RawGnss, settings: RawGnssSettings) -> float:
+    """s between the epochs that are used; a piece of a series may have too few to tell."""
+    return period(raw.epochs[0]) if raw.catalogue is None else max(raw.catalogue.period, settings.period)
