@@ -30,16 +30,17 @@ from graphnav.online.ahead import Live
 from graphnav.online.judging import CatchUp, Judgement
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.raw import codes_alone, settings_online, without_ambiguities
+from graphnav.online.sanity import find_period
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.tracker import Tracker
 from graphnav.online.walker import Walker
 from graphnav.recording import Recording
+from graphnav.recording.plausibility.readings import HOLE
 
 AFTER = 0.05  # s of IMU after a keyframe that a fix may look at
 _ODOMETER = 0.3  # s that a keyframe waits for the odometer
 _SILENT = 2.0  # s after which an odometer is not waited for
 _STEP = 0.5  # s between looks at a walk
-_MISSING = 5  # rows of the IMU in a row, whose work the next one does
 _KNOWN = 4.0  # s before the newest keyframe up to which the stops are known
 _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that level a vehicle without GNSS
@@ -79,7 +80,7 @@ class Smoother:
         self._began = -np.inf  # s, of what is being smoothed
         self._due = -np.inf  # s, of IMU time at which the next keyframes can be made
         self._awake = -np.inf  # s, at which there is anything to do
-        self._spacing = 0.0  # s, between the newest two rows of the IMU
+        self._period = np.inf  # s, of the IMU's rows
         self._dirty = np.inf
         self._settled: list[Trajectory] = []
         self._last_settled = -np.inf
@@ -159,14 +160,13 @@ class Smoother:
             self._dirty = min(self._dirty, t)
 
     def _look_if_due(self, now: float, before: float) -> None:
-        spacing, self._spacing = self._spacing, now - before
         if now < self._awake:
             return
-        if self._spacing > 1.5 * spacing > 0.0 and isinstance(self.tracker, Walker):
+        if now - before > HOLE * self._period and isinstance(self.tracker, Walker):
             # what is done at which row stays the same where some are missing, which may yet come
-            for k in range(1, min(round(self._spacing / spacing), _MISSING + 1)):
-                if before + k * spacing >= self._awake - SAME_TIME:
-                    self._look(before + k * spacing)
+            for k in range(1, round((now - before) / self._period)):
+                if before + k * self._period >= self._awake - SAME_TIME:
+                    self._look(before + k * self._period)
         self._look(now)
 
     def _look(self, now: float) -> None:
@@ -179,7 +179,7 @@ class Smoother:
             tracker.go_on(self.sensors)
             self._awake = now
         elif now >= self._due - SAME_TIME:
-            self._advance(tracker)
+            self._advance(tracker, now)
             self._awake = now
         elif self._again is not None:
             self._go_through(self._again, tracker)
@@ -221,7 +221,7 @@ class Smoother:
                 self.notes.append(Note("online.not_aligned", str(error)))
         if self.tracker is not None:
             self._judge_at_last()
-            self._advance(self.tracker, last=True)
+            self._advance(self.tracker, self.sensors.imu.newest, last=True)
             self.tracker.settle(self.sensors)
             self._collect(self.tracker)
 
@@ -268,7 +268,7 @@ class Smoother:
         self._fixes = [t for t in sensors.anchors_of_all().tolist() if t >= recording.start - SAME_TIME]
         self._began, self._judged = recording.start, recording.duration
         sensors.oldest = recording.start
-        self._advance(tracker)
+        self._advance(tracker, sensors.imu.newest)
         if self._found is not None and self.tracker is tracker:
             self._note_judgement(self._found, tracker)
 
@@ -378,22 +378,18 @@ class Smoother:
         self._due = self._awake = -np.inf
 
     # --------------------------------------------------------------------------------------------------- running
-    def _advance(self, tracker: Tracker, last: bool = False) -> None:
-        """Make the keyframes that are due."""
-        self.sensors.learn(tracker.newest - _KNOWN, tracker.stops)
-        sensors, period = self.sensors, 1.0 / self.settings.keyframes.rate
-        now = sensors.imu.newest
+    def _advance(self, tracker: Tracker, now: float, last: bool = False) -> None:
+        """Make the keyframes that are due at a time, s."""
+        sensors = self.sensors
+        sensors.learn(tracker.newest - _KNOWN, tracker.stops)
+        if isinstance(tracker, Walker):
+            self._advance_walk(tracker, now, last)
+            return
+        period, now = 1.0 / self.settings.keyframes.rate, sensors.imu.newest
         limit = now if last else now - AFTER
         odometer = sensors.odometer.newest
         if not last and now - odometer < _SILENT:
             limit = min(limit, max(odometer, now - _ODOMETER))
-        if isinstance(tracker, Walker):
-            at = _STEP * float(np.floor((now + SAME_TIME) / _STEP))
-            newest = tracker.take_steps(sensors, now if last else at - SURE, last, self._fixes, self._dirty)
-            if newest > -np.inf:
-                self._dirty, self._fixes = np.inf, [t for t in self._fixes if t > newest + SAME_TIME]
-            self._due = at + _STEP
-            return
         T = tracker.newest
         begun = bool(len(tracker.window)) or tracker.opened
         anchors = [t for t in self._fixes if T + SAME_TIME < t <= limit]
@@ -425,6 +421,14 @@ class Smoother:
                 return
         T = tracker.newest
         self._due = min([T + period, *(t for t in self._fixes if t > T)]) + AFTER
+
+    def _advance_walk(self, walker: Walker, now: float, last: bool) -> None:
+        self._period = find_period(self.sensors.imu.t)
+        at = _STEP * float(np.floor((now + SAME_TIME) / _STEP))
+        newest = walker.take_steps(self.sensors, now if last else at - SURE, last, self._fixes, self._dirty)
+        if newest > -np.inf:
+            self._dirty, self._fixes = np.inf, [t for t in self._fixes if t > newest + SAME_TIME]
+        self._due = at + _STEP
 
     def _collect(self, tracker: Tracker) -> None:
         for part in tracker.settled:
