@@ -9,9 +9,8 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.online.buffers import Buffer
+from graphnav.online.sanity import find_period
 from graphnav.recording.plausibility.readings import ALONE, HOLE, Excesses, find_contradicted, measure_excess
-
-_NEAR = 400  # rows that tell how often they come
 
 
 class Neighbours:
@@ -47,10 +46,10 @@ class Neighbours:
                 break
         else:
             return None
-        near = imu.t[-_NEAR:]
-        if len(near) < 4 or near[-3] != before[0][0] or near[-2] != before[1][0]:
+        near = imu.t[-3:]
+        if len(imu) < 4 or near[0] != before[0][0] or near[1] != before[1][0]:
             return None  # a late row stands between them
-        if np.diff(near[-3:]).max() >= HOLE * np.median(np.diff(near)):
+        if np.diff(near).max() >= HOLE * find_period(imu.t):
             return None
         self._last = before[0], now
         return before[0][0], before[1][0]
